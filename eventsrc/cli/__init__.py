@@ -1,0 +1,7 @@
+"""The commands about the log: record, import, simulate, router, log …"""
+
+import typer
+
+
+def register(app: typer.Typer) -> None:
+    """Add this package's commands to ``app``, in the order ``--help`` lists them."""

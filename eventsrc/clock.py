@@ -1,0 +1,12 @@
+"""The one place that reads the wall clock, so that everything else can be given a time."""
+
+import time
+from collections.abc import Callable
+
+Clock = Callable[[], int]
+"""Returns int nanoseconds since the Unix epoch."""
+
+
+def system_clock() -> int:
+    """Now, in int nanoseconds since the Unix epoch."""
+    return time.time_ns()

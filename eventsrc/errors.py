@@ -1,0 +1,61 @@
+"""Errors a person can act on.
+
+Every message names the value, the place and the next step. The command line prints it as one line
+and exits with ``exit_code``; nothing here is ever shown as a traceback.
+
+    MapfoldError                    1  something failed
+    ├── MisuseError                 2  the call itself is wrong
+    ├── LogError                    1  a log cannot be used as asked
+    │   ├── LogNotFound             2  no log there
+    │   ├── NotALog                 2  something else is there
+    │   ├── LogBusy                 1  another writer holds it
+    │   └── LogDamaged              1  bytes of the log are torn or rotten
+    ├── InvalidEnvelope             1  a payload is not an envelope (carries a Rejection reason)
+    └── TransportError              1  Zenoh cannot connect, listen or send
+
+``projections.errors`` adds the branch for databases and folds.
+"""
+
+
+class MapfoldError(Exception):
+    """Something failed; the message says what, where and what to do next."""
+
+    exit_code = 1
+
+
+class MisuseError(MapfoldError):
+    """The call itself is wrong: an argument, a combination, a missing piece."""
+
+    exit_code = 2
+
+
+class LogError(MapfoldError):
+    """A log cannot be used as asked."""
+
+
+class LogNotFound(LogError):
+    """There is no log at this path."""
+
+    exit_code = 2
+
+
+class NotALog(LogError):
+    """There is something at this path, but it is not a mapfold log."""
+
+    exit_code = 2
+
+
+class LogBusy(LogError):
+    """Another writer holds the log."""
+
+
+class LogDamaged(LogError):
+    """Bytes of the log are torn or rotten."""
+
+
+class InvalidEnvelope(MapfoldError):
+    """A payload is not an envelope."""
+
+
+class TransportError(MapfoldError):
+    """Zenoh cannot connect, listen or send."""

@@ -1,0 +1,124 @@
+"""From bytes to Accepted or Rejected: what is refused at the door, and why (DESIGN section 3).
+
+No I/O. The same function guards the recorder, the importer and the fold, so a log holds nothing
+under a robot's key that the fold cannot read. A refusal keeps the bytes; its caller writes them to
+the ``mapfold/rejected`` channel.
+"""
+
+import binascii
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from .envelope import Detection, Envelope
+from .ids import DetId, default_det_id
+
+DEFAULT_MAX_PAYLOAD_BYTES = 16 * 1024 * 1024
+
+Vector = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Accepted:
+    """A valid envelope with its vectors decoded.
+
+    ``det_ids`` and ``vectors`` run parallel to ``envelope.detections``. A vector is float32 of
+    shape (embedding_dim,), finite, not zero and *not* normalised; None where the detection
+    has none.
+    """
+
+    envelope: Envelope
+    det_ids: tuple[DetId, ...]
+    vectors: tuple[Vector | None, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Rejected:
+    """A payload that is not an envelope: ``reason`` names the field, its value and the rule."""
+
+    reason: str
+
+
+class _RefusalError(Exception):
+    """Inside this module only: carries a reason up to `ingest`."""
+
+
+def ingest(payload: bytes, *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES) -> Accepted | Rejected:
+    """Read one envelope. Never raises for bad input; it says Rejected and why."""
+    if len(payload) > max_bytes:
+        return Rejected(f"payload of {len(payload)} bytes is over the limit of {max_bytes}")
+    try:
+        envelope = Envelope.model_validate_json(payload)
+    except ValidationError as error:
+        return Rejected(_first_error(error))
+    except RecursionError:  # nesting deeper than the parser follows
+        return Rejected("not JSON that can be read: nested too deeply")
+    try:
+        return Accepted(envelope, _det_ids(envelope), _vectors(envelope))
+    except _RefusalError as refusal:
+        return Rejected(str(refusal))
+
+
+def _first_error(error: ValidationError) -> str:
+    """One line for the first thing that is wrong, and how many more there are."""
+    details = error.errors(include_url=False, include_context=False)
+    first = details[0]
+    if first["type"] == "json_invalid":
+        return f"not JSON: {first['msg'].removeprefix('Invalid JSON: ')}"
+    if first["type"] == "model_type" and not first["loc"]:
+        return f"not a JSON object but {type(first['input']).__name__}"
+    place = ".".join(str(part) for part in first["loc"]) or "envelope"
+    message = first["msg"].removeprefix("Value error, ")
+    more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
+    if first["type"] == "missing":
+        return f"{place}: required field is missing{more}"
+    value = repr(first["input"])
+    value = value if len(value) <= 80 else value[:77] + "..."
+    return f"{place}: {message} (got {value}){more}" if first["loc"] else f"{message}{more}"
+
+
+def _det_ids(envelope: Envelope) -> tuple[DetId, ...]:
+    ids = tuple(
+        DetId(d.det_id)
+        if d.det_id is not None
+        else default_det_id(envelope.run_id, envelope.keyframe_id, index)
+        for index, d in enumerate(envelope.detections)
+    )
+    seen: set[DetId] = set()
+    for index, det_id in enumerate(ids):
+        if det_id in seen:
+            raise _RefusalError(
+                f"detections.{index}.det_id: {det_id!r} stands twice in one envelope"
+            )
+        seen.add(det_id)
+    return ids
+
+
+def _vectors(envelope: Envelope) -> tuple[Vector | None, ...]:
+    return tuple(_vector(index, d) for index, d in enumerate(envelope.detections))
+
+
+def _vector(index: int, detection: Detection) -> Vector | None:
+    if detection.embedding is None:
+        return None
+    place = f"detections.{index}.embedding"
+    try:
+        raw = binascii.a2b_base64(detection.embedding, strict_mode=True)
+    except (binascii.Error, ValueError) as error:
+        raise _RefusalError(f"{place}: not base64: {error}") from None
+    dim = detection.embedding_dim
+    if dim is None:
+        raise _RefusalError(f"detections.{index}.embedding_dim: required beside an embedding")
+    if len(raw) != 4 * dim:
+        raise _RefusalError(
+            f"{place}: {len(raw)} bytes do not match embedding_dim {dim}, which takes {4 * dim}"
+        )
+    vector = np.frombuffer(raw, dtype="<f4")
+    largest = float(np.abs(vector).max())
+    if not np.isfinite(largest):
+        raise _RefusalError(f"{place}: holds NaN or infinity")
+    if largest == 0.0:
+        raise _RefusalError(f"{place}: is the zero vector, which has no direction")
+    return vector

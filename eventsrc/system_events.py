@@ -1,0 +1,58 @@
+"""mapfold's own events: they stand in the same log and the same offset space as the envelopes.
+
+``mapfold/rejected``  a payload refused at the door, with its bytes and the reason
+``mapfold/loss``      a gap that was noticed: who, first and last missing, why
+``mapfold/command``   what an operator said (kept for later; nothing writes it yet)
+"""
+
+import base64
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+RESERVED_PREFIX = "mapfold/"
+REJECTED_KEY = "mapfold/rejected"
+LOSS_KEY = "mapfold/loss"
+COMMAND_KEY = "mapfold/command"
+
+
+def is_system_key(key: str) -> bool:
+    """True for the keys of mapfold's own events; every other key carries envelopes."""
+    return key.startswith(RESERVED_PREFIX)
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+
+class RejectedPayload(_Model):
+    """The content of a ``mapfold/rejected`` event. ``payload`` is base64 of the refused bytes."""
+
+    key: str
+    reason: str
+    payload: str
+
+    @classmethod
+    def of(cls, key: str, reason: str, raw: bytes) -> "RejectedPayload":
+        """Keep ``raw``, which came under ``key`` and was refused for ``reason``."""
+        return cls(key=key, reason=reason, payload=base64.b64encode(raw).decode("ascii"))
+
+    @property
+    def raw(self) -> bytes:
+        """The refused bytes."""
+        return base64.b64decode(self.payload)
+
+
+class Loss(_Model):
+    """The content of a ``mapfold/loss`` event.
+
+    ``publisher`` names who it was lost from: a run id (cause ``keyframe_gap``), a Zenoh source id
+    (``transport_miss``) or the key expression (``queue_full``). ``first`` and ``last`` are the
+    first and last missing number in that publisher's own counting, None where nothing was counted.
+    """
+
+    publisher: str
+    first: int | None = None
+    last: int | None = None
+    count: Annotated[int, Field(ge=1)]
+    cause: Literal["keyframe_gap", "queue_full", "transport_miss"]

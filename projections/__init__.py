@@ -1,0 +1,1 @@
+"""projections: what the log means. A deterministic fold, its views and its databases."""

@@ -1,0 +1,22 @@
+"""The ``mapfold`` command: one composition root for both packages' commands."""
+
+import typer
+
+from eventsrc import cli as log_commands
+from eventsrc.cli._shell import run_app
+
+app = typer.Typer(
+    name="mapfold",
+    help="A robot's semantic map as a deterministic fold over an append-only log.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+log_commands.register(app)
+
+
+def main() -> None:
+    """Entry point of the ``mapfold`` program."""
+    run_app(app)

@@ -1,0 +1,236 @@
+"""What changed in the map: the contract between the fold and everything built on it.
+
+Sinks, the view, time travel and the web page are folds over these deltas and never look into a
+reducer. A delta carries *absolute* new values (a count, not an increment), so applying the last one
+per thing is enough, and applying one twice does no harm. ``offset`` names the event that caused it;
+the cause need not be a keyframe.
+
+Ordinals number the things of one kind 0, 1, 2 … in the order in which the fold met or founded them.
+They are never reused, and a database's ids are computed from them.
+
+Positions are integer micrometres in the map frame (``_um``), so that sums and comparisons are
+exact; `projections.exact` says why and where the bounds are. Timestamps are the robot's, float
+seconds.
+
+The deltas of one event come in this order: RunSeen, KeyframeAdded, ObservationAdded …, then places
+(PlaceFormed, PlacesMerged, KeyframePlaced, PlaceChanged), landmarks (ObjectFound / ObjectSeen),
+located-in (ObjectMoved), adjacency (PlacesLinked). A delta names only things that deltas before it
+have introduced.
+"""
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+UnitVector: TypeAlias = NDArray[np.int32]
+"""A unit vector as multiples of 2⁻²⁰, int32 of shape (dim,); see `projections.exact`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """The robot's pose in the map frame: micrometres, and radians as they came."""
+
+    x_um: int
+    y_um: int
+    yaw_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class RunSeen:
+    """A run was met for the first time, or turned out to have started earlier.
+
+    ``started_at`` is the earliest keyframe timestamp of the run so far, in seconds.
+    """
+
+    offset: int
+    run: int
+    run_id: str
+    started_at: float
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframeAdded:
+    """A new keyframe; ``pose`` is None when the robot did not know where it was."""
+
+    offset: int
+    keyframe: int
+    run: int
+    run_id: str
+    keyframe_id: int
+    timestamp: float
+    pose: Pose | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObservationAdded:
+    """A new detection of a keyframe.
+
+    ``embedding`` is None when the detection has none *or* it is of another space than the map's
+    (then ``foreign_space`` is true).
+    """
+
+    offset: int
+    observation: int
+    keyframe: int
+    run_id: str
+    keyframe_id: int
+    det_id: str
+    class_name: str
+    confidence: float
+    bbox: tuple[float, float, float, float]
+    embedding_model: str | None
+    embedding: UnitVector | None
+    foreign_space: bool
+
+
+@dataclass(frozen=True, slots=True)
+class EventSkipped:
+    """An envelope that changes nothing: a duplicate, a conflict, or a det_id used before.
+
+    ``kind`` is ``duplicate`` (same keyframe, same content), ``conflict`` (same keyframe, other
+    content: the first one stands) or ``det_id_reused`` (an observation of a new keyframe whose
+    det_id an earlier keyframe has: that observation is left out, the rest of the keyframe is
+    folded).
+    """
+
+    offset: int
+    kind: str
+    run_id: str
+    keyframe_id: int
+    det_id: str | None = None
+    first_offset: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceFormed:
+    """A place was founded by the keyframe that became its first core point.
+
+    ``place_id`` is ``{run_id}_p{counter}`` with a counter from 0 per founding run.
+    """
+
+    offset: int
+    place: int
+    place_id: str
+    founder: int
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """Two core points within ε of each other that joined two places; keyframe ordinals, µm."""
+
+    core: int
+    neighbour: int
+    distance_um: int
+
+
+@dataclass(frozen=True, slots=True)
+class PlacesMerged:
+    """Places became one. All members of ``absorbed`` belong to ``survivor`` from now on.
+
+    No KeyframePlaced is emitted for them: whoever keeps members moves them all. ``bridge`` is the
+    keyframe whose arrival did it, ``links`` the pairs of core points that join the parts, one pair
+    for each absorbed place. ``survivor_count`` and ``absorbed_counts`` are members before
+    the merge.
+    """
+
+    offset: int
+    survivor: int
+    absorbed: tuple[int, ...]
+    bridge: int
+    links: tuple[Link, ...]
+    survivor_count: int
+    absorbed_counts: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframePlaced:
+    """A keyframe (new, or noise until now) belongs to a place."""
+
+    offset: int
+    keyframe: int
+    place: int
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceChanged:
+    """A place's members changed: their number and the sums of their positions, in µm.
+
+    The centroid in metres is ``sum / (keyframe_count * 1_000_000)``, correctly rounded.
+    """
+
+    offset: int
+    place: int
+    keyframe_count: int
+    sum_x_um: int
+    sum_y_um: int
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectFound:
+    """A new Object, founded by an observation; its position is that keyframe's pose."""
+
+    offset: int
+    object: int
+    object_id: str
+    class_name: str
+    observation: int
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectSeen:
+    """An observation was assigned to an Object (the founding one too); the Object's new values.
+
+    ``similarity_q40`` is the cosine with the Object's mean embedding before this observation, as an
+    exact multiple of 2⁻⁴⁰ (2⁴⁰ for the founding one). The mean position in metres is
+    ``sum / (obs_count * 1_000_000)``. ``first_seen`` and ``last_seen`` are robot timestamps.
+    """
+
+    offset: int
+    object: int
+    observation: int
+    similarity_q40: int
+    obs_count: int
+    sum_x_um: int
+    sum_y_um: int
+    first_seen: float
+    last_seen: float
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectMoved:
+    """An Object is located in another place than before, or in none (None)."""
+
+    offset: int
+    object: int
+    place: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class PlacesLinked:
+    """The number of shared transitions of two places changed; ``a`` was founded before ``b``.
+
+    0 means the edge is gone (one of the two was absorbed, or relabelling moved the transitions).
+    """
+
+    offset: int
+    a: int
+    b: int
+    shared_transitions: int
+
+
+Delta: TypeAlias = (
+    RunSeen
+    | KeyframeAdded
+    | ObservationAdded
+    | EventSkipped
+    | PlaceFormed
+    | PlacesMerged
+    | KeyframePlaced
+    | PlaceChanged
+    | ObjectFound
+    | ObjectSeen
+    | ObjectMoved
+    | PlacesLinked
+)

@@ -1,0 +1,70 @@
+"""Errors of the fold, its settings and the databases; this side's branch of `eventsrc.errors`.
+
+MapfoldError
+├── SettingsError               2  a setting's name or value is wrong
+├── WhenceError                 2  a point in the log does not exist
+├── FoldError                   1  an event cannot be folded; names its offset
+└── DatabaseError               1  a database cannot be used as asked
+    ├── DatabaseUnavailable     1  no server answers, or it refused us
+    ├── ExtensionMissing        1  the server lacks AGE or pgvector
+    ├── EmbeddedServerError     1  the embedded server cannot run here or did not start
+    ├── ProjectionMissing       1  nothing has been projected there yet
+    ├── ProjectionMismatch      1  made from another log or with other settings
+    ├── ProjectionBusy          1  a rebuild or a tail already writes this target
+    └── CheckpointMoved         1  someone else moved the checkpoint under us
+"""
+
+from eventsrc.errors import MapfoldError
+
+
+class SettingsError(MapfoldError):
+    """A setting's name or value is wrong."""
+
+    exit_code = 2
+
+
+class WhenceError(MapfoldError):
+    """A point in the log does not exist."""
+
+    exit_code = 2
+
+
+class FoldError(MapfoldError):
+    """An event cannot be folded."""
+
+    def __init__(self, offset: int, reason: str) -> None:
+        super().__init__(f"event at offset {offset} cannot be folded: {reason}")
+        self.offset = offset
+        self.reason = reason
+
+
+class DatabaseError(MapfoldError):
+    """A database cannot be used as asked."""
+
+
+class DatabaseUnavailable(DatabaseError):
+    """No server answers, or it refused us."""
+
+
+class ExtensionMissing(DatabaseError):
+    """The server lacks AGE or pgvector."""
+
+
+class EmbeddedServerError(DatabaseError):
+    """The embedded server cannot run here or did not start."""
+
+
+class ProjectionMissing(DatabaseError):
+    """Nothing has been projected there yet."""
+
+
+class ProjectionMismatch(DatabaseError):
+    """The projection was made from another log or with other settings."""
+
+
+class ProjectionBusy(DatabaseError):
+    """A rebuild or a tail already writes this target."""
+
+
+class CheckpointMoved(DatabaseError):
+    """Someone else moved the checkpoint under us."""

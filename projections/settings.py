@@ -1,0 +1,59 @@
+"""Every parameter that changes the fold, in one frozen model.
+
+The fingerprint is part of a checkpoint's identity: a projection made with other settings is another
+projection, and is refused rather than mixed.
+"""
+
+import hashlib
+from collections.abc import Iterable
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from .errors import SettingsError
+
+
+class Settings(BaseModel):
+    """Parameters of the fold. Lengths in metres; similarities are cosines."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    eps_m: Annotated[float, Field(gt=0.0, le=1000.0)] = 1.5
+    """DBSCAN's ε: two poses are neighbours within this distance, inclusive."""
+    min_samples: Annotated[int, Field(ge=1, le=1_000_000)] = 3
+    """Neighbours, self included, that make a pose a core point."""
+    fusion_radius_m: Annotated[float, Field(gt=0.0, le=1000.0)] = 3.0
+    """An observation may fuse with an Object whose mean position is within this distance."""
+    fusion_similarity: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.7
+    """… and whose mean embedding has at least this cosine with the observation's."""
+    embedding_model: str | None = None
+    """The map's embedding model; None takes that of the first embedded detection."""
+    embedding_dim: Annotated[int, Field(ge=1, le=16_000)] | None = None
+    """The map's embedding dimension; None takes that of the first embedded detection."""
+
+    def fingerprint(self) -> str:
+        """16 hex digits that are equal exactly when every setting is."""
+        canonical = self.model_dump_json()
+        return hashlib.sha256(canonical.encode()).hexdigest()[:16]
+
+    def with_assignments(self, assignments: Iterable[str]) -> "Settings":
+        """These settings changed by ``name=value`` texts, as ``--set`` takes them.
+
+        Raises SettingsError that names the setting and the rule it breaks.
+        """
+        values: dict[str, Any] = self.model_dump()
+        for text in assignments:
+            name, equals, value = text.partition("=")
+            name = name.strip()
+            if not equals:
+                raise SettingsError(f"--set {text}: write it as name=value, such as eps_m=1.0")
+            if name not in values:
+                names = ", ".join(sorted(values))
+                raise SettingsError(f"--set {text}: no setting {name!r}; there are {names}")
+            values[name] = None if value.strip() in ("", "none") else value.strip()
+        try:
+            return Settings.model_validate(values)
+        except ValidationError as error:
+            first = error.errors()[0]
+            field = ".".join(str(part) for part in first["loc"])
+            raise SettingsError(f"--set {field}={first['input']}: {first['msg'].lower()}") from None

@@ -1,0 +1,1 @@
+"""Fixtures every test may use; those of one subsystem live in ``tests/fixtures_*.py``."""
