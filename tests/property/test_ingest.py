@@ -1,0 +1,62 @@
+"""Ingest answers every sequence of bytes, and keeps what a valid envelope says."""
+
+import json
+from typing import Any
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from eventsrc.ingest import Accepted, Rejected, ingest
+from tests.envelopes import detection, envelope, payload
+
+TEXT = st.text(st.characters(exclude_categories=["Cc", "Cs"]), min_size=1, max_size=256)
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+    max_leaves=12,
+)
+FIELDS = st.sampled_from(["run_id", "keyframe_id", "timestamp", "map_x", "map_yaw", "detections"])
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_are_answered(raw: bytes) -> None:
+    assert isinstance(ingest(raw), Accepted | Rejected)
+
+
+@given(st.dictionaries(FIELDS, JSON, max_size=3))
+def test_any_field_may_hold_any_json(fields: dict[str, Any]) -> None:
+    result = ingest(payload({**envelope(), **fields}))
+    assert isinstance(result, Accepted) or result.reason
+
+
+@given(
+    run_id=TEXT,
+    keyframe_id=st.integers(-(2**63), 2**63 - 1),
+    x=st.floats(-1e7, 1e7),
+    y=st.floats(-1e7, 1e7),
+    names=st.lists(TEXT, max_size=3),
+)
+def test_a_valid_envelope_is_accepted_unchanged(
+    run_id: str, keyframe_id: int, x: float, y: float, names: list[str]
+) -> None:
+    sent = envelope(
+        keyframe_id,
+        x,
+        y,
+        run_id=run_id,
+        timestamp=1.5,
+        detections=[detection(name) for name in names],
+    )
+    read = ingest(payload(sent))
+    assert isinstance(read, Accepted)
+    assert read.envelope.run_id == run_id
+    assert read.envelope.keyframe_id == keyframe_id
+    assert (read.envelope.map_x, read.envelope.map_y) == (x, y)
+    assert [d.class_name for d in read.envelope.detections] == names
+    assert list(read.det_ids) == [f"{run_id}_kf{keyframe_id}_d{i}" for i in range(len(names))]
+
+
+@given(st.binary(max_size=40))
+def test_ascii_escapes_and_plain_utf8_read_the_same(noise: bytes) -> None:
+    document = envelope(run_id="r🪑", note=noise.hex())
+    assert ingest(json.dumps(document).encode()) == ingest(payload(document))

@@ -1,0 +1,207 @@
+"""Every refusal of the envelope's contract, each with a reason that names the field."""
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+from eventsrc.ingest import Accepted, Rejected, ingest
+from tests.envelopes import detection, embedding, envelope, payload
+
+VECTOR = [0.6, 0.8, 0.0, 0.0]
+
+
+def refusal(document: Any, **options: Any) -> str:
+    result = ingest(document if isinstance(document, bytes) else payload(document), **options)
+    assert isinstance(result, Rejected)
+    return result.reason
+
+
+def accepted(document: Any) -> Accepted:
+    result = ingest(payload(document))
+    assert isinstance(result, Accepted), result
+    return result
+
+
+def without(document: dict[str, Any], field: str) -> dict[str, Any]:
+    return {k: v for k, v in document.items() if k != field}
+
+
+def test_a_whole_envelope_is_read_as_it_was_sent() -> None:
+    sent = envelope(
+        42, 2.14, 0.83, detections=[detection("cup", VECTOR, det_id="d"), detection("chair")]
+    )
+    read = accepted(sent)
+    assert read.envelope.run_id == "run-a"
+    assert read.envelope.keyframe_id == 42
+    assert (read.envelope.map_x, read.envelope.map_y, read.envelope.map_yaw) == (2.14, 0.83, 0.0)
+    assert read.det_ids == ("d", "run-a_kf42_d1")
+    assert read.vectors[0] is not None
+    assert read.vectors[0].tolist() == np.asarray(VECTOR, dtype=np.float32).tolist()
+    assert read.vectors[1] is None
+
+
+def test_unknown_fields_are_let_through() -> None:
+    accepted(envelope(battery=0.4, detections=[detection(track=7)]))
+
+
+def test_a_robot_without_a_pose_is_heard() -> None:
+    assert accepted(envelope(x=None)).envelope.map_x is None
+    assert accepted(envelope(map_x=None, map_y=None, map_yaw=None)).envelope.map_x is None
+
+
+@pytest.mark.parametrize(
+    "name", ["baker's rack", "x'}) DETACH DELETE r //", "$$; drop table", "🪑é"]
+)
+def test_names_may_hold_any_printable_character(name: str) -> None:
+    read = accepted(envelope(run_id=name, detections=[detection(name)]))
+    assert read.envelope.run_id == name
+    assert read.envelope.detections[0].class_name == name
+
+
+@pytest.mark.parametrize(
+    ("stamp", "stamp_ns"),
+    [
+        (0.0, 0),
+        (1774357234.567, 1_774_357_234_567_000_000),
+        (1560000002.614, 1_560_000_002_614_000_000),
+        (1e-9, 1),
+    ],
+)
+def test_stamp_ns_is_exact_to_the_decimal_that_was_sent(stamp: float, stamp_ns: int) -> None:
+    assert accepted(envelope(timestamp=stamp)).envelope.stamp_ns == stamp_ns
+
+
+@pytest.mark.parametrize(
+    ("raw", "says"),
+    [
+        (b"", "not JSON"),
+        (b"\xff\xfe", "not JSON"),
+        (b"{", "not JSON"),
+        (b"[" * 100_000, "not JSON"),
+        (b"[1]", "not a JSON object but list"),
+        (b'"x"', "not a JSON object but str"),
+        (b"null", "not a JSON object but NoneType"),
+    ],
+)
+def test_what_is_no_json_object_is_refused(raw: bytes, says: str) -> None:
+    assert refusal(raw).startswith(says)
+
+
+@pytest.mark.parametrize("field", ["run_id", "keyframe_id", "timestamp", "detections"])
+def test_a_missing_field_is_named(field: str) -> None:
+    assert refusal(without(envelope(), field)) == f"{field}: required field is missing"
+
+
+@pytest.mark.parametrize("field", ["class", "confidence", "bbox"])
+def test_a_missing_field_of_a_detection_is_named_with_its_place(field: str) -> None:
+    broken = envelope(detections=[detection(), without(detection(), field)])
+    assert refusal(broken) == f"detections.1.{field}: required field is missing"
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"run_id": 7},
+        {"run_id": None},
+        {"keyframe_id": "1"},
+        {"keyframe_id": 1.5},
+        {"keyframe_id": True},
+        {"keyframe_id": 2**63},
+        {"timestamp": "now"},
+        {"timestamp": -1.0},
+        {"timestamp": 1e300},
+        {"map_x": "2"},
+        {"map_x": 1e8},
+        {"map_y": None},
+        {"map_yaw": None},
+        {"detections": None},
+        {"detections": {}},
+        {"detections": [None]},
+        {"detections": [detection(bbox=[1.0, 2.0, 3.0])]},
+        {"detections": [detection(bbox=[1.0, 2.0, 3.0, "4"])]},
+        {"detections": [detection(confidence="high")]},
+        {"detections": [detection(**{"class": 3})]},
+        {"detections": [detection(det_id=3)]},
+        {"detections": [detection(embedding=[0.1, 0.2])]},
+    ],
+    ids=lambda fields: json.dumps(fields)[:60],
+)
+def test_a_wrong_type_or_range_is_refused(fields: dict[str, Any]) -> None:
+    reason = refusal({**envelope(), **fields})
+    assert next(iter(fields)) in reason
+
+
+@pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999"])
+@pytest.mark.parametrize("field", ["timestamp", "map_x", "map_yaw"])
+def test_numbers_must_be_finite(field: str, number: str) -> None:
+    raw = payload(envelope(**{field: 123456789.25})).replace(b"123456789.25", number.encode())
+    assert refusal(raw).startswith(f"{field}: ")
+
+
+@pytest.mark.parametrize(
+    ("fields", "says"),
+    [
+        ({"embedding": "***"}, "not base64"),
+        ({"embedding_dim": 5}, "16 bytes do not match embedding_dim 5, which takes 20"),
+        ({"embedding_dim": None}, "required beside an embedding"),
+        ({"embedding_dim": 0}, "embedding_dim"),
+        (embedding([0.0, -0.0, 0.0, 0.0]), "zero vector"),
+        (embedding([float("nan"), 1.0, 0.0, 0.0]), "NaN or infinity"),
+        (embedding([float("inf"), 1.0, 0.0, 0.0]), "NaN or infinity"),
+    ],
+)
+def test_a_bad_vector_is_refused(fields: dict[str, Any], says: str) -> None:
+    reason = refusal(envelope(detections=[detection("cup", VECTOR, **fields)]))
+    assert "detections.0.embedding" in reason
+    assert says in reason
+
+
+@pytest.mark.parametrize("field", ["run_id", "det_id", "class", "embedding_model"])
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "is empty"),
+        ("x" * 257, "is 257 characters long, more than 256"),
+        ("a\x00b", "has the control character U+0000 at index 1"),
+        ("tab\t", "has the control character U+0009 at index 3"),
+        ("\x85", "has the control character U+0085 at index 0"),
+    ],
+    ids=["empty", "long", "nul", "tab", "c1"],
+)
+def test_ids_are_clean_text(field: str, text: str, says: str) -> None:
+    broken = (
+        envelope(run_id=text)
+        if field == "run_id"
+        else envelope(detections=[detection("cup", VECTOR, **{field: text})])
+    )
+    assert says in refusal(broken)
+
+
+def test_256_characters_are_not_too_many() -> None:
+    accepted(envelope(run_id="x" * 256))
+
+
+def test_a_det_id_twice_in_one_envelope_is_refused() -> None:
+    twice = [detection(det_id="d"), detection(), detection(det_id="d")]
+    assert refusal(envelope(detections=twice)).startswith("detections.2.det_id: 'd' stands twice")
+
+
+def test_a_given_det_id_may_not_clash_with_a_made_one() -> None:
+    clash = [detection(det_id="run-a_kf1_d1"), detection()]
+    assert "stands twice" in refusal(envelope(detections=clash))
+
+
+def test_a_payload_over_the_limit_is_refused_before_it_is_read() -> None:
+    raw = payload(envelope())
+    assert refusal(raw, max_bytes=len(raw) - 1).startswith(f"payload of {len(raw)} bytes")
+    assert isinstance(ingest(raw, max_bytes=len(raw)), Accepted)
+
+
+def test_further_errors_are_counted() -> None:
+    assert refusal({}) == "run_id: required field is missing (and 3 more)"
+
+
+def test_a_reason_quotes_a_long_value_shortly() -> None:
+    assert len(refusal(envelope(timestamp="x" * 10_000))) < 200

@@ -1,0 +1,40 @@
+"""Settings: assignments from the command line, fingerprints, refusals in words."""
+
+import pytest
+
+from projections.errors import SettingsError
+from projections.settings import Settings
+
+
+def test_assignments_change_what_they_name() -> None:
+    changed = Settings().with_assignments(["eps_m=1.0", "min_samples = 8", "embedding_model=a=b"])
+    assert changed == Settings(eps_m=1.0, min_samples=8, embedding_model="a=b")
+
+
+def test_none_gives_a_setting_back() -> None:
+    pinned = Settings(embedding_model="m", embedding_dim=4)
+    assert pinned.with_assignments(["embedding_model=none", "embedding_dim="]) == Settings()
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("eps_m", "write it as name=value"),
+        ("eps=1", "no setting 'eps'; there are embedding_dim, embedding_model, eps_m"),
+        ("eps_m=wide", "--set eps_m=wide: input should be a valid number"),
+        ("eps_m=0", "--set eps_m=0: input should be greater than 0"),
+        ("eps_m=nan", "--set eps_m=nan"),
+        ("min_samples=2.5", "--set min_samples=2.5"),
+    ],
+)
+def test_a_wrong_assignment_is_refused_in_words(text: str, says: str) -> None:
+    with pytest.raises(SettingsError, match="--set") as caught:
+        Settings().with_assignments([text])
+    assert says in str(caught.value)
+    assert caught.value.exit_code == 2
+
+
+def test_the_fingerprint_tells_settings_apart() -> None:
+    settings = [Settings(), Settings(eps_m=1.0), Settings(min_samples=4), Settings(embedding_dim=4)]
+    assert len({s.fingerprint() for s in settings}) == len(settings)
+    assert Settings(eps_m=1.5).fingerprint() == Settings().fingerprint()
