@@ -1,0 +1,157 @@
+"""The condition language: what holds, what is refused, and at which column."""
+
+from dataclasses import dataclass, field
+
+import pytest
+
+from projections.timetravel.expression import (
+    FUNCTIONS,
+    Expression,
+    ExpressionError,
+    functions_help,
+)
+
+
+@dataclass
+class FakeFacts:
+    """A map written out by hand: three keyframes, two places, one of them absorbed."""
+
+    places: dict[str, str] = field(default_factory=lambda: {"a:1": "a_p0", "a:2": "a_p0"})
+
+    def place_count(self) -> int:
+        return 2
+
+    def noise_count(self) -> int:
+        return 1
+
+    def keyframe_count(self, run_id: str | None = None) -> int:
+        return {None: 3, "a": 3}.get(run_id, 0)
+
+    def object_count(self, class_name: str | None = None) -> int:
+        return {None: 5, "chair": 2}.get(class_name, 0)
+
+    def place_of(self, keyframe: str) -> str | None:
+        return self.places.get(keyframe)
+
+    def located_in(self, object_id: str) -> str | None:
+        return "a_p0" if object_id == "obj-1" else None
+
+    def sightings(self, object_id: str) -> int:
+        return 4 if object_id == "obj-1" else 0
+
+    def size(self, place_id: str) -> int:
+        return 2 if place_id == "a_p0" else 0
+
+    def transitions(self, a: str, b: str) -> int:
+        return 7 if {a, b} == {"a_p0", "a_p2"} else 0
+
+    def merged(self, place_id: str) -> bool:
+        return place_id == "a_p1"
+
+    def knows(self, kind: str, text: str) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(
+    ("text", "holds"),
+    [
+        ("place_count < 3", True),
+        ("place_count() < 2", False),
+        ("noise_count == 1 and keyframe_count >= 3", True),
+        ("keyframe_count('a') == keyframe_count", True),
+        ("keyframe_count('b') == 0", True),
+        ("object_count('chair') > 1", True),
+        ("object_count > 5", False),
+        ("same_place('a:1', 'a:2')", True),
+        ("same_place('a:1', 'a:3')", False),
+        ("same_place('a:3', 'a:3')", False),  # noise is in no place, not even with itself
+        ("not same_place('a:1', 'a:3')", True),
+        ("located_in('obj-1') == 'a_p0'", True),
+        ("located_in('obj-2') == none", True),
+        ("place_of('a:1') != place_of('a:3')", True),
+        ("transitions('a_p2', 'a_p0') == 7", True),
+        ("merged('a_p1') and not merged('a_p0')", True),
+        ("size('a_p0') == 2 and sightings('obj-1') == 4", True),
+        ("1 < 0 or 2 > 1 and 1 > 2", False),  # and binds tighter than or
+        ("(1 < 2 or 2 > 1) and 1 > 2", False),
+        ("1 < 2 or (2 > 1 and 1 > 2)", True),
+        ("not 1 > 2 and 1 < 2", True),  # not binds tighter than and
+        ("place_count > -1", True),
+    ],
+)
+def test_expressions_hold(text: str, holds: bool) -> None:
+    assert Expression(text).holds(FakeFacts()) is holds
+
+
+@pytest.mark.parametrize(
+    ("text", "column", "says"),
+    [
+        ("", 1, "expected a number, a text or a function, not the end"),
+        ("place_count <", 14, "not the end"),
+        ("place_count < 3 and placecount > 2", 21, "did you mean 'place_count'?"),
+        ("wibble > 1", 1, "there are keyframe_count, located_in"),
+        ("place_count = 3", 13, "write '=='"),
+        ("place_count < 'three'", 13, "cannot compare a number with a text or none"),
+        ("place_of('a:1') < 'a_p0'", 17, "texts have no order"),
+        ("place_count", 1, "must be true or false, and this is a number"),
+        ("place_count and 1 < 2", 1, "a side of and"),
+        ("1 < 2 or 'x'", 10, "a side of or"),
+        ("not place_count", 5, "what stands after not"),
+        ("1 < 2 < 3", 7, "one comparison at a time"),
+        ("(1 < 2", 7, "to close the parenthesis"),
+        ("1 < 2)", 6, "did not expect ')'"),
+        ("same_place('a:1')", 1, "write it as same_place(keyframe, keyframe)"),
+        ("same_place('a:1' 'a:2')", 18, "expected ','"),
+        ("object_count(chair) > 1", 14, "takes texts in quotes"),
+        ("merged('a_p0", 8, "not closed"),
+        ("place_count < 3.5", 16, "numbers are whole"),
+        ("place_count < 3 && 1 < 2", 17, "write and, or, not"),
+        ("(1 < 2) == (2 < 3)", 9, "truths are not compared"),
+        ("__import__('os') == 'x'", 1, "no function '__import__'"),
+        ("place_count < 3; 1", 16, "has no meaning here"),
+    ],
+)
+def test_an_error_points_at_its_column(text: str, column: int, says: str) -> None:
+    with pytest.raises(ExpressionError) as caught:
+        Expression(text)
+    assert says in str(caught.value)
+    assert caught.value.column == column
+    assert caught.value.exit_code == 2
+    assert "\n" not in str(caught.value)
+
+
+def test_the_pointer_stands_under_the_column() -> None:
+    with pytest.raises(ExpressionError) as caught:
+        Expression("place_count < 3 and wrong > 2")
+    source, caret = caught.value.pointer.splitlines()
+    assert source[caret.index("^") :].startswith("wrong")
+
+
+def test_deep_nesting_is_refused_not_overflowed() -> None:
+    assert Expression("(" * 90 + "1 < 2" + ")" * 90).holds(FakeFacts())
+    for text in ("(" * 5000 + "1 < 2", "not " * 5000 + "1 < 2"):
+        with pytest.raises(ExpressionError, match="nested more than"):
+            Expression(text)
+
+
+def test_ids_may_hold_quotes_and_backslashes() -> None:
+    facts = FakeFacts({r"it's:1": "p", 'b"\\s:1': "p"})
+    assert Expression(r"""same_place('it\'s:1', "b\"\\s:1")""").holds(facts)
+
+
+def test_it_says_what_it_names_and_what_it_read() -> None:
+    expression = Expression("same_place('a:1', 'a:3') or object_count('chair') > 9")
+    assert [(m.kind.value, m.text, m.column) for m in expression.mentions()] == [
+        ("keyframe", "a:1", 12),
+        ("keyframe", "a:3", 19),
+        ("class", "chair", 42),
+    ]
+    assert expression.readings(FakeFacts()) == (
+        ("same_place('a:1', 'a:3')", False),
+        ("object_count('chair')", 2),
+    )
+
+
+def test_the_help_lists_every_function() -> None:
+    listed = functions_help().splitlines()
+    assert [line.split("(")[0] for line in listed] == list(FUNCTIONS)
