@@ -1,1 +1,95 @@
-"""(being written)"""
+"""Arithmetic that gives the same bits on every machine, thread count and BLAS.
+
+Why it is exact. Floating-point sums depend on their order, and every BLAS kernel has its own. So
+nothing is summed here that is not an integer below 2⁵³ in magnitude, partial sums included: such
+sums are exact in float64 (and in int64), and what is exact has no order. What must be rounded is
+rounded by the operations that IEEE 754 defines to the last bit: +, ×, ÷, √ of two numbers, rint,
+and scaling by a power of two.
+
+Unit vectors are int32 multiples of 2⁻²⁰ (``UnitVector``). To make one, the float32 components are
+scaled by the power of two that brings the largest below 2²⁰ and rounded to integers; their squares
+add up to at most dim · 2⁴⁰, below 2⁵³ up to 2¹² dimensions; beyond, up to 2¹⁴, the components get
+fewer bits (`_component_bits`). The norm is the square root of that exact sum.
+
+Products of two unit vectors are multiples of 2⁻⁴⁰ (``_q40``). By Cauchy and Schwarz every partial
+sum is at most |a||b| ≈ 2⁴⁰, far below 2⁵³.
+
+Positions are integer micrometres, correctly rounded from the float that came; ±10¹³ (10,000 km,
+guarded by the envelope). Squared distances reach 8·10²⁶, so they are Python integers, never int64,
+unless the caller has bounded the difference first.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .deltas import UnitVector
+
+UNIT_BITS = 20
+UNIT = 1 << UNIT_BITS
+Q40 = 1 << (2 * UNIT_BITS)
+UM_PER_M = 1_000_000
+MAX_DIMENSION = 16_384
+_SAFE_UM = 1e12
+
+
+def metres_to_um(metres: float) -> int:
+    """The nearest integer micrometre to the float's exact value; ties go to the even one."""
+    scaled = metres * 1e6
+    nearest = round(scaled)
+    if abs(scaled) < _SAFE_UM and abs(scaled - nearest) < 0.49:
+        return nearest  # the product's rounding error, below 2⁻¹³, cannot reach the tie at 0.5
+    numerator, denominator = metres.as_integer_ratio()
+    floor, rest = divmod(numerator * UM_PER_M, denominator)
+    return floor + (2 * rest > denominator or (2 * rest == denominator and floor % 2 == 1))
+
+
+def mean_m(sum_um: int, count: int) -> float:
+    """The mean of ``count`` positions in metres, correctly rounded; 0.0 for none."""
+    return sum_um / (count * UM_PER_M) if count else 0.0
+
+
+def quantise(vector: NDArray[np.float32]) -> UnitVector:
+    """The direction of a finite, non-zero float32 vector of shape (dim,), dim ≤ 16,384."""
+    unit: UnitVector = quantise_rows(vector[np.newaxis])[0]
+    return unit
+
+
+def quantise_rows(rows: NDArray[np.float32]) -> NDArray[np.int32]:
+    """`quantise` for each row of shape (n, dim) at once; n rows cost little more than one."""
+    dim = rows.shape[1]
+    if dim > MAX_DIMENSION:
+        raise ValueError(f"an embedding of {dim} dimensions is beyond {MAX_DIMENSION}")
+    wide = rows.astype(np.float64)
+    _, exponents = np.frexp(np.maximum(wide.max(axis=1), -wide.min(axis=1)))
+    scaled = np.rint(np.ldexp(wide, (_component_bits(dim) - exponents)[:, np.newaxis]))
+    squares = np.einsum("ij,ij->i", scaled, scaled)
+    scaled *= float(UNIT)  # exact: a power of two
+    scaled /= np.sqrt(squares)[:, np.newaxis]
+    units: NDArray[np.int32] = np.rint(scaled).astype(np.int32)
+    return units
+
+
+def _component_bits(dim: int) -> int:
+    """Bits of a component so that dim squares of them stay below 2⁵³."""
+    return min(UNIT_BITS, (52 - (dim - 1).bit_length()) // 2)
+
+
+def to_float32(unit: UnitVector) -> NDArray[np.float32]:
+    """The unit vector as float32, exactly: 21 bits fit the 24 of a float32."""
+    return unit.astype(np.float32) * np.float32(1.0 / UNIT)
+
+
+def cosine_q40(a: UnitVector, b: UnitVector) -> int:
+    """The exact product of two unit vectors of one dimension, as a multiple of 2⁻⁴⁰."""
+    return int(np.dot(a.astype(np.float64), b.astype(np.float64)))
+
+
+def similarity_q40(dot: int, squares: int) -> int:
+    """dot / √squares as the nearest multiple of 2⁻⁴⁰ to its float64 value.
+
+    ``dot`` is an exact product of two vectors, ``squares`` the product of their exact squared
+    norms; both conversions, the root and the quotient are correctly rounded.
+    """
+    return round(dot / math.sqrt(squares) * Q40)
