@@ -2,6 +2,9 @@
 
 import typer
 
+from . import router
+
 
 def register(app: typer.Typer) -> None:
     """Add this package's commands to ``app``, in the order ``--help`` lists them."""
+    router.register(app)

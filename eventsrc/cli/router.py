@@ -1,0 +1,34 @@
+"""`mapfold router`: a Zenoh router, until a signal ends it."""
+
+import dataclasses
+
+import typer
+
+from eventsrc.endpoints import DEFAULT_ENDPOINT
+from eventsrc.router import Router
+
+from ._shell import say
+from ._signals import stop_on_signals
+from ._zenoh_options import ConfigOption, ConnectOption, ListenOption, zenoh_options
+
+
+def router(
+    listen: ListenOption = None, connect: ConnectOption = None, zenoh_config: ConfigOption = None
+) -> None:
+    """Run a Zenoh router in this process until Ctrl-C.
+
+    It listens on tcp/127.0.0.1:7447 unless --listen or a configuration file says otherwise.
+    --connect links it to other routers.
+    """
+    options = zenoh_options(connect, listen, zenoh_config)
+    if not options.listen and options.config_file is None:
+        options = dataclasses.replace(options, listen=(DEFAULT_ENDPOINT,))
+    with stop_on_signals() as stop, Router(options) as running:
+        say(f"router listening on {', '.join(running.endpoints)}; Ctrl-C ends it")
+        stop.wait()
+    say("router ended")
+
+
+def register(app: typer.Typer) -> None:
+    """Add `router` to ``app``."""
+    app.command()(router)

@@ -1,0 +1,45 @@
+"""Where Zenoh connects and listens: ``<protocol>/<address>``, such as ``tcp/127.0.0.1:7447``.
+
+Zenoh itself reports a malformed endpoint as "unable to connect", which sends people looking for a
+router that runs very well. So endpoints are checked here, before a session is opened. No I/O.
+"""
+
+from collections.abc import Iterable
+from typing import Final
+
+from .errors import TransportError
+
+DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
+"""Where `mapfold router` listens and every other command connects unless told otherwise."""
+
+_WITH_PORT: Final = ("tcp", "udp", "tls", "quic", "ws")
+_WITHOUT_PORT: Final = ("unixsock-stream", "unixpipe", "serial", "vsock")
+_EXAMPLE: Final = f"write it as <protocol>/<host>:<port>, for example {DEFAULT_ENDPOINT}"
+
+
+def check_endpoint(text: str) -> str:
+    """Return ``text`` if it is an endpoint; raise TransportError that says what is wrong if not."""
+    protocol, slash, rest = text.partition("/")
+    if not slash:
+        raise TransportError(f"endpoint {text!r} has no protocol; {_EXAMPLE}")
+    if protocol not in _WITH_PORT + _WITHOUT_PORT:
+        raise TransportError(f"endpoint {text!r}: {protocol!r} is no Zenoh protocol; {_EXAMPLE}")
+    address = rest.partition("#")[0].partition("?")[0]
+    if not address:
+        raise TransportError(f"endpoint {text!r} has no address; {_EXAMPLE}")
+    if protocol in _WITH_PORT:
+        _check_host_and_port(text, address)
+    return text
+
+
+def check_endpoints(texts: Iterable[str]) -> tuple[str, ...]:
+    """`check_endpoint` for each, in order."""
+    return tuple(check_endpoint(text) for text in texts)
+
+
+def _check_host_and_port(text: str, address: str) -> None:
+    host, colon, port = address.rpartition(":")
+    if not colon or not host:
+        raise TransportError(f"endpoint {text!r} has no port; {_EXAMPLE}")
+    if not (port.isascii() and port.isdigit() and int(port) <= 65_535):
+        raise TransportError(f"endpoint {text!r}: {port!r} is no port (0 to 65535); {_EXAMPLE}")

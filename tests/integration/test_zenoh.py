@@ -1,0 +1,170 @@
+"""The door to Zenoh, on real sessions: what is sent arrives, what fails says so in one line."""
+
+import queue
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from eventsrc._zenoh import Received, Session, ZenohOptions, open_session
+from eventsrc.errors import TransportError
+from eventsrc.router import Router
+from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK
+
+Sessions = Callable[[], Session]
+
+
+def _one_line(error: TransportError) -> str:
+    text = str(error)
+    assert "\n" not in text
+    assert ".rs:" not in text
+    return text
+
+
+@pytest.mark.parametrize("advanced", [False, True])
+@pytest.mark.parametrize("watched", [False, True])
+def test_bytes_arrive_as_sent_and_in_order(
+    connected: Sessions, *, advanced: bool, watched: bool
+) -> None:
+    arrived: queue.SimpleQueue[Received] = queue.SimpleQueue()
+    subscriber = connected()
+    subscriber.subscribe("tb/**", arrived.put, (lambda _: None) if watched else None)
+    publisher = connected().publisher("tb/detections", advanced=advanced)
+    assert publisher.wait_for_subscriber(DEADLINE_S)
+    sent = [bytes([n]) * size for n, size in enumerate((0, 1, 3_000, 9_000, 2_000_000))]
+    for payload in sent:
+        publisher.put(payload)
+    got = [arrived.get(timeout=DEADLINE_S) for _ in sent]
+    assert [m.payload for m in got] == sent
+    assert {m.key for m in got} == {"tb/detections"}
+
+
+def test_a_publisher_knows_whether_anybody_listens(connected: Sessions) -> None:
+    publisher = connected().publisher("tb/detections")
+    assert not publisher.has_subscriber
+    assert not publisher.wait_for_subscriber(0.01)
+    subscription = connected().subscribe("tb/*", lambda _: None)
+    assert publisher.wait_for_subscriber(DEADLINE_S)
+    subscription.close()
+
+
+def test_a_closed_subscription_is_silent(connected: Sessions) -> None:
+    arrived: queue.SimpleQueue[Received] = queue.SimpleQueue()
+    subscriber, publisher = connected(), connected().publisher("tb/detections")
+    closed = subscriber.subscribe("tb/*", arrived.put)
+    subscriber.subscribe("tb/detections", lambda message: arrived.put(message._replace(key="open")))
+    closed.close()
+    assert publisher.wait_for_subscriber(DEADLINE_S)
+    publisher.put(b"x")
+    assert arrived.get(timeout=DEADLINE_S).key == "open"
+    assert arrived.empty()
+
+
+def test_confirm_means_the_router_knows(connected: Sessions) -> None:
+    publisher_session = connected()
+    subscriber = connected()
+    arrived = threading.Event()
+    subscriber.subscribe("tb/detections", lambda _: arrived.set())
+    subscriber.confirm()
+    publisher_session.publisher("tb/detections").put(b"straight away")
+    assert arrived.wait(DEADLINE_S)
+
+
+def test_a_question_is_answered(connected: Sessions) -> None:
+    server = connected()
+    server.queryable("mapfold/relocalize", lambda asked: asked[::-1])
+    server.confirm()
+    asking = connected()
+    assert asking.get("mapfold/relocalize", b"abc", timeout_s=DEADLINE_S) == [b"cba"]
+    assert asking.get("mapfold/nobody", timeout_s=DEADLINE_S) == []
+
+
+def test_a_peer_can_be_called_directly() -> None:
+    with open_session(LOOPBACK, mode="peer") as peer:
+        assert not peer.linked
+
+
+def test_a_free_port_is_named_and_freed() -> None:
+    with Router(LOOPBACK) as router:
+        (endpoint,) = router.endpoints
+        assert not endpoint.endswith(":0")
+    with Router(ZenohOptions(listen=(endpoint,))) as again:
+        assert again.endpoints == (endpoint,)
+
+
+def test_a_busy_port_is_one_clear_line(endpoint: str) -> None:
+    with pytest.raises(TransportError) as caught:
+        Router(ZenohOptions(listen=(endpoint,)))
+    line = _one_line(caught.value)
+    assert endpoint in line
+    assert "in use" in line
+    assert "--listen" in line
+
+
+def test_an_absent_router_is_one_clear_line(endpoint: str) -> None:
+    with Router(LOOPBACK) as gone:
+        (away,) = gone.endpoints
+    with pytest.raises(TransportError) as caught:
+        open_session(ZenohOptions(connect=(away,)), mode="client")
+    line = _one_line(caught.value)
+    assert away in line
+    assert "mapfold router" in line
+
+
+def test_one_of_two_routers_is_enough(endpoint: str) -> None:
+    with Router(LOOPBACK) as gone:
+        (away,) = gone.endpoints
+    with open_session(ZenohOptions(connect=(away, endpoint)), mode="client") as session:
+        assert session.linked
+
+
+@pytest.mark.parametrize("mode", ["client", "peer", "router"])
+def test_a_malformed_endpoint_is_refused_before_anything_is_opened(mode: str) -> None:
+    with pytest.raises(TransportError, match="has no protocol"):
+        open_session(ZenohOptions(connect=("127.0.0.1:7447",)), mode=mode)  # type: ignore[arg-type]
+
+
+def test_a_malformed_key_expression_is_named(connected: Sessions) -> None:
+    with pytest.raises(TransportError, match="tb//detections") as caught:
+        connected().subscribe("tb//detections", lambda _: None)
+    _one_line(caught.value)
+
+
+def test_sending_on_a_closed_session_is_an_error(connected: Sessions) -> None:
+    session = connected()
+    publisher = session.publisher("tb/detections")
+    session.close()
+    session.close()
+    with pytest.raises(TransportError, match="tb/detections"):
+        publisher.put(b"x")
+
+
+def test_the_configuration_file_says_where(tmp_path: Path, endpoint: str) -> None:
+    file = tmp_path / "zenoh.json5"
+    file.write_text(f"{{ connect: {{ endpoints: ['{endpoint}'] }} }}")
+    with open_session(ZenohOptions(config_file=file), mode="client") as session:
+        assert session.linked
+
+
+def test_the_command_line_goes_before_the_file(tmp_path: Path, endpoint: str) -> None:
+    file = tmp_path / "zenoh.json5"
+    file.write_text("{ mode: 'router', connect: { endpoints: ['tcp/127.0.0.1:1'] } }")
+    options = ZenohOptions(connect=(endpoint,), config_file=file)
+    with open_session(options, mode="client") as session:
+        assert session.linked
+
+
+@pytest.mark.parametrize("text", [None, "{ mode: 12 }", "not json5 {"])
+def test_a_bad_configuration_file_is_named(tmp_path: Path, text: str | None) -> None:
+    file = tmp_path / "zenoh.json5"
+    if text is not None:
+        file.write_text(text)
+    with pytest.raises(TransportError) as caught:
+        open_session(ZenohOptions(config_file=file), mode="client")
+    assert str(file) in _one_line(caught.value)
+
+
+def test_a_recorder_is_a_peer_when_others_may_call_it() -> None:
+    assert ZenohOptions().mode == "client"
+    assert ZenohOptions(listen=("tcp/127.0.0.1:0",)).mode == "peer"

@@ -1,0 +1,47 @@
+"""A malformed endpoint is named as such, and never as a router that is down."""
+
+import pytest
+
+from eventsrc.endpoints import check_endpoint, check_endpoints
+from eventsrc.errors import TransportError
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    [
+        "tcp/127.0.0.1:7447",
+        "tcp/[::1]:7447",
+        "tls/robot.local:7448#verify_name_on_connect=false",
+        "udp/10.0.0.1:0?rel=0",
+        "unixsock-stream//tmp/zenoh.sock",
+    ],
+)
+def test_an_endpoint_passes_unchanged(endpoint: str) -> None:
+    assert check_endpoint(endpoint) == endpoint
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("127.0.0.1:7447", "has no protocol"),
+        ("", "has no protocol"),
+        ("http/127.0.0.1:80", "'http' is no Zenoh protocol"),
+        ("tcp/", "has no address"),
+        ("tcp/127.0.0.1", "has no port"),
+        ("tcp/:7447", "has no port"),
+        ("tcp/127.0.0.1:", "'' is no port"),
+        ("tcp/127.0.0.1:70000", "'70000' is no port"),
+        ("tcp/127.0.0.1:٧", "is no port"),
+        ("tcp/127.0.0.1:-1", "'-1' is no port"),
+    ],
+)
+def test_a_malformed_endpoint_is_named(text: str, complaint: str) -> None:
+    with pytest.raises(TransportError) as caught:
+        check_endpoint(text)
+    assert complaint in str(caught.value)
+    assert repr(text) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_order_stays() -> None:
+    assert check_endpoints(["tcp/b:1", "tcp/a:2"]) == ("tcp/b:1", "tcp/a:2")
