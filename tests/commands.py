@@ -1,0 +1,64 @@
+"""Run ``mapfold`` as a person would: a program of its own, with its own exit code and streams."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+PROGRAM = Path(sys.executable).with_name("mapfold")
+TIMEOUT_S = 120
+
+
+@dataclass(frozen=True)
+class Said:
+    """What a command said: its exit code, stdout for programs, stderr for people."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def json(self) -> Any:
+        """Stdout as one JSON document."""
+        return json.loads(self.out)
+
+    @property
+    def lines(self) -> list[Any]:
+        """Stdout as JSON lines."""
+        return [json.loads(line) for line in self.out.splitlines()]
+
+
+@dataclass(frozen=True)
+class Commands:
+    """Runs commands in one folder, whose ``.mapfold`` holds the embedded server."""
+
+    folder: Path
+    env: Mapping[str, str]
+
+    @classmethod
+    def in_folder(cls, folder: Path, **env: str) -> "Commands":
+        """Commands that see no database of the caller's."""
+        clean = {k: v for k, v in os.environ.items() if not k.startswith("MAPFOLD_")}
+        clean |= {"MAPFOLD_HOME": str(folder / "home"), "COLUMNS": "100", **env}
+        return cls(folder, clean)
+
+    def __call__(self, *args: str | Path, stdin: bytes | None = None, code: int | None = 0) -> Said:
+        """Run ``mapfold *args``; with ``code`` given, anything else it exits with is a failure."""
+        done = subprocess.run(
+            [str(PROGRAM), *map(str, args)],
+            cwd=self.folder,
+            env=dict(self.env),
+            input=stdin,
+            stdin=subprocess.DEVNULL if stdin is None else None,
+            capture_output=True,
+            timeout=TIMEOUT_S,
+            check=False,
+        )
+        said = Said(done.returncode, done.stdout.decode(), done.stderr.decode())
+        assert "Traceback" not in said.err, said.err
+        assert code is None or said.code == code, f"exit {said.code}: {said.err or said.out}"
+        return said
