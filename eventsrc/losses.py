@@ -1,0 +1,165 @@
+"""The gap ledger: which keyframes of which run never came. Pure; times are given to it.
+
+The rules:
+
+* Robots count their keyframes by one. What a run lacks are the ids between the lowest and the
+  highest that were recorded; what came before the lowest (a recorder started late) nobody can know.
+* A *hole* is a stretch of missing ids. It opens when an id beyond it is recorded, and a late
+  keyframe closes it: wholly, or by cutting it shorter or in two.
+* A hole is *reported* as a gap, once, when it has been open for the settle time or when the
+  recorder ends. Until then keyframes out of order and a publisher's resending may still fill it,
+  and nothing is written that would have to be taken back.
+* A log never forgets: the ``mapfold/loss`` event of a gap stays when a late keyframe closes it.
+  So what is lost *now* is never the sum of the loss events, but the holes of the whole log.
+* One keyframe twice is no loss. It is counted as a duplicate.
+
+A ledger is folded over a log from its start (or from a saved one) when a recorder opens it, so a
+hole between two recorders' lives is found like any other.
+"""
+
+from bisect import bisect_right
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Final
+
+DEFAULT_SETTLE_NS: Final = 5_000_000_000
+"""Longer than a publisher waits before it sends again, so a resent keyframe is no reported gap."""
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """The keyframes ``first`` to ``last`` of ``run_id``, both included, are missing."""
+
+    run_id: str
+    first: int
+    last: int
+
+    def __post_init__(self) -> None:
+        if self.last < self.first:
+            raise ValueError(f"gap of {self.run_id!r} ends at {self.last} before {self.first}")
+
+    @property
+    def count(self) -> int:
+        """How many keyframes are missing."""
+        return self.last - self.first + 1
+
+
+@dataclass(slots=True)
+class _Hole:
+    first: int
+    last: int
+    since_ns: int
+    reported: bool = False
+
+
+@dataclass(slots=True)
+class _Run:
+    """What is recorded of one run: ``first`` to ``last`` but for the holes, which are in order."""
+
+    first: int
+    last: int
+    holes: list[_Hole] = field(default_factory=list)
+
+    def index_of_hole(self, keyframe_id: int) -> int | None:
+        index = bisect_right(self.holes, keyframe_id, key=lambda hole: hole.first) - 1
+        if index >= 0 and keyframe_id <= self.holes[index].last:
+            return index
+        return None
+
+
+class GapLedger:
+    """What is recorded and what is missing, run by run. Memory: a few words per run and hole."""
+
+    def __init__(self, settle_ns: int = DEFAULT_SETTLE_NS) -> None:
+        self._settle_ns = settle_ns
+        self._runs: dict[str, _Run] = {}
+        self._unreported = 0
+        self.duplicates = 0
+        """Keyframes recorded more than once."""
+
+    def record(self, run_id: str, keyframe_id: int, now_ns: int) -> None:
+        """Take in one recorded keyframe. ``now_ns`` is when a hole it opens began to be open."""
+        run = self._runs.get(run_id)
+        if run is None:
+            self._runs[run_id] = _Run(keyframe_id, keyframe_id)
+        elif keyframe_id == run.last + 1:
+            run.last = keyframe_id
+        elif keyframe_id > run.last:
+            self._open(run, len(run.holes), run.last + 1, keyframe_id - 1, now_ns)
+            run.last = keyframe_id
+        elif keyframe_id < run.first:
+            if keyframe_id + 1 < run.first:
+                self._open(run, 0, keyframe_id + 1, run.first - 1, now_ns)
+            run.first = keyframe_id
+        else:
+            self._fill(run, keyframe_id)
+
+    def mark_reported(self, gap: Gap) -> None:
+        """The log says that ``gap`` was reported: what is left of it will not be reported again."""
+        run = self._runs.get(gap.run_id)
+        for hole in run.holes if run is not None else ():
+            if gap.first <= hole.first and hole.last <= gap.last and not hole.reported:
+                hole.reported = True
+                self._unreported -= 1
+
+    def due(self, now_ns: int) -> list[Gap]:
+        """The gaps to report now: open for the settle time. Each is returned once."""
+        if not self._unreported:
+            return []
+        return self._report(now_ns - self._settle_ns)
+
+    def flush(self) -> list[Gap]:
+        """Every gap not yet reported, however young: the recorder ends."""
+        return self._report(None)
+
+    def gaps(self) -> Iterator[Gap]:
+        """Everything that is missing now, reported or not, in the order the runs began."""
+        for run_id, run in self._runs.items():
+            for hole in run.holes:
+                yield Gap(run_id, hole.first, hole.last)
+
+    def missing(self) -> int:
+        """How many keyframes are missing now."""
+        return sum(gap.count for gap in self.gaps())
+
+    def stretch(self, run_id: str, keyframe_id: int) -> tuple[int, int] | None:
+        """The longest stretch of recorded keyframes around this one; None if it is missing."""
+        run = self._runs.get(run_id)
+        if run is None or not run.first <= keyframe_id <= run.last:
+            return None
+        index = bisect_right(run.holes, keyframe_id, key=lambda hole: hole.first)
+        before = run.holes[index - 1].last if index else run.first - 1
+        if keyframe_id <= before:
+            return None
+        after = run.holes[index].first if index < len(run.holes) else run.last + 1
+        return before + 1, after - 1
+
+    def _open(self, run: _Run, index: int, first: int, last: int, now_ns: int) -> None:
+        run.holes.insert(index, _Hole(first, last, now_ns))
+        self._unreported += 1
+
+    def _fill(self, run: _Run, keyframe_id: int) -> None:
+        index = run.index_of_hole(keyframe_id)
+        if index is None:
+            self.duplicates += 1
+            return
+        hole = run.holes[index]
+        parts = [
+            _Hole(first, last, hole.since_ns, hole.reported)
+            for first, last in ((hole.first, keyframe_id - 1), (keyframe_id + 1, hole.last))
+            if first <= last
+        ]
+        run.holes[index : index + 1] = parts
+        if not hole.reported:
+            self._unreported += len(parts) - 1
+
+    def _report(self, open_since_ns: int | None) -> list[Gap]:
+        reported = []
+        for run_id, run in self._runs.items():
+            for hole in run.holes:
+                if hole.reported or (open_since_ns is not None and hole.since_ns > open_since_ns):
+                    continue
+                hole.reported = True
+                self._unreported -= 1
+                reported.append(Gap(run_id, hole.first, hole.last))
+        return reported

@@ -1,0 +1,123 @@
+"""The gap ledger, case by case."""
+
+import pytest
+
+from eventsrc.losses import Gap, GapLedger
+
+SETTLE_NS = 10
+
+
+def _ledger(*keyframe_ids: int, at_ns: int = 0) -> GapLedger:
+    ledger = GapLedger(SETTLE_NS)
+    for keyframe_id in keyframe_ids:
+        ledger.record("run-a", keyframe_id, at_ns)
+    return ledger
+
+
+def test_a_run_in_order_lacks_nothing() -> None:
+    ledger = _ledger(40, 41, 42)
+    assert list(ledger.gaps()) == []
+    assert ledger.stretch("run-a", 41) == (40, 42)
+
+
+def test_what_lies_between_is_missing() -> None:
+    ledger = _ledger(1, 5, 9)
+    assert list(ledger.gaps()) == [Gap("run-a", 2, 4), Gap("run-a", 6, 8)]
+    assert ledger.missing() == 6
+
+
+def test_a_gap_is_reported_once_and_only_when_it_has_settled() -> None:
+    ledger = _ledger(1, 3, at_ns=100)
+    assert ledger.due(109) == []
+    assert ledger.due(110) == [Gap("run-a", 2, 2)]
+    assert ledger.due(1_000) == []
+    assert ledger.flush() == []
+    assert list(ledger.gaps()) == [Gap("run-a", 2, 2)], "reported is not closed"
+
+
+def test_a_late_keyframe_in_time_is_no_gap() -> None:
+    ledger = _ledger(1, 3, at_ns=100)
+    ledger.record("run-a", 2, 105)
+    assert ledger.due(1_000) == []
+    assert ledger.missing() == 0
+    assert ledger.duplicates == 0
+
+
+def test_a_late_keyframe_closes_a_reported_gap() -> None:
+    ledger = _ledger(1, 3)
+    ledger.flush()
+    ledger.record("run-a", 2, 50)
+    assert list(ledger.gaps()) == []
+    assert ledger.flush() == []
+
+
+def test_a_keyframe_in_the_middle_cuts_a_hole_in_two_of_the_same_age() -> None:
+    ledger = _ledger(1, 9, at_ns=100)
+    ledger.record("run-a", 5, 109)
+    assert ledger.due(110) == [Gap("run-a", 2, 4), Gap("run-a", 6, 8)]
+
+
+def test_the_halves_of_a_reported_hole_are_not_reported_again() -> None:
+    ledger = _ledger(1, 9)
+    ledger.flush()
+    ledger.record("run-a", 5, 50)
+    assert ledger.due(1_000) == []
+    assert ledger.missing() == 6
+
+
+def test_an_id_below_the_first_opens_a_hole_up_to_it() -> None:
+    ledger = _ledger(10, 7)
+    assert list(ledger.gaps()) == [Gap("run-a", 8, 9)]
+    ledger.record("run-a", 6, 0)
+    assert list(ledger.gaps()) == [Gap("run-a", 8, 9)]
+
+
+def test_runs_are_counted_apart() -> None:
+    ledger = _ledger(1, 2)
+    ledger.record("run-b", 7, 0)
+    ledger.record("run-b", 9, 0)
+    assert list(ledger.gaps()) == [Gap("run-b", 8, 8)]
+
+
+def test_twice_is_a_duplicate_and_no_loss() -> None:
+    ledger = _ledger(1, 2, 3, 2, 3, 1)
+    assert ledger.duplicates == 3
+    assert ledger.missing() == 0
+
+
+def test_what_an_earlier_recorder_reported_is_not_reported_again() -> None:
+    ledger = _ledger(1, 5, 7)
+    ledger.mark_reported(Gap("run-a", 2, 4))
+    ledger.mark_reported(Gap("run-unknown", 2, 4))
+    assert ledger.flush() == [Gap("run-a", 6, 6)]
+
+
+@pytest.mark.parametrize(
+    ("keyframe_id", "stretch"),
+    [
+        (0, None),
+        (1, (1, 2)),
+        (2, (1, 2)),
+        (3, None),
+        (4, None),
+        (5, (5, 7)),
+        (7, (5, 7)),
+        (8, None),
+    ],
+)
+def test_a_stretch_ends_at_the_holes(keyframe_id: int, stretch: tuple[int, int] | None) -> None:
+    assert _ledger(1, 2, 5, 6, 7).stretch("run-a", keyframe_id) == stretch
+
+
+def test_nothing_is_recorded_of_an_unknown_run() -> None:
+    assert _ledger(1).stretch("run-b", 1) is None
+
+
+def test_a_gap_holds_at_least_one_keyframe() -> None:
+    with pytest.raises(ValueError, match="ends at 2 before 3"):
+        Gap("run-a", 3, 2)
+
+
+def test_a_jump_of_the_whole_range_costs_nothing() -> None:
+    ledger = _ledger(-(2**63), 2**63 - 1)
+    assert ledger.missing() == 2**64 - 2
