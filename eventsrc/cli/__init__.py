@@ -2,9 +2,10 @@
 
 import typer
 
-from . import router
+from . import router, simulate
 
 
 def register(app: typer.Typer) -> None:
     """Add this package's commands to ``app``, in the order ``--help`` lists them."""
     router.register(app)
+    simulate.register(app)

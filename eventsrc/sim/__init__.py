@@ -1,0 +1,11 @@
+"""A simulated house and a robot that drives through it, for trying mapfold without a robot.
+
+Everything follows from a seed: floor plan, furniture, tours, detector noise and embeddings. Chance
+is drawn as integers from named PCG64 streams (`chance`), and coordinates are rounded to a tenth of
+a millimetre, so that the same seed gives the same payloads elsewhere.
+"""
+
+from .house import House, build_house
+from .run import DEFAULT_SEED, SimulatedRun, simulate_run
+
+__all__ = ["DEFAULT_SEED", "House", "SimulatedRun", "build_house", "simulate_run"]

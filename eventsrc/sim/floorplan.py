@@ -1,0 +1,175 @@
+"""A floor plan from a seed: day rooms on one side of a hall, night rooms on the other.
+
++---------+-----+-------+--------+
+| bedroom |bath | study | guest  |     the order, widths and door positions are the seed's;
++---- ----+- ---+-- ----+--- ----+     so is the side on which the day rooms lie
+|              hall              |
++-------- ---+--------+--- ------+
+|   living     dining   kitchen  |     living and dining room share a wide opening
++------------+--------+----------+
+"""
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from .chance import happens, stream, uniform
+from .shapes import Point, Rect, Segment
+
+DOOR_M = 1.0
+OPENING_M = 2.0
+DAY_ROOMS = ("living room", "dining room", "kitchen")
+NIGHT_ROOMS = ("bedroom", "bathroom", "study", "guest room")
+HALL = "hall"
+
+_WIDTHS_M = {
+    "living room": (5.2, 6.0),
+    "dining room": (4.0, 4.6),
+    "kitchen": (3.8, 4.4),
+    "bedroom": (3.8, 4.4),
+    "bathroom": (2.6, 3.0),
+    "study": (3.4, 4.0),
+    "guest room": (3.2, 3.8),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Room:
+    """A room and its inner extent."""
+
+    name: str
+    rect: Rect
+
+
+@dataclass(frozen=True, slots=True)
+class Door:
+    """A gap in the wall between two rooms, without a leaf. ``flat`` when the wall runs along x."""
+
+    rooms: tuple[str, str]
+    centre: Point
+    width_m: float
+    flat: bool
+
+
+@dataclass(frozen=True, slots=True)
+class FloorPlan:
+    """Rooms, doors and walls; the walls already have the doors cut out."""
+
+    outline: Rect
+    rooms: tuple[Room, ...]
+    doors: tuple[Door, ...]
+    walls: tuple[Segment, ...]
+
+    def room_at(self, x: float, y: float) -> str | None:
+        """The name of the room around (x, y), None outside."""
+        return next((room.name for room in self.rooms if room.rect.contains(x, y)), None)
+
+    def room(self, name: str) -> Room:
+        """The room of this name."""
+        return next(room for room in self.rooms if room.name == name)
+
+
+def build_floor_plan(seed: int) -> FloorPlan:
+    """The floor plan of house ``seed``: eight rooms, eight doors."""
+    rng = stream("floor plan", seed)
+    widths = {name: round(uniform(rng, *span), 1) for name, span in _WIDTHS_M.items()}
+    length = round(sum(widths[name] for name in DAY_ROOMS), 1)
+    day_depth, hall_depth = round(uniform(rng, 4.2, 4.8), 1), round(uniform(rng, 1.6, 1.9), 1)
+    night_depth = round(uniform(rng, 3.8, 4.4), 1)
+    day_first = happens(rng, 0.5)
+    depths = (
+        (day_depth, hall_depth, night_depth) if day_first else (night_depth, hall_depth, day_depth)
+    )
+    levels = (0.0, depths[0], round(depths[0] + depths[1], 1), round(sum(depths), 1))
+    day = _row(_order(rng, DAY_ROOMS, shuffle=False), widths, length, *_band(levels, day_first))
+    night = _row(
+        _order(rng, NIGHT_ROOMS, shuffle=True), widths, length, *_band(levels, not day_first)
+    )
+    hall = Room(HALL, Rect(0.0, levels[1], length, levels[2]))
+    doors = _doors(rng, day, night, levels[1:3], day_first=day_first)
+    outline = Rect(0.0, 0.0, length, levels[3])
+    return FloorPlan(
+        outline, (*day, hall, *night), doors, _walls(outline, levels, day, night, doors)
+    )
+
+
+def _band(levels: tuple[float, ...], first: bool) -> tuple[float, float]:
+    return (levels[0], levels[1]) if first else (levels[2], levels[3])
+
+
+def _order(rng: np.random.Generator, names: tuple[str, ...], *, shuffle: bool) -> list[str]:
+    if shuffle:
+        return [names[index] for index in rng.permutation(len(names)).tolist()]
+    return list(names) if happens(rng, 0.5) else list(reversed(names))
+
+
+def _row(
+    names: list[str], widths: dict[str, float], length: float, y0: float, y1: float
+) -> tuple[Room, ...]:
+    """Rooms side by side, stretched so that together they are ``length`` long."""
+    scale = length / sum(widths[name] for name in names)
+    rooms: list[Room] = []
+    x = 0.0
+    for index, name in enumerate(names):
+        end = length if index == len(names) - 1 else round(x + widths[name] * scale, 1)
+        rooms.append(Room(name, Rect(x, y0, end, y1)))
+        x = end
+    return tuple(rooms)
+
+
+def _doors(
+    rng: np.random.Generator,
+    day: tuple[Room, ...],
+    night: tuple[Room, ...],
+    hall_sides: tuple[float, ...],
+    *,
+    day_first: bool,
+) -> tuple[Door, ...]:
+    day_y, night_y = hall_sides if day_first else hall_sides[::-1]
+    doors = [_hall_door(rng, room, night_y) for room in night]
+    doors += [_hall_door(rng, room, day_y) for room in day if room.name != "dining room"]
+    for left, right in itertools.pairwise(day):
+        wide = {left.name, right.name} == {"living room", "dining room"}
+        width = OPENING_M if wide else DOOR_M
+        margin = 0.4 + width / 2
+        y = round(uniform(rng, left.rect.y0 + margin, left.rect.y1 - margin), 1)
+        doors.append(Door((left.name, right.name), (left.rect.x1, y), width, flat=False))
+    return tuple(doors)
+
+
+def _hall_door(rng: np.random.Generator, room: Room, y: float) -> Door:
+    margin = 0.3 + DOOR_M / 2
+    x = round(uniform(rng, room.rect.x0 + margin, room.rect.x1 - margin), 1)
+    return Door((room.name, HALL), (x, y), DOOR_M, flat=True)
+
+
+def _walls(
+    outline: Rect,
+    levels: tuple[float, ...],
+    day: tuple[Room, ...],
+    night: tuple[Room, ...],
+    doors: tuple[Door, ...],
+) -> tuple[Segment, ...]:
+    walls: list[Segment] = []
+    for y in levels:
+        gaps = [(d.centre[0], d.width_m) for d in doors if d.flat and d.centre[1] == y]
+        walls += [Segment(a, y, b, y) for a, b in _cut(outline.x0, outline.x1, gaps)]
+    for row in (day, night):
+        edges = [outline.x0, *(room.rect.x1 for room in row)]
+        y0, y1 = row[0].rect.y0, row[0].rect.y1
+        for x in edges:
+            gaps = [(d.centre[1], d.width_m) for d in doors if not d.flat and d.centre[0] == x]
+            inside = gaps if row is day else []
+            walls += [Segment(x, a, x, b) for a, b in _cut(y0, y1, inside)]
+    walls += [Segment(x, levels[1], x, levels[2]) for x in (outline.x0, outline.x1)]
+    return tuple(walls)
+
+
+def _cut(start: float, end: float, gaps: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """The line from ``start`` to ``end`` without its ``gaps`` of (centre, width)."""
+    pieces: list[tuple[float, float]] = []
+    for centre, width in sorted(gaps):
+        pieces.append((start, centre - width / 2))
+        start = centre + width / 2
+    return [*pieces, (start, end)]

@@ -1,0 +1,162 @@
+"""Where the robot can drive, and the way from here to there: A* on a grid, then pulled straight.
+
+Cells are 0.1 m. A cell is free when its centre keeps ``CLEARANCE_M`` from walls and furniture; that
+is more than the robot's radius, because a driven path cuts the planned path's corners a little.
+Costs are integers (10 straight, 14 diagonal, more near obstacles), so ties break the same way
+everywhere.
+"""
+
+import heapq
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from eventsrc.errors import MapfoldError
+
+from .shapes import Point, Rect, Walls, rect_clearance
+
+ROBOT_RADIUS_M = 0.18
+CLEARANCE_M = 0.28
+_COMFORT_M = 0.45
+_CELL_M = 0.1
+_STEPS = ((1, 0, 10), (-1, 0, 10), (0, 1, 10), (0, -1, 10))
+_DIAGONALS = ((1, 1, 14), (1, -1, 14), (-1, 1, 14), (-1, -1, 14))
+
+Cell = tuple[int, int]
+
+
+class DriveGrid:
+    """Free cells of one furnished floor plan."""
+
+    def __init__(self, outline: Rect, walls: Walls, obstacles: Sequence[Rect]) -> None:
+        self._outline = outline
+        self._columns = math.ceil(outline.width / _CELL_M)
+        self._rows = math.ceil(outline.height / _CELL_M)
+        centres = np.array(
+            [self._centre((i, j)) for j in range(self._rows) for i in range(self._columns)]
+        )
+        clearance = walls.clearance(centres)
+        for rect in obstacles:
+            clearance = np.minimum(clearance, rect_clearance(rect, centres))
+        self._clearance = clearance.reshape(self._rows, self._columns)
+
+    def clearance_at(self, x: float, y: float) -> float:
+        """Distance in metres from the cell around (x, y) to the nearest wall or furniture."""
+        i, j = self._cell((x, y))
+        if not (0 <= i < self._columns and 0 <= j < self._rows):
+            return 0.0
+        return float(self._clearance[j, i])
+
+    def free(self, x: float, y: float) -> bool:
+        """Whether the robot's centre may be planned at (x, y)."""
+        return self.clearance_at(x, y) >= CLEARANCE_M
+
+    def roomiest(self, around: Point, within: Rect, radius_m: float) -> Point:
+        """The free spot in ``within`` with the most space, at most ``radius_m`` from ``around``.
+
+        Nearer spots win ties. Raises MapfoldError when nothing there is free.
+        """
+        best: tuple[float, float, Cell] | None = None
+        for cell in self._cells_of(within):
+            x, y = self._centre(cell)
+            distance = math.hypot(x - around[0], y - around[1])
+            space = min(float(self._clearance[cell[1], cell[0]]), 0.7)
+            if distance > radius_m or space < CLEARANCE_M:
+                continue
+            rank = (-space, distance, cell)
+            best = rank if best is None or rank < best else best
+        if best is None:
+            raise MapfoldError(f"no free floor within {radius_m} m of {around}; try another --seed")
+        return self._centre(best[2])
+
+    def joins(self, spots: Sequence[Point]) -> bool:
+        """Whether one can drive between all of ``spots`` (each moved to free floor nearby)."""
+        try:
+            near = [self.roomiest(spot, Rect.around(*spot, 3.0, 3.0), 1.5) for spot in spots]
+            for spot in near[1:]:
+                self.route(near[0], spot)
+        except MapfoldError:
+            return False
+        return True
+
+    def route(self, start: Point, goal: Point) -> list[Point]:
+        """Way points from ``start`` to ``goal``, both included, joined by free straight lines."""
+        cells = self._search(self._cell(start), self._cell(goal))
+        points = [start, *(self._centre(cell) for cell in cells[1:-1]), goal]
+        pulled = [points[0]]
+        index = 0
+        while index < len(points) - 1:
+            ahead = min(len(points) - 1, index + 60)
+            while ahead > index + 1 and not self._straight(points[index], points[ahead]):
+                ahead -= 1
+            pulled.append(points[ahead])
+            index = ahead
+        return pulled
+
+    def _straight(self, a: Point, b: Point) -> bool:
+        count = max(2, math.ceil(math.hypot(b[0] - a[0], b[1] - a[1]) / 0.05))
+        return all(
+            self.clearance_at(a[0] + (b[0] - a[0]) * k / count, a[1] + (b[1] - a[1]) * k / count)
+            >= CLEARANCE_M + 0.03
+            for k in range(count + 1)
+        )
+
+    def _search(self, start: Cell, goal: Cell) -> list[Cell]:
+        frontier = [(self._guess(start, goal), 0, start)]
+        cost = {start: 0}
+        came: dict[Cell, Cell] = {}
+        while frontier:
+            _, spent, cell = heapq.heappop(frontier)
+            if cell == goal:
+                return _trace(came, cell)
+            if spent > cost[cell]:
+                continue
+            for neighbour, step in self._neighbours(cell, goal):
+                total = spent + step
+                if total < cost.get(neighbour, total + 1):
+                    cost[neighbour], came[neighbour] = total, cell
+                    heapq.heappush(
+                        frontier, (total + self._guess(neighbour, goal), total, neighbour)
+                    )
+        raise MapfoldError(f"no way from cell {start} to cell {goal}; try another --seed")
+
+    def _neighbours(self, cell: Cell, goal: Cell) -> Iterator[tuple[Cell, int]]:
+        for di, dj, step in (*_STEPS, *_DIAGONALS):
+            i, j = cell[0] + di, cell[1] + dj
+            if not (0 <= i < self._columns and 0 <= j < self._rows):
+                continue
+            space = self._clearance[j, i]
+            if space >= CLEARANCE_M or (i, j) == goal:
+                yield (i, j), step if space >= _COMFORT_M else 2 * step
+
+    @staticmethod
+    def _guess(a: Cell, b: Cell) -> int:
+        dx, dy = abs(a[0] - b[0]), abs(a[1] - b[1])
+        return 10 * max(dx, dy) + 4 * min(dx, dy)
+
+    def _cell(self, spot: Point) -> Cell:
+        return (
+            math.floor((spot[0] - self._outline.x0) / _CELL_M),
+            math.floor((spot[1] - self._outline.y0) / _CELL_M),
+        )
+
+    def _centre(self, cell: Cell) -> Point:
+        return (
+            self._outline.x0 + (cell[0] + 0.5) * _CELL_M,
+            self._outline.y0 + (cell[1] + 0.5) * _CELL_M,
+        )
+
+    def _cells_of(self, rect: Rect) -> Iterator[Cell]:
+        low, high = self._cell((rect.x0, rect.y0)), self._cell((rect.x1, rect.y1))
+        for j in range(max(low[1], 0), min(high[1] + 1, self._rows)):
+            for i in range(max(low[0], 0), min(high[0] + 1, self._columns)):
+                yield i, j
+
+
+def _trace(came: dict[Cell, Cell], cell: Cell) -> list[Cell]:
+    path = [cell]
+    while cell in came:
+        cell = came[cell]
+        path.append(cell)
+    return path[::-1]

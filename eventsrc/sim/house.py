@@ -1,0 +1,168 @@
+"""A furnished house: the floor plan and the objects in it, all from one seed.
+
+Pieces that stand are put with their back to a wall, clear of doors and of each other; the dining
+set stands free. A furnishing is taken only if the robot can still drive from every room to every
+other; otherwise the next attempt is drawn. Nothing is random but the seed.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from eventsrc.errors import MapfoldError
+
+from .catalogue import DINING_SET, FURNITURE, MODELS, Model
+from .chance import stream, uniform
+from .floorplan import Door, FloorPlan, Room, build_floor_plan
+from .grid import DriveGrid
+from .shapes import Point, Rect, Walls
+
+_ATTEMPTS = 40
+_TRIES = 250
+_DOOR_CLEAR_M = 0.85
+_CHAIR_OFFSETS = ((-0.35, -0.7), (0.35, -0.7), (-0.35, 0.7), (0.35, 0.7))
+
+
+@dataclass(frozen=True, slots=True)
+class Thing:
+    """One object. ``instance`` is its true identity; ``facing_rad`` is where its front looks."""
+
+    instance: str
+    model: Model
+    room: str
+    footprint: Rect
+    facing_rad: float
+
+    @property
+    def centre(self) -> Point:
+        """Where it is on the floor plan."""
+        return self.footprint.centre
+
+
+@dataclass(frozen=True)
+class House:
+    """A floor plan with things in it."""
+
+    seed: int
+    plan: FloorPlan
+    things: tuple[Thing, ...]
+
+    @cached_property
+    def walls(self) -> Walls:
+        """The walls, ready to be asked for lines of sight."""
+        return Walls(self.plan.walls)
+
+    @cached_property
+    def grid(self) -> DriveGrid:
+        """Where the robot can drive."""
+        return _grid(self.plan, self.things)
+
+
+def build_house(seed: int) -> House:
+    """The house of this seed. Raises MapfoldError if no attempt leaves it passable."""
+    plan = build_floor_plan(seed)
+    for attempt in range(_ATTEMPTS):
+        things = _furnish(plan, stream("furniture", seed, attempt))
+        if things is not None and _grid(plan, things).joins(
+            [room.rect.centre for room in plan.rooms]
+        ):
+            return House(seed, plan, _numbered(things))
+    raise MapfoldError(
+        f"house {seed}: no furnishing leaves every room reachable; try another --seed"
+    )
+
+
+def _grid(plan: FloorPlan, things: tuple[Thing, ...]) -> DriveGrid:
+    return DriveGrid(
+        plan.outline, Walls(plan.walls), [t.footprint for t in things if t.model.stands]
+    )
+
+
+def _numbered(things: tuple[Thing, ...]) -> tuple[Thing, ...]:
+    """Give instances of one model the names model-1, model-2 … in the order they were placed."""
+    counts: dict[str, int] = {}
+    named: list[Thing] = []
+    for thing in things:
+        count = counts[thing.model.name] = counts.get(thing.model.name, 0) + 1
+        named.append(replace(thing, instance=f"{thing.model.name}-{count}"))
+    return tuple(named)
+
+
+def _furnish(plan: FloorPlan, rng: np.random.Generator) -> tuple[Thing, ...] | None:
+    """Everything in FURNITURE and the dining set, or None when something finds no room."""
+    placed: list[Thing] = []
+    dining = _dining_set(plan, rng)
+    if dining is None:
+        return None
+    placed.extend(dining)
+    for room in plan.rooms:
+        for name in FURNITURE[room.name]:
+            thing = _against_a_wall(plan, room, MODELS[name], placed, rng)
+            if thing is None:
+                return None
+            placed.append(thing)
+    return tuple(placed)
+
+
+def _dining_set(plan: FloorPlan, rng: np.random.Generator) -> list[Thing] | None:
+    room = plan.room("dining room")
+    keep_clear = list(_thresholds(plan, room))
+    for _ in range(_TRIES):
+        x = round(uniform(rng, room.rect.x0 + 1.1, room.rect.x1 - 1.1), 2)
+        y = round(uniform(rng, room.rect.y0 + 1.1, room.rect.y1 - 1.1), 2)
+        if any(Rect.around(x, y, 1.7, 2.0).overlaps(clear) for clear in keep_clear):
+            continue
+        table, *chairs = (MODELS[name] for name in DINING_SET)
+        things = [_thing(table, room, Rect.around(x, y, table.width_m, table.depth_m), 0)]
+        for chair, (dx, dy) in zip(chairs, _CHAIR_OFFSETS, strict=True):
+            spot = Rect.around(x + dx, y + dy, chair.width_m, chair.depth_m)
+            things.append(_thing(chair, room, spot, 1 if dy < 0 else 3))
+        return things
+    return None
+
+
+def _against_a_wall(
+    plan: FloorPlan, room: Room, model: Model, placed: list[Thing], rng: np.random.Generator
+) -> Thing | None:
+    taken = [t.footprint for t in placed if t.room == room.name and t.model.stands == model.stands]
+    taken += _thresholds(plan, room)
+    for _ in range(_TRIES):
+        side = int(rng.integers(0, 4))
+        spot = _spot(room.rect, model, side, uniform(rng, 0.0, 1.0))
+        if room.rect.encloses(spot) and not any(spot.grown(0.05).overlaps(t) for t in taken):
+            return _thing(model, room, spot, side)
+    return None
+
+
+def _spot(rect: Rect, model: Model, side: int, along: float) -> Rect:
+    """The footprint with its back to a side (0 west, 1 south, 2 east, 3 north), 5 cm off it."""
+    gap = 0.05 + model.depth_m / 2
+    if side in (0, 2):
+        half = model.width_m / 2 + 0.05
+        y = round(rect.y0 + half + along * (rect.height - 2 * half), 2)
+        x = rect.x0 + gap if side == 0 else rect.x1 - gap
+        return Rect.around(x, y, model.depth_m, model.width_m)
+    half = model.width_m / 2 + 0.05
+    x = round(rect.x0 + half + along * (rect.width - 2 * half), 2)
+    y = rect.y0 + gap if side == 1 else rect.y1 - gap
+    return Rect.around(x, y, model.width_m, model.depth_m)
+
+
+def _thing(model: Model, room: Room, spot: Rect, side: int) -> Thing:
+    """``side`` is the one its back is to; its front looks the other way."""
+    quarter_turns = {0: 0.0, 1: 0.5, 2: 1.0, 3: -0.5}
+    return Thing("", model, room.name, spot, quarter_turns[side] * np.pi)
+
+
+def _thresholds(plan: FloorPlan, room: Room) -> Iterator[Rect]:
+    """The floor in front of the room's doors, to be kept free."""
+    for door in plan.doors:
+        if room.name in door.rooms:
+            yield _threshold(door)
+
+
+def _threshold(door: Door) -> Rect:
+    deep, wide = 2 * _DOOR_CLEAR_M, door.width_m
+    return Rect.around(*door.centre, *((wide, deep) if door.flat else (deep, wide)))

@@ -1,0 +1,68 @@
+"""`mapfold simulate` over a real router and into files, as a user runs it."""
+
+import json
+import queue
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from eventsrc._zenoh import Received, Session
+from eventsrc.sim import simulate_run
+from tests.fixtures_zenoh import DEADLINE_S, Program
+
+
+def test_every_keyframe_arrives_byte_for_byte_and_in_order(
+    endpoint: str, connected: Callable[[], Session], start: Callable[..., Program]
+) -> None:
+    received: queue.Queue[Received] = queue.Queue()
+    session = connected()
+    session.subscribe("tb/**", received.put)
+    session.confirm()
+    program = start("simulate", "--run", "b", "--speed", "0", "--connect", endpoint)
+    assert program.wait() == 0, program.lines
+    payloads = list(simulate_run(run="b").payloads)
+    arrived = [received.get(timeout=DEADLINE_S) for _ in payloads]
+    assert [message.payload for message in arrived] == payloads
+    assert {message.key for message in arrived} == {"tb/detections"}
+    assert f"published {len(payloads)} on tb/detections" in program.lines[-1]
+
+
+def test_it_says_so_when_nobody_listens(endpoint: str, start: Callable[..., Program]) -> None:
+    program = start("simulate", "--wait", "0.2", "--connect", endpoint)
+    assert program.wait() == 1
+    (line,) = program.lines
+    assert "nobody subscribed to 'tb/detections' within 0.2 s" in line
+    assert "mapfold record" in line
+
+
+def test_a_file_is_written_with_its_numbers(tmp_path: Path) -> None:
+    out = tmp_path / "run.jsonl.gz"
+    command = "from projections.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", command, "simulate", "--run", "c", "--out", str(out), "--json"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    numbers = json.loads(done.stdout)
+    run = simulate_run(run="c")
+    assert numbers["run_id"] == run.run_id
+    assert numbers["keyframes"] == len(run.envelopes)
+    assert Path(numbers["out"]).exists()
+    assert Path(numbers["truth"]).name == "run.truth.jsonl.gz"
+    assert f"{len(run.envelopes)} keyframes" in done.stderr
+
+
+def test_an_unwritable_place_is_one_clear_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    command = "from projections.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", command, "simulate", "--out", str(tmp_path / "file" / "x.jsonl")],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert "cannot be written" in done.stderr
