@@ -11,6 +11,9 @@ from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
+ENVELOPE_VERSION = 2
+"""The version of the models below. Older ones climb a ladder to it, see `eventsrc.upcast`."""
+
 MAX_ID_LENGTH = 256
 MAX_POSITION_M = 1e7
 """Bound of map_x and map_y, ±10,000 km: the fold computes in integer micrometres and is exact

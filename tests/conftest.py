@@ -1,5 +1,7 @@
 """Fixtures every test may use; those of one subsystem live in ``tests/fixtures_*.py``."""
 
 pytest_plugins = [
+    "tests.fixtures_postgres",
+    "tests.fixtures_log",
     "tests.fixtures_zenoh",
 ]

@@ -1,0 +1,150 @@
+"""What can still be read of an active segment, whatever happened to its bytes.
+
+The file is a row of chunks and commit marks. A chunk counts when its CRC holds and its sequence
+numbers continue. Where no good chunk stands, the next one is searched for: close by (a damaged
+mark or head), else behind the next commit mark. Then:
+
+* Bytes at the end that no good chunk and no commit mark follows are *torn*: the write that a crash
+  cut short. They were never synced, so nobody was told that they are recorded.
+* Everything else that cannot be read is *rot*: a mark or a chunk behind it proves that it was
+  synced once. Its offsets are known from what stands around it, and named as a gap.
+"""
+
+import mmap
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from eventsrc.errors import LogDamaged, NotALog
+
+from . import _mcap
+from ._mcap import BadRecord
+from .segment import ChunkRef, read_head
+
+_NEAR = 4096
+
+
+@dataclass(slots=True)
+class ActiveScan:
+    """The good chunks of an active segment and what is between and behind them."""
+
+    base: int
+    log_id: str | None
+    chunks: list[ChunkRef] = field(default_factory=list)
+    gaps: list[tuple[int, int]] = field(default_factory=list)
+    """First and last offset of events that were recorded once and are gone."""
+    lost_bytes: int = 0
+    torn_events: int = 0
+    """Events that had begun to be written in the torn end; none of them was synced."""
+    next_offset: int = 0
+
+
+def scan_active(path: Path, base: int) -> ActiveScan:
+    """Look at every byte of an active segment."""
+    with path.open("rb") as file:
+        data = file.read(1) and mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    if not data:
+        return ActiveScan(base, None, next_offset=base)
+    with data:
+        return _Scanner(path, base, data).run()
+
+
+class _Scanner:
+    def __init__(self, path: Path, base: int, data: mmap.mmap) -> None:
+        self._path = path
+        self._data = data
+        self._at = 0
+        self._promised = base
+        self.result = ActiveScan(base, None, next_offset=base)
+
+    def run(self) -> ActiveScan:
+        self._read_head()
+        while self._at < len(self._data):
+            if not self._take_chunk(self._at):
+                self._resync()
+        self._gap_up_to(self._promised)
+        return self.result
+
+    def _read_head(self) -> None:
+        try:
+            head, self._at = read_head(self._path, self._data[:_NEAR], self.result.base)
+            self.result.log_id = head["log_id"]
+        except (LogDamaged, NotALog):
+            self._resync()
+
+    def _take_chunk(self, at: int) -> bool:
+        """Accept the chunk at ``at`` and its mark; False when none is there."""
+        try:
+            length, first, following = self._good_chunk(at)
+        except BadRecord:
+            return False
+        if first < self.result.next_offset:
+            return False
+        self._gap_up_to(first)
+        self.result.chunks.append(ChunkRef(at, length, first, following))
+        self.result.next_offset = following
+        self._at = at + length
+        self._take_mark()
+        return True
+
+    def _good_chunk(self, at: int) -> tuple[int, int, int]:
+        head = _mcap.decode_chunk_head(self._data[at : at + _mcap.ZSTD_CHUNK_HEAD])
+        if at + head.length > len(self._data):
+            raise BadRecord("cut short inside a chunk")
+        body = _mcap.decode_chunk(self._data[at : at + head.length])
+        sequences = [message[1] for message in _mcap.walk(body)]
+        if not sequences or sequences != list(range(sequences[0], sequences[0] + len(sequences))):
+            raise BadRecord("a chunk's sequence numbers have holes")
+        first = self.result.base + sequences[0]
+        return head.length, first, first + len(sequences)
+
+    def _take_mark(self) -> None:
+        try:
+            _, following = _mcap.decode_mark(self._data[self._at : self._at + _mcap.MARK_BYTES])
+        except BadRecord:
+            return
+        self._promised = max(self._promised, following)
+        self._at += _mcap.MARK_BYTES
+
+    def _gap_up_to(self, offset: int) -> None:
+        if offset > self.result.next_offset:
+            self.result.gaps.append((self.result.next_offset, offset - 1))
+            self.result.next_offset = offset
+
+    def _resync(self) -> None:
+        """Move to where reading can go on: a good chunk close by, behind a mark, or the end."""
+        start = self._at
+        self._at = self._near_chunk(start) or self._after_mark(start) or len(self._data)
+        self.result.lost_bytes += self._at - start
+        if self._at == len(self._data):
+            self.result.torn_events += _count_begun(self._data[start:])
+
+    def _near_chunk(self, start: int) -> int | None:
+        at = start
+        while (at := self._data.find(b"\x06", at + 1, start + _NEAR)) >= 0:
+            try:
+                self._good_chunk(at)
+            except BadRecord:
+                continue
+            return at
+        return None
+
+    def _after_mark(self, start: int) -> int | None:
+        at = start - 1
+        while (at := self._data.find(_mcap.MARK_PATTERN, at + 1)) >= 0:
+            try:
+                _, following = _mcap.decode_mark(self._data[at : at + _mcap.MARK_BYTES])
+            except BadRecord:
+                continue
+            self._promised = max(self._promised, following)
+            return at + _mcap.MARK_BYTES
+        return None
+
+
+def _count_begun(torn: bytes) -> int:
+    """How many events a torn chunk had begun; nothing of them can be trusted, their number may."""
+    at, count = _mcap.PLAIN_CHUNK_HEAD, 0
+    while at + _mcap.FRAME.size <= len(torn):
+        opcode, length = _mcap.FRAME.unpack_from(torn, at)
+        count += opcode == _mcap.Opcode.MESSAGE
+        at += _mcap.FRAME.size + length
+    return count

@@ -1,0 +1,222 @@
+"""Making a sealed segment: chunked, zstd, indexed, with every byte under some checksum.
+
+    magic · Header · Metadata "mapfold.segment" · ( chunk · message indexes )* ·
+    Metadata "mapfold.seal" · DataEnd with the CRC of all before it ·
+    summary with its CRC · Footer · magic
+
+The file is written beside (``.mcap.sealing``), synced and renamed, so a sealed name never holds
+half a segment. Bodies of active chunks are joined as they are into chunks of about 1 MiB: the
+events' bytes are not taken apart, only their heads are walked for the index.
+
+The seal says how many events each chunk holds, which the MCAP index does not, so that an offset is
+found without reading chunks; and the SHA-256 of the segment before, which makes the chain.
+"""
+
+import hashlib
+import os
+import zlib
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from . import _mcap
+from ._active import SEGMENT_METADATA, file_head, head_metadata
+from ._mcap import (
+    Channel,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Metadata,
+    MetadataIndex,
+    Opcode,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+from ._naming import SEALED, SEALING, segment_path
+from .fsync import replace_durably, sync_file, unlink_quietly, write_all
+from .segment import SEAL_METADATA
+
+CHUNK_BYTES = 1024 * 1024
+NO_PREVIOUS = ""
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentPlan:
+    """What a sealed segment says of itself: its log, its base and the hash of the one before."""
+
+    log: Path
+    log_id: str
+    base: int
+    previous_sha256: str
+    notes: dict[str, str] = field(default_factory=dict)
+
+
+def seal(plan: SegmentPlan, bodies: Iterable[bytes]) -> str:
+    """Write the sealed segment from chunk bodies in offset order; its SHA-256.
+
+    Raises OSError when the disk refuses; nothing is left behind then.
+    """
+    temporary = segment_path(plan.log, plan.base, SEALING)
+    fd = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+    try:
+        builder = _Builder(fd, plan)
+        for body in _merged(bodies):
+            builder.add_chunk(body)
+        builder.finish()
+        sync_file(fd)
+    except BaseException:
+        unlink_quietly(temporary)
+        raise
+    finally:
+        os.close(fd)
+    replace_durably(temporary, segment_path(plan.log, plan.base, SEALED))
+    return builder.sha256.hexdigest()
+
+
+def _merged(bodies: Iterable[bytes]) -> Iterator[bytes]:
+    parts: list[bytes] = []
+    size = 0
+    for body in bodies:
+        parts.append(body)
+        size += len(body)
+        if size >= CHUNK_BYTES:
+            yield b"".join(parts)
+            parts, size = [], 0
+    if parts:
+        yield b"".join(parts)
+
+
+class _Builder:
+    """Writes front to back, keeping position, checksums and the index."""
+
+    def __init__(self, fd: int, plan: SegmentPlan) -> None:
+        self._fd = fd
+        self._at = 0
+        self._crc = 0
+        self.sha256 = hashlib.sha256()
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        self._counts: dict[int, int] = defaultdict(int)
+        self._chunks: list[ChunkIndex] = []
+        self._metadata: list[MetadataIndex] = []
+        self._edges = [0]
+        self._log_ns: list[int] = []
+        self._stamp_ns: list[int] = []
+        head = head_metadata(
+            plan.log_id, plan.base, {"previous_sha256": plan.previous_sha256, **plan.notes}
+        )
+        start = file_head(head)
+        length = len(_mcap.encode(head))
+        self._metadata.append(MetadataIndex(len(start) - length, length, SEGMENT_METADATA))
+        self._write(start)
+
+    def _write(self, data: bytes) -> None:
+        write_all(self._fd, data)
+        self._at += len(data)
+        self._crc = zlib.crc32(data, self._crc)
+        self.sha256.update(data)
+
+    def add_chunk(self, body: bytes) -> None:
+        """One chunk and the index of its messages."""
+        schemas, channels = _mcap.definitions(body)
+        self._schemas.update((s.id, s) for s in schemas)
+        self._channels.update((c.id, c) for c in channels)
+        entries: dict[int, list[int]] = defaultdict(list)
+        log_ns: list[int] = []
+        stamp_ns: list[int] = []
+        for channel_id, _, log, publish, payload_at, _ in _mcap.walk(body):
+            entries[channel_id] += (log, payload_at - 31)
+            log_ns.append(log)
+            stamp_ns.append(publish)
+        self._edges.append(self._edges[-1] + len(log_ns))
+        self._log_ns += (min(log_ns), max(log_ns))
+        self._stamp_ns += (min(stamp_ns), max(stamp_ns))
+        for channel_id, flat in entries.items():
+            self._counts[channel_id] += len(flat) // 2
+        self._write_chunk(body, min(log_ns), max(log_ns), entries)
+
+    def _write_chunk(
+        self, body: bytes, first_ns: int, last_ns: int, entries: dict[int, list[int]]
+    ) -> None:
+        chunk = _mcap.encode_chunk(body, first_ns, last_ns, compress=True)
+        start = self._at
+        self._write(chunk)
+        indexes_at = self._at
+        offsets: dict[int, int] = {}
+        for channel_id in sorted(entries):
+            offsets[channel_id] = self._at
+            self._write(_mcap.encode_message_index(channel_id, entries[channel_id]))
+        self._chunks.append(
+            ChunkIndex(
+                chunk_length=len(chunk),
+                chunk_start_offset=start,
+                compression="zstd",
+                compressed_size=len(chunk) - _mcap.ZSTD_CHUNK_HEAD,
+                message_end_time=last_ns,
+                message_index_length=self._at - indexes_at,
+                message_index_offsets=offsets,
+                message_start_time=first_ns,
+                uncompressed_size=len(body),
+            )
+        )
+
+    def finish(self) -> None:
+        """Seal, end of data, summary, footer."""
+        seal_record = _mcap.encode(self._seal())
+        self._metadata.append(MetadataIndex(self._at, len(seal_record), SEAL_METADATA))
+        self._write(seal_record)
+        self._write(_mcap.encode(DataEnd(self._crc)))
+        self._write_summary()
+
+    def _seal(self) -> Metadata:
+        return _mcap.own_metadata(
+            SEAL_METADATA,
+            {
+                "chunk_edges": ",".join(map(str, self._edges)),
+                "first_stamp_ns": str(min(self._stamp_ns)),
+                "last_stamp_ns": str(max(self._stamp_ns)),
+            },
+        )
+
+    def _write_summary(self) -> None:
+        start = self._at
+        summary = b""
+        groups: list[SummaryOffset] = []
+        for opcode, data in self._summary_groups():
+            groups.append(SummaryOffset(opcode, start + len(summary), len(data)))
+            summary += data
+        offsets_start = start + len(summary)
+        summary += _mcap.encode_all(groups)
+        footer = _mcap.encode(Footer(start, offsets_start, 0))
+        crc = zlib.crc32(footer[:-4], zlib.crc32(summary))
+        self._write(summary + _mcap.encode(Footer(start, offsets_start, crc)) + _mcap.MAGIC)
+
+    def _summary_groups(self) -> list[tuple[Opcode, bytes]]:
+        return [
+            (Opcode.SCHEMA, _mcap.encode_all(self._schemas.values())),
+            (Opcode.CHANNEL, _mcap.encode_all(self._channels.values())),
+            (Opcode.STATISTICS, _mcap.encode(self._statistics())),
+            (Opcode.CHUNK_INDEX, _mcap.encode_all(self._chunks)),
+            (Opcode.METADATA_INDEX, _mcap.encode_all(self._metadata)),
+        ]
+
+    def _statistics(self) -> Statistics:
+        return Statistics(
+            attachment_count=0,
+            channel_count=len(self._channels),
+            channel_message_counts=dict(self._counts),
+            chunk_count=len(self._chunks),
+            message_count=self._edges[-1],
+            message_end_time=max(self._log_ns),
+            message_start_time=min(self._log_ns),
+            metadata_count=len(self._metadata),
+            schema_count=len(self._schemas),
+        )
+
+
+def file_sha256(path: Path) -> str:
+    """The hash a following segment carries of this one."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

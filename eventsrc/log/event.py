@@ -1,0 +1,19 @@
+"""One event as it stands in a log."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One recorded message.
+
+    ``offset`` is its index in the log and its only order. ``logged_ns`` is when it was written,
+    ``stamp_ns`` when the robot says it happened, both int nanoseconds since the Unix epoch; either
+    may run backwards. ``payload`` is the message, byte for byte as it came.
+    """
+
+    offset: int
+    key: str
+    logged_ns: int
+    stamp_ns: int
+    payload: bytes

@@ -1,0 +1,78 @@
+"""When events reach the disk for good, and the calls that put them there.
+
+``always``   every event is synced before `append` returns
+``<N>ms``    group commit: events are written and synced together every N milliseconds, or sooner
+             when 256 events or 4 MiB wait (``50ms`` is the default)
+``never``    written every 50 ms and left to the operating system: survives kill -9, not a power cut
+"""
+
+import contextlib
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from eventsrc.errors import MisuseError
+
+GROUP_EVENTS = 256
+GROUP_BYTES = 4 * 1024 * 1024
+
+
+@dataclass(frozen=True, slots=True)
+class FsyncPolicy:
+    """How many events, bytes and nanoseconds may wait for a commit, and whether it syncs."""
+
+    interval_ns: int
+    max_events: int = GROUP_EVENTS
+    max_bytes: int = GROUP_BYTES
+    syncs: bool = True
+
+
+ALWAYS = FsyncPolicy(interval_ns=0, max_events=1)
+GROUP_COMMIT = FsyncPolicy(interval_ns=50_000_000)
+NEVER = FsyncPolicy(interval_ns=50_000_000, syncs=False)
+
+
+def parse_fsync(text: str) -> FsyncPolicy:
+    """``always``, ``never`` or a time such as ``50ms``."""
+    if text == "always":
+        return ALWAYS
+    if text == "never":
+        return NEVER
+    match = re.fullmatch(r"(\d{1,6})ms", text)
+    if match is None or int(match[1]) == 0:
+        raise MisuseError(f"--fsync {text!r} is none of always, never or <N>ms; try --fsync 50ms")
+    return FsyncPolicy(interval_ns=int(match[1]) * 1_000_000)
+
+
+def sync_file(fd: int) -> None:
+    """Bytes and size of an open file to stable storage. The size is part of fdatasync's promise."""
+    getattr(os, "fdatasync", os.fsync)(fd)
+
+
+def sync_directory(path: Path) -> None:
+    """Make a created, renamed or deleted name in ``path`` survive a power cut."""
+    fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
+def write_all(fd: int, data: bytes) -> None:
+    """Write every byte; the system may take fewer at a time."""
+    view = memoryview(data)
+    while view:
+        view = view[os.write(fd, view) :]
+
+
+def replace_durably(temporary: Path, final: Path) -> None:
+    """Rename a synced file to its name and sync the name."""
+    temporary.replace(final)
+    sync_directory(final.parent)
+
+
+def unlink_quietly(path: Path) -> None:
+    """Remove ``path`` if it is there."""
+    with contextlib.suppress(FileNotFoundError):
+        path.unlink()

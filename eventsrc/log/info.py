@@ -1,0 +1,96 @@
+"""What `mapfold log info` tells: counted from the indexes, without reading the events."""
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+from eventsrc.system_events import LOSS_KEY, REJECTED_KEY, Loss
+
+from . import _mcap
+from .reader import LogReader, OpenSegment
+from .segment import SealedFile
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentInfo:
+    """One segment: ``events`` are the durable ones, ``size_bytes`` what the file takes."""
+
+    name: str
+    base: int
+    events: int
+    size_bytes: int
+    sealed: bool
+
+
+@dataclass(frozen=True, slots=True)
+class LogInfo:
+    """A log at a glance. Times are int nanoseconds, None while the log is empty; the first is the
+    earliest and the last the latest, whatever their order in the log."""
+
+    log_id: str
+    path: Path
+    events: int
+    size_bytes: int
+    segments: tuple[SegmentInfo, ...]
+    keys: dict[str, int]
+    rejected: int
+    lost: int
+    first_logged_ns: int | None
+    last_logged_ns: int | None
+    first_stamp_ns: int | None
+    last_stamp_ns: int | None
+
+
+@dataclass(slots=True)
+class _Tally:
+    keys: Counter[str]
+    logged: list[int]
+    stamps: list[int]
+
+
+def log_info(path: Path) -> LogInfo:
+    """Count a log. Raises LogNotFound, NotALog or LogDamaged."""
+    tally = _Tally(Counter(), [], [])
+    with LogReader(path) as reader:
+        segments = tuple(_count(reader.open_segment(entry), tally) for entry in reader.segments)
+        losses = reader.read(keys={LOSS_KEY})
+        return LogInfo(
+            log_id=reader.log_id,
+            path=path,
+            events=reader.next_offset,
+            size_bytes=sum(s.size_bytes for s in segments),
+            segments=segments,
+            keys={key: tally.keys[key] for key in sorted(tally.keys)},
+            rejected=tally.keys[REJECTED_KEY],
+            lost=sum(Loss.model_validate_json(event.payload).count for event in losses),
+            first_logged_ns=min(tally.logged, default=None),
+            last_logged_ns=max(tally.logged, default=None),
+            first_stamp_ns=min(tally.stamps, default=None),
+            last_stamp_ns=max(tally.stamps, default=None),
+        )
+
+
+def _count(segment: OpenSegment, tally: _Tally) -> SegmentInfo:
+    if isinstance(segment, SealedFile):
+        _count_sealed(segment, tally)
+    else:
+        for chunk in segment.chunks:
+            for channel, _, log_ns, stamp_ns, _, _ in _mcap.walk(segment.read_chunk(chunk)):
+                tally.keys[segment.keys[channel]] += 1
+                tally.logged.append(log_ns)
+                tally.stamps.append(stamp_ns)
+    return SegmentInfo(
+        name=segment.path.name,
+        base=segment.base,
+        events=segment.next_offset - segment.base,
+        size_bytes=segment.size(),
+        sealed=isinstance(segment, SealedFile),
+    )
+
+
+def _count_sealed(segment: SealedFile, tally: _Tally) -> None:
+    statistics = segment.statistics
+    for channel, count in statistics.channel_message_counts.items():
+        tally.keys[segment.keys[channel]] += count
+    tally.logged += (statistics.message_start_time, statistics.message_end_time)
+    tally.stamps += (int(segment.seal["first_stamp_ns"]), int(segment.seal["last_stamp_ns"]))

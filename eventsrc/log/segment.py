@@ -1,0 +1,265 @@
+"""Segments, read side: where each chunk of events stands, and the events of one chunk.
+
+A sealed segment is opened by its footer: summary and seal name every chunk, its first offset and
+its channels, so nothing before the wanted event is read. An active one has no index; its chunk
+heads and commit marks are hopped over once (80 bytes each) and again only from where that ended.
+"""
+
+import os
+import zlib
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from eventsrc.errors import LogDamaged, NotALog
+
+from . import _mcap
+from ._active import SEGMENT_METADATA
+from ._mcap import (
+    BadRecord,
+    Channel,
+    ChunkIndex,
+    Footer,
+    Metadata,
+    MetadataIndex,
+    Opcode,
+    Statistics,
+)
+from .event import Event
+
+SEAL_METADATA = "mapfold.seal"
+_HEAD_READ = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkRef:
+    """Where a chunk stands and which offsets it holds. ``channels`` is None where not known."""
+
+    position: int
+    length: int
+    first: int
+    following: int
+    channels: frozenset[int] | None = None
+
+
+class Segment(Protocol):
+    """What a reader needs of a segment, sealed or active."""
+
+    path: Path
+    base: int
+    log_id: str
+    chunks: list[ChunkRef]
+    keys: dict[int, str]
+    next_offset: int
+
+    def read_chunk(self, chunk: ChunkRef) -> bytes:
+        """The chunk's body, CRC checked; LogDamaged naming the offsets otherwise."""
+
+
+class _File:
+    """An open segment file and what its head says."""
+
+    def __init__(self, path: Path, base: int) -> None:
+        self.path = path
+        self.base = base
+        self.chunks: list[ChunkRef] = []
+        self.keys: dict[int, str] = {}
+        self.next_offset = base
+        self._fd = os.open(path, os.O_RDONLY)
+        try:
+            self.head, self.head_bytes = read_head(path, os.pread(self._fd, _HEAD_READ, 0), base)
+        except BaseException:
+            self.close()
+            raise
+        self.log_id = self.head["log_id"]
+
+    def read_chunk(self, chunk: ChunkRef) -> bytes:
+        record = os.pread(self._fd, chunk.length, chunk.position)
+        try:
+            return _mcap.decode_chunk(record)
+        except BadRecord as error:
+            raise LogDamaged(
+                f"{self.path}: offsets {chunk.first} to {chunk.following - 1} cannot be read, at "
+                f"byte {chunk.position}: {error}; run `mapfold log verify {self.path.parent}`"
+            ) from None
+
+    def size(self) -> int:
+        return os.fstat(self._fd).st_size
+
+    def close(self) -> None:
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+
+    def __del__(self) -> None:
+        # Iterators share a segment with the reader that opened it; the last one closes the file.
+        self.close()
+
+
+def read_head(path: Path, data: bytes, base: int) -> tuple[dict[str, str], int]:
+    """Our metadata at the head of a segment and the byte after it."""
+    if not data.startswith(_mcap.MAGIC):
+        raise NotALog(f"{path} is no MCAP file; it does not belong into a log, move it away")
+    at = len(_mcap.MAGIC)
+    try:
+        for opcode, content in _mcap.records(data[at:]):
+            at += _mcap.FRAME.size + len(content)
+            if opcode == Opcode.METADATA:
+                metadata = _mcap.decode_as(Metadata, content)
+                if metadata.name == SEGMENT_METADATA:
+                    return _checked_head(metadata, base), at
+    except BadRecord as error:
+        raise LogDamaged(
+            f"{path}: damaged head: {error}; run `mapfold log recover {path.parent}`"
+        ) from None
+    raise NotALog(f"{path} is an MCAP file but no mapfold segment; use `mapfold import` for it")
+
+
+def _checked_head(metadata: Metadata, base: int) -> dict[str, str]:
+    values = _mcap.checked_metadata(metadata)
+    if values["base"] != str(base):
+        raise BadRecord(f"it was written as the segment at offset {values['base']}, not {base}")
+    return values
+
+
+class SealedFile(_File):
+    """An immutable segment, known from its summary."""
+
+    def __init__(self, path: Path, base: int) -> None:
+        super().__init__(path, base)
+        try:
+            self._read_summary()
+        except BadRecord as error:
+            self.close()
+            raise LogDamaged(
+                f"{path}: the index at its end cannot be read, which leaves offsets from {base} "
+                f"unreadable: {error}; run `mapfold log recover {path.parent}`"
+            ) from None
+        except BaseException:
+            self.close()
+            raise
+
+    def _read_summary(self) -> None:
+        size = self.size()
+        tail = os.pread(self._fd, _mcap.TAIL_BYTES, max(0, size - _mcap.TAIL_BYTES))
+        if not tail.endswith(_mcap.MAGIC) or tail[0] != Opcode.FOOTER:
+            raise BadRecord("no footer")
+        footer = _mcap.decode_as(Footer, tail[_mcap.FRAME.size :])
+        if not 0 < footer.summary_start <= size - _mcap.TAIL_BYTES:
+            raise BadRecord("the footer points nowhere")
+        length = size - _mcap.TAIL_BYTES - footer.summary_start
+        summary = os.pread(self._fd, length, footer.summary_start)
+        if zlib.crc32(tail[: _mcap.FOOTER_BYTES - 4], zlib.crc32(summary)) != footer.summary_crc:
+            raise BadRecord("the summary does not match its CRC")
+        self._take(summary)
+
+    def _take(self, summary: bytes) -> None:
+        indexes: list[ChunkIndex] = []
+        for opcode, content in _mcap.records(summary):
+            if opcode == Opcode.CHUNK_INDEX:
+                indexes.append(_mcap.decode_as(ChunkIndex, content))
+            elif opcode == Opcode.CHANNEL:
+                channel = _mcap.decode_as(Channel, content)
+                self.keys[channel.id] = channel.topic
+            elif opcode == Opcode.STATISTICS:
+                self.statistics = _mcap.decode_as(Statistics, content)
+            elif opcode == Opcode.METADATA_INDEX:
+                index = _mcap.decode_as(MetadataIndex, content)
+                if index.name == SEAL_METADATA:
+                    self.seal = self._metadata(index)
+        self._take_chunks(indexes)
+
+    def _metadata(self, index: MetadataIndex) -> dict[str, str]:
+        record = os.pread(self._fd, index.length, index.offset)
+        content = record[_mcap.FRAME.size :]
+        return _mcap.checked_metadata(_mcap.decode_as(Metadata, content))
+
+    def _take_chunks(self, indexes: list[ChunkIndex]) -> None:
+        edges = [self.base + int(n) for n in self.seal["chunk_edges"].split(",")]
+        if len(edges) != len(indexes) + 1:
+            raise BadRecord("the seal does not fit the index")
+        self.next_offset = edges[-1]
+        self.chunks = [
+            ChunkRef(
+                index.chunk_start_offset,
+                index.chunk_length,
+                first,
+                following,
+                frozenset(index.message_index_offsets),
+            )
+            for index, first, following in zip(indexes, edges, edges[1:], strict=False)
+        ]
+
+
+class ActiveFile(_File):
+    """A growing or left-over segment, known as far as its commit marks go."""
+
+    def __init__(self, path: Path, base: int) -> None:
+        super().__init__(path, base)
+        self.position = self.head_bytes
+        try:
+            self.refresh()
+        except BaseException:
+            self.close()
+            raise
+
+    def refresh(self) -> int:
+        """Take in what was committed since; the next offset."""
+        try:
+            while self._take_commit():
+                pass
+        except BadRecord:
+            # Either a chunk is just being written or the end is torn: nothing more is durable.
+            # Whether good chunks lie behind is asked once, by `LogReader` and by verify.
+            pass
+        return self.next_offset
+
+    def _take_commit(self) -> bool:
+        head_bytes = os.pread(self._fd, _mcap.PLAIN_CHUNK_HEAD + 1, self.position)
+        if len(head_bytes) <= _mcap.PLAIN_CHUNK_HEAD:
+            return False
+        head = _mcap.decode_chunk_head(head_bytes)
+        mark_at = self.position + head.length
+        first, following = _mcap.decode_mark(os.pread(self._fd, _mcap.MARK_BYTES, mark_at))
+        if first != self.next_offset:
+            raise BadRecord("a commit mark contradicts the one before it")
+        chunk = ChunkRef(self.position, head.length, first, following)
+        if head_bytes[-1] in (Opcode.SCHEMA, Opcode.CHANNEL):
+            self._learn(self.read_chunk(chunk))
+        self.chunks.append(chunk)
+        self.next_offset = following
+        self.position = mark_at + _mcap.MARK_BYTES
+        return True
+
+    def _learn(self, body: bytes) -> None:
+        _, channels = _mcap.definitions(body)
+        self.keys.update((c.id, c.topic) for c in channels)
+
+
+def chunk_events(
+    segment: Segment, chunk: ChunkRef, start: int, end: int, keys: Collection[str] | None
+) -> Iterator[Event]:
+    """The events of one chunk with offsets from ``start`` to before ``end``, in order."""
+    body = segment.read_chunk(chunk)
+    names, base, expected = segment.keys, segment.base, chunk.first
+    for channel, sequence, log_ns, publish_ns, at, stop in _mcap.walk(body):
+        offset = base + sequence
+        if offset != expected:
+            raise LogDamaged(
+                f"{segment.path}: offset {offset} stands where {expected} should; "
+                f"run `mapfold log verify {segment.path.parent}`"
+            )
+        expected = offset + 1
+        if offset < start:
+            continue
+        if offset >= end:
+            return
+        key = names[channel]
+        if keys is None or key in keys:
+            yield Event(offset, key, log_ns, publish_ns, body[at:stop])
+    if expected != chunk.following:
+        raise LogDamaged(
+            f"{segment.path}: offsets {expected} to {chunk.following - 1} are missing; "
+            f"run `mapfold log verify {segment.path.parent}`"
+        )

@@ -1,0 +1,195 @@
+"""Appending to a log: one writer, dense offsets, group commit, rotation.
+
+An event has an offset when `append` returns and is *recorded* when `durable_offset` has passed it.
+A writer belongs to one thread. Every error is final for it: what is synced stays, what waits was
+never called recorded, and the next writer goes on behind the last good event.
+"""
+
+import contextlib
+import time
+import uuid
+from pathlib import Path
+from types import TracebackType
+
+from eventsrc.clock import Clock, system_clock
+from eventsrc.envelope import ENVELOPE_VERSION
+from eventsrc.errors import LogError, MapfoldError, NotALog
+
+from ._active import ActiveSegment
+from ._lock import WriterLock
+from ._naming import LOCK, leftovers, list_segments
+from ._sealer import Sealer
+from .fsync import GROUP_COMMIT, FsyncPolicy, unlink_quietly
+from .recovery import Restart, restart
+
+ROTATE_BYTES = 64 * 1024 * 1024
+ROTATE_EVENTS = 1_000_000
+ROTATE_SECONDS = 3600.0
+_MAX_NS = 2**63
+
+
+class LogWriter:
+    """A context manager; creates the log if there is none, takes its lock, recovers what a
+    predecessor left. Raises LogBusy, NotALog, LogDamaged or LogError."""
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        fsync: FsyncPolicy = GROUP_COMMIT,
+        clock: Clock = system_clock,
+        rotate_bytes: int = ROTATE_BYTES,
+        rotate_events: int = ROTATE_EVENTS,
+        rotate_seconds: float = ROTATE_SECONDS,
+    ) -> None:
+        self.path = path
+        self._fsync = fsync
+        self._clock = clock
+        self._rotate_bytes = rotate_bytes
+        self._rotate_events = rotate_events
+        self._rotate_ns = int(rotate_seconds * 1e9)
+        self._closed = False
+        try:
+            self._open()
+        except OSError as error:
+            raise LogError(
+                f"{path}: {error.strerror or error}; check the folder's rights"
+            ) from error
+
+    def _open(self) -> None:
+        _make_log_directory(self.path)
+        self._lock = WriterLock(self.path, self._clock)
+        try:
+            self.restart: Restart = restart(self.path)
+            self.log_id = self.restart.log_id or uuid.uuid4().hex
+            self._sealer = Sealer(self.path, self.log_id, self.restart.previous_sha256)
+            self._begin_segment(self.restart.next_offset)
+        except BaseException:
+            self._lock.release()
+            raise
+
+    def _begin_segment(self, base: int) -> None:
+        self._active = ActiveSegment(self.path, self.log_id, base, self._fsync)
+        self._begun = time.monotonic_ns()
+
+    @property
+    def next_offset(self) -> int:
+        """The offset the next append gets."""
+        return self._active.next_offset
+
+    @property
+    def durable_offset(self) -> int:
+        """Every event below it is synced, and visible to readers."""
+        return self._active.committed
+
+    def append(
+        self,
+        key: str,
+        payload: bytes,
+        *,
+        stamp_ns: int | None = None,
+        logged_ns: int | None = None,
+        version: int = ENVELOPE_VERSION,
+    ) -> int:
+        """Take one event; its offset. Commits when the fsync policy says so.
+
+        ``logged_ns`` is now by the writer's clock unless given; ``stamp_ns`` is the same unless
+        given; both are int nanoseconds from 0 to 2^63 - 1.
+        """
+        logged = self._clock() if logged_ns is None else logged_ns
+        stamp = logged if stamp_ns is None else stamp_ns
+        if not (0 <= logged < _MAX_NS and 0 <= stamp < _MAX_NS):
+            raise LogError(f"times {logged} and {stamp} are not nanoseconds from 0 to 2^63 - 1")
+        offset = self._active.append(key, version, payload, logged, stamp)
+        self.commit_if_due()
+        return offset
+
+    def commit_if_due(self) -> bool:
+        """Group commit and rotation by time; True when something was committed."""
+        due = self._active.due()
+        if due:
+            self._active.commit()
+        if self._full():
+            self._rotate()
+        return due
+
+    def sync(self) -> int:
+        """Commit everything appended; the durable offset, which is then `next_offset`."""
+        self._active.commit()
+        return self.durable_offset
+
+    def _full(self) -> bool:
+        active = self._active
+        events = active.committed - active.base
+        return events > 0 and (
+            active.size >= self._rotate_bytes
+            or events >= self._rotate_events
+            or time.monotonic_ns() - self._begun >= self._rotate_ns
+        )
+
+    def _rotate(self) -> None:
+        finished = self._active
+        finished.commit()
+        try:
+            self._begin_segment(finished.committed)
+        except OSError as error:
+            raise LogError(
+                f"{self.path}: no new segment at offset {finished.committed}: "
+                f"{error.strerror or error}; every event before it is safe. "
+                "Free space or fix the disk, then start again"
+            ) from error
+        finished.close()
+        self._sealer.submit(finished.base)
+
+    def close(self) -> None:
+        """Commit, seal, let the next writer in. Raises LogError when the last events or the seal
+        could not be written; the log is released either way."""
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            self._active.commit()
+            self._finish_active()
+        finally:
+            self._active.close()
+            self._sealer.finish()
+            self._lock.release()
+        if self._sealer.error is not None:
+            raise self._sealer.error
+
+    def _finish_active(self) -> None:
+        """An empty segment stays only where it is all there is: it carries the log's id."""
+        if self._active.committed > self._active.base:
+            self._sealer.submit(self._active.base)
+        elif self._active.base > 0:
+            unlink_quietly(self._active.path)
+
+    def __enter__(self) -> "LogWriter":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
+        if error is None:
+            self.close()
+            return
+        with contextlib.suppress(MapfoldError):  # the first error is the one to tell
+            self.close()
+
+
+def _make_log_directory(path: Path) -> None:
+    if path.exists() and not path.is_dir():
+        raise NotALog(f"{path} is a file; a log is a directory, choose another name")
+    path.mkdir(parents=True, exist_ok=True)
+    if list_segments(path) or (path / LOCK).exists():
+        return
+    ours = set(leftovers(path))
+    others = [p for p in path.iterdir() if p not in ours and not p.name.startswith(".")]
+    if others:
+        raise NotALog(
+            f"{path} is no log: it holds {others[0].name} and no segment; "
+            "choose a new or an empty folder"
+        )
