@@ -5,6 +5,8 @@ import typer
 from eventsrc import cli as log_commands
 from eventsrc.cli._shell import run_app
 
+from . import db
+
 app = typer.Typer(
     name="mapfold",
     help="A robot's semantic map as a deterministic fold over an append-only log.",
@@ -15,6 +17,7 @@ app = typer.Typer(
 )
 
 log_commands.register(app)
+db.register(app)
 
 
 def main() -> None:

@@ -1,0 +1,86 @@
+"""Options that several commands share: which databases, which settings. Declared once."""
+
+import contextlib
+import json
+import signal
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any
+
+import typer
+from pydantic import ValidationError
+
+from projections.errors import SettingsError
+from projections.postgres.connect import Targets, open_targets
+from projections.settings import Settings
+
+DbOption = Annotated[
+    str | None,
+    typer.Option(
+        "--db",
+        metavar="URL",
+        help="PostgreSQL with Apache AGE for the graph [env MAPFOLD_DB; default: embedded server].",
+    ),
+]
+VectorDbOption = Annotated[
+    str | None,
+    typer.Option(
+        "--vector-db",
+        metavar="URL",
+        help="PostgreSQL with pgvector for the embeddings [env MAPFOLD_VECTOR_DB; default: --db].",
+    ),
+]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="NAME=VALUE", help="Change one setting of the fold, such as eps_m=1.0."
+    ),
+]
+SettingsOption = Annotated[
+    Path | None,
+    typer.Option("--settings", metavar="FILE", help="JSON object of settings; --set goes on top."),
+]
+
+
+def settings_from(file: Path | None, assignments: list[str] | None) -> Settings:
+    """The settings a command runs with. Raises SettingsError naming file and field."""
+    settings = Settings() if file is None else _settings_of_file(file)
+    return settings.with_assignments(assignments or ())
+
+
+def _settings_of_file(file: Path) -> Settings:
+    try:
+        document: Any = json.loads(file.read_text("utf-8"))
+        return Settings.model_validate(document)
+    except OSError as error:
+        raise SettingsError(f"--settings {file}: {error.strerror}") from None
+    except ValueError as error:
+        what = error.errors()[0] if isinstance(error, ValidationError) else None
+        told = f"{'.'.join(map(str, what['loc']))}: {what['msg']}" if what else str(error)
+        raise SettingsError(f"--settings {file}: {told}; give a JSON object of settings") from None
+
+
+@contextlib.contextmanager
+def databases(db: str | None, vector_db: str | None) -> Iterator[Targets]:
+    """The databases a command uses. Also after SIGTERM no embedded server is left behind."""
+    with _sigterm_unwinds(), open_targets(db, vector_db) as targets:
+        yield targets
+
+
+@contextlib.contextmanager
+def _sigterm_unwinds() -> Iterator[None]:
+    """SIGTERM ends the command through its ``finally`` blocks, as Ctrl-C does."""
+
+    def leave(signum: int, _frame: FrameType | None) -> None:
+        sys.exit(128 + signum)
+
+    if signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:  # the command has its own way
+        yield
+        return
+    signal.signal(signal.SIGTERM, leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)

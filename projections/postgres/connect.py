@@ -1,0 +1,220 @@
+"""From what the user said to connections: which databases, and a clear word when one fails.
+
+The graph and the vectors may share one database (the default) or live in two. Where they are:
+``--db`` and ``--vector-db``, else MAPFOLD_DB and MAPFOLD_VECTOR_DB, else the embedded server. The
+vectors go where the graph goes unless told otherwise.
+
+Messages name host, port and database, never a password.
+"""
+
+import contextlib
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Final, LiteralString
+
+import psycopg
+from psycopg import sql
+from psycopg.conninfo import conninfo_to_dict
+from psycopg.rows import TupleRow
+
+from eventsrc.errors import MisuseError
+from projections.errors import DatabaseError, DatabaseUnavailable, ExtensionMissing
+
+from .embedded import EmbeddedServer
+
+Connection = psycopg.Connection[TupleRow]
+
+CONNECT_SECONDS: Final = 10
+_PACKAGES: Final[Mapping[str, str]] = {"age": "Apache AGE", "vector": "pgvector"}
+
+
+@dataclass(frozen=True, slots=True)
+class Targets:
+    """The databases of one projection. ``embedded`` is ours to restart when it dies."""
+
+    graph_url: str
+    vector_url: str
+    embedded: EmbeddedServer | None = None
+
+    @property
+    def one_database(self) -> bool:
+        """True when both are written in one transaction."""
+        return self.graph_url == self.vector_url
+
+    def revive(self) -> None:
+        """Start the embedded server again if it is ours and has died."""
+        if self.embedded is not None:
+            self.embedded.start()
+
+
+@contextlib.contextmanager
+def open_targets(db: str | None = None, vector_db: str | None = None) -> Iterator[Targets]:
+    """The databases to use; the embedded server runs while the context is open, if it is needed."""
+    graph_url = db or os.environ.get("MAPFOLD_DB") or None
+    vector_url = vector_db or os.environ.get("MAPFOLD_VECTOR_DB") or graph_url
+    for url in (graph_url, vector_url):
+        if url is not None:
+            check_url(url)
+    if graph_url is not None and vector_url is not None:
+        yield Targets(graph_url, vector_url)
+        return
+    with EmbeddedServer() as server:
+        yield Targets(graph_url or server.url, vector_url or server.url, server)
+
+
+def check_url(url: str) -> None:
+    """Refuse what is no PostgreSQL URL, before anything tries to connect."""
+    try:
+        if not url.startswith(("postgresql://", "postgres://")):
+            raise MisuseError(
+                f"{_without_password(url)}: not a PostgreSQL URL; write it as"
+                " postgresql://user:password@host:port/database"
+            )
+        conninfo_to_dict(url)
+    except psycopg.ProgrammingError as error:
+        raise MisuseError(
+            f"{_without_password(url)}: not a PostgreSQL URL: {_first_line(error)}; write it as"
+            " postgresql://user:password@host:port/database"
+        ) from None
+
+
+def connect(url: str, *, application: str = "mapfold", autocommit: bool = False) -> Connection:
+    """A connection. Raises DatabaseUnavailable in one line that says what to do next."""
+    check_url(url)
+    try:
+        return psycopg.connect(
+            url,
+            autocommit=autocommit,
+            application_name=application,
+            connect_timeout=CONNECT_SECONDS,
+        )
+    except psycopg.OperationalError as error:
+        raise DatabaseUnavailable(f"{place(url)}: {_first_line(error)}; {_advice(error)}") from None
+
+
+def connect_for_cypher(url: str, *, application: str = "mapfold query") -> Connection:
+    """An autocommit connection that speaks Cypher: AGE loaded, ag_catalog on the search path."""
+    connection = connect(url, application=application, autocommit=True)
+    try:
+        load_age(connection)
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def load_age(connection: Connection) -> None:
+    """What each session needs before ``cypher()``. Raises ExtensionMissing when it cannot be had.
+
+    LOAD is for superusers only. Calling any of AGE's C functions loads its library too, and that an
+    ordinary reader may do.
+    """
+    try:
+        connection.execute("SELECT ag_catalog.agtype_build_map()")
+    except (psycopg.errors.InvalidSchemaName, psycopg.errors.UndefinedFunction):
+        raise ExtensionMissing(
+            f"{place_of(connection)}: the extension age is not created there; run mapfold replay,"
+            " or have a superuser run CREATE EXTENSION age"
+        ) from None
+    except psycopg.errors.InsufficientPrivilege:
+        raise ExtensionMissing(
+            f"{place_of(connection)}: user {connection.info.user} may not use Apache AGE; have a"
+            f" superuser run GRANT USAGE ON SCHEMA ag_catalog TO {connection.info.user}"
+        ) from None
+    connection.execute('SET search_path = ag_catalog, "$user", public')
+
+
+def ensure_extension(connection: Connection, name: LiteralString) -> str:
+    """Create the extension ``age`` or ``vector`` if need be; returns its version."""
+    version = extension_version(connection, name)
+    if version is not None:
+        return version
+    where = place_of(connection)
+    try:
+        with connection.transaction():
+            connection.execute(
+                sql.SQL("CREATE EXTENSION IF NOT EXISTS {}").format(sql.Identifier(name))
+            )
+    except psycopg.errors.InsufficientPrivilege:
+        raise ExtensionMissing(
+            f"{where}: user {connection.info.user} may not create the extension {name}; have a"
+            f" superuser run CREATE EXTENSION {name} there"
+        ) from None
+    except (psycopg.errors.UndefinedFile, psycopg.errors.FeatureNotSupported):
+        raise ExtensionMissing(_missing(name, where)) from None
+    except psycopg.errors.UniqueViolation:  # another session has just created it
+        pass
+    return extension_version(connection, name) or "unknown"
+
+
+def extension_version(connection: Connection, name: str) -> str | None:
+    """The installed version of an extension, None if the database has none."""
+    row = connection.execute(
+        "SELECT extversion FROM pg_catalog.pg_extension WHERE extname = %s", [name]
+    ).fetchone()
+    return None if row is None else str(row[0])
+
+
+def place(url: str) -> str:
+    """Host, port and database of a URL or connection string: what a message may show."""
+    try:
+        parts = conninfo_to_dict(url)
+    except psycopg.ProgrammingError:
+        return _without_password(url)
+    host = parts.get("host") or "local socket"
+    port = parts.get("port") or 5432
+    return f"database {parts.get('dbname') or parts.get('user') or 'default'} at {host}:{port}"
+
+
+def place_of(connection: Connection) -> str:
+    """The same for an open connection."""
+    return place(connection.info.dsn)
+
+
+@contextlib.contextmanager
+def database_errors(url: str) -> Iterator[None]:
+    """Map what psycopg raises inside to our errors: one line, the place, the server's own words."""
+    try:
+        yield
+    except psycopg.OperationalError as error:
+        raise DatabaseUnavailable(
+            f"{place(url)}: {_first_line(error)}; {_advice(error)}"
+        ) from error
+    except psycopg.errors.InsufficientPrivilege as error:
+        raise DatabaseError(
+            f"{place(url)}: {_first_line(error)}; grant it (docs/projections.md has the roles)"
+        ) from error
+    except psycopg.Error as error:
+        raise DatabaseError(f"{place(url)}: {_first_line(error)}") from error
+
+
+def _missing(name: str, where: str) -> str:
+    return (
+        f"{where}: the server has no {_PACKAGES.get(name, name)}; install the extension {name} on"
+        " it, or use docker/compose.yaml, or leave --db away for the embedded server"
+    )
+
+
+def _advice(error: psycopg.OperationalError) -> str:
+    text = str(error)
+    if "password" in text or "authentication" in text or "pg_hba" in text:
+        return "check user and password in the URL"
+    if "does not exist" in text and "database" in text:
+        return "create it with createdb, or name another in the URL"
+    if "does not exist" in text and "role" in text:
+        return "create it with createuser, or name another in the URL"
+    return "start the server or check the URL, or leave --db away for the embedded server"
+
+
+def _first_line(error: Exception) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    told = next((line for line in lines if "FATAL" in line), lines[0] if lines else repr(error))
+    return told.rstrip(".;")
+
+
+def _without_password(url: str) -> str:
+    head, at, tail = url.rpartition("@")
+    scheme, colon, rest = head.partition("://")
+    user = rest.partition(":")[0]
+    return f"{scheme}{colon}{user}{at}{tail}" if at else url

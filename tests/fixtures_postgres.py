@@ -1,0 +1,97 @@
+"""One embedded server per test session (and xdist worker); a fresh database for each test."""
+
+import shutil
+import tempfile
+from collections.abc import Iterator
+from itertools import count
+from pathlib import Path
+
+import psycopg
+import pytest
+from psycopg import sql
+
+from projections.postgres.connect import Targets, connect, ensure_extension
+from projections.postgres.embedded import EmbeddedServer
+
+_TEMPLATE = "mapfold_template"
+_numbers = count()
+
+
+@pytest.fixture(scope="session")
+def pg_server() -> Iterator[EmbeddedServer]:
+    """A running server of this session's own, stopped and removed at its end."""
+    # Not pytest's own temporary folder: each new session takes its permissions back to 0700, under
+    # the feet of a server that runs as another user.
+    home = Path(tempfile.mkdtemp(prefix="mapfold-test-"))
+    server = EmbeddedServer(home)
+    try:
+        server.start()
+        yield server
+    finally:
+        server.stop()
+        shutil.rmtree(home, ignore_errors=True)
+
+
+@pytest.fixture(scope="session")
+def _template(pg_server: EmbeddedServer) -> str:
+    with connect(pg_server.url, autocommit=True) as connection:
+        connection.execute(sql.SQL("CREATE DATABASE {}").format(sql.Identifier(_TEMPLATE)))
+    with connect(pg_server.url_of(_TEMPLATE), autocommit=True) as connection:
+        ensure_extension(connection, "age")
+        ensure_extension(connection, "vector")
+    return _TEMPLATE
+
+
+def _fresh_database(server: EmbeddedServer, template: str) -> str:
+    name = f"test_{next(_numbers)}"
+    with connect(server.url, autocommit=True) as connection:
+        connection.execute(
+            sql.SQL("CREATE DATABASE {} TEMPLATE {}").format(
+                sql.Identifier(name), sql.Identifier(template)
+            )
+        )
+    return name
+
+
+def _drop_database(server: EmbeddedServer, name: str) -> None:
+    with connect(server.url, autocommit=True) as connection:
+        connection.execute(sql.SQL("DROP DATABASE {} WITH (FORCE)").format(sql.Identifier(name)))
+
+
+@pytest.fixture
+def pg_url(pg_server: EmbeddedServer, _template: str) -> Iterator[str]:
+    """URL of a database with both extensions and nothing else, dropped after the test."""
+    name = _fresh_database(pg_server, _template)
+    yield pg_server.url_of(name)
+    _drop_database(pg_server, name)
+
+
+@pytest.fixture
+def bare_pg_url(pg_server: EmbeddedServer) -> Iterator[str]:
+    """URL of a database without our extensions."""
+    name = _fresh_database(pg_server, "template0")
+    yield pg_server.url_of(name)
+    _drop_database(pg_server, name)
+
+
+@pytest.fixture
+def one_database(pg_url: str) -> Targets:
+    """Graph and vectors in one fresh database."""
+    return Targets(pg_url, pg_url)
+
+
+@pytest.fixture
+def two_databases(pg_server: EmbeddedServer, _template: str, pg_url: str) -> Iterator[Targets]:
+    """Graph and vectors in a fresh database each."""
+    name = _fresh_database(pg_server, _template)
+    yield Targets(pg_url, pg_server.url_of(name))
+    _drop_database(pg_server, name)
+
+
+@pytest.fixture
+def pg(pg_url: str) -> Iterator[psycopg.Connection]:
+    """An autocommit connection to this test's database, as a psql user would have it."""
+    with psycopg.connect(pg_url, autocommit=True) as connection:
+        connection.execute("LOAD 'age'")
+        connection.execute('SET search_path = ag_catalog, "$user", public')
+        yield connection

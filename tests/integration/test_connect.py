@@ -1,0 +1,155 @@
+"""Which database a command uses, and the one line it says when that database fails it."""
+
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import psycopg
+import pytest
+
+from eventsrc.errors import MisuseError
+from projections.errors import DatabaseUnavailable, ExtensionMissing
+from projections.postgres.connect import (
+    connect,
+    connect_for_cypher,
+    ensure_extension,
+    open_targets,
+    place,
+)
+from projections.postgres.embedded import EmbeddedServer
+
+
+@pytest.fixture(autouse=True)
+def _no_urls_from_outside(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("MAPFOLD_DB", raising=False)
+    monkeypatch.delenv("MAPFOLD_VECTOR_DB", raising=False)
+
+
+A = "postgresql://u@host/a"
+B = "postgresql://u@host/b"
+C = "postgresql://u@host/c"
+
+
+def test_vectors_go_where_the_graph_goes() -> None:
+    with open_targets(A) as targets:
+        assert (targets.graph_url, targets.vector_url) == (A, A)
+        assert targets.one_database
+
+
+def test_two_databases() -> None:
+    with open_targets(A, B) as targets:
+        assert (targets.graph_url, targets.vector_url) == (A, B)
+        assert not targets.one_database
+
+
+def test_options_win_over_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MAPFOLD_DB", A)
+    monkeypatch.setenv("MAPFOLD_VECTOR_DB", B)
+    with open_targets() as targets:
+        assert (targets.graph_url, targets.vector_url) == (A, B)
+    with open_targets(C) as targets:
+        assert (targets.graph_url, targets.vector_url) == (C, B)
+
+
+@pytest.mark.parametrize(
+    "url", ["nonsense", "mysql://u:secret@host/db", "postgresql://u:secret@host/db?no_such=1"]
+)
+def test_a_bad_url_is_misuse_and_keeps_the_password_to_itself(url: str) -> None:
+    with pytest.raises(MisuseError, match="not a PostgreSQL URL") as caught, open_targets(url):
+        pass
+    assert "secret" not in str(caught.value)
+    assert caught.value.exit_code == 2
+
+
+def test_a_server_that_is_down() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))  # bound, not listening: connections are refused
+        url = f"postgresql://u:secret@127.0.0.1:{taken.getsockname()[1]}/db"
+        with pytest.raises(DatabaseUnavailable, match="refused") as caught:
+            connect(url)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert "secret" not in message
+    assert "database db at 127.0.0.1" in message
+
+
+def test_a_database_that_is_not_there(pg_server: EmbeddedServer) -> None:
+    with pytest.raises(DatabaseUnavailable, match=r'"nowhere" does not exist; create it with'):
+        connect(pg_server.url_of("nowhere"))
+
+
+def test_a_user_that_is_not_there(pg_server: EmbeddedServer) -> None:
+    url = pg_server.url.replace("postgres@", "stranger@")
+    with pytest.raises(DatabaseUnavailable, match=r"stranger.*does not exist; create it with"):
+        connect(url)
+
+
+def test_extensions_are_created_once_and_their_version_told(bare_pg_url: str) -> None:
+    with connect(bare_pg_url) as connection:
+        assert ensure_extension(connection, "vector") == ensure_extension(connection, "vector")
+        assert ensure_extension(connection, "age").startswith("1.")
+
+
+def test_an_extension_the_server_does_not_have(bare_pg_url: str) -> None:
+    with (
+        connect(bare_pg_url) as connection,
+        pytest.raises(ExtensionMissing, match=r"install the extension no_such_thing") as caught,
+    ):
+        ensure_extension(connection, "no_such_thing")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_user_who_may_not_create_extensions(pg_server: EmbeddedServer, bare_pg_url: str) -> None:
+    with connect(bare_pg_url, autocommit=True) as connection:
+        connection.execute("DROP ROLE IF EXISTS nobody_special")
+        connection.execute("CREATE ROLE nobody_special LOGIN")
+    with (
+        connect(bare_pg_url.replace("postgres@", "nobody_special@")) as connection,
+        pytest.raises(ExtensionMissing, match="have a superuser run CREATE EXTENSION age"),
+    ):
+        ensure_extension(connection, "age")
+
+
+@pytest.fixture
+def ordinary_url(pg_url: str) -> Iterator[str]:
+    """This test's database as a role without any privilege of its own."""
+    with connect(pg_url, autocommit=True) as admin:
+        admin.execute("DROP ROLE IF EXISTS ordinary")
+        admin.execute("CREATE ROLE ordinary LOGIN")
+        yield pg_url.replace("postgres@", "ordinary@")
+        admin.execute("DROP OWNED BY ordinary")
+        admin.execute("DROP ROLE ordinary")
+
+
+def test_cypher_without_being_superuser(pg: psycopg.Connection, ordinary_url: str) -> None:
+    with pytest.raises(ExtensionMissing, match="GRANT USAGE ON SCHEMA ag_catalog"):
+        connect_for_cypher(ordinary_url)
+    pg.execute("GRANT USAGE ON SCHEMA ag_catalog TO ordinary")
+    pg.execute("SELECT create_graph('some_graph')")
+    pg.execute("GRANT USAGE ON SCHEMA some_graph TO ordinary")
+    pg.execute("GRANT SELECT ON ALL TABLES IN SCHEMA ag_catalog TO ordinary")
+    with connect_for_cypher(ordinary_url) as connection:
+        rows = connection.execute(
+            "SELECT * FROM cypher('some_graph', $$ RETURN 7 $$) AS (n agtype)"
+        ).fetchall()
+    assert rows == [("7",)]
+
+
+def test_cypher_without_the_extension(bare_pg_url: str) -> None:
+    with pytest.raises(ExtensionMissing, match="age is not created there"):
+        connect_for_cypher(bare_pg_url)
+
+
+def test_place_names_no_password() -> None:
+    assert place("postgresql://u:secret@h:5433/maps") == "database maps at h:5433"
+
+
+def test_the_embedded_server_is_the_default(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pg_server: EmbeddedServer
+) -> None:
+    monkeypatch.setenv("MAPFOLD_HOME", str(pg_server.home))
+    with open_targets() as targets:
+        assert targets.one_database
+        with connect(targets.graph_url) as connection:
+            assert connection.execute("SELECT 1").fetchone() == (1,)
+    assert pg_server.running

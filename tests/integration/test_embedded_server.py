@@ -1,0 +1,170 @@
+"""The embedded server: shared by commands, stopped after the last, never left behind."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import psycopg
+import pytest
+
+from projections.errors import EmbeddedServerError
+from projections.postgres.embedded import EmbeddedServer
+
+WAIT_S = 60
+
+HOLDER = """
+import sys, signal
+from pathlib import Path
+from projections.cli._options import databases
+with databases(None, None) as targets:
+    print(targets.graph_url, flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    import shutil
+    import tempfile
+
+    folder = Path(tempfile.mkdtemp(prefix="mapfold-test-home-"))
+    yield folder
+    EmbeddedServer(folder).stop(discard_keep=True)
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def holder(home: Path) -> Iterator[subprocess.Popen[str]]:
+    """Another process that uses the server of ``home`` until its stdin is closed."""
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("MAPFOLD_")}
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLDER],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**environment, "MAPFOLD_HOME": str(home)},
+    )
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("postgresql://")
+        yield process
+    finally:
+        process.kill()
+        process.wait(WAIT_S)
+        for pipe in (process.stdin, process.stdout):
+            assert pipe is not None
+            pipe.close()
+
+
+def answers(server: EmbeddedServer) -> bool:
+    try:
+        with psycopg.connect(server.url) as connection:
+            return connection.execute("SELECT 1").fetchone() == (1,)
+    except psycopg.OperationalError:
+        return False
+
+
+def test_starts_serves_and_stops(home: Path) -> None:
+    with EmbeddedServer(home) as server:
+        assert answers(server)
+        assert server.data.stat().st_mode & 0o077 == 0
+    assert not server.running
+    assert not answers(server)
+
+
+def test_data_outlives_the_server(home: Path) -> None:
+    with EmbeddedServer(home) as server, psycopg.connect(server.url) as connection:
+        connection.execute("CREATE TABLE kept AS SELECT 7 AS n")
+    with EmbeddedServer(home) as server, psycopg.connect(server.url) as connection:
+        assert connection.execute("SELECT n FROM kept").fetchone() == (7,)
+
+
+def test_two_commands_share_it_and_the_last_one_stops_it(home: Path) -> None:
+    with EmbeddedServer(home) as server, holder(home) as other:
+        server.stop()
+        assert answers(server)
+        assert other.stdin is not None
+        other.stdin.close()
+        assert other.wait(WAIT_S) == 0
+        assert not server.running
+
+
+def test_db_start_keeps_it_and_db_stop_ends_that(home: Path) -> None:
+    server = EmbeddedServer(home).start(keep=True)
+    assert server.stop() is True
+    with EmbeddedServer(home) as again:
+        assert answers(again)
+    assert server.running
+    assert server.stop(discard_keep=True) is False
+    assert not server.running
+
+
+def test_db_stop_leaves_a_command_at_work_alone(home: Path) -> None:
+    with holder(home) as other:
+        server = EmbeddedServer(home)
+        assert server.stop(discard_keep=True) is True
+        assert answers(server)
+        assert other.poll() is None
+
+
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_leaves_no_server_behind(home: Path, signum: signal.Signals) -> None:
+    with holder(home) as other:
+        assert EmbeddedServer(home).running
+        other.send_signal(signum)
+        assert other.wait(WAIT_S) != 0
+    assert not EmbeddedServer(home).running
+
+
+def test_after_a_killed_command_the_next_one_stops_it(home: Path) -> None:
+    with holder(home) as other:
+        other.kill()
+        other.wait(WAIT_S)
+    assert EmbeddedServer(home).running
+    with EmbeddedServer(home):
+        pass
+    assert not EmbeddedServer(home).running
+
+
+def test_starts_again_after_the_server_itself_was_killed(home: Path) -> None:
+    with EmbeddedServer(home) as server:
+        postmaster = int((server.data / "postmaster.pid").read_text().split()[0])
+        with psycopg.connect(server.url, autocommit=True) as witness:
+            os.kill(postmaster, signal.SIGKILL)
+            with pytest.raises(psycopg.OperationalError):
+                list(witness.notifies(timeout=WAIT_S))
+        server.start()
+        assert answers(server)
+
+
+def test_a_path_too_long_for_a_socket(home: Path) -> None:
+    deep = home / ("d" * 60) / ("e" * 60)
+    with EmbeddedServer(deep) as server:
+        assert answers(server)
+    assert not server.running
+
+
+def test_a_path_with_spaces_quotes_and_percent(home: Path) -> None:
+    with EmbeddedServer(home / "my robot's 100% café") as server:
+        assert answers(server)
+
+
+def test_a_server_that_cannot_start_says_what_its_log_says(home: Path) -> None:
+    with EmbeddedServer(home) as server:
+        pass
+    (server.data / "postgresql.auto.conf").write_text("no_such_setting = 1\n")
+    with pytest.raises(EmbeddedServerError, match="no_such_setting") as caught:
+        server.start()
+    assert "\n" not in str(caught.value)
+    assert "--db" in str(caught.value)
+    assert not server.running
+
+
+def test_a_home_that_cannot_be_made(home: Path) -> None:
+    (home / "file").touch()
+    with pytest.raises(EmbeddedServerError, match="MAPFOLD_HOME"):
+        EmbeddedServer(home / "file" / "below").start()
