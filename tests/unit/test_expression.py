@@ -48,9 +48,6 @@ class FakeFacts:
     def merged(self, place_id: str) -> bool:
         return place_id == "a_p1"
 
-    def knows(self, kind: str, text: str) -> bool:
-        return True
-
 
 @pytest.mark.parametrize(
     ("text", "holds"),

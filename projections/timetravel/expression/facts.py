@@ -39,6 +39,3 @@ class Facts(Protocol):
 
     def merged(self, place_id: str) -> bool:
         """Whether a place was absorbed by another."""
-
-    def knows(self, kind: str, text: str) -> bool:
-        """Whether a keyframe, place, object, class or run of this name was ever in the map."""

@@ -1,0 +1,188 @@
+"""The history of a map: one fold over the deltas that remembers instead of forgetting.
+
+It is fed the deltas of each event, in order, and keeps for every place and object what happened to
+it and because of which event. `merges`, `why`, `bisect` and a map at any offset are read from it
+without folding again. It holds no embeddings. Which place a keyframe is in is found through the
+chain of absorptions (`place_at`), so a merge costs nothing per member.
+
+An ``end`` is a number of events: what is told is the map after the events 0 … end − 1.
+"""
+
+from array import array
+from bisect import bisect_left
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from projections.deltas import (
+    Delta,
+    EventSkipped,
+    KeyframeAdded,
+    KeyframePlaced,
+    ObjectFound,
+    ObjectMoved,
+    ObjectSeen,
+    PlaceChanged,
+    PlaceFormed,
+    PlacesLinked,
+    PlacesMerged,
+    RunSeen,
+)
+
+from .causes import Cause, cause_of
+from .lives import EdgeChange, Merge, ObjectLife, PlaceLife, last_before
+
+NEVER = 2**63 - 1
+"""The offset of what has not happened."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Move:
+    object: int
+    before: int | None
+
+
+class History:
+    """Everything that happened to places and objects in the events applied so far.
+
+    ``keyframe_offsets`` gives each keyframe's event, ``placed_offsets`` and ``placed_in`` the event
+    that placed it (`NEVER` for noise) and the place it joined then; all by keyframe ordinal.
+    """
+
+    def __init__(self) -> None:
+        self.next_offset = 0
+        self.keyframes: list[KeyframeAdded] = []
+        self.keyframe_offsets = array("q")
+        self.placed_offsets = array("q")
+        self.placed_in = array("q")
+        self.places: list[PlaceLife] = []
+        self.objects: list[ObjectLife] = []
+        self.merges: list[Merge] = []
+        self.runs: list[list[RunSeen]] = []
+        self.skipped: list[EventSkipped] = []
+        self.edges: dict[tuple[int, int], list[PlacesLinked]] = {}
+        self.keyframe_numbers: dict[tuple[str, int], int] = {}
+        self.place_numbers: dict[str, int] = {}
+        self.object_numbers: dict[str, int] = {}
+        self._apply: dict[type, Callable[[Any, Cause], None]] = {
+            RunSeen: self._run_seen,
+            KeyframeAdded: self._keyframe_added,
+            EventSkipped: self._event_skipped,
+            PlaceFormed: self._place_formed,
+            KeyframePlaced: self._keyframe_placed,
+            PlaceChanged: self._place_changed,
+            ObjectFound: self._object_found,
+            ObjectSeen: self._object_seen,
+        }
+
+    def apply(self, offset: int, deltas: Sequence[Delta]) -> None:
+        """Remember what the event at ``offset`` did."""
+        self.next_offset = offset + 1
+        if not deltas:
+            return
+        cause = cause_of(offset, deltas)
+        merges: list[PlacesMerged] = []
+        moves: list[_Move] = []
+        links: list[EdgeChange] = []
+        for delta in deltas:
+            if isinstance(delta, PlacesMerged):
+                merges.append(delta)
+            elif isinstance(delta, ObjectMoved):
+                moves.append(self._object_moved(delta))
+            elif isinstance(delta, PlacesLinked):
+                links.append(self._places_linked(delta))
+            elif (handle := self._apply.get(type(delta))) is not None:
+                handle(delta, cause)
+        for merge in merges:
+            self._places_merged(merge, cause, moves, links)
+
+    def place_at(self, keyframe: int, end: int | None = None) -> int | None:
+        """The place a keyframe is in after the events below ``end`` (default: all so far)."""
+        end = self.next_offset if end is None else end
+        if self.placed_offsets[keyframe] >= end:
+            return None
+        return self.survivor_of(self.placed_in[keyframe], end)
+
+    def survivor_of(self, place: int, end: int | None = None) -> int:
+        """Who stands for ``place`` after the events below ``end`` (default: all so far)."""
+        end = self.next_offset if end is None else end
+        while (merge := self.places[place].absorbed) is not None and merge.cause.offset < end:
+            place = merge.survivor
+        return place
+
+    def keyframe_count(self, end: int) -> int:
+        """Keyframes added by the events below ``end``."""
+        return bisect_left(self.keyframe_offsets, end)
+
+    def transitions(self, a: int, b: int, end: int) -> int:
+        """Shared transitions of two places after the events below ``end``."""
+        pair = (min(a, b), max(a, b))
+        linked = last_before(self.edges.get(pair, ()), end)
+        return 0 if linked is None else linked.shared_transitions
+
+    def _run_seen(self, delta: RunSeen, _: Cause) -> None:
+        if delta.run == len(self.runs):
+            self.runs.append([])
+        self.runs[delta.run].append(delta)
+
+    def _keyframe_added(self, delta: KeyframeAdded, _: Cause) -> None:
+        self.keyframe_numbers[delta.run_id, delta.keyframe_id] = len(self.keyframes)
+        self.keyframes.append(delta)
+        self.keyframe_offsets.append(delta.offset)
+        self.placed_offsets.append(NEVER)
+        self.placed_in.append(-1)
+
+    def _event_skipped(self, delta: EventSkipped, _: Cause) -> None:
+        self.skipped.append(delta)
+
+    def _place_formed(self, delta: PlaceFormed, cause: Cause) -> None:
+        self.place_numbers[delta.place_id] = len(self.places)
+        self.places.append(PlaceLife(delta, cause))
+
+    def _keyframe_placed(self, delta: KeyframePlaced, _: Cause) -> None:
+        self.placed_offsets[delta.keyframe] = delta.offset
+        self.placed_in[delta.keyframe] = delta.place
+        self.places[delta.place].joined.append(delta)
+
+    def _place_changed(self, delta: PlaceChanged, _: Cause) -> None:
+        self.places[delta.place].changes.append(delta)
+
+    def _object_found(self, delta: ObjectFound, cause: Cause) -> None:
+        self.object_numbers[delta.object_id] = len(self.objects)
+        self.objects.append(ObjectLife(delta, cause))
+
+    def _object_seen(self, delta: ObjectSeen, _: Cause) -> None:
+        self.objects[delta.object].seen.append(delta)
+
+    def _object_moved(self, delta: ObjectMoved) -> _Move:
+        life = self.objects[delta.object]
+        move = _Move(delta.object, life.located[-1].place if life.located else None)
+        life.located.append(delta)
+        return move
+
+    def _places_linked(self, delta: PlacesLinked) -> EdgeChange:
+        linked = self.edges.setdefault((delta.a, delta.b), [])
+        before = linked[-1].shared_transitions if linked else 0
+        linked.append(delta)
+        return EdgeChange(delta.a, delta.b, before, delta.shared_transitions)
+
+    def _places_merged(
+        self, delta: PlacesMerged, cause: Cause, moves: list[_Move], links: list[EdgeChange]
+    ) -> None:
+        places = {delta.survivor, *delta.absorbed}
+        merge = Merge(
+            number=len(self.merges) + 1,
+            cause=cause,
+            bridge=delta.bridge,
+            survivor=delta.survivor,
+            survivor_size=delta.survivor_count,
+            absorbed=delta.absorbed,
+            absorbed_sizes=delta.absorbed_counts,
+            links=delta.links,
+            objects=tuple(move.object for move in moves if move.before in delta.absorbed),
+            edges=tuple(link for link in links if link.a in places or link.b in places),
+        )
+        self.merges.append(merge)
+        self.places[delta.survivor].merges.append(merge)
+        for place in delta.absorbed:
+            self.places[place].absorbed = merge
