@@ -36,6 +36,16 @@ class Pose:
     y_um: int
     yaw_rad: float
 
+    @property
+    def x_m(self) -> float:
+        """Metres, correctly rounded."""
+        return self.x_um / 1_000_000
+
+    @property
+    def y_m(self) -> float:
+        """Metres, correctly rounded."""
+        return self.y_um / 1_000_000
+
 
 @dataclass(frozen=True, slots=True)
 class RunSeen:

@@ -1,1 +1,80 @@
-"""(being written)"""
+"""Adjacency: how often a robot passed from one place straight into another.
+
+``shared_transitions(A, B)`` counts the pairs of consecutive placed keyframes of one run, in
+keyframe_id order whatever order they arrived in and with noise skipped, whose places are A and B,
+A ≠ B, in either direction and by their *current* labels. So it always equals a recount:
+
+* a keyframe that gets a place comes between its two neighbours in the run: their own transition
+  goes, two new ones come;
+* when B is absorbed by A, A–B transitions are inside a place now and vanish; B–C become A–C.
+"""
+
+from projections.deltas import PlacesLinked
+
+from ._sorted_keys import SortedKeys
+
+
+class Adjacency:
+    """The reducer. Tell it what happened, in order; then ask which edges changed."""
+
+    def __init__(self) -> None:
+        self.placed: dict[int, SortedKeys] = {}  # per run: keyframe_id → place it joined
+        self.survivors: dict[int, int] = {}  # absorbed place → who absorbed it
+        self.edges: dict[int, dict[int, int]] = {}  # place → place → transitions, both ways round
+        self._before: dict[tuple[int, int], int] = {}  # changed edges, as they were
+
+    def places_merged(self, survivor: int, absorbed: tuple[int, ...]) -> None:
+        """The absorbed places' transitions are the survivor's now."""
+        for place in absorbed:
+            self.survivors[place] = survivor
+            for other, count in sorted(self.edges.get(place, {}).items()):
+                self._add(place, other, -count)
+                if other != survivor:
+                    self._add(survivor, other, count)
+            self.edges.pop(place, None)
+
+    def keyframe_placed(self, run: int, keyframe_id: int, place: int) -> None:
+        """A keyframe that had no place, perhaps because it is new, has one."""
+        placed = self.placed.get(run)
+        if placed is None:
+            placed = self.placed[run] = SortedKeys()
+        joined_before, joined_after = placed.add(keyframe_id, place)
+        before = place if joined_before is None else self._find(joined_before)
+        after = place if joined_after is None else self._find(joined_after)
+        if joined_before is not None and joined_after is not None and before != after:
+            self._add(before, after, -1)
+        if before != place:
+            self._add(before, place, 1)
+        if after != place:
+            self._add(place, after, 1)
+
+    def settle(self, offset: int) -> list[PlacesLinked]:
+        """The edges whose count is another than when last asked, ascending."""
+        if not self._before:
+            return []
+        linked = []
+        for (a, b), before in sorted(self._before.items()):
+            count = self.edges.get(a, {}).get(b, 0)
+            if count != before:
+                linked.append(PlacesLinked(offset, a, b, count))
+        self._before.clear()
+        return linked
+
+    def _find(self, place: int) -> int:
+        survivors = self.survivors
+        while place in survivors:
+            above = survivors[place]
+            if above in survivors:
+                survivors[place] = survivors[above]
+            place = above
+        return place
+
+    def _add(self, a: int, b: int, change: int) -> None:
+        count = self.edges.get(a, {}).get(b, 0)
+        self._before.setdefault((a, b) if a < b else (b, a), count)
+        for one, other in ((a, b), (b, a)):
+            edges = self.edges.setdefault(one, {})
+            if count + change:
+                edges[other] = count + change
+            else:
+                edges.pop(other, None)

@@ -1,1 +1,165 @@
-"""(being written)"""
+"""Landmarks: repeated sightings fused into Objects.
+
+The rules (DESIGN section 5), for an observation of class C made from the pose (x, y):
+
+1.  Candidates are Objects of class C whose mean position is within ``fusion_radius_m`` of (x, y),
+    inclusive, and whose mean embedding has at least ``fusion_similarity`` cosine with the
+    observation's.
+2.  The highest cosine wins, compared as multiples of 2⁻⁴⁰; ties go to the Object founded first.
+3.  The winner's position and embedding become the means over all its observations; ``first_seen``
+    and ``last_seen`` span their timestamps. Without a candidate a new Object is founded.
+
+An Object's position is the mean of the *robot's* poses, for lack of depth.
+
+The mean embedding is never rounded to a unit vector: the sum S of the unit vectors has the mean's
+direction, so the cosine with u is S·u / (|S||u|). S, S·u, |S|² and |u|² are exact integers;
+|S + u|² = |S|² + 2 S·u + |u|² keeps the norm up to date without touching S again.
+
+Every Object is listed in the nine grid cells of side ``fusion_radius_m`` around its mean, so one
+look-up finds all candidates however large the map is.
+"""
+
+import hashlib
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from projections.deltas import ObjectFound, ObjectSeen
+from projections.exact import Q40, metres_to_um
+
+MAX_OBSERVATIONS = 1 << 22
+"""Of one Object: S·u ≤ count · 2⁴⁰·(1 + tiny) must stay below 2⁶³."""
+
+Bucket = tuple[str, int, int]
+
+
+@dataclass(slots=True, eq=False)
+class Landmark:
+    """An Object: sums of positions, µm, and of unit vectors, int64 of shape (dim,)."""
+
+    class_name: str
+    vector_sum: NDArray[np.int64]
+    norm2: int
+    count: int
+    sum_x_um: int
+    sum_y_um: int
+    first_seen: float
+    last_seen: float
+    column: int
+    row: int
+
+
+def object_id(det_id: str) -> str:
+    """The id of the Object that the observation ``det_id`` founds."""
+    return "obj-" + hashlib.sha256(det_id.encode()).hexdigest()[:16]
+
+
+class Landmarks:
+    """The reducer."""
+
+    def __init__(self, fusion_radius_m: float, fusion_similarity: float) -> None:
+        self._radius_um = max(metres_to_um(fusion_radius_m), 1)
+        self._least_q40 = fusion_similarity * Q40
+        self.objects: list[Landmark] = []
+        self._near: dict[Bucket, list[int]] = {}
+
+    def fold(
+        self,
+        offset: int,
+        observation: int,
+        det_id: str,
+        class_name: str,
+        vector: NDArray[np.int64],
+        timestamp: float,
+        x_um: int,
+        y_um: int,
+    ) -> list[ObjectFound | ObjectSeen]:
+        """Fuse one observation. ``vector`` is its unit vector in int64, see `projections.exact`."""
+        norm2 = int(vector.dot(vector))
+        column, row = x_um // self._radius_um, y_um // self._radius_um
+        winner, best_q40, best_dot = -1, -math.inf, 0
+        for candidate in self._near.get((class_name, column, row), ()):
+            landmark = self.objects[candidate]
+            if not self._is_near(landmark, x_um, y_um):
+                continue
+            dot = int(landmark.vector_sum.dot(vector))
+            q40 = round(dot / math.sqrt(landmark.norm2 * norm2) * Q40)
+            if q40 > best_q40 or (q40 == best_q40 and candidate < winner):
+                winner, best_q40, best_dot = candidate, q40, dot
+        if winner < 0 or best_q40 < self._least_q40:
+            founded = Landmark(
+                class_name, vector.copy(), norm2, 1, x_um, y_um, timestamp, timestamp, column, row
+            )
+            return self._found(offset, observation, det_id, founded)
+        landmark = self.objects[winner]
+        landmark.vector_sum += vector
+        landmark.norm2 += 2 * best_dot + norm2
+        self._update(winner, landmark, timestamp, x_um, y_um)
+        return [_seen(offset, winner, observation, int(best_q40), landmark)]
+
+    def _is_near(self, landmark: Landmark, x_um: int, y_um: int) -> bool:
+        count = landmark.count
+        dx = landmark.sum_x_um - x_um * count
+        dy = landmark.sum_y_um - y_um * count
+        limit = self._radius_um * count
+        return dx * dx + dy * dy <= limit * limit
+
+    def _found(
+        self, offset: int, observation: int, det_id: str, landmark: Landmark
+    ) -> list[ObjectFound | ObjectSeen]:
+        ordinal = len(self.objects)
+        self.objects.append(landmark)
+        self._list(ordinal, landmark)
+        found = ObjectFound(offset, ordinal, object_id(det_id), landmark.class_name, observation)
+        return [found, _seen(offset, ordinal, observation, Q40, landmark)]
+
+    def _update(
+        self, ordinal: int, landmark: Landmark, timestamp: float, x_um: int, y_um: int
+    ) -> None:
+        if landmark.count >= MAX_OBSERVATIONS:
+            raise OverflowError(
+                f"object {ordinal} of class {landmark.class_name!r} has {MAX_OBSERVATIONS} "
+                "observations, the bound of its exact arithmetic"
+            )
+        landmark.count += 1
+        landmark.sum_x_um += x_um
+        landmark.sum_y_um += y_um
+        landmark.first_seen = min(landmark.first_seen, timestamp)
+        landmark.last_seen = max(landmark.last_seen, timestamp)
+        side = self._radius_um * landmark.count
+        column, row = landmark.sum_x_um // side, landmark.sum_y_um // side
+        if (column, row) != (landmark.column, landmark.row):
+            for bucket in _buckets(landmark):
+                self._near[bucket].remove(ordinal)
+            landmark.column, landmark.row = column, row
+            self._list(ordinal, landmark)
+
+    def _list(self, ordinal: int, landmark: Landmark) -> None:
+        for bucket in _buckets(landmark):
+            self._near.setdefault(bucket, []).append(ordinal)
+
+
+def _buckets(landmark: Landmark) -> list[Bucket]:
+    return [
+        (landmark.class_name, landmark.column + dx, landmark.row + dy)
+        for dx in (-1, 0, 1)
+        for dy in (-1, 0, 1)
+    ]
+
+
+def _seen(
+    offset: int, ordinal: int, observation: int, similarity_q40: int, landmark: Landmark
+) -> ObjectSeen:
+    return ObjectSeen(
+        offset,
+        ordinal,
+        observation,
+        similarity_q40,
+        landmark.count,
+        landmark.sum_x_um,
+        landmark.sum_y_um,
+        landmark.first_seen,
+        landmark.last_seen,
+    )

@@ -1,0 +1,82 @@
+"""What has been folded already: keyframes by run, det_ids, and a fingerprint of each content.
+
+A ``(run_id, keyframe_id)`` met again is a *duplicate* if its content is the same and a *conflict*
+if not. Content is what an envelope says, not how: key order, white space and unknown fields do not
+matter, an id written out and the same id by default are the same.
+"""
+
+import hashlib
+from array import array
+
+from eventsrc.ingest import Accepted
+
+_DIGEST_BYTES = 16
+
+
+def content_digest(accepted: Accepted) -> bytes:
+    """16 bytes that are equal for envelopes of equal content."""
+    envelope = accepted.envelope
+    said = (
+        envelope.timestamp,
+        envelope.map_x,
+        envelope.map_y,
+        envelope.map_yaw,
+        [
+            (det_id, d.class_name, d.confidence, d.bbox, d.embedding_model, vector is None)
+            for det_id, d, vector in zip(
+                accepted.det_ids, envelope.detections, accepted.vectors, strict=True
+            )
+        ],
+    )
+    digest = hashlib.blake2b(repr(said).encode("utf-8", "surrogatepass"), digest_size=_DIGEST_BYTES)
+    for vector in accepted.vectors:
+        if vector is not None:
+            digest.update(vector.data)
+    return digest.digest()
+
+
+class Seen:
+    """Keyframes and det_ids folded so far. A run's and a keyframe's ordinal count from 0."""
+
+    def __init__(self) -> None:
+        self.runs: dict[str, int] = {}
+        self.started: list[float] = []
+        self.keyframes: list[dict[int, int]] = []  # per run: keyframe_id → ordinal
+        self.keyframe_ids = array("q")
+        self.run_of = array("i")
+        self.offsets = array("q")
+        self.digests = bytearray()
+        self.det_ids: dict[str, int] = {}  # → ordinal of its keyframe, in order of arrival
+
+    def run(self, run_id: str, timestamp: float) -> tuple[int, bool]:
+        """The run's ordinal, and whether it is new or turns out to have started earlier."""
+        run = self.runs.get(run_id)
+        if run is None:
+            run = self.runs[run_id] = len(self.runs)
+            self.started.append(timestamp)
+            self.keyframes.append({})
+            return run, True
+        if timestamp < self.started[run]:
+            self.started[run] = timestamp
+            return run, True
+        return run, False
+
+    def find(self, run_id: str, keyframe_id: int) -> int | None:
+        """The ordinal of a keyframe that was folded, else None."""
+        run = self.runs.get(run_id)
+        return None if run is None else self.keyframes[run].get(keyframe_id)
+
+    def add(self, run: int, keyframe_id: int, offset: int, digest: bytes) -> int:
+        """Number a new keyframe."""
+        keyframe = len(self.offsets)
+        self.keyframes[run][keyframe_id] = keyframe
+        self.keyframe_ids.append(keyframe_id)
+        self.run_of.append(run)
+        self.offsets.append(offset)
+        self.digests += digest
+        return keyframe
+
+    def digest_of(self, keyframe: int) -> bytes:
+        """The content digest of a folded keyframe."""
+        start = keyframe * _DIGEST_BYTES
+        return bytes(self.digests[start : start + _DIGEST_BYTES])

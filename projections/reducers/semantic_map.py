@@ -1,0 +1,216 @@
+"""The whole fold: one envelope in, what it changed out. The only one who knows all reducers.
+
+Per keyframe, in this order (DESIGN section 5):
+
+1.  Seen before? Then it changes nothing: a duplicate, or a conflict, where the first one wins.
+2.  The run, the keyframe and its observations are new things of the map. A det_id that an earlier
+    keyframe has is left out, and said so.
+3.  With a pose, the keyframe goes to places; what it saw in the map's embedding space goes to
+    landmarks. Without one, it is kept and no more.
+4.  Located-in and adjacency hear what places and landmarks said, in its order, and settle.
+
+The fold has no clock, chance, disk, network or database. The same events give the same deltas.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eventsrc.ingest import Accepted, Vector
+from projections.deltas import (
+    Delta,
+    EventSkipped,
+    KeyframeAdded,
+    KeyframePlaced,
+    ObservationAdded,
+    PlacesMerged,
+    Pose,
+    RunSeen,
+)
+from projections.exact import metres_to_um, quantise_rows
+from projections.settings import Settings
+
+from ._crowd import Crowd
+from ._ruled_crowd import Neighbourhood, RuledCrowd
+from ._seen import Seen, content_digest
+from ._spaces import Space
+from .adjacency import Adjacency
+from .landmarks import Landmarks
+from .located_in import LocatedIn
+from .places import Places
+
+
+class SemanticMap:
+    """The fold's state. `fold` changes it in place and is otherwise pure.
+
+    ``next_offset`` is one past the last event folded or skipped. Another ``neighbourhood`` than
+    plain distance is the caller's to name beside the settings: it is not in their fingerprint.
+    """
+
+    def __init__(self, settings: Settings, neighbourhood: Neighbourhood | None = None) -> None:
+        self.settings = settings
+        self.next_offset = 0
+        self.seen = Seen()
+        self.space = Space(settings)
+        self.places = Places(
+            Crowd(metres_to_um(settings.eps_m), settings.min_samples)
+            if neighbourhood is None
+            else RuledCrowd(neighbourhood, settings.min_samples)
+        )
+        self.landmarks = Landmarks(settings.fusion_radius_m, settings.fusion_similarity)
+        self.located_in = LocatedIn()
+        self.adjacency = Adjacency()
+        self.observation_count = 0
+
+    def skip(self, offset: int) -> None:
+        """Pass over an event that says nothing about the map."""
+        self.next_offset = offset + 1
+
+    def fold(self, offset: int, accepted: Accepted) -> list[Delta]:
+        """Take in one envelope; what it changed, in the order `projections.deltas` states."""
+        self.next_offset = offset + 1
+        envelope, seen = accepted.envelope, self.seen
+        digest = content_digest(accepted)
+        earlier = seen.find(envelope.run_id, envelope.keyframe_id)
+        if earlier is not None:
+            kind = "duplicate" if seen.digest_of(earlier) == digest else "conflict"
+            first = seen.offsets[earlier]
+            return [EventSkipped(offset, kind, envelope.run_id, envelope.keyframe_id, None, first)]
+        deltas: list[Delta] = []
+        run, is_news = seen.run(envelope.run_id, envelope.timestamp)
+        if is_news:
+            deltas.append(RunSeen(offset, run, envelope.run_id, envelope.timestamp))
+        keyframe = seen.add(run, envelope.keyframe_id, offset, digest)
+        pose = _pose(accepted)
+        deltas.append(
+            KeyframeAdded(
+                offset,
+                keyframe,
+                run,
+                envelope.run_id,
+                envelope.keyframe_id,
+                envelope.timestamp,
+                pose,
+            )
+        )
+        sightings = self._observe(offset, keyframe, accepted, deltas)
+        if pose is not None:
+            place = self._place(offset, keyframe, run, envelope.run_id, pose, deltas)
+            self._fuse(offset, keyframe, place, pose, sightings, envelope.timestamp, deltas)
+            deltas += self.located_in.settle(offset)
+            deltas += self.adjacency.settle(offset)
+        return deltas
+
+    def _observe(
+        self, offset: int, keyframe: int, accepted: Accepted, deltas: list[Delta]
+    ) -> list[tuple[ObservationAdded, NDArray[np.int64]]]:
+        """Add the observations; those with a vector in the map's space, and it in int64."""
+        envelope, det_ids = accepted.envelope, self.seen.det_ids
+        if not envelope.detections:
+            return []
+        members = self.space.members(envelope.detections, accepted.vectors)
+        units = _units(members)
+        wide = units.astype(np.int64)
+        sightings, row = [], -1
+        for detection, det_id, vector, member in zip(
+            envelope.detections, accepted.det_ids, accepted.vectors, members, strict=True
+        ):
+            row += member is not None
+            first = det_ids.setdefault(det_id, keyframe)
+            if first != keyframe:
+                deltas.append(self._reused(offset, accepted, det_id, first))
+                continue
+            added = ObservationAdded(
+                offset,
+                self.observation_count,
+                keyframe,
+                envelope.run_id,
+                envelope.keyframe_id,
+                det_id,
+                detection.class_name,
+                detection.confidence,
+                detection.bbox,
+                detection.embedding_model,
+                None if member is None else units[row],
+                member is None and vector is not None,
+            )
+            self.observation_count += 1
+            deltas.append(added)
+            if member is not None:
+                sightings.append((added, wide[row]))
+        return sightings
+
+    def _reused(self, offset: int, accepted: Accepted, det_id: str, first: int) -> EventSkipped:
+        envelope = accepted.envelope
+        return EventSkipped(
+            offset,
+            "det_id_reused",
+            envelope.run_id,
+            envelope.keyframe_id,
+            det_id,
+            self.seen.offsets[first],
+        )
+
+    def _place(
+        self, offset: int, keyframe: int, run: int, run_id: str, pose: Pose, deltas: list[Delta]
+    ) -> int | None:
+        """Run places and tell who depends on them; the keyframe's own place."""
+        seen, place = self.seen, None
+        for delta in self.places.fold(
+            offset, keyframe, run, run_id, pose.x_um, pose.y_um, pose.yaw_rad
+        ):
+            deltas.append(delta)
+            if type(delta) is KeyframePlaced:
+                placed = delta.keyframe
+                if placed == keyframe:
+                    place = delta.place
+                else:
+                    self.located_in.keyframe_placed(placed, delta.place)
+                self.adjacency.keyframe_placed(
+                    seen.run_of[placed], seen.keyframe_ids[placed], delta.place
+                )
+            elif type(delta) is PlacesMerged:
+                self.located_in.places_merged(delta.survivor, delta.absorbed)
+                self.adjacency.places_merged(delta.survivor, delta.absorbed)
+        return place
+
+    def _fuse(
+        self,
+        offset: int,
+        keyframe: int,
+        place: int | None,
+        pose: Pose,
+        sightings: list[tuple[ObservationAdded, NDArray[np.int64]]],
+        timestamp: float,
+        deltas: list[Delta],
+    ) -> None:
+        for added, vector in sightings:
+            fused = self.landmarks.fold(
+                offset,
+                added.observation,
+                added.det_id,
+                added.class_name,
+                vector,
+                timestamp,
+                pose.x_um,
+                pose.y_um,
+            )
+            deltas += fused
+            self.located_in.object_seen(fused[-1].object, keyframe, place)
+
+
+def _pose(accepted: Accepted) -> Pose | None:
+    envelope = accepted.envelope
+    x, y, yaw = envelope.map_x, envelope.map_y, envelope.map_yaw
+    if x is None or y is None or yaw is None:
+        return None
+    return Pose(metres_to_um(x), metres_to_um(y), yaw)
+
+
+def _units(members: Sequence[Vector | None]) -> NDArray[np.int32]:
+    """The unit vectors of those that are there, one a row."""
+    rows = [vector for vector in members if vector is not None]
+    if not rows:
+        return np.empty((0, 0), np.int32)
+    return quantise_rows(np.array(rows))
