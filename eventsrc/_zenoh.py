@@ -13,9 +13,10 @@ What holds behind this door:
 """
 
 import contextlib
+import itertools
 import json
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -25,7 +26,7 @@ import zenoh
 
 from ._zenoh_errors import cannot_open, plain
 from .endpoints import DEFAULT_ENDPOINT, check_endpoints
-from .errors import TransportError
+from .errors import MisuseError, TransportError
 
 Mode = Literal["client", "peer", "router"]
 
@@ -158,6 +159,11 @@ class Session:
                 return Subscription(self.raw.declare_subscriber(key_expr, receive))
             return _subscribe_advanced(self.raw, key_expr, receive, on_miss)
 
+    def send(self, key: str, payload: bytes) -> None:
+        """Send one message that may be dropped if the network is full; never blocks on it."""
+        with _clear_errors(f"key {key!r}: not sent"):
+            self.raw.put(key, payload, congestion_control=zenoh.CongestionControl.DROP)
+
     def confirm(self) -> None:
         """Return when the other end has taken in everything declared so far.
 
@@ -209,6 +215,22 @@ class Session:
         self.close()
 
 
+def check_keys(key_exprs: Sequence[str]) -> None:
+    """Raise MisuseError if one is malformed or two overlap: a message under both comes twice."""
+    parsed = []
+    for text in key_exprs:
+        try:
+            parsed.append(zenoh.KeyExpr(text))
+        except zenoh.ZError as error:
+            raise MisuseError(f"key expression {text!r}: {plain(error)}") from None
+    for one, other in itertools.combinations(parsed, 2):
+        if one.intersects(other):
+            raise MisuseError(
+                f"key expressions {str(one)!r} and {str(other)!r} overlap: what matches both would "
+                "come twice; give the wider one alone"
+            )
+
+
 def open_session(options: ZenohOptions, *, mode: Mode) -> Session:
     """Open a session; raise TransportError if it cannot connect or listen as asked."""
     zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]
@@ -236,6 +258,10 @@ def _config(options: ZenohOptions, mode: Mode) -> zenoh.Config:
     if mode == "peer":  # a router starts before the routers it is linked to; a peer's error counts
         _set(config, "connect/exit_on_failure", True)
         _set(config, "connect/timeout_ms", _OPEN_TIMEOUT_MS)
+    if _is_unset(config, "scouting/delay") and not json.loads(
+        config.get_json("scouting/multicast/enabled")
+    ):
+        _set(config, "scouting/delay", 0)  # half a second's wait for answers nobody will give
     if mode == "router":
         _set(config, "adminspace/enabled", True)  # it is where `locators` come from
     return config

@@ -1,5 +1,6 @@
 """Real Zenoh parts: a router on a free port, sessions connected to it, programs beside the test."""
 
+import functools
 import subprocess
 import sys
 import threading
@@ -13,6 +14,17 @@ from eventsrc._zenoh import Session, ZenohOptions, open_session
 from eventsrc.router import Router
 
 _MAPFOLD = "from projections.cli import main; main()"
+PUBLISHER = """
+import sys
+from eventsrc._zenoh import ZenohOptions, open_session
+endpoint, key, *payloads = sys.argv[1:]
+with open_session(ZenohOptions(connect=(endpoint,)), mode="client") as session:
+    publisher = session.publisher(key)
+    assert publisher.wait_for_subscriber(30.0)
+    for payload in payloads:
+        publisher.put(payload.encode())
+    session.confirm()
+"""
 LOOPBACK = ZenohOptions(listen=("tcp/127.0.0.1:0",))
 DEADLINE_S = 30.0
 """Longer than any wait in a healthy run; only a broken one ever waits that long."""
@@ -35,11 +47,11 @@ def connected(endpoint: str) -> Iterator[Callable[[], Session]]:
 
 
 class Program:
-    """A mapfold command in a process of its own; its stderr is read line by line."""
+    """Python code in a process of its own; its stderr is read line by line."""
 
-    def __init__(self, arguments: Sequence[str]) -> None:
+    def __init__(self, code: str, arguments: Sequence[str]) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-c", _MAPFOLD, *arguments],
+            [sys.executable, "-c", code, *arguments],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -82,6 +94,11 @@ class Program:
         self._reader.join(DEADLINE_S)
         return code
 
+    def output(self) -> str:
+        """What it wrote to stdout; call it after `wait`."""
+        assert self.process.stdout is not None
+        return self.process.stdout.read()
+
     def close(self) -> None:
         """Make sure that nothing is left behind."""
         self.process.kill()
@@ -92,13 +109,25 @@ class Program:
 
 
 @pytest.fixture
-def start() -> Iterator[Callable[..., Program]]:
-    """Starts `mapfold …` programs; whatever still runs at the end of the test is killed."""
+def start_code() -> Iterator[Callable[..., Program]]:
+    """Starts Python code with arguments; whatever still runs at the end of the test is killed."""
     with ExitStack() as programs:
 
-        def run(*arguments: str) -> Program:
-            program = Program(arguments)
+        def run(code: str, *arguments: str) -> Program:
+            program = Program(code, arguments)
             programs.callback(program.close)
             return program
 
         yield run
+
+
+@pytest.fixture
+def start(start_code: Callable[..., Program]) -> Callable[..., Program]:
+    """Starts `mapfold …`."""
+    return functools.partial(start_code, _MAPFOLD)
+
+
+@pytest.fixture
+def publish(start_code: Callable[..., Program], endpoint: str) -> Callable[..., Program]:
+    """Starts a program that publishes ``<payload> <payload> …`` (text) under a key, and ends."""
+    return functools.partial(start_code, PUBLISHER, endpoint)

@@ -2,10 +2,11 @@
 
 import typer
 
-from . import router, simulate
+from . import record, router, simulate
 
 
 def register(app: typer.Typer) -> None:
     """Add this package's commands to ``app``, in the order ``--help`` lists them."""
+    record.register(app)
     router.register(app)
     simulate.register(app)

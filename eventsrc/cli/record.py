@@ -1,0 +1,94 @@
+"""`mapfold record`: Zenoh to log, until a signal ends it."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from eventsrc._zenoh import check_keys, open_session
+from eventsrc.ledger import ledger_of
+from eventsrc.log import LogReader, LogWriter, parse_fsync
+from eventsrc.recorder import DEFAULT_KEYS, DEFAULT_QUEUE_SIZE, Recorder, RecorderReport
+
+from ._shell import emit, finish, say
+from ._signals import stop_on_signals
+from ._zenoh_options import ConfigOption, ConnectOption, ListenOption, zenoh_options
+
+
+def record(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="The log; made if it is not there.")],
+    connect: ConnectOption = None,
+    listen: ListenOption = None,
+    zenoh_config: ConfigOption = None,
+    key: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--key",
+            metavar="KEY",
+            help="Key expression to record; wildcards * and ** work; may be repeated. "
+            f"[default: {DEFAULT_KEYS[0]}]",
+        ),
+    ] = None,
+    fsync: Annotated[
+        str,
+        typer.Option(metavar="POLICY", help="always, <N>ms or never: when events reach the disk."),
+    ] = "50ms",
+    queue: Annotated[
+        int, typer.Option(min=1, help="How many messages may wait for the disk.")
+    ] = DEFAULT_QUEUE_SIZE,
+    max_events: Annotated[
+        int | None, typer.Option(min=1, help="Stop after so many messages.")
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="The final numbers as JSON.")] = False,
+) -> None:
+    """Record what robots publish over Zenoh, until Ctrl-C.
+
+    Exit 3 when anything was rejected, lost or is missing.
+    """
+    policy = parse_fsync(fsync)
+    options = zenoh_options(connect, listen, zenoh_config)
+    keys = tuple(key or DEFAULT_KEYS)
+    check_keys(keys)
+    with (
+        stop_on_signals() as stop,
+        open_session(options, mode=options.mode) as session,
+        LogWriter(log, fsync=policy) as writer,
+    ):
+        with LogReader(log) as reader:
+            ledger = ledger_of(reader)
+        recorder = Recorder(
+            session, writer, keys, queue_size=queue, max_events=max_events, ledger=ledger
+        )
+        say(
+            f"recording {', '.join(keys)} to {log} from offset {writer.next_offset}; Ctrl-C ends it"
+        )
+        report = recorder.run(stop)
+    say(summary(log, report))
+    if json:
+        emit(as_json(report))
+    finish(findings=not report.clean)
+
+
+def summary(log: Path, report: RecorderReport) -> str:
+    """The last line for people."""
+    return (
+        f"{log}: {report.recorded} recorded, {report.rejected} rejected, {report.lost} lost, "
+        f"{report.missing} keyframes missing; {report.next_offset} events in the log"
+    )
+
+
+def as_json(report: RecorderReport) -> dict[str, int]:
+    """The final numbers for programs."""
+    return {
+        "recorded": report.recorded,
+        "rejected": report.rejected,
+        "queue_full": report.queue_full,
+        "transport_missed": report.transport_missed,
+        "missing": report.missing,
+        "next_offset": report.next_offset,
+    }
+
+
+def register(app: typer.Typer) -> None:
+    """Add `record` to ``app``."""
+    app.command()(record)

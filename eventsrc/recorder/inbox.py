@@ -1,0 +1,105 @@
+"""The bounded queue between Zenoh's thread and the writer's.
+
+Zenoh's callback only hands over: it may never wait, or the network waits with it. What does not
+fit is counted, per key, until the writer fetches the count and writes it into the log.
+"""
+
+import threading
+from collections import deque
+from typing import Final
+
+from eventsrc._zenoh import Missed, Received
+
+DEFAULT_QUEUE_SIZE: Final = 16_384
+"""Messages. At 9 kB each about 150 MB, and two seconds of 8,000 a second."""
+DEFAULT_QUEUE_BYTES: Final = 512 * 1024 * 1024
+"""Payload bytes, so that a queue of large messages does not take all memory."""
+
+
+class Inbox:
+    """Many threads `put`, one thread takes.
+
+    Holds at most ``size`` messages and, unless a single one is larger, ``max_bytes`` of payload.
+    """
+
+    def __init__(
+        self, size: int = DEFAULT_QUEUE_SIZE, max_bytes: int = DEFAULT_QUEUE_BYTES
+    ) -> None:
+        if size < 1:
+            raise ValueError(f"queue of {size} messages; at least 1")
+        self.size = size
+        self._max_bytes = max_bytes
+        self._bytes = 0
+        self._messages: deque[Received] = deque()
+        self._overflow: dict[str, int] = {}
+        self._missed: dict[str, int] = {}
+        self.overflowed = 0
+        """Messages that did not fit, since the beginning."""
+        self.missed = 0
+        """Messages that Zenoh says never came, since the beginning."""
+        self._lock = threading.Lock()
+        self._filled = threading.Condition(self._lock)
+        self._waiting = False
+        self._closed = False
+
+    def put(self, message: Received) -> None:
+        """Hand over one message, or count it as lost when the queue is full. Never blocks."""
+        with self._lock:
+            if self._fits(len(message.payload)):
+                self._messages.append(message)
+                self._bytes += len(message.payload)
+            else:
+                self.overflowed += 1
+                self._overflow[message.key] = self._overflow.get(message.key, 0) + 1
+            if self._waiting:
+                self._filled.notify()
+
+    def miss(self, missed: Missed) -> None:
+        """Count messages that Zenoh says never came."""
+        with self._lock:
+            self.missed += missed.missed
+            self._missed[missed.source] = self._missed.get(missed.source, 0) + missed.missed
+
+    def take(self, limit: int, timeout_s: float) -> list[Received]:
+        """Up to ``limit`` messages in order; empty when none came in time or it is closed."""
+        with self._lock:
+            if not self._messages and not self._closed and timeout_s > 0:
+                self._waiting = True
+                self._filled.wait(timeout_s)
+                self._waiting = False
+            count = min(limit, len(self._messages))
+            taken = [self._messages.popleft() for _ in range(count)]
+            self._bytes -= sum(len(message.payload) for message in taken)
+            return taken
+
+    def take_overflow(self) -> dict[str, int]:
+        """How many messages did not fit since the last call, by key."""
+        with self._lock:
+            overflow, self._overflow = self._overflow, {}
+            return overflow
+
+    def take_missed(self) -> dict[str, int]:
+        """How many messages Zenoh missed since the last call, by publisher."""
+        with self._lock:
+            missed, self._missed = self._missed, {}
+            return missed
+
+    def close(self) -> None:
+        """Wake the taker: nothing more will come."""
+        with self._lock:
+            self._closed = True
+            self._filled.notify_all()
+
+    @property
+    def closed(self) -> bool:
+        """Whether `close` was called; messages may still be waiting."""
+        return self._closed
+
+    def depth(self) -> int:
+        """How many messages wait."""
+        return len(self._messages)
+
+    def _fits(self, payload_bytes: int) -> bool:
+        if not self._messages:
+            return True
+        return len(self._messages) < self.size and self._bytes + payload_bytes <= self._max_bytes

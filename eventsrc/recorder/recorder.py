@@ -1,0 +1,105 @@
+"""Zenoh to log: callback → bounded queue → one writer thread."""
+
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Final
+
+from eventsrc._zenoh import Received, Session, check_keys
+from eventsrc.acks import ACK_PREFIX, Ack, ack_key
+from eventsrc.errors import TransportError
+from eventsrc.log import LogWriter
+from eventsrc.losses import GapLedger
+
+from .inbox import DEFAULT_QUEUE_SIZE, Inbox
+from .report import RecorderReport
+from .writing import Writing
+
+DEFAULT_KEYS: Final = ("tb/detections",)
+
+
+class Recorder:
+    """Records everything under ``keys`` from an open session into an open log.
+
+    Subscribed when the constructor returns: from then on nothing published passes it by. ``ledger``
+    is what the log already holds (see `eventsrc.ledger`); without it, a gap between an earlier
+    recorder's last keyframe and this one's first is not seen.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        writer: LogWriter,
+        keys: Sequence[str] = DEFAULT_KEYS,
+        *,
+        queue_size: int = DEFAULT_QUEUE_SIZE,
+        max_events: int | None = None,
+        ledger: GapLedger | None = None,
+    ) -> None:
+        check_keys(keys)
+        self._session = session
+        self._inbox = Inbox(queue_size)
+        self._writing = Writing(
+            self._inbox,
+            writer,
+            GapLedger() if ledger is None else ledger,
+            self._send_ack,
+            max_events=max_events,
+        )
+        self._subscriptions = [
+            session.subscribe(key, self._receive, on_miss=self._inbox.miss) for key in keys
+        ]
+        session.confirm()
+
+    def run(
+        self,
+        stop: threading.Event,
+        *,
+        every_s: float = 1.0,
+        watch: Callable[[RecorderReport], None] | None = None,
+    ) -> RecorderReport:
+        """Record until ``stop`` is set, then drain the queue and sync.
+
+        ``watch`` is called in this thread about every ``every_s`` seconds. Raises what ended the
+        writing early, a LogError; ``stop`` is set then too, and when ``max_events`` is reached.
+        """
+        with ThreadPoolExecutor(1, thread_name_prefix="log-writer") as thread:
+            writing = thread.submit(self._writing.run)
+            writing.add_done_callback(lambda _: stop.set())
+            try:
+                self._wait(stop, every_s, watch)
+            finally:
+                self._drain(writing)
+        return self._writing.report()
+
+    def report(self) -> RecorderReport:
+        """The numbers so far; may be asked for from any thread."""
+        return self._writing.report()
+
+    def _wait(
+        self,
+        stop: threading.Event,
+        every_s: float,
+        watch: Callable[[RecorderReport], None] | None,
+    ) -> None:
+        while not stop.wait(every_s if watch is not None else None):
+            if watch is not None:
+                watch(self.report())
+
+    def _drain(self, writing: "Future[None]") -> None:
+        for subscription in self._subscriptions:
+            subscription.close()
+        self._inbox.close()
+        writing.result()
+
+    def _receive(self, message: Received) -> None:
+        # Under `**` a recorder hears its own acks and those of others. They are answers, not data.
+        if not message.key.startswith(ACK_PREFIX):
+            self._inbox.put(message)
+
+    def _send_ack(self, ack: Ack) -> None:
+        try:
+            self._session.send(ack_key(ack.run_id), ack.model_dump_json().encode())
+        except TransportError:
+            # No way to tell the robot now. It will send again, and the next ack will cover that.
+            return

@@ -1,0 +1,35 @@
+"""What a recorder has done so far, as numbers."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderReport:
+    """Counted since this recorder began, but for what the log lacks, its end and the queue.
+
+    ``recorded`` are envelopes that are synced, ``rejected`` payloads that are kept under
+    ``mapfold/rejected``. ``queue_full`` and ``transport_missed`` are messages that were sent and
+    are not in the log. ``missing`` are the keyframes that the log's runs lack now, whatever the
+    cause and whichever recorder lost them, and ``missing_before`` were lacking when this one
+    began; a message lost in the queue is usually missing as well.
+    """
+
+    recorded: int
+    rejected: int
+    queue_full: int
+    transport_missed: int
+    missing: int
+    missing_before: int
+    queue_depth: int
+    queue_size: int
+    next_offset: int
+
+    @property
+    def lost(self) -> int:
+        """Messages that were sent and are not in the log."""
+        return self.queue_full + self.transport_missed
+
+    @property
+    def clean(self) -> bool:
+        """True when this recorder lost nothing, rejected nothing and left no new gap."""
+        return not (self.rejected or self.lost or self.missing > self.missing_before)

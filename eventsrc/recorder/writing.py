@@ -1,0 +1,164 @@
+"""The writer's thread: from the queue into the log, and what follows from it.
+
+* One thread owns the LogWriter. It takes batches from the inbox, appends, and lets the log commit.
+* Nothing follows from an event before it is synced: only then does it enter the gap ledger, count
+  as recorded, and get acknowledged to its robot.
+* Losses are written about once a second, not one by one: a queue that overflows is busy enough.
+* Keys under ``mapfold/`` are our own. From the network they could forge a loss or a command, so
+  `append_payload` rejects such a message like any other that is no envelope.
+"""
+
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Final, Literal
+
+from eventsrc._zenoh import Received
+from eventsrc.acks import Ack
+from eventsrc.append import append_payload
+from eventsrc.ingest import Accepted
+from eventsrc.log import LogWriter
+from eventsrc.losses import Gap, GapLedger
+from eventsrc.system_events import LOSS_KEY, Loss
+
+from .inbox import Inbox
+from .report import RecorderReport
+
+Acknowledge = Callable[[Ack], None]
+Cause = Literal["queue_full", "transport_miss"]
+
+_BATCH: Final = 256
+_IDLE_S: Final = 0.25
+_UNSYNCED_S: Final = 0.005
+"""How long to wait for more while a group commit is due: a tenth of the default group."""
+LOSSES_EVERY_NS: Final = 1_000_000_000
+
+
+class Writing:
+    """The work of the writer's thread: `run` is its whole life."""
+
+    def __init__(
+        self,
+        inbox: Inbox,
+        writer: LogWriter,
+        ledger: GapLedger,
+        acknowledge: Acknowledge,
+        *,
+        max_events: int | None,
+        losses_every_ns: int = LOSSES_EVERY_NS,
+    ) -> None:
+        self._inbox = inbox
+        self._writer = writer
+        self._ledger = ledger
+        self._acknowledge = acknowledge
+        self._room = max_events
+        self._losses_every_ns = losses_every_ns
+        self._losses_due_ns = time.monotonic_ns() + losses_every_ns
+        self._unsynced: deque[tuple[int, str, int]] = deque()
+        self._recorded = self._rejected = 0
+        self._missing = self._missing_before = ledger.missing()
+
+    def run(self) -> None:
+        """Record until the inbox is closed and empty, or there are as many events as asked for.
+
+        Raises LogError when the log cannot be written; all that was synced is safe.
+        """
+        while self._step():
+            pass
+        self._write_losses(self._ledger.flush())
+        self._writer.sync()
+        self._follow_up()
+
+    def report(self) -> RecorderReport:
+        """The numbers now; may be asked for from any thread."""
+        return RecorderReport(
+            recorded=self._recorded,
+            rejected=self._rejected,
+            queue_full=self._inbox.overflowed,
+            transport_missed=self._inbox.missed,
+            missing=self._missing,
+            missing_before=self._missing_before,
+            queue_depth=self._inbox.depth(),
+            queue_size=self._inbox.size,
+            next_offset=self._writer.next_offset,
+        )
+
+    def _step(self) -> bool:
+        """One batch and what follows from it; False when there will be no more."""
+        limit = _BATCH if self._room is None else min(_BATCH, self._room)
+        closed = self._inbox.closed  # before taking: what came before the closing is still taken
+        batch = self._inbox.take(limit, _UNSYNCED_S if self._unsynced else _IDLE_S)
+        for message in batch:
+            self._record(message)
+        self._writer.commit_if_due()
+        self._follow_up()
+        now_ns = time.monotonic_ns()
+        if now_ns >= self._losses_due_ns:
+            self._losses_due_ns = now_ns + self._losses_every_ns
+            self._write_losses(self._ledger.due(now_ns))
+        if self._room is not None:
+            self._room -= len(batch)
+        return bool(batch or not closed) and self._room != 0
+
+    def _record(self, message: Received) -> None:
+        result = append_payload(self._writer, message.key, message.payload)
+        if isinstance(result, Accepted):
+            envelope = result.envelope
+            offset = self._writer.next_offset - 1
+            self._unsynced.append((offset, envelope.run_id, envelope.keyframe_id))
+        else:
+            self._rejected += 1
+
+    def _follow_up(self) -> None:
+        """Everything synced since the last call: recorded, counted, acknowledged."""
+        durable = self._writer.durable_offset
+        unsynced = self._unsynced
+        if not unsynced or unsynced[0][0] >= durable:
+            return
+        now_ns = time.monotonic_ns()
+        synced: dict[str, list[int]] = {}
+        while unsynced and unsynced[0][0] < durable:
+            _, run_id, keyframe_id = unsynced.popleft()
+            self._ledger.record(run_id, keyframe_id, now_ns)
+            synced.setdefault(run_id, []).append(keyframe_id)
+            self._recorded += 1
+        for run_id, keyframe_ids in synced.items():
+            stretches = _stretches(self._ledger, run_id, keyframe_ids)
+            ack = Ack(run_id=run_id, log_id=self._writer.log_id, stretches=stretches)
+            self._acknowledge(ack)
+
+    def _write_losses(self, gaps: list[Gap]) -> None:
+        for gap in gaps:
+            self._append_loss(
+                Loss(
+                    publisher=gap.run_id,
+                    first=gap.first,
+                    last=gap.last,
+                    count=gap.count,
+                    cause="keyframe_gap",
+                )
+            )
+        self._write_counts("queue_full", self._inbox.take_overflow())
+        self._write_counts("transport_miss", self._inbox.take_missed())
+        self._missing = self._ledger.missing()
+
+    def _write_counts(self, cause: Cause, counts: dict[str, int]) -> None:
+        for publisher, count in counts.items():
+            self._append_loss(Loss(publisher=publisher, count=count, cause=cause))
+
+    def _append_loss(self, loss: Loss) -> None:
+        self._writer.append(LOSS_KEY, loss.model_dump_json().encode())
+
+
+def _stretches(
+    ledger: GapLedger, run_id: str, keyframe_ids: list[int]
+) -> tuple[tuple[int, int], ...]:
+    """The recorded stretches these keyframes lie in, in order, each once."""
+    found: list[tuple[int, int]] = []
+    for keyframe_id in sorted(keyframe_ids):
+        if found and keyframe_id <= found[-1][1]:
+            continue
+        stretch = ledger.stretch(run_id, keyframe_id)
+        if stretch is not None:
+            found.append(stretch)
+    return tuple(found)

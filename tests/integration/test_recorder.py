@@ -1,0 +1,310 @@
+"""The recorder on a real router, a real log and, mostly, a publisher in another process."""
+
+import itertools
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from eventsrc._zenoh import Received, Session, ZenohOptions, open_session
+from eventsrc.acks import Ack, ack_key
+from eventsrc.clock import system_clock
+from eventsrc.errors import LogError, MisuseError
+from eventsrc.ledger import ledger_of
+from eventsrc.log import Event, LogReader, LogWriter
+from eventsrc.losses import Gap
+from eventsrc.recorder import Recorder, RecorderReport
+from eventsrc.router import Router
+from eventsrc.system_events import LOSS_KEY, REJECTED_KEY, Loss, RejectedPayload
+from tests.envelopes import detection, envelope, payload
+from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK, Program
+
+Sessions = Callable[[], Session]
+KEY = "tb/detections"
+
+
+class Running:
+    """A recorder at work in this process; `finish` stops it and returns its report."""
+
+    def __init__(self, recorder: Recorder) -> None:
+        self._recorder = recorder
+        self._seen = threading.Condition()
+        self._latest = recorder.report()
+        self._stop = threading.Event()
+        self._thread = ThreadPoolExecutor(1)
+        self._done = self._thread.submit(recorder.run, self._stop, every_s=0.01, watch=self._watch)
+
+    def _watch(self, report: RecorderReport) -> None:
+        with self._seen:
+            self._latest = report
+            self._seen.notify_all()
+
+    def wait_until(self, true: Callable[[RecorderReport], bool]) -> None:
+        with self._seen:
+            assert self._seen.wait_for(lambda: true(self._latest), DEADLINE_S), self._latest
+
+    def finish(self) -> RecorderReport:
+        self._stop.set()
+        self._thread.shutdown()
+        return self._done.result()
+
+
+@contextmanager
+def recording(
+    session: Session, log: Path, keys: Sequence[str] = (KEY,), queue_size: int = 1_000
+) -> Iterator[Running]:
+    with LogWriter(log) as writer:
+        with LogReader(log) as reader:
+            ledger = ledger_of(reader)
+        running = Running(Recorder(session, writer, keys, queue_size=queue_size, ledger=ledger))
+        try:
+            yield running
+        finally:
+            running._stop.set()
+            running._thread.shutdown()
+
+
+def _events(log: Path) -> list[Event]:
+    with LogReader(log) as reader:
+        return list(reader.read())
+
+
+def _keyframes(*keyframe_ids: int, **fields: object) -> list[bytes]:
+    return [payload(envelope(k, **fields)) for k in keyframe_ids]
+
+
+def test_every_envelope_is_found_byte_for_byte(
+    connected: Sessions, publish: Callable[..., Program], tmp_path: Path
+) -> None:
+    sent = [
+        payload(envelope(k, detections=[detection("baker's rack 🧁", [1.0, 2.0], extra=k)]))
+        for k in range(50)
+    ]
+    with recording(connected(), tmp_path / "log") as running:
+        assert publish(KEY, *(p.decode() for p in sent)).wait() == 0
+        running.wait_until(lambda report: report.recorded == 50)
+        report = running.finish()
+    assert report.clean
+    assert report.next_offset == 50
+    events = _events(tmp_path / "log")
+    assert [e.payload for e in events] == sent
+    assert [e.offset for e in events] == list(range(50))
+    assert {e.key for e in events} == {KEY}
+    assert events[7].stamp_ns == 1_774_357_207_000_000_000
+
+
+def test_a_payload_that_is_no_envelope_is_kept_with_its_reason(
+    connected: Sessions, publish: Callable[..., Program], tmp_path: Path
+) -> None:
+    with recording(connected(), tmp_path / "log") as running:
+        publish(KEY, "no json", payload(envelope(1)).decode())
+        running.wait_until(lambda report: report.recorded == 1)
+        report = running.finish()
+    assert (report.recorded, report.rejected, report.clean) == (1, 1, False)
+    rejected, accepted = _events(tmp_path / "log")
+    assert (rejected.key, accepted.key) == (REJECTED_KEY, KEY)
+    kept = RejectedPayload.model_validate_json(rejected.payload)
+    assert (kept.key, kept.raw) == (KEY, b"no json")
+    assert "not JSON" in kept.reason
+
+
+def test_wildcards_record_every_key_under_its_own_name(connected: Sessions, tmp_path: Path) -> None:
+    with recording(connected(), tmp_path / "log", ["tb/*", "robots/**"]) as running:
+        session = connected()
+        for key in ("tb/detections", "tb/other", "robots/7/detections"):
+            publisher = session.publisher(key)
+            assert publisher.wait_for_subscriber(DEADLINE_S)
+            publisher.put(payload(envelope(1, run_id=key)))
+        running.wait_until(lambda report: report.recorded == 3)
+        running.finish()
+    assert {e.key for e in _events(tmp_path / "log")} == {
+        "tb/detections",
+        "tb/other",
+        "robots/7/detections",
+    }
+
+
+def test_our_own_events_cannot_be_forged_from_the_network(
+    connected: Sessions, tmp_path: Path
+) -> None:
+    forged = Loss(publisher="run-a", count=5, cause="queue_full").model_dump_json().encode()
+    with recording(connected(), tmp_path / "log", ["**"]) as running:
+        publisher = connected().publisher(LOSS_KEY)
+        assert publisher.wait_for_subscriber(DEADLINE_S)
+        publisher.put(forged)
+        running.wait_until(lambda report: report.rejected == 1)
+        running.finish()
+    (event,) = _events(tmp_path / "log")
+    assert event.key == REJECTED_KEY
+    kept = RejectedPayload.model_validate_json(event.payload)
+    assert (kept.key, kept.raw) == (LOSS_KEY, forged)
+    assert "reserved" in kept.reason
+
+
+def test_a_recorder_of_everything_does_not_record_its_own_acks(
+    connected: Sessions, tmp_path: Path
+) -> None:
+    acked = threading.Event()
+    watcher = connected()
+    watcher.subscribe(ack_key("run-a"), lambda _: acked.set())
+    watcher.confirm()
+    with recording(connected(), tmp_path / "log", ["**"]) as running:
+        publisher = connected().publisher(KEY)
+        assert publisher.wait_for_subscriber(DEADLINE_S)
+        publisher.put(payload(envelope(1)))
+        assert acked.wait(DEADLINE_S)
+        publisher.put(payload(envelope(2)))
+        running.wait_until(lambda report: report.recorded == 2)
+        assert running.finish().rejected == 0
+
+
+def test_an_ack_covers_what_is_synced_and_nothing_else(connected: Sessions, tmp_path: Path) -> None:
+    run_id = "robot/*?#$ 🤖"
+    acks: list[Ack] = []
+    covered = threading.Event()
+
+    def hear(message: Received) -> None:
+        acks.append(Ack.model_validate_json(message.payload))
+        if acks[-1].covers(9):
+            covered.set()
+
+    watcher = connected()
+    watcher.subscribe(ack_key(run_id), hear)
+    watcher.confirm()
+    with recording(connected(), tmp_path / "log") as running:
+        publisher = connected().publisher(KEY)
+        assert publisher.wait_for_subscriber(DEADLINE_S)
+        for message in (*_keyframes(1, 2, 3, 9, run_id=run_id), b"no envelope"):
+            publisher.put(message)
+        assert covered.wait(DEADLINE_S)
+        running.finish()
+    assert {ack.run_id for ack in acks} == {run_id}
+    claimed = {k for ack in acks for first, last in ack.stretches for k in range(first, last + 1)}
+    assert claimed == {1, 2, 3, 9}
+
+
+def test_a_full_queue_loses_loudly_and_never_blocks(connected: Sessions, tmp_path: Path) -> None:
+    """The clock is the gate: the writer stands in its first append until the gate opens."""
+    entered, gate = threading.Event(), threading.Event()
+    gate.set()
+
+    def gated_clock() -> int:
+        entered.set()
+        assert gate.wait(DEADLINE_S)
+        return system_clock()
+
+    publisher = connected().publisher(KEY)
+    with LogWriter(tmp_path / "log", clock=gated_clock) as writer:
+        running = Running(Recorder(connected(), writer, [KEY], queue_size=4))
+        assert publisher.wait_for_subscriber(DEADLINE_S)
+        gate.clear()
+        entered.clear()
+        messages = _keyframes(*range(12))
+        publisher.put(messages[0])
+        assert entered.wait(DEADLINE_S)
+        for message in messages[1:]:
+            publisher.put(message)
+        running.wait_until(lambda report: report.queue_full == 7)
+        gate.set()
+        running.wait_until(lambda report: report.recorded == 5)
+        publisher.put(payload(envelope(12)))
+        running.wait_until(lambda report: report.recorded == 6)
+        report = running.finish()
+    assert not report.clean
+    assert (report.lost, report.missing) == (7, 7)
+    events = _events(tmp_path / "log")
+    assert [e.payload for e in events if e.key == KEY] == [
+        *messages[:5],
+        payload(envelope(12)),
+    ]
+    losses = [Loss.model_validate_json(e.payload) for e in events if e.key == LOSS_KEY]
+    assert sum(loss.count for loss in losses if loss.cause == "queue_full") == 7
+    assert Loss(publisher="run-a", first=5, last=11, count=7, cause="keyframe_gap") in losses
+
+
+def test_a_gap_between_two_recorders_is_found_and_a_late_keyframe_closes_it(
+    connected: Sessions, tmp_path: Path
+) -> None:
+    log = tmp_path / "log"
+    publisher = connected().publisher(KEY)
+
+    def record(*keyframe_ids: int) -> RecorderReport:
+        with recording(connected(), log) as running:
+            assert publisher.wait_for_subscriber(DEADLINE_S)
+            for message in _keyframes(*keyframe_ids):
+                publisher.put(message)
+            running.wait_until(lambda report: report.recorded == len(keyframe_ids))
+            return running.finish()
+
+    assert record(1, 2).missing == 0
+    assert record(6).missing == 3
+    assert record(4).missing == 2
+    losses = [Loss.model_validate_json(e.payload) for e in _events(log) if e.key == LOSS_KEY]
+    assert losses == [Loss(publisher="run-a", first=3, last=5, count=3, cause="keyframe_gap")]
+    with LogReader(log) as reader:
+        assert list(ledger_of(reader).gaps()) == [Gap("run-a", 3, 3), Gap("run-a", 5, 5)]
+
+
+def test_recording_goes_on_when_the_router_comes_back(tmp_path: Path) -> None:
+    with Router(LOOPBACK) as router:
+        options = ZenohOptions(connect=router.endpoints)
+        recorder_session = open_session(options, mode="client")
+        publisher_session = open_session(options, mode="client")
+        publisher = publisher_session.publisher(KEY)
+    with (
+        recorder_session,
+        publisher_session,
+        recording_later(recorder_session, tmp_path / "log", router) as running,
+    ):
+        assert publisher.wait_for_subscriber(DEADLINE_S)
+        publisher.put(payload(envelope(1)))
+        running.wait_until(lambda report: report.recorded == 1)
+        assert running.finish().clean
+
+
+@contextmanager
+def recording_later(session: Session, log: Path, gone: Router) -> Iterator[Running]:
+    """A recorder that subscribes while its router is away, and then the router again."""
+    with recording(session, log) as running, Router(ZenohOptions(listen=gone.endpoints)):
+        yield running
+
+
+def test_it_stops_after_as_many_as_asked_for(connected: Sessions, tmp_path: Path) -> None:
+    with LogWriter(tmp_path / "log") as writer:
+        running = Running(Recorder(connected(), writer, [KEY], max_events=3))
+        publisher = connected().publisher(KEY)
+        assert publisher.wait_for_subscriber(DEADLINE_S)
+        for message in _keyframes(1, 2, 3, 4, 5):
+            publisher.put(message)
+        assert running._done.result(DEADLINE_S).recorded == 3
+        running.finish()
+    assert len(_events(tmp_path / "log")) == 3
+
+
+def test_a_log_that_cannot_be_written_ends_the_recording(
+    connected: Sessions, tmp_path: Path
+) -> None:
+    times = itertools.chain([system_clock()], itertools.repeat(-1))
+    with LogWriter(tmp_path / "log", clock=lambda: next(times)) as writer:
+        running = Running(Recorder(connected(), writer, [KEY]))
+        publisher = connected().publisher(KEY)
+        assert publisher.wait_for_subscriber(DEADLINE_S)
+        publisher.put(payload(envelope(1)))
+        with pytest.raises(LogError, match="not nanoseconds"):
+            running._done.result(DEADLINE_S)
+
+
+@pytest.mark.parametrize("keys", [["tb/*", "tb/detections"], ["**", "a"], ["a", "a"]])
+def test_overlapping_keys_would_record_twice(
+    connected: Sessions, tmp_path: Path, keys: list[str]
+) -> None:
+    with LogWriter(tmp_path / "log") as writer, pytest.raises(MisuseError, match="overlap"):
+        Recorder(connected(), writer, keys)
+
+
+def test_a_malformed_key_is_named(connected: Sessions, tmp_path: Path) -> None:
+    with LogWriter(tmp_path / "log") as writer, pytest.raises(MisuseError, match="'tb//x'"):
+        Recorder(connected(), writer, ["tb//x"])
