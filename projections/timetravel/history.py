@@ -114,6 +114,12 @@ class History:
         """Keyframes added by the events below ``end``."""
         return bisect_left(self.keyframe_offsets, end)
 
+    def cause_at(self, offset: int) -> Cause:
+        """The cause of what the event at ``offset`` did."""
+        number = bisect_left(self.keyframe_offsets, offset)
+        added = self.keyframes[number : number + 1]
+        return cause_of(offset, [k for k in added if k.offset == offset])
+
     def transitions(self, a: int, b: int, end: int) -> int:
         """Shared transitions of two places after the events below ``end``."""
         pair = (min(a, b), max(a, b))

@@ -1,0 +1,63 @@
+"""Merges as people and programs read them."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from .history import History
+from .lives import EdgeChange, Merge
+from .story import keyframe_name, link_document, link_text, place_name
+
+HEADER = ("#", "offset", "time", "bridge", "survivor", "absorbed", "keyframes", "objects", "edges")
+
+
+def merge_document(history: History, merge: Merge) -> dict[str, Any]:
+    """One merge as JSON; ``run_id`` and ``keyframe_id`` name the bridging keyframe."""
+    bridge = history.keyframes[merge.bridge]
+    return {
+        **merge.cause.document(),
+        "run_id": bridge.run_id,
+        "keyframe_id": bridge.keyframe_id,
+        "number": merge.number,
+        "survivor": place_name(history, merge.survivor),
+        "survivor_size": merge.survivor_size,
+        "absorbed": [place_name(history, place) for place in merge.absorbed],
+        "absorbed_sizes": list(merge.absorbed_sizes),
+        "links": [link_document(history, link) for link in merge.links],
+        "objects": [history.objects[number].object_id for number in merge.objects],
+        "edges": [_edge_document(history, edge) for edge in merge.edges],
+    }
+
+
+def _edge_document(history: History, edge: EdgeChange) -> dict[str, Any]:
+    return {
+        "a": place_name(history, edge.a),
+        "b": place_name(history, edge.b),
+        "before": edge.before,
+        "after": edge.after,
+    }
+
+
+def merge_row(history: History, merge: Merge) -> tuple[str, ...]:
+    """One row of the table under `HEADER`."""
+    return (
+        str(merge.number),
+        f"{merge.cause.offset:,}",
+        merge.cause.time or "",
+        keyframe_name(history, merge.bridge),
+        place_name(history, merge.survivor),
+        ", ".join(place_name(history, place) for place in merge.absorbed),
+        " + ".join(str(size) for size in (merge.survivor_size, *merge.absorbed_sizes)),
+        str(len(merge.objects)),
+        str(len(merge.edges)),
+    )
+
+
+def reason(history: History, merge: Merge) -> str:
+    """Why it happened: who bridged, and which core points are near each other."""
+    links = "; ".join(link_text(history, link) for link in merge.links)
+    return f"{keyframe_name(history, merge.bridge)} bridged them: {links}"
+
+
+def joined_sizes(merges: Sequence[Merge]) -> int:
+    """Places that merges took away."""
+    return sum(len(merge.absorbed) for merge in merges)
