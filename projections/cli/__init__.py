@@ -5,7 +5,7 @@ import typer
 from eventsrc import cli as log_commands
 from eventsrc.cli._shell import run_app
 
-from . import db
+from . import db, state
 
 app = typer.Typer(
     name="mapfold",
@@ -18,6 +18,7 @@ app = typer.Typer(
 
 log_commands.register(app)
 db.register(app)
+state.register(app)
 
 
 def main() -> None:

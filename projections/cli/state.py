@@ -1,0 +1,52 @@
+"""`mapfold state`: the map folded to a point in the log."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from eventsrc.cli._shell import emit
+from eventsrc.errors import MisuseError
+from eventsrc.log import LogReader
+from eventsrc.log.whence import resolve
+from projections.cli._options import SetOption, SettingsOption, settings_from
+from projections.digest import map_digest
+from projections.folding import fold_log
+from projections.state_json import state_document
+from projections.state_text import state_text
+
+
+def state(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="The log's folder.")],
+    at: Annotated[
+        str,
+        typer.Option(
+            "--at",
+            metavar="W",
+            help="Fold to here: number of events, ISO time, RUN:KEYFRAME (inclusive) or end.",
+        ),
+    ] = "end",
+    json_: Annotated[bool, typer.Option("--json", help="The whole map as JSON on stdout.")] = False,
+    digest: Annotated[bool, typer.Option("--digest", help="Print only the digest.")] = False,
+    set_: SetOption = None,
+    settings_file: SettingsOption = None,
+) -> None:
+    """The map folded to a point in the log: places, objects, adjacency, counts, digest."""
+    if json_ and digest:
+        raise MisuseError("--json and --digest together: --json holds the digest already")
+    settings = settings_from(settings_file, set_)
+    with LogReader(log) as reader:
+        _, view = fold_log(reader, settings, resolve(reader, at), keep_embeddings=False)
+    hexdigits = map_digest(view)
+    if json_:
+        emit(state_document(view, hexdigits))
+    elif digest:
+        sys.stdout.write(f"{hexdigits}\n")
+    else:
+        sys.stdout.write(state_text(view, hexdigits))
+
+
+def register(app: typer.Typer) -> None:
+    """Add `state` to the program."""
+    app.command()(state)

@@ -1,0 +1,67 @@
+"""A map in a few lines for people, what ``mapfold state`` prints."""
+
+from .settings import Settings
+from .view import MapView
+
+_MOST = 40
+
+
+def state_text(view: MapView, digest: str) -> str:
+    """The text, with a newline at its end."""
+    lines = [
+        f"after {_number(view.next_offset, 'events')}: {_counts(view)}",
+        f"settings {_settings(view.settings)}",
+        f"digest   {digest}",
+    ]
+    lines += _places(view)
+    return "\n".join(lines) + "\n"
+
+
+def _counts(view: MapView) -> str:
+    counts = view.counts()
+    names = ("runs", "keyframes", "observations", "objects", "places")
+    text = ", ".join(_number(counts[name], name) for name in names)
+    rare = {
+        "noise": "keyframes in no place",
+        "duplicates": "duplicates",
+        "conflicts": "conflicts",
+        "det_ids_reused": "det_ids used twice",
+        "foreign_embeddings": "embeddings of another space",
+    }
+    return text + "".join(f", {counts[key]} {words}" for key, words in rare.items() if counts[key])
+
+
+def _number(count: int, plural: str) -> str:
+    return f"{count} {plural if count != 1 else plural.removesuffix('s')}"
+
+
+def _settings(settings: Settings) -> str:
+    default = Settings().model_dump()
+    changed = {k: v for k, v in settings.model_dump().items() if v != default[k]}
+    shown = changed or {k: v for k, v in default.items() if v is not None}
+    text = ", ".join(f"{name}={value}" for name, value in shown.items())
+    return text if changed else f"default: {text}"
+
+
+def _places(view: MapView) -> list[str]:
+    if not view.places:
+        return ["no places yet"]
+    neighbours: dict[int, list[str]] = {place: [] for place in view.places}
+    for a, b, transitions in view.edges():
+        neighbours[a].append(f"{view.place_id(b)} ×{transitions}")
+        neighbours[b].append(f"{view.place_id(a)} ×{transitions}")
+    objects = dict.fromkeys(view.places, 0)
+    for found in view.objects:
+        if found.place is not None:
+            objects[found.place] += 1
+    width = max(len(place.place_id) for place in view.places.values())
+    lines = [f"{'place':<{width}}  keyframes  objects  centroid (m)        next to"]
+    for ordinal, place in list(view.places.items())[:_MOST]:
+        centroid = f"({place.centroid_x:.2f}, {place.centroid_y:.2f})"
+        lines.append(
+            f"{place.place_id:<{width}}  {place.keyframe_count:>9}  {objects[ordinal]:>7}  "
+            f"{centroid:<18}  {', '.join(neighbours[ordinal])}".rstrip()
+        )
+    if len(view.places) > _MOST:
+        lines.append(f"… and {len(view.places) - _MOST} more places; --json lists all")
+    return lines
