@@ -1,0 +1,5 @@
+"""Getting messages that others kept into a log."""
+
+from .run import DEFAULT_KEY, LAZY_COMMIT, ImportReport, check_sources, import_files
+
+__all__ = ["DEFAULT_KEY", "LAZY_COMMIT", "ImportReport", "check_sources", "import_files"]

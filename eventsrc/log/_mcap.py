@@ -30,6 +30,7 @@ from mcap.records import (
     Footer,
     Header,
     McapRecord,
+    Message,
     MessageIndex,
     Metadata,
     MetadataIndex,
@@ -37,6 +38,7 @@ from mcap.records import (
     Statistics,
     SummaryOffset,
 )
+from mcap.stream_reader import StreamReader
 
 MAGIC = b"\x89MCAP0\r\n"
 PROFILE = "mapfold"
@@ -66,6 +68,10 @@ and saves nothing more (measured on house-a: 0.757 of the size either way)."""
 
 
 Record = TypeVar("Record", bound=McapRecord)
+
+
+ForeignError = (McapError, zstandard.ZstdError)
+"""What the mcap package raises on files it cannot read, besides built-in errors."""
 
 
 class BadRecord(ValueError):
@@ -255,12 +261,15 @@ __all__ = [
     "ChunkIndex",
     "DataEnd",
     "Footer",
+    "ForeignError",
     "Header",
+    "Message",
     "MessageIndex",
     "Metadata",
     "MetadataIndex",
     "Opcode",
     "Schema",
     "Statistics",
+    "StreamReader",
     "SummaryOffset",
 ]

@@ -1,0 +1,105 @@
+"""`mapfold import`: messages that others kept, into a log."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+    TransferSpeedColumn,
+)
+
+from eventsrc.importers import (
+    DEFAULT_KEY,
+    LAZY_COMMIT,
+    ImportReport,
+    check_sources,
+    import_files,
+)
+from eventsrc.importers.record import Source
+from eventsrc.log import LogWriter
+
+from ._shell import emit, finish, people, say
+
+
+def import_(
+    log: Annotated[Path, typer.Argument(help="The log to append to; made if there is none.")],
+    files: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="FILE…",
+            help="JSON lines (plain or gzip), logger records, MCAP files, other logs; - is stdin.",
+        ),
+    ],
+    key: Annotated[str, typer.Option(help="Key for messages whose file names none.")] = DEFAULT_KEY,
+    json_: Annotated[bool, typer.Option("--json", help="Counts as JSON on stdout.")] = False,
+) -> None:
+    """Append recorded envelopes to a log, in the order of the files.
+
+    What is no envelope is kept with its bytes and the reason under mapfold/rejected, and makes the
+    command exit with 3.
+    """
+    check_sources(files)
+    with LogWriter(log, fsync=LAZY_COMMIT) as writer, _progress() as show:
+        report = import_files(writer, files, key=key, progress=show)
+    if json_:
+        emit({"log": str(log), **asdict(report)})
+    say(_summary(log, report))
+    finish(findings=report.rejected > 0)
+
+
+def _summary(log: Path, report: ImportReport) -> str:
+    parts = [f"imported {report.accepted} envelopes into {log}"]
+    if report.next_offset > report.first_offset:
+        parts.append(f"offsets {report.first_offset} to {report.next_offset - 1}")
+    if report.system:
+        parts.append(f"{report.system} rejects and losses taken over")
+    if report.skipped:
+        parts.append(f"{report.skipped} messages that are not JSON passed over")
+    parts.append(f"{report.rejected} rejected")
+    hint = f"; `mapfold log cat {log} --key mapfold/rejected` shows them" if report.rejected else ""
+    return ", ".join(parts) + hint
+
+
+@contextmanager
+def _progress() -> Iterator["_Show | None"]:
+    """A bar with rate and time left on a terminal, nothing elsewhere."""
+    if not people.is_terminal:
+        yield None
+        return
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TransferSpeedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=people, transient=True) as progress:
+        yield _Show(progress)
+
+
+class _Show:
+    """One task for each file."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+        self._tasks: dict[int, int] = {}
+
+    def __call__(self, source: Source) -> None:
+        task = self._tasks.get(id(source))
+        if task is None:
+            task = self._progress.add_task(source.name, total=source.size_bytes)
+            self._tasks[id(source)] = task
+        self._progress.update(task, completed=source.position())  # type: ignore[arg-type]
+
+
+def register(app: typer.Typer) -> None:
+    """Add `import` to ``app``."""
+    app.command("import")(import_)

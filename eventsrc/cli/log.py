@@ -1,0 +1,94 @@
+"""`mapfold log …`: look at a log."""
+
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from eventsrc.errors import MisuseError
+from eventsrc.log import LogInfo, LogReader, SegmentInfo, log_info
+from eventsrc.log.whence import resolve, resolve_start
+
+from ._event_text import event_document, event_line, iso_time
+from ._shell import emit, emit_lines
+
+LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="The log's folder.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Data as JSON on stdout.")]
+
+log_app = typer.Typer(help="Look at a log: info, cat, verify, recover.", no_args_is_help=True)
+
+
+@log_app.command()
+def info(log: LogArgument, json_: JsonOption = False) -> None:
+    """What a log holds: id, segments, offsets, counts by key, rejected, losses, times."""
+    report = log_info(log)
+    if json_:
+        emit(_info_document(report))
+    else:
+        sys.stdout.write(_info_text(report))
+
+
+def _info_document(report: LogInfo) -> dict[str, Any]:
+    return {
+        **asdict(report),
+        "path": str(report.path),
+        "segments": [asdict(s) for s in report.segments],
+    }
+
+
+def _info_text(report: LogInfo) -> str:
+    rows = [
+        ("log", f"{report.path} ({report.log_id})"),
+        ("events", f"{report.events} in {report.size_bytes:,} bytes"),
+        ("rejected", str(report.rejected)),
+        ("lost", str(report.lost)),
+    ]
+    if report.first_logged_ns is not None and report.last_logged_ns is not None:
+        rows.append(("logged", _span(report.first_logged_ns, report.last_logged_ns)))
+    if report.first_stamp_ns is not None and report.last_stamp_ns is not None:
+        rows.append(("stamped", _span(report.first_stamp_ns, report.last_stamp_ns)))
+    rows += [("key", f"{key}: {count}") for key, count in report.keys.items()]
+    rows += [("segment", _segment_text(segment)) for segment in report.segments]
+    return "".join(f"{name:<9} {value}\n" for name, value in rows)
+
+
+def _segment_text(segment: SegmentInfo) -> str:
+    state = "sealed" if segment.sealed else "active"
+    return f"{segment.name}: {segment.events} events, {segment.size_bytes:,} bytes, {state}"
+
+
+def _span(first_ns: int, last_ns: int) -> str:
+    return f"{iso_time(first_ns)} to {iso_time(last_ns)}"
+
+
+@log_app.command()
+def cat(
+    log: LogArgument,
+    from_: Annotated[str, typer.Option("--from", metavar="W", help="Where to start.")] = "0",
+    to: Annotated[str, typer.Option("--to", metavar="W", help="Where to stop.")] = "end",
+    key: Annotated[
+        list[str] | None, typer.Option(metavar="K", help="Only this key; may be given again.")
+    ] = None,
+    json_: JsonOption = False,
+) -> None:
+    """The events of a log, in order, one a line.
+
+    W is an offset, an ISO time, RUN:KEYFRAME or end. Offsets go from --from to before --to; a
+    keyframe or a time is included at either end.
+    """
+    with LogReader(log) as reader:
+        start, end = resolve_start(reader, from_), resolve(reader, to)
+        if start > end:
+            raise MisuseError(f"--from {from_} is offset {start}, behind --to {to}, which is {end}")
+        events = reader.read(start, end, keys=key or None)
+        if json_:
+            emit_lines(map(event_document, events))
+        else:
+            sys.stdout.writelines(f"{event_line(event)}\n" for event in events)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the `log` group to ``app``."""
+    app.add_typer(log_app, name="log")

@@ -1,0 +1,85 @@
+"""`mapfold import` and `mapfold log` as a person runs them."""
+
+import gzip
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.commands import Commands
+from tests.envelopes import envelope, payload
+from tests.fixtures_log import read_log
+
+PAYLOADS = [payload(envelope(i)) for i in range(1, 6)]
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Commands:
+    """Commands in an empty folder."""
+    return Commands.in_folder(tmp_path)
+
+
+def payloads_of(run: Commands, log: str) -> list[bytes]:
+    return [event.payload for event in read_log(run.folder / log)]
+
+
+def test_plain_gzip_and_standard_input_give_the_same_log(run: Commands) -> None:
+    lines = b"\n".join(PAYLOADS) + b"\r\n\n"
+    (run.folder / "plain.jsonl").write_bytes(lines)
+    (run.folder / "packed").write_bytes(gzip.compress(lines))
+    run("import", "a", "plain.jsonl")
+    run("import", "b", "packed")
+    run("import", "c", "-", stdin=lines)
+    run("import", "d", "-", stdin=gzip.compress(lines))
+    for name in "abcd":
+        assert payloads_of(run, name) == PAYLOADS
+
+
+def test_a_log_and_its_segments_import_into_the_same_events(run: Commands) -> None:
+    said = run("import", "a", "-", stdin=b"\n".join([*PAYLOADS, b"junk"]), code=3)
+    assert said.err.strip().endswith("`mapfold log cat a --key mapfold/rejected` shows them")
+    run("import", "b", "a")
+    run("import", "c", "a/00000000000000000000.mcap")
+    assert read_log(run.folder / "a") == read_log(run.folder / "b") == read_log(run.folder / "c")
+
+
+def test_import_says_what_it_did(run: Commands) -> None:
+    report = run("import", "a", "-", "--json", stdin=b"\n".join([*PAYLOADS, b"junk"]), code=3).json
+    assert report == {
+        "log": "a",
+        "accepted": 5,
+        "rejected": 1,
+        "system": 0,
+        "skipped": 0,
+        "first_offset": 0,
+        "next_offset": 6,
+    }
+
+
+def test_torn_gzip_keeps_what_came_before(run: Commands) -> None:
+    whole = gzip.compress(b"\n".join(PAYLOADS * 2000) + b"\n")
+    (run.folder / "torn.gz").write_bytes(whole[: len(whole) // 2])
+    said = run("import", "a", "torn.gz", code=1)
+    assert "torn.gz" in said.err
+    assert 0 < len(payloads_of(run, "a")) < 10_000
+
+
+def test_nothing_is_made_when_a_file_is_missing(run: Commands) -> None:
+    run("import", "a", "missing.jsonl", code=2)
+    assert not (run.folder / "a").exists()
+
+
+def test_info_and_cat(run: Commands) -> None:
+    run("import", "a", "-", "--key", "k", stdin=b"\n".join(PAYLOADS))
+    info = run("log", "info", "a", "--json").json
+    assert (info["events"], info["keys"], info["rejected"]) == (5, {"k": 5}, 0)
+    assert "k: 5" in run("log", "info", "a").out
+    shown = run("log", "cat", "a", "--json", "--from", "run-a:2", "--to", "run-a:3").lines
+    assert [(e["offset"], e["payload"]) for e in shown] == [
+        (1, json.loads(PAYLOADS[1])),
+        (2, json.loads(PAYLOADS[2])),
+    ]
+    assert set(shown[0]) == {"offset", "logged_ns", "stamp_ns", "key", "payload"}
+    assert len(run("log", "cat", "a", "--from", "3").out.splitlines()) == 2
+    assert run("log", "cat", "a", "--key", "absent").out == ""
+    assert "behind" in run("log", "cat", "a", "--from", "3", "--to", "1", code=2).err
