@@ -1,0 +1,134 @@
+"""After every keyframe the places are what batch DBSCAN and the rules, word by word, say."""
+
+import math
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from projections.deltas import Pose
+from projections.reducers._crowd import Crowd
+from projections.reducers._ruled_crowd import Neighbourhood, RuledCrowd
+from projections.reducers.places import NOISE, Places
+from tests.folds import NaivePlaces, batch_dbscan, near_matrix
+
+Point = tuple[int, int, float]
+EPS_UM = 1_500_000
+
+
+def _lattice(step_um: int, reach: int) -> st.SearchStrategy[Point]:
+    """Points on a lattice, so that many are at exactly the same distance, or at the same spot."""
+    index = st.integers(-reach, reach)
+    return st.builds(lambda i, j: (i * step_um, j * step_um, 0.0), index, index)
+
+
+LISTS = st.one_of(
+    st.lists(_lattice(EPS_UM, 3), max_size=25),  # neighbours exactly at ε
+    st.lists(_lattice(EPS_UM // 2, 5), max_size=40),
+    st.lists(_lattice(EPS_UM // 5, 12), max_size=40),
+    st.lists(st.builds(lambda i: (i * EPS_UM, 0, 0.0), st.integers(0, 25)), max_size=25),
+    st.lists(
+        st.builds(lambda x, y: (x, y, 0.0), *[st.integers(-5_000_000, 5_000_000)] * 2), max_size=40
+    ),
+)
+
+
+@st.composite
+def walks(draw: st.DrawFn) -> list[Point]:
+    """A robot's way: steps of up to a metre, with turns."""
+    steps = draw(st.lists(st.tuples(st.integers(0, 1_000_000), st.integers(0, 11)), max_size=45))
+    x = y = 0
+    points = []
+    for length, heading in steps:
+        yaw = heading * math.pi / 6
+        x += round(length * math.cos(yaw))
+        y += round(length * math.sin(yaw))
+        points.append((x, y, yaw))
+    return points
+
+
+POINTS = st.one_of(LISTS, walks())
+
+
+def check_every_prefix(places: Places, points: list[Point], matrix: np.ndarray, least: int) -> None:
+    naive = NaivePlaces(least)
+    for n, (x, y, yaw) in enumerate(points, start=1):
+        places.fold(n - 1, n - 1, 0, "r", x, y, yaw)
+        are_near = matrix[:n, :n]
+        labels, cores = batch_dbscan(are_near, least)
+        ours = [places.label(i) for i in range(n)]
+        assert {i for i in range(n) if places.crowd.is_core(i)} == cores
+        assert {i for i in range(n) if ours[i] == NOISE} == set(np.flatnonzero(labels == -1))
+        assert len({(ours[i], labels[i]) for i in cores}) == len({ours[i] for i in cores})
+        assert len({ours[i] for i in cores}) == len({labels[i] for i in cores})
+        naive.add(are_near)
+        assert ours == [NOISE if label is None else label for label in naive.labels]
+        members = [label for label in ours if label != NOISE]
+        assert all(places.member_counts[label] == members.count(label) for label in set(members))
+
+
+@given(points=POINTS, least=st.integers(1, 9))
+def test_plain_distance_equals_batch_dbscan(points: list[Point], least: int) -> None:
+    def is_near(i: int, j: int) -> bool:
+        (ax, ay, _), (bx, by, _) = points[i], points[j]
+        return (ax - bx) ** 2 + (ay - by) ** 2 <= EPS_UM**2
+
+    places = Places(Crowd(EPS_UM, least))
+    check_every_prefix(places, points, near_matrix(len(points), is_near), least)
+
+
+@given(points=POINTS, least=st.integers(1, 5), eps=st.integers(0, 4))
+def test_the_smallest_epsilons_too(points: list[Point], least: int, eps: int) -> None:
+    small = [(x // 500_000, y // 500_000, yaw) for x, y, yaw in points]
+
+    def is_near(i: int, j: int) -> bool:
+        return (small[i][0] - small[j][0]) ** 2 + (small[i][1] - small[j][1]) ** 2 <= eps**2
+
+    places = Places(Crowd(eps, least))
+    check_every_prefix(places, small, near_matrix(len(small), is_near), least)
+
+
+def _alike(a: Pose, b: Pose) -> bool:
+    """Near, and looking the same way within a right angle."""
+    near = (a.x_um - b.x_um) ** 2 + (a.y_um - b.y_um) ** 2 <= EPS_UM**2
+    return near and math.cos(a.yaw_rad - b.yaw_rad) > 0.01
+
+
+def _wall(a: Pose, b: Pose) -> bool:
+    """Near, and on the same side of a wall along x = 0."""
+    near = max(abs(a.x_um - b.x_um), abs(a.y_um - b.y_um)) <= EPS_UM
+    return near and (a.x_um < 0) == (b.x_um < 0)
+
+
+@given(points=POINTS, least=st.integers(1, 6), rule=st.sampled_from([_alike, _wall]))
+def test_any_symmetric_predicate_equals_batch_dbscan(points, least, rule) -> None:
+    poses = [Pose(*point) for point in points]
+    matrix = near_matrix(len(points), lambda i, j: rule(poses[i], poses[j]))
+    places = Places(RuledCrowd(Neighbourhood(EPS_UM, rule), least))
+    check_every_prefix(places, points, matrix, least)
+
+
+@given(points=POINTS, least=st.integers(1, 6))
+def test_both_crowds_tell_the_same_story(points: list[Point], least: int) -> None:
+    """Plain distance as a predicate gives the same deltas, but for which pair a merge names."""
+
+    def holds(a: Pose, b: Pose) -> bool:
+        return (a.x_um - b.x_um) ** 2 + (a.y_um - b.y_um) ** 2 <= EPS_UM**2
+
+    plain = Places(Crowd(EPS_UM, least))
+    ruled = Places(RuledCrowd(Neighbourhood(EPS_UM, holds), least))
+    for n, (x, y, yaw) in enumerate(points):
+        one = plain.fold(n, n, 0, "r", x, y, yaw)
+        other = ruled.fold(n, n, 0, "r", x, y, yaw)
+        assert [_without_links(d) for d in one] == [_without_links(d) for d in other]
+        for delta in one:
+            for link in getattr(delta, "links", ()):
+                assert plain.crowd.is_core(link.core)
+                assert plain.crowd.is_core(link.neighbour)
+                assert link.distance_um <= EPS_UM
+
+
+def _without_links(delta):
+    if not hasattr(delta, "links"):
+        return delta
+    return delta.offset, delta.survivor, delta.absorbed, delta.bridge, delta.absorbed_counts
