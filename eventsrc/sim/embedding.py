@@ -21,16 +21,16 @@ from .chance import Vector, direction, normals, stream, unit
 
 DIM = 512
 MODEL_NAME = "mapfold-simulated-512"
-_CLASS_SPACE = 56
+_CLASS_SPACE = 80
 
 _SHARES = {
     "common": 0.512,
-    "class": 0.160,
+    "class": 0.163,
     "model": 0.080,
-    "instance": 0.098,
+    "instance": 0.090,
     "side": 0.045,
-    "session": 0.020,
-    "noise": 0.085,
+    "session": 0.033,
+    "noise": 0.084,
 }
 _WEIGHTS = {part: math.sqrt(share) for part, share in _SHARES.items()}
 

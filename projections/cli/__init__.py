@@ -5,7 +5,7 @@ import typer
 from eventsrc import cli as log_commands
 from eventsrc.cli._shell import run_app
 
-from . import db, state
+from . import db, draw, state
 
 app = typer.Typer(
     name="mapfold",
@@ -19,6 +19,7 @@ app = typer.Typer(
 log_commands.register(app)
 db.register(app)
 state.register(app)
+draw.register(app)
 
 
 def main() -> None:

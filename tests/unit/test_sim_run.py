@@ -15,7 +15,7 @@ from eventsrc.sim import SimulatedRun, simulate_run
 from eventsrc.sim.embedding import DIM
 from eventsrc.sim.publish import truth_path, write_run
 
-WITNESS_SHA256 = "0359c0a93df37198f2c81cd7670f32a4de4f213e545bed360a077ef981e286a8"
+WITNESS_SHA256 = "45a5c268d921134a54a40c306e465d118652dad8097208828ca489accafd0ef0"
 """Of run a of house 7, its payloads joined by line ends. It moves only when the simulator does."""
 
 

@@ -1,0 +1,67 @@
+"""`mapfold draw`: a picture of the map folded to a point in the log."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from eventsrc.cli._shell import say
+from eventsrc.log import LogReader
+from eventsrc.log.whence import resolve
+from projections.cli._options import SetOption, SettingsOption, settings_from
+from projections.folding import fold_events
+from projections.reducers.semantic_map import SemanticMap
+from projections.view import MapView
+
+
+def draw(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="The log's folder.")],
+    at: Annotated[
+        str,
+        typer.Option(
+            "--at",
+            metavar="W",
+            help="Fold to here: number of events, ISO time, RUN:KEYFRAME (inclusive) or end.",
+        ),
+    ] = "end",
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="The picture; its suffix says how: png, svg, pdf.")
+    ] = Path("map.png"),
+    house: Annotated[
+        int | None,
+        typer.Option(metavar="SEED", help="Draw the plan of this simulated house under it.", min=0),
+    ] = None,
+    min_observations: Annotated[
+        int, typer.Option(metavar="N", help="Leave out objects seen less often.", min=1)
+    ] = 2,
+    merges: Annotated[
+        bool, typer.Option("--merges", help="Mark the keyframes that made places one.")
+    ] = False,
+    set_: SetOption = None,
+    settings_file: SettingsOption = None,
+) -> None:
+    """Draw the map: drive, places in their own colours, objects, which place is next to which."""
+    # Here and not above: matplotlib takes longer to import than most commands take to run.
+    from eventsrc.sim import build_house
+    from projections.drawing import draw_map, floor_of
+    from projections.drawing.merges import bridges_of, fold_with_merges
+
+    settings = settings_from(settings_file, set_)
+    view = MapView(settings, keep_embeddings=False)
+    with LogReader(log) as reader:
+        events = reader.read(0, resolve(reader, at))
+        merged = fold_with_merges(fold_events(events, SemanticMap(settings)), view)
+    draw_map(
+        view,
+        out,
+        title=f"{log.name} after {view.next_offset} events",
+        floor=None if house is None else floor_of(build_house(house)),
+        bridges=bridges_of(view, merged) if merges else (),
+        min_observations=min_observations,
+    )
+    say(f"wrote {out}: {len(view.places)} places, {len(view.objects)} objects")
+
+
+def register(app: typer.Typer) -> None:
+    """Add `draw` to ``app``."""
+    app.command()(draw)

@@ -1,0 +1,10 @@
+"""A picture of a map: rooms, drive, places, objects, which place is next to which.
+
+The only package that imports matplotlib, and by its objects alone: no pyplot, no global state.
+"""
+
+from .picture import draw_map
+from .scene import Bridge, Floor, LostRobot, Spot
+from .simulated import floor_of
+
+__all__ = ["Bridge", "Floor", "LostRobot", "Spot", "draw_map", "floor_of"]

@@ -1,0 +1,87 @@
+"""The sheet a map is drawn on: axes in metres, and the boxes that text already takes."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+
+from eventsrc.errors import MisuseError
+from projections.view import MapView
+
+from .labels import Extent
+from .scene import Floor, drives
+
+HALO = [withStroke(linewidth=2.2, foreground="white")]
+SUFFIXES = (".png", ".svg", ".pdf")
+
+_MARGIN_M = 0.35
+_WIDTH_IN = 13.0
+_HEAD_IN, _FOOT_IN = 0.7, 0.5
+_DPI = 120
+
+Bounds = tuple[float, float, float, float]
+
+
+@dataclass
+class Canvas:
+    """``bounds`` are x0, y0, x1, y1 of the drawn area; ``unit`` is the metres in a point."""
+
+    figure: Figure
+    axes: Axes
+    bounds: Bounds
+    unit: float
+    taken: list[Extent] = field(default_factory=list)
+
+    def head(self, line: int, text: str, size: float, colour: str, weight: str = "normal") -> None:
+        """A line of text above the map; lines are numbered from the top."""
+        height = self.figure.get_figheight()
+        y = 1 - (0.27 + 0.27 * line) / height
+        self.figure.text(0.02, y, text, fontsize=size, color=colour, weight=weight, va="center")
+
+    def foot(self, line: int, text: str, colour: str) -> None:
+        """A line of text below the map; lines are numbered from the top."""
+        y = (_FOOT_IN - 0.12 - 0.2 * line) / self.figure.get_figheight()
+        self.figure.text(0.02, y, text, fontsize=8.5, color=colour, va="center")
+
+    def save(self, out: Path) -> None:
+        """Write the picture; the same picture gives the same bytes."""
+        # What would differ from time to time: PDF's and SVG's date, SVG's ids salted by chance.
+        undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
+        try:
+            out.parent.mkdir(parents=True, exist_ok=True)
+            with rc_context({"svg.hashsalt": "mapfold", "svg.fonttype": "none"}):
+                self.figure.savefig(out, dpi=_DPI, metadata=undated.get(out.suffix.lower()))
+        except OSError as error:
+            raise MisuseError(
+                f"{out}: cannot be written: {error.strerror}; choose another"
+            ) from None
+
+
+def new_canvas(view: MapView, floor: Floor) -> Canvas:
+    """An empty sheet that fits every pose of ``view`` and every wall of ``floor``."""
+    x0, y0, x1, y1 = bounds = _bounds(view, floor)
+    height = _WIDTH_IN * (y1 - y0) / (x1 - x0) + _HEAD_IN + _FOOT_IN
+    figure = Figure(figsize=(_WIDTH_IN, height), facecolor="white")
+    axes = figure.add_axes((0.0, _FOOT_IN / height, 1.0, 1 - (_HEAD_IN + _FOOT_IN) / height))
+    axes.set_xlim(x0, x1)
+    axes.set_ylim(y0, y1)
+    axes.set_aspect("equal")
+    axes.set_axis_off()
+    return Canvas(figure, axes, bounds, (x1 - x0) / (_WIDTH_IN * 72))
+
+
+def _bounds(view: MapView, floor: Floor) -> Bounds:
+    spots = [spot for _, drive in drives(view) for spot in drive]
+    spots += [end for x0, y0, x1, y1 in floor.walls for end in ((x0, y0), (x1, y1))]
+    if not spots:
+        return (-2.0, -1.0, 2.0, 1.0)
+    xs, ys = [x for x, _ in spots], [y for _, y in spots]
+    x0, y0, x1, y1 = min(xs), min(ys), max(xs), max(ys)
+    # A drive along a line still gets a sheet, at least a third as high as wide and the reverse.
+    wide, high = max(x1 - x0, (y1 - y0) / 2, 1.0), max(y1 - y0, (x1 - x0) / 3, 1.0)
+    x, y = (x0 + x1) / 2, (y0 + y1) / 2
+    dx, dy = wide / 2 + _MARGIN_M, high / 2 + _MARGIN_M
+    return (x - dx, y - dy, x + dx, y + dy)

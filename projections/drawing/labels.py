@@ -1,0 +1,86 @@
+"""Where to put labels so that they do not cover each other. No drawing here.
+
+Greedy: the most important label first. Each tries spots on rings around its anchor, nearest ring
+first, and takes the first box that hits nothing taken before. A label that finds none within the
+rings is left out, and the caller says how many were.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+_ANGLES = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Extent:
+    """An upright box given by its middle and half sides."""
+
+    x: float
+    y: float
+    half_width: float
+    half_height: float
+
+    def hits(self, other: "Extent") -> bool:
+        """Whether the two boxes overlap."""
+        return (
+            abs(self.x - other.x) < self.half_width + other.half_width
+            and abs(self.y - other.y) < self.half_height + other.half_height
+        )
+
+    def inside(self, bounds: tuple[float, float, float, float]) -> bool:
+        """Whether the box lies within x0, y0, x1, y1."""
+        x0, y0, x1, y1 = bounds
+        return (
+            self.x - self.half_width >= x0
+            and self.x + self.half_width <= x1
+            and self.y - self.half_height >= y0
+            and self.y + self.half_height <= y1
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """A label of this size that belongs to an anchor."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+
+
+def place_labels(
+    wanted: Sequence[Wanted],
+    taken: Iterable[Extent],
+    bounds: tuple[float, float, float, float],
+    rings: Sequence[float],
+) -> list[Extent | None]:
+    """For each wanted label its box, or None where there was no room; runs parallel to ``wanted``.
+
+    ``rings`` are distances from the anchor to the box's nearest edge, ascending.
+    """
+    boxes = list(taken)
+    placed: list[Extent | None] = []
+    for label in wanted:
+        found = next(
+            (
+                box
+                for box in _candidates(label, rings)
+                if box.inside(bounds) and not any(box.hits(other) for other in boxes)
+            ),
+            None,
+        )
+        if found is not None:
+            boxes.append(found)
+        placed.append(found)
+    return placed
+
+
+def _candidates(label: Wanted, rings: Sequence[float]) -> Iterable[Extent]:
+    half_width, half_height = label.width / 2, label.height / 2
+    for ring in rings:
+        for step in range(_ANGLES):
+            angle = math.tau * step / _ANGLES
+            x = label.x + (ring + half_width) * math.cos(angle)
+            y = label.y + (ring + half_height) * math.sin(angle)
+            yield Extent(x, y, half_width, half_height)

@@ -1,0 +1,163 @@
+"""The upper layers: adjacency, names, objects, merges, the lost robot.
+
+Whatever carries text claims its box on the canvas, so that later and less important text keeps
+clear of it.
+"""
+
+import math
+from collections.abc import Sequence
+
+from matplotlib.patches import Circle
+
+from projections.view import MapView
+
+from . import palette
+from .canvas import HALO, Canvas
+from .labels import Extent, Wanted, place_labels
+from .scene import Bridge, Floor, LostRobot, Spot, object_groups
+
+_LABEL_PT = 8.0
+_RINGS_M = tuple(0.07 * 1.28**step for step in range(15))
+
+
+def draw_adjacency(canvas: Canvas, view: MapView) -> None:
+    """A dashed line between neighbouring places and the number of transitions on it."""
+    for a, b, count in view.edges():
+        one, other = view.places[a], view.places[b]
+        start, end = (one.centroid_x, one.centroid_y), (other.centroid_x, other.centroid_y)
+        line = {"arrowstyle": "-", "color": palette.INK, "lw": 1.2, "ls": (0, (4, 3))}
+        canvas.axes.annotate("", end, start, zorder=8, arrowprops=line)
+        middle = (start[0] + end[0]) / 2, (start[1] + end[1]) / 2
+        _badge(
+            canvas, middle, str(count), 7.5, ("white", palette.INK, palette.INK), "round,pad=0.2"
+        )
+
+
+def draw_place_names(canvas: Canvas, view: MapView) -> None:
+    """Each place's short name on its centroid; the run is in front of it only if there are more."""
+    short = len(view.runs) == 1
+    for ordinal, place in view.places.items():
+        name = place.place_id.rpartition("_")[2] if short else place.place_id
+        centroid = place.centroid_x, place.centroid_y
+        colours = palette.place_colour(ordinal), "white", "white"
+        _badge(canvas, centroid, name, 10, colours, "round,pad=0.3,rounding_size=0.9")
+
+
+def draw_room_names(canvas: Canvas, floor: Floor) -> None:
+    """In the first corner of the room that is free."""
+    height = 12 * canvas.unit
+    for name, (x0, y0, x1, y1) in floor.rooms:
+        width = 5.6 * len(name) * canvas.unit
+        dx, dy = width / 2 + 0.14, height / 2 + 0.1
+        corners = ((x0 + dx, y1 - dy), (x1 - dx, y1 - dy), (x0 + dx, y0 + dy), (x1 - dx, y0 + dy))
+        boxes = [Extent(x, y, width / 2, height / 2) for x, y in corners]
+        free = [box for box in boxes if not any(box.hits(taken) for taken in canvas.taken)]
+        _write(canvas, (free or boxes)[0], name, 9.5, palette.ROOM_NAME, style="italic")
+
+
+def draw_objects(canvas: Canvas, view: MapView, min_observations: int) -> int:
+    """A dot for each object, a label for each group; returns how many labels found no room."""
+    groups = object_groups(view, min_observations)
+    for group in groups:
+        colour = palette.INK if group.place is None else palette.place_colour(group.place)
+        xs, ys = [m.mean_x for m in group.members], [m.mean_y for m in group.members]
+        canvas.axes.scatter(
+            xs, ys, s=15, marker="D", facecolor=colour, edgecolor="white", lw=0.6, zorder=10
+        )
+        canvas.taken += (Extent(x, y, 0.04, 0.04) for x, y in zip(xs, ys, strict=True))
+    wanted = [_wanted(canvas, group.label, group.spot) for group in groups]
+    boxes = place_labels(wanted, canvas.taken, canvas.bounds, _RINGS_M)
+    for group, box in zip(groups, boxes, strict=True):
+        if box is not None:
+            _leader(canvas, group.spot, box)
+            _write(canvas, box, group.label, _LABEL_PT, palette.INK)
+    return sum(box is None for box in boxes)
+
+
+def draw_bridges(canvas: Canvas, bridges: Sequence[Bridge]) -> None:
+    """A ring around each keyframe that made places one, and what it did."""
+    for bridge in bridges:
+        canvas.axes.scatter(
+            [bridge.x], [bridge.y], s=110, marker="o", facecolor="none", edgecolor=palette.BRIDGE,
+            lw=1.8, zorder=13,
+        )  # fmt: skip
+        canvas.taken.append(Extent(bridge.x, bridge.y, 0.12, 0.12))
+    wanted = [_wanted(canvas, bridge.text, (bridge.x, bridge.y)) for bridge in bridges]
+    boxes = place_labels(wanted, canvas.taken, canvas.bounds, _RINGS_M)
+    for bridge, box in zip(bridges, boxes, strict=True):
+        if box is not None:
+            _leader(canvas, (bridge.x, bridge.y), box)
+            _write(canvas, box, bridge.text, _LABEL_PT, palette.BRIDGE, weight="bold")
+
+
+def draw_lost(canvas: Canvas, lost: LostRobot) -> None:
+    """The lost robot's true spot, the estimate with its spread, and the line between them."""
+    truth, estimate = lost.truth, lost.estimate
+    if estimate is not None:
+        if lost.spread_m:
+            circle = Circle((estimate.x, estimate.y), lost.spread_m, alpha=0.12, zorder=12)
+            circle.set_color(palette.ESTIMATE)
+            canvas.axes.add_patch(circle)
+        canvas.axes.plot(
+            (truth.x, estimate.x), (truth.y, estimate.y), color=palette.ESTIMATE, lw=1.6, ls=":",
+            zorder=13,
+        )  # fmt: skip
+        _robot(canvas, estimate, palette.ESTIMATE, "o")
+    _robot(canvas, truth, palette.TRUTH, "X")
+
+
+def _robot(canvas: Canvas, spot: Spot, colour: str, marker: str) -> None:
+    canvas.axes.scatter(
+        [spot.x], [spot.y], s=120, marker=marker, facecolor=colour, edgecolor="white", lw=1.2,
+        zorder=16,
+    )  # fmt: skip
+    if spot.yaw_rad is not None:
+        tip = spot.x + 0.5 * math.cos(spot.yaw_rad), spot.y + 0.5 * math.sin(spot.yaw_rad)
+        arrow = {"arrowstyle": "-|>", "color": colour, "lw": 1.8}
+        canvas.axes.annotate("", tip, (spot.x, spot.y), zorder=15, arrowprops=arrow)
+    canvas.taken.append(Extent(spot.x, spot.y, 0.15, 0.15))
+
+
+def _badge(
+    canvas: Canvas,
+    spot: tuple[float, float],
+    text: str,
+    size: float,
+    colours: tuple[str, str, str],
+    shape: str,
+) -> None:
+    """Text in a box; ``colours`` are the box's fill and edge, and the text's."""
+    fill, edge, ink = colours
+    box = {"boxstyle": shape, "facecolor": fill, "edgecolor": edge, "lw": 0.9}
+    canvas.axes.text(
+        *spot, text, ha="center", va="center", size=size, weight="bold", color=ink, bbox=box,
+        zorder=14,
+    )  # fmt: skip
+    half_width = (0.36 * size * len(text) + 0.45 * size) * canvas.unit
+    canvas.taken.append(Extent(*spot, half_width, 0.9 * size * canvas.unit))
+
+
+def _wanted(canvas: Canvas, text: str, spot: tuple[float, float]) -> Wanted:
+    width = (0.58 * len(text) * _LABEL_PT + 3) * canvas.unit
+    return Wanted(*spot, width, 1.3 * _LABEL_PT * canvas.unit)
+
+
+def _leader(canvas: Canvas, anchor: tuple[float, float], box: Extent) -> None:
+    canvas.axes.plot((anchor[0], box.x), (anchor[1], box.y), color=palette.LEADER, lw=0.5, zorder=9)
+
+
+def _write(
+    canvas: Canvas,
+    box: Extent,
+    text: str,
+    size: float,
+    colour: str,
+    *,
+    style: str = "normal",
+    weight: str = "normal",
+) -> None:
+    canvas.taken.append(box)
+    canvas.axes.text(
+        box.x, box.y, text, ha="center", va="center", size=size, color=colour, style=style,
+        weight=weight, path_effects=HALO, zorder=11,
+    )  # fmt: skip

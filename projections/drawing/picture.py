@@ -1,0 +1,99 @@
+"""The picture: layers from the floor up, important text before text that can move aside.
+
+Objects stand where the fold has them, which is where the *robot* was when it saw them (mean); their
+labels are moved aside to stay legible, a hairline leads back.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from eventsrc.errors import MisuseError
+from projections.view import MapView
+
+from . import palette
+from .canvas import SUFFIXES, Canvas, new_canvas
+from .ground import draw_drives, draw_floor, draw_regions, draw_walls
+from .marks import (
+    draw_adjacency,
+    draw_bridges,
+    draw_lost,
+    draw_objects,
+    draw_place_names,
+    draw_room_names,
+)
+from .scene import Bridge, Floor, LostRobot
+
+LEGEND = (
+    "■ start    ● keyframe, in its place's colour    ◆ object, drawn where the robot saw it from "
+    "(mean)    dashed: neighbouring places and their transitions"
+)
+
+
+def draw_map(
+    view: MapView,
+    out: Path,
+    *,
+    title: str,
+    floor: Floor | None = None,
+    lost: LostRobot | None = None,
+    bridges: Sequence[Bridge] = (),
+    min_observations: int = 2,
+) -> None:
+    """Draw ``view`` to ``out``; its suffix says how (.png, .svg, .pdf).
+
+    Objects seen fewer than ``min_observations`` times are left out. Raises MisuseError when ``out``
+    cannot be written or has another suffix.
+    """
+    if out.suffix.lower() not in SUFFIXES:
+        raise MisuseError(f"{out}: a picture is .png, .svg or .pdf; give --out such a name")
+    compose(view, title, floor or Floor(), lost, bridges, min_observations).save(out)
+
+
+def compose(
+    view: MapView,
+    title: str,
+    floor: Floor,
+    lost: LostRobot | None = None,
+    bridges: Sequence[Bridge] = (),
+    min_observations: int = 2,
+) -> Canvas:
+    """The finished sheet, not yet written anywhere."""
+    canvas = new_canvas(view, floor)
+    draw_floor(canvas, floor)
+    draw_regions(canvas, view)
+    draw_drives(canvas, view)
+    draw_walls(canvas, floor)
+    draw_adjacency(canvas, view)
+    draw_place_names(canvas, view)
+    if lost is not None:
+        draw_lost(canvas, lost)
+    draw_room_names(canvas, floor)
+    draw_bridges(canvas, bridges)
+    left_out = draw_objects(canvas, view, min_observations)
+    canvas.head(0, title, 14, palette.INK, "bold")
+    canvas.head(1, _numbers(view, min_observations), 9.5, palette.SMALL_PRINT)
+    for line, text in enumerate(_legend(lost, bridges, left_out)):
+        canvas.foot(line, text, palette.SMALL_PRINT)
+    return canvas
+
+
+def _numbers(view: MapView, min_observations: int) -> str:
+    counts, settings = view.counts(), view.settings
+    shown = sum(found.obs_count >= min_observations for found in view.objects)
+    return (
+        f"{counts['keyframes']} keyframes ({counts['noise']} in no place)  ·  "
+        f"{counts['places']} places  ·  {counts['objects']} objects, {shown} of them shown: seen "
+        f"{min_observations} times or more  ·  ε {settings.eps_m:g} m, "
+        f"min_samples {settings.min_samples}"
+    )
+
+
+def _legend(lost: LostRobot | None, bridges: Sequence[Bridge], left_out: int) -> list[str]:
+    parts = []
+    if bridges:
+        parts.append("○ keyframe that made two places one")
+    if lost is not None:
+        parts.append("✖ lost robot, true spot    ● (red) where the map puts it")
+    if left_out:
+        parts.append(f"{left_out} object labels had no room")
+    return [LEGEND, "    ".join(parts)]

@@ -1,0 +1,115 @@
+"""What a picture shows besides the map itself. All lengths in metres, all angles in radians."""
+
+from collections import defaultdict
+from dataclasses import dataclass
+
+from projections.records import KeyframeRecord, ObjectRecord
+from projections.view import MapView
+
+Line = tuple[float, float, float, float]
+Box = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Floor:
+    """A building's plan: wall lines, furniture boxes, and where to write the rooms' names.
+
+    Lines are x0, y0, x1, y1; boxes are x0, y0, x1, y1 with the lower corner first.
+    """
+
+    walls: tuple[Line, ...] = ()
+    furniture: tuple[Box, ...] = ()
+    rooms: tuple[tuple[str, Box], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Spot:
+    """A position, with a heading where one is known."""
+
+    x: float
+    y: float
+    yaw_rad: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LostRobot:
+    """Where a lost robot is, and where the map thinks it is (None: it did not say)."""
+
+    truth: Spot
+    estimate: Spot | None
+    spread_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Bridge:
+    """The keyframe whose arrival made places one, and a few words about it."""
+
+    x: float
+    y: float
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectGroup:
+    """Objects of one class in one place: one label on the picture, a dot for each."""
+
+    class_name: str
+    place: int | None
+    members: tuple[ObjectRecord, ...]
+
+    @property
+    def seen(self) -> int:
+        """Observations of all of them."""
+        return sum(member.obs_count for member in self.members)
+
+    @property
+    def label(self) -> str:
+        """The class, and how many if more than one."""
+        count = len(self.members)
+        return self.class_name if count == 1 else f"{self.class_name} ×{count}"
+
+    @property
+    def spot(self) -> tuple[float, float]:
+        """The middle of its members."""
+        count = len(self.members)
+        return (
+            sum(member.mean_x for member in self.members) / count,
+            sum(member.mean_y for member in self.members) / count,
+        )
+
+
+def object_groups(view: MapView, min_observations: int) -> list[ObjectGroup]:
+    """The objects seen at least that often, by place and class; most seen first."""
+    grouped: dict[tuple[int | None, str], list[ObjectRecord]] = defaultdict(list)
+    for found in view.objects:
+        if found.obs_count >= min_observations:
+            grouped[found.place, found.class_name].append(found)
+    groups = [ObjectGroup(name, place, tuple(all_)) for (place, name), all_ in grouped.items()]
+    return sorted(groups, key=lambda group: (-group.seen, group.members[0].ordinal))
+
+
+def spot_of(keyframe: KeyframeRecord) -> tuple[float, float] | None:
+    """Where a keyframe was taken, None without a pose."""
+    if keyframe.pose is None:
+        return None
+    return keyframe.pose.x_um / 1e6, keyframe.pose.y_um / 1e6
+
+
+def drives(view: MapView) -> list[tuple[str, list[tuple[float, float]]]]:
+    """Per run its id and its spots, in keyframe_id order."""
+    by_run: dict[int, list[KeyframeRecord]] = defaultdict(list)
+    for keyframe in view.keyframes:
+        by_run[keyframe.run].append(keyframe)
+    result = []
+    for run in view.runs:
+        ordered = sorted(by_run[run.ordinal], key=lambda k: k.keyframe_id)
+        result.append((run.run_id, [s for k in ordered if (s := spot_of(k)) is not None]))
+    return result
+
+
+def place_spots(view: MapView) -> dict[int, list[tuple[float, float]]]:
+    """Per place the spots of its keyframes."""
+    return {
+        ordinal: [s for k in place.members if (s := spot_of(view.keyframes[k])) is not None]
+        for ordinal, place in view.places.items()
+    }

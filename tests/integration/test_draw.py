@@ -1,0 +1,59 @@
+"""`mapfold draw` on a log of a simulated run."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from eventsrc.append import append_payload
+from eventsrc.log import LogWriter
+from eventsrc.sim import simulate_run
+
+_MAPFOLD = "from projections.cli import main; main()"
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("logs") / "drive"
+    with LogWriter(path) as writer:
+        for payload in list(simulate_run(7, "b").payloads)[:120]:
+            append_payload(writer, "tb/detections", payload)
+    return path
+
+
+def _draw(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", _MAPFOLD, "draw", *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_a_picture_of_any_point_with_other_settings(log: Path, tmp_path: Path) -> None:
+    whole, part = tmp_path / "whole.svg", tmp_path / "part.svg"
+    done = _draw(str(log), "--house", "7", "--merges", "--out", str(whole))
+    assert (done.returncode, done.stdout) == (0, "")
+    assert f"wrote {whole}" in done.stderr
+    arguments = ("--at", "40", "--set", "eps_m=0.75", "--set", "min_samples=8")
+    assert _draw(str(log), *arguments, "--out", str(part)).returncode == 0
+    assert "drive after 120 events" in whole.read_text("utf-8")
+    assert "ε 1.5 m, min_samples 3" in whole.read_text("utf-8")
+    assert "drive after 40 events" in part.read_text("utf-8")
+    assert "ε 0.75 m, min_samples 8" in part.read_text("utf-8")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--out", "map.bmp"), "a picture is .png, .svg or .pdf"),
+        (("--set", "epsilon=1"), "no setting 'epsilon'"),
+        (("--at", "nowhere"), "nowhere"),
+    ],
+)
+def test_misuse_is_one_line_and_exit_2(log: Path, arguments: tuple[str, ...], says: str) -> None:
+    done = _draw(str(log), *arguments)
+    assert done.returncode == 2
+    assert says in done.stderr
+    assert "Traceback" not in done.stderr

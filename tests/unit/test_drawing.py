@@ -1,0 +1,156 @@
+"""Map pictures: what stands on them, the same bytes each time, clear refusals."""
+
+import re
+import struct
+from pathlib import Path
+
+import pytest
+
+from eventsrc.errors import MisuseError
+from eventsrc.sim import build_house
+from projections import deltas as d
+from projections.drawing import Bridge, Floor, LostRobot, Spot, draw_map, floor_of
+from projections.drawing.canvas import Canvas
+from projections.drawing.palette import place_colour
+from projections.drawing.picture import compose
+from projections.settings import Settings
+from projections.view import MapView
+
+
+def _two_places() -> MapView:
+    """Ten keyframes along a line; the first five are p0, the last four p1, one between is noise."""
+    view = MapView(Settings())
+    view.apply(d.RunSeen(0, 0, "run", 0.0))
+    for index in range(10):
+        pose = d.Pose(index * 1_000_000, 500_000, 0.0)
+        view.apply(d.KeyframeAdded(index, index, 0, "run", index, float(index), pose))
+    view.apply(d.PlaceFormed(4, 0, "run_p0", 0))
+    view.apply(d.PlaceFormed(9, 1, "run_p1", 6))
+    for index in (0, 1, 2, 3, 4):
+        view.apply(d.KeyframePlaced(index, index, 0))
+    for index in (6, 7, 8, 9):
+        view.apply(d.KeyframePlaced(index, index, 1))
+    view.apply(d.PlaceChanged(4, 0, 5, 10_000_000, 2_500_000))
+    view.apply(d.PlaceChanged(9, 1, 4, 30_000_000, 2_000_000))
+    view.apply(d.PlacesLinked(9, 0, 1, 37))
+    for number, (name, count) in enumerate([("cup & saucer", 2), ("<vase>", 3), ("rare", 1)]):
+        box = (0.0, 0.0, 1.0, 1.0)
+        view.apply(
+            d.ObservationAdded(
+                number, number, 2, "run", 2, f"d{number}", name, 0.9, box, None, None, False
+            )
+        )
+        view.apply(d.ObjectFound(2, number, f"obj-{number}", name, number))
+        view.apply(
+            d.ObjectSeen(2, number, number, 0, count, count * 2_000_000, count * 500_000, 0.0, 0.0)
+        )
+        view.apply(d.ObjectMoved(2, number, 0))
+    view.advance(10)
+    return view
+
+
+def _texts(canvas: Canvas) -> list[str]:
+    return [text.get_text() for text in (*canvas.axes.texts, *canvas.figure.texts)]
+
+
+def test_the_picture_names_places_objects_and_transitions() -> None:
+    texts = _texts(compose(_two_places(), "a title", Floor()))
+    assert {"a title", "p0", "p1", "37", "cup & saucer", "<vase>"} <= set(texts)
+    assert "rare" not in texts  # seen once
+    assert any("2 places  ·  3 objects, 2 of them shown" in text for text in texts)
+
+
+def test_names_of_places_carry_the_run_when_there_are_several() -> None:
+    view = _two_places()
+    view.apply(d.RunSeen(10, 1, "other", 0.0))
+    texts = _texts(compose(view, "", Floor()))
+    assert {"run_p0", "run_p1"} <= set(texts)
+
+
+def test_objects_of_one_class_in_one_place_share_a_label() -> None:
+    view = _two_places()
+    box = (0.0, 0.0, 1.0, 1.0)
+    view.apply(d.ObservationAdded(3, 3, 3, "run", 3, "d3", "<vase>", 0.9, box, None, None, False))
+    view.apply(d.ObjectFound(3, 3, "obj-3", "<vase>", 3))
+    view.apply(d.ObjectSeen(3, 3, 3, 0, 2, 6_000_000, 1_000_000, 0.0, 0.0))
+    view.apply(d.ObjectMoved(3, 3, 0))
+    assert "<vase> ×2" in _texts(compose(view, "", Floor()))
+
+
+def test_the_house_the_lost_robot_and_the_bridge_are_on_it() -> None:
+    house = build_house(7)
+    canvas = compose(
+        _two_places(),
+        "",
+        floor_of(house),
+        LostRobot(Spot(2, 1, 0.3), Spot(3, 1), 0.5),
+        [Bridge(5.0, 0.5, "p0 took in p2")],
+    )
+    texts = _texts(canvas)
+    assert {room.name for room in house.plan.rooms} | {"p0 took in p2"} <= set(texts)
+    assert any("lost robot" in text for text in texts)
+
+
+def test_labels_that_find_no_room_are_counted_on_the_picture() -> None:
+    view = _two_places()
+    for number in range(3, 300):
+        box = (0.0, 0.0, 1.0, 1.0)
+        name = f"a rather long class name {number}"
+        view.apply(
+            d.ObservationAdded(
+                number, number, 0, "run", 0, f"d{number}", name, 0.9, box, None, None, False
+            )
+        )
+        view.apply(d.ObjectFound(2, number, f"obj-{number}", name, number))
+        view.apply(d.ObjectSeen(2, number, number, 0, 2, 4_000_000, 1_000_000, 0.0, 0.0))
+    texts = _texts(compose(view, "", Floor()))
+    drawn = sum(text.startswith("a rather long") for text in texts)
+    assert 0 < drawn < 297
+    assert any(f"{297 - drawn} object labels had no room" in text for text in texts)
+
+
+def test_a_lost_robot_without_an_estimate_is_drawn_too(tmp_path: Path) -> None:
+    lost = LostRobot(Spot(2, 1), None)
+    draw_map(_two_places(), tmp_path / "map.png", title="", lost=lost)
+    assert (tmp_path / "map.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("suffix", ["png", "svg", "pdf"])
+def test_the_same_map_gives_the_same_bytes(tmp_path: Path, suffix: str) -> None:
+    one, two = tmp_path / f"one.{suffix}", tmp_path / "sub" / f"two.{suffix}"
+    draw_map(_two_places(), one, title="t")
+    draw_map(_two_places(), two, title="t")
+    assert one.read_bytes() == two.read_bytes()
+
+
+def test_a_png_is_large_enough_to_read(tmp_path: Path) -> None:
+    out = tmp_path / "map.PNG"
+    draw_map(_two_places(), out, title="t", floor=floor_of(build_house(7)))
+    width, height = struct.unpack(">II", out.read_bytes()[16:24])
+    assert width >= 1200
+    assert height >= 800
+
+
+def test_an_empty_map_is_a_picture_too(tmp_path: Path) -> None:
+    texts = _texts(compose(MapView(Settings()), "nothing yet", Floor()))
+    assert any("0 places" in text for text in texts)
+    draw_map(MapView(Settings()), tmp_path / "map.png", title="nothing yet")
+    assert (tmp_path / "map.png").stat().st_size > 1_000
+
+
+@pytest.mark.parametrize("name", ["map.jpg", "map", "map.txt"])
+def test_another_suffix_is_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(MisuseError, match=r"a picture is \.png, \.svg or \.pdf"):
+        draw_map(MapView(Settings()), tmp_path / name, title="")
+
+
+def test_an_unwritable_place_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(MisuseError, match="cannot be written"):
+        draw_map(MapView(Settings()), tmp_path / "file" / "map.png", title="")
+
+
+def test_places_get_colours_of_their_own() -> None:
+    colours = [place_colour(index) for index in range(60)]
+    assert len(set(colours)) == 60
+    assert all(re.fullmatch("#[0-9a-f]{6}", colour) for colour in colours)
