@@ -3,6 +3,7 @@
 MapfoldError
 ├── SettingsError               2  a setting's name or value is wrong
 ├── WhenceError                 2  a point in the log does not exist
+├── QuestionError               2  a question about the map cannot be asked as it is
 ├── FoldError                   1  an event cannot be folded; names its offset
 └── DatabaseError               1  a database cannot be used as asked
     ├── DatabaseUnavailable     1  no server answers, or it refused us
@@ -25,6 +26,12 @@ class SettingsError(MapfoldError):
 
 class WhenceError(MapfoldError):
     """A point in the log does not exist."""
+
+    exit_code = 2
+
+
+class QuestionError(MapfoldError):
+    """A question about the map cannot be asked as it is."""
 
     exit_code = 2
 

@@ -1,0 +1,74 @@
+"""The camera behind the boxes: a pinhole that looks straight ahead of the robot.
+
+A box's centre gives a bearing, its height a relative depth: the height in pixels times the depth in
+metres is the same for one thing from wherever it is seen (its *size*, in pixel metres). A box that
+touches the picture's edge is cut off there, so what it says is worth less.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eventsrc.errors import MisuseError
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+_MIN_HEIGHT_PX = 4.0
+_EDGE_PX = 1.0
+_UNKNOWN_HEIGHT_PX = 100.0
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """Picture size in pixels and horizontal field of view in degrees."""
+
+    width_px: float = 640.0
+    height_px: float = 400.0
+    hfov_deg: float = 69.4
+
+    def __post_init__(self) -> None:
+        if not (self.width_px > 0 and self.height_px > 0 and 1.0 <= self.hfov_deg <= 170.0):
+            raise MisuseError(
+                f"a camera of {self.width_px} × {self.height_px} pixels and {self.hfov_deg}° is"
+                " none; give positive sizes and a horizontal field of view of 1 to 170 degrees"
+            )
+
+    @property
+    def focal_px(self) -> float:
+        """The focal length in pixels."""
+        return self.width_px / 2.0 / math.tan(math.radians(self.hfov_deg) / 2.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Views:
+    """What n boxes say. ``slope`` is the tangent of the bearing, left positive; heights are pixels.
+
+    ``cut_x`` and ``cut_y`` tell which boxes touch the picture's edge at a side, at top or bottom.
+    ``known`` is False where there is no box.
+    """
+
+    slope: Floats
+    height_px: Floats
+    cut_x: Flags
+    cut_y: Flags
+    known: Flags
+
+
+def views(camera: Camera, boxes: Sequence[tuple[float, float, float, float] | None]) -> Views:
+    """Read boxes (x_min, y_min, x_max, y_max in pixels); None or an empty box is unknown."""
+    rows = np.array(
+        [(0.0, 0.0, 0.0, 0.0) if box is None else box for box in boxes], dtype=np.float64
+    ).reshape(-1, 4)
+    x0, y0, x1, y1 = rows.T
+    known = (x1 > x0) & (y1 > y0)
+    slope = (camera.width_px / 2.0 - (x0 + x1) / 2.0) / camera.focal_px
+    return Views(
+        slope=np.where(known, slope, 0.0),
+        height_px=np.where(known, np.maximum(y1 - y0, _MIN_HEIGHT_PX), _UNKNOWN_HEIGHT_PX),
+        cut_x=(x0 <= _EDGE_PX) | (x1 >= camera.width_px - _EDGE_PX),
+        cut_y=(y0 <= _EDGE_PX) | (y1 >= camera.height_px - _EDGE_PX),
+        known=known,
+    )

@@ -1,0 +1,144 @@
+"""From matches to landmarks: where do the things stand that look like this crop?
+
+Matches of one crop show one thing or look-alikes of it, so they share one size (pixel metres, see
+`camera`), and with a size every observation alone gives a point: bearing and depth from its pose.
+The right size is the one under which observations from different poses agree on points; it is
+searched on a grid. Points within reach of each other are one landmark. Neither wrong fusions nor
+split Objects matter here, because only observations are looked at.
+
+Each landmark carries a table: how well its members' similarities fit, for a robot that looks at it
+from each direction (`_evidence`). From the side that was seen before a crop must be more similar
+than from behind; a look-alike fits a little worse from everywhere.
+
+No BLAS and no order but the candidates': the same candidates give the same landmarks.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .camera import Floats, Views
+from .model import Model
+
+DIRECTIONS: Final = 36
+"""Directions in a landmark's table, 10° apart."""
+MAX_LANDMARKS: Final = 8
+_DEPTHS: Final = np.exp(np.linspace(np.log(0.5), np.log(6.5), 28))
+_AGREE_M: Final = 0.3
+_CLUSTER_M: Final = 0.35
+_REACH_M: Final = 0.8
+_CUT_WEIGHT: Final = 0.2
+
+Indices = NDArray[np.intp]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Landmark:
+    """A thing that may be the crop. ``members`` index the crop's posed matches."""
+
+    x: float
+    y: float
+    members: Indices
+    table: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Landmarks:
+    """The landmarks of one crop, best first, and the size (pixel metres) they share."""
+
+    items: tuple[Landmark, ...]
+    size: float
+
+
+def find_landmarks(poses: Floats, views: Views, similarity: Floats, model: Model) -> Landmarks:
+    """``poses`` of shape (n, 3) in metres and radians, ``similarity`` of shape (n,); n ≥ 1."""
+    weight = np.clip((similarity - model.relevant) / 0.05, 0.1, 1.0)
+    weight = np.where(views.cut_x | views.cut_y | ~views.known, _CUT_WEIGHT * weight, weight)
+    rays, median_px = _rays(poses, views)
+    depth = _common_depth(poses, rays, weight, model)
+    points = poses[:, :2] + depth * rays
+    found = []
+    for x, y, members in _clusters(points, weight):
+        table = _evidence(poses[members], x, y, similarity[members], model)
+        found.append(Landmark(x, y, members, table))
+    found.sort(key=lambda landmark: (-float(landmark.table.max()), int(landmark.members[0])))
+    return Landmarks(tuple(found[:MAX_LANDMARKS]), depth * median_px)
+
+
+def _rays(poses: Floats, views: Views) -> tuple[Floats, float]:
+    """Per observation the vector to its thing, were the median height at a depth of 1 m."""
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    median_px = float(np.median(views.height_px))
+    relative = median_px / views.height_px
+    ahead = np.stack((cos, sin), axis=1)
+    left = np.stack((-sin, cos), axis=1)
+    return (ahead + views.slope[:, None] * left) * relative[:, None], median_px
+
+
+def _common_depth(poses: Floats, rays: Floats, weight: Floats, model: Model) -> float:
+    """The depth of the median height under which points from different poses agree best."""
+    dp = poses[:, None, :2] - poses[None, :, :2]
+    dr = rays[:, None] - rays[None]
+    pp, pr, rr = (dp * dp).sum(2), (dp * dr).sum(2), (dr * dr).sum(2)
+    apart = np.clip((np.sqrt(pp) - 0.3) / 0.7, 0.0, 1.0) * weight[:, None] * weight[None]
+    upper = np.nonzero(np.triu(apart, 1))  # pairs that can agree by more than chance
+    pp, pr, rr, apart = pp[upper], pr[upper], rr[upper], apart[upper]
+    squared = pp + 2.0 * _DEPTHS[:, None] * pr + (_DEPTHS * _DEPTHS)[:, None] * rr
+    agreed = 2.0 * (apart * np.exp(squared / (-2.0 * _AGREE_M**2))).sum(1)
+    usual = (np.log(_DEPTHS / model.usual_depth) / model.usual_depth_spread) ** 2
+    score = 6.0 * agreed / max(1.0, float(weight.sum())) - 0.5 * usual
+    return _peak(score)
+
+
+def _peak(score: Floats) -> float:
+    """The grid's best depth, refined by the parabola through its neighbours."""
+    best = int(np.argmax(score))
+    if not 0 < best < len(_DEPTHS) - 1:
+        return float(_DEPTHS[best])
+    below, here, above = (float(s) for s in score[best - 1 : best + 2])
+    curvature = below - 2.0 * here + above
+    shift = 0.5 * (below - above) / curvature if curvature < 0 else 0.0
+    return float(_DEPTHS[best] * (_DEPTHS[1] / _DEPTHS[0]) ** shift)
+
+
+def _clusters(points: Floats, weight: Floats) -> list[tuple[float, float, Indices]]:
+    """Points grouped around the densest one, then around the densest of the rest, and so on."""
+    between = _distances(points, points)
+    near = np.exp(between * between / (-2.0 * _CLUSTER_M**2))
+    free = np.ones(len(points), dtype=bool)
+    clusters: list[tuple[float, float, Indices]] = []
+    while free.any() and len(clusters) < 3 * MAX_LANDMARKS:
+        support = (near * (weight * free)).sum(1)
+        centre = int(np.argmax(np.where(free, support, -1.0)))
+        pull = near[centre] * free * (between[centre] < _REACH_M)
+        mean = (points * pull[:, None]).sum(0) / pull.sum()
+        mine = free & (np.hypot(points[:, 0] - mean[0], points[:, 1] - mean[1]) < _REACH_M)
+        mine[centre] = True
+        clusters.append((float(mean[0]), float(mean[1]), np.flatnonzero(mine)))
+        free &= ~mine
+    return clusters
+
+
+def _evidence(poses: Floats, x: float, y: float, similarity: Floats, model: Model) -> Floats:
+    """Log-likelihood (up to a constant) per direction from which the robot looks at the thing."""
+    directions = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS)
+    seen_from = np.arctan2(poses[:, 1] - y, poses[:, 0] - x)
+    apart = np.cos(directions[:, None] - seen_from[None])
+    expected = model.floor + model.side * np.exp(model.kappa * (apart - 1.0))
+    error = similarity[None] - expected
+    mean = error.mean(1)
+    count = min(float(len(similarity)), model.independent)
+    scatter = ((error - mean[:, None]) ** 2).mean(1) * (count / model.sigma_observation**2)
+    offset = mean * mean / (model.sigma_instance**2 + model.sigma_observation**2 / count)
+    offset = np.where(mean > 0, np.minimum(offset, model.too_similar), offset)
+    degrees = min(len(similarity) - 1.0, model.independent)
+    table: Floats = np.minimum(-0.5 * (scatter - 0.5 * degrees + offset), 1.5)
+    return table
+
+
+def _distances(a: Floats, b: Floats) -> Floats:
+    """Euclidean distances, shape (len(a), len(b))."""
+    distances: Floats = np.hypot(a[:, None, 0] - b[None, :, 0], a[:, None, 1] - b[None, :, 1])
+    return distances

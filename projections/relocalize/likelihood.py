@@ -1,0 +1,105 @@
+"""How well a pose explains the crops: a log-likelihood ratio against 'none of this is in the map'.
+
+Crops are independent evidence given the pose, so their logs add. Each crop is explained by its best
+landmark, or by none at a fixed price; that keeps one unknown or wrong crop from vetoing the others.
+For a landmark three things count: the table of similarities at the direction from which the pose
+looks at it, bearing and depth of the box against where the pose would see it, and whether it was
+ever seen from about there (walls are not in the map, but what was seen from where is). Last, the
+robot is where robots have driven.
+"""
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .camera import Floats
+from .landmarks import DIRECTIONS
+from .model import Model
+from .sighting import Sighting
+
+_IMPOSSIBLE: Final = -30.0
+_TURN: Final = 2.0 * np.pi
+
+
+def explain(sightings: Sequence[Sighting], poses: Floats, model: Model) -> tuple[Floats, Floats]:
+    """(totals of shape (h,), shares of shape (crops, h)); the shares leave out the prior."""
+    shares = np.stack([_explain_crop(sighting, poses, model) for sighting in sightings])
+    total: Floats = shares.sum(0) + _driven(sightings, poses, model)
+    return total, shares
+
+
+def _explain_crop(sighting: Sighting, poses: Floats, model: Model) -> Floats:
+    xs = np.array([landmark.x for landmark in sighting.landmarks])[:, None]
+    ys = np.array([landmark.y for landmark in sighting.landmarks])[:, None]
+    dx, dy = poses[None, :, 0] - xs, poses[None, :, 1] - ys
+    reach, looking_from = np.hypot(dx, dy), np.arctan2(dy, dx)
+    fit = _table_lookup(sighting, looking_from)
+    bearing = _wrap(looking_from + np.pi - poses[None, :, 2])
+    if sighting.bearing is None:
+        fit = fit + _in_view(bearing, reach, model)
+    else:
+        fit = fit + _box_fit(sighting, bearing, reach, model)
+    fit = np.maximum(fit + _seen_from(sighting, poses, model), _IMPOSSIBLE)
+    explained: Floats = np.logaddexp(0.0, fit.max(0) + model.unknown_price)
+    return explained
+
+
+def _table_lookup(sighting: Sighting, looking_from: Floats) -> Floats:
+    tables = np.stack([landmark.table for landmark in sighting.landmarks])
+    bins = np.rint(looking_from * (DIRECTIONS / _TURN)).astype(np.intp) % DIRECTIONS
+    values: Floats = np.take_along_axis(tables, bins, axis=1)
+    return values
+
+
+def _box_fit(sighting: Sighting, bearing: Floats, reach: Floats, model: Model) -> Floats:
+    counts = np.array([len(landmark.members) for landmark in sighting.landmarks])[:, None]
+    unsure_m = model.sigma_landmark + model.sigma_landmark_single / counts
+    off = _wrap(bearing - (sighting.bearing or 0.0))
+    width = model.sigma_bearing**2 + (unsure_m / np.maximum(reach, 0.6)) ** 2
+    width = width + (model.sigma_bearing_cut**2 if sighting.cut_x else 0.0)
+    depth = np.maximum(reach * np.maximum(np.cos(bearing), 0.1), 0.1)
+    ratio = np.log(depth / sighting.depth)
+    spread = model.sigma_log_depth**2 + (unsure_m / sighting.depth) ** 2
+    spread = spread + (model.sigma_log_depth_cut**2 if sighting.cut_y else 0.0)
+    fit: Floats = -0.5 * (off * off / width + ratio * ratio / spread)
+    return fit
+
+
+def _in_view(bearing: Floats, reach: Floats, model: Model) -> Floats:
+    outside = np.maximum(np.abs(bearing) - model.half_view, 0.0) / 0.1
+    far = (reach - model.usual_depth) / 1.2
+    fit: Floats = -0.5 * (outside * outside + far * far)
+    return fit
+
+
+def _seen_from(sighting: Sighting, poses: Floats, model: Model) -> Floats:
+    """Distance to the nearest pose that saw the landmark, as a penalty; shape (landmarks, h)."""
+    members = [landmark.members for landmark in sighting.landmarks]
+    seen = sighting.poses[np.concatenate(members)]
+    starts = np.cumsum([0] + [len(m) for m in members[:-1]])
+    squared = np.minimum.reduceat(_squared(seen, poses), starts, axis=0)
+    within = model.seen_from if sighting.bearing is not None else model.seen_from_no_box
+    penalty: Floats = -0.5 * np.minimum(squared / within**2, 6.25)
+    return penalty
+
+
+def _driven(sightings: Sequence[Sighting], poses: Floats, model: Model) -> Floats:
+    been = np.unique(np.concatenate([s.poses for s in sightings])[:, :2], axis=0)
+    squared = _squared(been, poses).min(0) / model.driven**2
+    penalty: Floats = -0.5 * np.minimum(squared, 9.0)
+    return penalty
+
+
+def _squared(points: Floats, poses: Floats) -> Floats:
+    """Squared distances in m², shape (points, h)."""
+    dx = points[:, 0][:, None] - poses[None, :, 0]
+    dy = points[:, 1][:, None] - poses[None, :, 1]
+    squared: Floats = dx * dx + dy * dy
+    return squared
+
+
+def _wrap(angle: Floats) -> Floats:
+    turned: NDArray[np.float64] = np.mod(angle + np.pi, _TURN) - np.pi
+    return turned
