@@ -61,13 +61,13 @@ def quantise_rows(rows: NDArray[np.float32]) -> NDArray[np.int32]:
     dim = rows.shape[1]
     if dim > MAX_DIMENSION:
         raise ValueError(f"an embedding of {dim} dimensions is beyond {MAX_DIMENSION}")
-    wide = rows.astype(np.float64)
-    _, exponents = np.frexp(np.maximum(wide.max(axis=1), -wide.min(axis=1)))
-    scaled = np.rint(np.ldexp(wide, (_component_bits(dim) - exponents)[:, np.newaxis]))
-    squares = np.einsum("ij,ij->i", scaled, scaled)
-    scaled *= float(UNIT)  # exact: a power of two
-    scaled /= np.sqrt(squares)[:, np.newaxis]
-    units: NDArray[np.int32] = np.rint(scaled).astype(np.int32)
+    scaled = rows.astype(np.float64)
+    _, exponents = np.frexp(np.abs(scaled).max(axis=1))
+    scaled *= np.ldexp(1.0, _component_bits(dim) - exponents)[:, np.newaxis]
+    np.rint(scaled, out=scaled)
+    norms = np.sqrt(np.einsum("ij,ij->i", scaled, scaled))
+    scaled *= (UNIT / norms)[:, np.newaxis]
+    units: NDArray[np.int32] = np.rint(scaled, out=scaled).astype(np.int32)
     return units
 
 

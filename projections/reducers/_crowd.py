@@ -13,7 +13,7 @@ core points.
 """
 
 from array import array
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -25,9 +25,24 @@ _FEW = 24  # below, a loop is quicker than four numpy calls
 
 
 class Cell:
-    """A square of the grid. ``core`` is its first core point or -1."""
+    """A square of the grid. ``core`` is its first core point or -1.
 
-    __slots__ = ("column", "core", "cores", "fences", "is_dense", "loose", "near", "points", "row")
+    ``near`` are the existing cells within reach; ``apart`` those of them that are not known to be
+    one cluster with this cell, see `Crowd.unite`.
+    """
+
+    __slots__ = (
+        "apart",
+        "column",
+        "core",
+        "cores",
+        "fences",
+        "is_dense",
+        "loose",
+        "near",
+        "points",
+        "row",
+    )
 
     def __init__(self, column: int, row: int) -> None:
         self.column = column
@@ -38,6 +53,7 @@ class Cell:
         self.core = -1
         self.is_dense = False
         self.near: list[Cell] = []
+        self.apart: list[Cell] = []
         self.fences: list[Fence | None] | None = None
 
 
@@ -84,18 +100,25 @@ class Crowd:
         """True when the two are within ε."""
         return self.distance2(a, b) <= self._eps2
 
-    def cores_around(self, point: int) -> Iterator[tuple[int, Cell | None]]:
-        """For the point's own and each near cell with core points: (its first, the cell).
+    def cores_around(self, point: int) -> list[tuple[int, Cell | None]]:
+        """(a core point, the cell it stands for) for each cell whose cluster may be in reach.
 
         All core points of a cell are one cluster, so the first stands for them. The own cell comes
-        first and as None: there every point is a neighbour. For the others, ask `reach`.
+        first and as None: there every point is a neighbour. For the others, ask `reach`. Cells
+        that `unite` has declared one cluster with the own cell are left out.
         """
         cell = self._cell(self.x[point], self.y[point])
-        if cell.core >= 0:
-            yield cell.core, None
-        for near in cell.near:
-            if near.core >= 0:
-                yield near.core, near
+        around: list[tuple[int, Cell | None]] = [(cell.core, None)] if cell.core >= 0 else []
+        if cell.apart:
+            around += [(near.core, near) for near in cell.apart if near.core >= 0]
+        return around
+
+    def unite(self, point: int, cell: Cell) -> None:
+        """Never mention ``cell`` again around the core point's cell: both are one cluster for good,
+        and whoever finds the one finds the other."""
+        own = self._cell(self.x[point], self.y[point])
+        if cell in own.apart:
+            own.apart.remove(cell)
 
     def reach(self, cell: Cell, point: int) -> int | None:
         """A core point of ``cell`` within ε of a point in another cell, or None."""
@@ -106,14 +129,14 @@ class Crowd:
                 return core
         return None
 
-    def loose_around(self, point: int) -> Iterator[int]:
+    def loose_around(self, point: int) -> list[int]:
         """The points within ε that are not core, without the point itself."""
         cell = self._cell(self.x[point], self.y[point])
-        yield from (other for other in cell.loose if other != point)
+        around = [other for other in cell.loose if other != point]
         for near in cell.near:
-            for other in near.loose:
-                if self.are_neighbours(other, point):
-                    yield other
+            if near.loose:
+                around += [other for other in near.loose if self.are_neighbours(other, point)]
+        return around
 
     def _cell(self, x_um: int, y_um: int) -> Cell:
         key = x_um // self._side, y_um // self._side
@@ -126,7 +149,9 @@ class Crowd:
             near = self._cells.get((column + dx, row + dy))
             if near is not None:
                 cell.near.append(near)
+                cell.apart.append(near)
                 near.near.append(cell)
+                near.apart.append(cell)
         return cell
 
     def _count_near(self, cell: Cell, x_um: int, y_um: int) -> list[int]:

@@ -75,6 +75,9 @@ class RuledCrowd:
         """Never needed here: `cores_around` gives neighbours only."""
         raise NotImplementedError
 
+    def unite(self, point: int, cell: None) -> None:
+        """Nothing to remember here."""
+
     def loose_around(self, point: int) -> Iterator[int]:
         """The point's neighbours that are not core."""
         return (other for other in self._neighbours(point) if not self.is_core(other))

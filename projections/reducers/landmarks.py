@@ -82,7 +82,10 @@ class Landmarks:
         winner, best_q40, best_dot = -1, -math.inf, 0
         for candidate in self._near.get((class_name, column, row), ()):
             landmark = self.objects[candidate]
-            if not self._is_near(landmark, x_um, y_um):
+            count = landmark.count
+            dx = landmark.sum_x_um - x_um * count
+            dy = landmark.sum_y_um - y_um * count
+            if dx * dx + dy * dy > (self._radius_um * count) ** 2:
                 continue
             dot = int(landmark.vector_sum.dot(vector))
             q40 = round(dot / math.sqrt(landmark.norm2 * norm2) * Q40)
@@ -98,13 +101,6 @@ class Landmarks:
         landmark.norm2 += 2 * best_dot + norm2
         self._update(winner, landmark, timestamp, x_um, y_um)
         return [_seen(offset, winner, observation, int(best_q40), landmark)]
-
-    def _is_near(self, landmark: Landmark, x_um: int, y_um: int) -> bool:
-        count = landmark.count
-        dx = landmark.sum_x_um - x_um * count
-        dy = landmark.sum_y_um - y_um * count
-        limit = self._radius_um * count
-        return dx * dx + dy * dy <= limit * limit
 
     def _found(
         self, offset: int, observation: int, det_id: str, landmark: Landmark

@@ -138,16 +138,21 @@ class Places:
         touched: dict[int, tuple[int, int]] = {}
         crowd, joined = self.crowd, self.joined
         for core in group:
+            own = NOISE
             for first, cell in crowd.cores_around(core):
                 place = joined[first]
                 if place == NOISE or first in fresh:
                     continue
                 place = self.find(place)
-                if place in touched:
-                    continue
-                neighbour = first if cell is None else crowd.reach(cell, core)  # type: ignore[arg-type]
-                if neighbour is not None:
-                    touched[place] = core, neighbour
+                if cell is None:
+                    own = place
+                    touched.setdefault(place, (core, first))
+                elif place == own:
+                    crowd.unite(core, cell)  # type: ignore[arg-type]
+                elif place not in touched:
+                    neighbour = crowd.reach(cell, core)  # type: ignore[arg-type]
+                    if neighbour is not None:
+                        touched[place] = core, neighbour
         return touched
 
     def _earliest_in_reach(self, point: int) -> int:

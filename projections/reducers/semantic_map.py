@@ -211,6 +211,4 @@ def _pose(accepted: Accepted) -> Pose | None:
 def _units(members: Sequence[Vector | None]) -> NDArray[np.int32]:
     """The unit vectors of those that are there, one a row."""
     rows = [vector for vector in members if vector is not None]
-    if not rows:
-        return np.empty((0, 0), np.int32)
-    return quantise_rows(np.array(rows))
+    return quantise_rows(np.array(rows)) if rows else np.empty((0, 0), np.int32)
