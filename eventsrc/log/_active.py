@@ -39,6 +39,17 @@ def file_head(metadata: Metadata) -> bytes:
     return _mcap.MAGIC + _mcap.encode_all([header, metadata])
 
 
+def key_channel(channel_id: int, schema_id: int, key: str, version: int) -> Channel:
+    """The channel of a key whose envelopes are of ``version``."""
+    return Channel(
+        id=channel_id,
+        topic=key,
+        message_encoding="json",
+        schema_id=schema_id,
+        metadata={ENVELOPE_VERSION_KEY: str(version)},
+    )
+
+
 class ActiveSegment:
     """Events go in by `append` and count once `commit` has returned."""
 
@@ -48,7 +59,8 @@ class ActiveSegment:
         self.committed = base
         self.next_offset = base
         self._policy = policy
-        self._channels: dict[tuple[str, int], int] = {}
+        self._channels: dict[tuple[str, int], Channel] = {}
+        self._used: set[int] = set()
         self._schemas: dict[str, int] = {}
         self._definitions: list[bytes] = []
         self._parts: list[bytes] = []
@@ -78,7 +90,7 @@ class ActiveSegment:
     def append(self, key: str, version: int, payload: bytes, logged_ns: int, stamp_ns: int) -> int:
         """Take one event; its offset. Commits when the policy says so."""
         self._check()
-        channel = self._channels.get((key, version)) or self._define(key, version)
+        channel = self._channel(key, version)
         if not self.waiting:
             self._oldest_wait = time.monotonic_ns()
             self._first_ns = self._last_ns = logged_ns
@@ -94,29 +106,25 @@ class ActiveSegment:
         self.next_offset = offset + 1
         return offset
 
-    def _define(self, key: str, version: int) -> int:
-        """The new channel's id. Definitions lead their chunk, where a reader that hops from chunk
-        to chunk sees that there are any."""
+    def _channel(self, key: str, version: int) -> int:
+        """The channel's id. Its record leads every chunk that uses it, so that no rot in one chunk
+        can take the names from another's events; the schema, which the key tells, stands once."""
+        known = self._channels.get((key, version))
+        if known is None:
+            known = self._channels[key, version] = self._define(key, version)
+        if known.id not in self._used:
+            self._used.add(known.id)
+            self._definitions.append(_mcap.encode(known))
+        return known.id
+
+    def _define(self, key: str, version: int) -> Channel:
         name, text = schema_of(key)
         schema = self._schemas.get(name)
         if schema is None:
             schema = self._schemas[name] = len(self._schemas) + 1
-            self._definitions.append(
-                _mcap.encode(Schema(id=schema, name=name, encoding="jsonschema", data=text))
-            )
-        channel = self._channels[key, version] = len(self._channels) + 1
-        self._definitions.append(
-            _mcap.encode(
-                Channel(
-                    id=channel,
-                    topic=key,
-                    message_encoding="json",
-                    schema_id=schema,
-                    metadata={ENVELOPE_VERSION_KEY: str(version)},
-                )
-            )
-        )
-        return channel
+            record = Schema(id=schema, name=name, encoding="jsonschema", data=text)
+            self._definitions.append(_mcap.encode(record))
+        return key_channel(len(self._channels) + 1, schema, key, version)
 
     def due(self) -> bool:
         """True when the policy wants a commit now."""
@@ -146,6 +154,7 @@ class ActiveSegment:
         self.size += len(chunk) + len(mark)
         self.committed = self.next_offset
         self._definitions.clear()
+        self._used.clear()
         self._parts.clear()
         self._waiting_bytes = 0
 

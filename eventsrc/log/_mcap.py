@@ -198,6 +198,16 @@ def decode_mark(data: bytes) -> tuple[int, int]:
     return first, following
 
 
+def marks_in(data: bytes) -> Iterator[int]:
+    """The next offset of every good commit mark anywhere in ``data``."""
+    at = -1
+    while (at := data.find(MARK_PATTERN, at + 1)) >= 0:
+        try:
+            yield decode_mark(data[at : at + MARK_BYTES])[1]
+        except BadRecord:
+            continue
+
+
 def walk(body: bytes) -> Iterator[tuple[int, int, int, int, int, int]]:
     """The messages of a chunk's body: channel, sequence, log time, publish time, and where the
     payload starts and ends in ``body``."""
@@ -213,8 +223,9 @@ def walk(body: bytes) -> Iterator[tuple[int, int, int, int, int, int]]:
         at = end
 
 
-def definitions(body: bytes) -> tuple[list[Schema], list[Channel]]:
-    """The schema and channel records of a chunk's body."""
+def definitions(body: bytes, *, leading: bool = False) -> tuple[list[Schema], list[Channel]]:
+    """The schema and channel records of a chunk's body; those before its first message only when
+    ``leading``."""
     schemas: list[Schema] = []
     channels: list[Channel] = []
     at = 0
@@ -225,6 +236,8 @@ def definitions(body: bytes) -> tuple[list[Schema], list[Channel]]:
             schemas.append(decode_as(Schema, body[start:at]))
         elif opcode == Opcode.CHANNEL:
             channels.append(decode_as(Channel, body[start:at]))
+        elif leading:
+            break
     return schemas, channels
 
 

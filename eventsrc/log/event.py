@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from eventsrc.envelope import ENVELOPE_VERSION
+
 
 @dataclass(frozen=True, slots=True)
 class Event:
@@ -9,7 +11,8 @@ class Event:
 
     ``offset`` is its index in the log and its only order. ``logged_ns`` is when it was written,
     ``stamp_ns`` when the robot says it happened, both int nanoseconds since the Unix epoch; either
-    may run backwards. ``payload`` is the message, byte for byte as it came.
+    may run backwards. ``payload`` is the message, byte for byte as it came, in the form of the
+    envelope's ``version`` (see `eventsrc.upcast`).
     """
 
     offset: int
@@ -17,3 +20,4 @@ class Event:
     logged_ns: int
     stamp_ns: int
     payload: bytes
+    version: int = ENVELOPE_VERSION

@@ -75,8 +75,10 @@ def _count(segment: OpenSegment, tally: _Tally) -> SegmentInfo:
         _count_sealed(segment, tally)
     else:
         for chunk in segment.chunks:
-            for channel, _, log_ns, stamp_ns, _, _ in _mcap.walk(segment.read_chunk(chunk)):
-                tally.keys[segment.keys[channel]] += 1
+            body = segment.read_chunk(chunk)
+            channels = segment.channels_of(body)
+            for channel, _, log_ns, stamp_ns, _, _ in _mcap.walk(body):
+                tally.keys[channels[channel].topic] += 1
                 tally.logged.append(log_ns)
                 tally.stamps.append(stamp_ns)
     return SegmentInfo(
@@ -91,6 +93,6 @@ def _count(segment: OpenSegment, tally: _Tally) -> SegmentInfo:
 def _count_sealed(segment: SealedFile, tally: _Tally) -> None:
     statistics = segment.statistics
     for channel, count in statistics.channel_message_counts.items():
-        tally.keys[segment.keys[channel]] += count
+        tally.keys[segment.channels[channel].topic] += count
     tally.logged += (statistics.message_start_time, statistics.message_end_time)
     tally.stamps += (int(segment.seal["first_stamp_ns"]), int(segment.seal["last_stamp_ns"]))

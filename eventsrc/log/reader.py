@@ -5,19 +5,22 @@ no lock and may read while a writer writes, rotates and seals. Damage stops it w
 after every event before it has been given out; `on_gap` lets it go on and be told what is missing.
 """
 
+import sys
+from bisect import bisect_right
 from collections import OrderedDict
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Generator, Iterator
 from pathlib import Path
 
 from eventsrc.errors import LogDamaged, LogNotFound, NotALog
 
 from ._naming import ACTIVE, SEALED, SegmentPath, list_segments, segment_path
 from .event import Event
-from .segment import ActiveFile, SealedFile, chunk_events
+from .segment import ActiveFile, SealedFile, Unreadable, chunk_events
 
 _OPEN_SEGMENTS = 8
 
 OpenSegment = SealedFile | ActiveFile
+OnGap = Callable[[Unreadable], None]
 
 
 class LogReader:
@@ -65,34 +68,70 @@ class LogReader:
         return None
 
     def read(
-        self, start: int = 0, end: int | None = None, *, keys: Collection[str] | None = None
+        self,
+        start: int = 0,
+        end: int | None = None,
+        *,
+        keys: Collection[str] | None = None,
+        on_gap: OnGap | None = None,
     ) -> Iterator[Event]:
-        """Events from offset ``start`` to before ``end`` (default: `next_offset` as of now)."""
-        stop = self.next_offset if end is None else min(end, self.next_offset)
+        """Events from offset ``start`` to before ``end`` (default: `next_offset` as of now).
+
+        Where events cannot be read this raises LogDamaged; with ``on_gap`` it calls that instead
+        and goes on behind the gap.
+        """
+        known = self.next_offset
+        stop = known if end is None else min(end, known)
+        report = on_gap or _stop_at_gap(self.path)
         at = max(start, 0)
-        for index, entry in self._entries_from(at):
+        for entry, following in self._entries_from(at):
             if at >= stop:
-                return
+                break
+            upto = min(stop, following)
+            at = yield from self._read_segment(entry, max(at, entry.base), upto, keys, report)
+            if at < upto:
+                report(Unreadable(at, upto - 1, f"missing after {entry.path.name}"))
+                at = upto
+        if end is None or end > known:
+            self._look_for_rot(start, report)
+
+    def _look_for_rot(self, start: int, report: OnGap) -> None:
+        """Whether more was recorded than the growing segment still shows."""
+        rot = self._last.rot() if isinstance(self._last, ActiveFile) else None
+        if rot is not None and rot.last >= start:
+            report(rot)
+
+    def _entries_from(self, start: int) -> Iterator[tuple[SegmentPath, int]]:
+        """Each segment from the one that holds ``start`` on, and the base of the next one."""
+        first = bisect_right(self._segments, start, key=lambda entry: entry.base) - 1
+        for index in range(max(first, 0), len(self._segments)):
+            is_last = index + 1 == len(self._segments)
+            yield self._segments[index], sys.maxsize if is_last else self._segments[index + 1].base
+
+    def _read_segment(
+        self, entry: SegmentPath, start: int, end: int, keys: Collection[str] | None, report: OnGap
+    ) -> Generator[Event, None, int]:
+        """The events of one segment; returns the offset behind the last it can account for."""
+        try:
             segment = self.open_segment(entry)
-            yield from _segment_events(segment, at, stop, keys)
-            at = max(at, segment.next_offset)
-            self._check_follows(index, segment)
-
-    def _entries_from(self, start: int) -> Iterator[tuple[int, SegmentPath]]:
-        first = 0
-        for index, entry in enumerate(self._segments):
-            if entry.base <= start:
-                first = index
-        yield from ((i, self._segments[i]) for i in range(first, len(self._segments)))
-
-    def _check_follows(self, index: int, segment: OpenSegment) -> None:
-        if index + 1 < len(self._segments):
-            following = self._segments[index + 1].base
-            if following != segment.next_offset:
-                raise LogDamaged(
-                    f"{self.path}: offsets {segment.next_offset} to {following - 1} are missing "
-                    f"after {segment.path.name}; run `mapfold log verify {self.path}`"
-                )
+        except LogDamaged as error:
+            report(Unreadable(start, end - 1, str(error)))
+            return end
+        wanted = _wanted_channels(segment, keys)
+        at = start
+        for chunk in segment.chunks:
+            if chunk.following <= at:
+                continue
+            if chunk.first >= end:
+                break
+            if wanted is None or chunk.channels is None or not wanted.isdisjoint(chunk.channels):
+                try:
+                    yield from chunk_events(segment, chunk, at, end, keys)
+                except LogDamaged as error:
+                    last = min(chunk.following, end) - 1
+                    report(Unreadable(max(chunk.first, at), last, str(error)))
+            at = chunk.following
+        return at
 
     def open_segment(self, entry: SegmentPath) -> OpenSegment:
         segment = self._open.get(entry.base)
@@ -138,14 +177,18 @@ def _open_segment(log: Path, entry: SegmentPath) -> OpenSegment:
     return SealedFile(segment_path(log, entry.base, SEALED), entry.base)
 
 
-def _segment_events(
-    segment: OpenSegment, start: int, end: int, keys: Collection[str] | None
-) -> Iterator[Event]:
-    wanted = None if keys is None else {c for c, key in segment.keys.items() if key in keys}
-    for chunk in segment.chunks:
-        if chunk.following <= start:
-            continue
-        if chunk.first >= end:
-            return
-        if wanted is None or chunk.channels is None or not wanted.isdisjoint(chunk.channels):
-            yield from chunk_events(segment, chunk, start, end, keys)
+def _stop_at_gap(log: Path) -> OnGap:
+    def stop(gap: Unreadable) -> None:
+        raise LogDamaged(
+            f"{log}: offsets {gap.first} to {gap.last} cannot be read: {gap.reason}; "
+            f"run `mapfold log verify {log}`"
+        )
+
+    return stop
+
+
+def _wanted_channels(segment: OpenSegment, keys: Collection[str] | None) -> set[int] | None:
+    """Which channels carry ``keys``; None where that cannot be told before reading a chunk."""
+    if keys is None or not isinstance(segment, SealedFile):
+        return None
+    return {id_ for id_, channel in segment.channels.items() if channel.topic in keys}

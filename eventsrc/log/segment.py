@@ -12,15 +12,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from eventsrc.envelope import ENVELOPE_VERSION
 from eventsrc.errors import LogDamaged, NotALog
 
 from . import _mcap
-from ._active import SEGMENT_METADATA
+from ._active import ENVELOPE_VERSION_KEY, SEGMENT_METADATA
 from ._mcap import (
     BadRecord,
     Channel,
     ChunkIndex,
     Footer,
+    Header,
     Metadata,
     MetadataIndex,
     Opcode,
@@ -43,6 +45,15 @@ class ChunkRef:
     channels: frozenset[int] | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class Unreadable:
+    """Offsets ``first`` to ``last`` (included) that were recorded and cannot be read, and why."""
+
+    first: int
+    last: int
+    reason: str
+
+
 class Segment(Protocol):
     """What a reader needs of a segment, sealed or active."""
 
@@ -50,11 +61,13 @@ class Segment(Protocol):
     base: int
     log_id: str
     chunks: list[ChunkRef]
-    keys: dict[int, str]
     next_offset: int
 
     def read_chunk(self, chunk: ChunkRef) -> bytes:
         """The chunk's body, CRC checked; LogDamaged naming the offsets otherwise."""
+
+    def channels_of(self, body: bytes) -> dict[int, Channel]:
+        """The channels its messages may name."""
 
 
 class _File:
@@ -64,7 +77,6 @@ class _File:
         self.path = path
         self.base = base
         self.chunks: list[ChunkRef] = []
-        self.keys: dict[int, str] = {}
         self.next_offset = base
         self._fd = os.open(path, os.O_RDONLY)
         try:
@@ -79,10 +91,7 @@ class _File:
         try:
             return _mcap.decode_chunk(record)
         except BadRecord as error:
-            raise LogDamaged(
-                f"{self.path}: offsets {chunk.first} to {chunk.following - 1} cannot be read, at "
-                f"byte {chunk.position}: {error}; run `mapfold log verify {self.path.parent}`"
-            ) from None
+            raise LogDamaged(f"{self.path.name} at byte {chunk.position}: {error}") from None
 
     def size(self) -> int:
         return os.fstat(self._fd).st_size
@@ -99,21 +108,34 @@ class _File:
 
 def read_head(path: Path, data: bytes, base: int) -> tuple[dict[str, str], int]:
     """Our metadata at the head of a segment and the byte after it."""
-    if not data.startswith(_mcap.MAGIC):
+    if not data.startswith(_mcap.MAGIC) and not _mcap.MAGIC.startswith(data):
         raise NotALog(f"{path} is no MCAP file; it does not belong into a log, move it away")
-    at = len(_mcap.MAGIC)
     try:
-        for opcode, content in _mcap.records(data[at:]):
-            at += _mcap.FRAME.size + len(content)
-            if opcode == Opcode.METADATA:
-                metadata = _mcap.decode_as(Metadata, content)
-                if metadata.name == SEGMENT_METADATA:
-                    return _checked_head(metadata, base), at
+        head = _find_head(data, base)
     except BadRecord as error:
         raise LogDamaged(
             f"{path}: damaged head: {error}; run `mapfold log recover {path.parent}`"
         ) from None
-    raise NotALog(f"{path} is an MCAP file but no mapfold segment; use `mapfold import` for it")
+    if head is None:
+        raise NotALog(f"{path} is an MCAP file but no segment of a log; `mapfold import` reads it")
+    return head
+
+
+def _find_head(data: bytes, base: int) -> tuple[dict[str, str], int] | None:
+    """None for a whole MCAP head that is not ours."""
+    at = len(_mcap.MAGIC)
+    profile = _mcap.PROFILE
+    for opcode, content in _mcap.records(data[at:]):
+        at += _mcap.FRAME.size + len(content)
+        if opcode == Opcode.HEADER:
+            profile = _mcap.decode_as(Header, content).profile
+        elif opcode == Opcode.METADATA:
+            metadata = _mcap.decode_as(Metadata, content)
+            if metadata.name == SEGMENT_METADATA:
+                return _checked_head(metadata, base), at
+    if profile == _mcap.PROFILE:
+        raise BadRecord("it ends before the segment's metadata")
+    return None
 
 
 def _checked_head(metadata: Metadata, base: int) -> dict[str, str]:
@@ -128,6 +150,7 @@ class SealedFile(_File):
 
     def __init__(self, path: Path, base: int) -> None:
         super().__init__(path, base)
+        self.channels: dict[int, Channel] = {}
         try:
             self._read_summary()
         except BadRecord as error:
@@ -139,6 +162,10 @@ class SealedFile(_File):
         except BaseException:
             self.close()
             raise
+
+    def channels_of(self, body: bytes) -> dict[int, Channel]:  # noqa: ARG002
+        """The same for all chunks, from the summary."""
+        return self.channels
 
     def _read_summary(self) -> None:
         size = self.size()
@@ -161,7 +188,7 @@ class SealedFile(_File):
                 indexes.append(_mcap.decode_as(ChunkIndex, content))
             elif opcode == Opcode.CHANNEL:
                 channel = _mcap.decode_as(Channel, content)
-                self.keys[channel.id] = channel.topic
+                self.channels[channel.id] = channel
             elif opcode == Opcode.STATISTICS:
                 self.statistics = _mcap.decode_as(Statistics, content)
             elif opcode == Opcode.METADATA_INDEX:
@@ -216,8 +243,8 @@ class ActiveFile(_File):
         return self.next_offset
 
     def _take_commit(self) -> bool:
-        head_bytes = os.pread(self._fd, _mcap.PLAIN_CHUNK_HEAD + 1, self.position)
-        if len(head_bytes) <= _mcap.PLAIN_CHUNK_HEAD:
+        head_bytes = os.pread(self._fd, _mcap.PLAIN_CHUNK_HEAD, self.position)
+        if len(head_bytes) < _mcap.PLAIN_CHUNK_HEAD:
             return False
         head = _mcap.decode_chunk_head(head_bytes)
         mark_at = self.position + head.length
@@ -225,16 +252,33 @@ class ActiveFile(_File):
         if first != self.next_offset:
             raise BadRecord("a commit mark contradicts the one before it")
         chunk = ChunkRef(self.position, head.length, first, following)
-        if head_bytes[-1] in (Opcode.SCHEMA, Opcode.CHANNEL):
-            self._learn(self.read_chunk(chunk))
         self.chunks.append(chunk)
         self.next_offset = following
         self.position = mark_at + _mcap.MARK_BYTES
         return True
 
-    def _learn(self, body: bytes) -> None:
-        _, channels = _mcap.definitions(body)
-        self.keys.update((c.id, c.topic) for c in channels)
+    def rot(self) -> Unreadable | None:
+        """What once was durable behind the last readable commit. A crash tears only the end, and
+        no commit mark can follow what was never synced; so where one does, bytes have rotted."""
+        while self.position < self.size():
+            rest = os.pread(self._fd, self.size() - self.position, self.position)
+            promised = max(_mcap.marks_in(rest), default=0)
+            before = self.next_offset
+            if self.refresh() == before:  # else a writer was at work between the two looks
+                if promised <= before:
+                    return None
+                return Unreadable(before, promised - 1, f"damaged at byte {self.position}")
+        return None
+
+    def channels_of(self, body: bytes) -> dict[int, Channel]:
+        """By id, from the records that lead the chunk."""
+        _, channels = _mcap.definitions(body, leading=True)
+        return {channel.id: channel for channel in channels}
+
+
+def envelope_version(channel: Channel) -> int:
+    """The version of the envelopes on a channel; the current one where none is said."""
+    return int(channel.metadata.get(ENVELOPE_VERSION_KEY, ENVELOPE_VERSION))
 
 
 def chunk_events(
@@ -242,24 +286,21 @@ def chunk_events(
 ) -> Iterator[Event]:
     """The events of one chunk with offsets from ``start`` to before ``end``, in order."""
     body = segment.read_chunk(chunk)
-    names, base, expected = segment.keys, segment.base, chunk.first
-    for channel, sequence, log_ns, publish_ns, at, stop in _mcap.walk(body):
+    names = {c.id: c.topic for c in segment.channels_of(body).values()}
+    versions = {c.id: envelope_version(c) for c in segment.channels_of(body).values()}
+    base, expected = segment.base, chunk.first
+    for channel_id, sequence, log_ns, publish_ns, at, stop in _mcap.walk(body):
         offset = base + sequence
         if offset != expected:
-            raise LogDamaged(
-                f"{segment.path}: offset {offset} stands where {expected} should; "
-                f"run `mapfold log verify {segment.path.parent}`"
-            )
+            raise LogDamaged(f"{segment.path.name}: offset {offset} stands in place of {expected}")
         expected = offset + 1
         if offset < start:
             continue
         if offset >= end:
             return
-        key = names[channel]
+        key = names[channel_id]
         if keys is None or key in keys:
-            yield Event(offset, key, log_ns, publish_ns, body[at:stop])
+            version = versions[channel_id]
+            yield Event(offset, key, log_ns, publish_ns, body[at:stop], version)
     if expected != chunk.following:
-        raise LogDamaged(
-            f"{segment.path}: offsets {expected} to {chunk.following - 1} are missing; "
-            f"run `mapfold log verify {segment.path.parent}`"
-        )
+        raise LogDamaged(f"{segment.path.name}: the chunk ends before offset {expected}")
