@@ -28,6 +28,10 @@ class Ack(BaseModel):
     log_id: str
     stretches: Annotated[tuple[tuple[int, int], ...], Field(min_length=1)]
 
+    def encode(self) -> bytes:
+        """The bytes that go over the wire."""
+        return self.model_dump_json().encode()
+
     def covers(self, keyframe_id: int) -> bool:
         """Whether this keyframe is among them."""
         return any(first <= keyframe_id <= last for first, last in self.stretches)

@@ -12,6 +12,8 @@ and exits with ``exit_code``; nothing here is ever shown as a traceback.
     │   └── LogDamaged              1  bytes of the log are torn or rotten
     ├── InvalidEnvelope             1  a payload is not an envelope (carries a Rejection reason)
     └── TransportError              1  Zenoh cannot connect, listen or send
+        └── SpoolError              1  a robot's spool cannot be used
+            └── SpoolFull           1  it has no room for another envelope
 
 ``projections.errors`` adds the branch for databases and folds.
 """
@@ -59,3 +61,11 @@ class InvalidEnvelope(MapfoldError):
 
 class TransportError(MapfoldError):
     """Zenoh cannot connect, listen or send."""
+
+
+class SpoolError(TransportError):
+    """A robot's spool cannot be used."""
+
+
+class SpoolFull(SpoolError):
+    """A robot's spool has no room for another envelope."""

@@ -99,7 +99,7 @@ class Recorder:
 
     def _send_ack(self, ack: Ack) -> None:
         try:
-            self._session.send(ack_key(ack.run_id), ack.model_dump_json().encode())
+            self._session.send(ack_key(ack.run_id), ack.encode())
         except TransportError:
             # No way to tell the robot now. It will send again, and the next ack will cover that.
             return

@@ -1,0 +1,103 @@
+"""The robot's side: publish envelopes so that none is lost while the link or the recorder is away.
+
+* `EnvelopePublisher.publish` writes the envelope into the spool and returns; it never waits for
+  the network. One thread does all the sending (`eventsrc.sending`), in the order of publishing.
+* An envelope leaves the spool when a recorder's ack covers it, and an ack covers what is synced in
+  a log. Until then it is sent again. So it may arrive more than once, which the fold absorbs: the
+  first one counts.
+* What no recorder would accept is refused here, by the same door (`eventsrc.ingest`); otherwise it
+  would be sent again for ever.
+"""
+
+import json
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from ._zenoh import ZenohOptions
+from .endpoints import check_endpoints
+from .errors import InvalidEnvelope
+from .ingest import Rejected, ingest
+from .sending import RESEND_AFTER_S, WINDOW, Sender
+from .spool import DEFAULT_SPOOL_BYTES, Spool
+
+
+class EnvelopePublisher:
+    """Publishes one robot's envelopes under ``key``; a context manager, usable from any thread.
+
+    The constructor opens the spool and begins to send what an earlier process left in it. It raises
+    SpoolError if the spool cannot be used and TransportError if an endpoint is malformed, but not
+    when nobody answers there: the sending thread tries until somebody does.
+    """
+
+    def __init__(
+        self,
+        options: ZenohOptions,
+        spool: Path,
+        key: str = "tb/detections",
+        *,
+        max_spool_bytes: int = DEFAULT_SPOOL_BYTES,
+        window: int = WINDOW,
+        resend_after_s: float = RESEND_AFTER_S,
+    ) -> None:
+        check_endpoints((*options.connect, *options.listen))
+        self._spool = Spool(spool, max_spool_bytes)
+        self._sender = Sender(
+            options, key, self._spool, window=window, resend_after_s=resend_after_s
+        )
+        self._thread = threading.Thread(
+            target=self._sender.run, name="envelope-sender", daemon=True
+        )
+        self._thread.start()
+        self._left: int | None = None
+
+    def publish(self, envelope: Mapping[str, Any] | bytes) -> None:
+        """Take one envelope: a dictionary, or its JSON as bytes, which are sent as they are.
+
+        Raises InvalidEnvelope with the reason a recorder would give, SpoolFull when the spool has
+        no room, SpoolError when the spool is closed or its disk fails.
+        """
+        payload = envelope if isinstance(envelope, bytes) else _encode(envelope)
+        outcome = ingest(payload)
+        if isinstance(outcome, Rejected):
+            raise InvalidEnvelope(f"envelope not published: {outcome.reason}")
+        self._sender.raise_failure()
+        self._spool.add(outcome.envelope.run_id, outcome.envelope.keyframe_id, payload)
+        self._sender.wake()
+
+    @property
+    def unacknowledged(self) -> int:
+        """How many envelopes no recorder has acknowledged yet."""
+        return len(self._spool)
+
+    def flush(self, timeout_s: float) -> bool:
+        """Wait until everything published is acknowledged; False when it was not in time."""
+        return self._sender.wait_until_acknowledged(timeout_s)
+
+    def close(self, timeout_s: float = 0.0) -> int:
+        """`flush`, then stop. How many envelopes stay in the spool, for the next process."""
+        if self._left is None:
+            if timeout_s > 0:
+                self.flush(timeout_s)
+            self._sender.stop()
+            self._thread.join()
+            self._left = len(self._spool)
+            self._spool.close()
+        return self._left
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _encode(envelope: Mapping[str, Any]) -> bytes:
+    try:
+        return json.dumps(envelope, ensure_ascii=False, allow_nan=False).encode()
+    except (TypeError, ValueError) as error:
+        raise InvalidEnvelope(f"envelope not published: not JSON: {error}") from None

@@ -1,0 +1,135 @@
+"""A robot's bounded spool on disk: what is published and not yet acknowledged.
+
+One SQLite file, one owner. A published envelope is in the file before anything is sent, so it
+outlives the robot's process; write-ahead logging without a sync per envelope means that a power
+cut may take the last moments, and never more. The order is the order of publishing.
+"""
+
+import sqlite3
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from .acks import Ack
+from .errors import SpoolError, SpoolFull
+
+DEFAULT_SPOOL_BYTES: Final = 1024 * 1024 * 1024
+"""Payload bytes. At 9 kB an envelope and two envelopes a second, sixteen hours without a link."""
+
+_SCHEMA: Final = """
+create table if not exists spooled (
+    seq integer primary key autoincrement,
+    run_id text not null,
+    keyframe_id integer not null,
+    payload blob not null
+);
+create index if not exists spooled_keyframe on spooled (run_id, keyframe_id);
+"""
+
+
+class Spooled(NamedTuple):
+    """One envelope that waits; ``seq`` grows with every envelope ever spooled in this file."""
+
+    seq: int
+    run_id: str
+    payload: bytes
+
+
+class Spool:
+    """Any thread may call; raises SpoolError when the file cannot be used."""
+
+    def __init__(self, path: Path, max_bytes: int = DEFAULT_SPOOL_BYTES) -> None:
+        self.path = path
+        self.max_bytes = max_bytes
+        self._lock = threading.Lock()
+        self._count = self._bytes = 0
+        with self._clear_errors():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._db = sqlite3.connect(
+                path, timeout=0, isolation_level=None, check_same_thread=False
+            )
+            try:
+                self._prepare()
+            except sqlite3.Error:
+                self._db.close()
+                raise
+
+    def _prepare(self) -> None:
+        self._db.execute("pragma locking_mode = exclusive")
+        self._db.execute("pragma journal_mode = wal")
+        self._db.execute("pragma synchronous = normal")
+        self._db.executescript(_SCHEMA)
+        row = self._db.execute("select count(*), coalesce(sum(length(payload)), 0) from spooled")
+        self._count, self._bytes = row.fetchone()
+
+    def add(self, run_id: str, keyframe_id: int, payload: bytes) -> None:
+        """Keep one envelope until it is acknowledged. Raises SpoolFull if there is no room."""
+        with self._clear_errors(), self._lock:
+            if self._bytes + len(payload) > self.max_bytes:
+                raise SpoolFull(
+                    f"{self.path}: {self._count} envelopes ({self._bytes} bytes) wait for a "
+                    f"recorder's acknowledgement and {self.max_bytes} bytes are the limit; "
+                    "bring the link or the recorder back, or allow a larger spool"
+                )
+            self._db.execute(
+                "insert into spooled (run_id, keyframe_id, payload) values (?, ?, ?)",
+                (run_id, keyframe_id, payload),
+            )
+            self._count += 1
+            self._bytes += len(payload)
+
+    def after(self, seq: int, limit: int) -> list[Spooled]:
+        """The oldest envelopes after ``seq``, in order, at most ``limit``."""
+        with self._clear_errors(), self._lock:
+            rows = self._db.execute(
+                "select seq, run_id, payload from spooled where seq > ? order by seq limit ?",
+                (seq, limit),
+            )
+            return [Spooled(*row) for row in rows]
+
+    def waiting_up_to(self, seq: int) -> int:
+        """How many envelopes up to ``seq`` still wait."""
+        with self._clear_errors(), self._lock:
+            rows = self._db.execute("select count(*) from spooled where seq <= ?", (seq,))
+            (count,) = rows.fetchone()
+            return int(count)
+
+    def acknowledge(self, ack: Ack) -> int:
+        """Let go of what ``ack`` covers; how many envelopes that were."""
+        removed = 0
+        with self._clear_errors(), self._lock:
+            for first, last in ack.stretches:
+                rows = self._db.execute(
+                    "delete from spooled where run_id = ? and keyframe_id between ? and ? "
+                    "returning length(payload)",
+                    (ack.run_id, first, last),
+                ).fetchall()
+                removed += len(rows)
+                self._bytes -= sum(size for (size,) in rows)
+            self._count -= removed
+        return removed
+
+    def __len__(self) -> int:
+        return self._count
+
+    def close(self) -> None:
+        """Let another process use the file. What waits stays in it."""
+        with self._lock:
+            self._db.close()
+
+    @contextmanager
+    def _clear_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise SpoolError(f"spool {self.path}: {error.strerror}") from None
+        except sqlite3.OperationalError as error:
+            hint = "another robot process uses it; give each its own spool"
+            hint = hint if "locked" in str(error) else "check the path, its rights and the disk"
+            raise SpoolError(f"spool {self.path}: {error}; {hint}") from None
+        except sqlite3.DatabaseError as error:
+            raise SpoolError(
+                f"spool {self.path}: {error}; move the file away and publish into a new one"
+            ) from None

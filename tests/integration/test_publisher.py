@@ -1,0 +1,203 @@
+"""The robot's publisher against real routers and recorders, with both of them going away."""
+
+import json
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from eventsrc._zenoh import Received, Session, ZenohOptions
+from eventsrc.acks import Ack, ack_key
+from eventsrc.errors import InvalidEnvelope, SpoolFull, TransportError
+from eventsrc.log import LogReader, LogWriter
+from eventsrc.publisher import EnvelopePublisher
+from eventsrc.router import Router
+from tests.envelopes import envelope, payload
+from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK, Program
+
+Sessions = Callable[[], Session]
+Start = Callable[..., Program]
+KEY = "tb/detections"
+
+
+def _stored(log: Path) -> list[bytes]:
+    with LogReader(log) as reader:
+        return [event.payload for event in reader.read(keys={KEY})]
+
+
+@pytest.fixture
+def robot(endpoint: str, tmp_path: Path) -> Iterator[EnvelopePublisher]:
+    with EnvelopePublisher(
+        ZenohOptions(connect=(endpoint,)), tmp_path / "spool", resend_after_s=0.2
+    ) as publisher:
+        yield publisher
+
+
+@pytest.fixture
+def recorder(start: Start, endpoint: str, tmp_path: Path) -> Callable[[], Program]:
+    def run() -> Program:
+        program = start("record", str(tmp_path / "log"), "--connect", endpoint)
+        program.wait_for("recording")
+        return program
+
+    return run
+
+
+def test_what_is_acknowledged_is_in_the_log(
+    robot: EnvelopePublisher, recorder: Callable[[], Program], tmp_path: Path
+) -> None:
+    recorder()
+    sent = [payload(envelope(k)) for k in range(200)]
+    for message in sent:
+        robot.publish(message)
+    assert robot.flush(DEADLINE_S)
+    assert robot.unacknowledged == 0
+    assert _stored(tmp_path / "log") == sent
+
+
+def test_a_dictionary_is_encoded(
+    robot: EnvelopePublisher, recorder: Callable[[], Program], tmp_path: Path
+) -> None:
+    recorder()
+    robot.publish(envelope(1, run_id="Küche 🤖"))
+    assert robot.flush(DEADLINE_S)
+    assert _stored(tmp_path / "log") == [payload(envelope(1, run_id="Küche 🤖"))]
+
+
+def test_it_starts_without_a_router_and_sends_when_there_is_one(
+    start: Start, tmp_path: Path
+) -> None:
+    with Router(LOOPBACK) as gone:
+        (endpoint,) = gone.endpoints
+    with EnvelopePublisher(ZenohOptions(connect=(endpoint,)), tmp_path / "spool") as robot:
+        for k in range(10):
+            robot.publish(envelope(k))
+        assert not robot.flush(0.01)
+        with Router(ZenohOptions(listen=(endpoint,))):
+            start("record", str(tmp_path / "log"), "--connect", endpoint)
+            assert robot.flush(DEADLINE_S)
+    assert _stored(tmp_path / "log") == [payload(envelope(k)) for k in range(10)]
+
+
+def test_what_an_earlier_process_left_is_sent(
+    endpoint: str, recorder: Callable[[], Program], tmp_path: Path
+) -> None:
+    options = ZenohOptions(connect=(endpoint,))
+    with EnvelopePublisher(options, tmp_path / "spool") as robot:
+        robot.publish(envelope(1))
+        assert robot.close() == 1
+        assert robot.close() == 1
+    recorder()
+    with EnvelopePublisher(options, tmp_path / "spool") as robot:
+        assert robot.flush(DEADLINE_S)
+    assert _stored(tmp_path / "log") == [payload(envelope(1))]
+
+
+def test_it_sends_again_until_a_recorder_answers(
+    robot: EnvelopePublisher, connected: Sessions, recorder: Callable[[], Program], tmp_path: Path
+) -> None:
+    """Somebody listens who never acknowledges; what they got twice was sent again."""
+    twice = threading.Semaphore(0)
+    viewer = connected()
+    viewer.subscribe(KEY, lambda _: twice.release())
+    viewer.confirm()
+    robot.publish(envelope(1))
+    assert twice.acquire(timeout=DEADLINE_S)
+    assert twice.acquire(timeout=DEADLINE_S)
+    assert robot.unacknowledged == 1
+    recorder()
+    assert robot.flush(DEADLINE_S)
+    assert set(_stored(tmp_path / "log")) == {payload(envelope(1))}
+
+
+def test_nonsense_on_the_ack_key_acknowledges_nothing(
+    robot: EnvelopePublisher, connected: Sessions
+) -> None:
+    arrived = threading.Semaphore(0)
+    viewer = connected()
+    viewer.subscribe(KEY, lambda _: arrived.release())
+    viewer.confirm()
+    robot.publish(envelope(1))
+    assert arrived.acquire(timeout=DEADLINE_S)
+    viewer.send(ack_key("run-a"), b"{}")
+    assert arrived.acquire(timeout=DEADLINE_S), "it is sent again"
+    viewer.send(ack_key("run-a"), Ack(run_id="run-a", log_id="l", stretches=((2, 9),)).encode())
+    assert arrived.acquire(timeout=DEADLINE_S)
+    assert robot.unacknowledged == 1
+    viewer.send(ack_key("run-a"), Ack(run_id="run-a", log_id="l", stretches=((0, 1),)).encode())
+    assert robot.flush(DEADLINE_S)
+
+
+@pytest.mark.parametrize(
+    "bad", [b"no json", {"run_id": "run-a"}, envelope(1, timestamp=float("nan")), {"run_id": {1}}]
+)
+def test_what_no_recorder_accepts_is_refused_here(robot: EnvelopePublisher, bad: object) -> None:
+    with pytest.raises(InvalidEnvelope, match="envelope not published: "):
+        robot.publish(bad)  # type: ignore[arg-type]
+    assert robot.unacknowledged == 0
+
+
+def test_a_full_spool_is_the_callers_to_decide(endpoint: str, tmp_path: Path) -> None:
+    message = payload(envelope(1))
+    options = ZenohOptions(connect=(endpoint,))
+    with EnvelopePublisher(options, tmp_path / "spool", max_spool_bytes=len(message)) as robot:
+        robot.publish(message)
+        with pytest.raises(SpoolFull):
+            robot.publish(payload(envelope(2)))
+        assert robot.unacknowledged == 1
+
+
+def test_a_malformed_endpoint_is_refused_at_once(tmp_path: Path) -> None:
+    with pytest.raises(TransportError, match="has no protocol"):
+        EnvelopePublisher(ZenohOptions(connect=("localhost",)), tmp_path / "spool")
+
+
+def test_kill_9_loses_nothing_that_was_acknowledged_and_resending_fills_the_rest(
+    robot: EnvelopePublisher,
+    connected: Sessions,
+    recorder: Callable[[], Program],
+    tmp_path: Path,
+) -> None:
+    """Three recorders are killed under load; each time the log must hold what was acked by then."""
+    acked: set[int] = set()
+    progress = threading.Condition()
+
+    def hear(message: Received) -> None:
+        with progress:
+            for first, last in Ack.model_validate_json(message.payload).stretches:
+                acked.update(range(first, last + 1))
+            progress.notify_all()
+
+    watcher = connected()
+    watcher.subscribe(ack_key("run-a"), hear)
+    watcher.confirm()
+    published = threading.Event()
+
+    def publish() -> None:
+        for k in range(6_000):
+            robot.publish(envelope(k, note="x" * 1_000))
+        published.set()
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    for wanted in (100, 500, 1_000):
+        program = recorder()
+        with progress:
+            assert progress.wait_for(lambda n=wanted: len(acked) >= n, DEADLINE_S)
+        assert program.end(signal.SIGKILL) == -signal.SIGKILL
+        with progress:
+            promised = set(acked)
+        with LogWriter(tmp_path / "log"):
+            pass  # what a restart does: recover the torn end
+        assert promised <= _keyframes(tmp_path / "log")
+    recorder()
+    thread.join()
+    assert published.is_set()
+    assert robot.flush(DEADLINE_S)
+    assert _keyframes(tmp_path / "log") == set(range(6_000))
+
+
+def _keyframes(log: Path) -> set[int]:
+    return {json.loads(p)["keyframe_id"] for p in _stored(log)}

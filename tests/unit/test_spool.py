@@ -1,0 +1,121 @@
+"""The robot's spool: bounded, in order, and still there after the process."""
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from eventsrc.acks import Ack
+from eventsrc.errors import SpoolError, SpoolFull
+from eventsrc.spool import Spool, Spooled
+
+
+def _ack(*stretches: tuple[int, int], run_id: str = "run-a") -> Ack:
+    return Ack(run_id=run_id, log_id="log", stretches=stretches)
+
+
+def _payloads(spool: Spool) -> list[bytes]:
+    return [spooled.payload for spooled in spool.after(0, 1_000)]
+
+
+@pytest.fixture
+def spool(tmp_path: Path) -> Iterator[Spool]:
+    spool = Spool(tmp_path / "spool", max_bytes=100)
+    yield spool
+    spool.close()
+
+
+def test_it_keeps_the_order_and_counts_on(spool: Spool) -> None:
+    for k in (3, 1, 2):
+        spool.add("run-a", k, b"%d" % k)
+    assert spool.after(0, 2) == [Spooled(1, "run-a", b"3"), Spooled(2, "run-a", b"1")]
+    assert spool.after(2, 2) == [Spooled(3, "run-a", b"2")]
+    assert spool.waiting_up_to(2) == 2
+    assert len(spool) == 3
+
+
+def test_an_ack_frees_what_it_covers_and_nothing_else(spool: Spool) -> None:
+    for run_id in ("run-a", "run-b"):
+        for k in range(6):
+            spool.add(run_id, k, f"{run_id}{k}".encode())
+    assert spool.acknowledge(_ack((0, 1), (4, 4), (9, 9))) == 3
+    assert len(spool) == 9
+    assert [p for p in _payloads(spool) if p.startswith(b"run-a")] == [
+        b"run-a2",
+        b"run-a3",
+        b"run-a5",
+    ]
+    assert spool.acknowledge(_ack((0, 1))) == 0
+
+
+def test_it_is_bounded_and_an_ack_makes_room(spool: Spool) -> None:
+    spool.add("run-a", 1, b"x" * 60)
+    with pytest.raises(SpoolFull, match="1 envelopes \\(60 bytes\\)"):
+        spool.add("run-a", 2, b"x" * 41)
+    spool.add("run-a", 2, b"x" * 40)
+    spool.acknowledge(_ack((1, 1)))
+    spool.add("run-a", 3, b"x" * 60)
+    assert len(spool) == 2
+
+
+def test_what_waits_is_there_for_the_next_process(tmp_path: Path) -> None:
+    code = (
+        "import os, sys; from pathlib import Path; from eventsrc.spool import Spool\n"
+        "spool = Spool(Path(sys.argv[1])); spool.add('run-a', 7, b'kept'); os._exit(9)"
+    )
+    path = tmp_path / "deep" / "spool"
+    assert subprocess.run([sys.executable, "-c", code, path], check=False).returncode == 9
+    with closing(Spool(path)) as spool:
+        assert (len(spool), _payloads(spool)) == (1, [b"kept"])
+        spool.add("run-a", 8, b"after")
+        assert _payloads(spool) == [b"kept", b"after"]
+
+
+def test_numbers_are_never_used_twice(tmp_path: Path) -> None:
+    """A cursor over the spool may outlive the row it points at."""
+    spool = Spool(tmp_path / "spool")
+    spool.add("run-a", 1, b"1")
+    spool.acknowledge(_ack((1, 1)))
+    spool.close()
+    with closing(Spool(tmp_path / "spool")) as again:
+        again.add("run-a", 2, b"2")
+        assert again.after(1, 10) == [Spooled(2, "run-a", b"2")]
+
+
+def test_one_owner(tmp_path: Path, spool: Spool) -> None:
+    spool.add("run-a", 1, b"1")
+    with pytest.raises(SpoolError, match="another robot process uses it"):
+        Spool(tmp_path / "spool")
+    spool.close()
+    Spool(tmp_path / "spool").close()
+
+
+def test_a_file_that_is_no_spool_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "photo.jpg"
+    path.write_bytes(b"not a database, but long enough to be looked at" * 100)
+    with pytest.raises(SpoolError, match=r"photo\.jpg.*move the file away"):
+        Spool(path)
+    assert path.stat().st_size == 4_700
+
+
+def test_a_place_where_no_file_can_be_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(SpoolError, match="file"):
+        Spool(tmp_path / "file" / "spool")
+    with pytest.raises(SpoolError, match="check the path"):
+        Spool(tmp_path)
+
+
+def test_a_closed_spool_says_so(spool: Spool) -> None:
+    spool.close()
+    with pytest.raises(SpoolError, match="closed"):
+        spool.add("run-a", 1, b"1")
+
+
+@pytest.mark.parametrize("keyframe_id", [-(2**63), 2**63 - 1])
+def test_every_keyframe_id_fits(spool: Spool, keyframe_id: int) -> None:
+    spool.add("run-a", keyframe_id, b"x")
+    assert spool.acknowledge(_ack((-(2**63), 2**63 - 1))) == 1
