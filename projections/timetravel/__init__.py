@@ -1,0 +1,28 @@
+"""Time travel: why the map is what it is, and what it would be under other settings.
+
+`Timeline` answers for one log under one setting: the map at any offset, every merge and its cause,
+the chronicle of a place or an object, the difference of two moments, and the event that made a
+condition true.
+"""
+
+from .causes import Cause
+from .difference import Difference
+from .expression import Expression, ExpressionError
+from .lookup import NoSuchThing
+from .search import Search, Turn
+from .story import Entry, Story
+from .timeline import Progress, Timeline
+
+__all__ = [
+    "Cause",
+    "Difference",
+    "Entry",
+    "Expression",
+    "ExpressionError",
+    "NoSuchThing",
+    "Progress",
+    "Search",
+    "Story",
+    "Timeline",
+    "Turn",
+]

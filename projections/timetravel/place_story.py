@@ -23,9 +23,9 @@ def place_story(history: History, life: PlaceLife, end: int) -> Story:
     return Story(
         kind="place",
         subject=life.place_id,
-        summary=_standing(history, life, end) if stands else _ended(history, life),
+        summary=_standing(history, life, end) if stands else _ended(history, life, end),
         entries=tuple(entries),
-        facts={"stands": stands, "absorbed_by": None if stands else _absorber(history, life)},
+        facts={"stands": stands, "absorbed_by": _absorber(history, life, end)},
     )
 
 
@@ -94,23 +94,21 @@ def _absorption(history: History, life: PlaceLife, merge: Merge) -> Entry:
     )
 
 
-def _ended(history: History, life: PlaceLife) -> str:
+def _ended(history: History, life: PlaceLife, end: int) -> str:
     merge = life.absorbed
-    if merge is None:
-        return "not founded yet"
-    now = history.survivor_of(life.formed.place)
+    if merge is None or life.formed.offset >= end:
+        return f"not founded yet; {life.cause.name} founds it at offset {life.formed.offset:,}"
+    now = history.survivor_of(life.formed.place, end)
     then = "" if now == merge.survivor else f"; that is part of {place_name(history, now)} now"
     by = place_name(history, merge.survivor)
     return f"absorbed by {by} at offset {merge.cause.offset:,} ({merge.cause.time}){then}"
 
 
-def _absorber(history: History, life: PlaceLife) -> dict[str, object] | None:
-    if life.absorbed is None:
+def _absorber(history: History, life: PlaceLife, end: int) -> dict[str, object] | None:
+    merge = life.absorbed
+    if merge is None or merge.cause.offset >= end:
         return None
-    return {
-        "place_id": place_name(history, life.absorbed.survivor),
-        **life.absorbed.cause.document(),
-    }
+    return {"place_id": place_name(history, merge.survivor), **merge.cause.document()}
 
 
 def _standing(history: History, life: PlaceLife, end: int) -> str:

@@ -4,9 +4,18 @@
 becomes a checked tree of the nodes in `syntax`, and nothing else is ever evaluated.
 """
 
+from .direction import Direction
 from .errors import ExpressionError
 from .evaluate import Expression, Mention
 from .facts import Facts
 from .functions import FUNCTIONS, functions_help
 
-__all__ = ["FUNCTIONS", "Expression", "ExpressionError", "Facts", "Mention", "functions_help"]
+__all__ = [
+    "FUNCTIONS",
+    "Direction",
+    "Expression",
+    "ExpressionError",
+    "Facts",
+    "Mention",
+    "functions_help",
+]

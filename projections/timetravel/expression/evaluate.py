@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, assert_never
 
+from .direction import Direction, direction_of
 from .errors import ExpressionError
 from .facts import Facts
 from .parser import parse
@@ -48,6 +49,11 @@ class Expression:
         """Every function it calls as written, with its value: why it holds or not."""
         seen = {self._text(call): _value(call, facts) for call in _calls(self._root)}
         return tuple(seen.items())
+
+    @property
+    def direction(self) -> Direction:
+        """Which way it can turn as events are added."""
+        return direction_of(self._root)
 
     def mentions(self) -> tuple[Mention, ...]:
         """The keyframes, places, objects, classes and runs it names."""

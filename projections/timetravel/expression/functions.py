@@ -18,6 +18,8 @@ class Function:
     says: str
     optional: bool = False
     """Whether the one parameter may be left out."""
+    rises: bool = False
+    """Whether more events never lower it (nor turn it from true to false)."""
 
     @property
     def signature(self) -> str:
@@ -45,6 +47,7 @@ _ALL = (
         lambda f, run=None: f.keyframe_count(run),
         "keyframes, of one run or of all",
         optional=True,
+        rises=True,
     ),
     Function(
         "object_count",
@@ -53,16 +56,29 @@ _ALL = (
         lambda f, name=None: f.object_count(name),
         "objects, of one class or of all",
         optional=True,
+        rises=True,
     ),
     Function(
         "place_of", (_KF,), Type.TEXT, lambda f, k: f.place_of(k), "the place a keyframe is in"
     ),
-    Function("same_place", (_KF, _KF), Type.TRUTH, _same_place, "two keyframes are in one place"),
+    Function(
+        "same_place",
+        (_KF, _KF),
+        Type.TRUTH,
+        _same_place,
+        "two keyframes are in one place",
+        rises=True,
+    ),
     Function(
         "located_in", (_OBJECT,), Type.TEXT, lambda f, o: f.located_in(o), "the place of an object"
     ),
     Function(
-        "sightings", (_OBJECT,), Type.NUMBER, lambda f, o: f.sightings(o), "times it was seen"
+        "sightings",
+        (_OBJECT,),
+        Type.NUMBER,
+        lambda f, o: f.sightings(o),
+        "times an object was seen",
+        rises=True,
     ),
     Function("size", (_PLACE,), Type.NUMBER, lambda f, p: f.size(p), "keyframes in a place"),
     Function(
@@ -72,7 +88,14 @@ _ALL = (
         lambda f, a, b: f.transitions(a, b),
         "drives between two places",
     ),
-    Function("merged", (_PLACE,), Type.TRUTH, lambda f, p: f.merged(p), "a place was absorbed"),
+    Function(
+        "merged",
+        (_PLACE,),
+        Type.TRUTH,
+        lambda f, p: f.merged(p),
+        "a place was absorbed",
+        rises=True,
+    ),
 )
 
 FUNCTIONS: dict[str, Function] = {function.name: function for function in _ALL}

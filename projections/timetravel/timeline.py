@@ -1,0 +1,180 @@
+"""One log under one setting, and every moment of its map.
+
+A timeline folds its log once, when something is first asked, and keeps the history; after that
+every question is a look-up. An event at offset o, and a merge it causes, shows in ``at(o + 1)``.
+"""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TypeAlias
+
+from eventsrc.log import LogReader
+from projections.digest import map_digest
+from projections.errors import WhenceError
+from projections.folding import FoldedEvent, fold_events
+from projections.reducers.semantic_map import SemanticMap
+from projections.settings import Settings
+from projections.view import MapView
+
+from .causes import Cause
+from .difference import Difference, difference_of
+from .expression import Expression
+from .facts import HistoryFacts, Tallies
+from .history import History
+from .lives import Merge
+from .lookup import NoSuchThing, find_keyframe, find_object, find_place
+from .moments import view_at
+from .object_story import object_story
+from .place_story import place_story
+from .rows import rows_of
+from .same_story import same_story
+from .search import Search, Searcher
+from .story import Story, place_name
+
+Progress: TypeAlias = Callable[[int, int], None]
+"""Told (events folded, events in all) from time to time."""
+
+_PROGRESS_EVERY = 500
+
+
+class Timeline:
+    """A context manager over a log; questions at an ``end``: the map after that many events."""
+
+    def __init__(
+        self, log: Path, settings: Settings | None = None, *, progress: Progress | None = None
+    ) -> None:
+        self.settings = settings or Settings()
+        self.reader = LogReader(log)
+        self._progress = progress
+        self._map = SemanticMap(self.settings)
+        self._latest = MapView(self.settings, keep_embeddings=False)
+        self._history = History()
+        self._tallies: Tallies | None = None
+
+    def __enter__(self) -> "Timeline":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.reader.close()
+
+    @property
+    def end(self) -> int:
+        """The number of events in the log as of opening or the last `refresh`."""
+        return self.reader.next_offset
+
+    def refresh(self) -> int:
+        """Take in what was recorded since; the new `end`."""
+        return self.reader.refresh()
+
+    @property
+    def history(self) -> History:
+        """What happened so far; folds what is not folded yet. Raises FoldError at a bad event."""
+        start, end = self._history.next_offset, self.end
+        if start < end:
+            self._tallies = None
+            for folded in fold_events(self.reader.read(start, end), self._map):
+                self._latest.apply_event(folded.offset, folded.deltas)
+                self._history.apply(folded.offset, folded.deltas)
+                if self._progress and folded.offset % _PROGRESS_EVERY == 0:
+                    self._progress(folded.offset, end)
+            if self._progress:
+                self._progress(end, end)
+        return self._history
+
+    def at(self, end: int | None = None) -> MapView:
+        """The map after the first ``end`` events, all of them for None; yours to change.
+
+        Its observations carry no embeddings, only their checksums.
+        """
+        return view_at(self.history, self._latest, self._end(end), self.settings)
+
+    def deltas(self, start: int = 0, end: int | None = None) -> Iterator[FoldedEvent]:
+        """What each event from ``start`` to before ``end`` changed, by a fold of its own."""
+        events = self.reader.read(0, self._end(end))
+        folded = fold_events(events, SemanticMap(self.settings))
+        return (event for event in folded if event.offset >= start)
+
+    def merges(self, end: int | None = None) -> list[Merge]:
+        """Every merge of places by the first ``end`` events, in order."""
+        before = self._end(end)
+        return [merge for merge in self.history.merges if merge.cause.offset < before]
+
+    def why(self, thing: str, end: int | None = None) -> Story:
+        """The chronicle of a place or an object; raises NoSuchThing with the nearest names."""
+        history = self.history
+        if thing in history.object_numbers:
+            life = find_object(history, thing)
+            det_ids = [self._latest.observations[seen.observation].det_id for seen in life.seen]
+            return object_story(history, det_ids, life, self._end(end))
+        if thing not in history.place_numbers and thing.startswith("obj-"):
+            raise NoSuchThing("object", thing, history.object_numbers)
+        return place_story(history, find_place(history, thing), self._end(end))
+
+    def why_same(self, first: str, second: str, end: int | None = None) -> Story:
+        """Since when, and by which merges, two keyframes (``run:keyframe``) are in one place."""
+        a, b = (find_keyframe(self.history, text) for text in (first, second))
+        return same_story(self.history, a, b, self._end(end))
+
+    def diff(self, start: int, end: int | None = None) -> Difference:
+        """What turns the map after ``start`` events into that after ``end``."""
+        last = self._end(end)
+        before, after = self.at(start), self.at(last)
+        return difference_of(
+            start,
+            last,
+            (rows_of(before), rows_of(after)),
+            (map_digest(before), map_digest(after)),
+            (before.counts(), after.counts()),
+            self._absorbed(start, last),
+        )
+
+    def facts(self, end: int | None = None) -> HistoryFacts:
+        """The map after ``end`` events as expressions ask it."""
+        history = self.history
+        if self._tallies is None:
+            self._tallies = Tallies(history)
+        return HistoryFacts(history, self._tallies, self._end(end))
+
+    def bisect(
+        self,
+        expression: Expression | str,
+        start: int = 0,
+        end: int | None = None,
+        *,
+        scan: bool = False,
+    ) -> Search:
+        """The first event from ``start`` on that made a condition true; with ``scan``, all turns.
+
+        Raises ExpressionError for a text that cannot be read or names what is not in the log.
+        """
+        asked = Expression(expression) if isinstance(expression, str) else expression
+        facts = self.facts(end)
+        self._check_names(asked, facts)
+        return Searcher(asked, facts, self.history.cause_at).search(start, facts.end, scan=scan)
+
+    def _end(self, end: int | None) -> int:
+        if end is None:
+            return self.end
+        if not 0 <= end <= self.end:
+            raise WhenceError(
+                f"{end} is no point in {self.reader.path}, which holds {self.end} events; "
+                f"give 0 to {self.end}"
+            )
+        return end
+
+    def _check_names(self, expression: Expression, facts: HistoryFacts) -> None:
+        """A misspelt id would make any condition quietly false; say so instead."""
+        for mention in expression.mentions():
+            names = facts.names(mention.kind)
+            if mention.text not in names:
+                error = NoSuchThing(mention.kind.value, mention.text, names)
+                raise expression.error_at(mention.column, str(error))
+
+    def _absorbed(self, start: int, end: int) -> dict[str, tuple[str, Cause]]:
+        history = self.history
+        return {
+            place_name(history, place): (place_name(history, merge.survivor), merge.cause)
+            for merge in history.merges
+            if start <= merge.cause.offset < end
+            for place in merge.absorbed
+        }
