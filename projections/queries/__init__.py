@@ -1,0 +1,1 @@
+"""Questions to the live databases, as library functions; nothing here writes."""

@@ -1,0 +1,214 @@
+"""Re-localisation against the live databases: one round trip, or two when they are apart.
+
+A `Reader` holds the connections and fetches candidates; `relocalize` is the whole question from
+databases to answer. What the ranking does with the candidates is `projections.relocalize`.
+"""
+
+import contextlib
+import json
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
+from typing import Any, Self
+
+import psycopg
+from pgvector.psycopg import register_vector
+from psycopg import sql
+
+from projections.errors import ExtensionMissing, ProjectionMissing, QuestionError
+from projections.postgres.connect import (
+    Connection,
+    Targets,
+    connect,
+    database_errors,
+    place_of,
+)
+from projections.relocalize import (
+    DEFAULT_CAMERA,
+    NEIGHBOURS,
+    Answer,
+    Camera,
+    Candidates,
+    Crop,
+    Match,
+    Method,
+    Spot,
+    rank,
+)
+from projections.relocalize.exact_search import check_space
+from projections.sinks.labels import graphid_base
+
+from ._statements import statements, tables
+
+_BASES = {
+    "observes_base": graphid_base("OBSERVES"),
+    "has_observation_base": graphid_base("HAS_OBSERVATION"),
+}
+_NUMBER = (1 << 48) - 1
+_EF_SEARCH = max(100, NEIGHBOURS)
+
+
+def relocalize(
+    targets: Targets,
+    crops: Sequence[Crop],
+    *,
+    top: int = 3,
+    method: Method = "joint",
+    camera: Camera = DEFAULT_CAMERA,
+) -> Answer:
+    """Where a robot is that sees ``crops``, from the databases as they are now."""
+    with Reader(targets) as reader:
+        return rank(crops, reader.candidates(crops), top=top, method=method, camera=camera)
+
+
+def prepare_graph(connection: Connection) -> None:
+    """Set up a session for walking along the graph's tables; AGE's operators are found last."""
+    connection.execute('SET search_path = "$user", public, ag_catalog')
+    connection.execute("SET jit = off")
+
+
+def prepare_vectors(connection: Connection) -> None:
+    """Set up a session for searching: vectors in binary, enough breadth.
+
+    Without a wider ``ef_search`` an HNSW index silently returns fewer rows than asked for.
+    """
+    try:
+        register_vector(connection)
+    except psycopg.ProgrammingError:
+        raise ExtensionMissing(
+            f"{place_of(connection)}: the extension vector is not created there; run mapfold replay"
+        ) from None
+    connection.execute("SELECT '[1]'::vector")  # loads the library, whose settings come next
+    connection.execute(sql.SQL("SET hnsw.ef_search = {}").format(sql.Literal(_EF_SEARCH)))
+
+
+class Reader:
+    """Connections to the databases of one projection, for questions one after the other."""
+
+    def __init__(self, targets: Targets) -> None:
+        self._targets = targets
+        self._vectors = connect(targets.vector_url, application="mapfold query", autocommit=True)
+        self._graph = self._vectors
+        try:
+            with database_errors(targets.vector_url):
+                prepare_vectors(self._vectors)
+            if not targets.one_database:
+                self._graph = connect(
+                    targets.graph_url, application="mapfold query", autocommit=True
+                )
+            prepare_graph(self._graph)
+        except BaseException:
+            self._vectors.close()
+            raise
+
+    def candidates(self, crops: Sequence[Crop], neighbours: int = NEIGHBOURS) -> Candidates:
+        """The observations most like each crop, with their places."""
+        return fetch(self._vectors, self._graph, crops, neighbours)
+
+    def close(self) -> None:
+        """Close the connections. May be called twice."""
+        self._vectors.close()
+        self._graph.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def fetch(
+    vectors: Connection, graph: Connection, crops: Sequence[Crop], neighbours: int = NEIGHBOURS
+) -> Candidates:
+    """Candidates over open connections; the same one twice means one round trip."""
+    one = vectors is graph
+    with _clear_errors(vectors):
+        rows = vectors.execute(
+            _statement("near_and_along" if one else "near", len(crops)),
+            {**_BASES, "neighbours": neighbours, **_bound(crops)},
+        ).fetchall()
+    _check_spaces(crops, rows)
+    near = [(*row[:10],) for row in rows]
+    if one:
+        return _assemble(len(crops), near, {row[1]: row[10:] for row in rows})
+    det_pks = sorted({row[1] for row in near})
+    with _clear_errors(graph):
+        along = graph.execute(_statement("along", 0), {**_BASES, "det_pks": det_pks}).fetchall()
+    return _assemble(len(crops), near, {row[0]: row[1:] for row in along})
+
+
+@lru_cache(maxsize=128)
+def _statement(name: str, crops: int) -> sql.Composed:
+    rows = [
+        sql.SQL("({}::int, {}::vector)").format(sql.Literal(i), sql.Placeholder(f"crop_{i}"))
+        for i in range(crops)
+    ]
+    questions = sql.SQL("VALUES {}").format(sql.SQL(", ").join(rows))
+    return statements("relocalize")[name].format(questions=questions, **tables())
+
+
+def _bound(crops: Sequence[Crop]) -> dict[str, Any]:
+    return {f"crop_{i}": crop.vector for i, crop in enumerate(crops)}
+
+
+def _assemble(
+    crops: int, near: Sequence[Sequence[Any]], along: dict[int, Sequence[Any]]
+) -> Candidates:
+    matches: list[list[Match]] = [[] for _ in range(crops)]
+    places: dict[int, Spot] = {}
+    for crop, det_pk, det_id, similarity, class_name, bbox, x, y, yaw, _ in near:
+        thing, its_id, its, there_id, there = along.get(det_pk, (None,) * 5)
+        found = None if thing is None else _properties(thing)
+        matches[crop].append(
+            Match(
+                det_pk - 1,
+                det_id,
+                similarity,
+                None if x is None else (x, y, yaw),
+                (bbox[0], bbox[1], bbox[2], bbox[3]),
+                class_name if found is None else found["class_name"],
+                None if found is None else found["object_id"],
+                _spot(places, its_id, its),
+                _spot(places, there_id, there),
+            )
+        )
+    ordered = (tuple(sorted(row, key=lambda m: (-m.similarity, m.observation))) for row in matches)
+    return Candidates(tuple(ordered), places)
+
+
+def _spot(places: dict[int, Spot], graphid: str | None, properties: str | None) -> int | None:
+    if graphid is None or properties is None:
+        return None
+    ordinal = (int(graphid) & _NUMBER) - 1
+    if ordinal not in places:
+        place = _properties(properties)
+        places[ordinal] = Spot(place["place_id"], place["centroid_x"], place["centroid_y"])
+    return ordinal
+
+
+@lru_cache(maxsize=4096)
+def _properties(agtype: str) -> dict[str, Any]:
+    properties: dict[str, Any] = json.loads(agtype)
+    return properties
+
+
+def _check_spaces(crops: Sequence[Crop], rows: Sequence[Sequence[Any]]) -> None:
+    model = next((row[9] for row in rows), None)
+    for crop in crops:
+        check_space(crop, len(crop.vector), model)
+
+
+@contextlib.contextmanager
+def _clear_errors(connection: Connection) -> Iterator[None]:
+    """What can be wrong with a question, or with a database that holds no map yet."""
+    with database_errors(connection.info.dsn):
+        try:
+            yield
+        except (psycopg.errors.UndefinedTable, psycopg.errors.InvalidSchemaName):
+            raise ProjectionMissing(
+                f"{place_of(connection)}: nothing has been projected there yet; run mapfold replay"
+            ) from None
+        except psycopg.errors.DataException as error:
+            raise QuestionError(
+                f"the question does not fit the map in {place_of(connection)}:"
+                f" {error.diag.message_primary}; ask with the model that made the map"
+            ) from None

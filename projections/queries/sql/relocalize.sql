@@ -1,0 +1,50 @@
+-- From crops to candidates: nearest observations, and from each along the graph to its Object, that
+-- Object's Place, and the Place its keyframe lies in. Ids follow from the observation's number
+-- (det_pk), so every step but the search is a look-up by id. `{questions}` is a VALUES list of
+-- (crop, vector) bind parameters.
+
+-- name: near
+-- The nearest `%(neighbours)s` observations of each crop, from the vectors' database.
+WITH question (crop, wanted) AS ({questions})
+SELECT question.crop, near.det_pk, near.det_id, 1 - near.distance, near.class_name, near.bbox,
+       near.map_x, near.map_y, near.map_yaw, near.embedding_model
+FROM question CROSS JOIN LATERAL (
+    SELECT det_pk, det_id, class_name, bbox, map_x, map_y, map_yaw, embedding_model,
+           embedding <=> question.wanted AS distance
+    FROM public.detection_embeddings ORDER BY embedding <=> question.wanted LIMIT %(neighbours)s
+) AS near
+
+-- name: along
+-- Object, its Place and the keyframe's Place of observations, from the graph's database.
+SELECT seen.det_pk, thing.properties, its.id, its.properties, there.id, there.properties
+FROM unnest(%(det_pks)s::bigint[]) AS seen (det_pk)
+LEFT JOIN {observes} AS observes
+    ON observes.id = ((%(observes_base)s + seen.det_pk)::text)::ag_catalog.graphid
+LEFT JOIN {object} AS thing ON thing.id = observes.end_id
+LEFT JOIN {located_in} AS located ON located.start_id = thing.id
+LEFT JOIN {place} AS its ON its.id = located.end_id
+LEFT JOIN {has_observation} AS has
+    ON has.id = ((%(has_observation_base)s + seen.det_pk)::text)::ag_catalog.graphid
+LEFT JOIN {in_place} AS in_place ON in_place.start_id = has.start_id
+LEFT JOIN {place} AS there ON there.id = in_place.end_id
+
+-- name: near_and_along
+-- Both in one round trip and one snapshot, when they share a database.
+WITH question (crop, wanted) AS ({questions})
+SELECT question.crop, near.det_pk, near.det_id, 1 - near.distance, near.class_name, near.bbox,
+       near.map_x, near.map_y, near.map_yaw, near.embedding_model,
+       thing.properties, its.id, its.properties, there.id, there.properties
+FROM question CROSS JOIN LATERAL (
+    SELECT det_pk, det_id, class_name, bbox, map_x, map_y, map_yaw, embedding_model,
+           embedding <=> question.wanted AS distance
+    FROM public.detection_embeddings ORDER BY embedding <=> question.wanted LIMIT %(neighbours)s
+) AS near
+LEFT JOIN {observes} AS observes
+    ON observes.id = ((%(observes_base)s + near.det_pk)::text)::ag_catalog.graphid
+LEFT JOIN {object} AS thing ON thing.id = observes.end_id
+LEFT JOIN {located_in} AS located ON located.start_id = thing.id
+LEFT JOIN {place} AS its ON its.id = located.end_id
+LEFT JOIN {has_observation} AS has
+    ON has.id = ((%(has_observation_base)s + near.det_pk)::text)::ag_catalog.graphid
+LEFT JOIN {in_place} AS in_place ON in_place.start_id = has.start_id
+LEFT JOIN {place} AS there ON there.id = in_place.end_id
