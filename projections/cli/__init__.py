@@ -5,7 +5,7 @@ import typer
 from eventsrc import cli as log_commands
 from eventsrc.cli._shell import run_app
 
-from . import db, draw, state
+from . import bisect, db, diff, draw, merges, state, why
 
 app = typer.Typer(
     name="mapfold",
@@ -20,6 +20,10 @@ log_commands.register(app)
 db.register(app)
 state.register(app)
 draw.register(app)
+merges.register(app)
+why.register(app)
+diff.register(app)
+bisect.register(app)
 
 
 def main() -> None:

@@ -1,0 +1,71 @@
+"""What the time travel commands share: the LOG and --at arguments, and a timeline with progress."""
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from eventsrc.cli._shell import people
+from eventsrc.log.whence import resolve
+from projections.cli._options import settings_from
+from projections.settings import Settings
+from projections.timetravel import Timeline
+
+LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="The log's folder.")]
+AtOption = Annotated[
+    str,
+    typer.Option(
+        "--at",
+        metavar="W",
+        help="Look from here: number of events, ISO time, RUN:KEYFRAME (inclusive) or end.",
+    ),
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")]
+AllOption = Annotated[bool, typer.Option("--all", help="Name every thing, however many.")]
+
+MOST_LINES = 10
+"""Things of a kind that a text answer names without --all."""
+
+
+@contextlib.contextmanager
+def timeline(log: Path, settings_file: Path | None, sets: list[str] | None) -> Iterator[Timeline]:
+    """The log's timeline under the settings of the command line, with a bar on a terminal."""
+    settings: Settings = settings_from(settings_file, sets)
+    with FoldBar() as bar, Timeline(log, settings, progress=bar) as opened:
+        yield opened
+
+
+class FoldBar:
+    """A bar for people while events are folded; nothing where nobody watches."""
+
+    def __init__(self) -> None:
+        self._bar = Progress(
+            TextColumn("folding"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+            console=people,
+            transient=True,
+            disable=not people.is_terminal,
+        )
+        self._task = self._bar.add_task("folding", total=None)
+
+    def __enter__(self) -> "FoldBar":
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def __call__(self, done: int, total: int) -> None:
+        self._bar.update(self._task, completed=done, total=total)
+        if done >= total:
+            self._bar.stop()
+
+
+def point(opened: Timeline, text: str) -> int:
+    """The number of events that W means in this log."""
+    return resolve(opened.reader, text)

@@ -1,0 +1,37 @@
+"""`mapfold diff`: what lies between two moments of a map."""
+
+import sys
+from typing import Annotated
+
+import typer
+
+from eventsrc.cli._shell import emit
+from projections.timetravel.text import difference_text
+
+from ._options import SetOption, SettingsOption
+from ._timeline import MOST_LINES, AllOption, JsonOption, LogArgument, point, timeline
+
+_W = "Number of events, ISO time, RUN:KEYFRAME (inclusive) or end."
+
+
+def diff(
+    log: LogArgument,
+    first: Annotated[str, typer.Argument(metavar="W1", help=f"From here. {_W}")],
+    second: Annotated[str, typer.Argument(metavar="W2", help="To here.")] = "end",
+    json_: JsonOption = False,
+    all_: AllOption = False,
+    set_: SetOption = None,
+    settings_file: SettingsOption = None,
+) -> None:
+    """Places, objects and adjacency that changed from one moment of the map to another."""
+    with timeline(log, settings_file, set_) as opened:
+        found = opened.diff(point(opened, first), point(opened, second))
+    if json_:
+        emit(found.document())
+    else:
+        sys.stdout.write(difference_text(found, most=None if all_ else MOST_LINES))
+
+
+def register(app: typer.Typer) -> None:
+    """Add `diff` to the program."""
+    app.command()(diff)

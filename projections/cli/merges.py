@@ -1,0 +1,56 @@
+"""`mapfold merges`: every merge of places, what made it and what changed hands."""
+
+import sys
+from typing import Annotated
+
+import typer
+
+from eventsrc.cli._shell import emit
+from eventsrc.errors import MisuseError
+from projections.timetravel.lives import Merge
+from projections.timetravel.merge_story import merge_document
+from projections.timetravel.text import merge_text, merges_text
+
+from ._options import SetOption, SettingsOption
+from ._timeline import AtOption, JsonOption, LogArgument, point, timeline
+
+
+def merges(
+    log: LogArgument,
+    at: AtOption = "end",
+    show: Annotated[
+        int | None,
+        typer.Option(
+            "--show", metavar="N", help="Merge number N alone, with links, objects and edges."
+        ),
+    ] = None,
+    json_: JsonOption = False,
+    set_: SetOption = None,
+    settings_file: SettingsOption = None,
+) -> None:
+    """Every merge of places: when, by which keyframe, who survived, who was absorbed."""
+    with timeline(log, settings_file, set_) as opened:
+        end = point(opened, at)
+        found = opened.merges(end)
+        if show is not None:
+            found = [numbered(found, show)]
+        if json_:
+            emit([merge_document(opened.history, merge) for merge in found])
+        elif show is not None:
+            sys.stdout.write(merge_text(opened.history, found[0]))
+        else:
+            sys.stdout.write(merges_text(opened.history, found, end))
+
+
+def numbered(found: list[Merge], number: int) -> Merge:
+    """The merge of this number; raises MisuseError naming those there are."""
+    for merge in found:
+        if merge.number == number:
+            return merge
+    there = f"there are 1 to {len(found)}" if found else "there are none"
+    raise MisuseError(f"no merge number {number}; {there} (see `mapfold merges LOG`)")
+
+
+def register(app: typer.Typer) -> None:
+    """Add `merges` to the program."""
+    app.command()(merges)

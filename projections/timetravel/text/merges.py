@@ -1,0 +1,44 @@
+"""`mapfold merges` for people."""
+
+from collections.abc import Sequence
+
+from projections.timetravel.history import History
+from projections.timetravel.lives import EdgeChange, Merge
+from projections.timetravel.merge_story import HEADER, merge_row
+from projections.timetravel.story import keyframe_name, link_text, place_name
+
+from .table import shortened, table
+
+MOST = 12
+
+
+def merges_text(history: History, merges: Sequence[Merge], end: int) -> str:
+    """The table of merges, or that there are none."""
+    if not merges:
+        formed = sum(life.formed.offset < end for life in history.places)
+        return f"no merges among {formed:,} places formed by {end:,} events\n"
+    rows = [merge_row(history, merge) for merge in merges]
+    return table(HEADER, rows, right="# offset objects edges")
+
+
+def merge_text(history: History, merge: Merge) -> str:
+    """One merge with everything that made it and that changed hands."""
+    cause, after = merge.cause, merge.cause.offset + 1
+    lines = [
+        f"merge {merge.number} at offset {cause.offset:,} ({cause.time}), shows from --at {after}",
+        f"bridge    {keyframe_name(history, merge.bridge)}",
+        *(f"link      {link_text(history, link)}" for link in merge.links),
+        f"survivor  {place_name(history, merge.survivor)}, {merge.survivor_size:,} keyframes",
+    ]
+    for place, size in zip(merge.absorbed, merge.absorbed_sizes, strict=True):
+        lines.append(f"absorbed  {place_name(history, place)}, {size:,} keyframes")
+    objects = [history.objects[number] for number in merge.objects]
+    named = [f"object    {o.object_id} ({o.found.class_name})" for o in objects]
+    lines += shortened(named, MOST, "--json lists all")
+    lines += shortened([_edge_text(history, e) for e in merge.edges], MOST, "--json lists all")
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _edge_text(history: History, edge: EdgeChange) -> str:
+    a, b = place_name(history, edge.a), place_name(history, edge.b)
+    return f"edge      {a} – {b}: {edge.before:,} → {edge.after:,} shared transitions"
