@@ -5,7 +5,7 @@ import typer
 from eventsrc import cli as log_commands
 from eventsrc.cli._shell import run_app
 
-from . import bisect, db, diff, draw, merges, state, why
+from . import bisect, db, diff, draw, merges, relocalize, state, why
 
 app = typer.Typer(
     name="mapfold",
@@ -19,6 +19,7 @@ app = typer.Typer(
 log_commands.register(app)
 db.register(app)
 state.register(app)
+relocalize.register(app)
 draw.register(app)
 merges.register(app)
 why.register(app)

@@ -1,0 +1,99 @@
+"""`mapfold relocalize`: which Place is this, from a few object crops."""
+
+import sys
+from pathlib import Path
+from typing import Annotated, cast, get_args
+
+import typer
+
+from eventsrc.cli._shell import emit, say
+from eventsrc.errors import MisuseError
+from projections.cli._options import (
+    DbOption,
+    SetOption,
+    SettingsOption,
+    VectorDbOption,
+    databases,
+    settings_from,
+)
+from projections.cli._question import (
+    HfovOption,
+    ImageOption,
+    QuestionArgument,
+    camera_from,
+    question_from,
+)
+from projections.queries.relocalize import relocalize as ask
+from projections.relocalize import UNKNOWN_BELOW, Answer, Camera, Crop, Method
+from projections.relocalize.as_of import relocalize_as_of
+from projections.relocalize.text import answer_text
+
+
+def relocalize(
+    query: QuestionArgument,
+    top: Annotated[int, typer.Option("--top", min=1, max=100, help="Places to list.")] = 3,
+    as_of: Annotated[
+        str | None,
+        typer.Option(
+            "--as-of",
+            metavar="W",
+            help="Ask the map as it was: number of events, ISO time, RUN:KEYFRAME or end of --log.",
+        ),
+    ] = None,
+    log: Annotated[
+        Path | None, typer.Option("--log", metavar="LOG", help="The log's folder, for --as-of.")
+    ] = None,
+    method: Annotated[
+        str, typer.Option("--method", help="joint, or plain: similarities summed per Place.")
+    ] = "joint",
+    hfov: HfovOption = 69.4,
+    image: ImageOption = "640x400",
+    db: DbOption = None,
+    vector_db: VectorDbOption = None,
+    set_: SetOption = None,
+    settings_file: SettingsOption = None,
+    json_: Annotated[bool, typer.Option("--json", help="The answer as JSON on stdout.")] = False,
+) -> None:
+    """Ranked Places with evidence, a pose hypothesis and a confidence, from object crops."""
+    how, camera, crops = method_from(method), camera_from(hfov, image), question_from(query)
+    if as_of is None:
+        answer = _live(crops, top, how, camera, db, vector_db)
+    elif log is None:
+        raise MisuseError("--as-of asks a past map, which only the log knows; give --log LOG too")
+    else:
+        settings = settings_from(settings_file, set_)
+        answer = relocalize_as_of(log, as_of, settings, crops, top=top, method=how, camera=camera)
+    _tell(answer, json_)
+
+
+def _live(
+    crops: tuple[Crop, ...],
+    top: int,
+    method: Method,
+    camera: Camera,
+    db: str | None,
+    vector_db: str | None,
+) -> Answer:
+    with databases(db, vector_db) as targets:
+        return ask(targets, crops, top=top, method=method, camera=camera)
+
+
+def method_from(text: str) -> Method:
+    """The method an option names."""
+    if text in get_args(Method):
+        return cast("Method", text)
+    raise MisuseError(f"--method {text}: there are joint and plain")
+
+
+def _tell(answer: Answer, as_json: bool) -> None:
+    if not as_json:
+        sys.stdout.write(answer_text(answer))
+        return
+    emit(answer.document())
+    if answer.unknown:
+        say(f"unknown: confidence {answer.confidence:.2f} is below {UNKNOWN_BELOW}")
+
+
+def register(app: typer.Typer) -> None:
+    """Add `relocalize` to the program."""
+    app.command()(relocalize)
