@@ -65,12 +65,12 @@ def _settings_of_file(file: Path) -> Settings:
 @contextlib.contextmanager
 def databases(db: str | None, vector_db: str | None) -> Iterator[Targets]:
     """The databases a command uses. Also after SIGTERM no embedded server is left behind."""
-    with _sigterm_unwinds(), open_targets(db, vector_db) as targets:
+    with sigterm_unwinds(), open_targets(db, vector_db) as targets:
         yield targets
 
 
 @contextlib.contextmanager
-def _sigterm_unwinds() -> Iterator[None]:
+def sigterm_unwinds() -> Iterator[None]:
     """SIGTERM ends the command through its ``finally`` blocks, as Ctrl-C does."""
 
     def leave(signum: int, _frame: FrameType | None) -> None:
