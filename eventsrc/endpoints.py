@@ -7,7 +7,7 @@ router that runs very well. So endpoints are checked here, before a session is o
 from collections.abc import Iterable
 from typing import Final
 
-from .errors import TransportError
+from .errors import MisuseError, TransportError
 
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 """Where `mapfold router` listens and every other command connects unless told otherwise."""
@@ -37,9 +37,21 @@ def check_endpoints(texts: Iterable[str]) -> tuple[str, ...]:
     return tuple(check_endpoint(text) for text in texts)
 
 
+def parse_address(text: str, option: str) -> tuple[str, int]:
+    """``PORT``, which means this machine only, or ``HOST:PORT``; MisuseError names ``option``."""
+    host, colon, port = text.rpartition(":")
+    if not _is_port(port) or (colon and not host):
+        raise MisuseError(f"{option} {text!r} is neither PORT nor HOST:PORT; try {option} 9464")
+    return host or "127.0.0.1", int(port)
+
+
+def _is_port(text: str) -> bool:
+    return text.isascii() and text.isdigit() and int(text) <= 65_535
+
+
 def _check_host_and_port(text: str, address: str) -> None:
     host, colon, port = address.rpartition(":")
     if not colon or not host:
         raise TransportError(f"endpoint {text!r} has no port; {_EXAMPLE}")
-    if not (port.isascii() and port.isdigit() and int(port) <= 65_535):
+    if not _is_port(port):
         raise TransportError(f"endpoint {text!r}: {port!r} is no port (0 to 65535); {_EXAMPLE}")

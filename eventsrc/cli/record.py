@@ -1,15 +1,19 @@
 """`mapfold record`: Zenoh to log, until a signal ends it."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from eventsrc._zenoh import check_keys, open_session
+from eventsrc.endpoints import parse_address
 from eventsrc.ledger import ledger_of
 from eventsrc.log import LogReader, LogWriter, parse_fsync
 from eventsrc.recorder import DEFAULT_KEYS, DEFAULT_QUEUE_SIZE, Recorder, RecorderReport
 
+from ._recorder_line import EVERY_S, watching
 from ._shell import emit, finish, say
 from ._signals import stop_on_signals
 from ._zenoh_options import ConfigOption, ConnectOption, ListenOption, zenoh_options
@@ -39,6 +43,10 @@ def record(
     max_events: Annotated[
         int | None, typer.Option(min=1, help="Stop after so many messages.")
     ] = None,
+    metrics: Annotated[
+        str | None,
+        typer.Option(metavar="PORT", help="Serve Prometheus metrics; PORT or HOST:PORT."),
+    ] = None,
     json: Annotated[bool, typer.Option("--json", help="The final numbers as JSON.")] = False,
 ) -> None:
     """Record what robots publish over Zenoh, until Ctrl-C.
@@ -49,6 +57,7 @@ def record(
     options = zenoh_options(connect, listen, zenoh_config)
     keys = tuple(key or DEFAULT_KEYS)
     check_keys(keys)
+    address = None if metrics is None else parse_address(metrics, "--metrics")
     with (
         stop_on_signals() as stop,
         open_session(options, mode=options.mode) as session,
@@ -59,14 +68,26 @@ def record(
         recorder = Recorder(
             session, writer, keys, queue_size=queue, max_events=max_events, ledger=ledger
         )
-        say(
-            f"recording {', '.join(keys)} to {log} from offset {writer.next_offset}; Ctrl-C ends it"
-        )
-        report = recorder.run(stop)
+        with _measured(address, recorder, log), watching(log) as watch:
+            named = ", ".join(keys)
+            say(f"recording {named} to {log} from offset {writer.next_offset}; Ctrl-C ends it")
+            report = recorder.run(stop, every_s=EVERY_S, watch=watch)
     say(summary(log, report))
     if json:
         emit(as_json(report))
     finish(findings=not report.clean)
+
+
+@contextmanager
+def _measured(address: tuple[str, int] | None, recorder: Recorder, log: Path) -> Iterator[None]:
+    if address is None:
+        yield
+        return
+    from eventsrc.metrics import serving_metrics  # costs nothing unless asked for
+
+    with serving_metrics(address, recorder.report, log) as port:
+        say(f"metrics on http://{address[0]}:{port}/metrics")
+        yield
 
 
 def summary(log: Path, report: RecorderReport) -> str:

@@ -2,8 +2,8 @@
 
 import pytest
 
-from eventsrc.endpoints import check_endpoint, check_endpoints
-from eventsrc.errors import TransportError
+from eventsrc.endpoints import check_endpoint, check_endpoints, parse_address
+from eventsrc.errors import MisuseError, TransportError
 
 
 @pytest.mark.parametrize(
@@ -45,3 +45,17 @@ def test_a_malformed_endpoint_is_named(text: str, complaint: str) -> None:
 
 def test_the_order_stays() -> None:
     assert check_endpoints(["tcp/b:1", "tcp/a:2"]) == ("tcp/b:1", "tcp/a:2")
+
+
+@pytest.mark.parametrize(
+    ("text", "address"),
+    [("9464", ("127.0.0.1", 9464)), ("0.0.0.0:0", ("0.0.0.0", 0)), ("::1:80", ("::1", 80))],
+)
+def test_an_address_is_a_port_or_host_and_port(text: str, address: tuple[str, int]) -> None:
+    assert parse_address(text, "--metrics") == address
+
+
+@pytest.mark.parametrize("text", ["", "x", ":1", "host:", "70000", "host:-1"])
+def test_what_is_no_address_names_the_option(text: str) -> None:
+    with pytest.raises(MisuseError, match=f"--metrics {text!r}"):
+        parse_address(text, "--metrics")

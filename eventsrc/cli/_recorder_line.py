@@ -1,0 +1,76 @@
+"""What a recorder says while it records: one line on a terminal, and losses everywhere."""
+
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.live import Live
+from rich.text import Text
+
+from eventsrc.recorder import RecorderReport
+
+from ._shell import people, say
+
+EVERY_S = 1.0
+
+
+class RecorderLine:
+    """Turns successive reports into the status line, and speaks up when losses grow."""
+
+    def __init__(self, log: Path, *, clock: Callable[[], float] = time.monotonic) -> None:
+        self._log = log
+        self._clock = clock
+        self._at_s = clock()
+        self._recorded = self._lost = self._rejected = 0
+
+    def line(self, report: RecorderReport, free_bytes: int) -> str:
+        """The status line; the rate is that since the call before."""
+        now_s = self._clock()
+        rate = (report.recorded - self._recorded) / max(now_s - self._at_s, 1e-9)
+        self._at_s, self._recorded = now_s, report.recorded
+        return (
+            f"{rate:,.0f}/s · {report.recorded:,} recorded · {report.rejected:,} rejected · "
+            f"{report.lost:,} lost · {report.missing:,} missing · "
+            f"queue {report.queue_depth:,}/{report.queue_size:,} · "
+            f"{free_bytes / 1e9:,.1f} GB free"
+        )
+
+    def complaints(self, report: RecorderReport) -> list[str]:
+        """A line for whatever has grown since the call before."""
+        lines = []
+        if report.lost > self._lost:
+            lines.append(
+                f"LOST {report.lost - self._lost} messages ({report.queue_full} in a full queue, "
+                f"{report.transport_missed} on the way, in all); see mapfold/loss in {self._log}"
+            )
+        if report.rejected > self._rejected:
+            lines.append(
+                f"rejected {report.rejected - self._rejected} payloads; "
+                f"see mapfold/rejected in {self._log}"
+            )
+        self._lost, self._rejected = report.lost, report.rejected
+        return lines
+
+
+@contextmanager
+def watching(log: Path) -> Iterator[Callable[[RecorderReport], None]]:
+    """What to give `Recorder.run` as ``watch``."""
+    status = RecorderLine(log)
+
+    def complain(report: RecorderReport) -> None:
+        for line in status.complaints(report):
+            say(line)
+
+    if not people.is_terminal:
+        yield complain
+        return
+    with Live(console=people, transient=True, auto_refresh=False) as live:
+
+        def show(report: RecorderReport) -> None:
+            complain(report)
+            text = status.line(report, shutil.disk_usage(log).free)
+            live.update(Text(text, no_wrap=True, overflow="ellipsis"), refresh=True)
+
+        yield show

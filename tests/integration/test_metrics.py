@@ -1,0 +1,73 @@
+"""Prometheus scrapes a recorder."""
+
+import re
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from eventsrc.errors import TransportError
+from eventsrc.metrics import serving_metrics
+from eventsrc.recorder import RecorderReport
+from tests.envelopes import envelope, payload
+from tests.fixtures_zenoh import DEADLINE_S, Program
+
+REPORT = RecorderReport(12, 3, 4, 5, 6, 0, 7, 100, 15)
+
+
+def _scrape(port: int) -> dict[str, float]:
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=DEADLINE_S) as answer:
+        text = answer.read().decode()
+    return {name: float(value) for name, value in re.findall(r"^(\w+) (\S+)$", text, re.MULTILINE)}
+
+
+def test_every_number_is_scraped_as_it_is_at_that_moment(tmp_path: Path) -> None:
+    with serving_metrics(("127.0.0.1", 0), lambda: REPORT, tmp_path) as port:
+        scraped = _scrape(port)
+    assert scraped.pop("mapfold_recorder_disk_free_bytes") > 0
+    assert scraped == {
+        "mapfold_recorder_recorded_total": 12,
+        "mapfold_recorder_rejected_total": 3,
+        "mapfold_recorder_queue_full_total": 4,
+        "mapfold_recorder_transport_missed_total": 5,
+        "mapfold_recorder_missing": 6,
+        "mapfold_recorder_queue_depth": 7,
+        "mapfold_recorder_queue_size": 100,
+        "mapfold_recorder_next_offset": 15,
+    }
+
+
+def test_a_busy_port_is_one_clear_line(tmp_path: Path) -> None:
+    with (
+        serving_metrics(("127.0.0.1", 0), lambda: REPORT, tmp_path) as port,
+        pytest.raises(TransportError, match=f"127.0.0.1:{port}.*in use.*--metrics"),
+        serving_metrics(("127.0.0.1", port), lambda: REPORT, tmp_path),
+    ):
+        pytest.fail("two servers on one port")
+
+
+def test_the_record_command_serves_them(
+    start: Callable[..., Program],
+    publish: Callable[..., Program],
+    endpoint: str,
+    tmp_path: Path,
+) -> None:
+    recorder = start(
+        "record",
+        str(tmp_path / "log"),
+        "--connect",
+        endpoint,
+        "--metrics",
+        "0",
+        "--fsync",
+        "always",
+    )
+    line = recorder.wait_for("metrics on")
+    port = int(line.rsplit(":", 1)[1].removesuffix("/metrics"))
+    recorder.wait_for("recording")
+    publish("tb/detections", payload(envelope(1)).decode(), "bad")
+    recorder.wait_for("rejected 1 payloads")
+    scraped = _scrape(port)
+    assert scraped["mapfold_recorder_recorded_total"] == 1
+    assert scraped["mapfold_recorder_rejected_total"] == 1

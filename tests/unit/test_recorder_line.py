@@ -1,0 +1,56 @@
+"""What a recorder says while it records."""
+
+import dataclasses
+from pathlib import Path
+
+from eventsrc.cli._recorder_line import RecorderLine
+from eventsrc.recorder import RecorderReport
+
+NOTHING = RecorderReport(
+    recorded=0,
+    rejected=0,
+    queue_full=0,
+    transport_missed=0,
+    missing=0,
+    missing_before=0,
+    queue_depth=0,
+    queue_size=100,
+    next_offset=0,
+)
+
+
+def _line(*times_s: float) -> RecorderLine:
+    return RecorderLine(Path("logs/run-7"), clock=iter(times_s).__next__)
+
+
+def test_the_rate_is_that_since_the_line_before() -> None:
+    status = _line(0.0, 2.0, 3.0)
+    busy = dataclasses.replace(NOTHING, recorded=5_000, queue_depth=7, missing=2)
+    assert status.line(busy, 12_300_000_000) == (
+        "2,500/s · 5,000 recorded · 0 rejected · 0 lost · 2 missing · queue 7/100 · 12.3 GB free"
+    )
+    assert status.line(busy, 0).startswith("0/s · 5,000 recorded")
+
+
+def test_a_loss_is_told_when_it_happens_and_once() -> None:
+    status = _line(0.0)
+    assert status.complaints(NOTHING) == []
+    lost = dataclasses.replace(NOTHING, queue_full=5, transport_missed=2)
+    (line,) = status.complaints(lost)
+    assert line.startswith("LOST 7 messages (5 in a full queue, 2 on the way, in all)")
+    assert "logs/run-7" in line
+    assert status.complaints(lost) == []
+    (line,) = status.complaints(dataclasses.replace(lost, queue_full=6))
+    assert line.startswith("LOST 1 messages (6 in a full queue")
+
+
+def test_rejections_are_told_too() -> None:
+    (line,) = _line(0.0).complaints(dataclasses.replace(NOTHING, rejected=3))
+    assert line == "rejected 3 payloads; see mapfold/rejected in logs/run-7"
+
+
+def test_clean_means_that_this_recorder_lost_nothing() -> None:
+    assert NOTHING.clean
+    assert dataclasses.replace(NOTHING, missing=4, missing_before=4).clean
+    for name in ("rejected", "queue_full", "transport_missed", "missing"):
+        assert not dataclasses.replace(NOTHING, **{name: 1}).clean, name
