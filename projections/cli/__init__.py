@@ -5,7 +5,7 @@ import typer
 from eventsrc import cli as log_commands
 from eventsrc.cli._shell import run_app
 
-from . import bisect, db, diff, draw, merges, relocalize, state, why
+from . import bisect, db, diff, draw, merges, relocalize, replay, state, status, tail, why
 
 app = typer.Typer(
     name="mapfold",
@@ -17,6 +17,9 @@ app = typer.Typer(
 )
 
 log_commands.register(app)
+replay.register(app)
+tail.register(app)
+status.register(app)
 db.register(app)
 state.register(app)
 relocalize.register(app)

@@ -1,0 +1,146 @@
+"""``mapfold replay``: rebuild the databases from a log."""
+
+from dataclasses import asdict
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from eventsrc.cli._shell import emit, people, say
+from eventsrc.log import LogReader
+from eventsrc.log.whence import resolve
+from projections.runner import RebuildProgress, RebuildReport, rebuild
+from projections.sink import SinkName
+from projections.sinks.loader import LoaderName
+
+from ._options import (
+    DbOption,
+    SetOption,
+    SettingsOption,
+    VectorDbOption,
+    databases,
+    settings_from,
+)
+
+
+class Sinks(StrEnum):
+    """What ``--only`` takes."""
+
+    graph = "graph"
+    vectors = "vectors"
+
+
+class Loaders(StrEnum):
+    """What ``--loader`` takes."""
+
+    copy = "copy"
+    insert = "insert"
+
+
+LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="The log's directory.")]
+OnlyOption = Annotated[
+    Sinks | None, typer.Option("--only", help="Write only the graph or only the vectors.")
+]
+LoaderOption = Annotated[
+    Loaders,
+    typer.Option("--loader", help="How rows are sent; insert where COPY is not allowed."),
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add ``replay`` to ``app``."""
+    app.command()(replay)
+
+
+def only_of(only: Sinks | None) -> SinkName | None:
+    """The sink's name, None for both."""
+    return None if only is None else only.value
+
+
+def loader_of(loader: Loaders) -> LoaderName:
+    """The loader's name."""
+    return loader.value
+
+
+def replay(
+    log: LogArgument,
+    until: Annotated[
+        str, typer.Option("--until", metavar="W", help="Offset, ISO time, run:keyframe, or end.")
+    ] = "end",
+    only: OnlyOption = None,
+    db: DbOption = None,
+    vector_db: VectorDbOption = None,
+    assignments: SetOption = None,
+    settings_file: SettingsOption = None,
+    loader: LoaderOption = Loaders.copy,
+    as_json: JsonOption = False,
+) -> None:
+    """Rebuild the databases from LOG. Readers see the old map until the new one is whole."""
+    settings = settings_from(settings_file, assignments)
+    with LogReader(log) as reader:
+        end = resolve(reader, until)
+    with databases(db, vector_db) as targets, _Bar() as bar:
+        report = rebuild(
+            log,
+            targets,
+            settings,
+            until=end,
+            only=only_of(only),
+            loader=loader_of(loader),
+            progress=bar.show,
+        )
+    if as_json:
+        emit(asdict(report))
+    else:
+        _tell(log, report)
+
+
+def _tell(log: Path, report: RebuildReport) -> None:
+    rows = sum(report.rows.values())
+    rate = report.events / report.total_s if report.total_s else 0.0
+    say(
+        f"{log}: {report.events} events, {rows} rows in {report.total_s:.2f} s"
+        f" ({rate:,.0f} events/s); digest {report.digest[:16]}"
+    )
+    counts = report.counts
+    say(
+        f"{counts['runs']} runs, {counts['keyframes']} keyframes, {counts['observations']}"
+        f" observations, {counts['objects']} objects, {counts['places']} places"
+    )
+    if report.hnsw is not None:
+        say(f"vector search: {report.hnsw.reason}")
+
+
+class _Bar:
+    """A progress bar with rate and time left on a terminal, silence elsewhere."""
+
+    def __init__(self) -> None:
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[rate]}"),
+            TimeRemainingColumn(),
+            console=people,
+            transient=True,
+            disable=not people.is_terminal,
+        )
+        self._task = self._progress.add_task("folding", total=None, rate="")
+
+    def __enter__(self) -> "_Bar":
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def show(self, at: RebuildProgress) -> None:
+        """Show where a rebuild is."""
+        speed = self._progress.tasks[0].speed
+        rate = f"{speed:,.0f} events/s" if speed else ""
+        self._progress.update(
+            self._task, description=at.stage, completed=at.done, total=at.total, rate=rate
+        )

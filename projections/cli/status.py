@@ -1,0 +1,77 @@
+"""``mapfold status``: where the log and the databases stand."""
+
+from dataclasses import asdict
+
+import typer
+
+from eventsrc.cli._shell import emit, finish, say
+from eventsrc.log import LogInfo, log_info
+from projections.runner.status import SinkStatus, Status, projection_status
+
+from ._options import (
+    DbOption,
+    SetOption,
+    SettingsOption,
+    VectorDbOption,
+    databases,
+    settings_from,
+)
+from .replay import JsonOption, LogArgument
+
+
+def register(app: typer.Typer) -> None:
+    """Add ``status`` to ``app``."""
+    app.command()(status)
+
+
+def status(
+    log: LogArgument,
+    db: DbOption = None,
+    vector_db: VectorDbOption = None,
+    assignments: SetOption = None,
+    settings_file: SettingsOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Offsets, lag, checkpoints, dead letters, rejected, losses, versions; exit 3 on findings."""
+    settings = settings_from(settings_file, assignments)
+    info = log_info(log)
+    with databases(db, vector_db) as targets:
+        found = projection_status(log, targets, settings)
+    if as_json:
+        emit(
+            {
+                "log": {
+                    "id": info.log_id,
+                    "next_offset": info.events,
+                    "rejected": info.rejected,
+                    "lost": info.lost,
+                },
+                "sinks": {s.sink: asdict(s) for s in found.sinks},
+            }
+        )
+    else:
+        _tell(info, found)
+    finish(findings=not found.healthy or bool(info.rejected) or bool(info.lost))
+
+
+def _tell(info: LogInfo, found: Status) -> None:
+    typer.echo(
+        f"log      {info.log_id}: {info.events} events, {info.rejected} rejected, {info.lost} lost"
+    )
+    for sink in found.sinks:
+        typer.echo(f"{sink.sink:<8} {_line(sink)}")
+        if sink.note:
+            say(f"         {sink.note}")
+        for letter in sink.dead_letters:
+            run = f" (run {letter.run_id})" if letter.run_id else ""
+            typer.echo(f"         parked: offset {letter.offset}{run}: {letter.reason}")
+
+
+def _line(sink: SinkStatus) -> str:
+    versions = ", ".join(f"{name} {number}" for name, number in (sink.versions or {}).items())
+    if sink.next_offset is None:
+        return f"{sink.condition} · {sink.place}" + (f" · {versions}" if versions else "")
+    return (
+        f"{sink.condition} at offset {sink.next_offset}, {sink.lag} behind · {sink.place}"
+        f" · {versions}"
+    )

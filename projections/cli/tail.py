@@ -1,0 +1,94 @@
+"""``mapfold tail``: keep the databases at the end of a log."""
+
+import contextlib
+import signal
+import threading
+from collections.abc import Iterator
+from dataclasses import asdict
+from types import FrameType
+from typing import Annotated
+
+import typer
+
+from eventsrc.cli._shell import emit, finish, say
+from projections.runner import TailReport, tail
+
+from ._options import (
+    DbOption,
+    SetOption,
+    SettingsOption,
+    VectorDbOption,
+    databases,
+    settings_from,
+)
+from .replay import (
+    JsonOption,
+    LoaderOption,
+    Loaders,
+    LogArgument,
+    OnlyOption,
+    loader_of,
+    only_of,
+)
+
+
+def register(app: typer.Typer) -> None:
+    """Add ``tail`` to ``app``."""
+    app.command(name="tail")(tail_command)
+
+
+def tail_command(
+    log: LogArgument,
+    once: Annotated[bool, typer.Option("--once", help="Stop when caught up.")] = False,
+    only: OnlyOption = None,
+    db: DbOption = None,
+    vector_db: VectorDbOption = None,
+    assignments: SetOption = None,
+    settings_file: SettingsOption = None,
+    loader: LoaderOption = Loaders.copy,
+    as_json: JsonOption = False,
+) -> None:
+    """Keep the databases live while LOG grows; what cannot be folded is parked and listed."""
+    settings = settings_from(settings_file, assignments)
+    with _stopped_by_signals() as stop, databases(db, vector_db) as targets:
+        report = tail(
+            log,
+            targets,
+            settings,
+            once=once,
+            only=only_of(only),
+            loader=loader_of(loader),
+            stop=stop,
+            on_trouble=lambda what: say(f"mapfold: {what}; trying again"),
+        )
+    if as_json:
+        emit(asdict(report))
+    else:
+        _tell(report)
+    finish(findings=bool(report.parked))
+
+
+def _tell(report: TailReport) -> None:
+    say(
+        f"{report.events} events written in {report.batches} batches; the databases are at offset"
+        f" {report.next_offset}"
+    )
+    for letter in report.parked:
+        say(f"parked: offset {letter.offset}: {letter.reason}")
+
+
+@contextlib.contextmanager
+def _stopped_by_signals() -> Iterator[threading.Event]:
+    """SIGTERM and Ctrl-C end the tail after the batch it is at; a second Ctrl-C at once."""
+    stop = threading.Event()
+
+    def drain(_signum: int, _frame: FrameType | None) -> None:
+        stop.set()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    before = {s: signal.signal(s, drain) for s in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield stop
+    finally:
+        for signum, handler in before.items():
+            signal.signal(signum, handler)

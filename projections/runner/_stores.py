@@ -1,0 +1,99 @@
+"""The databases of a run, and which sinks live in which: what shares one, commits together."""
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import psycopg
+
+from projections.postgres.connect import Connection, Targets, connect, database_errors, place
+from projections.settings import Settings
+from projections.sink import Sink, SinkName
+from projections.sinks import _checkpoint
+from projections.sinks.graph import GraphSink
+from projections.sinks.loader import LoaderName
+from projections.sinks.vectors import VectorSink
+
+Only: TypeAlias = SinkName | None
+
+
+@dataclass(slots=True)
+class Store:
+    """One database: its open autocommit connection and the sinks that are written through it."""
+
+    url: str
+    application: str
+    sinks: tuple[Sink[Any], ...]
+    connection: Connection
+
+    @property
+    def place(self) -> str:
+        """Where it is, for messages."""
+        return place(self.url)
+
+    def reconnect(self) -> None:
+        """Replace a lost connection; the sinks' locks are taken again."""
+        self.connection.close()
+        self.connection = _open(self.url, self.application, self.sinks)
+
+    def close(self) -> None:
+        """Close the connection, which gives the locks back."""
+        self.connection.close()
+
+
+@contextlib.contextmanager
+def open_stores(
+    targets: Targets,
+    settings: Settings,
+    *,
+    only: Only,
+    application: str,
+    loader: LoaderName = "copy",
+) -> Iterator[list[Store]]:
+    """The stores of ``targets``, each sink's writer lock held. Raises ProjectionBusy."""
+    stores: list[Store] = []
+    try:
+        for url, sinks in _layout(targets, settings, only, loader):
+            stores.append(Store(url, application, sinks, _open(url, application, sinks)))
+        yield stores
+    finally:
+        for store in stores:
+            store.close()
+
+
+def _layout(
+    targets: Targets, settings: Settings, only: Only, loader: LoaderName
+) -> list[tuple[str, tuple[Sink[Any], ...]]]:
+    graph = GraphSink(loader)
+    vectors = VectorSink(loader, dimension=settings.embedding_dim)
+    if only == "graph":
+        return [(targets.graph_url, (graph,))]
+    if only == "vectors":
+        return [(targets.vector_url, (vectors,))]
+    if targets.one_database:
+        return [(targets.graph_url, (graph, vectors))]
+    return [(targets.graph_url, (graph,)), (targets.vector_url, (vectors,))]
+
+
+def _open(url: str, application: str, sinks: tuple[Sink[Any], ...]) -> Connection:
+    connection = connect(url, application=application, autocommit=True)
+    try:
+        with database_errors(url):
+            # AGE and the schema commands talk; only what goes wrong is of interest.
+            connection.execute("SET client_min_messages = warning")
+            for sink in sinks:
+                _checkpoint.lock_writer(connection, sink.name)
+            _ensure_store(connection)
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def _ensure_store(connection: Connection) -> None:
+    try:
+        with connection.transaction():
+            _checkpoint.ensure_store(connection)
+    except (psycopg.errors.DuplicateSchema, psycopg.errors.UniqueViolation):
+        pass  # the other sink's service made it in the same moment

@@ -1,0 +1,154 @@
+"""Rebuild: the whole log into a shadow, and the shadow into the readers' view, or nothing at all.
+
+Everything up to the swap happens in *one* transaction per database: creating the shadow, COPY,
+indexes, the counts, the checkpoint, the swap. So an interruption at any moment, of any kind, leaves
+the old map served and nothing to clean up. What comes after the commit only helps: dropping what
+was replaced, statistics, the HNSW index of a large table.
+"""
+
+import contextlib
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, TypeAlias
+
+from eventsrc.log import Event, LogReader
+from projections.digest import map_digest
+from projections.errors import FoldError
+from projections.postgres.connect import Targets, database_errors
+from projections.settings import Settings
+from projections.sink import Checkpoint
+from projections.sinks import _checkpoint
+from projections.sinks.hnsw import HnswReport, build_hnsw
+from projections.sinks.loader import LoaderName
+
+from ._fold import LiveFold
+from ._stores import Only, Store, open_stores
+
+TICK_EVENTS: Final = 64
+"""Events between two looks at whether rows wait to be written and somebody wants to hear of it."""
+
+
+@dataclass(frozen=True, slots=True)
+class RebuildProgress:
+    """``done`` of ``total`` events are folded; ``stage`` says what is going on."""
+
+    stage: str
+    done: int
+    total: int
+
+
+OnProgress: TypeAlias = Callable[[RebuildProgress], None]
+
+
+@dataclass(frozen=True, slots=True)
+class RebuildReport:
+    """What a rebuild did. ``rows`` is by graph label and table; times are seconds."""
+
+    events: int
+    digest: str
+    counts: dict[str, int]
+    rows: dict[str, int]
+    fold_s: float
+    total_s: float
+    hnsw: HnswReport | None
+
+
+def rebuild(
+    log: Path,
+    targets: Targets,
+    settings: Settings,
+    *,
+    until: int | None = None,
+    only: Only = None,
+    loader: LoaderName = "copy",
+    progress: OnProgress | None = None,
+) -> RebuildReport:
+    """Fold the first ``until`` events (all for None) and put the result in the databases' place.
+
+    Raises FoldError at an event that cannot be folded, ProjectionBusy beside a tail or another
+    rebuild, and DatabaseError; the old map is served on then.
+    """
+    started = time.monotonic()
+    tell = progress or (lambda _: None)
+    with (
+        LogReader(log) as reader,
+        open_stores(
+            targets, settings, only=only, application="mapfold replay", loader=loader
+        ) as stores,
+    ):
+        total = reader.next_offset if until is None else min(until, reader.next_offset)
+        fold = LiveFold(settings)
+        with contextlib.ExitStack() as transactions:
+            for store in stores:
+                transactions.enter_context(database_errors(store.url))
+                transactions.enter_context(store.connection.transaction())
+                for sink in store.sinks:
+                    sink.begin(store.connection)
+            last = _fold_into(fold, reader.read(0, total), stores, total, tell)
+            folded = time.monotonic()
+            tell(RebuildProgress("writing", total, total))
+            digest = map_digest(fold.view)
+            checkpoint = Checkpoint(
+                reader.log_id,
+                settings.fingerprint(),
+                settings.model_dump_json(),
+                total,
+                _checkpoint.event_hash(last),
+                digest,
+            )
+            for store in stores:
+                _finish(store, fold, checkpoint)
+            tell(RebuildProgress("swapping", total, total))
+            for store in stores:
+                for sink in store.sinks:
+                    sink.swap(store.connection)
+        tell(RebuildProgress("tidying", total, total))
+        hnsw, rows = _after(stores, tell, total)
+    ended = time.monotonic()
+    counts = fold.view.counts()
+    return RebuildReport(total, digest, counts, rows, folded - started, ended - started, hnsw)
+
+
+def _fold_into(
+    fold: LiveFold, events: Iterable[Event], stores: list[Store], total: int, tell: OnProgress
+) -> Event | None:
+    sinks = [sink for store in stores for sink in store.sinks]
+    last: Event | None = None
+    for event in events:
+        try:
+            fold.feed(event, sinks)
+        except FoldError as error:
+            raise FoldError(
+                error.offset, f"{error.reason}; the databases stay as they were"
+            ) from None
+        last = event
+        if event.offset % TICK_EVENTS == 0:
+            tell(RebuildProgress("folding", event.offset + 1, total))
+            for store in stores:
+                for sink in store.sinks:
+                    sink.stream(store.connection, fold.view)
+    return last
+
+
+def _finish(store: Store, fold: LiveFold, checkpoint: Checkpoint) -> None:
+    for sink in store.sinks:
+        sink.finish(store.connection, fold.view)
+        _checkpoint.replace(store.connection, sink.name, checkpoint)
+
+
+def _after(
+    stores: list[Store], tell: OnProgress, total: int
+) -> tuple[HnswReport | None, dict[str, int]]:
+    hnsw: HnswReport | None = None
+    rows: dict[str, int] = {}
+    for store in stores:
+        with database_errors(store.url):
+            for sink in store.sinks:
+                sink.tidy(store.connection)
+                rows.update(sink.counts(store.connection))
+                if sink.name == "vectors":
+                    tell(RebuildProgress("indexing", total, total))
+                    hnsw = build_hnsw(store.connection)
+    return hnsw, rows

@@ -1,0 +1,221 @@
+"""Tail: keep the databases at the end of the log while it grows.
+
+A tail folds the log from its start (the fold's state lives nowhere else), and each sink listens
+from its own checkpoint on. A batch is what has come since the last one: one event when little
+comes, many when it is behind. Each batch is one transaction per database (`_writing`).
+
+An event that cannot be folded is parked: its offset and the reason go to the dead letters in the
+same transaction that moves past it. Parked events stay out at every later start, so that the rows
+remain what the fold says, until a rebuild tries them again.
+"""
+
+import threading
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from eventsrc.log import Event, LogReader, follow
+from projections.errors import FoldError, ProjectionMismatch
+from projections.postgres.connect import Targets, database_errors
+from projections.settings import Settings
+from projections.sink import Checkpoint, Sink
+from projections.sinks import _checkpoint
+from projections.sinks._checkpoint import DeadLetter, event_hash
+from projections.sinks.loader import LoaderName
+
+from ._dead_letters import dead_letter
+from ._fold import LiveFold, batches
+from ._stores import Only, Store, open_stores
+from ._writing import LostCommits, OnTrouble, SinkBatch, Writer
+
+BATCH_EVENTS: Final = 500
+"""At most this many events in one transaction: about half a second of work when behind."""
+HEARTBEAT_S: Final = 5.0
+ONCE_PATIENCE_S: Final = 60.0
+
+
+@dataclass(slots=True)
+class TailReport:
+    """What a tail did so far: batches and events written, where it stands, what it parked."""
+
+    next_offset: int = 0
+    events: int = 0
+    batches: int = 0
+    restarts: int = 0
+    parked: list[DeadLetter] = field(default_factory=list)
+
+
+OnBatch = Callable[[TailReport], None]
+
+
+def tail(
+    log: Path,
+    targets: Targets,
+    settings: Settings,
+    *,
+    once: bool = False,
+    only: Only = None,
+    loader: LoaderName = "copy",
+    stop: threading.Event | None = None,
+    on_batch: OnBatch | None = None,
+    on_trouble: OnTrouble | None = None,
+) -> TailReport:
+    """Follow ``log`` until ``stop`` is set, or with ``once`` only to its present end.
+
+    ``on_batch`` is called after each commit. Raises ProjectionMismatch when the databases were made
+    from another log or with other settings, ProjectionBusy, CheckpointMoved.
+    """
+    stop = stop or threading.Event()
+    report = TailReport()
+    while True:
+        opened = open_stores(
+            targets, settings, only=only, application="mapfold tail", loader=loader
+        )
+        with opened as stores:
+            run = _Run(log, targets, settings, stores, stop, once, report)
+            run.on_batch, run.on_trouble = on_batch or run.on_batch, on_trouble or run.on_trouble
+            try:
+                run.follow()
+            except LostCommits:
+                report.restarts += 1
+            else:
+                return report
+
+
+@dataclass(slots=True)
+class _Run:
+    """One pass from the start of the log; `tail` begins another when commits were lost."""
+
+    log: Path
+    targets: Targets
+    settings: Settings
+    stores: list[Store]
+    stop: threading.Event
+    once: bool
+    report: TailReport
+    on_batch: OnBatch = lambda _: None
+    on_trouble: OnTrouble = lambda _: None
+    checkpoints: dict[str, Checkpoint] = field(default_factory=dict)
+    parked: frozenset[int] = frozenset()
+    letters: list[DeadLetter] = field(default_factory=list)
+
+    def follow(self) -> None:
+        with LogReader(self.log) as reader:
+            self._begin(reader)
+            end = reader.next_offset
+            fold = LiveFold(self.settings)
+            events: Iterable[Event | None] = (
+                reader.read(0, end) if self.once else follow(self.log, 0, stop=self.stop)
+            )
+            patience = ONCE_PATIENCE_S if self.once else None
+            writers = [
+                Writer(store, self.targets.revive, self.stop, self.on_trouble, patience)
+                for store in self.stores
+            ]
+            beaten = time.monotonic()
+            for batch in batches(events, BATCH_EVENTS):
+                last = self._fold(fold, batch)
+                if last is not None:
+                    self._write(fold, writers, last)
+                elif time.monotonic() - beaten > HEARTBEAT_S:
+                    beaten = time.monotonic()
+                    for writer in writers:
+                        writer.beat(list(writer.store.sinks))
+                if self.once and self.stop.is_set():
+                    return
+
+    def _begin(self, reader: LogReader) -> None:
+        """Make what is missing, read the checkpoints, refuse what does not fit."""
+        parked: set[int] = set()
+        for store in self.stores:
+            with database_errors(store.url), store.connection.transaction():
+                for sink in store.sinks:
+                    sink.ensure(store.connection)
+                    _checkpoint.begin(store.connection, sink.name, reader.log_id, self.settings)
+                    found = _checkpoint.load(store.connection, sink.name)
+                    assert found is not None  # noqa: S101 - begun in this transaction
+                    self._check(found, sink, store, reader)
+                    self.checkpoints[sink.name] = found
+                    parked.update(d.offset for d in _checkpoint.parked(store.connection, sink.name))
+        self.parked = frozenset(parked)
+        self.report.next_offset = min(c.next_offset for c in self.checkpoints.values())
+
+    def _check(self, found: Checkpoint, sink: Sink[Any], store: Store, reader: LogReader) -> None:
+        _checkpoint.refuse_other_origin(
+            found, sink.name, store.place, reader.log_id, self.settings, self._advice()
+        )
+        if found.next_offset > reader.next_offset:
+            raise ProjectionMismatch(
+                f"{store.place}: the {sink.name} there hold {found.next_offset} events, but"
+                f" {self.log} has only {reader.next_offset}; {self._advice()}"
+            )
+
+    def _advice(self) -> str:
+        return f"to make them anew run: mapfold replay {self.log}"
+
+    def _fold(self, fold: LiveFold, batch: list[Event]) -> Event | None:
+        """Fold a batch; its last event, None for an empty one."""
+        sinks = [sink for store in self.stores for sink in store.sinks]
+        for event in batch:
+            due = [s for s in sinks if event.offset >= self.checkpoints[s.name].next_offset]
+            if event.offset in self.parked:
+                fold.skip(event.offset)
+                continue
+            try:
+                fold.feed(event, due)
+            except FoldError as error:
+                self._park(event, error, all_due=len(due) == len(sinks))
+                fold.skip(event.offset)
+            self._check_history(event, sinks)
+        return batch[-1] if batch else None
+
+    def _park(self, event: Event, error: FoldError, *, all_due: bool) -> None:
+        if not all_due:
+            raise ProjectionMismatch(
+                f"{error}, but it is in the databases already: they were made by another version;"
+                f" {self._advice()}"
+            )
+        letter = dead_letter(event, error.reason)
+        self.letters.append(letter)
+        self.report.parked.append(letter)
+
+    def _check_history(self, event: Event, sinks: list[Sink[Any]]) -> None:
+        """The last event below a checkpoint must be the one the checkpoint was made with."""
+        for sink in sinks:
+            checkpoint = self.checkpoints[sink.name]
+            if event.offset + 1 != checkpoint.next_offset:
+                continue
+            if event_hash(event) != checkpoint.last_event:
+                raise ProjectionMismatch(
+                    f"{self.log}: the event at offset {event.offset} is not the one that the"
+                    f" {sink.name} were made from; {self._advice()}"
+                )
+
+    def _write(self, fold: LiveFold, writers: list[Writer], last: Event) -> None:
+        next_offset = last.offset + 1
+        written = 0
+        for writer in writers:
+            parts = [
+                SinkBatch(
+                    sink,
+                    sink.take(fold.view),
+                    tuple(self.letters),
+                    self.checkpoints[sink.name],
+                    next_offset,
+                    event_hash(last),
+                )
+                for sink in writer.store.sinks
+                if self.checkpoints[sink.name].next_offset < next_offset
+            ]
+            if parts:
+                for part, after in zip(parts, writer.write(parts), strict=True):
+                    written = max(written, after.next_offset - part.before.next_offset)
+                    self.checkpoints[part.sink.name] = after
+        self.letters.clear()
+        if written:
+            self.report.events += written
+            self.report.batches += 1
+            self.report.next_offset = next_offset
+            self.on_batch(self.report)

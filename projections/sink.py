@@ -1,0 +1,76 @@
+"""The port between the fold and whatever its deltas are written to.
+
+A sink first only *notes* deltas; nothing is written until the runner *takes* what has changed and
+*writes* it inside a transaction that also moves the sink's checkpoint. What was taken is a value of
+its own, so a write that failed can be repeated with it, and writing it again does no harm.
+
+A rebuild goes another way to the same rows: `begin` a shadow, `stream` rows that can never change
+again while the fold runs, `finish` with the rest, `swap` the shadow in, all in one transaction;
+then `tidy` away what it replaced. Until the commit nobody sees anything of it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal, Protocol, TypeAlias, TypeVar
+
+from projections.deltas import Delta
+from projections.postgres.connect import Connection
+from projections.view import MapView
+
+SinkName: TypeAlias = Literal["graph", "vectors"]
+Changes = TypeVar("Changes")
+
+
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    """How far a sink is, and what it was made from.
+
+    ``next_offset`` events of the log ``log_id`` are in, folded with ``settings`` (canonical JSON;
+    ``fingerprint`` is their hash). ``last_event`` is `event_hash` of the last of them, "" for none:
+    it tells a log that was cut and continued differently. ``digest`` is the map's, when known.
+    """
+
+    log_id: str
+    fingerprint: str
+    settings: str
+    next_offset: int
+    last_event: str
+    digest: str | None = None
+
+
+class Sink(Protocol[Changes]):
+    """A place the map is written to. ``connection`` is inside a transaction of the runner's."""
+
+    @property
+    def name(self) -> SinkName:
+        """Under which the checkpoint and the locks know it."""
+
+    def note(self, delta: Delta, logged_ns: int, view: MapView) -> None:
+        """Remember that ``delta`` changes something; ``view`` has not applied it yet."""
+
+    def take(self, view: MapView) -> Changes:
+        """What changed since the last take, as ``view`` has it now."""
+
+    def ensure(self, connection: Connection) -> None:
+        """Create what `write` needs where it is missing; refuse what is not ours."""
+
+    def write(self, connection: Connection, changes: Changes) -> int:
+        """Write what was taken; how many rows that were."""
+
+    def begin(self, connection: Connection) -> None:
+        """Create an empty shadow."""
+
+    def stream(self, connection: Connection, view: MapView) -> int:
+        """Write to the shadow those rows that are final, if enough of them wait."""
+
+    def finish(self, connection: Connection, view: MapView) -> int:
+        """Write all other rows to the shadow, index it, and check its counts against the view's."""
+
+    def swap(self, connection: Connection) -> None:
+        """Put the shadow in the place of what readers see."""
+
+    def tidy(self, connection: Connection) -> None:
+        """After the commit (autocommit): remove what was replaced, gather statistics."""
+
+    def counts(self, connection: Connection) -> Mapping[str, int]:
+        """How many rows readers see, by label or table."""

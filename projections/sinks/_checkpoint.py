@@ -1,0 +1,204 @@
+"""Checkpoints, dead letters and the one-writer lock of a database, in its schema ``mapfold``."""
+
+import hashlib
+import json
+from dataclasses import dataclass
+from typing import Final
+
+from eventsrc.log import Event
+from projections.errors import (
+    CheckpointMoved,
+    DatabaseError,
+    ProjectionBusy,
+    ProjectionMismatch,
+)
+from projections.postgres.connect import Connection, place_of
+from projections.settings import Settings
+from projections.sink import Checkpoint, SinkName
+
+from ._sql import statements
+
+_LOCK_NUMBERS: Final[dict[SinkName, int]] = {"graph": 1, "vectors": 2}
+_MARK: Final = "mapfold"
+
+
+@dataclass(frozen=True, slots=True)
+class DeadLetter:
+    """An event that could not be folded and was left out. ``run_id`` when its payload tells one."""
+
+    offset: int
+    key: str
+    run_id: str | None
+    reason: str
+
+
+def event_hash(event: Event | None) -> str:
+    """Identifies an event by all it holds; "" for none."""
+    if event is None:
+        return ""
+    head = json.dumps([event.offset, event.key, event.logged_ns, event.stamp_ns]).encode()
+    return hashlib.sha256(head + b"\n" + event.payload).hexdigest()
+
+
+def lock_writer(connection: Connection, sink: SinkName) -> None:
+    """Be the only writer of a sink until the connection ends. Raises ProjectionBusy."""
+    number = {"number": _LOCK_NUMBERS[sink]}
+    row = connection.execute(statements("checkpoint")["lock"], number).fetchone()
+    if row is not None and row[0]:
+        return
+    holder = connection.execute(statements("checkpoint")["lock_holder"], number).fetchone()
+    who = f" ({holder[1]}, server process {holder[0]})" if holder else ""
+    raise ProjectionBusy(
+        f"{place_of(connection)}: another rebuild or tail{who} is writing the {sink} there;"
+        " wait for it or stop it"
+    )
+
+
+def writer_of(connection: Connection, sink: SinkName) -> str | None:
+    """The application that holds the sink's lock, None when nobody does."""
+    number = {"number": _LOCK_NUMBERS[sink]}
+    row = connection.execute(statements("checkpoint")["lock_holder"], number).fetchone()
+    return None if row is None else str(row[1])
+
+
+def has_store(connection: Connection) -> bool:
+    """Whether the schema ``mapfold`` is there. Raises when somebody else's is."""
+    row = connection.execute(statements("checkpoint")["schema_owner"]).fetchone()
+    if row is None:
+        return False
+    if not str(row[0]).startswith(_MARK):
+        raise DatabaseError(
+            f"{place_of(connection)}: has a schema mapfold that mapfold did not make; use another"
+            " database"
+        )
+    return True
+
+
+def ensure_store(connection: Connection) -> None:
+    """Create the schema ``mapfold`` and its tables if they are missing."""
+    if not has_store(connection):
+        connection.execute(statements("checkpoint")["create"])
+
+
+def load(connection: Connection, sink: SinkName) -> Checkpoint | None:
+    """The sink's checkpoint; None when nothing has been projected."""
+    if not has_store(connection):
+        return None
+    row = connection.execute(statements("checkpoint")["load"], {"sink": sink}).fetchone()
+    return None if row is None else Checkpoint(*row)
+
+
+def begin(connection: Connection, sink: SinkName, log_id: str, settings: Settings) -> None:
+    """Make a checkpoint at offset 0, if there is none."""
+    connection.execute(
+        statements("checkpoint")["begin"],
+        {
+            "sink": sink,
+            "log_id": log_id,
+            "fingerprint": settings.fingerprint(),
+            "settings": settings.model_dump_json(),
+        },
+    )
+
+
+def advance(
+    connection: Connection, sink: SinkName, before: Checkpoint, next_offset: int, last_event: str
+) -> Checkpoint:
+    """Move the checkpoint, in the transaction of the rows. Raises CheckpointMoved."""
+    cursor = connection.execute(
+        statements("checkpoint")["advance"],
+        {
+            "sink": sink,
+            "log_id": before.log_id,
+            "fingerprint": before.fingerprint,
+            "expected": before.next_offset,
+            "next_offset": next_offset,
+            "last_event": last_event,
+        },
+    )
+    after = Checkpoint(before.log_id, before.fingerprint, before.settings, next_offset, last_event)
+    if cursor.rowcount == 1:
+        return after
+    found = load(connection, sink)
+    raise CheckpointMoved(
+        f"{place_of(connection)}: the checkpoint of the {sink} was expected at offset"
+        f" {before.next_offset} of log {before.log_id}, but is"
+        f" {f'at {found.next_offset} of log {found.log_id}' if found else 'gone'}: something else"
+        " writes there; stop it, then start again"
+    )
+
+
+def replace(connection: Connection, sink: SinkName, checkpoint: Checkpoint) -> None:
+    """Put down a rebuild's checkpoint and forget the dead letters of the past."""
+    connection.execute(
+        statements("checkpoint")["replace"],
+        {
+            "sink": sink,
+            "log_id": checkpoint.log_id,
+            "fingerprint": checkpoint.fingerprint,
+            "settings": checkpoint.settings,
+            "next_offset": checkpoint.next_offset,
+            "last_event": checkpoint.last_event,
+            "digest": checkpoint.digest,
+        },
+    )
+    connection.execute(statements("checkpoint")["unpark"], {"sink": sink})
+
+
+def park(connection: Connection, sink: SinkName, letter: DeadLetter) -> None:
+    """Keep word of an event that was left out, in the transaction that moves past it."""
+    connection.execute(
+        statements("checkpoint")["park"],
+        {
+            "sink": sink,
+            "log_offset": letter.offset,
+            "key": letter.key,
+            "run_id": letter.run_id,
+            "reason": letter.reason,
+        },
+    )
+
+
+def parked(connection: Connection, sink: SinkName) -> list[DeadLetter]:
+    """The events left out, by offset."""
+    if not has_store(connection):
+        return []
+    rows = connection.execute(statements("checkpoint")["parked"], {"sink": sink}).fetchall()
+    return [DeadLetter(*row) for row in rows]
+
+
+def beat(connection: Connection, sink: SinkName) -> None:
+    """Say that the sink's tail lives."""
+    connection.execute(statements("checkpoint")["beat"], {"sink": sink})
+
+
+def ages(connection: Connection, sink: SinkName) -> tuple[float, float | None]:
+    """Seconds since the checkpoint moved, and since its tail last said that it lives."""
+    row = connection.execute(statements("checkpoint")["ages"], {"sink": sink}).fetchone()
+    return (0.0, None) if row is None else (row[0], row[1])
+
+
+def refuse_other_origin(
+    found: Checkpoint, sink: SinkName, where: str, log_id: str, settings: Settings, advice: str
+) -> None:
+    """Raise ProjectionMismatch when a checkpoint is of another log or other settings."""
+    if found.log_id != log_id:
+        raise ProjectionMismatch(
+            f"{where}: the {sink} there were made from log {found.log_id}, not from {log_id};"
+            f" {advice}"
+        )
+    if found.fingerprint != settings.fingerprint():
+        raise ProjectionMismatch(
+            f"{where}: the {sink} there were made with other settings"
+            f" ({', '.join(_differences(found.settings, settings))}); {advice}"
+        )
+
+
+def _differences(before: str, settings: Settings) -> list[str]:
+    old, new = json.loads(before), json.loads(settings.model_dump_json())
+    names = sorted(old.keys() | new.keys())
+    return [
+        f"{name}={old.get(name)} there, {new.get(name)} here"
+        for name in names
+        if old.get(name) != new.get(name)
+    ] or ["made by another version"]

@@ -1,0 +1,164 @@
+"""Making, finding, indexing and swapping graphs.
+
+AGE keeps a graph as a schema, so a graph is *ours* when the schema carries our mark as its comment.
+Anything else under our names is somebody's and is refused, never touched.
+
+The swap. Readers name the graph and AGE resolves each label's table by that name, so a reader in
+the middle of a statement must not find half of its tables before the swap and half after. Therefore
+all tables of the old graph are locked exclusively *before* any name moves: a reader that already
+has one of them is waited for; one that comes later waits at its first table, and PostgreSQL
+resolves the name again when it gets the lock. We wait for the locks only briefly and try again:
+while we wait with some of them in hand a reader may wait for us, and below the server's
+deadlock_timeout (1 s) it is always us who give way. The old graph is renamed, and dropped later,
+when every transaction that may still have its name has ended.
+"""
+
+import time
+from typing import Final
+
+import psycopg
+from psycopg import sql
+
+from projections.errors import DatabaseError
+from projections.postgres.connect import Connection, place_of
+
+from ._sql import statements
+from .labels import (
+    CHANGING_EDGES,
+    EDGE_LABELS,
+    GRAPH,
+    KEYS,
+    LABEL_IDS,
+    LABELS,
+    MATCHED,
+    OLD_GRAPH,
+    VERTEX_LABELS,
+)
+
+LOCK_ATTEMPT_MS: Final = 200
+LOCK_SECONDS: Final = 120.0
+_MARK: Final = "mapfold"
+
+
+def exists(connection: Connection, graph: str) -> bool:
+    """Whether a graph of ours has this name. Raises DatabaseError when it is somebody else's."""
+    row = connection.execute(statements("graph")["state"], {"graph": graph}).fetchone()
+    if row is None:
+        return False
+    if not row[0] or not str(row[1]).startswith(_MARK):
+        raise DatabaseError(
+            f"{place_of(connection)}: has a {'graph' if row[0] else 'schema'} {graph} that mapfold"
+            " did not make; rename or drop it, or use another database"
+        )
+    return True
+
+
+def create(connection: Connection, graph: str) -> None:
+    """An empty graph with all labels, in the order that gives them their constant ids."""
+    _use_age(connection)
+    run = statements("graph")
+    connection.execute(run["create_graph"], {"graph": graph})
+    connection.execute(run["mark"].format(graph=sql.Identifier(graph)))
+    for label in VERTEX_LABELS:
+        connection.execute(run["create_vlabel"], {"graph": graph, "label": label})
+    for edge in EDGE_LABELS:
+        connection.execute(run["create_elabel"], {"graph": graph, "label": edge})
+    found: dict[str, int] = dict(connection.execute(run["label_ids"], {"graph": graph}).fetchall())
+    if any(found.get(label) != number for label, number in LABEL_IDS.items()):
+        raise DatabaseError(
+            f"{place_of(connection)}: this version of Apache AGE numbers labels in another way"
+            f" ({found}); use AGE 1.5 to 1.8"
+        )
+
+
+def index(connection: Connection, graph: str) -> None:
+    """The indexes of our queries and upserts, but for those that AGE has made itself."""
+    run = statements("graph")
+    rows = connection.execute(run["indexed"], {"graph": graph}).fetchall()
+    unique = {(table, column): is_unique for table, column, is_unique in rows}
+    schema = sql.Identifier(graph)
+    for label in LABELS:
+        table = sql.Identifier(label)
+        if (label in VERTEX_LABELS or label in CHANGING_EDGES) and not unique.get((label, "id")):
+            column = sql.Identifier("id")
+            connection.execute(run["index_unique"].format(graph=schema, label=table, column=column))
+        for end in ("start_id", "end_id") if label in EDGE_LABELS else ():
+            if (label, end) not in unique:
+                column = sql.Identifier(end)
+                connection.execute(run["index"].format(graph=schema, label=table, column=column))
+    for vertex, key in KEYS.items():
+        literal = sql.Literal(f'"{key}"')
+        table = sql.Identifier(vertex)
+        connection.execute(run["index_key"].format(graph=schema, label=table, key=literal))
+    for vertex in MATCHED:
+        connection.execute(run["index_match"].format(graph=schema, label=sql.Identifier(vertex)))
+
+
+def counts(connection: Connection, graph: str) -> dict[str, int]:
+    """Rows by label."""
+    each = [
+        sql.SQL("SELECT {}, count(*) FROM {}").format(
+            sql.Literal(label), sql.Identifier(graph, label)
+        )
+        for label in LABELS
+    ]
+    return dict(connection.execute(sql.SQL(" UNION ALL ").join(each)).fetchall())
+
+
+def swap_in(connection: Connection, shadow: str) -> None:
+    """Give ``shadow`` the readers' name; what had it becomes the old graph."""
+    _use_age(connection)
+    run = statements("graph")
+    if exists(connection, GRAPH):
+        if exists(connection, OLD_GRAPH):
+            drop(connection, OLD_GRAPH)
+        _lock_all(connection, GRAPH)
+        connection.execute(run["rename_graph"], {"graph": GRAPH, "new_name": OLD_GRAPH})
+    connection.execute(run["rename_graph"], {"graph": shadow, "new_name": GRAPH})
+
+
+def drop(connection: Connection, graph: str) -> None:
+    """Drop a graph of ours, if it is there."""
+    if exists(connection, graph):
+        _use_age(connection)
+        with connection.cursor() as cursor:
+            cursor.execute("SET LOCAL client_min_messages = warning")
+            cursor.execute(statements("graph")["drop_graph"], {"graph": graph})
+
+
+def analyze(connection: Connection, graph: str) -> None:
+    """Gather statistics, so that the planner knows which labels are large."""
+    for label in LABELS:
+        connection.execute(
+            statements("graph")["analyze"].format(
+                graph=sql.Identifier(graph), label=sql.Identifier(label)
+            )
+        )
+
+
+def _use_age(connection: Connection) -> None:
+    """AGE's own functions find their operator classes by the search path only."""
+    connection.execute("SET LOCAL search_path = ag_catalog, public")
+
+
+def _lock_all(connection: Connection, graph: str) -> None:
+    names = ["_ag_label_vertex", "_ag_label_edge", *LABELS]
+    tables = sql.SQL(", ").join(sql.Identifier(graph, name) for name in names)
+    lock = statements("graph")["lock"].format(tables=tables)
+    deadline = time.monotonic() + LOCK_SECONDS
+    while True:
+        try:
+            with connection.transaction():
+                connection.execute(
+                    sql.SQL("SET LOCAL lock_timeout = {}").format(sql.Literal(LOCK_ATTEMPT_MS))
+                )
+                connection.execute(lock)
+        except psycopg.errors.LockNotAvailable:
+            if time.monotonic() > deadline:
+                raise DatabaseError(
+                    f"{place_of(connection)}: readers kept the graph {graph} locked for"
+                    f" {LOCK_SECONDS:.0f} s; end their transactions, then run the rebuild again"
+                ) from None
+        else:
+            connection.execute("SET LOCAL lock_timeout = DEFAULT")
+            return

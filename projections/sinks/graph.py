@@ -1,0 +1,138 @@
+"""The sink that writes the map as an Apache AGE graph."""
+
+from collections.abc import Mapping
+from typing import Final
+
+from psycopg import sql
+
+from projections.deltas import Delta
+from projections.errors import DatabaseError
+from projections.postgres.connect import Connection, ensure_extension, place_of
+from projections.sink import SinkName
+from projections.view import MapView
+
+from . import _graph_ddl, _readers, _swap_guard
+from ._sql import statements
+from .graph_rows import GraphChanges, GraphRows
+from .labels import (
+    COUNT_KEYS,
+    EDGE_LABELS,
+    GRAPH,
+    LABELS,
+    NEXT_GRAPH,
+    OLD_GRAPH,
+    VERTEX_LABELS,
+    Label,
+)
+from .loader import InsertLoader, Loader, LoaderName, insert_columns, loader_of
+
+STREAM_ROWS: Final = 20_000
+"""Keyframes and observations that wait before a rebuild writes them: enough to make COPY's round
+trips vanish, few enough to keep memory small."""
+SMALL_BATCH: Final = 200
+"""Below this many rows an INSERT, sent down the pipeline, beats COPY's extra round trips."""
+
+
+class GraphSink:
+    """Implements `projections.sink.Sink` for the graph ``semantic_map``."""
+
+    name: Final[SinkName] = "graph"
+
+    def __init__(self, loader: LoaderName = "copy") -> None:
+        self._loader: Loader = loader_of(loader)
+        self._rows = GraphRows()
+
+    def note(self, delta: Delta, logged_ns: int, view: MapView) -> None:  # noqa: ARG002 - the port
+        """Remember what ``delta`` changes."""
+        self._rows.note(delta, view)
+
+    def take(self, view: MapView) -> GraphChanges:
+        """What changed since the last take."""
+        return self._rows.take(view)
+
+    def ensure(self, connection: Connection) -> None:
+        """Create an empty graph if there is none."""
+        ensure_extension(connection, "age")
+        if not _graph_ddl.exists(connection, GRAPH):
+            _graph_ddl.create(connection, GRAPH)
+            _graph_ddl.index(connection, GRAPH)
+
+    def write(self, connection: Connection, changes: GraphChanges) -> int:
+        """Insert, upsert and delete what was taken."""
+        few = InsertLoader()
+        for label, rows in changes.inserted.items():
+            self._insert(
+                few if len(rows) < SMALL_BATCH else self._loader, connection, GRAPH, label, rows
+            )
+        for label, rows in changes.upserted.items():
+            kind = "upsert_vertex" if label in VERTEX_LABELS else "upsert_edge"
+            insert_columns(connection, kind, GRAPH, label, rows)
+        for label, ids in changes.deleted.items():
+            query = statements("graph")["delete"].format(
+                graph=sql.Identifier(GRAPH), label=sql.Identifier(label)
+            )
+            connection.execute(query, [[str(i) for i in ids]])
+        parts = (changes.inserted, changes.upserted, changes.deleted)
+        return sum(len(rows) for part in parts for rows in part.values())
+
+    def begin(self, connection: Connection) -> None:
+        """Create an empty shadow graph; refuse early if the name in use is not ours."""
+        ensure_extension(connection, "age")
+        _graph_ddl.exists(connection, GRAPH)
+        _graph_ddl.drop(connection, NEXT_GRAPH)
+        _graph_ddl.create(connection, NEXT_GRAPH)
+
+    def stream(self, connection: Connection, view: MapView) -> int:
+        """Write the rows that are final, if enough of them wait."""
+        if self._rows.fixed_waiting < STREAM_ROWS:
+            return 0
+        return self._load(connection, self._rows.take_fixed(view))
+
+    def finish(self, connection: Connection, view: MapView) -> int:
+        """Write the rest to the shadow, index it, compare counts."""
+        changes = self.take(view)
+        written = self._load(connection, changes.inserted) + self._load(
+            connection, changes.upserted
+        )
+        _graph_ddl.index(connection, NEXT_GRAPH)
+        found, expected = _graph_ddl.counts(connection, NEXT_GRAPH), view.counts()
+        wrong = [
+            f"{label}: {found[label]} rows, {expected[COUNT_KEYS[label]]} in the map"
+            for label in LABELS
+            if found[label] != expected[COUNT_KEYS[label]]
+        ]
+        if wrong:
+            raise DatabaseError(
+                f"{place_of(connection)}: the rebuilt graph does not match the map"
+                f" ({'; '.join(wrong)}); the old one stays, please report this"
+            )
+        return written
+
+    def swap(self, connection: Connection) -> None:
+        """Put the shadow in the readers' place, open to the same roles."""
+        _readers.copy_privileges(connection, GRAPH, NEXT_GRAPH)
+        _graph_ddl.swap_in(connection, NEXT_GRAPH)
+
+    def tidy(self, connection: Connection) -> None:
+        """Drop the replaced graph once its last reader is gone; gather statistics."""
+        _graph_ddl.analyze(connection, GRAPH)
+        if _swap_guard.earlier_transactions_ended(connection):
+            with connection.transaction():
+                _graph_ddl.drop(connection, OLD_GRAPH)
+
+    def counts(self, connection: Connection) -> Mapping[str, int]:
+        """Rows by label."""
+        return _graph_ddl.counts(connection, GRAPH)
+
+    def _load(self, connection: Connection, rows_of: Mapping[Label, list[object]]) -> int:
+        for label, rows in rows_of.items():
+            self._insert(self._loader, connection, NEXT_GRAPH, label, rows)
+        return sum(map(len, rows_of.values()))
+
+    def _insert(
+        self, loader: Loader, connection: Connection, graph: str, label: Label, rows: list[object]
+    ) -> None:
+        if label in EDGE_LABELS:
+            loader.edges(connection, graph, label, rows)  # type: ignore[arg-type]
+        else:
+            loader.vertices(connection, graph, label, rows)  # type: ignore[arg-type]

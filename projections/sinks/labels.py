@@ -1,0 +1,91 @@
+"""The names and numbers of the graph: labels, their ids, and how a row's id is computed.
+
+A graph of AGE is a schema and each label a table. A vertex or edge is known by its graphid,
+``label id << 48 | number``. AGE numbers labels per graph in the order in which they are made, from
+3 on; we make ours in the order written here, so the label ids are constants. The numbers come from
+the fold's ordinals, so every id follows from the log alone and no write has to look one up:
+
+    Run, Keyframe, Observation, Object, Place     ordinal + 1
+    Pose, HAS_KEYFRAME, HAS_POSE, IN_PLACE        keyframe + 1
+    HAS_OBSERVATION, OBSERVES                     observation + 1
+    LOCATED_IN                                    object + 1
+    ADJACENT_TO                                   (a + 1) << 24 | (b + 1)
+"""
+
+from typing import Final, Literal, TypeAlias
+
+GRAPH: Final = "semantic_map"
+NEXT_GRAPH: Final = "semantic_map_next"
+"""The shadow a rebuild writes."""
+OLD_GRAPH: Final = "semantic_map_old"
+"""What the shadow replaced, until the last reader has left it."""
+TABLE: Final = "detection_embeddings"
+
+VertexLabel: TypeAlias = Literal["Run", "Keyframe", "Pose", "Observation", "Object", "Place"]
+EdgeLabel: TypeAlias = Literal[
+    "HAS_KEYFRAME",
+    "HAS_POSE",
+    "HAS_OBSERVATION",
+    "OBSERVES",
+    "LOCATED_IN",
+    "IN_PLACE",
+    "ADJACENT_TO",
+]
+Label: TypeAlias = VertexLabel | EdgeLabel
+
+VERTEX_LABELS: Final[tuple[VertexLabel, ...]] = (
+    "Run",
+    "Keyframe",
+    "Pose",
+    "Observation",
+    "Object",
+    "Place",
+)
+EDGE_LABELS: Final[tuple[EdgeLabel, ...]] = (
+    "HAS_KEYFRAME",
+    "HAS_POSE",
+    "HAS_OBSERVATION",
+    "OBSERVES",
+    "LOCATED_IN",
+    "IN_PLACE",
+    "ADJACENT_TO",
+)
+LABELS: Final[tuple[Label, ...]] = (*VERTEX_LABELS, *EDGE_LABELS)
+LABEL_IDS: Final[dict[Label, int]] = {label: 3 + i for i, label in enumerate(LABELS)}
+
+CHANGING_EDGES: Final[tuple[EdgeLabel, ...]] = ("LOCATED_IN", "IN_PLACE", "ADJACENT_TO")
+"""Edges that a later event may move or remove; the others are written once."""
+
+KEYS: Final[dict[VertexLabel, str]] = {
+    "Run": "run_id",
+    "Observation": "det_id",
+    "Object": "object_id",
+    "Place": "place_id",
+}
+"""The property by which a reader finds a vertex; each gets a btree index."""
+
+MATCHED: Final[tuple[VertexLabel, ...]] = ("Observation", "Object", "Place")
+"""Vertices that readers find by ``{key: value}``, which only a GIN index serves."""
+
+COUNT_KEYS: Final[dict[Label, str]] = {
+    "Run": "runs",
+    "Keyframe": "keyframes",
+    "Pose": "poses",
+    "Observation": "observations",
+    "Object": "objects",
+    "Place": "places",
+    **{label: label for label in EDGE_LABELS},
+}
+"""The name under which `MapView.counts` counts a label's rows."""
+
+
+def graphid_base(label: Label) -> int:
+    """The graphid of number 0 of a label; add the number to get a row's id."""
+    return LABEL_IDS[label] << 48
+
+
+def adjacency_number(a: int, b: int) -> int:
+    """The number of the edge between places ``a`` and ``b`` (ordinals, below 2²⁴ - 1 each)."""
+    if not 0 <= a < b < (1 << 24) - 1:
+        raise ValueError(f"places {a} and {b} cannot be an edge: want 0 ≤ a < b < 2²⁴ - 1")
+    return (a + 1) << 24 | (b + 1)

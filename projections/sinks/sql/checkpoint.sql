@@ -1,0 +1,88 @@
+-- Where each sink stands, in a schema of its own beside the rows, so that rows and progress commit
+-- together. `sink` is 'graph' or 'vectors'.
+
+-- name: schema_owner
+-- NULL when there is no such schema, else its comment ('' for none): ours carries our mark.
+SELECT coalesce(obj_description(oid, 'pg_namespace'), '') FROM pg_namespace WHERE nspname = 'mapfold'
+
+-- name: create
+CREATE SCHEMA mapfold;
+COMMENT ON SCHEMA mapfold IS 'mapfold: progress of the projections; made and removed by mapfold';
+CREATE TABLE mapfold.checkpoint (
+    sink         text PRIMARY KEY CHECK (sink IN ('graph', 'vectors')),
+    log_id       text NOT NULL,
+    fingerprint  text NOT NULL,           -- of the settings
+    settings     text NOT NULL,           -- canonical JSON, to say what differs
+    next_offset  bigint NOT NULL CHECK (next_offset >= 0),
+    last_event   text NOT NULL,           -- hash of the event at next_offset - 1, '' for none
+    digest       text,                    -- of the whole map, when a rebuild computed it
+    moved_at     timestamptz NOT NULL DEFAULT now(),
+    heartbeat_at timestamptz              -- when a tail last said that it lives
+);
+CREATE TABLE mapfold.dead_letter (
+    sink       text NOT NULL,
+    log_offset bigint NOT NULL,
+    key        text NOT NULL,
+    run_id     text,                      -- when the payload still tells
+    reason     text NOT NULL,
+    parked_at  timestamptz NOT NULL DEFAULT now(),
+    PRIMARY KEY (sink, log_offset)
+);
+
+-- name: load
+SELECT log_id, fingerprint, settings, next_offset, last_event, digest
+FROM mapfold.checkpoint WHERE sink = %(sink)s
+
+-- name: begin
+-- A first checkpoint; two tails that both find none must not both get one.
+INSERT INTO mapfold.checkpoint (sink, log_id, fingerprint, settings, next_offset, last_event)
+VALUES (%(sink)s, %(log_id)s, %(fingerprint)s, %(settings)s, 0, '')
+ON CONFLICT (sink) DO NOTHING
+
+-- name: advance
+-- Compare-and-set: moves only from the offset we think it is at, of the log and settings we have.
+UPDATE mapfold.checkpoint
+SET next_offset = %(next_offset)s, last_event = %(last_event)s, digest = NULL,
+    moved_at = now(), heartbeat_at = now()
+WHERE sink = %(sink)s AND next_offset = %(expected)s
+  AND log_id = %(log_id)s AND fingerprint = %(fingerprint)s
+
+-- name: replace
+-- A rebuild starts a new history, whatever was there.
+INSERT INTO mapfold.checkpoint
+    (sink, log_id, fingerprint, settings, next_offset, last_event, digest)
+VALUES (%(sink)s, %(log_id)s, %(fingerprint)s, %(settings)s, %(next_offset)s, %(last_event)s,
+        %(digest)s)
+ON CONFLICT (sink) DO UPDATE
+SET log_id = EXCLUDED.log_id, fingerprint = EXCLUDED.fingerprint, settings = EXCLUDED.settings,
+    next_offset = EXCLUDED.next_offset, last_event = EXCLUDED.last_event,
+    digest = EXCLUDED.digest, moved_at = now(), heartbeat_at = NULL
+
+-- name: beat
+UPDATE mapfold.checkpoint SET heartbeat_at = now() WHERE sink = %(sink)s
+
+-- name: ages
+SELECT extract(epoch FROM now() - moved_at)::float8, extract(epoch FROM now() - heartbeat_at)::float8
+FROM mapfold.checkpoint WHERE sink = %(sink)s
+
+-- name: park
+INSERT INTO mapfold.dead_letter (sink, log_offset, key, run_id, reason)
+VALUES (%(sink)s, %(log_offset)s, %(key)s, %(run_id)s, %(reason)s)
+ON CONFLICT (sink, log_offset) DO UPDATE SET reason = EXCLUDED.reason
+
+-- name: parked
+SELECT log_offset, key, run_id, reason FROM mapfold.dead_letter
+WHERE sink = %(sink)s ORDER BY log_offset
+
+-- name: unpark
+DELETE FROM mapfold.dead_letter WHERE sink = %(sink)s
+
+-- name: lock
+-- One writer per sink and database. The numbers are 'mapf' and the sink's own.
+SELECT pg_try_advisory_lock(1835102310, %(number)s)
+
+-- name: lock_holder
+SELECT a.pid, coalesce(nullif(a.application_name, ''), 'unknown')
+FROM pg_locks l JOIN pg_stat_activity a USING (pid)
+WHERE l.locktype = 'advisory' AND l.granted AND l.classid = 1835102310 AND l.objid = %(number)s
+  AND l.database = (SELECT oid FROM pg_database WHERE datname = current_database())

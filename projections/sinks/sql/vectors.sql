@@ -1,0 +1,69 @@
+-- The table of searchable detections (DESIGN section 6). `{schema}` is public for what readers see
+-- and mapfold for a rebuild's shadow; `{vector}` is the type, wherever the extension put it.
+
+-- name: create
+CREATE TABLE {schema}.detection_embeddings (
+    det_pk          bigint PRIMARY KEY,            -- ordinal of the observation + 1
+    run_id          text NOT NULL,
+    det_id          text NOT NULL UNIQUE,          -- joins the graph's Observation
+    keyframe_id     bigint NOT NULL,
+    class_name      text NOT NULL,
+    confidence      double precision NOT NULL,
+    bbox            real[] NOT NULL,               -- x_min, y_min, x_max, y_max in pixels
+    map_x           double precision,              -- metres; NULL when the robot had no pose
+    map_y           double precision,
+    map_yaw         double precision,              -- radians
+    embedding_model text,
+    embedding       {vector}({dimension}) NOT NULL,  -- unit length
+    ingested_at     timestamptz NOT NULL           -- when the event was logged
+);
+COMMENT ON TABLE {schema}.detection_embeddings IS 'mapfold: made from the log; rebuilt at will';
+
+-- name: plain
+-- In the row itself: 512 dimensions fit a page, and a search that reads every row stays out of TOAST.
+ALTER TABLE {schema}.detection_embeddings ALTER COLUMN embedding SET STORAGE PLAIN
+
+-- name: external
+-- Too wide for a page; at least not compressed, which embeddings do not do.
+ALTER TABLE {schema}.detection_embeddings ALTER COLUMN embedding SET STORAGE EXTERNAL
+
+-- name: redimension
+ALTER TABLE {schema}.detection_embeddings ALTER COLUMN embedding TYPE {vector}({dimension})
+
+-- name: drop
+DROP TABLE {schema}.detection_embeddings
+
+-- name: move
+ALTER TABLE mapfold.detection_embeddings SET SCHEMA public
+
+-- name: insert
+INSERT INTO {schema}.detection_embeddings
+    (det_pk, run_id, det_id, keyframe_id, class_name, confidence, bbox, map_x, map_y, map_yaw,
+     embedding_model, embedding, ingested_at)
+SELECT det_pk, run_id, det_id, keyframe_id, class_name, confidence, bbox::real[], map_x, map_y,
+       map_yaw, embedding_model, embedding::{vector}, ingested_at
+FROM unnest(%s::bigint[], %s::text[], %s::text[], %s::bigint[], %s::text[], %s::float8[], %s::text[],
+            %s::float8[], %s::float8[], %s::float8[], %s::text[], %s::text[], %s::timestamptz[])
+    AS r(det_pk, run_id, det_id, keyframe_id, class_name, confidence, bbox, map_x, map_y, map_yaw,
+         embedding_model, embedding, ingested_at)
+
+-- name: state
+-- NULL when there is no such table, else its comment and the declared dimension.
+SELECT coalesce(obj_description(c.oid, 'pg_class'), ''), a.atttypmod
+FROM pg_class c LEFT JOIN pg_attribute a ON a.attrelid = c.oid AND a.attname = 'embedding'
+WHERE c.oid = to_regclass(%(table)s)
+
+-- name: count
+SELECT count(*) FROM {schema}.detection_embeddings
+
+-- name: hnsw
+CREATE INDEX detection_embeddings_hnsw ON public.detection_embeddings
+USING hnsw (embedding {opclass})
+
+-- name: extension_schema
+SELECT nspname FROM pg_extension JOIN pg_namespace n ON n.oid = extnamespace WHERE extname = 'vector'
+
+-- name: shape
+SELECT (SELECT count(*) FROM public.detection_embeddings), a.atttypmod
+FROM pg_attribute a
+WHERE a.attrelid = 'public.detection_embeddings'::regclass AND a.attname = 'embedding'

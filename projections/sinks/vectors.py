@@ -1,0 +1,173 @@
+"""The sink that writes searchable detections to ``detection_embeddings`` (pgvector)."""
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import psycopg
+from psycopg import sql
+
+from projections.deltas import Delta
+from projections.errors import DatabaseError
+from projections.postgres.connect import Connection, ensure_extension, place_of
+from projections.sink import SinkName
+from projections.view import MapView
+
+from . import _readers
+from ._sql import statements
+from .labels import TABLE
+from .loader import Loader, LoaderName, loader_of
+from .vector_rows import VectorRow, VectorRows
+
+DEFAULT_DIMENSION: Final = 512
+PLAIN_DIMENSION: Final = 1_900
+"""Up to here a row fits one page of 8 kB and can be kept out of TOAST."""
+STREAM_ROWS: Final = 2_000
+SMALL_BATCH: Final = 4
+_PUBLIC: Final = "public"
+_SHADOW: Final = "mapfold"
+_MARK: Final = "mapfold"
+
+
+class VectorSink:
+    """Implements `projections.sink.Sink` for the table. The declared dimension is the map's."""
+
+    name: Final[SinkName] = "vectors"
+
+    def __init__(self, loader: LoaderName = "copy", *, dimension: int | None = None) -> None:
+        self._loader: Loader = loader_of(loader)
+        self._dimension = dimension or DEFAULT_DIMENSION
+        self._shadow_dimension = self._dimension
+        self._rows = VectorRows()
+        self._type: sql.Composable = sql.Identifier("vector")
+
+    def note(self, delta: Delta, logged_ns: int, view: MapView) -> None:  # noqa: ARG002 - the port
+        """Remember the row that ``delta`` adds, if it does."""
+        self._rows.note(delta, logged_ns)
+
+    def take(self, view: MapView) -> list[VectorRow]:
+        """The rows added since the last take."""
+        return self._rows.take(view)
+
+    def ensure(self, connection: Connection) -> None:
+        """Create the table if there is none; learn the dimension it has."""
+        self._find_type(connection)
+        dimension = self._existing(connection)
+        if dimension is None:
+            self._create(connection, _PUBLIC, self._dimension)
+        else:
+            self._dimension = dimension
+
+    def write(self, connection: Connection, changes: Sequence[VectorRow]) -> int:
+        """Add the rows that were taken."""
+        if changes:
+            dimension = len(changes[0].embedding)
+            if dimension != self._dimension:
+                self._redimension(connection, _PUBLIC, dimension)
+                self._dimension = dimension
+            self._loader.vectors(connection, _PUBLIC, self._type, changes)
+        return len(changes)
+
+    def begin(self, connection: Connection) -> None:
+        """Create an empty shadow table; refuse early if the name in use is not ours."""
+        self._find_type(connection)
+        self._existing(connection)
+        self._shadow_dimension = self._dimension
+        self._create(connection, _SHADOW, self._dimension)
+
+    def stream(self, connection: Connection, view: MapView) -> int:
+        """Write the waiting rows, if they are enough."""
+        return self._load(connection, view) if self._rows.waiting >= STREAM_ROWS else 0
+
+    def finish(self, connection: Connection, view: MapView) -> int:
+        """Write the rest to the shadow; compare counts."""
+        written = self._load(connection, view)
+        found = self._count(connection, _SHADOW)
+        expected = sum(o.embedding_crc is not None for o in view.observations)
+        if found != expected:
+            raise DatabaseError(
+                f"{place_of(connection)}: the rebuilt table has {found} rows, the map {expected}"
+                " searchable detections; the old one stays, please report this"
+            )
+        return written
+
+    def swap(self, connection: Connection) -> None:
+        """Put the shadow in the readers' place, open to the same roles."""
+        if self._existing(connection) is not None:
+            _readers.copy_privileges(connection, _PUBLIC, _SHADOW, table=TABLE)
+            try:
+                connection.execute(_statement("drop", _PUBLIC))
+            except psycopg.errors.DependentObjectsStillExist as error:
+                raise DatabaseError(
+                    f"{place_of(connection)}: something else depends on {TABLE}"
+                    f" ({error.diag.message_detail}); drop it, then run the rebuild again"
+                ) from None
+        connection.execute(statements("vectors")["move"])
+        self._dimension = self._shadow_dimension
+
+    def tidy(self, connection: Connection) -> None:
+        """Gather statistics."""
+        connection.execute("ANALYZE public.detection_embeddings (det_pk, det_id, run_id)")
+
+    def counts(self, connection: Connection) -> Mapping[str, int]:
+        """Rows of the table."""
+        return {TABLE: self._count(connection, _PUBLIC)}
+
+    def _load(self, connection: Connection, view: MapView) -> int:
+        rows = self._rows.take(view)
+        if rows:
+            dimension = len(rows[0].embedding)
+            if dimension != self._shadow_dimension:
+                self._redimension(connection, _SHADOW, dimension)
+                self._shadow_dimension = dimension
+            self._loader.vectors(connection, _SHADOW, self._type, rows)
+        return len(rows)
+
+    def _find_type(self, connection: Connection) -> None:
+        ensure_extension(connection, "vector")
+        row = connection.execute(statements("vectors")["extension_schema"]).fetchone()
+        schema = str(row[0]) if row else _PUBLIC
+        self._type = sql.Identifier(schema, "vector")
+
+    def _existing(self, connection: Connection) -> int | None:
+        """Declared dimension of the readers' table; None without one. Refuses somebody else's."""
+        row = connection.execute(
+            statements("vectors")["state"], {"table": f"{_PUBLIC}.{TABLE}"}
+        ).fetchone()
+        if row is None:
+            return None
+        if not str(row[0]).startswith(_MARK):
+            raise DatabaseError(
+                f"{place_of(connection)}: has a table {TABLE} that mapfold did not make; rename or"
+                " drop it, or use another database"
+            )
+        return int(row[1])
+
+    def _create(self, connection: Connection, schema: str, dimension: int) -> None:
+        create = statements("vectors")["create"]
+        connection.execute(create.format(**self._names(schema, dimension)))
+        self._set_storage(connection, schema, dimension)
+
+    def _redimension(self, connection: Connection, schema: str, dimension: int) -> None:
+        """The map's space is known now; the server refuses if rows of another are there."""
+        redimension = statements("vectors")["redimension"]
+        connection.execute(redimension.format(**self._names(schema, dimension)))
+        self._set_storage(connection, schema, dimension)
+
+    def _set_storage(self, connection: Connection, schema: str, dimension: int) -> None:
+        kind = "plain" if dimension <= PLAIN_DIMENSION else "external"
+        connection.execute(_statement(kind, schema))
+
+    def _names(self, schema: str, dimension: int) -> dict[str, sql.Composable]:
+        return {
+            "schema": sql.Identifier(schema),
+            "vector": self._type,
+            "dimension": sql.Literal(dimension),
+        }
+
+    def _count(self, connection: Connection, schema: str) -> int:
+        row = connection.execute(_statement("count", schema)).fetchone()
+        return int(row[0]) if row else 0
+
+
+def _statement(name: str, schema: str) -> sql.Composed:
+    return statements("vectors")[name].format(schema=sql.Identifier(schema))
