@@ -133,8 +133,11 @@ def ensure_extension(connection: Connection, name: LiteralString) -> str:
     where = place_of(connection)
     try:
         with connection.transaction():
+            # Writing the graph puts ag_catalog first on the search path, and there the operators of
+            # pgvector would be out of sight of everybody else. AGE itself fixes its own schema.
+            schema = sql.SQL(" WITH SCHEMA public" if name == "vector" else "")
             connection.execute(
-                sql.SQL("CREATE EXTENSION IF NOT EXISTS {}").format(sql.Identifier(name))
+                sql.SQL("CREATE EXTENSION IF NOT EXISTS {}{}").format(sql.Identifier(name), schema)
             )
     except psycopg.errors.InsufficientPrivilege:
         raise ExtensionMissing(
