@@ -1,15 +1,20 @@
 """The gap ledger of a log: folded from its events when a recorder opens it, or when one asks.
 
 Of an envelope only two fields are needed, and reading those two is several times quicker than the
-whole door. What the short reading does not understand goes through the door all the same.
+whole door. Envelopes of older versions do not count their keyframes and are passed over. A recorder
+saves its ledger beside the log, so only the first reading ever is of the whole log.
 """
 
 import time
+from collections import Counter
 from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from .ingest import Accepted, ingest
+from . import _ledger_cache
+from .envelope import ENVELOPE_VERSION
 from .log import Event, LogReader
 from .losses import DEFAULT_SETTLE_NS, Gap, GapLedger
 from .system_events import LOSS_KEY, Loss, is_system_key
@@ -24,15 +29,54 @@ class _Identity(BaseModel):
     keyframe_id: int
 
 
+@dataclass(frozen=True, slots=True)
+class LossSummary:
+    """What a log lacks. ``gaps`` are open now: no later keyframe closed them. The other two are
+    messages that never reached the log, by cause, as the loss events add up."""
+
+    gaps: tuple[Gap, ...]
+    queue_full: int
+    transport_missed: int
+
+    @property
+    def missing(self) -> int:
+        """How many keyframes are missing now."""
+        return sum(gap.count for gap in self.gaps)
+
+
+def losses_of(reader: LogReader) -> LossSummary:
+    """What the log lacks now, for `status` and `log info`."""
+    counts: Counter[str] = Counter()
+    for event in reader.read(keys={LOSS_KEY}):
+        loss = Loss.model_validate_json(event.payload)
+        counts[loss.cause] += loss.count
+    gaps = tuple(ledger_of(reader).gaps())
+    return LossSummary(gaps, counts["queue_full"], counts["transport_miss"])
+
+
 def ledger_of(
     reader: LogReader, *, settle_ns: int = DEFAULT_SETTLE_NS, now_ns: int | None = None
 ) -> GapLedger:
-    """The ledger of a whole log.
+    """The ledger of a whole log, beginning where a saved one ends.
 
     Holes the log never reported count as open since ``now_ns`` (by default: now, monotonic clock).
     """
     now_ns = time.monotonic_ns() if now_ns is None else now_ns
-    return fold_ledger(reader.read(), GapLedger(settle_ns), now_ns)
+    ledger = GapLedger(settle_ns)
+    start = 0
+    saved = _ledger_cache.load(reader)
+    if saved is not None:
+        start = saved.next_offset
+        ledger.restore(saved.runs, now_ns)
+    return fold_ledger(reader.read(start), ledger, now_ns)
+
+
+def save_ledger(path: Path, log_id: str, next_offset: int, ledger: GapLedger) -> None:
+    """Save the ledger of the first ``next_offset`` events of the log at ``path``, as a cache.
+
+    They must be durable, with everything the ledger reported among them.
+    """
+    _ledger_cache.save(path, log_id, next_offset, ledger)
 
 
 def fold_ledger(events: Iterable[Event], ledger: GapLedger, now_ns: int) -> GapLedger:
@@ -41,7 +85,7 @@ def fold_ledger(events: Iterable[Event], ledger: GapLedger, now_ns: int) -> GapL
         if event.key == LOSS_KEY:
             _take_loss(ledger, event.payload)
         elif not is_system_key(event.key):
-            identity = _identity(event.payload)
+            identity = _identity(event)
             if identity is not None:
                 ledger.record(*identity, now_ns)
     return ledger
@@ -53,12 +97,11 @@ def _take_loss(ledger: GapLedger, payload: bytes) -> None:
         ledger.mark_reported(Gap(loss.publisher, loss.first, loss.last))
 
 
-def _identity(payload: bytes) -> tuple[str, int] | None:
+def _identity(event: Event) -> tuple[str, int] | None:
+    if event.version != ENVELOPE_VERSION:
+        return None
     try:
-        found = _Identity.model_validate_json(payload)
-    except (ValidationError, RecursionError):
-        outcome = ingest(payload)
-        if not isinstance(outcome, Accepted):
-            return None  # an envelope the fold cannot read either; `log verify` names it
-        return outcome.envelope.run_id, outcome.envelope.keyframe_id
+        found = _Identity.model_validate_json(event.payload)
+    except ValidationError:
+        return None  # an envelope the fold cannot read either; `log verify` names it
     return found.run_id, found.keyframe_id

@@ -18,9 +18,9 @@ hole between two recorders' lives is found like any other.
 """
 
 from bisect import bisect_right
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, NamedTuple
 
 DEFAULT_SETTLE_NS: Final = 5_000_000_000
 """Longer than a publisher waits before it sends again, so a resent keyframe is no reported gap."""
@@ -65,6 +65,15 @@ class _Run:
         if index >= 0 and keyframe_id <= self.holes[index].last:
             return index
         return None
+
+
+class RunState(NamedTuple):
+    """What a ledger knows of one run: ``holes`` are (first, last, whether reported), in order."""
+
+    run_id: str
+    first: int
+    last: int
+    holes: tuple[tuple[int, int, bool], ...]
 
 
 class GapLedger:
@@ -133,6 +142,28 @@ class GapLedger:
             return None
         after = run.holes[index].first if index < len(run.holes) else run.last + 1
         return before + 1, after - 1
+
+    def state(self) -> tuple[RunState, ...]:
+        """Everything `restore` needs to go on from here, but for how long holes have been open."""
+        return tuple(
+            RunState(
+                run_id,
+                run.first,
+                run.last,
+                tuple((hole.first, hole.last, hole.reported) for hole in run.holes),
+            )
+            for run_id, run in self._runs.items()
+        )
+
+    def restore(self, runs: Iterable[RunState], now_ns: int) -> None:
+        """Take the place of what is here; holes not yet reported count as open since ``now_ns``."""
+        self._runs = {
+            run.run_id: _Run(run.first, run.last, [_Hole(a, b, now_ns, r) for a, b, r in run.holes])
+            for run in runs
+        }
+        self._unreported = sum(
+            not hole.reported for run in self._runs.values() for hole in run.holes
+        )
 
     def _open(self, run: _Run, index: int, first: int, last: int, now_ns: int) -> None:
         run.holes.insert(index, _Hole(first, last, now_ns))

@@ -33,7 +33,7 @@ class RecorderLine:
         return (
             f"{rate:,.0f}/s · {report.recorded:,} recorded · {report.rejected:,} rejected · "
             f"{report.lost:,} lost · {report.missing:,} missing · "
-            f"queue {report.queue_depth:,}/{report.queue_size:,} · "
+            f"queue {report.queue_depth:,} · "
             f"{free_bytes / 1e9:,.1f} GB free"
         )
 

@@ -16,15 +16,20 @@ from typing import Final, Literal
 from eventsrc._zenoh import Received
 from eventsrc.acks import Ack
 from eventsrc.append import append_payload
+from eventsrc.envelope import ENVELOPE_VERSION
 from eventsrc.ingest import Accepted
+from eventsrc.ledger import save_ledger
 from eventsrc.log import LogWriter
 from eventsrc.losses import Gap, GapLedger
 from eventsrc.system_events import LOSS_KEY, Loss
+from eventsrc.upcast import guess_version
 
 from .inbox import Inbox
 from .report import RecorderReport
 
 Acknowledge = Callable[[Ack], None]
+_Identity = tuple[str, int]
+"""run_id and keyframe_id."""
 Cause = Literal["queue_full", "transport_miss"]
 
 _BATCH: Final = 256
@@ -32,6 +37,8 @@ _IDLE_S: Final = 0.25
 _UNSYNCED_S: Final = 0.005
 """How long to wait for more while a group commit is due: a tenth of the default group."""
 LOSSES_EVERY_NS: Final = 1_000_000_000
+_SAVE_EVERY_NS: Final = 60_000_000_000
+"""So a recorder that was killed leaves a minute of its log to be read again, not the whole."""
 
 
 class Writing:
@@ -54,7 +61,8 @@ class Writing:
         self._room = max_events
         self._losses_every_ns = losses_every_ns
         self._losses_due_ns = time.monotonic_ns() + losses_every_ns
-        self._unsynced: deque[tuple[int, str, int]] = deque()
+        self._save_due_ns = time.monotonic_ns() + _SAVE_EVERY_NS
+        self._unsynced: deque[tuple[int, _Identity | None]] = deque()
         self._recorded = self._rejected = 0
         self._missing = self._missing_before = ledger.missing()
 
@@ -66,8 +74,7 @@ class Writing:
         while self._step():
             pass
         self._write_losses(self._ledger.flush())
-        self._writer.sync()
-        self._follow_up()
+        self._save()
 
     def report(self) -> RecorderReport:
         """The numbers now; may be asked for from any thread."""
@@ -96,6 +103,9 @@ class Writing:
         if now_ns >= self._losses_due_ns:
             self._losses_due_ns = now_ns + self._losses_every_ns
             self._write_losses(self._ledger.due(now_ns))
+        if now_ns >= self._save_due_ns:
+            self._save_due_ns = now_ns + _SAVE_EVERY_NS
+            self._save()
         if self._room is not None:
             self._room -= len(batch)
         return bool(batch or not closed) and self._room != 0
@@ -103,9 +113,8 @@ class Writing:
     def _record(self, message: Received) -> None:
         result = append_payload(self._writer, message.key, message.payload)
         if isinstance(result, Accepted):
-            envelope = result.envelope
             offset = self._writer.next_offset - 1
-            self._unsynced.append((offset, envelope.run_id, envelope.keyframe_id))
+            self._unsynced.append((offset, _identity(message, result)))
         else:
             self._rejected += 1
 
@@ -118,14 +127,22 @@ class Writing:
         now_ns = time.monotonic_ns()
         synced: dict[str, list[int]] = {}
         while unsynced and unsynced[0][0] < durable:
-            _, run_id, keyframe_id = unsynced.popleft()
-            self._ledger.record(run_id, keyframe_id, now_ns)
-            synced.setdefault(run_id, []).append(keyframe_id)
+            _, identity = unsynced.popleft()
             self._recorded += 1
+            if identity is not None:
+                run_id, keyframe_id = identity
+                self._ledger.record(run_id, keyframe_id, now_ns)
+                synced.setdefault(run_id, []).append(keyframe_id)
         for run_id, keyframe_ids in synced.items():
             stretches = _stretches(self._ledger, run_id, keyframe_ids)
             ack = Ack(run_id=run_id, log_id=self._writer.log_id, stretches=stretches)
             self._acknowledge(ack)
+
+    def _save(self) -> None:
+        """Sync, so that the ledger is that of the whole log, and save it beside the log."""
+        next_offset = self._writer.sync()
+        self._follow_up()
+        save_ledger(self._writer.path, self._writer.log_id, next_offset, self._ledger)
 
     def _write_losses(self, gaps: list[Gap]) -> None:
         for gap in gaps:
@@ -148,6 +165,13 @@ class Writing:
 
     def _append_loss(self, loss: Loss) -> None:
         self._writer.append(LOSS_KEY, loss.model_dump_json().encode())
+
+
+def _identity(message: Received, accepted: Accepted) -> _Identity | None:
+    """Which keyframe it is; None for a form older than the envelope, which counts nothing."""
+    if guess_version(message.payload) != ENVELOPE_VERSION:
+        return None
+    return accepted.envelope.run_id, accepted.envelope.keyframe_id
 
 
 def _stretches(

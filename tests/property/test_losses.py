@@ -70,3 +70,21 @@ def test_a_stretch_is_the_longest_around_a_keyframe(recorded: set[int], probe: i
     while last + 1 in recorded:
         last += 1
     assert ledger.stretch("run-a", probe) == ((first, last) if probe in recorded else None)
+
+
+@given(steps, st.integers(0, 20))
+def test_restored_it_goes_on_as_if_nothing_had_been(
+    steps: list[tuple[str, int, int]], at: int
+) -> None:
+    whole, half = GapLedger(SETTLE_NS), GapLedger(SETTLE_NS)
+    for index, (run_id, keyframe_id, _) in enumerate(steps):
+        if index == at:
+            assert half.flush() == whole.flush()
+            restored = GapLedger(SETTLE_NS)
+            restored.restore(half.state(), 0)
+            half = restored
+        whole.record(run_id, keyframe_id, 0)
+        half.record(run_id, keyframe_id, 0)
+    assert half.state() == whole.state()
+    assert half.due(SETTLE_NS) == whole.due(SETTLE_NS)
+    assert half.flush() == []

@@ -27,7 +27,7 @@ def test_the_rate_is_that_since_the_line_before() -> None:
     status = _line(0.0, 2.0, 3.0)
     busy = dataclasses.replace(NOTHING, recorded=5_000, queue_depth=7, missing=2)
     assert status.line(busy, 12_300_000_000) == (
-        "2,500/s · 5,000 recorded · 0 rejected · 0 lost · 2 missing · queue 7/100 · 12.3 GB free"
+        "2,500/s · 5,000 recorded · 0 rejected · 0 lost · 2 missing · queue 7 · 12.3 GB free"
     )
     assert status.line(busy, 0).startswith("0/s · 5,000 recorded")
 
