@@ -5,7 +5,21 @@ import typer
 from eventsrc import cli as log_commands
 from eventsrc.cli._shell import run_app
 
-from . import bisect, db, diff, draw, merges, relocalize, replay, state, status, tail, why
+from . import (
+    bisect,
+    db,
+    diff,
+    draw,
+    evaluate,
+    merges,
+    relocalize,
+    replay,
+    state,
+    status,
+    tail,
+    whatif,
+    why,
+)
 
 app = typer.Typer(
     name="mapfold",
@@ -23,11 +37,13 @@ status.register(app)
 db.register(app)
 state.register(app)
 relocalize.register(app)
+evaluate.register(app)
 draw.register(app)
 merges.register(app)
 why.register(app)
 diff.register(app)
 bisect.register(app)
+whatif.register(app)
 
 
 def main() -> None:

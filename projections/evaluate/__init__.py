@@ -1,0 +1,6 @@
+"""Scores of places, landmarks and re-localisation against ground truth."""
+
+from .run import Evaluation, evaluate
+from .truth import Truth, read_truth
+
+__all__ = ["Evaluation", "Truth", "evaluate", "read_truth"]

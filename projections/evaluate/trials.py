@@ -1,0 +1,97 @@
+"""Asking: each question put to the map, and its answer held against the truth."""
+
+import math
+import time
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from projections.relocalize import Answer, Camera, ExactIndex, Method, rank
+from projections.view import MapView
+
+from .map_scores import instances_of
+from .questions import Question
+from .truth import Truth
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One question's outcome. Lengths in metres; None where the truth or the answer has nothing.
+
+    ``known`` says that at least one of the crops' true instances is in the map. A place *is* a room
+    when most of its keyframes are in it, and *contains* it when any is.
+    """
+
+    question: Question
+    answer: Answer
+    known: bool
+    pose_error_m: float | None
+    yaw_error_rad: float | None
+    centroid_error_m: float | None
+    room_of_pose: str | None
+    rooms_of_places: tuple[str | None, ...]
+    contains: tuple[bool, ...]
+    nearest_place: bool | None
+    seconds: float
+
+
+class Examiner:
+    """Puts questions to a folded map by exact search, and knows the map's own truth."""
+
+    def __init__(self, view: MapView, truth: Truth, *, camera: Camera, method: Method) -> None:
+        self._index = ExactIndex(view)
+        self._camera, self._method = camera, method
+        self._instances = {i for _, i in instances_of(view, truth) if i is not None}
+        self._rooms: dict[str, Counter[str]] = {p.place_id: Counter() for p in view.places.values()}
+        self._drive: list[tuple[float, float, str | None, str | None]] = []
+        for keyframe in view.keyframes:
+            if keyframe.pose is None:
+                continue
+            room = truth.room((keyframe.run_id, keyframe.keyframe_id))
+            place_id = view.place_id(keyframe.place)
+            if room is not None and place_id is not None:
+                self._rooms[place_id][room] += 1
+            self._drive.append((keyframe.pose.x_um / 1e6, keyframe.pose.y_um / 1e6, room, place_id))
+
+    def ask(self, questions: Iterable[Question]) -> list[Trial]:
+        """One trial for each question, three places asked for."""
+        return [self._ask(question) for question in questions]
+
+    def _ask(self, question: Question) -> Trial:
+        began = time.perf_counter()
+        candidates = self._index.search(question.crops)
+        answer = rank(question.crops, candidates, top=3, method=self._method, camera=self._camera)
+        seconds = time.perf_counter() - began
+        pose, places = answer.pose, answer.places
+        known = any(i in self._instances for i in question.instances if i is not None)
+        here = self._nearest(question.x, question.y)
+        return Trial(
+            question,
+            answer,
+            known,
+            None if pose is None else math.hypot(pose.x - question.x, pose.y - question.y),
+            None if pose is None or pose.yaw is None else _turn(pose.yaw - question.yaw),
+            math.hypot(places[0].centroid_x - question.x, places[0].centroid_y - question.y)
+            if places
+            else None,
+            None if pose is None else self._nearest(pose.x, pose.y)[2],
+            tuple(self._room_of(place.place_id) for place in places),
+            tuple((question.room or "") in self._rooms[place.place_id] for place in places),
+            None if here[3] is None or not places else places[0].place_id == here[3],
+            seconds,
+        )
+
+    def _nearest(self, x: float, y: float) -> tuple[float, float, str | None, str | None]:
+        """The map keyframe nearest to a position; ties go to the earlier one."""
+        if not self._drive:
+            return x, y, None, None
+        return min(self._drive, key=lambda k: (k[0] - x) ** 2 + (k[1] - y) ** 2)
+
+    def _room_of(self, place_id: str) -> str | None:
+        rooms = self._rooms[place_id]
+        return max(sorted(rooms), key=rooms.__getitem__) if rooms else None
+
+
+def _turn(angle: float) -> float:
+    """The size of an angle difference, 0 … π."""
+    return abs(math.remainder(angle, 2.0 * math.pi))
