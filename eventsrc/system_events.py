@@ -47,12 +47,13 @@ class Loss(_Model):
     """The content of a ``mapfold/loss`` event.
 
     ``publisher`` names who it was lost from: a run id (cause ``keyframe_gap``), a Zenoh source id
-    (``transport_miss``) or the key expression (``queue_full``). ``first`` and ``last`` are the
-    first and last missing number in that publisher's own counting, None where nothing was counted.
+    (``transport_miss``), the key expression (``queue_full``), or ``log`` where a recovered log
+    lacks the event of this very offset (``rot``). ``first`` and ``last`` are the first and last
+    missing number in that publisher's own counting, None where nothing was counted.
     """
 
     publisher: str
     first: int | None = None
     last: int | None = None
     count: Annotated[int, Field(ge=1)]
-    cause: Literal["keyframe_gap", "queue_full", "transport_miss"]
+    cause: Literal["keyframe_gap", "queue_full", "transport_miss", "rot"]

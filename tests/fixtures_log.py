@@ -1,7 +1,8 @@
 """Logs, envelopes and small helpers for the tests of the log."""
 
 import json
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ BY_HAND = FsyncPolicy(interval_ns=10**18, max_events=10**9, max_bytes=10**12)
 """Commits only when told to, so that a test decides where chunks end."""
 
 KEY = "tb/detections"
+
+MEMORY_DISK = Path("/dev/shm")
 
 
 def envelope(keyframe_id: int, run_id: str = "run", **more: Any) -> bytes:
@@ -42,6 +45,22 @@ def read_log(path: Path, start: int = 0, end: int | None = None) -> list[Event]:
     """All durable events."""
     with LogReader(path) as reader:
         return list(reader.read(start, end))
+
+
+def read_with_gaps(path: Path) -> tuple[list[Event], set[int]]:
+    """All that can be read, and the offsets named as unreadable."""
+    named: set[int] = set()
+    with LogReader(path) as reader:
+        shown = list(reader.read(on_gap=lambda gap: named.update(range(gap.first, gap.last + 1))))
+    return shown, named
+
+
+@pytest.fixture
+def quick_path() -> Iterator[Path]:
+    """A folder in memory where there is one, for tests that sync tens of thousands of times."""
+    base = MEMORY_DISK if MEMORY_DISK.is_dir() else None
+    with tempfile.TemporaryDirectory(dir=base) as name:
+        yield Path(name)
 
 
 @pytest.fixture

@@ -8,11 +8,21 @@ from typing import Annotated, Any
 import typer
 
 from eventsrc.errors import MisuseError
-from eventsrc.log import LogInfo, LogReader, SegmentInfo, log_info
+from eventsrc.log import (
+    Finding,
+    LogInfo,
+    LogReader,
+    SegmentInfo,
+    SegmentRecovery,
+    Unreadable,
+    log_info,
+    recover_log,
+    verify_log,
+)
 from eventsrc.log.whence import resolve, resolve_start
 
 from ._event_text import event_document, event_line, iso_time
-from ._shell import emit, emit_lines
+from ._shell import emit, emit_lines, finish, say
 
 LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="The log's folder.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Data as JSON on stdout.")]
@@ -71,6 +81,9 @@ def cat(
     key: Annotated[
         list[str] | None, typer.Option(metavar="K", help="Only this key; may be given again.")
     ] = None,
+    skip_damage: Annotated[
+        bool, typer.Option("--skip-damage", help="Name unreadable offsets and go on (exit 3).")
+    ] = False,
     json_: JsonOption = False,
 ) -> None:
     """The events of a log, in order, one a line.
@@ -78,15 +91,82 @@ def cat(
     W is an offset, an ISO time, RUN:KEYFRAME or end. Offsets go from --from to before --to; a
     keyframe or a time is included at either end.
     """
+    gaps: list[Unreadable] = []
+
+    def note(gap: Unreadable) -> None:
+        gaps.append(gap)
+        say(f"{log}: offsets {gap.first} to {gap.last} cannot be read: {gap.reason}")
+
     with LogReader(log) as reader:
         start, end = resolve_start(reader, from_), resolve(reader, to)
         if start > end:
             raise MisuseError(f"--from {from_} is offset {start}, behind --to {to}, which is {end}")
-        events = reader.read(start, end, keys=key or None)
+        events = reader.read(
+            start,
+            None if to == "end" else end,
+            keys=key or None,
+            on_gap=note if skip_damage else None,
+        )
         if json_:
             emit_lines(map(event_document, events))
         else:
             sys.stdout.writelines(f"{event_line(event)}\n" for event in events)
+    finish(findings=bool(gaps))
+
+
+@log_app.command()
+def verify(log: LogArgument, json_: JsonOption = False) -> None:
+    """Read every byte of a log and say what is not as it should be; exit 3 if anything is not.
+
+    Checks magic, CRCs, hash chain, dense offsets and every payload; reports keyframes that stand
+    twice, clocks that ran backwards, and losses.
+    """
+    result = verify_log(log)
+    if json_:
+        emit({**asdict(result), "path": str(log)})
+    else:
+        for finding in result.findings:
+            sys.stdout.write(f"{_finding_text(finding)}\n")
+    size = f"{result.events} events in {result.segments} segments, {result.size_bytes:,} bytes"
+    say(f"{log}: {size}: {f'{len(result.findings)} findings' if result.findings else 'all good'}")
+    finish(findings=bool(result.findings))
+
+
+def _finding_text(finding: Finding) -> str:
+    where = [finding.segment] if finding.segment else []
+    if finding.first_offset is not None:
+        where.append(f"offsets {finding.first_offset} to {finding.last_offset}")
+    return f"{finding.kind:<9} {': '.join([*where, finding.message])}"
+
+
+@log_app.command()
+def recover(log: LogArgument, json_: JsonOption = False) -> None:
+    """Bring a damaged or left-over log back in order, keeping everything that can be read.
+
+    Originals in which something recorded is damaged stay beside as *.damaged; lost offsets become
+    mapfold/loss events. Exit 0: nothing was lost, 3: something was.
+    """
+    report = recover_log(log)
+    if json_:
+        emit({**asdict(report), "path": str(log)})
+    for segment in report.segments:
+        say(_recovery_text(segment))
+    say(f"{log}: {report.events} events" if report.segments else f"{log}: nothing to recover")
+    finish(findings=report.lost)
+
+
+def _recovery_text(segment: SegmentRecovery) -> str:
+    parts = [f"{segment.name}: kept {segment.kept_events} events ({segment.kept_bytes:,} bytes)"]
+    if segment.lost_events:
+        gaps = ", ".join(f"{first} to {last}" for first, last in segment.gaps)
+        parts.append(f"lost {segment.lost_events} recorded events (offsets {gaps})")
+    if segment.lost_bytes:
+        parts.append(f"left out {segment.lost_bytes:,} bytes")
+    if segment.torn_events:
+        parts.append(f"with {segment.torn_events} events that were never synced")
+    if segment.kept_copy:
+        parts.append(f"original kept as {segment.kept_copy}")
+    return ", ".join(parts)
 
 
 def register(app: typer.Typer) -> None:

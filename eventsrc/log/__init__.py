@@ -1,10 +1,14 @@
 """The log: an append-only directory of MCAP segments, the only truth (docs/log-format.md)."""
 
 from .event import Event
+from .findings import Finding
 from .fsync import ALWAYS, GROUP_COMMIT, NEVER, FsyncPolicy, parse_fsync
 from .info import LogInfo, SegmentInfo, log_info
 from .reader import LogReader
+from .recover import RecoveryReport, SegmentRecovery, recover_log
+from .segment import Unreadable
 from .tail import follow
+from .verify import Verification, verify_log
 from .writer import LogWriter
 
 __all__ = [
@@ -12,12 +16,19 @@ __all__ = [
     "GROUP_COMMIT",
     "NEVER",
     "Event",
+    "Finding",
     "FsyncPolicy",
     "LogInfo",
     "LogReader",
     "LogWriter",
+    "RecoveryReport",
     "SegmentInfo",
+    "SegmentRecovery",
+    "Unreadable",
+    "Verification",
     "follow",
     "log_info",
     "parse_fsync",
+    "recover_log",
+    "verify_log",
 ]

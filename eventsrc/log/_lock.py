@@ -50,6 +50,21 @@ class WriterLock:
         self.release()
 
 
+def is_held(log: Path) -> bool:
+    """Whether a writer is at work on ``log`` right now."""
+    try:
+        fd = os.open(log / LOCK, os.O_RDONLY)
+    except FileNotFoundError:
+        return False
+    try:
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(fd)
+    return False
+
+
 def _holder(fd: int) -> str:
     try:
         text = json.loads(os.pread(fd, 4096, 0))

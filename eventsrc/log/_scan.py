@@ -17,15 +17,15 @@ from pathlib import Path
 from eventsrc.errors import LogDamaged, NotALog
 
 from . import _mcap
-from ._mcap import BadRecord
+from ._mcap import BadRecord, Channel
 from .segment import ChunkRef, read_head
 
 _NEAR = 4096
 
 
 @dataclass(slots=True)
-class ActiveScan:
-    """The good chunks of an active segment and what is between and behind them."""
+class Scan:
+    """The good chunks of a segment and what is between and behind them."""
 
     base: int
     log_id: str | None
@@ -36,14 +36,46 @@ class ActiveScan:
     torn_events: int = 0
     """Events that had begun to be written in the torn end; none of them was synced."""
     next_offset: int = 0
+    channels: dict[int, Channel] = field(default_factory=dict)
+    """What the segment's index says of channels; its chunks name their own as well."""
+
+    def take(self, chunk: ChunkRef) -> None:
+        """The next good chunk; what lies before it is a gap."""
+        self.gap_up_to(chunk.first)
+        self.chunks.append(chunk)
+        self.next_offset = chunk.following
+
+    def gap_up_to(self, offset: int) -> None:
+        """Offsets before ``offset`` that no good chunk holds are gone."""
+        if offset > self.next_offset:
+            self.gaps.append((self.next_offset, offset - 1))
+            self.next_offset = offset
 
 
-def scan_active(path: Path, base: int) -> ActiveScan:
+def chunk_extent(data: mmap.mmap, at: int, scan: Scan) -> tuple[int, int, int]:
+    """Length, first and next offset of the chunk at ``at``; BadRecord unless all of it is good."""
+    head = _mcap.decode_chunk_head(data[at : at + _mcap.ZSTD_CHUNK_HEAD])
+    if at + head.length > len(data):
+        raise BadRecord("cut short inside a chunk")
+    body = _mcap.decode_chunk(data[at : at + head.length])
+    channels = {*scan.channels, *(channel.id for channel in _mcap.definitions(body)[1])}
+    sequences = []
+    for channel, sequence, _, _, _, _ in _mcap.walk(body):
+        if channel not in channels:
+            raise BadRecord(f"a chunk uses channel {channel}, which nothing defines")
+        sequences.append(sequence)
+    if not sequences or sequences != list(range(sequences[0], sequences[0] + len(sequences))):
+        raise BadRecord("a chunk's sequence numbers have holes")
+    first = scan.base + sequences[0]
+    return head.length, first, first + len(sequences)
+
+
+def scan_active(path: Path, base: int) -> Scan:
     """Look at every byte of an active segment."""
     with path.open("rb") as file:
         data = file.read(1) and mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     if not data:
-        return ActiveScan(base, None, next_offset=base)
+        return Scan(base, None, next_offset=base)
     with data:
         return _Scanner(path, base, data).run()
 
@@ -54,14 +86,14 @@ class _Scanner:
         self._data = data
         self._at = 0
         self._promised = base
-        self.result = ActiveScan(base, None, next_offset=base)
+        self.result = Scan(base, None, next_offset=base)
 
-    def run(self) -> ActiveScan:
+    def run(self) -> Scan:
         self._read_head()
         while self._at < len(self._data):
             if not self._take_chunk(self._at):
                 self._resync()
-        self._gap_up_to(self._promised)
+        self.result.gap_up_to(self._promised)
         return self.result
 
     def _read_head(self) -> None:
@@ -74,28 +106,15 @@ class _Scanner:
     def _take_chunk(self, at: int) -> bool:
         """Accept the chunk at ``at`` and its mark; False when none is there."""
         try:
-            length, first, following = self._good_chunk(at)
+            length, first, following = chunk_extent(self._data, at, self.result)
         except BadRecord:
             return False
         if first < self.result.next_offset:
             return False
-        self._gap_up_to(first)
-        self.result.chunks.append(ChunkRef(at, length, first, following))
-        self.result.next_offset = following
+        self.result.take(ChunkRef(at, length, first, following))
         self._at = at + length
         self._take_mark()
         return True
-
-    def _good_chunk(self, at: int) -> tuple[int, int, int]:
-        head = _mcap.decode_chunk_head(self._data[at : at + _mcap.ZSTD_CHUNK_HEAD])
-        if at + head.length > len(self._data):
-            raise BadRecord("cut short inside a chunk")
-        body = _mcap.decode_chunk(self._data[at : at + head.length])
-        sequences = [message[1] for message in _mcap.walk(body)]
-        if not sequences or sequences != list(range(sequences[0], sequences[0] + len(sequences))):
-            raise BadRecord("a chunk's sequence numbers have holes")
-        first = self.result.base + sequences[0]
-        return head.length, first, first + len(sequences)
 
     def _take_mark(self) -> None:
         try:
@@ -104,11 +123,6 @@ class _Scanner:
             return
         self._promised = max(self._promised, following)
         self._at += _mcap.MARK_BYTES
-
-    def _gap_up_to(self, offset: int) -> None:
-        if offset > self.result.next_offset:
-            self.result.gaps.append((self.result.next_offset, offset - 1))
-            self.result.next_offset = offset
 
     def _resync(self) -> None:
         """Move to where reading can go on: a good chunk close by, behind a mark, or the end."""
@@ -122,7 +136,7 @@ class _Scanner:
         at = start
         while (at := self._data.find(b"\x06", at + 1, start + _NEAR)) >= 0:
             try:
-                self._good_chunk(at)
+                chunk_extent(self._data, at, self.result)
             except BadRecord:
                 continue
             return at

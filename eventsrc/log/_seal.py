@@ -40,6 +40,8 @@ from .segment import SEAL_METADATA
 
 CHUNK_BYTES = 1024 * 1024
 NO_PREVIOUS = ""
+REPLACES = "replaces_sha256"
+"""In the head of a recovered segment: the hash its successor knows its original by."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,16 +78,33 @@ def seal(plan: SegmentPlan, bodies: Iterable[bytes]) -> str:
 
 
 def _merged(bodies: Iterable[bytes]) -> Iterator[bytes]:
+    """Bodies joined or parted to about CHUNK_BYTES: what one flipped bit can cost, and what one
+    event takes to read."""
     parts: list[bytes] = []
     size = 0
     for body in bodies:
-        parts.append(body)
-        size += len(body)
-        if size >= CHUNK_BYTES:
-            yield b"".join(parts)
-            parts, size = [], 0
+        for part in _parted(body):
+            parts.append(part)
+            size += len(part)
+            if size >= CHUNK_BYTES:
+                yield b"".join(parts)
+                parts, size = [], 0
     if parts:
         yield b"".join(parts)
+
+
+def _parted(body: bytes) -> Iterator[bytes]:
+    """A large body in several, each led by the same channel records."""
+    if len(body) < 2 * CHUNK_BYTES:
+        yield body
+        return
+    channels = _mcap.encode_all(_mcap.definitions(body)[1])
+    start, lead = 0, b""
+    for *_, end in _mcap.walk(body):
+        if end - start >= CHUNK_BYTES and end < len(body):
+            yield lead + body[start:end]
+            start, lead = end, channels
+    yield lead + body[start:]
 
 
 class _Builder:

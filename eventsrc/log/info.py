@@ -4,9 +4,10 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-from eventsrc.system_events import LOSS_KEY, REJECTED_KEY, Loss
+from eventsrc.system_events import LOSS_KEY, REJECTED_KEY
 
 from . import _mcap
+from ._losses import count_lost
 from .reader import LogReader, OpenSegment
 from .segment import SealedFile
 
@@ -25,7 +26,8 @@ class SegmentInfo:
 @dataclass(frozen=True, slots=True)
 class LogInfo:
     """A log at a glance. Times are int nanoseconds, None while the log is empty; the first is the
-    earliest and the last the latest, whatever their order in the log."""
+    earliest and the last the latest, whatever their order in the log. ``lost`` is what the log says
+    was lost, less the keyframes that came late after all."""
 
     log_id: str
     path: Path
@@ -53,7 +55,6 @@ def log_info(path: Path) -> LogInfo:
     tally = _Tally(Counter(), [], [])
     with LogReader(path) as reader:
         segments = tuple(_count(reader.open_segment(entry), tally) for entry in reader.segments)
-        losses = reader.read(keys={LOSS_KEY})
         return LogInfo(
             log_id=reader.log_id,
             path=path,
@@ -62,7 +63,7 @@ def log_info(path: Path) -> LogInfo:
             segments=segments,
             keys={key: tally.keys[key] for key in sorted(tally.keys)},
             rejected=tally.keys[REJECTED_KEY],
-            lost=sum(Loss.model_validate_json(event.payload).count for event in losses),
+            lost=count_lost(reader) if tally.keys[LOSS_KEY] else 0,
             first_logged_ns=min(tally.logged, default=None),
             last_logged_ns=max(tally.logged, default=None),
             first_stamp_ns=min(tally.stamps, default=None),

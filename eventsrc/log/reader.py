@@ -29,7 +29,7 @@ class LogReader:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._open: OrderedDict[int, OpenSegment] = OrderedDict()
-        self._segments = _segments_of(path)
+        self._segments = segments_of(path)
         self._last = self.open_segment(self._segments[-1])
         self.log_id = self._last.log_id
 
@@ -154,7 +154,8 @@ class LogReader:
         self.close()
 
 
-def _segments_of(path: Path) -> list[SegmentPath]:
+def segments_of(path: Path) -> list[SegmentPath]:
+    """The segments of a log; LogNotFound or NotALog when there are none."""
     if not path.exists():
         raise LogNotFound(f"no log at {path}; record or import one, or check the path")
     if not path.is_dir():

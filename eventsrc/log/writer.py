@@ -18,9 +18,9 @@ from eventsrc.errors import LogError, MapfoldError, NotALog
 from ._active import ActiveSegment
 from ._lock import WriterLock
 from ._naming import LOCK, leftovers, list_segments
+from ._restart import Restart, restart
 from ._sealer import Sealer
 from .fsync import GROUP_COMMIT, FsyncPolicy, unlink_quietly
-from .recovery import Restart, restart
 
 ROTATE_BYTES = 64 * 1024 * 1024
 ROTATE_EVENTS = 1_000_000
@@ -81,6 +81,10 @@ class LogWriter:
     def durable_offset(self) -> int:
         """Every event below it is synced, and visible to readers."""
         return self._active.committed
+
+    def now_ns(self) -> int:
+        """The writer's clock."""
+        return self._clock()
 
     def append(
         self,

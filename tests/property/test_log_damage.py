@@ -2,28 +2,16 @@
 
 import contextlib
 import shutil
-import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 from eventsrc.errors import LogError
-from eventsrc.log import Event, LogReader, LogWriter
+from eventsrc.log import Event, LogWriter
 from eventsrc.log._mcap import MARK_BYTES
 from eventsrc.log._scan import scan_active
 from eventsrc.log.fsync import ALWAYS
-from tests.fixtures_log import BY_HAND, KEY, read_log
+from tests.fixtures_log import BY_HAND, KEY, read_log, read_with_gaps
 
 MEMORY_DISK = Path("/dev/shm")
-
-
-@pytest.fixture
-def quick_path() -> Iterator[Path]:
-    """A folder in memory where there is one: these tests sync tens of thousands of times."""
-    base = MEMORY_DISK if MEMORY_DISK.is_dir() else None
-    with tempfile.TemporaryDirectory(dir=base) as name:
-        yield Path(name)
 
 
 def make_active(path: Path) -> tuple[Path, list[Event], dict[int, int]]:
@@ -90,10 +78,3 @@ def test_any_flip_in_an_active_segment_is_named(quick_path: Path) -> None:
             with contextlib.suppress(LogError):
                 assert read_log(file.parent) == events
         data[at] ^= 0x41
-
-
-def read_with_gaps(log: Path) -> tuple[list[Event], set[int]]:
-    named: set[int] = set()
-    with LogReader(log) as reader:
-        shown = list(reader.read(on_gap=lambda gap: named.update(range(gap.first, gap.last + 1))))
-    return shown, named

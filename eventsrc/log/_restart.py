@@ -14,7 +14,7 @@ from pathlib import Path
 from eventsrc.errors import LogDamaged
 
 from ._naming import ACTIVE, SegmentPath, leftovers, list_segments, segment_path
-from ._scan import ActiveScan, scan_active
+from ._scan import Scan, scan_active
 from ._seal import NO_PREVIOUS, SegmentPlan, file_sha256, seal
 from .fsync import sync_directory, unlink_quietly
 from .segment import ActiveFile, SealedFile
@@ -42,30 +42,33 @@ def restart(log: Path) -> Restart:
         unlink_quietly(path)
     segments = list_segments(log)
     state = Restart()
-    for segment in segments:
+    for index, segment in enumerate(segments):
+        reach = segments[index + 1].base if index + 1 < len(segments) else segment.base
         if segment.sealed:
             unlink_quietly(segment_path(log, segment.base, ACTIVE))
         else:
-            _seal_leftover(log, segment, state)
+            _seal_leftover(log, segment, reach, state)
     _read_end(log, state)
     return state
 
 
-def _seal_leftover(log: Path, segment: SegmentPath, state: Restart) -> None:
+def _seal_leftover(log: Path, segment: SegmentPath, reach: int, state: Restart) -> None:
+    """``reach`` is the base of the next segment: this one was whole before that was begun."""
     scan = scan_active(segment.path, segment.base)
+    scan.gap_up_to(reach)
     _refuse_rot(segment.path, scan)
     state.torn_bytes += scan.lost_bytes
     state.torn_events += scan.torn_events
     state.log_id = state.log_id or scan.log_id
     if scan.chunks:
-        seal_active(log, segment, scan)
+        _seal_active(log, segment, scan)
         state.recovered_segments += 1
         state.recovered_events += scan.next_offset - segment.base
     segment.path.unlink()
     sync_directory(log)
 
 
-def _refuse_rot(path: Path, scan: ActiveScan) -> None:
+def _refuse_rot(path: Path, scan: Scan) -> None:
     if scan.gaps:
         first, last = scan.gaps[0]
         raise LogDamaged(
@@ -74,13 +77,12 @@ def _refuse_rot(path: Path, scan: ActiveScan) -> None:
         )
 
 
-def seal_active(log: Path, segment: SegmentPath, scan: ActiveScan) -> str:
-    """Seal the good chunks of an active segment; the new file's SHA-256."""
+def _seal_active(log: Path, segment: SegmentPath, scan: Scan) -> None:
     before = [s for s in list_segments(log) if s.base < segment.base]
     previous = file_sha256(before[-1].path) if before else NO_PREVIOUS
     file = ActiveFile(segment.path, segment.base)
     plan = SegmentPlan(log, file.log_id, segment.base, previous)
-    return seal(plan, (file.read_chunk(chunk) for chunk in scan.chunks))
+    seal(plan, (file.read_chunk(chunk) for chunk in scan.chunks))
 
 
 def _read_end(log: Path, state: Restart) -> None:

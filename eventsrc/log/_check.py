@@ -1,0 +1,69 @@
+"""Is every byte of a sealed segment what was sealed?
+
+The CRC in DataEnd covers everything before it, the CRC in the footer the summary and the footer,
+and the magic ends the file; so there is no byte that nothing checks.
+"""
+
+import hashlib
+import os
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+from . import _mcap
+from ._mcap import DataEnd
+
+_BLOCK = 1024 * 1024
+_DATA_END_BYTES = _mcap.FRAME.size + 4
+
+
+@dataclass(frozen=True, slots=True)
+class FileCheck:
+    """``sha256`` of the whole file; ``fault`` is None when every checksum holds."""
+
+    sha256: str
+    fault: str | None
+
+
+def check_sealed(path: Path) -> FileCheck:
+    """Read the whole file, a block at a time."""
+    with path.open("rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        tail = os.pread(file.fileno(), _mcap.TAIL_BYTES, max(0, size - _mcap.TAIL_BYTES))
+        summary_start, fault = _summary_start(tail, size)
+        data_end_at = summary_start - _DATA_END_BYTES
+        sha256 = hashlib.sha256()
+        crc = 0
+        at = 0
+        while block := file.read(_BLOCK):
+            sha256.update(block)
+            crc = zlib.crc32(block[: max(0, data_end_at - at)], crc)
+            at += len(block)
+        if fault is None:
+            fault = _data_end_fault(file.fileno(), data_end_at, crc)
+        if fault is None:
+            fault = _summary_fault(file.fileno(), summary_start, size, tail)
+    return FileCheck(sha256.hexdigest(), fault)
+
+
+def _summary_start(tail: bytes, size: int) -> tuple[int, str | None]:
+    if len(tail) < _mcap.TAIL_BYTES or not tail.endswith(_mcap.MAGIC):
+        return _DATA_END_BYTES, "no magic at its end"
+    start = int.from_bytes(tail[9:17], "little")
+    if not _DATA_END_BYTES < start < size:
+        return _DATA_END_BYTES, "the footer points nowhere"
+    return start, None
+
+
+def _data_end_fault(fd: int, at: int, crc: int) -> str | None:
+    if os.pread(fd, _DATA_END_BYTES, at) != _mcap.encode(DataEnd(crc)):
+        return "the data section does not match its CRC"
+    return None
+
+
+def _summary_fault(fd: int, start: int, size: int, tail: bytes) -> str | None:
+    summary = os.pread(fd, size - _mcap.TAIL_BYTES - start, start)
+    footer = tail[: _mcap.FOOTER_BYTES]
+    if zlib.crc32(footer[:-4], zlib.crc32(summary)) != int.from_bytes(footer[-4:], "little"):
+        return "the summary does not match its CRC"
+    return None

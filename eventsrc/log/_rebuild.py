@@ -1,0 +1,100 @@
+"""A new sealed segment from what a scan found good, every offset accounted for.
+
+An event that is gone leaves a ``mapfold/loss`` event at its offset, cause ``rot``: offsets are what
+checkpoints, maps and people point at, so none may move, and a loss that stands in the log is seen
+by everybody who reads it.
+"""
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from eventsrc.envelope import ENVELOPE_VERSION
+from eventsrc.system_events import LOSS_KEY, Loss
+
+from . import _mcap
+from ._active import key_channel
+from ._mcap import Channel, Schema
+from ._raw import read_body
+from ._scan import Scan
+from ._schemas import schema_of
+from ._seal import SegmentPlan, seal
+from .segment import ChunkRef
+
+_BATCH = 4096
+
+
+@dataclass(slots=True)
+class _Definitions:
+    """The channels of the good chunks, their schemas, and one channel for losses."""
+
+    channels: dict[int, Channel] = field(default_factory=dict)
+    schemas: dict[int, Schema] = field(default_factory=dict)
+
+    def learn(self, body: bytes) -> None:
+        schemas, channels = _mcap.definitions(body)
+        self.schemas.update((schema.id, schema) for schema in schemas)
+        self.channels.update((channel.id, channel) for channel in channels)
+
+    def loss_channel(self) -> int:
+        for channel in self.channels.values():
+            if channel.topic == LOSS_KEY:
+                return channel.id
+        id_ = max(self.channels, default=0) + 1
+        schema = max([*self.schemas, *(c.schema_id for c in self.channels.values())], default=0) + 1
+        self.channels[id_] = key_channel(id_, schema, LOSS_KEY, ENVELOPE_VERSION)
+        return id_
+
+    def encode(self) -> bytes:
+        """All of them, schemas first. A schema that is gone is made again from its key."""
+        for channel in self.channels.values():
+            if channel.schema_id not in self.schemas:
+                name, text = schema_of(channel.topic)
+                self.schemas[channel.schema_id] = Schema(
+                    id=channel.schema_id, name=name, encoding="jsonschema", data=text
+                )
+        return _mcap.encode_all([*self.schemas.values(), *self.channels.values()])
+
+
+def rebuild(plan: SegmentPlan, source: Path | None, scan: Scan) -> str:
+    """Seal the good chunks of ``source`` and losses for the gaps; the new file's SHA-256."""
+    if source is None:
+        return seal(plan, _bodies(-1, scan))
+    fd = os.open(source, os.O_RDONLY)
+    try:
+        return seal(plan, _bodies(fd, scan))
+    finally:
+        os.close(fd)
+
+
+def _bodies(fd: int, scan: Scan) -> Iterator[bytes]:
+    definitions = _Definitions(dict(scan.channels))
+    for chunk in scan.chunks:
+        definitions.learn(read_body(fd, chunk))
+    loss_channel = definitions.loss_channel() if scan.gaps else 0
+    prelude = definitions.encode()
+    logged_ns = 0
+    pieces: list[tuple[int, ChunkRef | int]] = [(c.first, c) for c in scan.chunks]
+    pieces += scan.gaps
+    for first, rest in sorted(pieces, key=lambda piece: piece[0]):
+        if isinstance(rest, ChunkRef):
+            body = read_body(fd, rest)
+            logged_ns = max(message[2] for message in _mcap.walk(body))
+            yield prelude + body
+            prelude = b""
+        else:
+            for start in range(first, rest + 1, _BATCH):
+                upto = min(start + _BATCH, rest + 1)
+                yield prelude + _losses(scan.base, loss_channel, start, upto, logged_ns)
+                prelude = b""
+
+
+def _losses(base: int, channel: int, first: int, following: int, logged_ns: int) -> bytes:
+    parts: list[bytes] = []
+    for offset in range(first, following):
+        loss = Loss(publisher="log", first=offset, last=offset, count=1, cause="rot")
+        payload = loss.model_dump_json().encode()
+        head = _mcap.encode_message_head(channel, offset - base, logged_ns, logged_ns, len(payload))
+        parts += (head, payload)
+    return b"".join(parts)

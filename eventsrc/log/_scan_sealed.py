@@ -1,0 +1,89 @@
+"""What can still be read of a sealed segment: by its index, or, where that is gone, by searching
+the bytes for chunks. Every chunk is decompressed and its CRC and sequence checked."""
+
+import mmap
+from itertools import pairwise
+from pathlib import Path
+
+from eventsrc.errors import LogDamaged, NotALog
+
+from . import _mcap
+from ._mcap import BadRecord, Metadata
+from ._scan import Scan, chunk_extent
+from .segment import SEAL_METADATA, ChunkRef, SealedFile, read_head
+
+_HEAD_BYTES = 4096
+
+
+def scan_sealed(path: Path, base: int, following: int | None) -> Scan:
+    """Look at every chunk. ``following`` is the base of the next segment, if there is one: how far
+    this one reached when its own index cannot say."""
+    with path.open("rb") as file:
+        data = file.read(1) and mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    if not data:
+        scan = Scan(base, None, next_offset=base)
+        scan.gap_up_to(following or base)
+        return scan
+    with data:
+        return _scan(path, base, following, data)
+
+
+def _scan(path: Path, base: int, following: int | None, data: mmap.mmap) -> Scan:
+    scan = Scan(base, _log_id(path, base, data), next_offset=base)
+    try:
+        index = SealedFile(path, base)
+        promised = index.next_offset
+        scan.channels = index.channels
+        places = [chunk.position for chunk in index.chunks]
+    except (LogDamaged, NotALog):
+        promised = _promised(data, base)
+        places = _chunk_places(data)
+    for at in places:
+        try:
+            length, first, after = chunk_extent(data, at, scan)
+        except BadRecord:
+            continue
+        if first >= scan.next_offset:
+            scan.take(ChunkRef(at, length, first, after))
+    scan.gap_up_to(max(promised, following or base))
+    scan.lost_bytes = _unread_bytes(data, places, scan)
+    return scan
+
+
+def _log_id(path: Path, base: int, data: mmap.mmap) -> str | None:
+    try:
+        return read_head(path, data[:_HEAD_BYTES], base)[0]["log_id"]
+    except (LogDamaged, NotALog):
+        return None
+
+
+def _chunk_places(data: mmap.mmap) -> list[int]:
+    """Everywhere a compressed chunk seems to start."""
+    places = []
+    at = -1
+    while (at := data.find(_mcap.ZSTD_PATTERN, at + 1)) >= 0:
+        if at >= _mcap.ZSTD_PATTERN_AT:
+            places.append(at - _mcap.ZSTD_PATTERN_AT)
+    return places
+
+
+def _promised(data: mmap.mmap, base: int) -> int:
+    """How far the segment reached by its seal, if that can be found."""
+    name = SEAL_METADATA.encode()
+    at = data.rfind(name)
+    while at >= 0:
+        try:
+            start = at - 4
+            metadata = _mcap.decode_as(Metadata, data[start:])
+            edges = _mcap.checked_metadata(metadata)["chunk_edges"]
+            return base + int(edges.rsplit(",", 1)[-1])
+        except (BadRecord, KeyError):
+            at = data.rfind(name, 0, at)
+    return base
+
+
+def _unread_bytes(data: mmap.mmap, places: list[int], scan: Scan) -> int:
+    """Bytes of chunks that could not be taken, up to the next chunk or the end."""
+    taken = {chunk.position for chunk in scan.chunks}
+    edges = [*places, len(data)]
+    return sum(following - at for at, following in pairwise(edges) if at not in taken)

@@ -1,0 +1,148 @@
+"""`mapfold log verify`: read every byte and say everything that is not as it should be.
+
+Of the files: magic, checksums, the hash chain, dense offsets, torn ends. Of the events: payloads
+the door would refuse today, keyframes that stand twice, clocks that ran backwards, losses. Findings
+that may be many are told once for each run or key, with their number and the first offset.
+"""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from eventsrc.errors import LogDamaged, NotALog
+
+from ._check import check_sealed
+from ._lock import is_held
+from ._naming import SEALED, SegmentPath, segment_path
+from ._raw import raw_events
+from ._scan import Scan, scan_active
+from ._scan_sealed import scan_sealed
+from ._seal import NO_PREVIOUS, REPLACES
+from ._verify_events import EventFindings
+from .findings import Finding, Kind
+from .reader import segments_of
+from .segment import read_head
+
+_HEAD_BYTES = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class Verification:
+    """What was looked at and what was found."""
+
+    path: Path
+    log_id: str | None
+    segments: int
+    events: int
+    size_bytes: int
+    findings: tuple[Finding, ...]
+
+
+def verify_log(log: Path) -> Verification:
+    """Look at everything. Raises only when there is no log at all."""
+    return _Verifier(log).run()
+
+
+class _Verifier:
+    def __init__(self, log: Path) -> None:
+        self._log = log
+        self._segments = segments_of(log)
+        self._live = is_held(log)
+        self._found: list[Finding] = []
+        self._events = EventFindings()
+        self._log_id: str | None = None
+        self._next = 0
+        self._count = 0
+        self._known_as: set[str] = {NO_PREVIOUS}
+        """Hashes by which a successor may know the segment before it."""
+
+    def run(self) -> Verification:
+        size = 0
+        for index, segment in enumerate(self._segments):
+            is_last = index + 1 == len(self._segments)
+            size += self._visit(segment, None if is_last else self._segments[index + 1].base)
+        return Verification(
+            self._log,
+            self._log_id,
+            len(self._segments),
+            self._count,
+            size,
+            (*self._found, *self._events.findings()),
+        )
+
+    def _visit(self, segment: SegmentPath, reach: int | None) -> int:
+        """Look at one segment, which ends at ``reach`` if that is known; its size in bytes."""
+        if not segment.sealed and not segment.path.exists():  # sealed since the folder was listed
+            segment = SegmentPath(segment_path(self._log, segment.base, SEALED), segment.base, True)
+        name = segment.path.name
+        if segment.base != self._next:
+            last = max(segment.base - 1, self._next)
+            self._add("gap", "events before this segment are missing", name, self._next, last)
+        head = self._check_head(segment)
+        if segment.sealed:
+            scan = scan_sealed(segment.path, segment.base, reach)
+            self._check_file(segment, scan, head)
+        else:
+            scan = scan_active(segment.path, segment.base)
+            if reach is not None:
+                scan.gap_up_to(reach)
+            self._check_end(name, scan)
+            self._known_as = set()  # it gets its hash when it is sealed
+        for first, last in scan.gaps:
+            self._add("gap", "recorded events cannot be read", name, first, last)
+        self._look_at_events(segment, scan)
+        self._next = scan.next_offset
+        return segment.path.stat().st_size
+
+    def _check_head(self, segment: SegmentPath) -> dict[str, str]:
+        try:
+            with segment.path.open("rb") as file:
+                head, _ = read_head(segment.path, file.read(_HEAD_BYTES), segment.base)
+        except (LogDamaged, NotALog) as error:
+            self._add("crc", str(error), segment.path.name)
+            return {}
+        self._log_id = self._log_id or head["log_id"]
+        if head["log_id"] != self._log_id:
+            text = f"belongs to log {head['log_id']}, not {self._log_id}"
+            self._add("log_id", text, segment.path.name)
+        return head
+
+    def _check_file(self, segment: SegmentPath, scan: Scan, head: dict[str, str]) -> None:
+        name = segment.path.name
+        check = check_sealed(segment.path)
+        if check.fault is not None:
+            known = "" if scan.gaps else "; no event is affected"
+            self._add("crc", f"{check.fault}{known}", name)
+        previous = head.get("previous_sha256", NO_PREVIOUS)
+        if head and self._known_as and previous not in self._known_as:
+            self._add("chain", "was not written after the segment before it", name)
+        self._known_as = {check.sha256, head.get(REPLACES) or check.sha256}
+
+    def _check_end(self, name: str, scan: Scan) -> None:
+        if scan.lost_bytes and not scan.gaps and not self._live:
+            text = f"{scan.lost_bytes} bytes at its end were being written when the writer died"
+            self._add("torn", text, name, count=scan.torn_events)
+
+    def _look_at_events(self, segment: SegmentPath, scan: Scan) -> None:
+        fd = os.open(segment.path, os.O_RDONLY)
+        try:
+            for chunk in scan.chunks:
+                for event in raw_events(fd, scan, chunk):
+                    self._events.take(event)
+                    self._count += 1
+        finally:
+            os.close(fd)
+
+    def _add(
+        self,
+        kind: Kind,
+        message: str,
+        segment: str,
+        first: int | None = None,
+        last: int | None = None,
+        *,
+        count: int | None = None,
+    ) -> None:
+        if count is None:
+            count = 1 if first is None or last is None else last - first + 1
+        self._found.append(Finding(kind, message, segment, first, last, count))

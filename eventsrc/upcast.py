@@ -1,0 +1,105 @@
+"""Reading yesterday's logs: old forms of the envelope climb a ladder to today's.
+
+A log keeps payloads as they came, so what a form means must outlive the robots that sent it. Each
+channel of a log says the version of its envelopes; `read_envelope` takes an event up from its
+version, one step at a time, and through the same door as new ones.
+
+    1   the bare list of a detector, before there was an envelope: ``[{"class_name": "cup",
+        "confidence": 0.87, "bbox": [120.0, 80.0, 250.0, 310.0]}, …]``. It does not say who saw it,
+        when and where; the event around it says what can be said: the run is ``unnamed:<key>``,
+        the keyframe id is the event's offset, the time is the event's stamp, and there is no pose.
+        So it becomes observations without a place. ``class_name`` became ``class``.
+    2   the envelope of DESIGN section 3.
+
+To change the envelope: raise ENVELOPE_VERSION, write the step from the version before, and add a
+log of that version to the tests. Never change a step that has been released.
+"""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, Protocol
+
+from .envelope import ENVELOPE_VERSION
+from .ingest import DEFAULT_MAX_PAYLOAD_BYTES, Accepted, Rejected, ingest
+
+BARE_LIST_VERSION = 1
+
+
+class Recorded(Protocol):
+    """What a step may know of the event around a payload; `eventsrc.log.Event` is one."""
+
+    @property
+    def offset(self) -> int: ...
+    @property
+    def key(self) -> str: ...
+    @property
+    def stamp_ns(self) -> int: ...
+    @property
+    def payload(self) -> bytes: ...
+    @property
+    def version(self) -> int: ...
+
+
+Step = Callable[[Any, Recorded], Any]
+"""From the JSON value of one version to that of the next. Raises ValueError for what is none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """A payload that is about to be recorded, as far as a step may know it."""
+
+    offset: int
+    key: str
+    stamp_ns: int
+    payload: bytes
+    version: int
+
+
+def read_envelope(
+    event: Recorded, *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES
+) -> Accepted | Rejected:
+    """The envelope of an event of any version."""
+    if event.version == ENVELOPE_VERSION:
+        return ingest(event.payload, max_bytes=max_bytes)
+    if event.version not in LADDER:
+        return Rejected(f"envelope version {event.version} is unknown here; upgrade mapfold")
+    if len(event.payload) > max_bytes:
+        return Rejected(f"payload of {len(event.payload)} bytes is over the limit of {max_bytes}")
+    try:
+        document = json.loads(event.payload)
+        for version in range(event.version, ENVELOPE_VERSION):
+            document = LADDER[version](document, event)
+        payload = json.dumps(document).encode()
+    except (ValueError, RecursionError) as error:
+        return Rejected(f"not an envelope of version {event.version}: {error}")
+    return ingest(payload, max_bytes=2 * max_bytes)
+
+
+def guess_version(payload: bytes) -> int:
+    """The version of a payload that does not say: a list with an object in it is a bare list."""
+    start = payload[:64].split()
+    return BARE_LIST_VERSION if b"".join(start).startswith(b"[{") else ENVELOPE_VERSION
+
+
+def _envelope_around_bare_list(document: Any, event: Recorded) -> dict[str, Any]:
+    if not isinstance(document, list) or not all(isinstance(d, dict) for d in document):
+        raise ValueError("not a list of detections")
+    return {
+        "run_id": f"unnamed:{event.key}",
+        "keyframe_id": event.offset,
+        "timestamp": event.stamp_ns / 1e9,
+        "detections": [_class_for_class_name(detection) for detection in document],
+    }
+
+
+def _class_for_class_name(detection: dict[str, Any]) -> dict[str, Any]:
+    if "class" in detection or "class_name" not in detection:
+        return detection
+    rest = {name: value for name, value in detection.items() if name != "class_name"}
+    return {**rest, "class": detection["class_name"]}
+
+
+LADDER: Mapping[int, Step] = MappingProxyType({1: _envelope_around_bare_list})
+"""The step up from each older version."""

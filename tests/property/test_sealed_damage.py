@@ -1,0 +1,152 @@
+"""A sealed segment with any one byte changed: verify names it or no event has changed, reading
+never makes anything up, and recovery keeps every chunk that is whole at its own offsets."""
+
+import contextlib
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from eventsrc.errors import LogError
+from eventsrc.log import Event, LogWriter, log_info, recover_log, verify_log
+from eventsrc.log import _seal as sealing
+from eventsrc.system_events import LOSS_KEY, Loss
+from tests.fixtures_log import BY_HAND, KEY, envelope, read_log, read_with_gaps
+
+MEMORY_DISK = Path("/dev/shm")
+EVENTS = 6
+
+
+@pytest.fixture
+def sealed(quick_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, list[Event]]:
+    """A sealed segment of one event a chunk, and its events."""
+    monkeypatch.setattr(sealing, "CHUNK_BYTES", 1)
+    log = quick_path / "log"
+    with LogWriter(log, fsync=BY_HAND) as writer:
+        for index in range(EVENTS):
+            writer.append(KEY, envelope(index), stamp_ns=index, logged_ns=9)
+            if index % 2:
+                writer.sync()
+    return next(log.glob("*.mcap")), read_log(log)
+
+
+def test_a_whole_segment_has_no_findings(sealed: tuple[Path, list[Event]]) -> None:
+    verified = verify_log(sealed[0].parent)
+    assert verified.findings == ()
+    assert (verified.events, verified.segments) == (EVENTS, 1)
+
+
+def test_every_flip_is_found_and_never_read_as_data(sealed: tuple[Path, list[Event]]) -> None:
+    file, events = sealed
+    data = bytearray(file.read_bytes())
+    for at in range(len(data)):
+        data[at] ^= 0x20
+        file.write_bytes(data)
+        findings = verify_log(file.parent).findings
+        assert findings, f"byte {at} of {len(data)} changed and nobody noticed"
+        named = {
+            offset
+            for f in findings
+            if f.first_offset is not None and f.last_offset is not None
+            for offset in range(f.first_offset, f.last_offset + 1)
+        }
+        with contextlib.suppress(LogError):
+            shown, gaps = read_with_gaps(file.parent)
+            assert all(event == events[event.offset] for event in shown)
+            assert {e.offset for e in shown} | gaps == set(range(EVENTS))
+            assert gaps <= named
+        data[at] ^= 0x20
+
+
+def test_recovery_keeps_every_whole_chunk_at_its_offsets(sealed: tuple[Path, list[Event]]) -> None:
+    file, events = sealed
+    log = file.parent
+    original = file.read_bytes()
+    for at in range(0, len(original), 3):
+        damaged = bytearray(original)
+        damaged[at] ^= 0x20
+        file.write_bytes(damaged)
+        report = recover_log(log)
+        (segment,) = report.segments
+        assert segment.kept_events + segment.lost_events == EVENTS
+        assert segment.lost_events in (0, 1)
+        assert segment.kept_copy is not None
+        assert (log / segment.kept_copy).read_bytes() == bytes(damaged)
+        lost = {o for first, last in segment.gaps for o in range(first, last + 1)}
+        for event, was in zip(read_log(log), events, strict=True):
+            if event.offset not in lost:
+                assert event == was
+                continue
+            loss = Loss.model_validate_json(event.payload)
+            assert event.key == LOSS_KEY
+            assert (loss.first, loss.last, loss.cause) == (event.offset, event.offset, "rot")
+        assert {f.kind for f in verify_log(log).findings} == ({"loss"} if lost else set())
+        assert log_info(log).lost == len(lost)
+        assert recover_log(log).segments == ()
+        (log / segment.kept_copy).unlink()
+
+
+def test_a_missing_segment_becomes_losses(quick_path: Path) -> None:
+    log = quick_path / "log"
+    with LogWriter(log, rotate_events=2, fsync=BY_HAND) as writer:
+        for index in range(EVENTS):
+            writer.append(KEY, envelope(index))
+            if index % 2:
+                writer.sync()
+                writer.commit_if_due()
+    (log / "00000000000000000002.mcap").unlink()
+    assert [f.kind for f in verify_log(log).findings] == ["gap", "chain"]
+    with pytest.raises(LogError, match="offsets 2 to 3"):
+        read_log(log)
+    report = recover_log(log)
+    assert [s.gaps for s in report.segments] == [((2, 3),)]
+    assert [e.key == LOSS_KEY for e in read_log(log)] == [False, False, True, True, False, False]
+    assert [f.kind for f in verify_log(log).findings] == ["loss"]
+    with LogWriter(log) as writer:
+        assert writer.next_offset == EVENTS
+
+
+def test_the_chain_notices_a_segment_put_in_anothers_place(quick_path: Path) -> None:
+    for name in ("a", "b"):
+        with LogWriter(quick_path / name, rotate_events=1, fsync=BY_HAND) as writer:
+            for index in range(3):
+                writer.append(KEY, envelope(index, name))
+                writer.sync()
+                writer.commit_if_due()
+    middle = "00000000000000000001.mcap"
+    shutil.copy(quick_path / "b" / middle, quick_path / "a" / middle)
+    kinds = [f.kind for f in verify_log(quick_path / "a").findings]
+    assert kinds == ["log_id", "chain", "chain"]
+
+
+def test_verify_tells_what_no_checksum_knows(quick_path: Path) -> None:
+    log = quick_path / "log"
+    loss = {"publisher": "r", "first": 2, "last": 4, "count": 3, "cause": "keyframe_gap"}
+    with LogWriter(log) as writer:
+        writer.append(KEY, envelope(1, "r"), stamp_ns=5, logged_ns=100)
+        writer.append(KEY, b'{"run_id": 3}', stamp_ns=6, logged_ns=101)
+        writer.append(KEY, envelope(5, "r"), stamp_ns=4, logged_ns=99)
+        writer.append(KEY, envelope(1, "r"), stamp_ns=5, logged_ns=102)
+        writer.append(LOSS_KEY, json.dumps(loss).encode(), logged_ns=103)
+        writer.append(LOSS_KEY, b"{}", logged_ns=104)
+    found = [(f.kind, f.first_offset, f.count) for f in verify_log(log).findings]
+    assert found == [
+        ("schema", 1, 1),
+        ("time", 2, 1),
+        ("time", 2, 1),
+        ("duplicate", 3, 1),
+        ("loss", 4, 3),
+        ("schema", 5, 1),
+    ]
+    assert log_info(log).lost == 3
+
+
+def test_a_late_keyframe_closes_its_gap(quick_path: Path) -> None:
+    log = quick_path / "log"
+    loss = {"publisher": "r", "first": 2, "last": 4, "count": 3, "cause": "keyframe_gap"}
+    with LogWriter(log) as writer:
+        writer.append(LOSS_KEY, json.dumps(loss).encode())
+        writer.append(KEY, envelope(3, "r"))
+        writer.append(KEY, envelope(2, "other"))
+    assert log_info(log).lost == 2
