@@ -26,6 +26,10 @@ def pg_server() -> Iterator[EmbeddedServer]:
     server = EmbeddedServer(home)
     try:
         server.start()
+        with connect(server.url, autocommit=True) as connection:
+            # These tests kill the server, never the machine; without it a database is dropped fast.
+            connection.execute("ALTER SYSTEM SET fsync = off")
+            connection.execute("SELECT pg_reload_conf()")
         yield server
     finally:
         server.stop()

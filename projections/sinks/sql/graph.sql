@@ -28,7 +28,7 @@ SET start_id = EXCLUDED.start_id, end_id = EXCLUDED.end_id, properties = EXCLUDE
 
 -- name: delete
 DELETE FROM {graph}.{label}
-WHERE id = ANY (SELECT unnest(%s::text[])::ag_catalog.graphid)
+WHERE id OPERATOR(ag_catalog.=) ANY (%s::text[]::ag_catalog.graphid[])
 
 -- name: copy_vertex
 COPY {graph}.{label} (id, properties) FROM STDIN

@@ -1,0 +1,136 @@
+"""What a projection's tables must hold, two ways: read from the server, and said from the view.
+
+`expected_graph` is written for being obviously right, not fast, and shares nothing with the sinks
+but the label numbering that docs/projections.md promises.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import psycopg
+from psycopg import sql
+
+from projections.exact import Q40
+from projections.postgres.connect import Targets
+from projections.view import MapView
+
+ORDER = (
+    "Run", "Keyframe", "Pose", "Observation", "Object", "Place", "HAS_KEYFRAME", "HAS_POSE",
+    "HAS_OBSERVATION", "OBSERVES", "LOCATED_IN", "IN_PLACE", "ADJACENT_TO",
+)  # fmt: skip
+VERTICES = ORDER[:6]
+
+
+def gid(label: str, number: int) -> str:
+    """The graphid of a label's row, as text."""
+    return str((3 + ORDER.index(label)) << 48 | number)
+
+
+def graph_rows(url: str) -> dict[str, list[tuple[str, ...]]]:
+    """All rows of the graph as text, by label, ordered by id."""
+    vertex = sql.SQL("SELECT id::text, properties::text FROM {} ORDER BY id")
+    edge = sql.SQL(
+        "SELECT id::text, start_id::text, end_id::text, properties::text FROM {} ORDER BY id"
+    )
+    with psycopg.connect(url) as connection:
+        connection.execute("SET search_path = ag_catalog, public")
+        return {
+            label: connection.execute(
+                (vertex if label in VERTICES else edge).format(
+                    sql.Identifier("semantic_map", label)
+                )
+            ).fetchall()
+            for label in ORDER
+        }
+
+
+def vector_rows(url: str) -> list[tuple[Any, ...]]:
+    """All rows of the table, embeddings as text, ordered by det_pk."""
+    with psycopg.connect(url) as connection:
+        connection.execute("SET timezone = 'UTC'")
+        return connection.execute(
+            "SELECT det_pk, run_id, det_id, keyframe_id, class_name, confidence, bbox, map_x,"
+            " map_y, map_yaw, embedding_model, embedding::text, ingested_at"
+            " FROM detection_embeddings ORDER BY det_pk"
+        ).fetchall()
+
+
+def all_rows(targets: Targets) -> tuple[Mapping[str, Any], list[tuple[Any, ...]]]:
+    """Every row of both."""
+    return graph_rows(targets.graph_url), vector_rows(targets.vector_url)
+
+
+def expected_graph(view: MapView) -> dict[str, list[tuple[Any, ...]]]:
+    """Every row the graph must have, properties as dictionaries, ordered by id."""
+    rows: dict[str, list[tuple[Any, ...]]] = {label: [] for label in ORDER}
+    for run in view.runs:
+        properties: dict[str, Any] = {"run_id": run.run_id, "started_at": run.started_at}
+        rows["Run"].append((gid("Run", run.ordinal + 1), properties))
+    for k in view.keyframes:
+        n = k.ordinal + 1
+        name = {"run_id": k.run_id, "keyframe_id": k.keyframe_id}
+        rows["Keyframe"].append((gid("Keyframe", n), {**name, "timestamp": k.timestamp}))
+        run_end = gid("Run", k.run + 1)
+        rows["HAS_KEYFRAME"].append((gid("HAS_KEYFRAME", n), run_end, gid("Keyframe", n), {}))
+        if k.pose is not None:
+            at = {"map_x": k.pose.x_um / 1e6, "map_y": k.pose.y_um / 1e6, "map_yaw": k.pose.yaw_rad}
+            rows["Pose"].append((gid("Pose", n), {**name, **at}))
+            rows["HAS_POSE"].append((gid("HAS_POSE", n), gid("Keyframe", n), gid("Pose", n), {}))
+        if k.place is not None:
+            place_end = gid("Place", k.place + 1)
+            rows["IN_PLACE"].append((gid("IN_PLACE", n), gid("Keyframe", n), place_end, {}))
+    _expect_landmarks(view, rows)
+    for p in view.places.values():
+        properties = {
+            "place_id": p.place_id,
+            "centroid_x": p.centroid_x,
+            "centroid_y": p.centroid_y,
+            "keyframe_count": p.keyframe_count,
+        }
+        rows["Place"].append((gid("Place", p.ordinal + 1), properties))
+    for a, b, shared in view.edges():
+        ends = gid("Place", a + 1), gid("Place", b + 1)
+        number = (a + 1) << 24 | (b + 1)
+        rows["ADJACENT_TO"].append(
+            (gid("ADJACENT_TO", number), *ends, {"shared_transitions": shared})
+        )
+    return {label: sorted(found, key=lambda row: int(row[0])) for label, found in rows.items()}
+
+
+def _expect_landmarks(view: MapView, rows: dict[str, list[tuple[Any, ...]]]) -> None:
+    for o in view.observations:
+        n, k = o.ordinal + 1, view.keyframes[o.keyframe]
+        properties: dict[str, Any] = {
+            "det_id": o.det_id,
+            "class_name": o.class_name,
+            "confidence": o.confidence,
+            "bbox": list(o.bbox),
+            "run_id": k.run_id,
+            "keyframe_id": k.keyframe_id,
+        }
+        rows["Observation"].append((gid("Observation", n), properties))
+        start = gid("Keyframe", o.keyframe + 1)
+        rows["HAS_OBSERVATION"].append(
+            (gid("HAS_OBSERVATION", n), start, gid("Observation", n), {})
+        )
+        if o.object is not None:
+            assert o.similarity_q40 is not None
+            ends = gid("Observation", n), gid("Object", o.object + 1)
+            rows["OBSERVES"].append(
+                (gid("OBSERVES", n), *ends, {"similarity": o.similarity_q40 / Q40})
+            )
+    for obj in view.objects:
+        n = obj.ordinal + 1
+        properties = {
+            "object_id": obj.object_id,
+            "class_name": obj.class_name,
+            "mean_x": obj.mean_x,
+            "mean_y": obj.mean_y,
+            "obs_count": obj.obs_count,
+            "first_seen": obj.first_seen,
+            "last_seen": obj.last_seen,
+        }
+        rows["Object"].append((gid("Object", n), properties))
+        if obj.place is not None:
+            ends = gid("Object", n), gid("Place", obj.place + 1)
+            rows["LOCATED_IN"].append((gid("LOCATED_IN", n), *ends, {}))
