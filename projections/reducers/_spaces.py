@@ -5,10 +5,6 @@ of another space is *foreign*: it is counted, but neither fused nor searched. A 
 no model is of the unnamed model, which is a model like any other.
 """
 
-from collections.abc import Sequence
-
-from eventsrc.envelope import Detection
-from eventsrc.ingest import Vector
 from projections.settings import Settings
 
 
@@ -26,20 +22,10 @@ class Space:
         """Fix the space."""
         self.is_decided, self.model, self.dim = True, model, dim
 
-    def has(self, detection: Detection, vector: Vector) -> bool:
-        """True when the detection's vector is of the map's space; the first one decides it."""
-        model, dim = detection.embedding_model, len(vector)
+    def has(self, model: str | None, dim: int) -> bool:
+        """True when a vector of this model and dimension is in the map; the first one decides."""
         if not self.is_decided:
             if self._wanted_model not in (None, model) or self._wanted_dim not in (None, dim):
                 return False
             self.decide(model, dim)
         return model == self.model and dim == self.dim
-
-    def members(
-        self, detections: Sequence[Detection], vectors: Sequence[Vector | None]
-    ) -> list[Vector | None]:
-        """``vectors`` with None in place of the foreign ones."""
-        return [
-            vector if vector is not None and self.has(detection, vector) else None
-            for detection, vector in zip(detections, vectors, strict=True)
-        ]

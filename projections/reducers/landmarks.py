@@ -13,7 +13,8 @@ An Object's position is the mean of the *robot's* poses, for lack of depth.
 
 The mean embedding is never rounded to a unit vector: the sum S of the unit vectors has the mean's
 direction, so the cosine with u is S·u / (|S||u|). S, S·u, |S|² and |u|² are exact integers;
-|S + u|² = |S|² + 2 S·u + |u|² keeps the norm up to date without touching S again.
+|S + u|² = |S|² + 2 S·u + |u|² keeps the norm up to date without touching S again. S·u is at most
+count · 2⁴⁰, so float64 multiplies exactly up to 2¹² observations, int64 beyond.
 
 Every Object is listed in the nine grid cells of side ``fusion_radius_m`` around its mean, so one
 look-up finds all candidates however large the map is.
@@ -30,17 +31,18 @@ from projections.deltas import ObjectFound, ObjectSeen
 from projections.exact import Q40, metres_to_um
 
 MAX_OBSERVATIONS = 1 << 22
-"""Of one Object: S·u ≤ count · 2⁴⁰·(1 + tiny) must stay below 2⁶³."""
+"""Of one Object: S·u, a little over count · 2⁴⁰ at most, must stay below 2⁶³."""
+_MAX_IN_FLOAT = 1 << 12
 
 Bucket = tuple[str, int, int]
 
 
 @dataclass(slots=True, eq=False)
 class Landmark:
-    """An Object: sums of positions, µm, and of unit vectors, int64 of shape (dim,)."""
+    """An Object: sums of positions, µm, and of unit vectors, integers in float64, shape (dim,)."""
 
     class_name: str
-    vector_sum: NDArray[np.int64]
+    vector_sum: NDArray[np.float64]
     norm2: int
     count: int
     sum_x_um: int
@@ -71,12 +73,12 @@ class Landmarks:
         observation: int,
         det_id: str,
         class_name: str,
-        vector: NDArray[np.int64],
+        vector: NDArray[np.float64],
         timestamp: float,
         x_um: int,
         y_um: int,
     ) -> list[ObjectFound | ObjectSeen]:
-        """Fuse one observation. ``vector`` is its unit vector in int64, see `projections.exact`."""
+        """Fuse one observation. ``vector`` is its unit vector, see `exact.unit_rows`."""
         norm2 = int(vector.dot(vector))
         column, row = x_um // self._radius_um, y_um // self._radius_um
         winner, best_q40, best_dot = -1, -math.inf, 0
@@ -87,7 +89,7 @@ class Landmarks:
             dy = landmark.sum_y_um - y_um * count
             if dx * dx + dy * dy > (self._radius_um * count) ** 2:
                 continue
-            dot = int(landmark.vector_sum.dot(vector))
+            dot = _dot(landmark, vector)
             q40 = round(dot / math.sqrt(landmark.norm2 * norm2) * Q40)
             if q40 > best_q40 or (q40 == best_q40 and candidate < winner):
                 winner, best_q40, best_dot = candidate, q40, dot
@@ -135,6 +137,12 @@ class Landmarks:
     def _list(self, ordinal: int, landmark: Landmark) -> None:
         for bucket in _buckets(landmark):
             self._near.setdefault(bucket, []).append(ordinal)
+
+
+def _dot(landmark: Landmark, vector: NDArray[np.float64]) -> int:
+    if landmark.count <= _MAX_IN_FLOAT:
+        return int(landmark.vector_sum.dot(vector))
+    return int(landmark.vector_sum.astype(np.int64).dot(vector.astype(np.int64)))
 
 
 def _buckets(landmark: Landmark) -> list[Bucket]:

@@ -65,6 +65,10 @@ class Places:
         self.run_ids[run] = run_id
         deltas: list[Delta] = []
         fresh = self.crowd.insert(x_um, y_um, yaw)
+        if fresh == [point] and (settled := self.crowd.settled(point)) is not None:
+            place = self.find(self.joined[settled])
+            self._join(point, place)
+            return [KeyframePlaced(offset, keyframe, place), self._changed(offset, place)]
         joining = self._grow(offset, point, fresh, deltas) if fresh else {}
         if point not in joining:
             place = self._earliest_in_reach(point)

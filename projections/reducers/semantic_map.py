@@ -13,11 +13,12 @@ The fold has no clock, chance, disk, network or database. The same events give t
 """
 
 from collections.abc import Sequence
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from eventsrc.ingest import Accepted, Vector
+from eventsrc.ingest import Accepted
 from projections.deltas import (
     Delta,
     EventSkipped,
@@ -28,7 +29,7 @@ from projections.deltas import (
     Pose,
     RunSeen,
 )
-from projections.exact import metres_to_um, quantise_rows
+from projections.exact import Units, metres_to_um, unit_vectors
 from projections.settings import Settings
 
 from ._crowd import Crowd
@@ -39,6 +40,9 @@ from .adjacency import Adjacency
 from .landmarks import Landmarks
 from .located_in import LocatedIn
 from .places import Places
+
+Sighting: TypeAlias = tuple[int, str, str, NDArray[np.float64]]
+"""An observation that can be fused: ordinal, det_id, class name, unit vector."""
 
 
 class SemanticMap:
@@ -67,8 +71,13 @@ class SemanticMap:
         """Pass over an event that says nothing about the map."""
         self.next_offset = offset + 1
 
-    def fold(self, offset: int, accepted: Accepted) -> list[Delta]:
-        """Take in one envelope; what it changed, in the order `projections.deltas` states."""
+    def fold(
+        self, offset: int, accepted: Accepted, units: Sequence[Units | None] | None = None
+    ) -> list[Delta]:
+        """Take in one envelope; what it changed, in the order `projections.deltas` states.
+
+        ``units`` is ``unit_vectors(accepted.vectors)`` for a caller who made it beforehand.
+        """
         self.next_offset = offset + 1
         envelope, seen = accepted.envelope, self.seen
         digest = content_digest(accepted)
@@ -94,7 +103,9 @@ class SemanticMap:
                 pose,
             )
         )
-        sightings = self._observe(offset, keyframe, accepted, deltas)
+        if units is None:
+            units = unit_vectors(accepted.vectors)
+        sightings = self._observe(offset, keyframe, accepted, units, deltas)
         if pose is not None:
             place = self._place(offset, keyframe, run, envelope.run_id, pose, deltas)
             self._fuse(offset, keyframe, place, pose, sightings, envelope.timestamp, deltas)
@@ -103,42 +114,46 @@ class SemanticMap:
         return deltas
 
     def _observe(
-        self, offset: int, keyframe: int, accepted: Accepted, deltas: list[Delta]
-    ) -> list[tuple[ObservationAdded, NDArray[np.int64]]]:
-        """Add the observations; those with a vector in the map's space, and it in int64."""
+        self,
+        offset: int,
+        keyframe: int,
+        accepted: Accepted,
+        units: Sequence[Units | None],
+        deltas: list[Delta],
+    ) -> list[Sighting]:
+        """Add the observations; those with a vector in the map's space."""
         envelope, det_ids = accepted.envelope, self.seen.det_ids
-        if not envelope.detections:
-            return []
-        members = self.space.members(envelope.detections, accepted.vectors)
-        units = _units(members)
-        wide = units.astype(np.int64)
-        sightings, row = [], -1
-        for detection, det_id, vector, member in zip(
-            envelope.detections, accepted.det_ids, accepted.vectors, members, strict=True
+        run_id, keyframe_id = envelope.run_id, envelope.keyframe_id
+        sightings: list[Sighting] = []
+        for detection, det_id, unit in zip(
+            envelope.detections, accepted.det_ids, units, strict=True
         ):
-            row += member is not None
+            model = detection.embedding_model
+            is_member = unit is not None and self.space.has(model, len(unit[0]))
             first = det_ids.setdefault(det_id, keyframe)
             if first != keyframe:
                 deltas.append(self._reused(offset, accepted, det_id, first))
                 continue
-            added = ObservationAdded(
-                offset,
-                self.observation_count,
-                keyframe,
-                envelope.run_id,
-                envelope.keyframe_id,
-                det_id,
-                detection.class_name,
-                detection.confidence,
-                detection.bbox,
-                detection.embedding_model,
-                None if member is None else units[row],
-                member is None and vector is not None,
+            class_name = detection.class_name
+            deltas.append(
+                ObservationAdded(
+                    offset,
+                    self.observation_count,
+                    keyframe,
+                    run_id,
+                    keyframe_id,
+                    det_id,
+                    class_name,
+                    detection.confidence,
+                    detection.bbox,
+                    model,
+                    unit[1] if unit is not None and is_member else None,
+                    unit is not None and not is_member,
+                )
             )
+            if unit is not None and is_member:
+                sightings.append((self.observation_count, det_id, class_name, unit[0]))
             self.observation_count += 1
-            deltas.append(added)
-            if member is not None:
-                sightings.append((added, wide[row]))
         return sightings
 
     def _reused(self, offset: int, accepted: Accepted, det_id: str, first: int) -> EventSkipped:
@@ -181,20 +196,14 @@ class SemanticMap:
         keyframe: int,
         place: int | None,
         pose: Pose,
-        sightings: list[tuple[ObservationAdded, NDArray[np.int64]]],
+        sightings: list[Sighting],
         timestamp: float,
         deltas: list[Delta],
     ) -> None:
-        for added, vector in sightings:
+        x_um, y_um = pose.x_um, pose.y_um
+        for observation, det_id, class_name, vector in sightings:
             fused = self.landmarks.fold(
-                offset,
-                added.observation,
-                added.det_id,
-                added.class_name,
-                vector,
-                timestamp,
-                pose.x_um,
-                pose.y_um,
+                offset, observation, det_id, class_name, vector, timestamp, x_um, y_um
             )
             deltas += fused
             self.located_in.object_seen(fused[-1].object, keyframe, place)
@@ -206,9 +215,3 @@ def _pose(accepted: Accepted) -> Pose | None:
     if x is None or y is None or yaw is None:
         return None
     return Pose(metres_to_um(x), metres_to_um(y), yaw)
-
-
-def _units(members: Sequence[Vector | None]) -> NDArray[np.int32]:
-    """The unit vectors of those that are there, one a row."""
-    rows = [vector for vector in members if vector is not None]
-    return quantise_rows(np.array(rows)) if rows else np.empty((0, 0), np.int32)
