@@ -120,6 +120,8 @@ class Cluster:
     def stop(self) -> None:
         """Stop the server, ending its sessions; it writes everything down first."""
         with _as_one_line("stop", self.data):
+            # Somebody may have closed a folder above since the start; pg_ctl must still get in.
+            let_server_user_enter(self.data, self.programs)
             self._run(
                 "pg_ctl", "stop", "--wait", "--timeout", str(START_SECONDS), "--mode", "fast",
                 "--silent", "--pgdata", str(self.data),
