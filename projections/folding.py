@@ -1,18 +1,26 @@
 """Folding a log: the shell around the pure fold that reads events and turns them into deltas."""
 
+import gc
 import sys
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import islice
 
-from eventsrc.ingest import Rejected, ingest
+from eventsrc.ingest import Accepted, Rejected
 from eventsrc.log import Event, LogReader
 from eventsrc.system_events import is_system_key
+from eventsrc.upcast import read_envelope
 
 from .deltas import Delta
 from .errors import FoldError
+from .exact import Units, unit_vectors
 from .reducers.semantic_map import SemanticMap
 from .settings import Settings
 from .view import MapView
+
+AHEAD = 32
+"""How far to read ahead in a log that is there already: 100 vectors fit a core's cache."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,26 +31,51 @@ class FoldedEvent:
     deltas: list[Delta]
 
 
-def fold_events(events: Iterable[Event], semantic_map: SemanticMap) -> Iterator[FoldedEvent]:
-    """Fold events in offset order, each as it is asked for.
+def fold_events(
+    events: Iterable[Event], semantic_map: SemanticMap, *, ahead: int = 1
+) -> Iterator[FoldedEvent]:
+    """Fold events in offset order.
+
+    Up to ``ahead`` of them are read and validated together before the first of these is folded,
+    which is quicker; with 1, each is read as it is asked for, as befits a live log.
 
     Raises FoldError at an envelope that does not validate. The map has not taken it in then; its
     ``next_offset`` is that event's offset, and ``semantic_map.skip(offset)`` passes over it.
     """
-    for event in events:
-        yield FoldedEvent(event.offset, fold_event(event, semantic_map))
+    coming = iter(events)
+    while chunk := list(islice(coming, ahead)):
+        doors = [_read(event) for event in chunk]
+        vectors = [v for a in doors if isinstance(a, Accepted) for v in a.vectors]
+        units = iter(unit_vectors(vectors))
+        for event, door in zip(chunk, doors, strict=True):
+            yield FoldedEvent(event.offset, _fold(event, door, units, semantic_map))
 
 
 def fold_event(event: Event, semantic_map: SemanticMap) -> list[Delta]:
     """Fold one event; see `fold_events`."""
+    return next(fold_events([event], semantic_map)).deltas
+
+
+def _read(event: Event) -> Accepted | Rejected | None:
+    """The envelope in an event; None for mapfold's own, which say nothing about the map."""
     if is_system_key(event.key):
+        return None
+    # The size limit belongs to the door; what is in the log was let in.
+    return read_envelope(event, max_bytes=sys.maxsize)
+
+
+def _fold(
+    event: Event,
+    door: Accepted | Rejected | None,
+    units: Iterator[Units | None],
+    semantic_map: SemanticMap,
+) -> list[Delta]:
+    if door is None:
         semantic_map.skip(event.offset)
         return []
-    # The size limit belongs to the door; what is in the log was let in.
-    accepted = ingest(event.payload, max_bytes=sys.maxsize)
-    if isinstance(accepted, Rejected):
-        raise FoldError(event.offset, accepted.reason)
-    return semantic_map.fold(event.offset, accepted)
+    if isinstance(door, Rejected):
+        raise FoldError(event.offset, door.reason)
+    return semantic_map.fold(event.offset, door, list(islice(units, len(door.vectors))))
 
 
 def fold_log(
@@ -54,6 +87,22 @@ def fold_log(
 ) -> tuple[SemanticMap, MapView]:
     """Fold the first ``until`` events of a log, all of them for None."""
     semantic_map, view = SemanticMap(settings), MapView(settings, keep_embeddings=keep_embeddings)
-    for folded in fold_events(reader.read(0, until), semantic_map):
-        view.apply_event(folded.offset, folded.deltas)
+    with no_cycle_search():
+        for folded in fold_events(reader.read(0, until), semantic_map, ahead=AHEAD):
+            view.apply_event(folded.offset, folded.deltas)
     return semantic_map, view
+
+
+@contextmanager
+def no_cycle_search() -> Iterator[None]:
+    """Keep the garbage collector from searching for cycles: a fold makes none, and only ever adds.
+
+    The search looks at all records again and again as a map grows, a fifth of the whole time.
+    """
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
