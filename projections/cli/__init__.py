@@ -8,6 +8,7 @@ from eventsrc.cli._shell import run_app
 from . import (
     bisect,
     db,
+    demo,
     diff,
     draw,
     evaluate,
@@ -30,6 +31,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
+demo.register(app)
 log_commands.register(app)
 replay.register(app)
 tail.register(app)

@@ -1,0 +1,5 @@
+"""`python -m projections.cli`: the ``mapfold`` command without its entry point installed."""
+
+from . import main
+
+main()

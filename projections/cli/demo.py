@@ -1,0 +1,42 @@
+"""`mapfold demo`: the whole story on one machine."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from eventsrc.cli._shell import emit, say
+from eventsrc.sim import DEFAULT_SEED
+from projections.cli._options import DbOption, VectorDbOption, sigterm_unwinds
+
+
+def demo(
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="Where to leave log, databases and map.png.")
+    ] = Path("logs/demo"),
+    seed: Annotated[int, typer.Option(help="Which simulated house.", min=0)] = DEFAULT_SEED,
+    speed: Annotated[
+        float, typer.Option(help="Times as fast as the robot drives.", min=1.0, max=1000.0)
+    ] = 30.0,
+    db: DbOption = None,
+    vector_db: VectorDbOption = None,
+    json_: Annotated[bool, typer.Option("--json", help="The numbers as JSON on stdout.")] = False,
+) -> None:
+    """Explore, record, replay, get lost, ask, draw: everything once, each part real.
+
+    A robot explores a simulated house and is recorded through a Zenoh router; the log is replayed
+    into databases; a second, lost robot asks where it is. Unless --db says otherwise the databases
+    are the demo's own, in DIR; yours are not touched.
+    """
+    # Here and not above: the demo alone needs nearly everything, and that takes a while to import.
+    from projections.demo import DemoOptions, run_demo
+
+    with sigterm_unwinds():
+        numbers = run_demo(DemoOptions(out, seed, speed, db, vector_db), say)
+    if json_:
+        emit(numbers)
+
+
+def register(app: typer.Typer) -> None:
+    """Add `demo` to ``app``."""
+    app.command()(demo)

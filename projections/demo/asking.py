@@ -1,0 +1,156 @@
+"""Run B is lost: it looks around, sends a few crops without a pose, and gets Places.
+
+The question is not chosen for its answer. The robot looks around where it starts and takes the
+first picture with the most detections, counting at most three; it asks with the surest of them,
+then with the two surest, then three. Afterwards it asks once from every keyframe of its whole run
+that shows anything, to tell what a single question is worth.
+"""
+
+import json
+import math
+import statistics
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from eventsrc.sim import SimulatedRun
+from projections.drawing import LostRobot, Spot
+from projections.postgres.connect import Targets
+from projections.queries.relocalize import Reader
+from projections.relocalize import Answer, rank, read_crops
+from projections.view import MapView
+
+from .folder import DemoFolder
+
+MOST_CROPS: Final = 3
+NEAR_M: Final = 1.5
+"""An estimate this near counts as right; the same bound the answer's confidence is about."""
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """One question and its answer; ``error_m`` is None when no pose came back."""
+
+    classes: tuple[str, ...]
+    answer: Answer
+    error_m: float | None
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Everywhere:
+    """One question from each of ``asked`` keyframes. Answers of "unknown" count as not near."""
+
+    asked: int
+    unknown: int
+    near: int
+    median_error_m: float
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """Run B's first questions, where it truly was, and how it went from everywhere else."""
+
+    run_id: str
+    keyframe_id: int
+    room: str
+    truth: Spot
+    questions: tuple[Asked, ...]
+    everywhere: Everywhere
+
+    @property
+    def drawn(self) -> LostRobot:
+        """For the picture: the last question's estimate."""
+        pose = self.questions[-1].answer.pose if self.questions else None
+        if pose is None:
+            return LostRobot(self.truth, None)
+        return LostRobot(self.truth, Spot(pose.x, pose.y, pose.yaw), pose.spread_m)
+
+
+def ask_lost(targets: Targets, run: SimulatedRun, folder: DemoFolder) -> Lost:
+    """Ask the databases where run B is."""
+    index = _first_question(run)
+    pose, truth = run.true_poses[index], run.truth[index]
+    best = _surest(run.envelopes[index]["detections"])
+    with Reader(targets) as reader:
+        questions = tuple(
+            _ask(reader, run, index, best[:count], folder) for count in range(1, len(best) + 1)
+        )
+        everywhere = _everywhere(reader, run)
+    return Lost(
+        run.run_id,
+        truth["keyframe_id"],
+        truth["room"],
+        Spot(pose.x, pose.y, pose.yaw_rad),
+        questions,
+        everywhere,
+    )
+
+
+def rooms_of(view: MapView, run: SimulatedRun) -> dict[str, str]:
+    """For each place the room most of its keyframes were truly taken in."""
+    rooms = {line["keyframe_id"]: str(line["room"]) for line in run.truth}
+    named: dict[str, str] = {}
+    for place in view.places.values():
+        seen = Counter(rooms[view.keyframes[member].keyframe_id] for member in place.members)
+        named[place.place_id] = max(sorted(seen), key=lambda room: seen[room], default="?")
+    return named
+
+
+def _first_question(run: SimulatedRun) -> int:
+    """Among the keyframes at the start, the first that shows the most things, at most three.
+
+    Should the start show nothing at all, the first keyframe of the run that shows anything.
+    """
+    start = run.true_poses[0]
+    here = [
+        index
+        for index, pose in enumerate(run.true_poses)
+        if math.dist((pose.x, pose.y), (start.x, start.y)) < 0.05
+    ]
+    shown = [min(len(envelope["detections"]), MOST_CROPS) for envelope in run.envelopes]
+    best = max(here, key=lambda index: (shown[index], -index))
+    return best if shown[best] else next(i for i, count in enumerate(shown) if count)
+
+
+def _surest(detections: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    return sorted(detections, key=lambda d: (-d["confidence"], d["det_id"]))[:MOST_CROPS]
+
+
+def _ask(
+    reader: Reader,
+    run: SimulatedRun,
+    index: int,
+    detections: Sequence[dict[str, Any]],
+    folder: DemoFolder | None = None,
+) -> Asked:
+    question = {"crops": detections}
+    if folder is not None:
+        folder.question(len(detections)).write_text(json.dumps(question) + "\n", "utf-8")
+    started = time.monotonic()
+    crops = read_crops(question)
+    answer = rank(crops, reader.candidates(crops))
+    seconds = time.monotonic() - started
+    true, pose = run.true_poses[index], answer.pose
+    error = None if pose is None else math.dist((pose.x, pose.y), (true.x, true.y))
+    return Asked(tuple(d["class"] for d in detections), answer, error, seconds)
+
+
+def _everywhere(reader: Reader, run: SimulatedRun) -> Everywhere:
+    started = time.monotonic()
+    asked = [
+        _ask(reader, run, index, _surest(envelope["detections"]))
+        for index, envelope in enumerate(run.envelopes)
+        if envelope["detections"]
+    ]
+    known = [a.error_m for a in asked if a.error_m is not None and not a.answer.unknown]
+    return Everywhere(
+        asked=len(asked),
+        unknown=len(asked) - len(known),
+        near=sum(error <= NEAR_M for error in known),
+        median_error_m=statistics.median(known) if known else math.nan,
+        seconds=time.monotonic() - started,
+    )

@@ -1,0 +1,72 @@
+"""mapfold commands in processes of their own, none of which outlives the demo."""
+
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
+
+from eventsrc.errors import MapfoldError
+
+_END_S: Final = 10.0
+_POLL_S: Final = 0.05
+
+
+class Children:
+    """Processes that end with the ``with`` block: asked first, killed if they do not listen."""
+
+    def __init__(self) -> None:
+        self._running: dict[str, subprocess.Popen[bytes]] = {}
+        self._said: dict[str, Path] = {}
+
+    def start(self, name: str, arguments: Sequence[str], said: Path) -> None:
+        """Start ``mapfold *arguments``; its stderr goes to the file ``said``."""
+        with said.open("wb") as errors:
+            self._running[name] = subprocess.Popen(  # noqa: S603  # our own program and arguments
+                [sys.executable, "-m", "projections.cli", *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=errors,
+            )
+        self._said[name] = said
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait until all have ended. Raises MapfoldError if one fails or takes too long."""
+        deadline = time.monotonic() + timeout_s
+        pause = threading.Event()
+        while any(process.poll() is None for process in self._running.values()):
+            self._check()
+            if time.monotonic() > deadline:
+                slow = [name for name, p in self._running.items() if p.poll() is None]
+                raise MapfoldError(
+                    f"mapfold {' and '.join(slow)} did not end within {timeout_s:g} s; "
+                    f"{self._said[slow[0]]} has what it said"
+                )
+            pause.wait(_POLL_S)
+        self._check()
+
+    def _check(self) -> None:
+        for name, process in self._running.items():
+            code = process.poll()
+            if code:
+                lines = self._said[name].read_text("utf-8", "replace").strip().splitlines()
+                said = lines[-1] if lines else "it said nothing"
+                raise MapfoldError(f"mapfold {name} ended with exit {code}: {said}")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
+    ) -> None:
+        for process in self._running.values():
+            process.terminate()  # does nothing to one that has ended
+        for process in self._running.values():
+            try:
+                process.wait(_END_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()

@@ -1,0 +1,66 @@
+"""The demo's folder: made afresh each time, but never over something that is not the demo's.
+
+A file named ``MARKER`` says that the demo made a folder. Its log, questions and picture are removed
+before the next demo; the database server's files in it are kept, because making them takes longest
+and a replay replaces what is in them.
+"""
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from eventsrc.errors import MisuseError
+
+MARKER: Final = ".mapfold-demo"
+_MADE: Final = ("map.png", "settings.json", "question-*.json", "record.txt", "simulate.txt")
+
+
+@dataclass(frozen=True, slots=True)
+class DemoFolder:
+    """Where everything of one demo lies."""
+
+    path: Path
+
+    @property
+    def log(self) -> Path:
+        """The event log."""
+        return self.path / "log"
+
+    @property
+    def map(self) -> Path:
+        """The picture."""
+        return self.path / "map.png"
+
+    @property
+    def settings(self) -> Path:
+        """The fold's settings, for ``--settings``."""
+        return self.path / "settings.json"
+
+    def question(self, crops: int) -> Path:
+        """The question with this many crops, as the lost robot asked it."""
+        return self.path / f"question-{crops}.json"
+
+    def said(self, child: str) -> Path:
+        """What a child process said on stderr."""
+        return self.path / f"{child}.txt"
+
+
+def fresh_folder(path: Path) -> DemoFolder:
+    """An empty demo folder at ``path``. Raises MisuseError when something else is there."""
+    try:
+        if path.exists() and not (path / MARKER).exists() and any(path.iterdir()):
+            raise MisuseError(
+                f"{path}: not empty and not made by the demo; choose another --out or remove it"
+            )
+        path.mkdir(parents=True, exist_ok=True)
+        (path / MARKER).write_text("made by mapfold demo; the next one removes it\n")
+        folder = DemoFolder(path)
+        if folder.log.exists():
+            shutil.rmtree(folder.log)
+        for pattern in _MADE:
+            for old in path.glob(pattern):
+                old.unlink()
+    except OSError as error:
+        raise MisuseError(f"{path}: {error.strerror}; choose another --out") from None
+    return folder

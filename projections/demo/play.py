@@ -1,0 +1,120 @@
+"""The stages in order: record, map, merge, ask, draw. Each tells what it did as soon as it is done.
+
+House and runs are made before the clock starts: they stand for the world, not for mapfold.
+"""
+
+import contextlib
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from eventsrc.sim import DEFAULT_SEED, simulate_run
+from projections.drawing import draw_map, floor_of
+from projections.drawing.merges import bridges_of
+from projections.postgres.connect import Targets, open_targets
+from projections.postgres.embedded import EmbeddedServer
+from projections.runner import rebuild
+from projections.settings import Settings
+
+from . import story
+from .asking import ask_lost, rooms_of
+from .folder import DemoFolder, fresh_folder
+from .mapping import fold_with_rooms, most_telling, places_with
+from .next_steps import commands
+from .numbers import document
+from .recording import record_run
+
+SETTINGS: Final = Settings(eps_m=0.75, min_samples=8)
+"""A look around puts 22 keyframes on one spot and a drive through a door three or four within
+0.75 m: these settings call the first a place and not the second. The default chains the house."""
+
+
+@dataclass(frozen=True, slots=True)
+class DemoOptions:
+    """Where to leave everything, which house, how fast to play it, which databases if not ours."""
+
+    out: Path
+    seed: int = DEFAULT_SEED
+    speed: float = 30.0
+    db: str | None = None
+    vector_db: str | None = None
+
+
+Tell = Callable[[str], None]
+
+
+def run_demo(options: DemoOptions, tell: Tell) -> dict[str, Any]:
+    """Play the demo, telling it line by line; returns its numbers as a JSON document."""
+    explorer, lost_run = simulate_run(options.seed, "a"), simulate_run(options.seed, "b")
+    folder = fresh_folder(options.out)
+    folder.settings.write_text(SETTINGS.model_dump_json(indent=2) + "\n", "utf-8")
+    clock = _Stages(tell)
+    house = explorer.house
+    detections = sum(len(envelope["detections"]) for envelope in explorer.envelopes)
+    rooms = len(house.plan.rooms)
+    with contextlib.ExitStack() as stack:
+        with clock.stage("Run A explores the house and is recorded"):
+            recorded = record_run(explorer, options.seed, folder, options.speed)
+            clock.tell(story.tell_recording(recorded, detections, rooms, options.speed))
+        with clock.stage("The log is replayed into the databases"):
+            targets = stack.enter_context(_databases(folder, options))
+            replayed = rebuild(folder.log, targets, SETTINGS)
+            folded = fold_with_rooms(folder, SETTINGS, explorer)
+            default_places = places_with(folder, Settings())
+            clock.tell(story.tell_map(folded, replayed, Settings(), default_places))
+        with clock.stage("How two places became one"):
+            clock.tell(story.tell_merges(folded.merges))
+        with clock.stage("Run B is lost and asks"):
+            lost = ask_lost(targets, lost_run, folder)
+            clock.tell(story.tell_lost(lost, rooms_of(folded.view, explorer)))
+    with clock.stage("The map is drawn"):
+        draw_map(
+            folded.view,
+            folder.map,
+            title=f"House {house.seed}: explored by {explorer.run_id}, {lost.run_id} lost in it",
+            floor=floor_of(house),
+            lost=lost.drawn,
+            bridges=bridges_of(folded.view, folded.deltas),
+        )
+        clock.tell([f"   {folder.map}"])
+    tell(f"{clock.total:.1f} s in all. Go on with it:")
+    clock.tell(commands(folder, most_telling(folded.merges), options.db, options.vector_db))
+    return document(options.seed, SETTINGS, recorded, folded, replayed, lost, clock.seconds, folder)
+
+
+class _Stages:
+    def __init__(self, tell: Tell) -> None:
+        self._tell = tell
+        self.seconds: dict[str, float] = {}
+
+    @property
+    def total(self) -> float:
+        return sum(self.seconds.values())
+
+    def tell(self, lines: Iterable[str]) -> None:
+        for line in lines:
+            self._tell(line)
+
+    @contextlib.contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        self._tell(f"{len(self.seconds) + 1}. {name}")
+        started = time.monotonic()
+        yield
+        self.seconds[name] = time.monotonic() - started
+        self._tell(f"   [{self.seconds[name]:.1f} s]")
+
+
+@contextlib.contextmanager
+def _databases(folder: DemoFolder, options: DemoOptions) -> Iterator[Targets]:
+    """The user's databases if given, else a server of the demo's own, in its folder.
+
+    Not the user's embedded server, nor what MAPFOLD_DB names: the demo must not replace their map.
+    """
+    if options.db is not None:
+        with open_targets(options.db, options.vector_db or options.db) as targets:
+            yield targets
+        return
+    with EmbeddedServer(folder.path) as server:
+        yield Targets(server.url, options.vector_db or server.url, server)

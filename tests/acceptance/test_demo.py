@@ -1,0 +1,201 @@
+"""`mapfold demo` as a user runs it: true numbers, commands that work, nothing left behind."""
+
+import json
+import math
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from eventsrc.log import LogReader
+from eventsrc.sim import simulate_run
+from projections.cli._options import settings_from
+from projections.digest import map_digest
+from projections.folding import fold_log
+
+_COMMAND = [sys.executable, "-m", "projections.cli", "demo", "--speed", "300"]
+_DEADLINE_S = 120.0
+
+
+@dataclass(frozen=True)
+class Played:
+    """One whole demo."""
+
+    out: Path
+    numbers: dict[str, Any]
+    story: list[str]
+
+
+def _run(*arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*_COMMAND, *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=_DEADLINE_S,
+        **options,
+    )
+
+
+@pytest.fixture(scope="module")
+def played(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Played]:
+    out = tmp_path_factory.mktemp("a folder") / "demo"
+    done = _run("--out", str(out), "--json")
+    assert done.returncode == 0, done.stderr
+    yield Played(out, json.loads(done.stdout), done.stderr.splitlines())
+    assert _processes_of(out) == []
+
+
+def test_every_keyframe_went_through_the_router_into_the_log(played: Played) -> None:
+    run = simulate_run()
+    with LogReader(played.out / "log") as reader:
+        events = list(reader.read())
+    assert [event.payload for event in events] == list(run.payloads)
+    assert {event.key for event in events} == {"tb/detections"}
+    record = played.numbers["record"]
+    assert (record["published"], record["recorded"]) == (len(events), len(events))
+    assert record["intact"] is True
+    assert (record["rejected"], record["lost"]) == (0, 0)
+    assert f"{len(events)} of {len(events)} keyframes" in "\n".join(played.story)
+
+
+def test_the_map_it_tells_of_is_the_fold_of_the_log(played: Played) -> None:
+    settings = settings_from(played.out / "settings.json", None)
+    with LogReader(played.out / "log") as reader:
+        _, view = fold_log(reader, settings)
+    told = played.numbers["map"]
+    counts = view.counts()
+    assert {name: told[name] for name in ("keyframes", "places", "objects")} == {
+        name: counts[name] for name in ("keyframes", "places", "objects")
+    }
+    assert told["transitions"] == sum(count for _, _, count in view.edges()) > 0
+    assert told["digest"] == map_digest(view) == played.numbers["replay"]["digest"]
+    rows = played.numbers["replay"]["rows"]
+    assert rows["Observation"] == counts["observations"]
+    assert rows["ADJACENT_TO"] == counts["ADJACENT_TO"]
+
+
+def test_the_merges_are_where_the_number_of_places_falls(played: Played) -> None:
+    settings = settings_from(played.out / "settings.json", None)
+    assert played.numbers["merges"]
+    with LogReader(played.out / "log") as reader:
+        for merge in played.numbers["merges"]:
+            _, before = fold_log(reader, settings, merge["offset"])
+            _, after = fold_log(reader, settings, merge["offset"] + 1)
+            absorbed = [part["place_id"] for part in merge["absorbed"]]
+            names_after = {place.place_id for place in after.places.values()}
+            assert len(before.places) == merge["places_before"]
+            assert merge["survivor"]["place_id"] in names_after
+            assert not names_after & set(absorbed)
+
+
+def test_the_error_is_the_distance_to_where_the_robot_truly_was(played: Played) -> None:
+    lost = played.numbers["relocalize"]
+    run = simulate_run(run="b")
+    pose = run.true_poses[lost["keyframe_id"] - 1]
+    assert lost["room"] == run.truth[lost["keyframe_id"] - 1]["room"]
+    assert 1 <= len(lost["questions"]) <= 3
+    for number, asked in enumerate(lost["questions"], start=1):
+        assert len(asked["classes"]) == number
+        found = asked["pose"]
+        distance = math.dist((found["x"], found["y"]), (pose.x, pose.y))
+        assert asked["error_m"] == pytest.approx(distance)
+        assert f"pose {distance:.2f} m off" in "\n".join(played.story)
+    every = lost["everywhere"]
+    assert every["asked"] == sum(bool(envelope["detections"]) for envelope in run.envelopes)
+    assert every["near"] > 0.7 * every["asked"]
+
+
+def test_the_questions_hold_crops_and_no_pose(played: Played) -> None:
+    for number, _ in enumerate(played.numbers["relocalize"]["questions"], start=1):
+        question = json.loads((played.out / f"question-{number}.json").read_text())
+        assert set(question) == {"crops"}
+        assert len(question["crops"]) == number
+
+
+def test_the_picture_is_there(played: Played) -> None:
+    picture = played.out / "map.png"
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert picture.stat().st_size > 50_000
+
+
+def test_the_commands_it_ends_with_work_as_they_stand(played: Played) -> None:
+    start = next(i for i, line in enumerate(played.story) if "Go on with it" in line)
+    commands = [line.strip() for line in played.story[start + 1 :]]
+    assert len(commands) >= 6
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    script = "set -e\n" + "\n".join(commands)
+    done = subprocess.run(
+        ["bash", "-c", script],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=_DEADLINE_S,
+        env={**os.environ, "PATH": path},
+    )
+    assert done.returncode == 0, done.stderr
+    for asked in played.numbers["relocalize"]["questions"][:1]:
+        assert asked["places"][0]["place_id"] in done.stdout
+
+
+def test_it_can_be_played_again_into_its_own_folder(played: Played) -> None:
+    done = _run("--out", str(played.out), "--seed", "3", "--json")
+    assert done.returncode == 0, done.stderr
+    again = json.loads(done.stdout)
+    assert again["record"]["run_id"] == "sim-3-a"
+    assert again["record"]["intact"] is True
+
+
+def test_it_takes_no_folder_that_is_not_its_own(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+    done = _run("--out", str(tmp_path))
+    assert done.returncode == 2
+    assert "not empty and not made by the demo" in done.stderr
+    assert (tmp_path / "thesis.tex").read_text() == "years of work"
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_ended_early_it_leaves_no_process_behind(tmp_path: Path) -> None:
+    out = tmp_path / "demo"
+    slow = [*_COMMAND[:-1], "1", "--out", str(out)]
+    demo = subprocess.Popen(slow, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        _until(lambda: (out / "record.txt").exists() and "recording" in _read(out / "record.txt"))
+        assert any("record" in command for command in _processes_of(out))
+        demo.terminate()
+        assert demo.wait(_DEADLINE_S) != 0
+        assert _processes_of(out) == []
+    finally:
+        demo.kill()
+        demo.wait()
+
+
+def _read(path: Path) -> str:
+    return path.read_text("utf-8")
+
+
+def _until(condition: Any) -> None:
+    deadline, pause = time.monotonic() + _DEADLINE_S, threading.Event()
+    while not condition():
+        assert time.monotonic() < deadline
+        pause.wait(0.05)
+
+
+def _processes_of(out: Path) -> list[str]:
+    """Command lines of running processes that name ``out``, without this one."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            command = entry.read_bytes().replace(b"\0", b" ").decode("utf-8", "replace")
+        except OSError:  # it has ended since
+            continue
+        if str(out) in command and int(entry.parent.name) != os.getpid():
+            found.append(command)
+    return found
