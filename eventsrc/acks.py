@@ -32,6 +32,11 @@ class Ack(BaseModel):
         """The bytes that go over the wire."""
         return self.model_dump_json().encode()
 
+    @classmethod
+    def decode(cls, payload: bytes) -> "Ack":
+        """Back from bytes; raises ValidationError for anything that is no ack."""
+        return cls.model_validate_json(payload)
+
     def covers(self, keyframe_id: int) -> bool:
         """Whether this keyframe is among them."""
         return any(first <= keyframe_id <= last for first, last in self.stretches)

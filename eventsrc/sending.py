@@ -134,7 +134,7 @@ class Sender:
 
     def _hear(self, message: Received) -> None:
         try:
-            ack = Ack.model_validate_json(message.payload)
+            ack = Ack.decode(message.payload)
         except ValidationError:
             return  # not from a recorder we understand, so nothing is acknowledged
         with self._changed:

@@ -166,7 +166,7 @@ def test_kill_9_loses_nothing_that_was_acknowledged_and_resending_fills_the_rest
 
     def hear(message: Received) -> None:
         with progress:
-            for first, last in Ack.model_validate_json(message.payload).stretches:
+            for first, last in Ack.decode(message.payload).stretches:
                 acked.update(range(first, last + 1))
             progress.notify_all()
 

@@ -2,17 +2,21 @@
 
 import json
 import signal
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from eventsrc._zenoh import Received, Session
+from eventsrc.acks import Ack, ack_key
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.router import Router
 from tests.envelopes import envelope, payload
-from tests.fixtures_zenoh import LOOPBACK, PUBLISHER, Program
+from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK, PUBLISHER, Program
 
 Start = Callable[..., Program]
+Sessions = Callable[[], Session]
 KEY = "tb/detections"
 
 
@@ -108,3 +112,57 @@ def test_misuse_is_one_line_and_exit_2(
     (line,) = recorder.lines
     assert complaint in line
     assert not (tmp_path / "log").exists()
+
+
+_ON_A_SMALL_DISK = """
+import resource, sys
+from projections.cli import main
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+main()
+"""
+
+
+def test_a_full_disk_is_one_line_and_what_is_synced_stays(
+    start_code: Start, endpoint: str, connected: Sessions, tmp_path: Path
+) -> None:
+    """A limit on the size of files is the disk here: some of 20 envelopes fit."""
+    log = tmp_path / "log"
+    acked: set[int] = set()
+    heard = threading.Event()
+
+    def hear(message: Received) -> None:
+        for first, last in Ack.decode(message.payload).stretches:
+            acked.update(range(first, last + 1))
+        heard.set()
+
+    watcher = connected()
+    watcher.subscribe(ack_key("run-a"), hear)
+    watcher.confirm()
+    arguments = ("record", str(log), "--connect", endpoint, "--fsync", "always")
+    recorder = start_code(_ON_A_SMALL_DISK, *arguments)
+    recorder.wait_for("recording")
+    publisher = connected().publisher(KEY)
+    assert publisher.wait_for_subscriber(DEADLINE_S)
+    sent = [payload(envelope(k, note="x" * 10_000)) for k in range(20)]
+    for message in sent:
+        publisher.put(message)
+    assert recorder.wait() == 1
+    line = recorder.lines[-1]
+    assert line.startswith(f"mapfold: {log}")
+    assert "File too large" in line
+    assert "every event before it is safe" in line
+    assert not any("Traceback" in said for said in recorder.lines)
+    stored = _stored(log)
+    assert stored == sent[: len(stored)]
+    assert heard.wait(DEADLINE_S)
+    assert max(acked) < len(stored)
+
+
+def test_a_place_where_no_log_can_be_is_one_line(
+    start: Start, endpoint: str, tmp_path: Path
+) -> None:
+    (tmp_path / "file").touch()
+    recorder = start("record", str(tmp_path / "file" / "log"), "--connect", endpoint)
+    assert recorder.wait() in (1, 2)
+    (line,) = recorder.lines
+    assert str(tmp_path / "file") in line

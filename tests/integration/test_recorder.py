@@ -1,6 +1,7 @@
 """The recorder on a real router, a real log and, mostly, a publisher in another process."""
 
 import itertools
+import json
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -8,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+import zenoh
 
 from eventsrc._zenoh import Received, Session, ZenohOptions, open_session
 from eventsrc.acks import Ack, ack_key
@@ -167,7 +169,7 @@ def test_an_ack_covers_what_is_synced_and_nothing_else(connected: Sessions, tmp_
     covered = threading.Event()
 
     def hear(message: Received) -> None:
-        acks.append(Ack.model_validate_json(message.payload))
+        acks.append(Ack.decode(message.payload))
         if acks[-1].covers(9):
             covered.set()
 
@@ -223,6 +225,45 @@ def test_a_full_queue_loses_loudly_and_never_blocks(connected: Sessions, tmp_pat
     losses = [Loss.model_validate_json(e.payload) for e in events if e.key == LOSS_KEY]
     assert sum(loss.count for loss in losses if loss.cause == "queue_full") == 7
     assert Loss(publisher="run-a", first=5, last=11, count=7, cause="keyframe_gap") in losses
+
+
+def test_what_an_advanced_publisher_sent_and_never_came_is_a_loss(
+    connected: Sessions, tmp_path: Path
+) -> None:
+    """The numbers of an advanced publisher are put on by hand, so that some can be left out."""
+    with recording(connected(), tmp_path / "log") as running:
+        robot = connected()
+        publisher = robot.raw.declare_publisher(KEY)
+        for number in (0, 1, 4, 5, 9):
+            robot.raw.put(
+                KEY,
+                payload(envelope(number)),
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                source_info=zenoh.SourceInfo(publisher.id, number),
+            )
+        running.wait_until(lambda report: report.recorded == 5)
+        running.wait_until(lambda report: report.transport_missed == 5)
+        assert not running.finish().clean
+    losses = [
+        Loss.model_validate_json(event.payload)
+        for event in _events(tmp_path / "log")
+        if event.key == LOSS_KEY
+    ]
+    missed = [loss for loss in losses if loss.cause == "transport_miss"]
+    assert sum(loss.count for loss in missed) == 5
+    assert {loss.publisher.split(":")[0] for loss in missed} == {str(robot.raw.zid())}
+    assert [(x.first, x.last) for x in losses if x.cause == "keyframe_gap"] == [(2, 3), (6, 8)]
+
+
+def test_an_older_form_is_recorded_and_counts_no_keyframes(
+    connected: Sessions, publish: Callable[..., Program], tmp_path: Path
+) -> None:
+    bare = json.dumps([detection(class_name="cup")]).replace('"class"', '"class_name"')
+    with recording(connected(), tmp_path / "log") as running:
+        publish(KEY, bare, "not json", bare)
+        running.wait_until(lambda report: (report.recorded, report.rejected) == (2, 1))
+        assert running.finish().missing == 0
+    assert [e.payload.decode() for e in _events(tmp_path / "log") if e.key == KEY] == [bare, bare]
 
 
 def test_a_gap_between_two_recorders_is_found_and_a_late_keyframe_closes_it(
