@@ -17,7 +17,7 @@ KNN = """
     ORDER BY distance LIMIT 10
 """
 TRAVERSAL = """
-    SELECT place_id::text, x::text, y::text, class_name::text
+    SELECT place_id, x, y, class_name
     FROM cypher('semantic_map', $$
         MATCH (obs:Observation)-[:OBSERVES]->(obj:Object)-[:LOCATED_IN]->(p:Place)
         WHERE obs.det_id = $det_id
@@ -25,7 +25,7 @@ TRAVERSAL = """
     $$, %s) AS (place_id agtype, x agtype, y agtype, class_name agtype)
 """
 INLINE = """
-    SELECT place_id::text, x::text, y::text, class_name::text
+    SELECT place_id, x, y, class_name
     FROM cypher('semantic_map', $$
         MATCH (obs:Observation {det_id: 'plain_kf1_d0'})
               -[:OBSERVES]->(obj:Object)-[:LOCATED_IN]->(p:Place)
