@@ -71,10 +71,14 @@ class Writing:
 
         Raises LogError when the log cannot be written; all that was synced is safe.
         """
-        while self._step():
-            pass
-        self._write_losses(self._ledger.flush())
-        self._save()
+        try:
+            while self._step():
+                pass
+            self._sync()
+            self._write_losses(self._ledger.flush())
+            self._save()
+        finally:
+            self._follow_up()  # what was synced before an error is recorded all the same
 
     def report(self) -> RecorderReport:
         """The numbers now; may be asked for from any thread."""
@@ -94,7 +98,8 @@ class Writing:
         """One batch and what follows from it; False when there will be no more."""
         limit = _BATCH if self._room is None else min(_BATCH, self._room)
         closed = self._inbox.closed  # before taking: what came before the closing is still taken
-        batch = self._inbox.take(limit, _UNSYNCED_S if self._unsynced else _IDLE_S)
+        waiting = self._writer.durable_offset < self._writer.next_offset
+        batch = self._inbox.take(limit, _UNSYNCED_S if waiting else _IDLE_S)
         for message in batch:
             self._record(message)
         self._writer.commit_if_due()
@@ -138,10 +143,14 @@ class Writing:
             ack = Ack(run_id=run_id, log_id=self._writer.log_id, stretches=stretches)
             self._acknowledge(ack)
 
-    def _save(self) -> None:
-        """Sync, so that the ledger is that of the whole log, and save it beside the log."""
+    def _sync(self) -> int:
+        """Make everything durable, so that the ledger is that of the whole log; its end."""
         next_offset = self._writer.sync()
         self._follow_up()
+        return next_offset
+
+    def _save(self) -> None:
+        next_offset = self._sync()
         save_ledger(self._writer.path, self._writer.log_id, next_offset, self._ledger)
 
     def _write_losses(self, gaps: list[Gap]) -> None:

@@ -16,7 +16,7 @@ from eventsrc.acks import Ack, ack_key
 from eventsrc.clock import system_clock
 from eventsrc.errors import LogError, MisuseError
 from eventsrc.ledger import ledger_of
-from eventsrc.log import Event, LogReader, LogWriter
+from eventsrc.log import Event, FsyncPolicy, LogReader, LogWriter
 from eventsrc.losses import Gap
 from eventsrc.recorder import Recorder, RecorderReport
 from eventsrc.router import Router
@@ -264,6 +264,27 @@ def test_an_older_form_is_recorded_and_counts_no_keyframes(
         running.wait_until(lambda report: (report.recorded, report.rejected) == (2, 1))
         assert running.finish().missing == 0
     assert [e.payload.decode() for e in _events(tmp_path / "log") if e.key == KEY] == [bare, bare]
+
+
+def test_a_gap_in_the_last_moment_is_written_before_the_end(
+    connected: Sessions, tmp_path: Path
+) -> None:
+    """The group commit never comes due: what the last events tell is known only at the end."""
+    lazy = FsyncPolicy(interval_ns=10**18)
+    with LogWriter(tmp_path / "log", fsync=lazy) as writer:
+        running = Running(Recorder(connected(), writer, [KEY]))
+        publisher = connected().publisher(KEY)
+        assert publisher.wait_for_subscriber(DEADLINE_S)
+        for message in _keyframes(1, 4, 2):
+            publisher.put(message)
+        running.wait_until(lambda report: report.next_offset == 3)
+        report = running.finish()
+    assert (report.recorded, report.missing) == (3, 1)
+    assert [
+        Loss.model_validate_json(event.payload)
+        for event in _events(tmp_path / "log")
+        if event.key == LOSS_KEY
+    ] == [Loss(publisher="run-a", first=3, last=3, count=1, cause="keyframe_gap")]
 
 
 def test_a_gap_between_two_recorders_is_found_and_a_late_keyframe_closes_it(
