@@ -2,7 +2,7 @@
 
 import gc
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
@@ -17,10 +17,15 @@ from .errors import FoldError
 from .exact import Units, unit_vectors
 from .reducers.semantic_map import SemanticMap
 from .settings import Settings
+from .snapshot import SnapshotCache
 from .view import MapView
 
 AHEAD = 32
 """How far to read ahead in a log that is there already: 100 vectors fit a core's cache."""
+
+
+WORTH_A_SNAPSHOT = 5_000
+"""Events; folding fewer takes about as long as reading a snapshot of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,10 +92,41 @@ def fold_log(
 ) -> tuple[SemanticMap, MapView]:
     """Fold the first ``until`` events of a log, all of them for None."""
     semantic_map, view = SemanticMap(settings), MapView(settings, keep_embeddings=keep_embeddings)
-    with no_cycle_search():
-        for folded in fold_events(reader.read(0, until), semantic_map, ahead=AHEAD):
-            view.apply_event(folded.offset, folded.deltas)
+    _fold_on(reader, semantic_map, view, until)
     return semantic_map, view
+
+
+def fold_log_cached(
+    reader: LogReader,
+    settings: Settings,
+    until: int | None = None,
+    *,
+    note: Callable[[str], None] = lambda _: None,
+) -> tuple[SemanticMap, MapView]:
+    """`fold_log` without embeddings, from the nearest snapshot beside the log, and leaving one.
+
+    ``note`` is told of snapshots that could not be used or kept; the result is the same.
+    """
+    end = reader.next_offset if until is None else min(until, reader.next_offset)
+    cache = SnapshotCache(reader.path, reader.log_id, settings, note)
+    semantic_map, view = cache.latest(end) or (
+        SemanticMap(settings),
+        MapView(settings, keep_embeddings=False),
+    )
+    start = semantic_map.next_offset
+    _fold_on(reader, semantic_map, view, end)
+    if end - start >= WORTH_A_SNAPSHOT:
+        cache.keep(semantic_map, view)
+    return semantic_map, view
+
+
+def _fold_on(
+    reader: LogReader, semantic_map: SemanticMap, view: MapView, until: int | None
+) -> None:
+    events = reader.read(semantic_map.next_offset, until)
+    with no_cycle_search():
+        for folded in fold_events(events, semantic_map, ahead=AHEAD):
+            view.apply_event(folded.offset, folded.deltas)
 
 
 @contextmanager

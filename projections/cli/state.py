@@ -6,13 +6,13 @@ from typing import Annotated
 
 import typer
 
-from eventsrc.cli._shell import emit
+from eventsrc.cli._shell import emit, say
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 from eventsrc.log.whence import resolve
 from projections.cli._options import SetOption, SettingsOption, settings_from
 from projections.digest import map_digest
-from projections.folding import fold_log
+from projections.folding import fold_log_cached
 from projections.state_json import state_document
 from projections.state_text import state_text
 
@@ -37,7 +37,7 @@ def state(
         raise MisuseError("--json and --digest together: --json holds the digest already")
     settings = settings_from(settings_file, set_)
     with LogReader(log) as reader:
-        _, view = fold_log(reader, settings, resolve(reader, at), keep_embeddings=False)
+        _, view = fold_log_cached(reader, settings, resolve(reader, at), note=say)
     hexdigits = map_digest(view)
     if json_:
         emit(state_document(view, hexdigits))

@@ -19,6 +19,7 @@ import numpy as np
 
 from ._fence import Fence, turned
 from ._grid import NEIGHBOUR_CELLS, cell_side_um
+from ._state import State
 
 _SCAN = 4096
 _FEW = 24  # below, a loop is quicker than four numpy calls
@@ -151,6 +152,35 @@ class Crowd:
             if near.loose:
                 around += [other for other in near.loose if self.are_neighbours(other, point)]
         return around
+
+    def dump(self) -> State:
+        """Everything, for a snapshot. Cells come in the order in which they were made."""
+        cells = self._cells.values()
+        sparse = [point for cell in cells for point in cell.cores]
+        return {
+            "x": np.array(self.x, np.int64),
+            "y": np.array(self.y, np.int64),
+            "loose": np.array(list(self._counts), np.int32),
+            "counts": np.array(list(self._counts.values()), np.int32),
+            "core": np.array([cell.core for cell in cells], np.int32),
+            "sparse_cores": np.array(sparse, np.int32),
+        }
+
+    def load(self, state: State) -> None:
+        """Take over what `dump` gave; what cells know of each other is found again when asked."""
+        self.x = array("q", state["x"].tobytes())
+        self.y = array("q", state["y"].tobytes())
+        self._counts = dict(zip(state["loose"].tolist(), state["counts"].tolist(), strict=True))
+        for point, (x_um, y_um) in enumerate(zip(self.x, self.y, strict=True)):
+            cell = self._cell(x_um, y_um)
+            cell.points.append(point)
+            if point in self._counts:
+                cell.loose.append(point)
+        for cell, core in zip(self._cells.values(), state["core"].tolist(), strict=True):
+            cell.core = core
+            cell.is_dense = len(cell.points) >= self._min_samples
+        for point in state["sparse_cores"].tolist():
+            self._cell(self.x[point], self.y[point]).cores.append(point)
 
     def _cell(self, x_um: int, y_um: int) -> Cell:
         key = x_um // self._side, y_um // self._side

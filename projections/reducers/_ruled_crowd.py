@@ -10,7 +10,11 @@ from array import array
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+import numpy as np
+
 from projections.deltas import Pose
+
+from ._state import State
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +89,25 @@ class RuledCrowd:
     def loose_around(self, point: int) -> Iterator[int]:
         """The point's neighbours that are not core."""
         return (other for other in self._neighbours(point) if not self.is_core(other))
+
+    def dump(self) -> State:
+        """Everything, for a snapshot."""
+        return {
+            "x": np.array(self.x, np.int64),
+            "y": np.array(self.y, np.int64),
+            "yaw": np.array([pose.yaw_rad for pose in self._poses]),
+            "counts": np.array(self._counts, np.int32),
+        }
+
+    def load(self, state: State) -> None:
+        """Take over what `dump` gave."""
+        self.x = array("q", state["x"].tobytes())
+        self.y = array("q", state["y"].tobytes())
+        self._counts = array("i", state["counts"].tobytes())
+        self._poses = list(map(Pose, self.x, self.y, state["yaw"].tolist()))
+        for point, pose in enumerate(self._poses):
+            key = pose.x_um // self._side, pose.y_um // self._side
+            self._cells.setdefault(key, []).append(point)
 
     def _neighbours(self, point: int) -> Iterator[int]:
         column, row = self.x[point] // self._side, self.y[point] // self._side

@@ -10,7 +10,11 @@ import marshal
 from array import array
 from zlib import crc32
 
+import numpy as np
+
 from eventsrc.ingest import Accepted
+
+from ._state import State
 
 _DIGEST_BYTES = 16
 
@@ -85,3 +89,31 @@ class Seen:
         """The content digest of a folded keyframe."""
         start = keyframe * _DIGEST_BYTES
         return bytes(self.digests[start : start + _DIGEST_BYTES])
+
+    def dump(self) -> State:
+        """Everything, for a snapshot."""
+        return {
+            "runs": list(self.runs),
+            "started": self.started,
+            "keyframe_ids": np.array(self.keyframe_ids, np.int64),
+            "run_of": np.array(self.run_of, np.int32),
+            "offsets": np.array(self.offsets, np.int64),
+            "digests": np.frombuffer(bytes(self.digests), np.uint8),
+            "det_ids": list(self.det_ids),
+            "det_keyframes": np.array(list(self.det_ids.values()), np.int32),
+        }
+
+    def load(self, state: State) -> None:
+        """Take over what `dump` gave."""
+        self.runs = {run_id: run for run, run_id in enumerate(state["runs"])}
+        self.started = state["started"]
+        self.keyframe_ids = array("q", state["keyframe_ids"].tobytes())
+        self.run_of = array("i", state["run_of"].tobytes())
+        self.offsets = array("q", state["offsets"].tobytes())
+        self.digests = bytearray(state["digests"].tobytes())
+        self.det_ids = dict(zip(state["det_ids"], state["det_keyframes"].tolist(), strict=True))
+        self.keyframes = [{} for _ in self.runs]
+        for keyframe, (run, keyframe_id) in enumerate(
+            zip(self.run_of, self.keyframe_ids, strict=True)
+        ):
+            self.keyframes[run][keyframe_id] = keyframe

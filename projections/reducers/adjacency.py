@@ -9,9 +9,14 @@ A ≠ B, in either direction and by their *current* labels. So it always equals 
 * when B is absorbed by A, A–B transitions are inside a place now and vanish; B–C become A–C.
 """
 
+from array import array
+
+import numpy as np
+
 from projections.deltas import PlacesLinked
 
 from ._sorted_keys import SortedKeys
+from ._state import State
 
 
 class Adjacency:
@@ -59,6 +64,31 @@ class Adjacency:
                 linked.append(PlacesLinked(offset, a, b, count))
         self._before.clear()
         return linked
+
+    def dump(self) -> State:
+        """Everything, for a snapshot."""
+        columns = {run: placed.columns() for run, placed in self.placed.items()}
+        edges = [[a, b, n] for a, row in self.edges.items() for b, n in row.items() if a < b]
+        return {
+            "placed": [[run, len(keys)] for run, (keys, _) in columns.items()],
+            "keys": np.array([k for keys, _ in columns.values() for k in keys], np.int64),
+            "labels": np.array([p for _, labels in columns.values() for p in labels], np.int32),
+            "survivors": list(map(list, self.survivors.items())),
+            "edges": edges,
+        }
+
+    def load(self, state: State) -> None:
+        """Take over what `dump` gave."""
+        start = 0
+        for run, count in state["placed"]:
+            keys = array("q", state["keys"][start : start + count].tobytes())
+            labels = array("i", state["labels"][start : start + count].tobytes())
+            self.placed[run] = SortedKeys.of(keys, labels)
+            start += count
+        self.survivors = dict(state["survivors"])
+        for a, b, transitions in state["edges"]:
+            self.edges.setdefault(a, {})[b] = transitions
+            self.edges.setdefault(b, {})[a] = transitions
 
     def _find(self, place: int) -> int:
         survivors = self.survivors

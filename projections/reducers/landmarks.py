@@ -30,6 +30,8 @@ from numpy.typing import NDArray
 from projections.deltas import ObjectFound, ObjectSeen
 from projections.exact import Q40, metres_to_um
 
+from ._state import State
+
 MAX_OBSERVATIONS = 1 << 22
 """Of one Object: S·u, a little over count · 2⁴⁰ at most, must stay below 2⁶³."""
 _MAX_IN_FLOAT = 1 << 12
@@ -103,6 +105,37 @@ class Landmarks:
         landmark.norm2 += 2 * best_dot + norm2
         self._update(winner, landmark, timestamp, x_um, y_um)
         return [_seen(offset, winner, observation, int(best_q40), landmark)]
+
+    def dump(self) -> State:
+        """Everything, for a snapshot. The vectors' sums are one matrix, a row for each Object."""
+        objects = self.objects
+        return {
+            "classes": [o.class_name for o in objects],
+            "vectors": np.array([o.vector_sum for o in objects]),
+            "norms2": [o.norm2 for o in objects],
+            "counts": [o.count for o in objects],
+            "sums_x_um": [o.sum_x_um for o in objects],
+            "sums_y_um": [o.sum_y_um for o in objects],
+            "seen": np.array([(o.first_seen, o.last_seen) for o in objects]).reshape(-1, 2),
+            "cells": [(o.column, o.row) for o in objects],
+        }
+
+    def load(self, state: State) -> None:
+        """Take over what `dump` gave."""
+        for index, (first, last) in enumerate(state["seen"].tolist()):
+            landmark = Landmark(
+                state["classes"][index],
+                state["vectors"][index].copy(),
+                state["norms2"][index],
+                state["counts"][index],
+                state["sums_x_um"][index],
+                state["sums_y_um"][index],
+                first,
+                last,
+                *state["cells"][index],
+            )
+            self.objects.append(landmark)
+            self._list(index, landmark)
 
     def _found(
         self, offset: int, observation: int, det_id: str, landmark: Landmark

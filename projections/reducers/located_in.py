@@ -7,6 +7,8 @@ has a place is nowhere.
 
 from projections.deltas import ObjectMoved
 
+from ._state import State
+
 
 class LocatedIn:
     """The reducer. Tell it what happened, in order; then ask what moved."""
@@ -56,6 +58,23 @@ class LocatedIn:
                 moved.append(ObjectMoved(offset, seen, place))
         self._touched.clear()
         return moved
+
+    def dump(self) -> State:
+        """Everything, for a snapshot."""
+        return {
+            "votes": [list(map(list, votes.items())) for votes in self.votes],
+            "located": self.located,
+            "waiting": [[keyframe, seen] for keyframe, seen in self.waiting.items()],
+        }
+
+    def load(self, state: State) -> None:
+        """Take over what `dump` gave."""
+        self.votes = [dict(votes) for votes in state["votes"]]
+        self.located = state["located"]
+        self.waiting = dict(state["waiting"])
+        for seen, votes in enumerate(self.votes):
+            for place in votes:
+                self.voters.setdefault(place, {})[seen] = None
 
     def _vote(self, seen: int, place: int) -> None:
         votes = self.votes[seen]

@@ -24,6 +24,8 @@ import math
 from array import array
 from collections.abc import Iterator
 
+import numpy as np
+
 from projections.deltas import (
     Delta,
     KeyframePlaced,
@@ -35,6 +37,7 @@ from projections.deltas import (
 
 from ._crowd import Crowd
 from ._ruled_crowd import RuledCrowd
+from ._state import State, part, prefixed
 
 NOISE = -1
 
@@ -95,6 +98,34 @@ class Places:
         """The point's current place, or NOISE."""
         joined = self.joined[point]
         return joined if joined == NOISE else self.find(joined)
+
+    def dump(self) -> State:
+        """Everything, for a snapshot."""
+        own = {
+            "joined": np.array(self.joined, np.int32),
+            "keyframes": np.array(self.keyframes, np.int32),
+            "runs": np.array(self.runs, np.int32),
+            "run_ids": [[run, run_id] for run, run_id in self.run_ids.items()],
+            "founded": [[run, count] for run, count in self.founded.items()],
+            "survivors": self.survivors,
+            "member_counts": self.member_counts,
+            "sums_x_um": self.sums_x_um,
+            "sums_y_um": self.sums_y_um,
+        }
+        return own | prefixed("crowd", self.crowd.dump())
+
+    def load(self, state: State) -> None:
+        """Take over what `dump` gave."""
+        self.joined = array("i", state["joined"].tobytes())
+        self.keyframes = array("i", state["keyframes"].tobytes())
+        self.runs = array("i", state["runs"].tobytes())
+        self.run_ids = dict(state["run_ids"])
+        self.founded = dict(state["founded"])
+        self.survivors = state["survivors"]
+        self.member_counts = state["member_counts"]
+        self.sums_x_um = state["sums_x_um"]
+        self.sums_y_um = state["sums_y_um"]
+        self.crowd.load(part("crowd", state))
 
     def _grow(
         self, offset: int, newcomer: int, fresh: list[int], deltas: list[Delta]

@@ -13,6 +13,8 @@ The fold has no clock, chance, disk, network or database. The same events give t
 """
 
 from collections.abc import Sequence
+from functools import reduce
+from operator import or_
 from typing import TypeAlias
 
 import numpy as np
@@ -36,6 +38,7 @@ from ._crowd import Crowd
 from ._ruled_crowd import Neighbourhood, RuledCrowd
 from ._seen import Seen, content_digest
 from ._spaces import Space
+from ._state import State, part, prefixed
 from .adjacency import Adjacency
 from .landmarks import Landmarks
 from .located_in import LocatedIn
@@ -43,6 +46,7 @@ from .places import Places
 
 Sighting: TypeAlias = tuple[int, str, str, NDArray[np.float64]]
 """An observation that can be fused: ordinal, det_id, class name, unit vector."""
+Reducer: TypeAlias = Seen | Places | Landmarks | LocatedIn | Adjacency
 
 
 class SemanticMap:
@@ -112,6 +116,35 @@ class SemanticMap:
             deltas += self.located_in.settle(offset)
             deltas += self.adjacency.settle(offset)
         return deltas
+
+    def dump(self) -> State:
+        """Everything but the settings, for a snapshot."""
+        space = self.space
+        own = {
+            "next_offset": self.next_offset,
+            "observation_count": self.observation_count,
+            "space": [space.model, space.dim] if space.is_decided else None,
+        }
+        parts = (prefixed(name, reducer.dump()) for name, reducer in self._parts())
+        return reduce(or_, parts, own)
+
+    def load(self, state: State) -> None:
+        """Take over what `dump` gave, into a map that has folded nothing yet."""
+        self.next_offset = state["next_offset"]
+        self.observation_count = state["observation_count"]
+        if state["space"] is not None:
+            self.space.decide(*state["space"])
+        for name, reducer in self._parts():
+            reducer.load(part(name, state))
+
+    def _parts(self) -> tuple[tuple[str, Reducer], ...]:
+        return (
+            ("seen", self.seen),
+            ("places", self.places),
+            ("landmarks", self.landmarks),
+            ("located_in", self.located_in),
+            ("adjacency", self.adjacency),
+        )
 
     def _observe(
         self,

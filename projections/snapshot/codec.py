@@ -1,0 +1,60 @@
+"""A fold and its view as one container, and back."""
+
+import zlib
+from typing import Any
+
+from projections.reducers._state import part, prefixed
+from projections.reducers.semantic_map import SemanticMap
+from projections.settings import Settings
+from projections.view import MapView
+
+from .container import NotAContainer, pack, unpack
+from .view_state import dump_view, load_view
+
+FOLD_VERSION = 1
+"""Raise it with every change of the reducers after which the same log gives another map."""
+
+
+class SnapshotRefused(ValueError):
+    """A snapshot cannot be used here; the message says why."""
+
+
+def snapshot(semantic_map: SemanticMap, view: MapView, log_id: str) -> bytes:
+    """Both, as of ``semantic_map.next_offset``; the view's embeddings are left out."""
+    about = {
+        "fold_version": FOLD_VERSION,
+        "log_id": log_id,
+        "fingerprint": semantic_map.settings.fingerprint(),
+        "offset": semantic_map.next_offset,
+    }
+    return pack(
+        prefixed("about", about)
+        | prefixed("map", semantic_map.dump())
+        | prefixed("view", dump_view(view))
+    )
+
+
+def restore(data: bytes, settings: Settings, log_id: str) -> tuple[SemanticMap, MapView]:
+    """The fold and the view of `snapshot`, the view without embeddings. Raises SnapshotRefused."""
+    semantic_map, view = SemanticMap(settings), MapView(settings, keep_embeddings=False)
+    try:
+        state = unpack(data)
+        _check(part("about", state), settings, log_id)
+        semantic_map.load(part("map", state))
+        load_view(view, part("view", state))
+    except (NotAContainer, zlib.error) as error:
+        raise SnapshotRefused(str(error)) from None
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        if isinstance(error, SnapshotRefused):
+            raise
+        raise SnapshotRefused(f"its content does not fit together: {error!r}") from None
+    return semantic_map, view
+
+
+def _check(about: dict[str, Any], settings: Settings, log_id: str) -> None:
+    if about["fold_version"] != FOLD_VERSION:
+        raise SnapshotRefused(f"it is of fold version {about['fold_version']}, not {FOLD_VERSION}")
+    if about["log_id"] != log_id:
+        raise SnapshotRefused(f"it is of the log {about['log_id']}, not of {log_id}")
+    if about["fingerprint"] != settings.fingerprint():
+        raise SnapshotRefused("it was made with other settings")

@@ -1,0 +1,49 @@
+"""A snapshot taken anywhere, restored and folded on, equals the fold from the start."""
+
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from projections.deltas import Delta
+from projections.digest import map_digest
+from projections.settings import Settings
+from projections.snapshot import restore, snapshot
+from projections.snapshot.container import unpack
+from tests.folds import Folded, fold
+from tests.property.test_fold_recounts import SETTINGS, runs
+
+
+def _plain(delta: Delta) -> tuple[Any, ...]:
+    values = (getattr(delta, field.name) for field in fields(delta))
+    return type(delta), *(v.tolist() if isinstance(v, np.ndarray) else v for v in values)
+
+
+def _lists(state: dict[str, Any]) -> dict[str, Any]:
+    return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in state.items()}
+
+
+@given(documents=runs(), cut=st.integers(0, 45), least=st.sampled_from([1, 2, 3, 5]))
+def test_restore_then_fold_is_fold_from_the_start(
+    documents: list[dict[str, Any]], cut: int, least: int
+) -> None:
+    settings = Settings(**{**SETTINGS, "min_samples": least})
+    whole = Folded.start(settings).take(documents)
+    begun = Folded.start(settings).take(documents[:cut])
+    again = Folded(*restore(snapshot(begun.map, begun.view, "log"), settings, "log"), [])
+    again.take(documents[cut:])
+    assert [list(map(_plain, d)) for d in again.deltas] == [
+        list(map(_plain, d)) for d in whole.deltas[cut:]
+    ]
+    assert map_digest(again.view) == map_digest(whole.view)
+    assert again.view.counts() == whole.view.counts()
+
+
+@given(documents=runs())
+def test_a_restored_fold_gives_the_same_snapshot(documents: list[dict[str, Any]]) -> None:
+    folded = fold(documents, **SETTINGS)
+    data = snapshot(folded.map, folded.view, "log")
+    again = restore(data, folded.view.settings, "log")
+    assert _lists(unpack(data)) == _lists(unpack(snapshot(*again, "log")))
