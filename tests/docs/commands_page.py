@@ -59,7 +59,7 @@ def _section(name: str, command: Any) -> str:
 
 
 def _usage(argument: Any) -> str:
-    name: str = _name(argument) + ("…" if argument.nargs == -1 else "")
+    name: str = _name(argument).rstrip("…") + ("…" if argument.nargs == -1 else "")
     return name if argument.required else f"[{name}]"
 
 
