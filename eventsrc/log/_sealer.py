@@ -47,12 +47,14 @@ class Sealer:
                 continue  # a later segment carries the hash of this one, so order must hold
             try:
                 self._seal(base)
-            except (OSError, MapfoldError) as error:
-                reason = getattr(error, "strerror", None) or error
+            except OSError as error:
                 self.error = LogError(
-                    f"{segment_path(self._log, base, ACTIVE)} could not be sealed: {reason}; its "
-                    "events are safe and readable, and the next start seals it"
+                    f"{segment_path(self._log, base, ACTIVE)} could not be sealed: "
+                    f"{error.strerror or error}; its events are safe and readable, and the next "
+                    "start seals it"
                 )
+            except MapfoldError as error:
+                self.error = LogError(f"{error}; run `mapfold log recover {self._log}`")
 
     def _seal(self, base: int) -> None:
         path = segment_path(self._log, base, ACTIVE)

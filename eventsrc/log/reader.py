@@ -49,12 +49,20 @@ class LogReader:
             if isinstance(self._last, ActiveFile):
                 self._last.refresh()
             following = self._following()
-            if following is None:
+            if following is not None:
+                self._segments.append(following)
+                self._last = self.open_segment(following)
+            elif isinstance(self._last, ActiveFile) and self._last.was_replaced():
+                self._reopen_last()
+            else:
                 return self.next_offset
-            if isinstance(self._last, ActiveFile) and self._last.refresh() > following.base:
-                continue
-            self._segments.append(following)
-            self._last = self.open_segment(following)
+
+    def _reopen_last(self) -> None:
+        """A restarted writer has sealed the segment, perhaps with events that had no commit mark
+        yet, or has begun an empty one anew."""
+        entry = self._segments[-1]
+        self._open.pop(entry.base, None)
+        self._last = self.open_segment(entry)
 
     def _following(self) -> SegmentPath | None:
         """The segment that starts where the last one ends, once its writer has begun it."""

@@ -28,6 +28,7 @@ from ._mcap import (
     Opcode,
     Statistics,
 )
+from ._naming import SEALED, segment_path
 from .event import Event
 
 SEAL_METADATA = "mapfold.seal"
@@ -74,6 +75,7 @@ class _File:
     """An open segment file and what its head says."""
 
     def __init__(self, path: Path, base: int) -> None:
+        self._fd = -1  # for __del__, should opening fail
         self.path = path
         self.base = base
         self.chunks: list[ChunkRef] = []
@@ -256,6 +258,14 @@ class ActiveFile(_File):
         self.next_offset = following
         self.position = mark_at + _mcap.MARK_BYTES
         return True
+
+    def was_replaced(self) -> bool:
+        """Whether another file stands for this segment by now: sealed, or begun anew."""
+        try:
+            now = self.path.stat()
+        except FileNotFoundError:
+            return segment_path(self.path.parent, self.base, SEALED).exists()
+        return now.st_ino != os.fstat(self._fd).st_ino
 
     def rot(self) -> Unreadable | None:
         """What once was durable behind the last readable commit. A crash tears only the end, and

@@ -111,7 +111,7 @@ def test_the_chain_notices_a_segment_put_in_anothers_place(quick_path: Path) -> 
     for name in ("a", "b"):
         with LogWriter(quick_path / name, rotate_events=1, fsync=BY_HAND) as writer:
             for index in range(3):
-                writer.append(KEY, envelope(index, name))
+                writer.append(KEY, envelope(index, name), logged_ns=index)
                 writer.sync()
                 writer.commit_if_due()
     middle = "00000000000000000001.mcap"

@@ -1,0 +1,1 @@
+"""Programs that break things on purpose, for the tests and for `scripts/chaos_*`."""

@@ -1,0 +1,196 @@
+"""Whatever dies while a tail is at work, the end equals a rebuild, row by row."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import psycopg
+import pytest
+
+from projections.errors import CheckpointMoved, DatabaseUnavailable
+from projections.postgres.connect import Targets, connect, ensure_extension
+from projections.postgres.embedded import EmbeddedServer
+from projections.runner import TailReport, rebuild, tail
+from projections.settings import Settings
+from tests.logs import bridge, walk, write_log
+from tests.rows import all_rows
+
+SETTINGS = Settings()
+WAIT_S = 120.0
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.mark.parametrize("kind", ["one_database", "two_databases"])
+def test_killed_between_any_two_statements(
+    tmp_path: Path, kind: str, request: pytest.FixtureRequest
+) -> None:
+    targets: Targets = request.getfixturevalue(kind)
+    log = write_log(tmp_path / "log", walk(12) + list(bridge())[:12])
+    result = subprocess.run(
+        [
+            sys.executable, "-m", "tests.chaos.crash_driver",
+            str(log), targets.graph_url, targets.vector_url,
+        ],
+        cwd=ROOT, capture_output=True, text=True, timeout=WAIT_S, check=False,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    found = json.loads(result.stdout)
+    assert found["wrong"] == []
+    assert found["steps"] > 40
+
+
+@pytest.fixture
+def own_server() -> Iterator[EmbeddedServer]:
+    """A server that a test may kill."""
+    home = Path(tempfile.mkdtemp(prefix="mapfold-test-kill-"))
+    server = EmbeddedServer(home)
+    try:
+        with server, connect(server.url, autocommit=True) as connection:
+            ensure_extension(connection, "age")
+            ensure_extension(connection, "vector")
+            connection.close()
+            yield server
+    finally:
+        server.stop()
+        shutil.rmtree(home, ignore_errors=True)
+
+
+def kill_postgres(server: EmbeddedServer) -> None:
+    """SIGKILL to the postmaster; returns when its sessions have noticed."""
+    with psycopg.connect(server.url, autocommit=True) as witness:
+        os.kill(int((server.data / "postmaster.pid").read_text().split()[0]), signal.SIGKILL)
+        with pytest.raises(psycopg.OperationalError):
+            list(witness.notifies(timeout=WAIT_S))
+
+
+def test_postgres_itself_is_killed_again_and_again(
+    tmp_path: Path, own_server: EmbeddedServer
+) -> None:
+    log = write_log(tmp_path / "log", walk(60) + list(bridge()))
+    targets = Targets(own_server.url, own_server.url, own_server)
+    kills: list[int] = []
+    troubles: list[str] = []
+
+    def kill_sometimes(report: TailReport) -> None:
+        if report.next_offset in (20, 50) and report.next_offset not in kills:
+            kills.append(report.next_offset)
+            kill_postgres(own_server)
+
+    report = tail(
+        log,
+        targets,
+        SETTINGS,
+        once=True,
+        batch_events=10,
+        on_batch=kill_sometimes,
+        on_trouble=troubles.append,
+    )
+    assert kills == [20, 50]
+    assert troubles
+    assert report.next_offset == 80
+    tailed = all_rows(targets)
+    rebuild(log, targets, SETTINGS)
+    assert all_rows(targets) == tailed
+
+
+def cut_connections(url: str) -> None:
+    """End every other session of the database and wait until they are gone."""
+    with connect(url, autocommit=True) as admin:
+        admin.execute(
+            "SELECT pg_terminate_backend(pid, 10000) FROM pg_stat_activity"
+            " WHERE datname = current_database() AND pid <> pg_backend_pid()"
+        )
+
+
+def test_a_cut_connection_is_made_again(tmp_path: Path, one_database: Targets) -> None:
+    log = write_log(tmp_path / "log", walk(60))
+
+    def cut(_: TailReport) -> None:
+        cut_connections(one_database.graph_url)
+
+    report = tail(
+        log,
+        one_database,
+        SETTINGS,
+        once=True,
+        on_batch=cut,
+    )
+    assert (report.next_offset, report.batches, report.restarts) == (60, 6, 0)
+    tailed = all_rows(one_database)
+    rebuild(log, one_database, SETTINGS)
+    assert all_rows(one_database) == tailed
+
+
+def test_commits_the_server_lost_are_made_again(tmp_path: Path, one_database: Targets) -> None:
+    """A crash with synchronous_commit = off takes the database back a little, rows and all."""
+    log = write_log(tmp_path / "log", walk(40) + list(bridge()))
+
+    def go_back(report: TailReport) -> None:
+        if report.next_offset == 30 and not report.restarts:
+            cut_connections(one_database.graph_url)
+            rebuild(log, one_database, SETTINGS, until=13)
+
+    report = tail(log, one_database, SETTINGS, once=True, batch_events=10, on_batch=go_back)
+    assert (report.next_offset, report.restarts) == (60, 1)
+    tailed = all_rows(one_database)
+    rebuild(log, one_database, SETTINGS)
+    assert all_rows(one_database) == tailed
+
+
+def test_a_checkpoint_moved_by_somebody_else_stops_the_tail(
+    tmp_path: Path, one_database: Targets
+) -> None:
+    log = write_log(tmp_path / "log", walk(40))
+
+    def overtake(_: TailReport) -> None:
+        cut_connections(one_database.graph_url)
+        rebuild(log, one_database, SETTINGS, until=33)
+
+    with pytest.raises(CheckpointMoved, match="something else writes there"):
+        tail(log, one_database, SETTINGS, once=True, batch_events=10, on_batch=overtake)
+
+
+def test_a_checkpoint_moved_behind_our_back_changes_no_row(
+    tmp_path: Path, one_database: Targets, pg: psycopg.Connection
+) -> None:
+    log = write_log(tmp_path / "log", walk(40))
+    seen = []
+
+    def move(_: TailReport) -> None:
+        pg.execute(
+            "UPDATE mapfold.checkpoint SET next_offset = next_offset + 1 WHERE sink = 'graph'"
+        )
+        seen.append(all_rows(one_database))
+
+    with pytest.raises(CheckpointMoved, match="expected at offset 10 of log"):
+        tail(log, one_database, SETTINGS, once=True, batch_events=10, on_batch=move)
+    assert all_rows(one_database) == seen[-1]
+
+
+def test_a_stopped_tail_gives_up_on_a_database_that_is_away(
+    tmp_path: Path, own_server: EmbeddedServer
+) -> None:
+    log = write_log(tmp_path / "log", walk(20))
+    targets = Targets(own_server.url, own_server.url)  # nobody revives it
+    stop = threading.Event()
+
+    def kill_then_stop(_: TailReport) -> None:
+        kill_postgres(own_server)
+        write_log(log, walk(5, first=20))
+
+    with pytest.raises(DatabaseUnavailable, match="stopped while the database was away"):
+        tail(
+            log,
+            targets,
+            SETTINGS,
+            stop=stop,
+            on_batch=kill_then_stop,
+            on_trouble=lambda _: stop.set(),
+        )

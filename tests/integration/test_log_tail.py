@@ -1,0 +1,136 @@
+"""A tail sees every event once and in order, across rotations, from another process too."""
+
+import queue
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from eventsrc.errors import LogDamaged, LogError
+from eventsrc.log import Event, LogWriter, follow
+from eventsrc.log._mcap import MARK_BYTES
+from tests.chaos.log_writer import payload_at
+from tests.fixtures_log import BY_HAND, KEY
+
+ROOT = Path(__file__).parents[2]
+TIMEOUT_S = 60
+
+
+@contextmanager
+def tail(path: Path, start: int = 0) -> Iterator["queue.Queue[Event | None]"]:
+    """A queue that a tail in a thread of its own fills; None when it has caught up."""
+    got: queue.Queue[Event | None] = queue.Queue()
+    stop = threading.Event()
+
+    def run() -> None:
+        for event in follow(path, start, stop=stop):
+            got.put(event)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield got
+    finally:
+        stop.set()
+        thread.join(TIMEOUT_S)
+        assert not thread.is_alive()
+
+
+def next_event(got: "queue.Queue[Event | None]") -> Event:
+    deadline = time.monotonic() + TIMEOUT_S
+    while (event := got.get(timeout=deadline - time.monotonic())) is None:
+        pass
+    return event
+
+
+def test_rotation_under_load(log_path: Path) -> None:
+    total = 3000
+    with (
+        LogWriter(log_path, rotate_events=64) as writer,
+        tail(log_path) as first,
+        tail(log_path, start=total // 2) as second,
+    ):
+        for offset in range(total):
+            writer.append(KEY, payload_at(offset))
+        writer.sync()
+        for start, got in ((0, first), (total // 2, second)):
+            for offset in range(start, total):
+                event = next_event(got)
+                assert (event.offset, event.payload) == (offset, payload_at(offset))
+
+
+def test_a_tail_of_another_process(log_path: Path) -> None:
+    with LogWriter(log_path):
+        pass  # so that there is a log to follow
+    command = [sys.executable, "-m", "tests.chaos.log_writer", str(log_path), "5ms"]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) as process:
+        try:
+            with tail(log_path) as got:
+                for offset in range(5000):
+                    event = next_event(got)
+                    assert (event.offset, event.payload) == (offset, payload_at(offset))
+        finally:
+            process.kill()
+
+
+def test_a_tail_goes_on_through_a_restart(log_path: Path) -> None:
+    with LogWriter(log_path) as writer:
+        writer.append(KEY, b"0")
+    with tail(log_path) as got:
+        assert next_event(got).payload == b"0"
+        for number in range(1, 4):
+            with LogWriter(log_path) as writer:
+                writer.append(KEY, b"%d" % number)
+            assert next_event(got).payload == b"%d" % number
+
+
+def test_unsynced_events_are_not_shown(log_path: Path) -> None:
+    with LogWriter(log_path, fsync=BY_HAND) as writer, tail(log_path) as got:
+        writer.append(KEY, b"waiting")
+        assert got.get(timeout=TIMEOUT_S) is None
+        assert got.get(timeout=TIMEOUT_S) is None
+        writer.sync()
+        assert next_event(got).payload == b"waiting"
+
+
+def test_a_tail_stops_at_what_it_cannot_read(log_path: Path) -> None:
+    stop = threading.Event()
+    writer = LogWriter(log_path, fsync=BY_HAND)
+    writer.append(KEY, b"good")
+    writer.sync()
+    size = next(log_path.glob("*.active")).stat().st_size
+    writer.append(KEY, b"rotten")
+    writer.sync()
+    with next(log_path.glob("*.active")).open("r+b") as file:
+        file.seek(size + 60)
+        file.write(b"\xff")
+    events = follow(log_path, 0, stop=stop)
+    first = next(events)
+    assert first is not None
+    assert first.payload == b"good"
+    with pytest.raises(LogDamaged, match="offsets 1 to 1"):
+        next(events)
+    with pytest.raises(LogError, match="log recover"):
+        writer.close()
+
+
+def test_a_tail_gets_what_recovery_found_behind_the_last_mark(log_path: Path) -> None:
+    writer = LogWriter(log_path, fsync=BY_HAND)
+    for payload in (b"zero", b"one"):
+        writer.append(KEY, payload)
+        writer.sync()
+    active = next(log_path.glob("*.active"))
+    torn = active.read_bytes()[:-MARK_BYTES]
+    writer.close()
+    next(log_path.glob("*.mcap")).unlink()
+    active.write_bytes(torn)  # as after a kill between the sync and the mark
+    with tail(log_path) as got:
+        assert next_event(got).payload == b"zero"
+        with LogWriter(log_path) as writer:
+            writer.append(KEY, b"two")
+        assert [next_event(got).payload for _ in range(2)] == [b"one", b"two"]
