@@ -14,17 +14,21 @@ from .posterior import Posterior
 UNKNOWN_BELOW: Final = 0.3
 """Below this confidence the answer is 'unknown'."""
 
-WEIGHTS: Final[tuple[float, ...]] = (-3.0, 0.4, 0.4, 0.2, 1.0, -1.0)
+WEIGHTS: Final[tuple[float, ...]] = (-6.877, 0.463, 0.301, 0.437, 4.437, -0.215)
 """Intercept, then one weight for each of `features`."""
+
+
+_MOST: Final = 7.0
+"""A crop explains no more than this; keeps one lucky feature from deciding alone."""
 
 
 def features(posterior: Posterior, crops: int) -> tuple[float, ...]:
     """What the confidence depends on; ``crops`` counts all crops asked with, at least 1."""
     shares = (*posterior.shares, 0.0, 0.0)
     return (
-        shares[0],
-        shares[1],
-        min(posterior.total, 24.0) / crops,
+        min(shares[0], _MOST),
+        min(shares[1], _MOST),
+        min(posterior.total / crops, _MOST),
         posterior.mass,
         posterior.expected_error_m,
     )
