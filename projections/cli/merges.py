@@ -1,12 +1,14 @@
 """`mapfold merges`: every merge of places, what made it and what changed hands."""
 
 import sys
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from eventsrc.cli._shell import emit
+from eventsrc.cli._shell import emit, say
 from eventsrc.errors import MisuseError
+from projections.timetravel import Timeline
 from projections.timetravel.lives import Merge
 from projections.timetravel.merge_story import merge_document
 from projections.timetravel.text import merge_text, merges_text
@@ -24,6 +26,13 @@ def merges(
             "--show", metavar="N", help="Merge number N alone, with links, objects and edges."
         ),
     ] = None,
+    draw: Annotated[
+        int | None,
+        typer.Option("--draw", metavar="N", help="Draw merge number N, before and after."),
+    ] = None,
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="The picture of --draw: .png, .svg or .pdf.")
+    ] = Path("merge.png"),
     json_: JsonOption = False,
     set_: SetOption = None,
     settings_file: SettingsOption = None,
@@ -32,6 +41,8 @@ def merges(
     with timeline(log, settings_file, set_) as opened:
         end = point(opened, at)
         found = opened.merges(end)
+        if draw is not None:
+            _draw(opened, numbered(found, draw), out)
         if show is not None:
             found = [numbered(found, show)]
         if json_:
@@ -40,6 +51,14 @@ def merges(
             sys.stdout.write(merge_text(opened.history, found[0]))
         else:
             sys.stdout.write(merges_text(opened.history, found, end))
+
+
+def _draw(opened: Timeline, merge: Merge, out: Path) -> None:
+    # Here and not above: matplotlib takes longer to import than most commands take to run.
+    from projections.timetravel.picture import draw_merge
+
+    draw_merge(opened, merge, out)
+    say(f"wrote {out}: merge {merge.number}, before and after")
 
 
 def numbered(found: list[Merge], number: int) -> Merge:

@@ -26,10 +26,15 @@ def alternatives(
     if size > MOST_ALTERNATIVES:
         raise SettingsError(f"--grid: {size:,} combinations; try at most {MOST_ALTERNATIVES}")
     found = [common] if sets and not axes else []
-    found += [base.with_assignments(text.replace(",", " ").split()) for text in tries]
+    found += [assigned(base, text) for text in tries]
     if axes:
         found += [common.with_assignments(combination) for combination in product(*axes)]
     return list(dict.fromkeys(found))
+
+
+def assigned(settings: Settings, text: str) -> Settings:
+    """``settings`` changed by several assignments in one text, parted by spaces or commas."""
+    return settings.with_assignments(text.replace(",", " ").split())
 
 
 def _axis(text: str) -> list[str]:
@@ -49,4 +54,4 @@ def changed_settings(base: Settings, other: Settings) -> dict[str, object]:
 def settings_name(base: Settings, other: Settings) -> str:
     """``eps_m=1.0 min_samples=8``: what is different from the base."""
     changed = changed_settings(base, other)
-    return " ".join(f"{name}={value}" for name, value in changed.items()) or "as it is"
+    return " ".join(f"{name}={value}" for name, value in changed.items()) or "no change"

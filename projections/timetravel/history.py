@@ -28,9 +28,11 @@ from projections.deltas import (
     PlacesMerged,
     RunSeen,
 )
+from projections.settings import Settings
 
 from .causes import Cause, cause_of
 from .lives import EdgeChange, Merge, ObjectLife, PlaceLife, last_before
+from .neighbours import Neighbours
 
 NEVER = 2**63 - 1
 """The offset of what has not happened."""
@@ -49,7 +51,8 @@ class History:
     that placed it (`NEVER` for noise) and the place it joined then; all by keyframe ordinal.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
         self.next_offset = 0
         self.keyframes: list[KeyframeAdded] = []
         self.keyframe_offsets = array("q")
@@ -64,6 +67,7 @@ class History:
         self.keyframe_numbers: dict[tuple[str, int], int] = {}
         self.place_numbers: dict[str, int] = {}
         self.object_numbers: dict[str, int] = {}
+        self._neighbours: tuple[int, Neighbours] | None = None
         self._apply: dict[type, Callable[[Any, Cause], None]] = {
             RunSeen: self._run_seen,
             KeyframeAdded: self._keyframe_added,
@@ -95,6 +99,14 @@ class History:
                 handle(delta, cause)
         for merge in merges:
             self._places_merged(merge, cause, moves, links)
+
+    @property
+    def neighbours(self) -> Neighbours:
+        """Who is near whom, among the keyframes so far."""
+        count = len(self.keyframes)
+        if self._neighbours is None or self._neighbours[0] != count:
+            self._neighbours = count, Neighbours(self.keyframes, self.settings)
+        return self._neighbours[1]
 
     def place_at(self, keyframe: int, end: int | None = None) -> int | None:
         """The place a keyframe is in after the events below ``end`` (default: all so far)."""

@@ -1,11 +1,12 @@
 """Merges as people and programs read them."""
 
-from collections.abc import Sequence
 from typing import Any
 
+from .bridging import chains_of
 from .history import History
+from .links import chain_document, link_document
 from .lives import EdgeChange, Merge
-from .story import keyframe_name, link_document, link_text, place_name
+from .story import keyframe_name, place_name
 
 HEADER = ("#", "offset", "time", "bridge", "survivor", "absorbed", "keyframes", "objects", "edges")
 
@@ -23,6 +24,7 @@ def merge_document(history: History, merge: Merge) -> dict[str, Any]:
         "absorbed": [place_name(history, place) for place in merge.absorbed],
         "absorbed_sizes": list(merge.absorbed_sizes),
         "links": [link_document(history, link) for link in merge.links],
+        "chains": [chain_document(history, chain) for chain in chains_of(history, merge)],
         "objects": [history.objects[number].object_id for number in merge.objects],
         "edges": [_edge_document(history, edge) for edge in merge.edges],
     }
@@ -50,14 +52,3 @@ def merge_row(history: History, merge: Merge) -> tuple[str, ...]:
         str(len(merge.objects)),
         str(len(merge.edges)),
     )
-
-
-def reason(history: History, merge: Merge) -> str:
-    """Why it happened: who bridged, and which core points are near each other."""
-    links = "; ".join(link_text(history, link) for link in merge.links)
-    return f"{keyframe_name(history, merge.bridge)} bridged them: {links}"
-
-
-def joined_sizes(merges: Sequence[Merge]) -> int:
-    """Places that merges took away."""
-    return sum(len(merge.absorbed) for merge in merges)

@@ -1,36 +1,35 @@
 """What became of a log under one setting: small enough to send between processes and to compare.
 
 Keyframes and observations have the same ordinals under any settings, since the log alone decides
-them; places and objects do not.
+them; places and objects do not. So places are numbered here by the event that founded them and then
+by their first member, which two folds share until they part.
 """
 
 from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, TypeAlias
 
+from projections.digest import map_digest
+from projections.evaluate.map_scores import object_scores, place_scores
+from projections.evaluate.truth import Truth
 from projections.settings import Settings
 from projections.view import MapView
 
-from .history import NEVER, History
+from .history import History
 from .lives import PlaceLife
 
-
-@dataclass(frozen=True, slots=True)
-class Step:
-    """What one event did to the partition of keyframes into places.
-
-    ``placed`` pairs keyframes with places, ``merged`` absorbed places with survivors; both sorted.
-    Places are numbered in the order of founding, so steps of two folds compare until they differ.
-    """
-
-    placed: tuple[tuple[int, int], ...]
-    merged: tuple[tuple[int, int], ...]
+Offsets: TypeAlias = "array[int]"
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """One fold's result. ``places`` and ``objects`` name each keyframe's and observation's group,
-    None for none; ``object_numbers`` and ``steps`` tell how they came about."""
+    """One fold's result. ``places`` and ``objects`` name each keyframe's and each observation's
+    group, None for none; ``posed`` are the keyframes that have a pose, so can be in a place.
+
+    The rest tells how it came about: by keyframe the event that placed it and the place joined
+    then, the merges as (offset, absorbed, survivor), by observation its object and its event.
+    """
 
     settings: Settings
     digest: str
@@ -38,66 +37,67 @@ class Outcome:
     merges: int
     places: tuple[str | None, ...]
     objects: tuple[str | None, ...]
-    posed: tuple[int, ...]
-    """Ordinals of the keyframes that have a pose: only those can be in a place."""
-    object_numbers: "array[int]"
-    observation_offsets: "array[int]"
-    steps: dict[int, Step]
+    keyframes: tuple[tuple[str, int], ...]
+    posed: Offsets
+    placed_offsets: Offsets
+    placed_in: Offsets
+    merged: tuple[tuple[int, int, int], ...]
+    fused_into: Offsets
+    observation_offsets: Offsets
+    scores: dict[str, dict[str, Any]] | None
+    """``places`` and ``objects`` against the truth (`projections.evaluate.map_scores`)."""
     seconds: float
 
 
-def outcome_of(view: MapView, history: History, digest: str, seconds: float) -> Outcome:
-    """Condense a fold into its outcome."""
-    place_ids = [place.place_id for place in view.all_places]
-    places = (keyframe.place for keyframe in view.keyframes)
-    numbers = array("q", (-1 if o.object is None else o.object for o in view.observations))
+def outcome_of(view: MapView, history: History, truth: Truth | None, seconds: float) -> Outcome:
+    """Condense a fold, which took ``seconds``, into its outcome."""
+    numbers = _numbers(history.places)
+    fused = array("q", (-1 if o.object is None else o.object for o in view.observations))
     offsets = history.keyframe_offsets
     return Outcome(
         settings=view.settings,
-        digest=digest,
+        digest=map_digest(view),
         counts=view.counts(),
         merges=len(history.merges),
-        places=tuple(None if place is None else place_ids[place] for place in places),
-        objects=tuple(None if n < 0 else view.objects[n].object_id for n in numbers),
-        posed=tuple(k.ordinal for k in view.keyframes if k.pose is not None),
-        object_numbers=numbers,
+        places=tuple(view.place_id(keyframe.place) for keyframe in view.keyframes),
+        objects=tuple(None if n < 0 else view.objects[n].object_id for n in fused),
+        keyframes=tuple((k.run_id, k.keyframe_id) for k in view.keyframes),
+        posed=array("q", (k.ordinal for k in view.keyframes if k.pose is not None)),
+        placed_offsets=history.placed_offsets,
+        placed_in=array("q", (-1 if p < 0 else numbers[p] for p in history.placed_in)),
+        merged=tuple(
+            (merge.cause.offset, numbers[place], numbers[merge.survivor])
+            for merge in history.merges
+            for place in merge.absorbed
+        ),
+        fused_into=fused,
         observation_offsets=array("q", (offsets[o.keyframe] for o in view.observations)),
-        steps=_steps(history),
+        scores=None if truth is None else _scores(view, truth),
         seconds=seconds,
     )
 
 
-def first_parting(first: Outcome, second: Outcome) -> tuple[int | None, int | None]:
-    """The first offsets at which two folds of one log part ways: in places, and in objects."""
-    offsets = sorted(first.steps.keys() | second.steps.keys())
-    in_places = next((o for o in offsets if first.steps.get(o) != second.steps.get(o)), None)
-    pairs = zip(first.object_numbers, second.object_numbers, strict=True)
-    differing = next((i for i, (a, b) in enumerate(pairs) if a != b), None)
-    in_objects = None if differing is None else first.observation_offsets[differing]
-    return in_places, in_objects
+def _scores(view: MapView, truth: Truth) -> dict[str, dict[str, Any]]:
+    return {"places": place_scores(view, truth), "objects": object_scores(view, truth)}
 
 
-def _steps(history: History) -> dict[int, Step]:
-    numbers = _numbers(history.places)
-    placed: dict[int, list[tuple[int, int]]] = {}
-    merged: dict[int, list[tuple[int, int]]] = {}
-    for keyframe, offset in enumerate(history.placed_offsets):
-        if offset != NEVER:
-            pair = (keyframe, numbers[history.placed_in[keyframe]])
-            placed.setdefault(offset, []).append(pair)
-    for merge in history.merges:
-        pairs = [(numbers[place], numbers[merge.survivor]) for place in merge.absorbed]
-        merged.setdefault(merge.cause.offset, []).extend(pairs)
-    return {
-        offset: Step(tuple(sorted(placed.get(offset, ()))), tuple(sorted(merged.get(offset, ()))))
-        for offset in placed.keys() | merged.keys()
-    }
+def places_part(first: Outcome, second: Outcome) -> int | None:
+    """The first event after which two folds of one log have different places; None for never."""
+    placings = zip(
+        first.placed_offsets, first.placed_in, second.placed_offsets, second.placed_in, strict=True
+    )
+    parted = [min(o1, o2) for o1, p1, o2, p2 in placings if (o1, p1) != (o2, p2)]
+    parted += [offset for offset, _, _ in set(first.merged) ^ set(second.merged)]
+    return min(parted, default=None)
+
+
+def objects_part(first: Outcome, second: Outcome) -> int | None:
+    """The first event after which two folds of one log have different objects."""
+    pairs = zip(first.fused_into, second.fused_into, first.observation_offsets, strict=True)
+    return next((offset for a, b, offset in pairs if a != b), None)
 
 
 def _numbers(places: Sequence[PlaceLife]) -> list[int]:
-    """Each place's number by founding event and then by first member: places that one event founds
-    are founded in an order that may depend on the settings, and that is no difference."""
-
     def age(ordinal: int) -> tuple[int, int]:
         life = places[ordinal]
         first = [d.keyframe for d in life.joined if d.offset == life.formed.offset]

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from projections.exact import mean_m
 
 from .history import History
+from .links import reason
 from .lives import Merge, PlaceLife
-from .merge_story import reason
 from .story import Entry, Story, counted, keyframe_name, passed_mark, place_name, spot
 
 MOST_FOUNDERS = 6

@@ -6,8 +6,8 @@ to that event are why.
 """
 
 from .history import NEVER, History
+from .links import reason
 from .lives import Merge
-from .merge_story import reason
 from .story import Entry, Story, keyframe_name, place_name, spot
 
 

@@ -1,9 +1,10 @@
 """A chronicle: what happened to one thing, entry by entry, each with the event that caused it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from projections.deltas import Link, Pose
+from projections.deltas import Pose
 
 from .causes import Cause
 from .history import History
@@ -61,24 +62,14 @@ def spot(pose: Pose | None) -> str:
     return f"({pose.x_um / 1e6:.2f}, {pose.y_um / 1e6:.2f})"
 
 
-def link_text(history: History, link: Link) -> str:
-    """Which two core points are within ε, and how near."""
-    core, neighbour = keyframe_name(history, link.core), keyframe_name(history, link.neighbour)
-    return f"{core} and {neighbour} are core points {link.distance_um / 1e6:.3f} m apart"
-
-
-def link_document(history: History, link: Link) -> dict[str, Any]:
-    """A link as JSON."""
-    return {
-        "core": keyframe_name(history, link.core),
-        "neighbour": keyframe_name(history, link.neighbour),
-        "distance_m": link.distance_um / 1e6,
-    }
-
-
 def counted(number: int, word: str) -> str:
     """``1 keyframe``, ``2 keyframes``."""
     return f"{number:,} {word}" if number == 1 else f"{number:,} {word}s"
+
+
+def listed(names: Sequence[str]) -> str:
+    """``a``, ``a and b``, ``a, b and c``."""
+    return " and ".join(part for part in (", ".join(names[:-1]), names[-1]) if part)
 
 
 def passed_mark(before: int, after: int) -> bool:

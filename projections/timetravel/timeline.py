@@ -11,7 +11,7 @@ from typing import TypeAlias
 from eventsrc.log import LogReader
 from projections.digest import map_digest
 from projections.errors import WhenceError
-from projections.folding import FoldedEvent, fold_events
+from projections.folding import AHEAD, FoldedEvent, fold_events
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 from projections.view import MapView
@@ -48,7 +48,7 @@ class Timeline:
         self._progress = progress
         self._map = SemanticMap(self.settings)
         self._latest = MapView(self.settings, keep_embeddings=False)
-        self._history = History()
+        self._history = History(self.settings)
         self._tallies: Tallies | None = None
 
     def __enter__(self) -> "Timeline":
@@ -72,7 +72,8 @@ class Timeline:
         start, end = self._history.next_offset, self.end
         if start < end:
             self._tallies = None
-            for folded in fold_events(self.reader.read(start, end), self._map):
+            events = self.reader.read(start, end)
+            for folded in fold_events(events, self._map, ahead=AHEAD):
                 self._latest.apply_event(folded.offset, folded.deltas)
                 self._history.apply(folded.offset, folded.deltas)
                 if self._progress and folded.offset % _PROGRESS_EVERY == 0:
@@ -91,7 +92,7 @@ class Timeline:
     def deltas(self, start: int = 0, end: int | None = None) -> Iterator[FoldedEvent]:
         """What each event from ``start`` to before ``end`` changed, by a fold of its own."""
         events = self.reader.read(0, self._end(end))
-        folded = fold_events(events, SemanticMap(self.settings))
+        folded = fold_events(events, SemanticMap(self.settings), ahead=AHEAD)
         return (event for event in folded if event.offset >= start)
 
     def merges(self, end: int | None = None) -> list[Merge]:

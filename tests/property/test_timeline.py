@@ -5,6 +5,7 @@ import math
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from projections.folding import fold_log
 from projections.settings import Settings
 from projections.state_json import state_document
 from projections.timetravel import Expression, Timeline
+from projections.timetravel.bridging import chains_of
+from projections.timetravel.lives import Merge
 from projections.timetravel.rows import rows_of
 from projections.timetravel.search import Search
 from projections.view import MapView
@@ -241,7 +244,27 @@ def test_the_links_of_a_merge_are_true(documents: list[dict[str, Any]]) -> None:
                 assert is_core(after, link.neighbour)
                 assert not (is_core(before, link.core) and is_core(before, link.neighbour))
             assert len(merge.links) == len(merge.absorbed)
+            assert_chains_join(opened, merge, before, after)
             event(f"{len(merge.absorbed)} absorbed")
+
+
+def assert_chains_join(opened: Timeline, merge: Merge, before: MapView, after: MapView) -> None:
+    """Every absorbed place hangs by core points, each near the next, on one that is joined."""
+    joined = {merge.survivor}
+    for chain in chains_of(opened.history, merge):
+        assert before.keyframes[chain.points[0]].place == chain.joined
+        assert before.keyframes[chain.points[-1]].place == chain.absorbed
+        assert chain.joined in joined
+        joined.add(chain.absorbed)
+        for point in (chain.points[0], chain.points[-1]):
+            assert is_core(before, point)
+        assert chain.made_core
+        for point in chain.made_core:
+            assert is_core(after, point)
+            assert not is_core(before, point)
+        for near, far in pairwise(chain.points):
+            assert distance_um(after, near, far) <= RULES.eps_m * 1e6
+    assert joined == set(merge.places)
 
 
 def distance_um(view: MapView, a: int, b: int) -> float:

@@ -41,7 +41,7 @@ def test_the_merge_is_told_whole(corridor: Timeline) -> None:
     (merge,) = corridor.merges()
     (cup,) = corridor.at().objects
     document = merge_document(corridor.history, merge)
-    links = document.pop("links")
+    links, chains = document.pop("links"), document.pop("chains")
     assert document == {
         "offset": 8,
         "time": "2026-03-24T13:00:09.000Z",
@@ -57,6 +57,15 @@ def test_the_merge_is_told_whole(corridor: Timeline) -> None:
         "edges": [{"a": "run-a_p0", "b": "run-a_p1", "before": 1, "after": 0}],
     }
     assert [link["distance_m"] for link in links] == [1.0]
+    assert chains == [
+        {
+            "from": "run-a_p0",
+            "to": "run-a_p1",
+            "points": ["run-a:2", "run-a:3", "run-a:9", "run-a:6", "run-a:5"],
+            "distances_m": [1.0, 1.0, 1.0, 1.0],
+            "made_core": ["run-a:3", "run-a:9", "run-a:6"],
+        }
+    ]
 
 
 def test_merges_before_an_offset(corridor: Timeline) -> None:
@@ -80,8 +89,10 @@ def test_a_standing_place_is_told(corridor: Timeline) -> None:
         "founded: run-a:2 at (1.00, 0.00) became the first core point; "
         "members run-a:1, run-a:2, run-a:3"
     )
-    assert story.entries[1].text.startswith(
-        "absorbed run-a_p1 (3 keyframes), having 3 itself; run-a:9 bridged them: "
+    assert story.entries[1].text == (
+        "absorbed run-a_p1 (3 keyframes), having 3 itself; "
+        "run-a:9 made run-a:3, itself and run-a:6 core points: run-a:2 (run-a_p0) –1.000 m– "
+        "run-a:3 –1.000 m– run-a:9 –1.000 m– run-a:6 –1.000 m– run-a:5 (run-a_p1)"
     )
 
 

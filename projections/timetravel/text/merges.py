@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 
 from projections.timetravel.history import History
+from projections.timetravel.links import reason
 from projections.timetravel.lives import EdgeChange, Merge
 from projections.timetravel.merge_story import HEADER, merge_row
-from projections.timetravel.story import keyframe_name, link_text, place_name
+from projections.timetravel.story import counted, place_name
 
 from .table import shortened, table
 
@@ -16,9 +17,9 @@ def merges_text(history: History, merges: Sequence[Merge], end: int) -> str:
     """The table of merges, or that there are none."""
     if not merges:
         formed = sum(life.formed.offset < end for life in history.places)
-        return f"no merges among {formed:,} places formed by {end:,} events\n"
+        return f"no merges: {counted(end, 'event')} formed {counted(formed, 'place')}\n"
     rows = [merge_row(history, merge) for merge in merges]
-    return table(HEADER, rows, right="# offset objects edges")
+    return table(HEADER, rows, right=("#", "offset", "objects", "edges"))
 
 
 def merge_text(history: History, merge: Merge) -> str:
@@ -26,8 +27,7 @@ def merge_text(history: History, merge: Merge) -> str:
     cause, after = merge.cause, merge.cause.offset + 1
     lines = [
         f"merge {merge.number} at offset {cause.offset:,} ({cause.time}), shows from --at {after}",
-        f"bridge    {keyframe_name(history, merge.bridge)}",
-        *(f"link      {link_text(history, link)}" for link in merge.links),
+        f"because   {reason(history, merge)}",
         f"survivor  {place_name(history, merge.survivor)}, {merge.survivor_size:,} keyframes",
     ]
     for place, size in zip(merge.absorbed, merge.absorbed_sizes, strict=True):

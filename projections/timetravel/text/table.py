@@ -1,14 +1,15 @@
 """A plain table: columns as wide as their widest cell, two spaces between, no lines."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 
-def table(header: Sequence[str], rows: Iterable[Sequence[str]], *, right: str = "") -> str:
-    """The rows under the header, a line each. ``right`` names the columns aligned to the right,
-    parted by spaces."""
+def table(
+    header: Sequence[str], rows: Iterable[Sequence[str]], *, right: Collection[str] = ()
+) -> str:
+    """The rows under the header, a line each; ``right`` names the columns aligned to the right."""
     cells = [list(header), *(list(row) for row in rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(header))]
-    to_right = [name in right.split() for name in header]
+    to_right = [name in right for name in header]
     lines = (
         "  ".join(
             cell.rjust(width) if flush else cell.ljust(width)

@@ -1,0 +1,116 @@
+"""`mapfold whatif`: the same log under other settings, side by side."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from eventsrc.cli._shell import emit, say
+from eventsrc.errors import MisuseError
+from eventsrc.log import LogReader
+from eventsrc.log.whence import resolve
+from projections.evaluate.truth import read_truth
+from projections.timetravel import Timeline
+from projections.timetravel.alternatives import alternatives, assigned
+from projections.timetravel.story import counted
+from projections.timetravel.text import whatif_text
+from projections.timetravel.whatif import WhatIf, what_if
+
+from ._options import SettingsOption, settings_from
+from ._timeline import MOST_LINES, AllOption, AtOption, FoldBar, JsonOption, LogArgument
+
+
+def whatif(
+    log: LogArgument,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="Change a setting; all --set make one alternative, and hold for all of a --grid.",
+        ),
+    ] = None,
+    try_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--try",
+            metavar="'NAME=VALUE …'",
+            help="One alternative of its own; give it several times for several.",
+        ),
+    ] = None,
+    grid: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--grid",
+            metavar="NAME=VALUE,…",
+            help="Every combination of these values, with those of other --grid.",
+        ),
+    ] = None,
+    base: Annotated[
+        str,
+        typer.Option(
+            metavar="'NAME=VALUE …'", help="Compare with these settings instead of the defaults."
+        ),
+    ] = "",
+    at: AtOption = "end",
+    truth: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--truth", metavar="FILE", help="Score places and objects against this ground truth."
+        ),
+    ] = None,
+    json_: JsonOption = False,
+    all_: AllOption = False,
+    picture: Annotated[
+        Path | None,
+        typer.Option(
+            "--picture", metavar="FILE", help="Draw the maps side by side (.png, .svg, .pdf)."
+        ),
+    ] = None,
+    processes: Annotated[
+        int | None,
+        typer.Option(metavar="N", min=1, help="Fold in this many processes [default: processors]."),
+    ] = None,
+    settings_file: SettingsOption = None,
+) -> None:
+    """What the map would be under other settings: places, noise, merges, objects, differences.
+
+    ARI is the adjusted Rand index against the base: 1 is the same partition of keyframes into
+    places or observations into objects, 0 no better than chance. With --truth, V is the V-measure
+    against rooms and instances: 1 is perfect.
+    """
+    common = assigned(settings_from(settings_file, None), base)
+    others = alternatives(common, set_ or (), try_ or (), grid or ())
+    if not others:
+        raise MisuseError("nothing to try; give --set eps_m=1.0, --try or --grid eps_m=0.5,1.0")
+    scored = read_truth(truth) if truth else None
+    with LogReader(log) as reader:
+        end = resolve(reader, at)
+    with FoldBar() as bar:
+        found = what_if(log, common, others, end, truth=scored, processes=processes, progress=bar)
+    if picture is not None:
+        _draw(log, found, picture)
+    if json_:
+        emit(found.document())
+    else:
+        sys.stdout.write(whatif_text(found, most=None if all_ else MOST_LINES))
+
+
+def _draw(log: Path, found: WhatIf, out: Path) -> None:
+    # Here and not above: matplotlib takes longer to import than most commands take to run.
+    from projections.timetravel.picture import draw_maps
+
+    maps = []
+    for each in found.all:
+        with Timeline(log, each.outcome.settings) as opened:
+            counts = each.outcome.counts
+            title = f"{each.name}: {counted(counts['places'], 'place')}, {counts['noise']} noise"
+            maps.append((title, opened.at(found.end)))
+    draw_maps(maps, out)
+    say(f"wrote {out}: {len(maps)} maps")
+
+
+def register(app: typer.Typer) -> None:
+    """Add `whatif` to the program."""
+    app.command()(whatif)

@@ -1,0 +1,76 @@
+"""Who was near a keyframe at any moment: what a merge is explained and drawn with.
+
+Counts as the fold's own rule does, exactly and from the poses alone: a keyframe is a core point
+when at least ``min_samples`` posed keyframes, itself included, are within ε of it, inclusive.
+"""
+
+from bisect import bisect_left
+from collections import defaultdict
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from projections.deltas import KeyframeAdded
+from projections.exact import metres_to_um
+from projections.geometry import distance_um
+from projections.settings import Settings
+
+
+class Neighbours:
+    """The poses of keyframes in a grid of ε, for asking who is within ε of whom."""
+
+    def __init__(self, keyframes: Sequence[KeyframeAdded], settings: Settings) -> None:
+        self._radius = metres_to_um(settings.eps_m)
+        self._min_samples = settings.min_samples
+        posed = [(n, k.offset, k.pose) for n, k in enumerate(keyframes) if k.pose is not None]
+        self._numbers = [n for n, _, _ in posed]
+        self._offsets = [offset for _, offset, _ in posed]
+        self._spots = np.array([(p.x_um, p.y_um) for _, _, p in posed], np.int64).reshape(-1, 2)
+        self._row = {number: row for row, number in enumerate(self._numbers)}
+        cells: defaultdict[tuple[int, int], list[int]] = defaultdict(list)
+        for row, (_, _, pose) in enumerate(posed):
+            cells[self._cell(pose.x_um, pose.y_um)].append(row)
+        self._cells = {cell: np.array(rows, np.int64) for cell, rows in cells.items()}
+
+    def of(self, keyframe: int, end: int) -> list[int]:
+        """Keyframes within ε of a posed ``keyframe``, itself too, after ``end`` events; ascending
+        ordinals."""
+        x, y = self._spots[self._row[keyframe]]
+        column, row = self._cell(int(x), int(y))
+        around = [(column + i, row + j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+        rows = np.concatenate([self._cells[cell] for cell in around if cell in self._cells])
+        rows = np.sort(rows[rows < bisect_left(self._offsets, end)])
+        # In these cells a difference is at most 2·10⁹ µm, so its square fits int64.
+        near = ((self._spots[rows] - (x, y)) ** 2).sum(axis=1) <= self._radius**2
+        return [self._numbers[row] for row in rows[near]]
+
+    def is_core(self, keyframe: int, end: int) -> bool:
+        """Whether it is a core point after ``end`` events; false before it came."""
+        row = self._row.get(keyframe)
+        if row is None or self._offsets[row] >= end:
+            return False
+        return len(self.of(keyframe, end)) >= self._min_samples
+
+    def made_core(self, bridge: int, offset: int) -> list[int]:
+        """The keyframes that the coming of ``bridge`` at ``offset`` made core points."""
+        if bridge not in self._row:
+            return []
+        return [
+            keyframe
+            for keyframe in self.of(bridge, offset + 1)
+            if self.is_core(keyframe, offset + 1) and not self.is_core(keyframe, offset)
+        ]
+
+    def distance_um(self, a: int, b: int) -> int:
+        """The distance of two posed keyframes, rounded down."""
+        (ax, ay), (bx, by) = (map(int, self._spots[self._row[k]]) for k in (a, b))
+        return distance_um(ax, ay, bx, by)
+
+    def spots(self, keyframes: Sequence[int]) -> NDArray[np.float64]:
+        """Positions of posed keyframes in metres, shape (n, 2)."""
+        metres: NDArray[np.float64] = self._spots[[self._row[k] for k in keyframes]] / 1e6
+        return metres
+
+    def _cell(self, x_um: int, y_um: int) -> tuple[int, int]:
+        return x_um // self._radius, y_um // self._radius

@@ -1,0 +1,182 @@
+"""Folding one log under several settings at once, on several processes.
+
+Each process reads and validates the log once and feeds all of its settings from that, so reading is
+paid once per process and not once per setting. Few events are folded here and now: starting
+a process takes longer than they do.
+"""
+
+import multiprocessing
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, wait
+from itertools import islice
+from multiprocessing.sharedctypes import Synchronized
+from pathlib import Path
+
+from eventsrc.ingest import Accepted, Rejected, ingest
+from eventsrc.log import Event, LogReader
+from eventsrc.system_events import is_system_key
+from projections.deltas import Delta
+from projections.errors import FoldError
+from projections.evaluate.truth import Truth
+from projections.exact import Units, unit_vectors
+from projections.folding import AHEAD
+from projections.reducers.semantic_map import SemanticMap
+from projections.settings import Settings
+from projections.view import MapView
+
+from .history import History
+from .outcome import Outcome, outcome_of
+
+Progress = Callable[[int, int], None]
+
+WORTH_A_PROCESS = 20_000
+"""Events times settings from which processes are started: about two seconds of folding."""
+_POLL_S = 0.2
+
+_done: "Synchronized[int] | None" = None
+"""In a worker process: events folded by all of them together."""
+
+
+def fold_all(
+    log: Path,
+    settings: Sequence[Settings],
+    end: int,
+    *,
+    truth: Truth | None = None,
+    processes: int | None = None,
+    progress: Progress | None = None,
+) -> list[Outcome]:
+    """The outcome of the first ``end`` events under each of ``settings``, in their order.
+
+    Raises FoldError at an event that cannot be folded.
+    """
+    workers = min(processes or _processors(), len(settings))
+    if workers <= 1 or (processes is None and end * len(settings) < WORTH_A_PROCESS):
+        return fold_several(log, settings, end, truth, progress)
+    shares = [list(settings[index::workers]) for index in range(workers)]
+    outcomes = _in_processes(log, shares, end, truth, progress)
+    return [outcomes[index % workers][index // workers] for index in range(len(settings))]
+
+
+def fold_several(
+    log: Path,
+    settings: Sequence[Settings],
+    end: int,
+    truth: Truth | None = None,
+    progress: Progress | None = None,
+) -> list[Outcome]:
+    """The same in this process: one pass over the log for all of ``settings``."""
+    folds = [_Fold(each) for each in settings]
+    with LogReader(log) as reader:
+        events = reader.read(0, end)
+        while chunk := list(islice(events, AHEAD)):
+            _fold_chunk(chunk, folds)
+            if progress is not None:
+                progress(chunk[-1].offset + 1, end)
+    return [fold.outcome(truth) for fold in folds]
+
+
+class _Fold:
+    """One setting's map, view and history, and the time they took."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.map = SemanticMap(settings)
+        self.view = MapView(settings, keep_embeddings=False)
+        self.history = History(settings)
+        self.seconds = 0.0
+
+    def take(self, offset: int, door: Accepted | None, units: list[Units | None]) -> None:
+        """Fold one event; None is one of mapfold's own."""
+        deltas: list[Delta] = []
+        if door is None:
+            self.map.skip(offset)
+        else:
+            deltas = self.map.fold(offset, door, units)
+        self.view.apply_event(offset, deltas)
+        self.history.apply(offset, deltas)
+
+    def outcome(self, truth: Truth | None) -> Outcome:
+        return outcome_of(self.view, self.history, truth, self.seconds)
+
+
+def _fold_chunk(chunk: Sequence[Event], folds: Sequence[_Fold]) -> None:
+    """As `projections.folding.fold_events`, reading and validating once for all folds."""
+    doors = [_read(event) for event in chunk]
+    vectors = [v for door in doors if door is not None for v in door.vectors]
+    units = iter(unit_vectors(vectors))
+    read = [
+        (event.offset, door, [] if door is None else list(islice(units, len(door.vectors))))
+        for event, door in zip(chunk, doors, strict=True)
+    ]
+    for fold in folds:
+        started = time.perf_counter()
+        for offset, door, own in read:
+            fold.take(offset, door, own)
+        fold.seconds += time.perf_counter() - started
+
+
+def _read(event: Event) -> Accepted | None:
+    """The envelope in an event, None in one of mapfold's own."""
+    if is_system_key(event.key):
+        return None
+    accepted = ingest(event.payload, max_bytes=sys.maxsize)
+    if isinstance(accepted, Rejected):
+        raise FoldError(event.offset, accepted.reason)
+    return accepted
+
+
+def _in_processes(
+    log: Path,
+    shares: list[list[Settings]],
+    end: int,
+    truth: Truth | None,
+    progress: Progress | None,
+) -> list[list[Outcome]]:
+    # Spawned, not forked: the caller may have threads (a writer, a Zenoh session) whose locks a
+    # fork would copy in whatever state they are.
+    context = multiprocessing.get_context("spawn")
+    done = context.Value("q", 0)
+    with ProcessPoolExecutor(
+        len(shares), mp_context=context, initializer=_start_worker, initargs=(done,)
+    ) as pool:
+        futures = [pool.submit(_work, log, share, end, truth) for share in shares]
+        _watch(futures, done, end * len(shares), progress)
+        return [future.result() for future in futures]
+
+
+def _start_worker(done: "Synchronized[int]") -> None:
+    global _done
+    _done = done
+
+
+def _work(log: Path, settings: list[Settings], end: int, truth: Truth | None) -> list[Outcome]:
+    counted = 0
+
+    def report(folded: int, _: int) -> None:
+        nonlocal counted
+        if _done is not None:
+            with _done.get_lock():
+                _done.value += folded - counted
+        counted = folded
+
+    return fold_several(log, settings, end, truth, report)
+
+
+def _watch(
+    futures: "list[Future[list[Outcome]]]",
+    done: "Synchronized[int]",
+    total: int,
+    progress: Progress | None,
+) -> None:
+    while wait(futures, timeout=_POLL_S).not_done:
+        if progress is not None:
+            progress(done.value, total)
+
+
+def _processors() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

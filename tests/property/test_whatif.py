@@ -1,0 +1,83 @@
+"""What-if against folding each setting alone and comparing the maps after every event."""
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from eventsrc.log import LogReader
+from projections.digest import map_digest
+from projections.folding import fold_log
+from projections.settings import Settings
+from projections.timetravel.whatif import what_if
+from projections.view import MapView
+from tests.fixtures_timetravel import walks, write_log
+
+BASE = Settings(eps_m=0.7, min_samples=3, fusion_radius_m=2.0)
+OTHERS = st.lists(
+    st.builds(
+        Settings,
+        eps_m=st.sampled_from([0.7, 1.1, 1.4]),
+        min_samples=st.integers(2, 4),
+        fusion_radius_m=st.sampled_from([1.0, 2.0]),
+        fusion_similarity=st.sampled_from([0.7, 0.999]),
+    ),
+    min_size=1,
+    max_size=3,
+)
+
+
+def groups(view: MapView) -> tuple[set[frozenset[int]], set[frozenset[int]]]:
+    """The places as sets of keyframes and the objects as sets of observations."""
+    return (
+        {frozenset(place.members) for place in view.places.values()},
+        {frozenset(found.observations) for found in view.objects},
+    )
+
+
+def parting(first: list[Any], second: list[Any]) -> int | None:
+    """The first event after which two lists of states, one per number of events, differ."""
+    return next(
+        (i - 1 for i, pair in enumerate(zip(first, second, strict=True)) if pair[0] != pair[1]),
+        None,
+    )
+
+
+@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.too_slow])
+@given(walks(most=20), OTHERS)
+def test_it_is_each_fold_alone_compared(
+    documents: list[dict[str, Any]], others: list[Settings]
+) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        log = write_log(Path(folder) / "log", documents)
+        found = what_if(log, BASE, others, len(documents))
+        states: dict[Settings, list[Any]] = {}
+        with LogReader(log) as reader:
+            for each in {BASE, *others}:
+                views = [fold_log(reader, each, n)[1] for n in range(len(documents) + 1)]
+                states[each] = [groups(view) for view in views]
+                states[each].append(map_digest(views[-1]))
+    for each, alternative in zip(others, found.alternatives, strict=True):
+        base, other = states[BASE], states[each]
+        assert alternative.outcome.digest == other[-1]
+        assert alternative.places.same is (base[-2][0] == other[-2][0])
+        assert alternative.objects.same is (base[-2][1] == other[-2][1])
+        for index, parted in enumerate((alternative.parted_places, alternative.parted_objects)):
+            expected = parting([s[index] for s in base[:-1]], [s[index] for s in other[:-1]])
+            assert parted == expected
+
+
+@settings(deadline=None, max_examples=20, suppress_health_check=[HealthCheck.too_slow])
+@given(walks(most=20))
+def test_todays_settings_change_nothing(documents: list[dict[str, Any]]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        log = write_log(Path(folder) / "log", documents)
+        found = what_if(log, BASE, [BASE], len(documents))
+    (same,) = found.alternatives
+    assert same.same
+    assert same.parted_places is None
+    assert same.parted_objects is None
+    assert same.outcome.digest == found.base.outcome.digest
+    assert same.name == "no change"
