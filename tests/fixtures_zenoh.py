@@ -1,9 +1,11 @@
 """Real Zenoh parts: a router on a free port, sessions connected to it, programs beside the test."""
 
 import functools
+import re
 import subprocess
 import sys
 import threading
+import urllib.request
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from typing import IO
@@ -28,6 +30,13 @@ with open_session(ZenohOptions(connect=(endpoint,)), mode="client") as session:
 LOOPBACK = ZenohOptions(listen=("tcp/127.0.0.1:0",))
 DEADLINE_S = 30.0
 """Longer than any wait in a healthy run; only a broken one ever waits that long."""
+
+
+def scrape(port: int) -> dict[str, float]:
+    """The samples a recorder's ``/metrics`` gives now."""
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=DEADLINE_S) as answer:
+        text = answer.read().decode()
+    return {name: float(value) for name, value in re.findall(r"^(\w+) (\S+)$", text, re.MULTILINE)}
 
 
 @pytest.fixture

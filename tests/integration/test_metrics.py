@@ -1,7 +1,5 @@
 """Prometheus scrapes a recorder."""
 
-import re
-import urllib.request
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,20 +9,14 @@ from eventsrc.errors import TransportError
 from eventsrc.metrics import serving_metrics
 from eventsrc.recorder import RecorderReport
 from tests.envelopes import envelope, payload
-from tests.fixtures_zenoh import DEADLINE_S, Program
+from tests.fixtures_zenoh import Program, scrape
 
 REPORT = RecorderReport(12, 3, 4, 5, 6, 0, 7, 100, 15)
 
 
-def _scrape(port: int) -> dict[str, float]:
-    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=DEADLINE_S) as answer:
-        text = answer.read().decode()
-    return {name: float(value) for name, value in re.findall(r"^(\w+) (\S+)$", text, re.MULTILINE)}
-
-
 def test_every_number_is_scraped_as_it_is_at_that_moment(tmp_path: Path) -> None:
     with serving_metrics(("127.0.0.1", 0), lambda: REPORT, tmp_path) as port:
-        scraped = _scrape(port)
+        scraped = scrape(port)
     assert scraped.pop("mapfold_recorder_disk_free_bytes") > 0
     assert scraped == {
         "mapfold_recorder_recorded_total": 12,
@@ -68,6 +60,6 @@ def test_the_record_command_serves_them(
     recorder.wait_for("recording")
     publish("tb/detections", payload(envelope(1)).decode(), "bad")
     recorder.wait_for("rejected 1 payloads")
-    scraped = _scrape(port)
+    scraped = scrape(port)
     assert scraped["mapfold_recorder_recorded_total"] == 1
     assert scraped["mapfold_recorder_rejected_total"] == 1

@@ -1,0 +1,59 @@
+"""docs/recording.md is run, not trusted."""
+
+import re
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+from eventsrc._zenoh import ZenohOptions, open_session
+from eventsrc.endpoints import DEFAULT_ENDPOINT
+from eventsrc.metrics import serving_metrics
+from eventsrc.recorder import DEFAULT_QUEUE_SIZE, RecorderReport
+from eventsrc.recorder.inbox import DEFAULT_QUEUE_BYTES
+from eventsrc.sending import WINDOW
+from eventsrc.spool import DEFAULT_SPOOL_BYTES
+from tests.fixtures_zenoh import Program, scrape
+
+PAGE = (Path(__file__).parents[2] / "docs" / "recording.md").read_text()
+Start = Callable[..., Program]
+
+
+def _block(language: str) -> str:
+    (block,) = re.findall(rf"^```{language}\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
+    return str(block)
+
+
+def test_the_three_terminals_say_what_the_page_says(
+    start: Start, start_code: Start, endpoint: str, tmp_path: Path
+) -> None:
+    log = str(tmp_path / "log")
+    recorder = start("record", log, "--connect", endpoint)
+    recorder.wait_for("recording")
+    code = _block("python").replace(DEFAULT_ENDPOINT, endpoint)
+    robot = start_code(code.replace("spool.sqlite", str(tmp_path / "spool.sqlite")))
+    assert robot.wait() == 0, robot.lines
+    assert recorder.end(signal.SIGINT) == 0
+    for line in recorder.lines:
+        assert f"    {line.replace(log, 'logs/run-7')}\n" in PAGE
+
+
+def test_every_metric_is_on_the_page(tmp_path: Path) -> None:
+    report = RecorderReport(0, 0, 0, 0, 0, 0, 0, 1, 0)
+    with serving_metrics(("127.0.0.1", 0), lambda: report, tmp_path) as port:
+        served = set(scrape(port))
+    assert set(re.findall(r"mapfold_recorder_\w+", PAGE)) == served
+
+
+def test_the_configuration_is_one_that_zenoh_reads(endpoint: str, tmp_path: Path) -> None:
+    file = tmp_path / "zenoh.json5"
+    file.write_text(_block("json5"))
+    options = ZenohOptions(connect=(endpoint,), config_file=file)
+    with open_session(options, mode="client") as session:
+        assert session.linked
+
+
+def test_the_numbers_on_the_page_are_those_in_the_code() -> None:
+    assert f"{DEFAULT_QUEUE_SIZE:,} messages" in PAGE
+    assert f"or {DEFAULT_QUEUE_BYTES >> 20} MB" in PAGE
+    assert f"at most {WINDOW:,} envelopes under way" in PAGE
+    assert f"{DEFAULT_SPOOL_BYTES >> 30} GiB unless" in PAGE
