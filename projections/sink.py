@@ -57,6 +57,9 @@ class Sink(Protocol[Changes]):
     def write(self, connection: Connection, changes: Changes) -> int:
         """Write what was taken; how many rows that were."""
 
+    def clear(self, connection: Connection) -> None:
+        """Before a rebuild's transaction (autocommit): remove what an earlier one left behind."""
+
     def begin(self, connection: Connection) -> None:
         """Create an empty shadow."""
 

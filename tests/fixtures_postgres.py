@@ -1,10 +1,12 @@
 """One embedded server per test session (and xdist worker); a fresh database for each test."""
 
+import os
 import shutil
 import tempfile
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
+from urllib.parse import urlsplit, urlunsplit
 
 import psycopg
 import pytest
@@ -13,13 +15,33 @@ from psycopg import sql
 from projections.postgres.connect import Targets, connect, ensure_extension
 from projections.postgres.embedded import EmbeddedServer
 
-_TEMPLATE = "mapfold_template"
+_TEMPLATE = f"mapfold_template_{os.getpid()}"
 _numbers = count()
+
+
+class OtherServer(EmbeddedServer):
+    """The server that MAPFOLD_TEST_DB names, a superuser's URL: to test against other versions."""
+
+    def __init__(self, url: str) -> None:
+        self._url = url
+
+    def url_of(self, database: str) -> str:
+        """URL of one of its databases."""
+        return _url_with_database(self._url, database)
+
+
+def _url_with_database(url: str, database: str) -> str:
+    """``url`` with another database."""
+    parts = urlsplit(url)
+    return urlunsplit(parts._replace(path=f"/{database}"))
 
 
 @pytest.fixture(scope="session")
 def pg_server() -> Iterator[EmbeddedServer]:
     """A running server of this session's own, stopped and removed at its end."""
+    if "MAPFOLD_TEST_DB" in os.environ:
+        yield OtherServer(os.environ["MAPFOLD_TEST_DB"])
+        return
     # Not pytest's own temporary folder: each new session takes its permissions back to 0700, under
     # the feet of a server that runs as another user.
     home = Path(tempfile.mkdtemp(prefix="mapfold-test-"))
@@ -47,7 +69,7 @@ def _template(pg_server: EmbeddedServer) -> str:
 
 
 def _fresh_database(server: EmbeddedServer, template: str) -> str:
-    name = f"test_{next(_numbers)}"
+    name = f"test_{os.getpid()}_{next(_numbers)}"
     with connect(server.url, autocommit=True) as connection:
         connection.execute(
             sql.SQL("CREATE DATABASE {} TEMPLATE {}").format(

@@ -28,10 +28,8 @@ def gid(label: str, number: int) -> str:
 
 def graph_rows(url: str) -> dict[str, list[tuple[str, ...]]]:
     """All rows of the graph as text, by label, ordered by id."""
-    vertex = sql.SQL("SELECT id::text, properties::text FROM {} ORDER BY id")
-    edge = sql.SQL(
-        "SELECT id::text, start_id::text, end_id::text, properties::text FROM {} ORDER BY id"
-    )
+    vertex = sql.SQL("SELECT id::text, properties FROM {} ORDER BY id")
+    edge = sql.SQL("SELECT id::text, start_id::text, end_id::text, properties FROM {} ORDER BY id")
     with psycopg.connect(url) as connection:
         connection.execute("SET search_path = ag_catalog, public")
         return {

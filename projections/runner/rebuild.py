@@ -83,6 +83,8 @@ def rebuild(
         with contextlib.ExitStack() as transactions:
             for store in stores:
                 transactions.enter_context(database_errors(store.url))
+                for sink in store.sinks:
+                    sink.clear(store.connection)
                 transactions.enter_context(store.connection.transaction())
                 for sink in store.sinks:
                     sink.begin(store.connection)

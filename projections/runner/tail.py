@@ -58,6 +58,7 @@ def tail(
     once: bool = False,
     only: Only = None,
     loader: LoaderName = "copy",
+    batch_events: int = BATCH_EVENTS,
     stop: threading.Event | None = None,
     on_batch: OnBatch | None = None,
     on_trouble: OnTrouble | None = None,
@@ -75,6 +76,7 @@ def tail(
         )
         with opened as stores:
             run = _Run(log, targets, settings, stores, stop, once, report)
+            run.batch_events = batch_events
             run.on_batch, run.on_trouble = on_batch or run.on_batch, on_trouble or run.on_trouble
             try:
                 run.follow()
@@ -95,6 +97,7 @@ class _Run:
     stop: threading.Event
     once: bool
     report: TailReport
+    batch_events: int = BATCH_EVENTS
     on_batch: OnBatch = lambda _: None
     on_trouble: OnTrouble = lambda _: None
     checkpoints: dict[str, Checkpoint] = field(default_factory=dict)
@@ -115,7 +118,7 @@ class _Run:
                 for store in self.stores
             ]
             beaten = time.monotonic()
-            for batch in batches(events, BATCH_EVENTS):
+            for batch in batches(events, self.batch_events):
                 last = self._fold(fold, batch)
                 if last is not None:
                     self._write(fold, writers, last)

@@ -110,8 +110,6 @@ def swap_in(connection: Connection, shadow: str) -> None:
     _use_age(connection)
     run = statements("graph")
     if exists(connection, GRAPH):
-        if exists(connection, OLD_GRAPH):
-            drop(connection, OLD_GRAPH)
         _lock_all(connection, GRAPH)
         connection.execute(run["rename_graph"], {"graph": GRAPH, "new_name": OLD_GRAPH})
     connection.execute(run["rename_graph"], {"graph": shadow, "new_name": GRAPH})

@@ -75,11 +75,20 @@ class GraphSink:
         parts = (changes.inserted, changes.upserted, changes.deleted)
         return sum(len(rows) for part in parts for rows in part.values())
 
-    def begin(self, connection: Connection) -> None:
-        """Create an empty shadow graph; refuse early if the name in use is not ours."""
+    def clear(self, connection: Connection) -> None:
+        """Drop a replaced graph that a reader held on to; refuse a graph that is not ours.
+
+        Not inside the rebuild's transaction: AGE 1.5 crashes the session that drops a graph after
+        it has made another one in the same transaction.
+        """
         ensure_extension(connection, "age")
         _graph_ddl.exists(connection, GRAPH)
-        _graph_ddl.drop(connection, NEXT_GRAPH)
+        for graph in (OLD_GRAPH, NEXT_GRAPH):
+            with connection.transaction():
+                _graph_ddl.drop(connection, graph)
+
+    def begin(self, connection: Connection) -> None:
+        """Create an empty shadow graph."""
         _graph_ddl.create(connection, NEXT_GRAPH)
 
     def stream(self, connection: Connection, view: MapView) -> int:

@@ -67,10 +67,13 @@ class VectorSink:
             self._loader.vectors(connection, _PUBLIC, self._type, changes)
         return len(changes)
 
-    def begin(self, connection: Connection) -> None:
-        """Create an empty shadow table; refuse early if the name in use is not ours."""
+    def clear(self, connection: Connection) -> None:
+        """Nothing is ever left behind; refuse early if the name in use is not ours."""
         self._find_type(connection)
         self._existing(connection)
+
+    def begin(self, connection: Connection) -> None:
+        """Create an empty shadow table."""
         self._shadow_dimension = self._dimension
         self._create(connection, _SHADOW, self._dimension)
 

@@ -120,6 +120,7 @@ def test_a_cut_connection_is_made_again(tmp_path: Path, one_database: Targets) -
         one_database,
         SETTINGS,
         once=True,
+        batch_events=10,
         on_batch=cut,
     )
     assert (report.next_offset, report.batches, report.restarts) == (60, 6, 0)

@@ -36,7 +36,7 @@ def trip(connection: psycopg.Connection, loader: Loader, texts: list[str]) -> li
         rows = [(base + i, text) for i, text in enumerate(texts, 1)]
         loader.vertices(connection, "agtype_trip", "Thing", rows)  # type: ignore[arg-type]
         found = connection.execute(
-            'SELECT properties::text FROM agtype_trip."Thing" ORDER BY id'
+            'SELECT properties FROM agtype_trip."Thing" ORDER BY id'
         ).fetchall()
     return [row[0] for row in found]
 

@@ -49,10 +49,10 @@ SELECT ag_catalog.create_graph(%(graph)s::name)
 COMMENT ON SCHEMA {graph} IS 'mapfold: made from the log; rebuilt at will'
 
 -- name: create_vlabel
-SELECT ag_catalog.create_vlabel(%(graph)s::cstring, %(label)s::cstring)
+SELECT ag_catalog.create_vlabel(%(graph)s, %(label)s)
 
 -- name: create_elabel
-SELECT ag_catalog.create_elabel(%(graph)s::cstring, %(label)s::cstring)
+SELECT ag_catalog.create_elabel(%(graph)s, %(label)s)
 
 -- name: label_ids
 SELECT l.name, l.id FROM ag_catalog.ag_label l JOIN ag_catalog.ag_graph g ON g.graphid = l.graph

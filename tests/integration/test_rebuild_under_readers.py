@@ -1,0 +1,184 @@
+"""Readers run the queries of DESIGN section 6 in a loop while maps are rebuilt under them."""
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import psycopg
+import pytest
+
+from projections.errors import ProjectionBusy
+from projections.postgres.connect import Targets, connect_for_cypher
+from projections.runner import RebuildProgress, rebuild, tail
+from projections.settings import Settings
+from tests.logs import bridge, walk, write_log
+from tests.rows import all_rows
+
+SETTINGS = Settings()
+WAIT_S = 60.0
+REBUILDS = 6
+
+COUNT_PATHS = (
+    "SELECT * FROM cypher('semantic_map', $$"
+    " MATCH (o:Observation)-[:OBSERVES]->(b:Object)-[:LOCATED_IN]->(p:Place)"
+    " RETURN count(*) $$) AS (n agtype)"
+)
+COUNT_LABELS = (
+    "SELECT * FROM cypher('semantic_map', $$"
+    " MATCH (r:Run)-[:HAS_KEYFRAME]->(k:Keyframe)-[:HAS_OBSERVATION]->(o:Observation)"
+    " RETURN count(*) $$) AS (n agtype)"
+)
+COUNT_VECTORS = "SELECT count(*) FROM detection_embeddings"
+
+
+class Reader(threading.Thread):
+    """Runs a query until told to stop; keeps every answer and every error."""
+
+    def __init__(self, open_: Callable[[], psycopg.Connection], query: str, prepare: bool) -> None:
+        super().__init__()
+        self.open, self.query, self.prepare = open_, query, prepare
+        self.answers: list[str] = []
+        self.errors: list[Exception] = []
+        self.stop = threading.Event()
+        self.first = threading.Event()
+
+    def run(self) -> None:
+        with self.open() as connection:
+            while not self.stop.is_set():
+                try:
+                    row = connection.execute(self.query, prepare=self.prepare).fetchone()  # type: ignore[arg-type]
+                except psycopg.Error as error:
+                    self.errors.append(error)
+                    return
+                finally:
+                    self.first.set()
+                assert row is not None
+                self.answers.append(str(row[0]))
+
+
+def single_answer(connection: psycopg.Connection, query: str) -> str:
+    row = connection.execute(query).fetchone()  # type: ignore[arg-type]
+    assert row is not None
+    return str(row[0])
+
+
+@pytest.mark.parametrize("prepare", [False, True], ids=["plain", "prepared"])
+def test_readers_see_one_map_or_the_other_and_never_an_error(
+    tmp_path: Path, one_database: Targets, pg: psycopg.Connection, prepare: bool
+) -> None:
+    log = write_log(tmp_path / "log", walk(150, rooms=2) + list(bridge()) + walk(150, first=150))
+    queries = (COUNT_PATHS, COUNT_LABELS, COUNT_VECTORS)
+    allowed: dict[str, set[str]] = {query: set() for query in queries}
+    for until in (170, None):
+        rebuild(log, one_database, SETTINGS, until=until)
+        for query in queries:
+            allowed[query].add(single_answer(pg, query))
+    assert all(len(answers) == 2 for answers in allowed.values())
+
+    url = one_database.graph_url
+    readers = [Reader(lambda: connect_for_cypher(url), query, prepare) for query in queries]
+    for reader in readers:
+        reader.start()
+    try:
+        for reader in readers:
+            assert reader.first.wait(WAIT_S)
+        for n in range(REBUILDS):
+            rebuild(log, one_database, SETTINGS, until=170 if n % 2 == 0 else None)
+    finally:
+        for reader in readers:
+            reader.stop.set()
+            reader.join(WAIT_S)
+    for reader in readers:
+        assert reader.errors == []
+        assert set(reader.answers) <= allowed[reader.query]
+        assert len(reader.answers) > REBUILDS
+    names = pg.execute("SELECT name::text FROM ag_graph").fetchall()
+    assert names == [("semantic_map",)]
+
+
+def test_a_reader_in_a_long_transaction_keeps_its_graph_and_the_next_rebuild_clears_it(
+    tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It read only the table so far; its later look at the graph must still find a whole one."""
+    monkeypatch.setattr("projections.sinks._swap_guard.WAIT_SECONDS", 0.2)
+    log = write_log(tmp_path / "log", walk(60))
+    rebuild(log, one_database, SETTINGS)
+    with connect_for_cypher(one_database.graph_url) as reader:
+        before = single_answer(reader, COUNT_PATHS)
+        with reader.transaction():
+            reader.execute("SELECT 1")
+            rebuild(log, one_database, SETTINGS)
+            assert single_answer(reader, COUNT_PATHS) == before
+        graphs = reader.execute("SELECT name::text FROM ag_graph ORDER BY 1").fetchall()
+        assert graphs == [("semantic_map",), ("semantic_map_old",)]
+    rebuild(log, one_database, SETTINGS)
+    with connect_for_cypher(one_database.graph_url) as reader:
+        graphs = reader.execute("SELECT name::text FROM ag_graph").fetchall()
+        assert graphs == [("semantic_map",)]
+
+
+class Interrupted(Exception):
+    """Stands for whatever ends a rebuild in the middle."""
+
+
+@pytest.mark.parametrize("stage", ["folding", "writing", "swapping", "tidying", "indexing"])
+@pytest.mark.parametrize("kind", ["one_database", "two_databases"])
+def test_interrupted_at_each_stage_one_whole_map_is_served(
+    tmp_path: Path, kind: str, stage: str, request: pytest.FixtureRequest
+) -> None:
+    targets: Targets = request.getfixturevalue(kind)
+    log = write_log(tmp_path / "log", walk(100) + list(bridge()))
+    rebuild(log, targets, SETTINGS, until=100)
+    old = all_rows(targets)
+
+    def interrupt(at: RebuildProgress) -> None:
+        if at.stage == stage:
+            raise Interrupted
+
+    with pytest.raises(Interrupted):
+        rebuild(log, targets, SETTINGS, progress=interrupt)
+    found = all_rows(targets)
+    rebuild(log, targets, SETTINGS)
+    new = all_rows(targets)
+    assert new != old
+    assert found == (new if stage in ("tidying", "indexing") else old)
+    assert tail(log, targets, SETTINGS, once=True).events == 0
+
+
+def test_a_rebuild_refuses_to_run_beside_a_tail_and_the_other_way_round(
+    tmp_path: Path, one_database: Targets
+) -> None:
+    log = write_log(tmp_path / "log", walk(30))
+    refused = []
+
+    def try_others(_: object) -> None:
+        with pytest.raises(ProjectionBusy, match=r"\(mapfold (tail|replay), server process \d+\)"):
+            rebuild(log, one_database, SETTINGS)
+        with pytest.raises(ProjectionBusy, match="is writing the graph there"):
+            tail(log, one_database, SETTINGS, once=True)
+        with pytest.raises(ProjectionBusy, match="is writing the vectors there"):
+            tail(log, one_database, SETTINGS, once=True, only="vectors")
+        refused.append(True)
+
+    tail(log, one_database, SETTINGS, once=True, on_batch=try_others)
+    rebuild(
+        log,
+        one_database,
+        SETTINGS,
+        progress=lambda at: try_others(at) if at.stage == "writing" else None,
+    )
+    assert refused == [True, True]
+
+
+def test_the_two_sinks_may_be_written_at_the_same_time(
+    tmp_path: Path, one_database: Targets
+) -> None:
+    log = write_log(tmp_path / "log", walk(30))
+
+    def other(_: object) -> None:
+        tail(log, one_database, SETTINGS, once=True, only="vectors")
+
+    tail(log, one_database, SETTINGS, once=True, only="graph", on_batch=other)
+    apart = all_rows(one_database)
+    rebuild(log, one_database, SETTINGS)
+    assert all_rows(one_database) == apart
