@@ -15,7 +15,7 @@ import pytest
 from eventsrc._zenoh import Session, ZenohOptions, open_session
 from eventsrc.router import Router
 
-_MAPFOLD = "from projections.cli import main; main()"
+MAPFOLD = "from projections.cli import main; main()"
 PUBLISHER = """
 import sys
 from eventsrc._zenoh import ZenohOptions, open_session
@@ -133,7 +133,7 @@ def start_code() -> Iterator[Callable[..., Program]]:
 @pytest.fixture
 def start(start_code: Callable[..., Program]) -> Callable[..., Program]:
     """Starts `mapfold …`."""
-    return functools.partial(start_code, _MAPFOLD)
+    return functools.partial(start_code, MAPFOLD)
 
 
 @pytest.fixture
