@@ -37,9 +37,10 @@ def simulate(
     listen: ListenOption = None,
     zenoh_config: ConfigOption = None,
 ) -> None:
-    """Drive a robot through a seeded house and publish what it sees, or write it to a file.
+    """A seeded house run, over Zenoh or into a file.
 
-    The ground truth (room and instance) goes to a file beside --out, never into the messages.
+    A robot drives through a simulated house and publishes what it sees, or writes it down. The
+    ground truth (room and instance) goes to a file beside --out, never into the messages.
     """
     simulated = simulate_run(seed, run)
     document = _numbers(simulated)

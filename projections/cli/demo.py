@@ -22,7 +22,7 @@ def demo(
     vector_db: VectorDbOption = None,
     json_: Annotated[bool, typer.Option("--json", help="The numbers as JSON on stdout.")] = False,
 ) -> None:
-    """Explore, record, replay, get lost, ask, draw: everything once, each part real.
+    """The whole story on one machine, each part real.
 
     A robot explores a simulated house and is recorded through a Zenoh router; the log is replayed
     into databases; a second, lost robot asks where it is. Unless --db says otherwise the databases

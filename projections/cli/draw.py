@@ -40,7 +40,10 @@ def draw(
     set_: SetOption = None,
     settings_file: SettingsOption = None,
 ) -> None:
-    """Draw the map: drive, places in their own colours, objects, which place is next to which."""
+    """A picture of the map, as of any point in the log.
+
+    Drive, places in their own colours, objects, and which place is next to which.
+    """
     # Here and not above: matplotlib takes longer to import than most commands take to run.
     from eventsrc.sim import build_house
     from projections.drawing import draw_map, floor_of
