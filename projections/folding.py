@@ -20,8 +20,8 @@ from .settings import Settings
 from .snapshot import SnapshotCache
 from .view import MapView
 
-AHEAD = 32
-"""How far to read ahead in a log that is there already: 100 vectors fit a core's cache."""
+AHEAD = 16
+"""How far to read ahead in a log that is there already: 50 vectors fit a core's cache."""
 
 
 WORTH_A_SNAPSHOT = 5_000

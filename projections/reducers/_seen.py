@@ -26,20 +26,17 @@ def content_digest(accepted: Accepted) -> bytes:
     tell a conflict from a duplicate in the one of 4 billion that differs in nothing but a vector.
     """
     envelope, checksum = accepted.envelope, 0
-    for vector in accepted.vectors:
-        if vector is not None:
+    said: list[object] = [envelope.timestamp, envelope.map_x, envelope.map_y, envelope.map_yaw]
+    for det_id, vector, d in zip(
+        accepted.det_ids, accepted.vectors, envelope.detections, strict=True
+    ):
+        said += (det_id, d.class_name, d.confidence, d.bbox, d.embedding_model)
+        if vector is None:
+            said.append(None)
+        else:
             checksum = crc32(vector.data, checksum)
-    said = (
-        envelope.timestamp,
-        envelope.map_x,
-        envelope.map_y,
-        envelope.map_yaw,
-        [
-            (det_id, d.class_name, d.confidence, d.bbox, d.embedding_model, d.embedding_dim)
-            for det_id, d in zip(accepted.det_ids, envelope.detections, strict=True)
-        ],
-        checksum,
-    )
+            said.append(len(vector))
+    said.append(checksum)
     # Version 2 writes values and nothing of how this process holds them.
     return hashlib.blake2b(marshal.dumps(said, 2), digest_size=_DIGEST_BYTES).digest()
 

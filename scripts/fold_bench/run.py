@@ -1,0 +1,211 @@
+"""Every claim about the fold's cost as a ratio within one run, so that no machine matters."""
+
+import json
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from itertools import islice
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from plain import fold_plain
+from streams import DIM, MODEL, house_walk, keyframes, random_walk
+
+from eventsrc.ingest import Accepted, ingest
+from eventsrc.log import LogReader, LogWriter
+from projections.exact import unit_vectors
+from projections.folding import AHEAD, fold_events, fold_log, no_cycle_search
+from projections.reducers._crowd import Crowd
+from projections.reducers.places import NOISE, Places
+from projections.reducers.semantic_map import SemanticMap
+from projections.settings import Settings
+from projections.view import MapView
+
+QUICK = "--quick" in sys.argv
+EPS_UM, LEAST = 1_500_000, 3
+clock = time.process_time  # other work on the machine is not ours
+
+
+def report(name: str, value: float, limit: float, unit: str = "") -> None:
+    verdict = "ok" if value <= limit else "TOO MUCH"
+    print(f"{name:<66} {value:>9.2f}{unit}  (at most {limit:g}{unit})  {verdict}", flush=True)
+
+
+def fold_places(points: list[tuple[int, int]]) -> tuple[float, list[int]]:
+    places = Places(Crowd(EPS_UM, LEAST))
+    start = clock()
+    for n, (x, y) in enumerate(points):
+        places.fold(n, n, 0, "r", x, y, 0.0)
+    return clock() - start, [places.label(n) for n in range(len(points))]
+
+
+def same_noise(ours: list[int], theirs: list[int]) -> bool:
+    return [label == NOISE for label in ours] == [label < 0 for label in theirs]
+
+
+def plain() -> None:
+    points = random_walk(4_000 if QUICK else 16_000)
+    seconds, ours = fold_places(points)
+    start = clock()
+    theirs = fold_plain(points, EPS_UM, LEAST)
+    slow = clock() - start
+    if not same_noise(ours, theirs):
+        raise SystemExit("the plain version disagrees about noise")
+    print(f"{len(points)} poses: ours {seconds:.2f} s, plain {slow:.1f} s")
+    report("time / time of plain O(n²), × 40", seconds / slow * 40, 1)
+
+
+def peer() -> None:
+    points = random_walk(2_000 if QUICK else 16_000)
+    seconds, ours = fold_places(points)
+    job = {"points": points, "eps": EPS_UM, "min_samples": LEAST}
+    done = subprocess.run(
+        [".venv-bench/bin/python", "scripts/fold_bench/peer.py"],
+        input=json.dumps(job),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    theirs = json.loads(done.stdout)
+    if not same_noise(ours, theirs["labels"]):
+        raise SystemExit("incdbscan disagrees about noise")
+    print(f"{len(points)} poses: ours {seconds:.2f} s, incdbscan {theirs['seconds']:.1f} s")
+    report("time / time of incdbscan, × 20", seconds / theirs["seconds"] * 20, 1)
+
+
+def lifelong() -> None:
+    count = 100_000 if QUICK else 1_000_000
+    places = Places(Crowd(EPS_UM, LEAST))
+    before, number = _resident(), 0
+
+    def fold_one(at: tuple[float, float]) -> None:
+        nonlocal number
+        places.fold(number, number, 0, "r", round(at[0] * 1e6), round(at[1] * 1e6), 0.0)
+        number += 1
+
+    _tenths("places alone", house_walk(count), count, fold_one)
+    report("  memory per keyframe", (_resident() - before) / count, 300, " B")
+    semantic_map = SemanticMap(Settings())
+    _tenths(
+        "whole fold without detections",
+        keyframes(count, 0),
+        count,
+        lambda accepted: semantic_map.fold(semantic_map.next_offset, accepted),
+    )
+
+
+def _tenths(name: str, stream, count: int, fold_one: Callable) -> None:
+    tenths = []
+    for _ in range(10):
+        seconds = 0.0
+        for _ in range(10):  # the stream's own making is not timed
+            chunk = list(islice(stream, count // 100))
+            start = clock()
+            for item in chunk:
+                fold_one(item)
+            seconds += clock() - start
+        tenths.append(seconds / count * 10e6)
+    print(f"{count} keyframes in one house, {name}: {tenths[1]:.1f} µs, last {tenths[9]:.1f} µs")
+    report("  last tenth / second tenth", tenths[9] / tenths[1], 1.5)
+
+
+def growth() -> None:
+    small, large = (2_000, 20_000) if QUICK else (10_000, 100_000)
+    few = _fold_time(small)
+    before = _resident()
+    many = _fold_time(large)
+    memory = (_resident() - before) / 1e6
+    print(f"three detections a keyframe: {few / small * 1e6:.0f} and {many / large * 1e6:.0f} µs")
+    report(f"time({large}) / time({small})", many / few, 12)
+    print(f"memory of the fold and its view after {large} keyframes: {memory:.0f} MB")
+
+
+def _fold_time(count: int) -> float:
+    semantic_map, view = SemanticMap(Settings()), MapView(Settings(), keep_embeddings=False)
+    stream, seconds = keyframes(count, 3), 0.0
+    with no_cycle_search():
+        while chunk := list(islice(stream, AHEAD)):
+            start = clock()
+            units = iter(unit_vectors([v for accepted in chunk for v in accepted.vectors]))
+            for accepted in chunk:
+                offset = semantic_map.next_offset
+                deltas = semantic_map.fold(offset, accepted, list(islice(units, 3)))
+                view.apply_event(offset, deltas)
+            seconds += clock() - start
+    global kept
+    kept = semantic_map, view  # measured while it is there
+    return seconds
+
+
+def whole() -> None:
+    count = 2_000 if QUICK else 8_000
+    with tempfile.TemporaryDirectory() as folder:
+        with LogWriter(Path(folder) / "log") as writer:
+            for accepted in keyframes(count, 3):
+                writer.append("tb/detections", _payload(accepted))
+        with LogReader(Path(folder) / "log") as reader:
+            rounds = [_whole_once(reader) for _ in range(5)]
+    names = ("read", "read + json.loads", "read + validate", "fold", "fold and view")
+    best = [min(column) / count * 1e6 for column in zip(*rounds, strict=True)]
+    print(", ".join(f"{name} {value:.0f} µs" for name, value in zip(names, best, strict=True)))
+    ratios = [statistics.median(r[i] / r[1] for r in rounds) for i in (3, 4)]
+    report("whole fold / (read + json.loads)", ratios[0], 4)
+    print(f"  and with a view built from the deltas: {ratios[1]:.2f}")
+
+
+def _whole_once(reader: LogReader) -> list[float]:
+    def timed(work: Callable[[], object]) -> float:
+        start = clock()
+        work()
+        return clock() - start
+
+    def fold_all() -> None:
+        with no_cycle_search():
+            for _ in fold_events(reader.read(), SemanticMap(Settings()), ahead=AHEAD):
+                pass
+
+    return [
+        timed(lambda: [None for _ in reader.read()]),
+        timed(lambda: [json.loads(event.payload) and None for event in reader.read()]),
+        timed(lambda: [ingest(event.payload) and None for event in reader.read()]),
+        timed(fold_all),
+        timed(lambda: fold_log(reader, Settings(), keep_embeddings=False)),
+    ]
+
+
+def _payload(accepted: Accepted) -> bytes:
+    import base64
+
+    document = accepted.envelope.model_dump(by_alias=True, exclude_none=True)
+    for detection, det_id, vector in zip(
+        document["detections"], accepted.det_ids, accepted.vectors, strict=True
+    ):
+        raw = base64.b64encode(vector.tobytes()).decode()
+        detection |= {
+            "det_id": det_id,
+            "embedding": raw,
+            "embedding_dim": DIM,
+            "embedding_model": MODEL,
+        }
+    return json.dumps(document).encode()
+
+
+def _resident() -> int:
+    """Bytes of memory in use now, on Linux; else the most so far."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+BENCHMARKS = {f.__name__: f for f in (plain, peer, lifelong, growth, whole)}
+
+if __name__ == "__main__":
+    wanted = [name for name in sys.argv[1:] if not name.startswith("--")]
+    for name in wanted or BENCHMARKS:
+        BENCHMARKS[name]()
