@@ -88,7 +88,7 @@ def _seen_from(sighting: Sighting, poses: Floats, model: Model) -> Floats:
 def _driven(sightings: Sequence[Sighting], poses: Floats, model: Model) -> Floats:
     been = np.unique(np.concatenate([s.poses for s in sightings])[:, :2], axis=0)
     squared = _squared(been, poses).min(0) / model.driven**2
-    penalty: Floats = -0.5 * np.minimum(squared, 9.0)
+    penalty: Floats = np.maximum(-0.5 * squared, -model.driven_most)
     return penalty
 
 

@@ -19,7 +19,7 @@ class Model:
     floor: float = 0.776
     side: float = 0.09
     kappa: float = 1.2
-    sigma_observation: float = 0.013
+    sigma_observation: float = 0.016
     sigma_instance: float = 0.009
     independent: float = 6.0
     """Observations of one object err alike: more than this many count no more."""
@@ -29,7 +29,7 @@ class Model:
     """Above this the question's session is the map's own: all its cosines are shifted down."""
     relevant: float = 0.72
     """Less similar observations show another model and are not looked at."""
-    unknown_price: float = 6.0
+    unknown_price: float = 7.0
     """Log-likelihood a perfect match has over 'this crop is not in the map'."""
     sigma_bearing: float = 0.06
     sigma_bearing_cut: float = 0.08
@@ -42,7 +42,9 @@ class Model:
     usual_depth: float = 2.6
     usual_depth_spread: float = 0.45
     driven: float = 0.7
-    """The robot is where it has been before, within about this."""
+    """The robot is where it has been before, within about this …"""
+    driven_most: float = 2.5
+    """… unless three things speak against it: half of a building may not be explored yet."""
     seen_from: float = 4.0
     seen_from_no_box: float = 0.8
     """… and sees an object from about where that was seen before; without boxes all hangs on it."""
