@@ -124,17 +124,21 @@ def read_head(path: Path, data: bytes, base: int) -> tuple[dict[str, str], int]:
 
 
 def _find_head(data: bytes, base: int) -> tuple[dict[str, str], int] | None:
-    """None for a whole MCAP head that is not ours."""
+    """None for an MCAP head that is not ours."""
     at = len(_mcap.MAGIC)
     profile = _mcap.PROFILE
-    for opcode, content in _mcap.records(data[at:]):
-        at += _mcap.FRAME.size + len(content)
-        if opcode == Opcode.HEADER:
-            profile = _mcap.decode_as(Header, content).profile
-        elif opcode == Opcode.METADATA:
-            metadata = _mcap.decode_as(Metadata, content)
-            if metadata.name == SEGMENT_METADATA:
-                return _checked_head(metadata, base), at
+    try:
+        for opcode, content in _mcap.records(data[at:]):
+            at += _mcap.FRAME.size + len(content)
+            if opcode == Opcode.HEADER:
+                profile = _mcap.decode_as(Header, content).profile
+            elif opcode == Opcode.METADATA:
+                metadata = _mcap.decode_as(Metadata, content)
+                if metadata.name == SEGMENT_METADATA:
+                    return _checked_head(metadata, base), at
+    except BadRecord:
+        if profile == _mcap.PROFILE:
+            raise
     if profile == _mcap.PROFILE:
         raise BadRecord("it ends before the segment's metadata")
     return None
