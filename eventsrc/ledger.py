@@ -71,6 +71,12 @@ def ledger_of(
     return fold_ledger(reader.read(start), ledger, now_ns)
 
 
+def unread_events(reader: LogReader) -> int:
+    """How many events `ledger_of` would have to read."""
+    saved = _ledger_cache.load(reader)
+    return reader.next_offset - (0 if saved is None else saved.next_offset)
+
+
 def save_ledger(path: Path, log_id: str, next_offset: int, ledger: GapLedger) -> None:
     """Save the ledger of the first ``next_offset`` events of the log at ``path``, as a cache.
 
@@ -92,7 +98,10 @@ def fold_ledger(events: Iterable[Event], ledger: GapLedger, now_ns: int) -> GapL
 
 
 def _take_loss(ledger: GapLedger, payload: bytes) -> None:
-    loss = Loss.model_validate_json(payload)
+    try:
+        loss = Loss.model_validate_json(payload)
+    except ValidationError:
+        return  # of a later version; what it says was lost is still seen in the keyframes
     if loss.cause == "keyframe_gap" and loss.first is not None and loss.last is not None:
         ledger.mark_reported(Gap(loss.publisher, loss.first, loss.last))
 

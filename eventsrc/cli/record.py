@@ -3,20 +3,25 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
 from eventsrc._zenoh import check_keys, open_session
 from eventsrc.endpoints import parse_address
-from eventsrc.ledger import ledger_of
+from eventsrc.errors import LogDamaged
+from eventsrc.ledger import ledger_of, unread_events
 from eventsrc.log import LogReader, LogWriter, parse_fsync
+from eventsrc.losses import GapLedger
 from eventsrc.recorder import DEFAULT_KEYS, DEFAULT_QUEUE_SIZE, Recorder, RecorderReport
 
 from ._recorder_line import EVERY_S, watching
 from ._shell import emit, finish, say
 from ._signals import stop_on_signals
 from ._zenoh_options import ConfigOption, ConnectOption, ListenOption, zenoh_options
+
+_MANY: Final = 100_000
+"""Events that take seconds to read; below it nobody notices."""
 
 
 def record(
@@ -63,10 +68,8 @@ def record(
         open_session(options, mode=options.mode) as session,
         LogWriter(log, fsync=policy) as writer,
     ):
-        with LogReader(log) as reader:
-            ledger = ledger_of(reader)
         recorder = Recorder(
-            session, writer, keys, queue_size=queue, max_events=max_events, ledger=ledger
+            session, writer, keys, queue_size=queue, max_events=max_events, ledger=_ledger(log)
         )
         with _measured(address, recorder, log), watching(log) as watch:
             named = ", ".join(keys)
@@ -76,6 +79,18 @@ def record(
     if json:
         emit(as_json(report))
     finish(findings=not report.clean)
+
+
+def _ledger(log: Path) -> GapLedger | None:
+    """What the log lacks so far. Damage in an old segment is no reason not to record."""
+    try:
+        with LogReader(log) as reader:
+            if unread_events(reader) >= _MANY:
+                say(f"reading {log} once, to know which keyframes it lacks …")
+            return ledger_of(reader)
+    except LogDamaged as error:
+        say(f"recording all the same, without knowing what the log lacks so far: {error}")
+        return None
 
 
 @contextmanager

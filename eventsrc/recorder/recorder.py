@@ -23,7 +23,7 @@ class Recorder:
 
     Subscribed when the constructor returns: from then on nothing published passes it by. ``ledger``
     is what the log already holds (see `eventsrc.ledger`); without it, a gap between an earlier
-    recorder's last keyframe and this one's first is not seen.
+    recorder's last keyframe and this one's first is not seen, and no ledger is saved.
     """
 
     def __init__(
@@ -42,7 +42,7 @@ class Recorder:
         self._writing = Writing(
             self._inbox,
             writer,
-            GapLedger() if ledger is None else ledger,
+            ledger,
             self._send_ack,
             max_events=max_events,
         )

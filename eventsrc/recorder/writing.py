@@ -48,7 +48,7 @@ class Writing:
         self,
         inbox: Inbox,
         writer: LogWriter,
-        ledger: GapLedger,
+        ledger: GapLedger | None,
         acknowledge: Acknowledge,
         *,
         max_events: int | None,
@@ -56,7 +56,8 @@ class Writing:
     ) -> None:
         self._inbox = inbox
         self._writer = writer
-        self._ledger = ledger
+        self._ledger = GapLedger() if ledger is None else ledger
+        self._saves = ledger is not None  # one that does not know the whole log is not its ledger
         self._acknowledge = acknowledge
         self._room = max_events
         self._losses_every_ns = losses_every_ns
@@ -64,7 +65,7 @@ class Writing:
         self._save_due_ns = time.monotonic_ns() + _SAVE_EVERY_NS
         self._unsynced: deque[tuple[int, _Identity | None]] = deque()
         self._recorded = self._rejected = 0
-        self._missing = self._missing_before = ledger.missing()
+        self._missing = self._missing_before = self._ledger.missing()
 
     def run(self) -> None:
         """Record until the inbox is closed and empty, or there are as many events as asked for.
@@ -151,7 +152,8 @@ class Writing:
 
     def _save(self) -> None:
         next_offset = self._sync()
-        save_ledger(self._writer.path, self._writer.log_id, next_offset, self._ledger)
+        if self._saves:
+            save_ledger(self._writer.path, self._writer.log_id, next_offset, self._ledger)
 
     def _write_losses(self, gaps: list[Gap]) -> None:
         for gap in gaps:

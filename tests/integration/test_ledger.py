@@ -6,7 +6,7 @@ import pytest
 
 from eventsrc._ledger_cache import NAME
 from eventsrc.append import append_payload
-from eventsrc.ledger import fold_ledger, ledger_of, losses_of, save_ledger
+from eventsrc.ledger import fold_ledger, ledger_of, losses_of, save_ledger, unread_events
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.losses import Gap, GapLedger
 from eventsrc.system_events import LOSS_KEY, Loss
@@ -45,6 +45,13 @@ def log(tmp_path: Path) -> Path:
 def _ledger(log: Path) -> GapLedger:
     with LogReader(log) as reader:
         return ledger_of(reader, now_ns=0)
+
+
+def test_how_much_there_is_to_read(log: Path) -> None:
+    with LogReader(log) as reader:
+        assert unread_events(reader) == 12
+        _save(log)
+        assert unread_events(reader) == 5
 
 
 def test_what_a_log_lacks_is_read_from_its_events(log: Path) -> None:

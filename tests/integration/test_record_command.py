@@ -1,6 +1,7 @@
 """`mapfold record` in a process of its own: what it says, how it ends, what it refuses."""
 
 import json
+import random
 import signal
 import threading
 from collections.abc import Callable
@@ -8,8 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from eventsrc._ledger_cache import NAME
 from eventsrc._zenoh import Received, Session
 from eventsrc.acks import Ack, ack_key
+from eventsrc.append import append_payload
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.router import Router
 from tests.envelopes import envelope, payload
@@ -166,3 +169,24 @@ def test_a_place_where_no_log_can_be_is_one_line(
     assert recorder.wait() in (1, 2)
     (line,) = recorder.lines
     assert str(tmp_path / "file") in line
+
+
+def test_rot_in_an_old_segment_does_not_keep_a_robot_from_recording(
+    start: Start, publish: Start, endpoint: str, tmp_path: Path
+) -> None:
+    log = tmp_path / "log"
+    with LogWriter(log) as writer:
+        for k in range(3):
+            noise = random.Random(k).randbytes(20_000).hex()  # so that the middle is a payload
+            append_payload(writer, KEY, payload(envelope(k, note=noise)))
+    (segment,) = log.glob("*.mcap")
+    rotten = bytearray(segment.read_bytes())
+    rotten[len(rotten) // 2] ^= 0xFF
+    segment.write_bytes(rotten)
+    recorder = start("record", str(log), "--connect", endpoint)
+    recorder.wait_for("recording all the same")
+    recorder.wait_for("from offset 3")
+    assert publish(KEY, payload(envelope(3)).decode()).wait() == 0
+    assert recorder.end(signal.SIGINT) == 0
+    assert "1 recorded" in recorder.lines[-1]
+    assert not (log / NAME).exists()
