@@ -26,7 +26,7 @@ AtOption = Annotated[
 JsonOption = Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")]
 AllOption = Annotated[bool, typer.Option("--all", help="Name every thing, however many.")]
 
-MOST_LINES = 10
+MOST_LINES = 5
 """Things of a kind that a text answer names without --all."""
 
 

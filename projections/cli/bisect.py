@@ -3,6 +3,7 @@
 import contextlib
 import sys
 from collections.abc import Iterator
+from textwrap import indent
 from typing import Annotated
 
 import typer
@@ -22,7 +23,7 @@ EXPR compares numbers and ids, joined by and, or, not and parentheses, for examp
 none is no place. It may ask:
 
 \b
-{functions_help()}
+{indent(functions_help(), "    ")}
 """
 
 

@@ -15,14 +15,15 @@ from itertools import islice
 from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 
-from eventsrc.ingest import Accepted, Rejected, ingest
+from eventsrc.ingest import Accepted, Rejected
 from eventsrc.log import Event, LogReader
 from eventsrc.system_events import is_system_key
+from eventsrc.upcast import read_envelope
 from projections.deltas import Delta
 from projections.errors import FoldError
 from projections.evaluate.truth import Truth
 from projections.exact import Units, unit_vectors
-from projections.folding import AHEAD
+from projections.folding import AHEAD, no_cycle_search
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 from projections.view import MapView
@@ -72,10 +73,11 @@ def fold_several(
     folds = [_Fold(each) for each in settings]
     with LogReader(log) as reader:
         events = reader.read(0, end)
-        while chunk := list(islice(events, AHEAD)):
-            _fold_chunk(chunk, folds)
-            if progress is not None:
-                progress(chunk[-1].offset + 1, end)
+        with no_cycle_search():
+            while chunk := list(islice(events, AHEAD)):
+                _fold_chunk(chunk, folds)
+                if progress is not None:
+                    progress(chunk[-1].offset + 1, end)
     return [fold.outcome(truth) for fold in folds]
 
 
@@ -122,7 +124,7 @@ def _read(event: Event) -> Accepted | None:
     """The envelope in an event, None in one of mapfold's own."""
     if is_system_key(event.key):
         return None
-    accepted = ingest(event.payload, max_bytes=sys.maxsize)
+    accepted = read_envelope(event, max_bytes=sys.maxsize)
     if isinstance(accepted, Rejected):
         raise FoldError(event.offset, accepted.reason)
     return accepted

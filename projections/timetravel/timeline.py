@@ -11,9 +11,16 @@ from typing import TypeAlias
 from eventsrc.log import LogReader
 from projections.digest import map_digest
 from projections.errors import WhenceError
-from projections.folding import AHEAD, FoldedEvent, fold_events
+from projections.folding import (
+    AHEAD,
+    FoldedEvent,
+    fold_events,
+    fold_log_cached,
+    no_cycle_search,
+)
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
+from projections.snapshot import SnapshotCache
 from projections.view import MapView
 
 from .causes import Cause
@@ -38,14 +45,24 @@ _PROGRESS_EVERY = 500
 
 
 class Timeline:
-    """A context manager over a log; questions at an ``end``: the map after that many events."""
+    """A context manager over a log; questions at an ``end``: the map after that many events.
+
+    ``progress`` is told while events are folded, ``note`` of snapshots that could not be used.
+    """
 
     def __init__(
-        self, log: Path, settings: Settings | None = None, *, progress: Progress | None = None
+        self,
+        log: Path,
+        settings: Settings | None = None,
+        *,
+        progress: Progress | None = None,
+        note: Callable[[str], None] = lambda _: None,
     ) -> None:
         self.settings = settings or Settings()
         self.reader = LogReader(log)
         self._progress = progress
+        self._note = note
+        self._asked_before = False
         self._map = SemanticMap(self.settings)
         self._latest = MapView(self.settings, keep_embeddings=False)
         self._history = History(self.settings)
@@ -69,25 +86,27 @@ class Timeline:
     @property
     def history(self) -> History:
         """What happened so far; folds what is not folded yet. Raises FoldError at a bad event."""
-        start, end = self._history.next_offset, self.end
-        if start < end:
+        if self._history.next_offset < self.end:
             self._tallies = None
-            events = self.reader.read(start, end)
-            for folded in fold_events(events, self._map, ahead=AHEAD):
-                self._latest.apply_event(folded.offset, folded.deltas)
-                self._history.apply(folded.offset, folded.deltas)
-                if self._progress and folded.offset % _PROGRESS_EVERY == 0:
-                    self._progress(folded.offset, end)
-            if self._progress:
-                self._progress(end, end)
+            with no_cycle_search():
+                self._fold_to(self.end)
         return self._history
 
     def at(self, end: int | None = None) -> MapView:
         """The map after the first ``end`` events, all of them for None; yours to change.
 
-        Its observations carry no embeddings, only their checksums.
+        Its observations carry no embeddings, only their checksums. The first time it is taken from
+        the nearest snapshot beside the log, if there is one; who asks again gets the history
+        folded, and from then on it is a look-up.
         """
-        return view_at(self.history, self._latest, self._end(end), self.settings)
+        wanted = self._end(end)
+        if self._history.next_offset < wanted and not self._asked_before:
+            self._asked_before = True
+            if (view := self._from_snapshot(wanted)) is not None:
+                return view
+        history = self.history
+        with no_cycle_search():
+            return view_at(history, self._latest, wanted, self.settings)
 
     def deltas(self, start: int = 0, end: int | None = None) -> Iterator[FoldedEvent]:
         """What each event from ``start`` to before ``end`` changed, by a fold of its own."""
@@ -162,6 +181,23 @@ class Timeline:
                 f"give 0 to {self.end}"
             )
         return end
+
+    def _fold_to(self, end: int) -> None:
+        events = self.reader.read(self._history.next_offset, end)
+        for folded in fold_events(events, self._map, ahead=AHEAD):
+            self._latest.apply_event(folded.offset, folded.deltas)
+            self._history.apply(folded.offset, folded.deltas)
+            if self._progress and folded.offset % _PROGRESS_EVERY == 0:
+                self._progress(folded.offset, end)
+        if self._progress:
+            self._progress(end, end)
+
+    def _from_snapshot(self, end: int) -> MapView | None:
+        """The map at ``end`` from the nearest snapshot; None when there is none below."""
+        cache = SnapshotCache(self.reader.path, self.reader.log_id, self.settings, self._note)
+        if not any(offset <= end for offset in cache.offsets()):
+            return None
+        return fold_log_cached(self.reader, self.settings, end, note=self._note)[1]
 
     def _check_names(self, expression: Expression, facts: HistoryFacts) -> None:
         """A misspelt id would make any condition quietly false; say so instead."""

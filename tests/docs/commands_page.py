@@ -50,7 +50,8 @@ def _section(name: str, command: Any) -> str:
     arguments = [p for p in command.params if p.param_type_name == "argument"]
     options = [p for p in command.params if p.param_type_name == "option" and p.name != "help"]
     usage = " ".join([name, *map(_usage, arguments), *(["[OPTIONS]"] if options else [])])
-    lines = [f"## {name}", "", inspect.cleandoc(command.help), "", f"    {usage}", ""]
+    said = inspect.cleandoc(command.help).replace("\b\n", "")  # a mark to click: do not wrap
+    lines = [f"## {name}", "", said, "", f"    {usage}", ""]
     rows = [f"| `{_name(p)}` | {_cell(p.help)} |" for p in arguments]
     rows += [f"| `{_flags(p)}` | {_cell(p.help)} |" for p in options]
     if rows:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from projections.timetravel.difference import Difference, object_shift_m, place_shift_m
 from projections.timetravel.rows import ObjectRow, PlaceRow
+from projections.timetravel.story import counted
 
 from .table import shortened
 
@@ -25,9 +26,10 @@ def _lines(diff: Difference, most: int | None) -> Iterator[str]:
         return
     yield f"from {diff.start:,} to {diff.end:,}: digest {first[:16]} → {second[:16]}"
     yield f"keyframes  {_keyframes(diff)}"
-    for title, summary, details in (_places(diff), _objects(diff), _edges(diff)):
+    for title, summary, groups in (_places(diff), _objects(diff), _edges(diff)):
         yield f"{title:<11}{summary}"
-        yield from (f"  {line}" for line in shortened(details, most, HINT))
+        for group in groups:
+            yield from (f"  {line}" for line in shortened(group, most, HINT))
 
 
 def _keyframes(diff: Difference) -> str:
@@ -47,17 +49,19 @@ def _parts(parts: Sequence[tuple[int, str]]) -> str:
     return ", ".join(f"{count:,} {what}" for count, what in parts if count) or "unchanged"
 
 
-def _places(diff: Difference) -> tuple[str, str, list[str]]:
+def _places(diff: Difference) -> tuple[str, str, list[list[str]]]:
     found = diff.places
     parts = [
         (len(found.came), "formed"),
         (len(found.went), "gone"),
         (len(found.changed), "changed"),
     ]
-    lines = [f"+ {_place(row)}" for row in found.came]
-    lines += [f"- {row.place_id}{_into(diff, row)}" for row in found.went]
-    lines += [f"~ {_place_change(before, after)}" for before, after in found.changed]
-    return "places", _parts(parts), lines
+    groups = [
+        [f"+ {_place(row)}" for row in found.came],
+        [f"- {row.place_id}{_into(diff, row)}" for row in found.went],
+        [f"~ {_place_change(before, after)}" for before, after in found.changed],
+    ]
+    return "places", _parts(parts), groups
 
 
 def _place(row: PlaceRow) -> str:
@@ -105,7 +109,7 @@ class _ObjectChange:
         return parts[0] + " " + ", ".join(parts[1:])
 
 
-def _objects(diff: Difference) -> tuple[str, str, list[str]]:
+def _objects(diff: Difference) -> tuple[str, str, list[list[str]]]:
     found = diff.objects
     changed = [_ObjectChange(before, after) for before, after in found.changed]
     relocated = [change for change in changed if change.relocated]
@@ -116,20 +120,24 @@ def _objects(diff: Difference) -> tuple[str, str, list[str]]:
         (sum(change.seen > 0 for change in changed), "seen again"),
         (len(relocated), "relocated"),
     ]
-    lines = [f"+ {o.object_id} {o.class_name} in {o.place_id or 'no place'}" for o in found.came]
-    lines += [f"- {o.object_id} {o.class_name}" for o in found.went]
-    lines += [f"> {change.text()}" for change in relocated]
-    lines += [f"~ {change.text()}" for change in others]
-    return "objects", _parts(parts), lines
+    groups = [
+        [f"+ {o.object_id} {o.class_name} in {o.place_id or 'no place'}" for o in found.came],
+        [f"- {o.object_id} {o.class_name}" for o in found.went],
+        [f"> {change.text()}" for change in relocated],
+        [f"~ {change.text()}" for change in others],
+    ]
+    return "objects", _parts(parts), groups
 
 
-def _edges(diff: Difference) -> tuple[str, str, list[str]]:
+def _edges(diff: Difference) -> tuple[str, str, list[list[str]]]:
     found = diff.edges
     parts = [(len(found.came), "new"), (len(found.went), "gone"), (len(found.changed), "changed")]
-    lines = [f"+ {e.a} – {e.b}: {e.shared_transitions:,} transitions" for e in found.came]
-    lines += [f"- {e.a} – {e.b}" for e in found.went]
-    lines += [
-        f"~ {after.a} – {after.b}: {before.shared_transitions:,} → {after.shared_transitions:,}"
-        for before, after in found.changed
+    groups = [
+        [f"+ {e.a} – {e.b}: {counted(e.shared_transitions, 'transition')}" for e in found.came],
+        [f"- {e.a} – {e.b}" for e in found.went],
+        [
+            f"~ {after.a} – {after.b}: {before.shared_transitions:,} → {after.shared_transitions:,}"
+            for before, after in found.changed
+        ],
     ]
-    return "adjacency", _parts(parts), lines
+    return "adjacency", _parts(parts), groups
