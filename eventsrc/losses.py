@@ -111,6 +111,21 @@ class GapLedger:
                 hole.reported = True
                 self._unreported -= 1
 
+    def missing_reported(self) -> int:
+        """How many of the missing keyframes have been reported."""
+        return sum(
+            hole.last - hole.first + 1
+            for run in self._runs.values()
+            for hole in run.holes
+            if hole.reported
+        )
+
+    def assume(self, gap: Gap, now_ns: int) -> None:
+        """Take the word of a loss event for it, without having seen the keyframes around it."""
+        self.record(gap.run_id, gap.first - 1, now_ns)
+        self.record(gap.run_id, gap.last + 1, now_ns)
+        self.mark_reported(gap)
+
     def due(self, now_ns: int) -> list[Gap]:
         """The gaps to report now: open for the settle time. Each is returned once."""
         if not self._unreported:

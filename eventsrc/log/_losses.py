@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from eventsrc.losses import Gap
+from eventsrc.losses import Gap, GapLedger
 from eventsrc.system_events import LOSS_KEY, Loss, is_system_key
 
 from .event import Event
@@ -20,7 +20,7 @@ class _Identity(BaseModel):
 
 def count_lost(reader: LogReader) -> int:
     """Reads the losses, and everything behind the first gap of keyframes, which may close it."""
-    open_gaps: dict[str, set[int]] = {}
+    ledger = GapLedger()
     others = 0
     for event in _losses_and_what_follows(reader):
         if event.key == LOSS_KEY:
@@ -28,13 +28,12 @@ def count_lost(reader: LogReader) -> int:
             if loss is None:
                 continue
             if loss.cause == "keyframe_gap" and loss.first is not None and loss.last is not None:
-                gap = Gap(loss.publisher, loss.first, loss.last)
-                open_gaps.setdefault(gap.run_id, set()).update(range(gap.first, gap.last + 1))
+                ledger.assume(Gap(loss.publisher, loss.first, loss.last), now_ns=0)
             else:
                 others += loss.count
         else:
-            _close(open_gaps, event)
-    return others + sum(map(len, open_gaps.values()))
+            _close(ledger, event)
+    return others + ledger.missing_reported()
 
 
 def _losses_and_what_follows(reader: LogReader) -> Iterator[Event]:
@@ -53,11 +52,11 @@ def _loss(event: Event) -> Loss | None:
         return None
 
 
-def _close(open_gaps: dict[str, set[int]], event: Event) -> None:
+def _close(ledger: GapLedger, event: Event) -> None:
     if is_system_key(event.key):
         return
     try:
         found = _Identity.model_validate_json(event.payload)
     except (ValidationError, RecursionError):
         return
-    open_gaps.get(found.run_id, set()).discard(found.keyframe_id)
+    ledger.record(found.run_id, found.keyframe_id, now_ns=0)

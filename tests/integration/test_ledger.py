@@ -7,7 +7,7 @@ import pytest
 from eventsrc._ledger_cache import NAME
 from eventsrc.append import append_payload
 from eventsrc.ledger import fold_ledger, ledger_of, losses_of, save_ledger, unread_events
-from eventsrc.log import LogReader, LogWriter
+from eventsrc.log import LogReader, LogWriter, log_info
 from eventsrc.losses import Gap, GapLedger
 from eventsrc.system_events import LOSS_KEY, Loss
 from tests.envelopes import detection, envelope, payload
@@ -65,6 +65,16 @@ def test_the_summary_tells_gaps_and_messages_apart(log: Path) -> None:
         losses = losses_of(reader)
     assert losses.missing == 5
     assert (losses.queue_full, losses.transport_missed) == (7, 1)
+
+
+def test_log_info_counts_what_was_reported_less_what_came_late(log: Path) -> None:
+    assert log_info(log).lost == 3 + 7 + 1
+    with LogWriter(log) as writer:
+        for k in (3, 2, 6, 3):
+            append_payload(writer, KEY, payload(envelope(k)))
+        endless = {"publisher": "run-c", "first": 1, "last": 2**62, "count": 2**62}
+        writer.append(LOSS_KEY, _loss(**endless, cause="keyframe_gap"))
+    assert log_info(log).lost == 1 + 7 + 1 + 2**62
 
 
 def _save(log: Path, *, log_id: str | None = None, next_offset: int = SAVED_AT) -> None:

@@ -121,3 +121,14 @@ def test_a_gap_holds_at_least_one_keyframe() -> None:
 def test_a_jump_of_the_whole_range_costs_nothing() -> None:
     ledger = _ledger(-(2**63), 2**63 - 1)
     assert ledger.missing() == 2**64 - 2
+
+
+def test_a_loss_events_word_can_be_taken_for_a_gap() -> None:
+    ledger = GapLedger(SETTLE_NS)
+    ledger.assume(Gap("run-a", 2, 4), now_ns=0)
+    ledger.assume(Gap("run-a", 8, 2**62), now_ns=0)
+    assert ledger.missing_reported() == 3 + 2**62 - 7
+    ledger.record("run-a", 3, 0)
+    ledger.record("run-a", 9, 0)
+    ledger.record("run-b", 9, 0)
+    assert ledger.missing_reported() == 2 + 2**62 - 8
