@@ -1,15 +1,30 @@
 """``mapfold db``: the embedded server, and whether the databases still agree with the log."""
 
+from dataclasses import asdict
 from typing import Annotated
 
 import typer
 
-from eventsrc.cli._shell import emit, say
+from eventsrc.cli._shell import emit, finish, say
 from projections.postgres.embedded import EmbeddedServer
+from projections.runner import rebuild
+from projections.runner.check import CheckReport
+from projections.runner.check import check as check_projections
 
-group = typer.Typer(help="The embedded PostgreSQL server.", no_args_is_help=True)
+from ._options import (
+    DbOption,
+    SetOption,
+    SettingsOption,
+    VectorDbOption,
+    databases,
+    settings_from,
+)
+from .replay import JsonOption, LogArgument, OnlyOption, only_of
 
-JsonOption = Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")]
+group = typer.Typer(
+    help="The embedded PostgreSQL server, and a check of any database against a log.",
+    no_args_is_help=True,
+)
 
 
 def register(app: typer.Typer) -> None:
@@ -54,3 +69,47 @@ def stop(as_json: JsonOption = False) -> None:
         say("another command is using the server; it stops when that command ends")
     else:
         say("stopped")
+
+
+@group.command()
+def check(
+    log: LogArgument,
+    only: OnlyOption = None,
+    repair: Annotated[
+        bool, typer.Option("--repair", help="Rebuild what differs, up to the same offset.")
+    ] = False,
+    db: DbOption = None,
+    vector_db: VectorDbOption = None,
+    assignments: SetOption = None,
+    settings_file: SettingsOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Prove the databases equal to LOG at their checkpoints, row by row; exit 3 if they are not."""
+    settings = settings_from(settings_file, assignments)
+    with databases(db, vector_db) as targets:
+        reports = check_projections(log, targets, settings, only=only_of(only))
+        wrong = [report for report in reports if report.differing]
+        for report in wrong if repair else ():
+            rebuild(log, targets, settings, until=report.next_offset, only=report.sink)
+    if as_json:
+        emit({"sinks": [asdict(r) for r in reports], "repaired": repair and bool(wrong)})
+    else:
+        _tell(reports)
+        if wrong:
+            say("rebuilt" if repair else f"to mend it run: mapfold db check --repair {log}")
+    finish(findings=bool(wrong))
+
+
+def _tell(reports: list[CheckReport]) -> None:
+    for report in reports:
+        typer.echo(
+            f"{report.sink}: {report.rows} rows at offset {report.next_offset},"
+            f" {report.differing} differ"
+        )
+        for difference in report.differences:
+            typer.echo(
+                f"  {difference.kind} {difference.table} {difference.id}:"
+                f" expected {difference.expected}, found {difference.found}"
+            )
+        if report.differing > len(report.differences):
+            typer.echo(f"  and {report.differing - len(report.differences)} more")

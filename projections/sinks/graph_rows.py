@@ -7,7 +7,7 @@ only *which* is remembered; what they say is read from the view when the rows ar
 thousand changes of one Object in a batch are one row.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -156,6 +156,29 @@ class GraphRows:
             self._placed.update(view.all_places[place].unordered_members)
 
 
+def expected_rows(view: MapView, label: Label) -> Iterator[Row]:
+    """Every row of a label that the map has, by graphid: what a table must hold, streamed."""
+    keyframes, observations = range(len(view.keyframes)), range(len(view.observations))
+    posed = (k for k in keyframes if view.keyframes[k].pose)
+    fused = (o for o in observations if view.observations[o].object is not None)
+    rows: dict[Label, Callable[[], Iterable[Row]]] = {
+        "Run": lambda: (_run(view, r) for r in range(len(view.runs))),
+        "Keyframe": lambda: (_keyframe(view, k) for k in keyframes),
+        "Pose": lambda: (_pose(view, k) for k in posed),
+        "Observation": lambda: (_observation(view, o) for o in observations),
+        "Object": lambda: (_object(view, o) for o in range(len(view.objects))),
+        "Place": lambda: (_place(view, p) for p in sorted(view.places)),
+        "HAS_KEYFRAME": lambda: (_has_keyframe(view, k) for k in keyframes),
+        "HAS_POSE": lambda: (_has_pose(k) for k in posed),
+        "HAS_OBSERVATION": lambda: (_has_observation(view, o) for o in observations),
+        "OBSERVES": lambda: (_observes(view, o) for o in fused),
+        "LOCATED_IN": lambda: _located_in(view, range(len(view.objects))),
+        "IN_PLACE": lambda: _in_place(view, keyframes),
+        "ADJACENT_TO": lambda: _adjacent_to(view, sorted(view.adjacency)),
+    }
+    return iter(rows[label]())
+
+
 def _run(view: MapView, ordinal: int) -> VertexRow:
     run = view.runs[ordinal]
     properties = f'{{"run_id": {text(run.run_id)}, "started_at": {number(run.started_at)}}}'
@@ -233,21 +256,21 @@ def _observes(view: MapView, ordinal: int) -> EdgeRow:
     )
 
 
-def _located_in(view: MapView, objects: list[int]) -> Iterator[EdgeRow]:
+def _located_in(view: MapView, objects: Iterable[int]) -> Iterator[EdgeRow]:
     for o in objects:
         place = view.objects[o].place
         if place is not None:
             yield _BASE["LOCATED_IN"] + o, _BASE["Object"] + o, _BASE["Place"] + place, _NONE
 
 
-def _in_place(view: MapView, keyframes: list[int]) -> Iterator[EdgeRow]:
+def _in_place(view: MapView, keyframes: Iterable[int]) -> Iterator[EdgeRow]:
     for k in keyframes:
         place = view.keyframes[k].place
         if place is not None:
             yield _BASE["IN_PLACE"] + k, _BASE["Keyframe"] + k, _BASE["Place"] + place, _NONE
 
 
-def _adjacent_to(view: MapView, links: list[tuple[int, int]]) -> Iterator[EdgeRow]:
+def _adjacent_to(view: MapView, links: Iterable[tuple[int, int]]) -> Iterator[EdgeRow]:
     base = graphid_base("ADJACENT_TO")
     for a, b in links:
         shared = view.adjacency.get((a, b))

@@ -1,0 +1,209 @@
+"""Prove that the databases hold exactly what the log says, row by row.
+
+Each sink is compared at its own checkpoint, in one read-only snapshot, so that a tail may go on
+writing. Both sides stream in the order of their ids and are merged: nothing is held in memory but
+the map itself. Properties are compared as values with their types, not as text: the server orders
+keys and writes floats in its own way.
+"""
+
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal, TypeAlias
+
+from psycopg import IsolationLevel, sql
+
+from eventsrc.log import Event, LogReader
+from projections.errors import ProjectionMissing
+from projections.postgres.connect import Connection, Targets, connect, database_errors, place
+from projections.settings import Settings
+from projections.sink import Checkpoint, Sink, SinkName
+from projections.sinks import _checkpoint
+from projections.sinks.graph_rows import Row, expected_rows
+from projections.sinks.labels import GRAPH, LABELS, TABLE, VERTEX_LABELS
+from projections.sinks.vector_rows import VectorRow
+from projections.sinks.vectors import VectorSink
+
+from ._fold import LiveFold
+
+Kind: TypeAlias = Literal["missing", "extra", "different"]
+Keyed: TypeAlias = tuple[int, Any]
+"""A row's id and the rest of it, in a form that compares."""
+NAMED: Final = 100
+"""This many differences are named; all are counted."""
+STREAM_ROWS: Final = 2_000
+
+_VECTORS: Final = """
+SELECT det_pk, run_id, det_id, keyframe_id, class_name, confidence, bbox, map_x, map_y, map_yaw,
+       embedding_model, embedding::real[],
+       (extract(epoch FROM ingested_at) * 1000000)::bigint
+FROM public.detection_embeddings ORDER BY det_pk
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """A row that is missing, extra or different; ``id`` is its graphid or det_pk."""
+
+    table: str
+    id: int
+    kind: Kind
+    expected: str | None
+    found: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class CheckReport:
+    """One sink at its checkpoint. ``differences`` names the first of ``differing``."""
+
+    sink: SinkName
+    next_offset: int
+    rows: int
+    differing: int
+    differences: tuple[Difference, ...]
+
+
+def check(
+    log: Path, targets: Targets, settings: Settings, *, only: SinkName | None = None
+) -> list[CheckReport]:
+    """Compare what is there with the fold. Raises ProjectionMissing and ProjectionMismatch."""
+    sinks: tuple[tuple[SinkName, str], ...] = (
+        ("graph", targets.graph_url),
+        ("vectors", targets.vector_url),
+    )
+    return [_check(log, sink, url, settings) for sink, url in sinks if only in (None, sink)]
+
+
+def _check(log: Path, sink: SinkName, url: str, settings: Settings) -> CheckReport:
+    tally = _Tally()
+    with LogReader(log) as reader, connect(url, application="mapfold check") as connection:
+        connection.isolation_level = IsolationLevel.REPEATABLE_READ
+        connection.read_only = True
+        with database_errors(url):
+            checkpoint = _checkpoint.load(connection, sink)
+            if checkpoint is None:
+                raise ProjectionMissing(
+                    f"{place(url)}: no {sink} have been projected there; run: mapfold replay {log}"
+                )
+            advice = f"to make them anew run: mapfold replay {log}"
+            _checkpoint.refuse_other_origin(
+                checkpoint, sink, place(url), reader.log_id, settings, advice
+            )
+            compare = _compare_graph if sink == "graph" else _compare_vectors
+            compare(connection, reader, checkpoint, settings, tally)
+    return CheckReport(
+        sink, checkpoint.next_offset, tally.rows, tally.differing, tuple(tally.differences)
+    )
+
+
+class _Tally:
+    """Merges two streams ordered by id and keeps what differs."""
+
+    def __init__(self) -> None:
+        self.rows = 0
+        self.differing = 0
+        self.differences: list[Difference] = []
+
+    def merge(self, table: str, expected: Iterator[Keyed], found: Iterator[Keyed]) -> None:
+        want, have = next(expected, None), next(found, None)
+        while want is not None or have is not None:
+            self.rows += 1
+            if have is None or (want is not None and want[0] < have[0]):
+                self._differs(table, "missing", want, None)
+                want = next(expected, None)
+            elif want is None or have[0] < want[0]:
+                self._differs(table, "extra", None, have)
+                have = next(found, None)
+            else:
+                if want[1] != have[1]:
+                    self._differs(table, "different", want, have)
+                want, have = next(expected, None), next(found, None)
+
+    def _differs(self, table: str, kind: Kind, want: Keyed | None, have: Keyed | None) -> None:
+        self.differing += 1
+        row = want or have
+        if row is not None and len(self.differences) < NAMED:
+            said = [None if side is None else _shortened(side[1]) for side in (want, have)]
+            self.differences.append(Difference(table, row[0], kind, said[0], said[1]))
+
+
+def _events(
+    connection: Connection, reader: LogReader, checkpoint: Checkpoint, sink: SinkName
+) -> Iterator[tuple[Event, bool]]:
+    """The events of the projection, and whether each was parked."""
+    parked = {letter.offset for letter in _checkpoint.parked(connection, sink)}
+    for event in reader.read(0, checkpoint.next_offset):
+        yield event, event.offset in parked
+
+
+def _compare_graph(
+    connection: Connection,
+    reader: LogReader,
+    checkpoint: Checkpoint,
+    settings: Settings,
+    tally: _Tally,
+) -> None:
+    fold = LiveFold(settings)
+    for _ in _folded(fold, _events(connection, reader, checkpoint, "graph"), []):
+        pass
+    for label in LABELS:
+        columns = ["id"] if label in VERTEX_LABELS else ["id", "start_id", "end_id"]
+        ids = sql.SQL(", ").join(sql.SQL("{}::text").format(sql.Identifier(c)) for c in columns)
+        query = sql.SQL("SELECT {}, properties FROM {} ORDER BY {}.id USING OPERATOR(ag_catalog.<)")
+        table = sql.Identifier(GRAPH, label)
+        with connection.cursor(name="check") as cursor:
+            cursor.itersize = STREAM_ROWS
+            cursor.execute(query.format(ids, table, sql.Identifier(label)))
+            expected = (_graph_row(row) for row in expected_rows(fold.view, label))
+            tally.merge(label, expected, (_graph_row(row) for row in cursor))
+
+
+def _compare_vectors(
+    connection: Connection,
+    reader: LogReader,
+    checkpoint: Checkpoint,
+    settings: Settings,
+    tally: _Tally,
+) -> None:
+    fold, sink = LiveFold(settings), VectorSink()
+    events = _events(connection, reader, checkpoint, "vectors")
+    expected = (
+        _vector_row(row) for _ in _folded(fold, events, [sink]) for row in sink.take(fold.view)
+    )
+    # Binary, so that a float32 arrives as the float32 it is.
+    with connection.cursor(name="check", binary=True) as cursor:
+        cursor.itersize = STREAM_ROWS
+        cursor.execute(_VECTORS)
+        tally.merge(TABLE, expected, ((row[0], row[1:]) for row in cursor))
+
+
+def _folded(
+    fold: LiveFold, events: Iterable[tuple[Event, bool]], sinks: list[Sink[Any]]
+) -> Iterator[None]:
+    for event, parked in events:
+        if parked:
+            fold.skip(event.offset)
+        else:
+            fold.feed(event, sinks)
+        yield
+
+
+def _graph_row(row: Row | tuple[Any, ...]) -> Keyed:
+    *ends, properties = row
+    # Floats as marked text, so that 1.0 is not 1 and -0.0 is not 0.0.
+    values = json.loads(properties, parse_float=lambda text: f"float {float(text)!r}", strict=False)
+    return int(ends[0]), (tuple(map(int, ends[1:])), values)
+
+
+def _vector_row(row: VectorRow) -> Keyed:
+    pose = row.pose or (None, None, None)
+    return row.det_pk, (
+        row.run_id, row.det_id, row.keyframe_id, row.class_name, row.confidence, list(row.bbox),
+        *pose, row.embedding_model, row.embedding.tolist(), row.ingested_us,
+    )  # fmt: skip
+
+
+def _shortened(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 300 else text[:297] + "..."

@@ -1,0 +1,113 @@
+"""`db check` finds every kind of damage, names it, and `--repair` undoes it."""
+
+from pathlib import Path
+
+import psycopg
+import pytest
+
+from projections.errors import ProjectionMismatch, ProjectionMissing
+from projections.postgres.connect import Targets
+from projections.runner import rebuild, tail
+from projections.runner.check import NAMED, check
+from projections.settings import Settings
+from tests.logs import append_raw, bridge, walk, write_log
+
+SETTINGS = Settings()
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    return write_log(tmp_path / "log", walk(80) + list(bridge()) + walk(20, first=80, seed=4))
+
+
+def test_a_sound_projection(log: Path, two_databases: Targets) -> None:
+    rebuild(log, two_databases, SETTINGS, only="vectors", until=90)
+    rebuild(log, two_databases, SETTINGS, only="graph")
+    graph, vectors = check(log, two_databases, SETTINGS)
+    assert (graph.sink, graph.differing, graph.next_offset) == ("graph", 0, 120)
+    assert (vectors.sink, vectors.differing, vectors.next_offset) == ("vectors", 0, 90)
+    assert graph.rows > 500
+    assert vectors.rows > 30
+
+
+def test_a_parked_event_is_no_difference(log: Path, one_database: Targets) -> None:
+    append_raw(log, b"not an envelope")
+    write_log(log, walk(10, run_id="after"))
+    assert tail(log, one_database, SETTINGS, once=True).parked
+    assert [r.differing for r in check(log, one_database, SETTINGS)] == [0, 0]
+
+
+DAMAGE = {
+    "a vertex gone": (
+        (
+            'DELETE FROM semantic_map."Observation" WHERE id = (SELECT max(id::text)::graphid'
+            ' FROM semantic_map."Observation")'
+        ),
+        [("Observation", "missing")],
+    ),
+    "an edge too many": (
+        (
+            'INSERT INTO semantic_map."ADJACENT_TO" (id, start_id, end_id, properties)'
+            " SELECT _graphid(15, 99), id, id, '{}' FROM semantic_map.\"Place\" LIMIT 1"
+        ),
+        [("ADJACENT_TO", "extra")],
+    ),
+    "an int where a float was": (
+        (
+            'UPDATE semantic_map."Run" SET properties = \'{"run_id": "run-a", "started_at":'
+            " 1774357200}' WHERE id = _graphid(3, 1)"
+        ),
+        [("Run", "different")],
+    ),
+    "an edge to another end": (
+        (
+            'UPDATE semantic_map."OBSERVES" SET end_id = start_id WHERE id = (SELECT max(id::text)'
+            '::graphid FROM semantic_map."OBSERVES")'
+        ),
+        [("OBSERVES", "different")],
+    ),
+    "a vector changed": (
+        "UPDATE detection_embeddings SET embedding = '[1,0,0,0,0,0,0,0]' WHERE det_pk = 1",
+        [("detection_embeddings", "different")],
+    ),
+    "a name changed": (
+        "UPDATE detection_embeddings SET class_name = class_name || ' ' WHERE det_pk = 1",
+        [("detection_embeddings", "different")],
+    ),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_damage_is_named_and_repaired(
+    log: Path, one_database: Targets, pg: psycopg.Connection, damage: str
+) -> None:
+    rebuild(log, one_database, SETTINGS)
+    statement, expected = DAMAGE[damage]
+    assert pg.execute(statement).rowcount == 1  # type: ignore[arg-type]
+    reports = check(log, one_database, SETTINGS)
+    found = [(d.table, d.kind) for report in reports for d in report.differences]
+    assert found == expected
+    for report in reports:
+        if report.differing:
+            rebuild(log, one_database, SETTINGS, until=report.next_offset, only=report.sink)
+    assert [r.differing for r in check(log, one_database, SETTINGS)] == [0, 0]
+
+
+def test_all_differences_are_counted_though_not_all_are_named(
+    log: Path, one_database: Targets, pg: psycopg.Connection
+) -> None:
+    rebuild(log, one_database, SETTINGS)
+    gone = pg.execute('DELETE FROM semantic_map."HAS_KEYFRAME"').rowcount
+    (graph,) = check(log, one_database, SETTINGS, only="graph")
+    assert graph.differing == gone > NAMED
+    assert len(graph.differences) == NAMED
+
+
+def test_what_cannot_be_compared_is_refused(
+    log: Path, tmp_path: Path, one_database: Targets
+) -> None:
+    with pytest.raises(ProjectionMissing, match="mapfold replay"):
+        check(log, one_database, SETTINGS)
+    rebuild(log, one_database, SETTINGS)
+    with pytest.raises(ProjectionMismatch, match="min_samples=3 there, 2 here"):
+        check(log, one_database, SETTINGS.with_assignments(["min_samples=2"]))
