@@ -7,6 +7,7 @@ the ``mapfold/rejected`` channel.
 
 import binascii
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,6 +89,8 @@ def _det_ids(envelope: Envelope) -> tuple[DetId, ...]:
         else default_det_id(envelope.run_id, envelope.keyframe_id, index)
         for index, d in enumerate(envelope.detections)
     )
+    if len(set(ids)) == len(ids):
+        return ids
     seen: set[DetId] = set()
     for index, det_id in enumerate(ids):
         if det_id in seen:
@@ -100,23 +103,29 @@ def _det_ids(envelope: Envelope) -> tuple[DetId, ...]:
 
 def _vectors(envelope: Envelope) -> tuple[Vector | None, ...]:
     detections = envelope.detections
-    raws = [_raw(index, d) for index, d in enumerate(detections) if d.embedding is not None]
-    if not raws:
-        return (None,) * len(detections)
-    if len(raws) == len(detections) and len({*map(len, raws)}) == 1:  # as a rule: check all at once
-        matrix = np.frombuffer(b"".join(raws), dtype="<f4").reshape(len(raws), -1)
-        largest = np.abs(matrix).max(axis=1).tolist()
-        if all(0.0 < value < math.inf for value in largest):
-            return tuple(matrix)
-    rest = iter(raws)
-    return tuple(
-        None if d.embedding is None else _vector(index, next(rest))
-        for index, d in enumerate(detections)
+    return _vectors_of_one_kind(detections) or tuple(
+        None if d.embedding is None else _vector(index, d) for index, d in enumerate(detections)
     )
 
 
-def _raw(index: int, detection: Detection) -> bytes:
-    """The bytes of an embedding, as many as its dimension says."""
+def _vectors_of_one_kind(detections: Sequence[Detection]) -> tuple[Vector, ...] | None:
+    """All vectors at once if there is nothing odd about them, as a rule; None to look closer."""
+    try:
+        raws = [pybase64.b64decode(d.embedding, validate=True) for d in detections]  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        return None
+    dims = {d.embedding_dim for d in detections}
+    sizes = {*map(len, raws)}
+    if None in dims or len(dims) != 1 or sizes != {4 * dim for dim in dims if dim}:
+        return None
+    matrix = np.frombuffer(b"".join(raws), dtype="<f4").reshape(len(raws), -1)
+    largest: list[float] = np.abs(matrix).max(axis=1).tolist()
+    if 0.0 in largest or not sum(largest) < math.inf:  # a NaN or infinity is in the sum as well
+        return None
+    return tuple(matrix)
+
+
+def _vector(index: int, detection: Detection) -> Vector:
     place = f"detections.{index}.embedding"
     raw = _base64(place, detection.embedding or "")
     dim = detection.embedding_dim
@@ -126,23 +135,6 @@ def _raw(index: int, detection: Detection) -> bytes:
         raise _RefusalError(
             f"{place}: {len(raw)} bytes do not match embedding_dim {dim}, which takes {4 * dim}"
         )
-    return raw
-
-
-def _base64(place: str, text: str) -> bytes:
-    try:
-        return pybase64.b64decode(text, validate=True)  # seven times as quick as binascii
-    except (binascii.Error, ValueError):
-        pass
-    try:
-        return binascii.a2b_base64(text, strict_mode=True)  # … which can say what is wrong
-    except (binascii.Error, ValueError) as error:
-        raise _RefusalError(f"{place}: not base64: {error}") from None
-
-
-def _vector(index: int, raw: bytes) -> Vector:
-    """One vector that the quick check for all did not pass."""
-    place = f"detections.{index}.embedding"
     vector = np.frombuffer(raw, dtype="<f4")
     largest = float(np.abs(vector).max())
     if not np.isfinite(largest):
@@ -150,3 +142,10 @@ def _vector(index: int, raw: bytes) -> Vector:
     if largest == 0.0:
         raise _RefusalError(f"{place}: is the zero vector, which has no direction")
     return vector
+
+
+def _base64(place: str, text: str) -> bytes:
+    try:
+        return binascii.a2b_base64(text, strict_mode=True)  # slower, but says what is wrong
+    except (binascii.Error, ValueError) as error:
+        raise _RefusalError(f"{place}: not base64: {error}") from None

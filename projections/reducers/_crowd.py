@@ -70,13 +70,14 @@ class Crowd:
         self.y = array("q")
         self._cells: dict[tuple[int, int], Cell] = {}
         self._counts: dict[int, int] = {}
+        self._newest: Cell | None = None  # where the last point went
 
     def insert(self, x_um: int, y_um: int, yaw_rad: float) -> list[int]:  # noqa: ARG002
         """Add a point; the indices of the points that became core by it, ascending."""
         point = len(self.x)
         self.x.append(x_um)
         self.y.append(y_um)
-        cell = self._cell(x_um, y_um)
+        cell = self._newest = self._cell(x_um, y_um)
         cell.points.append(point)
         fresh = self._count_near(cell, x_um, y_um)
         if cell.is_dense:
@@ -99,7 +100,7 @@ class Crowd:
 
         A robot at home meets this at almost every keyframe.
         """
-        cell = self._cell(self.x[point], self.y[point])
+        cell = self._home(point)
         if cell.apart or cell.core in (point, -1) or cell.loose:
             return None
         for near in cell.near:
@@ -122,7 +123,7 @@ class Crowd:
         first and as None: there every point is a neighbour. For the others, ask `reach`. Cells
         that `unite` has declared one cluster with the own cell are left out.
         """
-        cell = self._cell(self.x[point], self.y[point])
+        cell = self._home(point)
         around: list[tuple[int, Cell | None]] = [(cell.core, None)] if cell.core >= 0 else []
         if cell.apart:
             around += [(near.core, near) for near in cell.apart if near.core >= 0]
@@ -131,7 +132,7 @@ class Crowd:
     def unite(self, point: int, cell: Cell) -> None:
         """Never mention ``cell`` again around the core point's cell: both are one cluster for good,
         and whoever finds the one finds the other."""
-        own = self._cell(self.x[point], self.y[point])
+        own = self._home(point)
         if cell in own.apart:
             own.apart.remove(cell)
 
@@ -146,7 +147,7 @@ class Crowd:
 
     def loose_around(self, point: int) -> list[int]:
         """The points within ε that are not core, without the point itself."""
-        cell = self._cell(self.x[point], self.y[point])
+        cell = self._home(point)
         around = [other for other in cell.loose if other != point]
         for near in cell.near:
             if near.loose:
@@ -181,6 +182,12 @@ class Crowd:
             cell.is_dense = len(cell.points) >= self._min_samples
         for point in state["sparse_cores"].tolist():
             self._cell(self.x[point], self.y[point]).cores.append(point)
+
+    def _home(self, point: int) -> Cell:
+        """The point's own cell; nearly always it is the newcomer's that is asked for."""
+        if point == len(self.x) - 1 and self._newest is not None:
+            return self._newest
+        return self._cell(self.x[point], self.y[point])
 
     def _cell(self, x_um: int, y_um: int) -> Cell:
         key = x_um // self._side, y_um // self._side
@@ -259,10 +266,12 @@ class Crowd:
         Exact in int64: neighbours' cells bound both differences by 3·side, so the sum of squares
         is below 9·ε² ≤ 9·10¹⁸ for the largest ε that settings allow.
         """
+        count = 0
         if len(cell.points) < _FEW:
             x, y, eps2 = self.x, self.y, self._eps2
-            return sum((x[p] - x_um) ** 2 + (y[p] - y_um) ** 2 <= eps2 for p in cell.points)
-        count = 0
+            for point in cell.points:
+                count += (x[point] - x_um) ** 2 + (y[point] - y_um) ** 2 <= eps2
+            return count
         for start in range(0, len(cell.points), _SCAN):
             points = np.array(cell.points[start : start + _SCAN])
             dx = np.frombuffer(self.x, np.int64)[points] - x_um

@@ -65,7 +65,7 @@ def peer() -> None:
     seconds, ours = fold_places(points)
     job = {"points": points, "eps": EPS_UM, "min_samples": LEAST}
     done = subprocess.run(
-        [".venv-bench/bin/python", "scripts/fold_bench/peer.py"],
+        [".venv/bench-peer/bin/python", "scripts/fold_bench/peer.py"],
         input=json.dumps(job),
         capture_output=True,
         text=True,
