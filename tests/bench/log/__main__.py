@@ -1,0 +1,132 @@
+"""Every claim about the log's speed, measured side by side in one run.
+
+python -m tests.bench.log [--quick] [--seconds S] [--rate N] [--folder DIR] [NAME…]
+names: record read latency
+"""
+
+import argparse
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from eventsrc.log import ALWAYS, GROUP_COMMIT, LogReader, LogWriter
+
+from .latency import latency
+from .payloads import KEY, Payloads
+from .plain import append_plain, read_mcap
+from .recording import record
+
+
+@contextmanager
+def fresh(folder: Path, name: str) -> Iterator[Path]:
+    """A path for a log or a file that is gone afterwards."""
+    path = folder / name
+    yield path
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def say(what: str, value: str, wanted: str) -> None:
+    """One line of the result."""
+    print(f"{what:<58} {value:>18}   {wanted}", flush=True)
+
+
+def bench_record(folder: Path, seconds: float, rate: float) -> None:
+    """Through Zenoh, without it, and a bare loop before and after."""
+    payloads = Payloads()
+    with fresh(folder, "plain") as path:
+        before = append_plain(path, payloads, min(seconds, 5))
+    with fresh(folder, "recorded") as path:
+        done = record(path, GROUP_COMMIT, rate, seconds)
+    with fresh(folder, "plain") as path:
+        after = append_plain(path, payloads, min(seconds, 5))
+    with fresh(folder, "appended") as path:
+        appended = append_log(path, payloads, min(seconds, 5))
+    plain = (before + after) / 2
+    recorded = f"{done.recorded_per_s:,.0f}/s"
+    say(f"recorded through a router for {seconds:.0f} s", recorded, "≥ 8,000/s")
+    say("  published and not recorded", f"{done.lost} of {done.published}", "0")
+    say("  bare file loop / recording", f"{plain / done.recorded_per_s:.2f}", "≤ 4")
+    say("  bare file loop", f"{before:,.0f} {after:,.0f}/s", "")
+    say("  bare file loop / LogWriter alone", f"{plain / appended:.2f}", "")
+
+
+def append_log(path: Path, payloads: Payloads, seconds: float) -> float:
+    """The log's writer by itself, sealing included: events a second."""
+    start = time.perf_counter()
+    count = 0
+    with LogWriter(path) as writer:
+        while time.perf_counter() - start < seconds:
+            writer.append(KEY, payloads[count])
+            count += 1
+    return count / (time.perf_counter() - start)
+
+
+def bench_read(folder: Path, events: int) -> None:
+    """A long log of small events, then a shorter one of 9 kB events."""
+    for detections, count in ((0, events), (3, events // 20)):
+        payloads = Payloads(detections)
+        with fresh(folder, "long") as path:
+            with LogWriter(path, fsync=GROUP_COMMIT) as writer:
+                for number in range(count):
+                    writer.append(KEY, payloads[number])
+            size = len(payloads[0])
+            _read(path, f"{count:,} events of {size:,} bytes")
+
+
+def _read(path: Path, what: str) -> None:
+    start = time.perf_counter()
+    with LogReader(path) as reader:
+        last = list(reader.read(reader.next_offset - 10))
+    ms = (time.perf_counter() - start) * 1e3
+    assert len(last) == 10
+    say(f"{what}: open, read the last ten", f"{ms:.1f} ms", "≤ 300 ms")
+    bare = read_mcap(path)
+    start = time.perf_counter()
+    with LogReader(path) as reader:
+        count = sum(1 for _ in reader.read())
+    ours = count / (time.perf_counter() - start)
+    bare = (bare + read_mcap(path)) / 2
+    say(f"{what}: read all", f"{ours:,.0f}/s", "")
+    say("  ours / mcap's stream reader (which checks no CRC)", f"{ours / bare:.2f}", "≥ 0.6")
+
+
+def bench_latency(folder: Path, seconds: float) -> None:
+    """From publish to a tail in another process, 200 events a second."""
+    for name, policy, wanted in (
+        ("group commit", GROUP_COMMIT, "p50 ≤ 60, p99 ≤ 150"),
+        ("--fsync always", ALWAYS, ""),
+    ):
+        with fresh(folder, "tailed") as path:
+            found = latency(path, policy, seconds)
+        value = f"{found.p50:.1f} {found.p99:.1f} {found.worst:.1f} ms"
+        say(f"publish to tail, {name}: p50 p99 worst", value, wanted)
+
+
+def main() -> None:
+    """All, or those named."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("names", nargs="*", default=["record", "read", "latency"])
+    parser.add_argument("--quick", action="store_true", help="a tenth of everything")
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--rate", type=float, default=8500.0)
+    parser.add_argument("--folder", type=Path, help="on the disk to measure; default: /tmp")
+    args = parser.parse_args()
+    part = 0.1 if args.quick else 1.0
+    with tempfile.TemporaryDirectory(dir=args.folder) as name:
+        folder = Path(name)
+        if "record" in args.names:
+            bench_record(folder, args.seconds * part, args.rate)
+        if "read" in args.names:
+            bench_read(folder, int(1_000_000 * part))
+        if "latency" in args.names:
+            bench_latency(folder, args.seconds * part / 2)
+
+
+if __name__ == "__main__":
+    main()
