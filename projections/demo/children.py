@@ -48,6 +48,16 @@ class Children:
             pause.wait(_POLL_S)
         self._check()
 
+    def wait_said(self, name: str, text: str, timeout_s: float) -> None:
+        """Wait until the process ``name`` has said ``text``; raises as `wait` does."""
+        deadline = time.monotonic() + timeout_s
+        pause = threading.Event()
+        while text not in self._said[name].read_text("utf-8", "replace"):
+            self._check()
+            if time.monotonic() > deadline:
+                raise MapfoldError(f"mapfold {name} did not begin within {timeout_s:g} s")
+            pause.wait(_POLL_S)
+
     def _check(self) -> None:
         for name, process in self._running.items():
             code = process.poll()

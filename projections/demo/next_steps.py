@@ -22,7 +22,7 @@ def commands(
     """Lines to paste; comments say what for."""
     if shutil.which(MAPFOLD) is None:
         activate = Path(sys.prefix) / "bin" / "activate"
-        yield f"   . {_quoted(_near(activate))}"
+        yield f"   . {_quoted(_near(activate))}    # puts mapfold on the path"
     if db is None:
         yield f"   export MAPFOLD_HOME={_quoted(folder.path)}    # where the databases are"
     else:

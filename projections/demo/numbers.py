@@ -1,6 +1,6 @@
 """The demo's numbers as one JSON document. Lengths in metres, times in seconds."""
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from projections.runner import RebuildReport
@@ -8,41 +8,51 @@ from projections.settings import Settings
 
 from .asking import Asked, Lost
 from .folder import DemoFolder
+from .following import Followed
 from .mapping import Folded
 from .recording import Recorded
 
 
-def document(
-    seed: int,
-    settings: Settings,
-    recorded: Recorded,
-    folded: Folded,
-    replayed: RebuildReport,
-    lost: Lost,
-    seconds: dict[str, float],
-    folder: DemoFolder,
-) -> dict[str, Any]:
-    """What ``mapfold demo --json`` prints."""
-    counts = folded.view.counts()
+@dataclass(frozen=True, slots=True)
+class Played:
+    """What the stages brought. ``same_rows``: the replay wrote the rows that the tail had."""
+
+    seed: int
+    settings: Settings
+    recorded: Recorded
+    followed: Followed
+    replayed: RebuildReport
+    same_rows: bool
+    folded: Folded
+    lost: Lost
+
+
+def document(played: Played, seconds: dict[str, float], folder: DemoFolder) -> dict[str, Any]:
+    """What ``mapfold demo --json`` prints; ``seconds`` by stage."""
+    view, replayed = played.folded.view, played.replayed
+    counts = view.counts()
     return {
-        "seed": seed,
-        "settings": settings.model_dump(),
-        "record": asdict(recorded),
+        "seed": played.seed,
+        "settings": played.settings.model_dump(),
+        "record": asdict(played.recorded),
+        "tail": asdict(played.followed),
+        "replay": {
+            "rows": replayed.rows,
+            "same_rows_as_tail": played.same_rows,
+            "digest": replayed.digest,
+            "seconds": replayed.total_s,
+        },
         "map": {
             "keyframes": counts["keyframes"],
             "places": counts["places"],
             "objects": counts["objects"],
             "adjacent_pairs": counts["adjacency"],
-            "transitions": sum(count for _, _, count in folded.view.edges()),
-            "digest": folded.digest,
+            "transitions": sum(count for _, _, count in view.edges()),
+            "digest": played.folded.digest,
+            "fold_seconds": played.folded.seconds,
         },
-        "merges": [asdict(merge) for merge in folded.merges],
-        "replay": {
-            "rows": replayed.rows,
-            "digest": replayed.digest,
-            "seconds": replayed.total_s,
-        },
-        "relocalize": _lost(lost),
+        "merges": [asdict(merge) for merge in played.folded.merges],
+        "relocalize": _lost(played.lost),
         "seconds": {**seconds, "total": sum(seconds.values())},
         "files": {
             "folder": str(folder.path),

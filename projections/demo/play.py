@@ -21,9 +21,10 @@ from projections.settings import Settings
 from . import story
 from .asking import ask_lost, rooms_of
 from .folder import DemoFolder, fresh_folder
+from .following import fingerprint
 from .mapping import fold_with_rooms, most_telling, places_with
 from .next_steps import commands
-from .numbers import document
+from .numbers import Played, document
 from .recording import record_run
 
 SETTINGS: Final = Settings(eps_m=0.75, min_samples=8)
@@ -56,15 +57,18 @@ def run_demo(options: DemoOptions, tell: Tell) -> dict[str, Any]:
     rooms = len(house.plan.rooms)
     with contextlib.ExitStack() as stack:
         with clock.stage("Run A explores the house and is recorded"):
-            recorded = record_run(explorer, options.seed, folder, options.speed)
-            clock.tell(story.tell_recording(recorded, detections, rooms, options.speed))
-        with clock.stage("The log is replayed into the databases"):
             targets = stack.enter_context(_databases(folder, options))
+            recorded, followed = record_run(explorer, options.speed, folder, targets, SETTINGS)
+            clock.tell(story.tell_recording(recorded, followed, detections, rooms, options.speed))
+        with clock.stage("The databases are thrown away and the log is replayed"):
+            before = fingerprint(targets)
             replayed = rebuild(folder.log, targets, SETTINGS)
+            same_rows = fingerprint(targets) == before
             folded = fold_with_rooms(folder, SETTINGS, explorer)
+            clock.tell(story.tell_replay(replayed, folded, same_rows))
+        with clock.stage("The map"):
             default_places = places_with(folder, Settings())
-            clock.tell(story.tell_map(folded, replayed, Settings(), default_places))
-        with clock.stage("How two places became one"):
+            clock.tell(story.tell_map(folded, Settings(), default_places))
             clock.tell(story.tell_merges(folded.merges))
         with clock.stage("Run B is lost and asks"):
             lost = ask_lost(targets, lost_run, folder)
@@ -81,7 +85,11 @@ def run_demo(options: DemoOptions, tell: Tell) -> dict[str, Any]:
         clock.tell([f"   {folder.map}"])
     tell(f"{clock.total:.1f} s in all. Go on with it:")
     clock.tell(commands(folder, most_telling(folded.merges), options.db, options.vector_db))
-    return document(options.seed, SETTINGS, recorded, folded, replayed, lost, clock.seconds, folder)
+    return document(
+        Played(options.seed, SETTINGS, recorded, followed, replayed, same_rows, folded, lost),
+        clock.seconds,
+        folder,
+    )
 
 
 class _Stages:

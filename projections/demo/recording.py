@@ -1,4 +1,7 @@
-"""Run A explores the house: one process drives and publishes, another records, a router between."""
+"""Run A explores the house: one process drives, another records, a router between them.
+
+Meanwhile a tail in this process writes what is recorded into the databases.
+"""
 
 import time
 from dataclasses import dataclass
@@ -9,9 +12,12 @@ from eventsrc.log import LogReader, log_info
 from eventsrc.router import Router
 from eventsrc.sim import SimulatedRun
 from eventsrc.system_events import is_system_key
+from projections.postgres.connect import Targets
+from projections.settings import Settings
 
 from .children import Children
 from .folder import DemoFolder
+from .following import Followed, Follower
 
 _ANY_PORT: Final = ZenohOptions(listen=("tcp/127.0.0.1:0",))
 _PATIENCE_S: Final = 40.0
@@ -35,8 +41,14 @@ class Recorded:
     seconds: float
 
 
-def record_run(run: SimulatedRun, seed: int, folder: DemoFolder, speed: float) -> Recorded:
-    """Have run A of house ``seed`` published and recorded into the folder's log."""
+def record_run(
+    run: SimulatedRun,
+    speed: float,
+    folder: DemoFolder,
+    targets: Targets,
+    settings: Settings,
+) -> tuple[Recorded, Followed]:
+    """Have run A published, recorded into the folder's log, and followed into the databases."""
     started = time.monotonic()
     count = len(run.envelopes)
     drive_s = run.true_poses[-1].time_s
@@ -47,17 +59,21 @@ def record_run(run: SimulatedRun, seed: int, folder: DemoFolder, speed: float) -
             ("record", str(folder.log), *connect, "--max-events", str(count)),
             folder.said("record"),
         )
-        children.start(
-            "simulate",
-            ("simulate", "--seed", str(seed), "--run", "a", "--speed", str(speed), *connect),
-            folder.said("simulate"),
-        )
-        children.wait(_PATIENCE_S + drive_s / speed)
+        children.wait_said("record", "recording", _PATIENCE_S)
+        with Follower(folder.log, targets, settings) as follower:
+            seed = str(run.house.seed)
+            children.start(
+                "simulate",
+                ("simulate", "--seed", seed, "--run", "a", "--speed", str(speed), *connect),
+                folder.said("simulate"),
+            )
+            children.wait(_PATIENCE_S + drive_s / speed)
+            followed = follower.caught_up(count)
     seconds = time.monotonic() - started
     info = log_info(folder.log)
     with LogReader(folder.log) as reader:
         payloads = [event.payload for event in reader.read() if not is_system_key(event.key)]
-    return Recorded(
+    recorded = Recorded(
         run_id=run.run_id,
         published=count,
         recorded=len(payloads),
@@ -68,3 +84,4 @@ def record_run(run: SimulatedRun, seed: int, folder: DemoFolder, speed: float) -
         log_bytes=info.size_bytes,
         seconds=seconds,
     )
+    return recorded, followed

@@ -8,12 +8,15 @@ from projections.settings import Settings
 from projections.sinks.labels import EDGE_LABELS, TABLE, VERTEX_LABELS
 
 from .asking import NEAR_M, Asked, Lost
+from .following import Followed
 from .mapping import Folded, MergeMoment, Part, most_telling
 from .recording import Recorded
 
 
-def tell_recording(recorded: Recorded, detections: int, rooms: int, speed: float) -> Iterator[str]:
-    """How run A got into the log."""
+def tell_recording(
+    recorded: Recorded, followed: Followed, detections: int, rooms: int, speed: float
+) -> Iterator[str]:
+    """How run A got into the log, and from there into the databases."""
     kept = "byte for byte" if recorded.intact else "NOT byte for byte"
     yield (
         f"   {recorded.run_id} drove {recorded.drive_seconds:.0f} s through {rooms} rooms, played "
@@ -27,16 +30,36 @@ def tell_recording(recorded: Recorded, detections: int, rooms: int, speed: float
         f"   {kept}; {recorded.rejected} rejected, {recorded.lost} lost, "
         f"{recorded.log_bytes / 1e6:.1f} MB"
     )
+    yield (
+        f"   a tail wrote them to Apache AGE and pgvector as they came, in {followed.batches} "
+        f"transactions:"
+    )
+    yield (
+        f"   {1000 * followed.median_delay_s:.0f} ms (median) after it was recorded an event could "
+        f"be queried, after {1000 * followed.worst_delay_s:.0f} ms at worst"
+    )
 
 
-def tell_map(
-    folded: Folded, replayed: RebuildReport, other_settings: Settings, other_places: int
-) -> Iterator[str]:
+def tell_replay(replayed: RebuildReport, folded: Folded, same_rows: bool) -> Iterator[str]:
+    """That the databases are disposable."""
+    nodes = sum(replayed.rows[label] for label in VERTEX_LABELS)
+    edges = sum(replayed.rows[label] for label in EDGE_LABELS)
+    rows = "the same rows as" if same_rows else "OTHER rows than"
+    yield (
+        f"   all made anew from the log in {replayed.total_s:.2f} s: {nodes} nodes, {edges} edges, "
+        f"{replayed.rows[TABLE]} vectors;"
+    )
+    digest = "the same digest" if replayed.digest == folded.digest else "ANOTHER digest"
+    yield (
+        f"   {rows} the tail wrote, and {digest} as a fold without a database: "
+        f"{folded.digest[:16]}…"
+    )
+
+
+def tell_map(folded: Folded, other_settings: Settings, other_places: int) -> Iterator[str]:
     """What the log became, and honestly with which settings."""
     counts, settings = folded.view.counts(), folded.view.settings
     transitions = sum(count for _, _, count in folded.view.edges())
-    nodes = sum(replayed.rows[label] for label in VERTEX_LABELS)
-    edges = sum(replayed.rows[label] for label in EDGE_LABELS)
     yield (
         f"   {counts['places']} places from {counts['keyframes']} keyframes ({counts['noise']} in "
         f"none), {counts['objects']} objects from {counts['observations']} observations,"
@@ -49,15 +72,6 @@ def tell_map(
         f"   (the default, {other_settings.eps_m:g} m and {other_settings.min_samples}, chains "
         f"this drive into {_count(other_places, 'place')})"
     )
-    yield (
-        f"   written in {replayed.total_s:.2f} s: {nodes} nodes and {edges} edges in Apache AGE, "
-        f"{replayed.rows[TABLE]} vectors in pgvector"
-    )
-    same = "the same digest" if replayed.digest == folded.digest else "ANOTHER digest"
-    yield (
-        f"   folded once more, without a database, in {folded.seconds:.2f} s: {same}, "
-        f"{folded.digest[:16]}…"
-    )
 
 
 def tell_merges(merges: tuple[MergeMoment, ...]) -> Iterator[str]:
@@ -67,18 +81,17 @@ def tell_merges(merges: tuple[MergeMoment, ...]) -> Iterator[str]:
         yield "   no two places became one on this drive"
         return
     parts = " and ".join(map(_part, (merge.survivor, *merge.absorbed)))
+    more = f"; {len(merges)} such moments on this drive" if len(merges) > 1 else ""
     after = merge.places_before - len(merge.absorbed)
+    yield f"   and how two places became one: {parts}"
     yield (
-        f"   keyframe {merge.keyframe_id}, event {merge.offset} of the log, taken in the "
-        f"{merge.bridge_room}, bridged"
+        f"   were bridged by keyframe {merge.keyframe_id} in the {merge.bridge_room}, event "
+        f"{merge.offset} of the log, and are {_short(merge.survivor.place_id)} since,"
     )
-    yield f"   {parts}"
     yield (
-        f"   all are {_short(merge.survivor.place_id)} from then on, because it was founded first: "
-        f"{_count(merge.places_before, 'place')} before, {after} after"
+        f"   because it was founded first ({_count(merge.places_before, 'place')} before, "
+        f"{after} after{more})"
     )
-    if len(merges) > 1:
-        yield f"   ({len(merges)} such moments on this drive, all on the picture)"
 
 
 def tell_lost(lost: Lost, rooms: dict[str, str]) -> Iterator[str]:

@@ -82,6 +82,14 @@ def test_the_map_it_tells_of_is_the_fold_of_the_log(played: Played) -> None:
     assert rows["ADJACENT_TO"] == counts["ADJACENT_TO"]
 
 
+def test_the_tail_kept_up_and_the_replay_wrote_the_same_rows(played: Played) -> None:
+    tail = played.numbers["tail"]
+    assert tail["events"] == played.numbers["record"]["recorded"]
+    assert 1 <= tail["batches"] <= tail["events"]
+    assert 0 < tail["median_delay_s"] <= tail["worst_delay_s"] < 10
+    assert played.numbers["replay"]["same_rows_as_tail"] is True
+
+
 def test_the_merges_are_where_the_number_of_places_falls(played: Played) -> None:
     settings = settings_from(played.out / "settings.json", None)
     assert played.numbers["merges"]

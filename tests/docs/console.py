@@ -24,11 +24,15 @@ from urllib.parse import quote
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 HOME_OF_DOCS: Final = "/home/you/mapfold"
+_DEMO: Final = """#!/usr/bin/env bash
+PATH=/usr/bin:/bin exec .venv/bin/python -m projections.cli demo "$@"
+"""
 _MARK: Final = "@@ command ended with"
 _TIMEOUT_S: Final = 240
 _VARYING: Final = (
     (re.compile(r"\b\d+(\.\d+)? (s|ms)\b(?! (of driving|through))"), "<time>"),
     (re.compile(r"\b[\d,]+ events/s"), "<rate>"),
+    (re.compile(r"\b\d+ transactions\b"), "<count> transactions"),
     (re.compile(r"\b[0-9a-f]{32}\b"), "<log id>"),
     (re.compile(r"(?<=logged    ).*"), "<time> to <time>"),
 )
@@ -104,13 +108,14 @@ def matches(says: list[str], printed: list[str]) -> bool:
 
 
 def _furnish(folder: Path) -> None:
-    """The sample log, and a scripts/demo that leaves out making the virtual environment."""
+    """The sample log, and a scripts/demo that finds its virtual environment made already."""
     (folder / "logs").mkdir()
     (folder / "logs" / "sample").symlink_to(ROOT / "logs" / "sample")
     (folder / "scripts").mkdir()
     demo = folder / "scripts" / "demo"
-    demo.write_text('#!/usr/bin/env bash\nexec mapfold demo "$@"\n', "utf-8")
+    demo.write_text(_DEMO, "utf-8")
     demo.chmod(0o755)
+    (folder / ".venv").symlink_to(sys.prefix)
 
 
 def _environment() -> dict[str, str]:
