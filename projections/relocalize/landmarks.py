@@ -127,7 +127,7 @@ def _evidence(poses: Floats, x: float, y: float, similarity: Floats, model: Mode
     seen_from = np.arctan2(poses[:, 1] - y, poses[:, 0] - x)
     apart = np.cos(directions[:, None] - seen_from[None])
     expected = model.floor + model.side * np.exp(model.kappa * (apart - 1.0))
-    error = similarity[None] - expected
+    error = np.minimum(similarity, model.usual_best)[None] - expected
     mean = error.mean(1)
     count = min(float(len(similarity)), model.independent)
     scatter = ((error - mean[:, None]) ** 2).mean(1) * (count / model.sigma_observation**2)
@@ -135,6 +135,8 @@ def _evidence(poses: Floats, x: float, y: float, similarity: Floats, model: Mode
     offset = np.where(mean > 0, np.minimum(offset, model.too_similar), offset)
     degrees = min(len(similarity) - 1.0, model.independent)
     table: Floats = np.minimum(-0.5 * (scatter - 0.5 * degrees + offset), 1.5)
+    if float(similarity.max()) > model.usual_best + model.same_crop:
+        table = table + model.same_crop_worth
     return table
 
 

@@ -25,8 +25,15 @@ class Model:
     """Observations of one object err alike: more than this many count no more."""
     too_similar: float = 3.0
     """A crop *more* like an object than expected is penalised no further than this χ²."""
-    usual_best: float = 0.878
-    """Above this the question's session is the map's own: all its cosines are shifted down."""
+    usual_best: float = 0.885
+    """No observation counts as more similar than this."""
+    same_crop: float = 0.04
+    """Beyond that by this much, the crop is the very one in the map …"""
+    same_crop_worth: float = 15.0
+    """… which decides between look-alikes."""
+    usual_third: float = 0.875
+    """A third best match above this tells that the question's session is the map's own: then all
+    cosines are higher, and are shifted down."""
     relevant: float = 0.72
     """Less similar observations show another model and are not looked at."""
     unknown_price: float = 7.0

@@ -40,14 +40,22 @@ def sightings(
     crops: Sequence[Crop], matches: Sequence[Sequence[Match]], camera: Camera, model: Model
 ) -> tuple[Sighting, ...]:
     """Sightings of the crops that have a relevant match with a pose; maybe none."""
-    best = max((m.similarity for row in matches for m in row), default=0.0)
-    shift = max(0.0, best - model.usual_best)
+    shift = _session_shift(matches, model)
     found = []
     for crop, row in zip(crops, matches, strict=True):
         relevant = [m for m in row if m.pose is not None and m.similarity - shift > model.relevant]
         if relevant:
             found.append(_sighting(crop, relevant, shift, camera, model))
     return tuple(found)
+
+
+def _session_shift(matches: Sequence[Sequence[Match]], model: Model) -> float:
+    """By how much all cosines are higher than usual, as they are within one session.
+
+    The third best match tells, not the best: a crop that *is* in the map says nothing about others.
+    """
+    third = [row[min(2, len(row) - 1)].similarity for row in matches if row]
+    return max(0.0, max(third, default=0.0) - model.usual_third)
 
 
 def _sighting(

@@ -16,31 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from projections.evaluate.calibration import auroc, expected_calibration_error
-from projections.exact import quantise, to_float32
-from projections.reducers.semantic_map import SemanticMap
-from projections.relocalize import Camera, Crop, ExactIndex
+from projections.relocalize import Camera, ExactIndex
 from projections.relocalize.confidence import WEIGHTS, features
 from projections.relocalize.model import MODEL
 from projections.relocalize.rank import weigh
-from projections.settings import Settings
-from projections.view import MapView
 from tests.relocalization.buildings import Building, Keyframe
 from tests.relocalization.drives import drive
+from tests.relocalization.rooms import crops_of, fold
 
 FITTED, HELD_OUT = range(6), range(6, 8)
 WITHIN_M = 1.5
 RIDGE = 0.1
 Row = tuple[tuple[float, ...], bool, bool]
 """Features, whether the answer was right, whether the question was known."""
-
-
-def fold(run: Sequence[Keyframe]) -> MapView:
-    """The map of a run."""
-    settings = Settings(eps_m=1.0)
-    semantic_map, view = SemanticMap(settings), MapView(settings)
-    for offset, keyframe in enumerate(run):
-        view.apply_event(offset, semantic_map.fold(offset, keyframe.accepted))
-    return view
 
 
 def runs_of(seed: int) -> tuple[list[Keyframe], list[Keyframe]]:
@@ -73,7 +61,8 @@ def ask(mapped: Sequence[Keyframe], asked: Sequence[Keyframe], step: int) -> lis
 
 
 def _row(index: ExactIndex, instances: set[str], keyframe: Keyframe, drawn: list[int]) -> Row:
-    crops = sorted((_crop(keyframe, i) for i in drawn), key=lambda crop: crop.order)
+    seen = crops_of(keyframe)
+    crops = sorted((seen[i] for i in drawn), key=lambda crop: crop.order)
     known = any(keyframe.instances[i] in instances for i in drawn)
     posterior = weigh(crops, index.search(crops), Camera(), MODEL)
     if posterior is None:
@@ -81,12 +70,6 @@ def _row(index: ExactIndex, instances: set[str], keyframe: Keyframe, drawn: list
     envelope = keyframe.accepted.envelope
     error = math.hypot(posterior.x - (envelope.map_x or 0), posterior.y - (envelope.map_y or 0))
     return features(posterior, len(crops)), known and error <= WITHIN_M, known
-
-
-def _crop(keyframe: Keyframe, index: int) -> Crop:
-    vector, detection = keyframe.accepted.vectors[index], keyframe.accepted.envelope.detections
-    assert vector is not None
-    return Crop(to_float32(quantise(vector)), detection[index].bbox, detection[index].class_name)
 
 
 def fit(x: NDArray[np.float64], y: NDArray[np.bool_]) -> NDArray[np.float64]:

@@ -1,0 +1,121 @@
+"""`mapfold evaluate` on generated runs, and on the shared trial data where it is there."""
+
+import gzip
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from tests.commands import Commands
+from tests.logs import write_log
+from tests.relocalization.buildings import Building, Keyframe
+from tests.relocalization.drives import drive
+
+SHARED = Path(os.environ.get("MAPFOLD_SHARED_DATA", "../shared/data"))
+
+
+@pytest.fixture(scope="module")
+def mapfold(tmp_path_factory: pytest.TempPathFactory) -> Commands:
+    return Commands.in_folder(tmp_path_factory.mktemp("evaluate"))
+
+
+def save(folder: Path, name: str, run: list[Keyframe]) -> tuple[Path, Path]:
+    """A run as log and truth file."""
+    documents = []
+    for keyframe in run:
+        document = keyframe.accepted.envelope.model_dump(by_alias=True)
+        for seen, vector in zip(document["detections"], keyframe.accepted.vectors, strict=True):
+            assert vector is not None
+            seen |= {"embedding_dim": len(vector), "embedding_model": "made"}
+            seen["embedding"] = _base64(vector.tobytes())
+        documents.append(document)
+    truth = folder / f"{name}.truth.jsonl.gz"
+    lines = [
+        {
+            "run_id": d["run_id"],
+            "keyframe_id": d["keyframe_id"],
+            "room": keyframe.room,
+            "instances": keyframe.instances,
+        }
+        for d, keyframe in zip(documents, run, strict=True)
+    ]
+    truth.write_bytes(gzip.compress("\n".join(map(json.dumps, lines)).encode()))
+    return write_log(folder / name, documents), truth
+
+
+def _base64(data: bytes) -> str:
+    import base64
+
+    return base64.b64encode(data).decode()
+
+
+@pytest.fixture(scope="module")
+def runs(mapfold: Commands) -> list[str]:
+    """Arguments: a mapped run, one of the same building, one of another."""
+    building, stranger = Building(31, things=40), Building(32, things=40)
+    arguments = []
+    for flag, name, run in (
+        ("--map", "a", drive(building, "a", 1, 200)),
+        ("--query", "b", drive(building, "b", 2, 80)),
+        ("--query", "x", drive(stranger, "x", 3, 80)),
+    ):
+        log, truth = save(mapfold.folder, name, run)
+        arguments += [flag, str(log), "--truth", str(truth)]
+    return arguments
+
+
+def test_the_scores_have_their_shape_and_sense(mapfold: Commands, runs: list[str]) -> None:
+    picture = mapfold.folder / "fails.png"
+    scores = mapfold("evaluate", *runs, "--json", "--picture", picture).json
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert set(scores["relocalization"]) == {"1", "2", "3"}
+    assert scores["places"]["keyframes"] <= 200
+    assert 0 < scores["objects"]["instances"] <= 40
+    three = scores["relocalization"]["3"]
+    assert 0 < three["known"] < three["questions"]
+    assert three["pose_error_m"]["p50"] < 0.5 * three["centroid_error_m"]["p50"]
+    assert three["auroc"] > 0.9
+
+
+def test_it_is_deterministic_but_for_the_clock(mapfold: Commands, runs: list[str]) -> None:
+    one, other = (mapfold("evaluate", *runs, "--json").json for _ in range(2))
+    for scores in (one, other):
+        for column in scores["relocalization"].values():
+            del column["latency_ms"]
+    assert one == other
+
+
+def test_the_table_and_the_plain_recipe(mapfold: Commands, runs: list[str]) -> None:
+    said = mapfold("evaluate", *runs, "--method", "plain")
+    assert "re-localisation (plain)" in said.out
+    assert "pose error p50" in said.out
+
+
+def test_truth_that_fits_nothing_is_misuse(mapfold: Commands, runs: list[str]) -> None:
+    broken = mapfold.folder / "broken.jsonl"
+    broken.write_text('{"run_id": "a"}\n')
+    said = mapfold("evaluate", *runs[:2], "--query", runs[5], "--truth", broken, code=2)
+    assert "broken.jsonl, line 1" in said.err
+    said = mapfold("evaluate", *runs[:2], "--query", runs[5], code=2)
+    assert "--truth" in said.err
+
+
+@pytest.mark.skipif(
+    not (SHARED / "house" / "house-a.jsonl.gz").exists(),
+    reason=f"the trial data is absent: no {SHARED}/house/house-a.jsonl.gz (MAPFOLD_SHARED_DATA)",
+)
+def test_the_trial_house_is_found_again(mapfold: Commands) -> None:
+    arguments: list[str] = []
+    for flag, run in (("--map", "house-a"), ("--query", "house-c"), ("--query", "home-2")):
+        folder = SHARED / run.split("-")[0]
+        mapfold("import", mapfold.folder / run, (folder / f"{run}.jsonl.gz").resolve())
+        truth = (folder / f"{run}.truth.jsonl.gz").resolve()
+        arguments += [flag, str(mapfold.folder / run), "--truth", str(truth)]
+    scores = mapfold("evaluate", *arguments, "--json").json["relocalization"]
+    assert scores["3"]["pose_error_m"]["p50"] <= 0.6
+    assert scores["3"]["pose_error_m"]["p90"] <= 2.5
+    assert scores["1"]["pose_error_m"]["p50"] <= 1.0
+    assert scores["3"]["auroc"] >= 0.95
+    assert scores["3"]["known_called_unknown"] <= 0.05
+    assert all(scores[n]["ece"] <= 0.08 for n in "123")

@@ -1,0 +1,167 @@
+"""Asking the databases gives what exact search in the folded map gives, in one database or two."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import psycopg
+import pytest
+
+from eventsrc.log import LogReader
+from projections.errors import ProjectionMissing, QuestionError
+from projections.folding import fold_log
+from projections.postgres.connect import Targets
+from projections.queries.relocalize import Reader, relocalize
+from projections.relocalize import Candidates, Crop, ExactIndex, rank, read_crops
+from projections.runner import rebuild
+from projections.settings import Settings
+from projections.view import MapView
+from tests.commands import Commands
+from tests.envelopes import detection
+from tests.logs import walk, write_log
+
+SETTINGS = Settings()
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    return write_log(tmp_path / "log", walk(60, seed=3))
+
+
+@pytest.fixture
+def view(log: Path) -> MapView:
+    with LogReader(log) as reader:
+        return fold_log(reader, SETTINGS)[1]
+
+
+@pytest.fixture(params=["one_database", "two_databases"])
+def targets(request: pytest.FixtureRequest, log: Path) -> Targets:
+    found: Targets = request.getfixturevalue(request.param)
+    rebuild(log, found, SETTINGS)
+    return found
+
+
+def questions() -> Iterator[tuple[Crop, ...]]:
+    for document in walk(12, seed=9, run_id="run-b"):
+        if document["detections"]:
+            yield read_crops(document)
+
+
+def found(candidates: Candidates) -> list[list[tuple[object, ...]]]:
+    return [
+        [
+            (m.det_id, m.pose, m.class_name, m.object_id, m.object_place, m.keyframe_place)
+            for m in sorted(row, key=lambda m: m.observation)
+        ]
+        for row in candidates.matches
+    ]
+
+
+def test_candidates_are_those_of_exact_search(targets: Targets, view: MapView) -> None:
+    index = ExactIndex(view)
+    with Reader(targets) as reader:
+        asked = 0
+        for crops in questions():
+            live, exact = reader.candidates(crops, 200), index.search(crops, 200)
+            assert found(live) == found(exact)
+            places = {m.object_place for row in live.matches for m in row} - {None}
+            assert all(live.places[p] == exact.places[p] for p in places if p is not None)
+            for ours, theirs in zip(live.matches, exact.matches, strict=True):
+                assert [m.similarity for m in ours] == pytest.approx(
+                    [m.similarity for m in theirs], abs=1e-5
+                )
+            asked += 1
+        assert asked > 5
+
+
+def test_the_library_call_answers(targets: Targets, view: MapView) -> None:
+    index = ExactIndex(view)
+    for crops in questions():
+        live, exact = relocalize(targets, crops), rank(crops, index.search(crops))
+        assert [p.place_id for p in live.places] == [p.place_id for p in exact.places]
+        assert live.confidence == pytest.approx(exact.confidence, abs=0.02)
+
+
+def test_another_embedding_space_is_refused(targets: Targets) -> None:
+    with pytest.raises(QuestionError, match="dimensions"):
+        relocalize(targets, read_crops([detection("cup", [1.0, 0.0, 0.0])]))
+    other = detection("cup", [1.0] * 8, embedding_model="another/model")
+    with pytest.raises(QuestionError, match="another/model"):
+        relocalize(targets, read_crops([other]))
+
+
+def test_an_empty_database_says_what_to_do(one_database: Targets) -> None:
+    with pytest.raises(ProjectionMissing, match="mapfold replay"):
+        relocalize(one_database, read_crops([detection("cup", [1.0] * 8)]))
+
+
+def test_two_round_trips_at_most(targets: Targets, monkeypatch: pytest.MonkeyPatch) -> None:
+    sent = 0
+    execute = psycopg.Connection.execute
+
+    def counted(*args: object, **kwargs: object) -> object:
+        nonlocal sent
+        sent += 1
+        return execute(*args, **kwargs)  # type: ignore[arg-type]
+
+    crops = next(questions())
+    with Reader(targets) as reader:
+        monkeypatch.setattr(psycopg.Connection, "execute", counted)
+        reader.candidates(crops)
+    assert sent == (1 if targets.one_database else 2)
+
+
+class TestCommand:
+    """`mapfold relocalize` as a person runs it."""
+
+    @pytest.fixture
+    def mapfold(self, tmp_path: Path) -> Commands:
+        return Commands.in_folder(tmp_path)
+
+    @pytest.fixture
+    def question(self, tmp_path: Path) -> Path:
+        file = tmp_path / "question.json"
+        seen = next(d for d in walk(12, seed=9) if d["detections"])
+        file.write_text(json.dumps(seen))
+        return file
+
+    def test_as_of_asks_the_log_alone(self, mapfold: Commands, log: Path, question: Path) -> None:
+        said = mapfold("relocalize", question, "--log", log, "--as-of", "end", "--json")
+        answer = said.json
+        assert set(answer) >= {"places", "pose", "confidence"}
+        assert set(answer["places"][0]) == {
+            "place_id",
+            "score",
+            "centroid_x",
+            "centroid_y",
+            "evidence",
+        }
+        evidence = answer["places"][0]["evidence"][0]
+        assert set(evidence) == {"det_id", "object_id", "class_name", "similarity"}
+        assert set(answer["pose"]) == {"x", "y", "yaw", "spread_m"}
+        nothing = mapfold("relocalize", question, "--log", log, "--as-of", "0", "--json").json
+        assert nothing["places"] == []
+        assert nothing["pose"] is None
+        assert nothing["confidence"] == 0.0
+
+    def test_plain_and_text(self, mapfold: Commands, log: Path, question: Path) -> None:
+        said = mapfold("relocalize", question, "--log", log, "--as-of", "end", "--method", "plain")
+        assert "run-a_p" in said.out
+
+    @pytest.mark.parametrize(
+        ("arguments", "said"),
+        [
+            (["--as-of", "end"], "--log"),
+            (["--method", "magic"], "joint and plain"),
+            (["--image", "big"], "--image"),
+            (["--hfov", "0"], "field of view"),
+            (["--as-of", "end", "--log", "nowhere"], "nowhere"),
+        ],
+        ids=lambda value: str(value)[:30],
+    )
+    def test_misuse_is_one_line(
+        self, mapfold: Commands, question: Path, arguments: list[str], said: str
+    ) -> None:
+        refused = mapfold("relocalize", question, *arguments, code=2)
+        assert said in refused.err
+        assert len(refused.err.strip().splitlines()) == 1

@@ -1,0 +1,60 @@
+"""Scores against scikit-learn's and against counting pairs by hand."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from sklearn import metrics
+
+from projections.evaluate.calibration import auroc, expected_calibration_error, percentile
+from projections.evaluate.clustering import agreement
+
+LABELS = st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4)), max_size=40)
+SCORES = st.lists(st.sampled_from([0.0, 0.1, 0.25, 0.5, 0.75, 1.0]), max_size=15)
+
+
+@given(LABELS)
+def test_agreement_is_sklearns(pairs: list[tuple[int, int]]) -> None:
+    classes, clusters = [a for a, _ in pairs], [b for _, b in pairs]
+    ours = agreement(classes, clusters)
+    h, c, v = metrics.homogeneity_completeness_v_measure(classes, clusters)
+    assert (ours.homogeneity, ours.completeness) == pytest.approx((h, c), abs=1e-9)
+    assert ours.v_measure == pytest.approx(v, abs=1e-9)
+    if pairs:
+        rand = metrics.adjusted_rand_score(classes, clusters)
+        assert ours.adjusted_rand == pytest.approx(rand, abs=1e-9)
+
+
+@given(LABELS, st.randoms())
+def test_agreement_knows_no_order(pairs: list[tuple[int, int]], random: object) -> None:
+    shuffled = list(pairs)
+    random.shuffle(shuffled)  # type: ignore[attr-defined]
+    one, other = (agreement([a for a, _ in p], [b for _, b in p]) for p in (pairs, shuffled))
+    assert one == other
+
+
+@given(SCORES, SCORES)
+def test_auroc_is_the_share_of_pairs_in_order(known: list[float], unknown: list[float]) -> None:
+    value = auroc(known, unknown)
+    if not known or not unknown:
+        assert value is None
+        return
+    pairs = [(k > u) + 0.5 * (k == u) for k in known for u in unknown]
+    assert value == pytest.approx(sum(pairs) / len(pairs))
+
+
+def test_calibration_error_is_the_weighted_gap() -> None:
+    confidence = [0.95, 0.95, 0.15, 0.15]
+    assert expected_calibration_error(confidence, [True, False, False, False]) == pytest.approx(
+        (2 * 0.45 + 2 * 0.15) / 4
+    )
+    assert expected_calibration_error([1.0], [True]) == 0.0
+    assert expected_calibration_error([], []) == 0.0
+
+
+def test_percentiles_interpolate() -> None:
+    assert percentile([3.0, 1.0, 2.0], 0.5) == 2.0
+    assert percentile([1.0, 2.0], 0.9) == pytest.approx(1.9)
+    assert percentile([], 0.5) is None
+    assert not math.isnan(percentile([5.0], 0.99) or 0.0)

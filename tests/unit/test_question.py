@@ -1,0 +1,70 @@
+"""What a question may look like, and how a bad one is refused."""
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+from projections.errors import QuestionError
+from projections.relocalize import parse_question, read_crops
+from projections.relocalize.crops import MAX_CROPS
+from tests.envelopes import MODEL, detection, embedding, envelope
+
+VECTOR = [3.0, 4.0, 0.0]
+
+
+def test_an_envelope_its_detections_and_crops_are_the_same_question() -> None:
+    seen = [detection("cup", VECTOR, det_id="d0"), detection("chair", [0.0, 1.0, 0.0])]
+    asked = [read_crops(q) for q in (envelope(1, detections=seen), seen, {"crops": seen})]
+    for crops in asked:
+        assert [c.class_name for c in crops] == ["cup", "chair"]
+        assert crops[0].bbox == (120.0, 80.0, 250.0, 310.0)
+        assert crops[0].det_id == "d0"
+        assert crops[0].model == MODEL
+        np.testing.assert_allclose(crops[0].vector, [0.6, 0.8, 0.0], atol=1e-6)
+
+
+def test_a_crop_may_be_nothing_but_numbers() -> None:
+    (crop,) = parse_question(json.dumps({"crops": [{"embedding": [0, 2.5]}]}))
+    assert crop.vector.tolist() == [0.0, 1.0]
+    assert (crop.bbox, crop.class_name, crop.det_id, crop.model) == (None, None, None, None)
+
+
+def test_crops_without_an_embedding_are_left_out() -> None:
+    crops = read_crops([detection("cup"), detection("chair", VECTOR)])
+    assert [c.class_name for c in crops] == ["chair"]
+
+
+NAN = embedding([float("nan"), 1.0])
+
+
+@pytest.mark.parametrize(
+    ("question", "said"),
+    [
+        (b"\xff", "not JSON"),
+        (b"[" * 100_000, "not JSON"),
+        ({}, "neither an envelope"),
+        ("text", "neither an envelope"),
+        ([], "none of the 0 crops"),
+        ([detection("cup")], "none of the 1 crops"),
+        ([{"embedding": "###"}], "crops.0.embedding: not base64"),
+        ([{"embedding": "AAA="}], "2 bytes are no row"),
+        ([{"embedding": []}], "is empty"),
+        ([{"embedding": [0.0, 0.0]}], "only zeros"),
+        ([NAN], "NaN"),
+        ([{"embedding": [1e300]}], "NaN or infinity"),
+        ([{"embedding": [1.0], "embedding_dim": 2}], "embedding_dim says 2"),
+        ([{"embedding": [1.0], "bbox": [1, 2]}], "crops.0.bbox"),
+        ([7], "crops.0"),
+        ([{"embedding": [1.0]}, {"embedding": [1.0, 2.0]}], "mixes embedding spaces (1, 2)"),
+        ([{"embedding": [1.0]}] * (MAX_CROPS + 1), f"more than {MAX_CROPS}"),
+    ],
+    ids=lambda value: str(value)[:40],
+)
+def test_a_bad_question_is_refused_with_its_reason(question: Any, said: str) -> None:
+    payload = question if isinstance(question, bytes) else json.dumps(question)
+    with pytest.raises(QuestionError, match=r".") as refused:
+        parse_question(payload)
+    assert said in str(refused.value)
+    assert "\n" not in str(refused.value)
