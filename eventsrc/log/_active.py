@@ -12,6 +12,7 @@ A commit that fails leaves the file at the last good byte, and the segment refus
 
 import os
 import time
+import zlib
 from pathlib import Path
 
 from eventsrc.errors import LogError
@@ -141,17 +142,20 @@ class ActiveSegment:
         self._check()
         if not self.waiting:
             return
-        body = b"".join(self._definitions + self._parts)
-        chunk = _mcap.encode_chunk(body, self._first_ns, self._last_ns, compress=False)
+        lead, body = b"".join(self._definitions), b"".join(self._parts)
+        size = len(lead) + len(body)
+        crc = zlib.crc32(body, zlib.crc32(lead))
+        head = _mcap.encode_plain_chunk_head(size, crc, self._first_ns, self._last_ns)
         mark = _mcap.encode_mark(self.committed, self.next_offset)
         try:
-            write_all(self._fd, chunk)
+            write_all(self._fd, head + lead)
+            write_all(self._fd, body)  # not joined to its head: it is megabytes
             if self._policy.syncs:
                 sync_file(self._fd)
             write_all(self._fd, mark)
         except OSError as error:
             raise self._fail(error) from error
-        self.size += len(chunk) + len(mark)
+        self.size += len(head) + size + len(mark)
         self.committed = self.next_offset
         self._definitions.clear()
         self._used.clear()

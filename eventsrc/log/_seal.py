@@ -159,7 +159,7 @@ class _Builder:
     def _write_chunk(
         self, body: bytes, first_ns: int, last_ns: int, entries: dict[int, list[int]]
     ) -> None:
-        chunk = _mcap.encode_chunk(body, first_ns, last_ns, compress=True)
+        chunk = _mcap.encode_chunk(body, first_ns, last_ns)
         start = self._at
         self._write(chunk)
         indexes_at = self._at
