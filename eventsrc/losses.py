@@ -17,6 +17,7 @@ A ledger is folded over a log from its start (or from a saved one) when a record
 hole between two recorders' lives is found like any other.
 """
 
+import heapq
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -44,27 +45,32 @@ class Gap:
         return self.last - self.first + 1
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class _Hole:
+    run_id: str
     first: int
     last: int
     since_ns: int
     reported: bool = False
+    closed: bool = False
+
+    @property
+    def count(self) -> int:
+        return self.last - self.first + 1
 
 
 @dataclass(slots=True)
 class _Run:
     """What is recorded of one run: ``first`` to ``last`` but for the holes, which are in order."""
 
+    run_id: str
     first: int
     last: int
     holes: list[_Hole] = field(default_factory=list)
 
-    def index_of_hole(self, keyframe_id: int) -> int | None:
-        index = bisect_right(self.holes, keyframe_id, key=lambda hole: hole.first) - 1
-        if index >= 0 and keyframe_id <= self.holes[index].last:
-            return index
-        return None
+    def holes_before(self, keyframe_id: int) -> int:
+        """How many holes begin at or before ``keyframe_id``."""
+        return bisect_right(self.holes, keyframe_id, key=lambda hole: hole.first)
 
 
 class RunState(NamedTuple):
@@ -82,7 +88,11 @@ class GapLedger:
     def __init__(self, settle_ns: int = DEFAULT_SETTLE_NS) -> None:
         self._settle_ns = settle_ns
         self._runs: dict[str, _Run] = {}
-        self._unreported = 0
+        # Holes to report, oldest first: (since_ns, a number that makes it unique, hole).
+        self._young: list[tuple[int, int, _Hole]] = []
+        self._opened = 0
+        self.missing = 0
+        """How many keyframes are missing now."""
         self.duplicates = 0
         """Keyframes recorded more than once."""
 
@@ -90,7 +100,7 @@ class GapLedger:
         """Take in one recorded keyframe. ``now_ns`` is when a hole it opens began to be open."""
         run = self._runs.get(run_id)
         if run is None:
-            self._runs[run_id] = _Run(keyframe_id, keyframe_id)
+            self._runs[run_id] = _Run(run_id, keyframe_id, keyframe_id)
         elif keyframe_id == run.last + 1:
             run.last = keyframe_id
         elif keyframe_id > run.last:
@@ -106,19 +116,10 @@ class GapLedger:
     def mark_reported(self, gap: Gap) -> None:
         """The log says that ``gap`` was reported: what is left of it will not be reported again."""
         run = self._runs.get(gap.run_id)
-        for hole in run.holes if run is not None else ():
-            if gap.first <= hole.first and hole.last <= gap.last and not hole.reported:
-                hole.reported = True
-                self._unreported -= 1
-
-    def missing_reported(self) -> int:
-        """How many of the missing keyframes have been reported."""
-        return sum(
-            hole.last - hole.first + 1
-            for run in self._runs.values()
-            for hole in run.holes
-            if hole.reported
-        )
+        index = run.holes_before(gap.first - 1) if run is not None else 0
+        while run is not None and index < len(run.holes) and run.holes[index].last <= gap.last:
+            run.holes[index].reported = True
+            index += 1
 
     def assume(self, gap: Gap, now_ns: int) -> None:
         """Take the word of a loss event for it, without having seen the keyframes around it."""
@@ -128,8 +129,6 @@ class GapLedger:
 
     def due(self, now_ns: int) -> list[Gap]:
         """The gaps to report now: open for the settle time. Each is returned once."""
-        if not self._unreported:
-            return []
         return self._report(now_ns - self._settle_ns)
 
     def flush(self) -> list[Gap]:
@@ -138,20 +137,21 @@ class GapLedger:
 
     def gaps(self) -> Iterator[Gap]:
         """Everything that is missing now, reported or not, in the order the runs began."""
-        for run_id, run in self._runs.items():
+        for run in self._runs.values():
             for hole in run.holes:
-                yield Gap(run_id, hole.first, hole.last)
+                yield Gap(run.run_id, hole.first, hole.last)
 
-    def missing(self) -> int:
-        """How many keyframes are missing now."""
-        return sum(gap.count for gap in self.gaps())
+    def missing_reported(self) -> int:
+        """How many of the missing keyframes have been reported."""
+        holes = (hole for run in self._runs.values() for hole in run.holes)
+        return sum(hole.count for hole in holes if hole.reported)
 
     def stretch(self, run_id: str, keyframe_id: int) -> tuple[int, int] | None:
         """The longest stretch of recorded keyframes around this one; None if it is missing."""
         run = self._runs.get(run_id)
         if run is None or not run.first <= keyframe_id <= run.last:
             return None
-        index = bisect_right(run.holes, keyframe_id, key=lambda hole: hole.first)
+        index = run.holes_before(keyframe_id)
         before = run.holes[index - 1].last if index else run.first - 1
         if keyframe_id <= before:
             return None
@@ -162,50 +162,49 @@ class GapLedger:
         """Everything `restore` needs to go on from here, but for how long holes have been open."""
         return tuple(
             RunState(
-                run_id,
+                run.run_id,
                 run.first,
                 run.last,
                 tuple((hole.first, hole.last, hole.reported) for hole in run.holes),
             )
-            for run_id, run in self._runs.items()
+            for run in self._runs.values()
         )
 
     def restore(self, runs: Iterable[RunState], now_ns: int) -> None:
-        """Take the place of what is here; holes not yet reported count as open since ``now_ns``."""
-        self._runs = {
-            run.run_id: _Run(run.first, run.last, [_Hole(a, b, now_ns, r) for a, b, r in run.holes])
-            for run in runs
-        }
-        self._unreported = sum(
-            not hole.reported for run in self._runs.values() for hole in run.holes
-        )
+        """Fill a new ledger; holes not yet reported count as open since ``now_ns``."""
+        for saved in runs:
+            run = self._runs[saved.run_id] = _Run(saved.run_id, saved.first, saved.last)
+            for first, last, reported in saved.holes:
+                self._add(run, len(run.holes), _Hole(run.run_id, first, last, now_ns, reported))
 
     def _open(self, run: _Run, index: int, first: int, last: int, now_ns: int) -> None:
-        run.holes.insert(index, _Hole(first, last, now_ns))
-        self._unreported += 1
+        self._add(run, index, _Hole(run.run_id, first, last, now_ns))
+
+    def _add(self, run: _Run, index: int, hole: _Hole) -> None:
+        run.holes.insert(index, hole)
+        self.missing += hole.count
+        if not hole.reported:
+            self._opened += 1
+            heapq.heappush(self._young, (hole.since_ns, self._opened, hole))
 
     def _fill(self, run: _Run, keyframe_id: int) -> None:
-        index = run.index_of_hole(keyframe_id)
-        if index is None:
+        index = run.holes_before(keyframe_id) - 1
+        if index < 0 or keyframe_id > run.holes[index].last:
             self.duplicates += 1
             return
-        hole = run.holes[index]
-        parts = [
-            _Hole(first, last, hole.since_ns, hole.reported)
-            for first, last in ((hole.first, keyframe_id - 1), (keyframe_id + 1, hole.last))
-            if first <= last
-        ]
-        run.holes[index : index + 1] = parts
-        if not hole.reported:
-            self._unreported += len(parts) - 1
+        hole = run.holes.pop(index)
+        hole.closed = True
+        self.missing -= hole.count
+        for first, last in ((keyframe_id + 1, hole.last), (hole.first, keyframe_id - 1)):
+            if first <= last:
+                self._add(run, index, _Hole(run.run_id, first, last, hole.since_ns, hole.reported))
 
     def _report(self, open_since_ns: int | None) -> list[Gap]:
+        """In the order of run ids and keyframes, so that equal ledgers report equally."""
         reported = []
-        for run_id, run in self._runs.items():
-            for hole in run.holes:
-                if hole.reported or (open_since_ns is not None and hole.since_ns > open_since_ns):
-                    continue
+        while self._young and (open_since_ns is None or self._young[0][0] <= open_since_ns):
+            hole = heapq.heappop(self._young)[2]
+            if not (hole.reported or hole.closed):
                 hole.reported = True
-                self._unreported -= 1
-                reported.append(Gap(run_id, hole.first, hole.last))
-        return reported
+                reported.append(Gap(hole.run_id, hole.first, hole.last))
+        return sorted(reported, key=lambda gap: (gap.run_id, gap.first))

@@ -48,6 +48,13 @@ def record(
     max_events: Annotated[
         int | None, typer.Option(min=1, help="Stop after so many messages.")
     ] = None,
+    gaps: Annotated[
+        bool,
+        typer.Option(
+            "--gaps/--no-gaps",
+            help="Missing keyframe ids are losses; off for robots that do not count by one.",
+        ),
+    ] = True,
     metrics: Annotated[
         str | None,
         typer.Option(metavar="PORT", help="Serve Prometheus metrics; PORT or HOST:PORT."),
@@ -69,7 +76,13 @@ def record(
         LogWriter(log, fsync=policy) as writer,
     ):
         recorder = Recorder(
-            session, writer, keys, queue_size=queue, max_events=max_events, ledger=_ledger(log)
+            session,
+            writer,
+            keys,
+            queue_size=queue,
+            max_events=max_events,
+            ledger=_ledger(log),
+            report_gaps=gaps,
         )
         with _measured(address, recorder, log), watching(log) as watch:
             named = ", ".join(keys)

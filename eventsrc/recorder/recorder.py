@@ -24,6 +24,7 @@ class Recorder:
     Subscribed when the constructor returns: from then on nothing published passes it by. ``ledger``
     is what the log already holds (see `eventsrc.ledger`); without it, a gap between an earlier
     recorder's last keyframe and this one's first is not seen, and no ledger is saved.
+    ``report_gaps`` off is for robots that do not count their keyframes by one.
     """
 
     def __init__(
@@ -35,6 +36,7 @@ class Recorder:
         queue_size: int = DEFAULT_QUEUE_SIZE,
         max_events: int | None = None,
         ledger: GapLedger | None = None,
+        report_gaps: bool = True,
     ) -> None:
         check_keys(keys)
         self._session = session
@@ -45,6 +47,7 @@ class Recorder:
             ledger,
             self._send_ack,
             max_events=max_events,
+            report_gaps=report_gaps,
         )
         self._subscriptions = [
             session.subscribe(key, self._receive, on_miss=self._inbox.miss) for key in keys

@@ -52,6 +52,7 @@ class Writing:
         acknowledge: Acknowledge,
         *,
         max_events: int | None,
+        report_gaps: bool = True,
         losses_every_ns: int = LOSSES_EVERY_NS,
     ) -> None:
         self._inbox = inbox
@@ -60,12 +61,13 @@ class Writing:
         self._saves = ledger is not None  # one that does not know the whole log is not its ledger
         self._acknowledge = acknowledge
         self._room = max_events
+        self._report_gaps = report_gaps
         self._losses_every_ns = losses_every_ns
         self._losses_due_ns = time.monotonic_ns() + losses_every_ns
         self._save_due_ns = time.monotonic_ns() + _SAVE_EVERY_NS
         self._unsynced: deque[tuple[int, _Identity | None]] = deque()
         self._recorded = self._rejected = 0
-        self._missing = self._missing_before = self._ledger.missing()
+        self._missing = self._missing_before = self._ledger.missing if report_gaps else 0
 
     def run(self) -> None:
         """Record until the inbox is closed and empty, or there are as many events as asked for.
@@ -156,7 +158,7 @@ class Writing:
             save_ledger(self._writer.path, self._writer.log_id, next_offset, self._ledger)
 
     def _write_losses(self, gaps: list[Gap]) -> None:
-        for gap in gaps:
+        for gap in gaps if self._report_gaps else ():
             self._append_loss(
                 Loss(
                     publisher=gap.run_id,
@@ -168,7 +170,7 @@ class Writing:
             )
         self._write_counts("queue_full", self._inbox.take_overflow())
         self._write_counts("transport_miss", self._inbox.take_missed())
-        self._missing = self._ledger.missing()
+        self._missing = self._ledger.missing if self._report_gaps else 0
 
     def _write_counts(self, cause: Cause, counts: dict[str, int]) -> None:
         for publisher, count in counts.items():

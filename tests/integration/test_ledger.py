@@ -106,7 +106,7 @@ def test_a_saved_ledger_that_cannot_be_believed_is_not(log: Path, spoil: str) ->
     elif spoil == "torn":
         (log / NAME).write_text((log / NAME).read_text()[:-9])
     assert _ledger(log).stretch("from-the-cache", 1) is None
-    assert _ledger(log).missing() == 5
+    assert _ledger(log).missing == 5
 
 
 def test_saving_and_going_on_equals_reading_everything(log: Path) -> None:

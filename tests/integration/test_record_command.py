@@ -56,6 +56,24 @@ def test_a_rejected_payload_is_exit_3(
     assert "1 recorded, 1 rejected" in recorder.lines[-1]
 
 
+@pytest.mark.parametrize(("option", "code", "losses"), [("--gaps", 3, 2), ("--no-gaps", 0, 0)])
+def test_robots_that_do_not_count_by_one(
+    start: Start,
+    publish: Start,
+    endpoint: str,
+    tmp_path: Path,
+    option: str,
+    code: int,
+    losses: int,
+) -> None:
+    log = tmp_path / "log"
+    recorder = start("record", str(log), "--connect", endpoint, "--max-events", "3", option)
+    recorder.wait_for("recording")
+    publish(KEY, *(payload(envelope(k * 15)).decode() for k in range(3)))
+    assert recorder.wait() == code
+    assert len(_stored(log)) == 3 + losses
+
+
 def test_without_a_router_it_is_one_line_and_no_log(start: Start, tmp_path: Path) -> None:
     with Router(LOOPBACK) as gone:
         (away,) = gone.endpoints

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc.losses import GapLedger
+from eventsrc.losses import Gap, GapLedger
 
 SETTLE_NS = 5
 
@@ -29,7 +29,7 @@ def test_missing_is_what_lies_between_and_was_never_recorded(
         ledger.record(run_id, keyframe_id, now_ns)
     missing = {(gap.run_id, k) for gap in ledger.gaps() for k in range(gap.first, gap.last + 1)}
     assert missing == {(run_id, k) for run_id in RUNS for k in _missing(recorded[run_id])}
-    assert ledger.missing() == len(missing)
+    assert ledger.missing == len(missing)
     assert ledger.duplicates == duplicates
 
 
@@ -88,3 +88,31 @@ def test_restored_it_goes_on_as_if_nothing_had_been(
     assert half.state() == whole.state()
     assert half.due(SETTLE_NS) == whole.due(SETTLE_NS)
     assert half.flush() == []
+
+
+@given(
+    st.lists(st.integers(0, 30), min_size=1),
+    st.lists(st.tuples(st.integers(0, 30), st.integers(0, 10))),
+    st.lists(st.integers(0, 30)),
+)
+def test_what_was_reported_stays_so_until_a_keyframe_closes_it(
+    before: list[int], told: list[tuple[int, int]], late: list[int]
+) -> None:
+    """Whole holes of the ledger are reported, as an earlier recorder would have done."""
+    ledger = GapLedger(SETTLE_NS)
+    for keyframe_id in before:
+        ledger.record("run-a", keyframe_id, 0)
+    holes = list(ledger.gaps())
+    reported: set[int] = set()
+    for first, length in told:
+        ledger.mark_reported(Gap("run-a", first, first + length))
+        for hole in holes:
+            if first <= hole.first and hole.last <= first + length:
+                reported |= set(range(hole.first, hole.last + 1))
+    for keyframe_id in late:
+        ledger.record("run-a", keyframe_id, 0)
+    missing = _missing(set(before + late))
+    assert ledger.missing_reported() == len(reported & missing)
+    flushed = {k for gap in ledger.flush() for k in range(gap.first, gap.last + 1)}
+    assert flushed == missing - reported
+    assert ledger.missing_reported() == ledger.missing == len(missing)

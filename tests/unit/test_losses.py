@@ -23,7 +23,7 @@ def test_a_run_in_order_lacks_nothing() -> None:
 def test_what_lies_between_is_missing() -> None:
     ledger = _ledger(1, 5, 9)
     assert list(ledger.gaps()) == [Gap("run-a", 2, 4), Gap("run-a", 6, 8)]
-    assert ledger.missing() == 6
+    assert ledger.missing == 6
 
 
 def test_a_gap_is_reported_once_and_only_when_it_has_settled() -> None:
@@ -39,7 +39,7 @@ def test_a_late_keyframe_in_time_is_no_gap() -> None:
     ledger = _ledger(1, 3, at_ns=100)
     ledger.record("run-a", 2, 105)
     assert ledger.due(1_000) == []
-    assert ledger.missing() == 0
+    assert ledger.missing == 0
     assert ledger.duplicates == 0
 
 
@@ -62,7 +62,7 @@ def test_the_halves_of_a_reported_hole_are_not_reported_again() -> None:
     ledger.flush()
     ledger.record("run-a", 5, 50)
     assert ledger.due(1_000) == []
-    assert ledger.missing() == 6
+    assert ledger.missing == 6
 
 
 def test_an_id_below_the_first_opens_a_hole_up_to_it() -> None:
@@ -82,7 +82,7 @@ def test_runs_are_counted_apart() -> None:
 def test_twice_is_a_duplicate_and_no_loss() -> None:
     ledger = _ledger(1, 2, 3, 2, 3, 1)
     assert ledger.duplicates == 3
-    assert ledger.missing() == 0
+    assert ledger.missing == 0
 
 
 def test_what_an_earlier_recorder_reported_is_not_reported_again() -> None:
@@ -120,7 +120,7 @@ def test_a_gap_holds_at_least_one_keyframe() -> None:
 
 def test_a_jump_of_the_whole_range_costs_nothing() -> None:
     ledger = _ledger(-(2**63), 2**63 - 1)
-    assert ledger.missing() == 2**64 - 2
+    assert ledger.missing == 2**64 - 2
 
 
 def test_a_loss_events_word_can_be_taken_for_a_gap() -> None:
