@@ -1,17 +1,20 @@
 """`mapfold simulate`: a run through a simulated house, published or written down."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 
 from eventsrc._zenoh import ZenohOptions, open_session
+from eventsrc.errors import MisuseError
 from eventsrc.sim import DEFAULT_SEED, SimulatedRun, simulate_run
 from eventsrc.sim.publish import publish_run, write_run
 
 from ._shell import emit, finish, say
 from ._signals import stop_on_signals
 from ._zenoh_options import ConfigOption, ConnectOption, ListenOption, zenoh_options
+
+_LONGEST_NAME: Final = 100
 
 
 def simulate(
@@ -42,6 +45,10 @@ def simulate(
     A robot drives through a simulated house and publishes what it sees, or writes it down. The
     ground truth (room and instance) goes to a file beside --out, never into the messages.
     """
+    if not run.isprintable() or not 1 <= len(run) <= _LONGEST_NAME:
+        raise MisuseError(
+            f"--run {run!r}: give a name of 1 to {_LONGEST_NAME} printable characters"
+        )
     simulated = simulate_run(seed, run)
     document = _numbers(simulated)
     if out is not None:

@@ -18,6 +18,8 @@ HALO = [withStroke(linewidth=2.2, foreground="white")]
 SUFFIXES = (".png", ".svg", ".pdf")
 
 _MARGIN_M = 0.35
+_AROUND_POSES_M = 0.4
+"""So that a place's region, which reaches 0.55 m around its keyframes, is whole."""
 _WIDTH_IN = 13.0
 _HEAD_IN, _FOOT_IN = 0.7, 0.5
 _DPI = 120
@@ -74,7 +76,9 @@ def new_canvas(view: MapView, floor: Floor) -> Canvas:
 
 
 def _bounds(view: MapView, floor: Floor) -> Bounds:
-    spots = [spot for _, drive in drives(view) for spot in drive]
+    reach = _AROUND_POSES_M
+    poses = [spot for _, drive in drives(view) for spot in drive]
+    spots = [(x + dx, y + dy) for x, y in poses for dx in (-reach, reach) for dy in (-reach, reach)]
     spots += [end for x0, y0, x1, y1 in floor.walls for end in ((x0, y0), (x1, y1))]
     if not spots:
         return (-2.0, -1.0, 2.0, 1.0)

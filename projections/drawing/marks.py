@@ -14,7 +14,7 @@ from projections.view import MapView
 from . import palette
 from .canvas import HALO, Canvas
 from .labels import Extent, Wanted, place_labels
-from .scene import Bridge, Floor, LostRobot, Spot, object_groups
+from .scene import Bridge, Floor, LostRobot, Spot, object_groups, place_names
 
 _LABEL_PT = 8.0
 _RINGS_M = tuple(0.07 * 1.28**step for step in range(15))
@@ -34,13 +34,12 @@ def draw_adjacency(canvas: Canvas, view: MapView) -> None:
 
 
 def draw_place_names(canvas: Canvas, view: MapView) -> None:
-    """Each place's short name on its centroid; the run is in front of it only if there are more."""
-    short = len(view.runs) == 1
+    """Each place's name on its centroid, in its colour."""
+    names = place_names(view)
     for ordinal, place in view.places.items():
-        name = place.place_id.rpartition("_")[2] if short else place.place_id
         centroid = place.centroid_x, place.centroid_y
         colours = palette.place_colour(ordinal), "white", "white"
-        _badge(canvas, centroid, name, 10, colours, "round,pad=0.3,rounding_size=0.9")
+        _badge(canvas, centroid, names[ordinal], 10, colours, "round,pad=0.3,rounding_size=0.9")
 
 
 def draw_room_names(canvas: Canvas, floor: Floor) -> None:

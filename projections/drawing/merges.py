@@ -6,7 +6,7 @@ from projections.deltas import PlacesMerged
 from projections.folding import FoldedEvent
 from projections.view import MapView
 
-from .scene import Bridge, spot_of
+from .scene import Bridge, place_names, spot_of
 
 
 def fold_with_merges(events: Iterable[FoldedEvent], view: MapView) -> list[PlacesMerged]:
@@ -20,20 +20,13 @@ def fold_with_merges(events: Iterable[FoldedEvent], view: MapView) -> list[Place
 
 def bridges_of(view: MapView, merges: Iterable[PlacesMerged]) -> list[Bridge]:
     """One mark for each merge, where its bridging keyframe was taken."""
+    names = place_names(view)
     marks: list[Bridge] = []
     for merge in merges:
         keyframe = view.keyframes[merge.bridge]
         spot = spot_of(keyframe)
         if spot is not None:
-            absorbed = " and ".join(_short(view, place) for place in merge.absorbed)
-            text = (
-                f"{absorbed} into {_short(view, merge.survivor)}, keyframe {keyframe.keyframe_id}"
-            )
+            absorbed = " and ".join(names[place] for place in merge.absorbed)
+            text = f"{absorbed} into {names[merge.survivor]}, keyframe {keyframe.keyframe_id}"
             marks.append(Bridge(*spot, text))
     return marks
-
-
-def _short(view: MapView, place: int) -> str:
-    """p3 instead of run_p3 while there is one run only, as the picture's place names."""
-    name = view.all_places[place].place_id
-    return name.rpartition("_")[2] if len(view.runs) == 1 else name

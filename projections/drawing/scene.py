@@ -1,10 +1,13 @@
 """What a picture shows besides the map itself. All lengths in metres, all angles in radians."""
 
-from collections import defaultdict
+import math
+from collections import Counter, defaultdict
 from dataclasses import dataclass
 
 from projections.records import KeyframeRecord, ObjectRecord
 from projections.view import MapView
+
+_NEAR_M = 1.0
 
 Line = tuple[float, float, float, float]
 Box = tuple[float, float, float, float]
@@ -51,7 +54,7 @@ class Bridge:
 
 @dataclass(frozen=True, slots=True)
 class ObjectGroup:
-    """Objects of one class in one place: one label on the picture, a dot for each."""
+    """Objects of one class in one place near each other: one label, a dot for each."""
 
     class_name: str
     place: int | None
@@ -80,12 +83,36 @@ class ObjectGroup:
 
 def object_groups(view: MapView, min_observations: int) -> list[ObjectGroup]:
     """The objects seen at least that often, by place and class; most seen first."""
-    grouped: dict[tuple[int | None, str], list[ObjectRecord]] = defaultdict(list)
+    grouped: dict[tuple[int | None, str], list[list[ObjectRecord]]] = defaultdict(list)
     for found in view.objects:
         if found.obs_count >= min_observations:
-            grouped[found.place, found.class_name].append(found)
-    groups = [ObjectGroup(name, place, tuple(all_)) for (place, name), all_ in grouped.items()]
+            _add(grouped[found.place, found.class_name], found)
+    groups = [
+        ObjectGroup(name, place, tuple(members))
+        for (place, name), clumps in grouped.items()
+        for members in clumps
+    ]
     return sorted(groups, key=lambda group: (-group.seen, group.members[0].ordinal))
+
+
+def _add(clumps: list[list[ObjectRecord]], found: ObjectRecord) -> None:
+    """Put an object to the first clump whose first member is near, else begin another."""
+    for clump in clumps:
+        first = clump[0].mean_x, clump[0].mean_y
+        if math.dist(first, (found.mean_x, found.mean_y)) <= _NEAR_M:
+            clump.append(found)
+            return
+    clumps.append([found])
+
+
+def place_names(view: MapView) -> dict[int, str]:
+    """What to call each place, living or absorbed: p3, or run_p3 where two runs have a p3."""
+    short = {p.ordinal: p.place_id.rpartition("_")[2] for p in view.all_places}
+    used = Counter(short.values())
+    return {
+        ordinal: name if used[name] == 1 else view.all_places[ordinal].place_id
+        for ordinal, name in short.items()
+    }
 
 
 def spot_of(keyframe: KeyframeRecord) -> tuple[float, float] | None:

@@ -7,6 +7,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+
 from eventsrc._zenoh import Received, Session
 from eventsrc.sim import simulate_run
 from tests.fixtures_zenoh import DEADLINE_S, Program
@@ -52,6 +54,20 @@ def test_a_file_is_written_with_its_numbers(tmp_path: Path) -> None:
     assert Path(numbers["out"]).exists()
     assert Path(numbers["truth"]).name == "run.truth.jsonl.gz"
     assert f"{len(run.envelopes)} keyframes" in done.stderr
+
+
+@pytest.mark.parametrize("name", ["", "two\nlines", "x" * 101])
+def test_a_run_that_could_not_be_told_from_others_is_refused(name: str) -> None:
+    command = "from projections.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", command, "simulate", "--run", name, "--out", "never.jsonl"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert "give a name of 1 to 100 printable characters" in done.stderr
+    assert not Path("never.jsonl").exists()
 
 
 def test_an_unwritable_place_is_one_clear_line(tmp_path: Path) -> None:

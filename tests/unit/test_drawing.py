@@ -60,11 +60,22 @@ def test_the_picture_names_places_objects_and_transitions() -> None:
     assert any("2 places  ·  3 objects, 2 of them shown" in text for text in texts)
 
 
-def test_names_of_places_carry_the_run_when_there_are_several() -> None:
+def test_names_of_places_carry_the_run_where_two_runs_have_the_same() -> None:
     view = _two_places()
     view.apply(d.RunSeen(10, 1, "other", 0.0))
+    view.apply(d.PlaceFormed(10, 2, "other_p1", 9))
     texts = _texts(compose(view, "", Floor()))
-    assert {"run_p0", "run_p1"} <= set(texts)
+    assert {"p0", "run_p1", "other_p1"} <= set(texts)
+
+
+def test_objects_of_one_class_far_apart_keep_labels_of_their_own() -> None:
+    view = _two_places()
+    box = (0.0, 0.0, 1.0, 1.0)
+    view.apply(d.ObservationAdded(3, 3, 4, "run", 4, "d3", "<vase>", 0.9, box, None, None, False))
+    view.apply(d.ObjectFound(4, 3, "obj-3", "<vase>", 3))
+    view.apply(d.ObjectSeen(4, 3, 3, 0, 2, 8_000_000, 1_000_000, 0.0, 0.0))
+    view.apply(d.ObjectMoved(4, 3, 0))
+    assert _texts(compose(view, "", Floor())).count("<vase>") == 2
 
 
 def test_objects_of_one_class_in_one_place_share_a_label() -> None:
