@@ -115,6 +115,14 @@ def two_databases(pg_server: EmbeddedServer, _template: str, pg_url: str) -> Ite
 
 
 @pytest.fixture
+def third_database(pg_server: EmbeddedServer, _template: str) -> Iterator[Targets]:
+    """Graph and vectors in one more fresh database, beside those of ``two_databases``."""
+    name = _fresh_database(pg_server, _template)
+    yield Targets(pg_server.url_of(name), pg_server.url_of(name))
+    _drop_database(pg_server, name)
+
+
+@pytest.fixture
 def pg(pg_url: str) -> Iterator[psycopg.Connection]:
     """An autocommit connection to this test's database, as a psql user would have it."""
     with psycopg.connect(pg_url, autocommit=True) as connection:

@@ -101,7 +101,7 @@ class _Run:
     on_batch: OnBatch = lambda _: None
     on_trouble: OnTrouble = lambda _: None
     checkpoints: dict[str, Checkpoint] = field(default_factory=dict)
-    parked: frozenset[int] = frozenset()
+    parked: dict[int, DeadLetter] = field(default_factory=dict)
     letters: list[DeadLetter] = field(default_factory=list)
 
     def follow(self) -> None:
@@ -131,7 +131,7 @@ class _Run:
 
     def _begin(self, reader: LogReader) -> None:
         """Make what is missing, read the checkpoints, refuse what does not fit."""
-        parked: set[int] = set()
+        parked: dict[int, DeadLetter] = {}
         for store in self.stores:
             with database_errors(store.url), store.connection.transaction():
                 for sink in store.sinks:
@@ -141,8 +141,9 @@ class _Run:
                     assert found is not None  # noqa: S101 - begun in this transaction
                     self._check(found, sink, store, reader)
                     self.checkpoints[sink.name] = found
-                    parked.update(d.offset for d in _checkpoint.parked(store.connection, sink.name))
-        self.parked = frozenset(parked)
+                    letters = _checkpoint.parked(store.connection, sink.name)
+                    parked.update((letter.offset, letter) for letter in letters)
+        self.parked = parked
         self.report.next_offset = min(c.next_offset for c in self.checkpoints.values())
 
     def _check(self, found: Checkpoint, sink: Sink[Any], store: Store, reader: LogReader) -> None:
@@ -164,6 +165,8 @@ class _Run:
         for event in batch:
             due = [s for s in sinks if event.offset >= self.checkpoints[s.name].next_offset]
             if event.offset in self.parked:
+                # Parked by the other sink, which is further: it has to stay out of this one too.
+                self.letters.append(self.parked[event.offset])
                 fold.skip(event.offset)
                 continue
             try:
@@ -204,13 +207,13 @@ class _Run:
                 SinkBatch(
                     sink,
                     sink.take(fold.view),
-                    tuple(self.letters),
-                    self.checkpoints[sink.name],
+                    tuple(d for d in self.letters if d.offset >= at.next_offset),
+                    at,
                     next_offset,
                     event_hash(last),
                 )
                 for sink in writer.store.sinks
-                if self.checkpoints[sink.name].next_offset < next_offset
+                if (at := self.checkpoints[sink.name]).next_offset < next_offset
             ]
             if parts:
                 for part, after in zip(parts, writer.write(parts), strict=True):

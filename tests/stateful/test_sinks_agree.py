@@ -1,0 +1,217 @@
+"""Memory, both loaders, one database and two: driven together through everything, always equal.
+
+The machine writes events (walks, merges, duplicates, conflicts, unreadable ones), tails in batches
+of any size, crashes tails at any statement, rebuilds to any offset, and compares. Memory tails
+once, straight through; the databases go their crooked ways.
+"""
+
+import contextlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar
+
+import psycopg
+import pytest
+from hypothesis import HealthCheck, Phase, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    rule,
+    run_state_machine_as_test,
+)
+
+from eventsrc.log import LogReader
+from projections.errors import FoldError
+from projections.postgres.connect import Targets, connect
+from projections.runner import rebuild, tail
+from projections.runner._fold import LiveFold
+from projections.settings import Settings
+from projections.sinks.loader import LoaderName
+from projections.sinks.memory import MemorySink
+from tests.envelopes import envelope
+from tests.logs import append_raw, bridge, walk, write_log
+from tests.rows import ORDER, graph_rows, vector_rows
+
+SETTINGS = Settings()
+EXAMPLES = int(os.environ.get("MAPFOLD_STATEFUL_EXAMPLES", "8"))
+PLACES = st.sampled_from(["one", "two"])
+
+
+class Crash(Exception):
+    """The tail's process dies here: nothing after it runs, its connections go."""
+
+
+class Bomb:
+    """Raises `Crash` at the n-th statement psycopg is asked to send."""
+
+    def __init__(self, patch: pytest.MonkeyPatch, at: int) -> None:
+        self.left = at
+        for method in ("execute", "copy"):
+            patch.setattr(psycopg.Cursor, method, self._stepping(getattr(psycopg.Cursor, method)))
+
+    def _stepping(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        def step(*args: Any, **kwargs: Any) -> Any:
+            self.left -= 1
+            if self.left < 0:
+                raise Crash
+            return original(*args, **kwargs)
+
+        return step
+
+
+class SinksAgree(RuleBasedStateMachine):
+    targets: dict[str, Targets]
+    loaders: ClassVar[dict[str, LoaderName]] = {"one": "copy", "two": "insert"}
+
+    @initialize()
+    def begin(self) -> None:
+        self.folder = Path(tempfile.mkdtemp(prefix="mapfold-agree-"))
+        self.log = write_log(self.folder / "log", walk(3, seed=99, run_id="first"))
+        self.keyframes = {"run-a": 0, "run-b": 0}
+        self.unreadable = False
+        self.fold, self.memory = LiveFold(SETTINGS), MemorySink()
+        for name in self.targets:
+            self._empty(self.targets[name])
+
+    def _empty(self, targets: Targets) -> None:
+        for url in {targets.graph_url, targets.vector_url}:
+            with connect(url, autocommit=True) as connection:
+                connection.execute("SET client_min_messages = warning")
+                connection.execute("SET search_path = ag_catalog, public")
+                connection.execute("SELECT drop_graph(name, true) FROM ag_graph")
+                connection.execute("DROP SCHEMA IF EXISTS mapfold CASCADE")
+                connection.execute("DROP TABLE IF EXISTS public.detection_embeddings")
+
+    @rule(run=st.sampled_from(["run-a", "run-b"]), count=st.integers(1, 12), seed=st.integers(0, 9))
+    def robot_walks(self, run: str, count: int, seed: int) -> None:
+        first = self.keyframes[run]
+        self.keyframes[run] += count
+        write_log(self.log, walk(count, seed=seed, run_id=run, first=first))
+
+    @rule(start=st.integers(0, 15))
+    def rooms_are_joined(self, start: int) -> None:
+        first = self.keyframes["run-b"]
+        self.keyframes["run-b"] += 6
+        joining = enumerate(bridge()[start : start + 6])
+        documents = [{**d, "keyframe_id": first + i} for i, d in joining]
+        write_log(self.log, documents)
+
+    @rule(conflict=st.booleans())
+    def something_comes_twice(self, conflict: bool) -> None:
+        write_log(self.log, [envelope(0, 1.0 if conflict else None, run_id="first")] * 2)
+
+    @rule()
+    def something_unreadable_comes(self) -> None:
+        append_raw(self.log, b'{"run_id": "broken"}')
+        self.unreadable = True
+
+    @rule(name=PLACES, size=st.integers(1, 20))
+    def tail_catches_up(self, name: str, size: int) -> None:
+        self._tail(name, size)
+
+    @rule(name=PLACES, size=st.integers(1, 20), at=st.integers(0, 80))
+    def tail_crashes(self, name: str, size: int, at: int) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            Bomb(patch, at)
+            with contextlib.suppress(Crash):
+                self._tail(name, size)
+
+    @rule(name=PLACES, size=st.integers(1, 20), only=st.sampled_from(["graph", "vectors"]))
+    def one_sink_goes_ahead(self, name: str, size: int, only: Any) -> None:
+        tail(
+            self.log, self.targets[name], SETTINGS, once=True, only=only, batch_events=size,
+            loader=self.loaders[name],
+        )  # fmt: skip
+
+    @rule(name=PLACES, until=st.none() | st.integers(0, 40))
+    def rebuild_to_some_offset(self, name: str, until: int | None) -> None:
+        try:
+            rebuild(self.log, self.targets[name], SETTINGS, until=until, loader=self.loaders[name])
+        except FoldError:
+            assert self.unreadable
+
+    @rule(name=PLACES, at=st.integers(0, 150))
+    def rebuild_crashes(self, name: str, at: int) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            Bomb(patch, at)
+            with contextlib.suppress(Crash, FoldError):
+                rebuild(self.log, self.targets[name], SETTINGS, loader=self.loaders[name])
+
+    @rule(size=st.integers(1, 20))
+    def all_agree_once_caught_up(self, size: int) -> None:
+        self._memory_catches_up()
+        graph = {
+            label: [_values(row) for _, row in sorted(self.memory.graph[label].items())]  # type: ignore[index]
+            for label in ORDER
+        }
+        vectors = [
+            (r.det_pk, r.det_id, r.class_name, list(r.bbox), r.ingested_at)
+            for _, r in sorted(self.memory.vectors.items())
+        ]
+        for name, targets in self.targets.items():
+            self._tail(name, size)
+            found = graph_rows(targets.graph_url)
+            assert {label: [_values(row) for row in rows] for label, rows in found.items()} == graph
+            rows = vector_rows(targets.vector_url)
+            assert [(r[0], r[2], r[4], r[6], r[-1]) for r in rows] == vectors
+
+    @invariant()
+    def memory_counts_what_the_view_counts(self) -> None:
+        if self.memory.next_offset:
+            counts = self.fold.view.counts()
+            assert len(self.memory.graph["IN_PLACE"]) == counts["IN_PLACE"]
+            assert len(self.memory.graph["ADJACENT_TO"]) == counts["ADJACENT_TO"]
+            assert len(self.memory.graph["Place"]) == counts["places"]
+
+    def teardown(self) -> None:
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _tail(self, name: str, size: int) -> None:
+        tail(
+            self.log, self.targets[name], SETTINGS, once=True, batch_events=size,
+            loader=self.loaders[name],
+        )  # fmt: skip
+
+    def _memory_catches_up(self) -> None:
+        with LogReader(self.log) as reader:
+            last = None
+            for event in reader.read(self.memory.next_offset):
+                try:
+                    self.fold.feed(event, [self.memory])  # type: ignore[list-item]
+                except FoldError:
+                    self.fold.skip(event.offset)
+                last = event
+        if last is not None:
+            self.memory.write(self.memory.take(self.fold.view), last)
+
+
+def _values(row: tuple[Any, ...]) -> tuple[Any, ...]:
+    return (*map(int, row[:-1]), json.dumps(json.loads(row[-1]), sort_keys=True))
+
+
+@pytest.fixture
+def machine(third_database: Targets, two_databases: Targets) -> type[SinksAgree]:
+    """One database with COPY, two with INSERT; each example starts with them empty."""
+    targets = {"one": third_database, "two": two_databases}
+    return type("Machine", (SinksAgree,), {"targets": targets})
+
+
+@pytest.mark.timeout(900)
+def test_all_sinks_always_agree(machine: type[SinksAgree]) -> None:
+    run_state_machine_as_test(
+        machine,
+        settings=settings(
+            max_examples=EXAMPLES,
+            stateful_step_count=14,
+            deadline=None,
+            # Not shrunk: each example takes seconds, and the steps are told as they are.
+            phases=(Phase.explicit, Phase.reuse, Phase.generate),
+            suppress_health_check=list(HealthCheck),
+        ),
+    )
