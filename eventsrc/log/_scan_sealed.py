@@ -2,7 +2,6 @@
 the bytes for chunks. Every chunk is decompressed and its CRC and sequence checked."""
 
 import mmap
-from itertools import pairwise
 from pathlib import Path
 
 from eventsrc.errors import LogDamaged, NotALog
@@ -46,7 +45,7 @@ def _scan(path: Path, base: int, following: int | None, data: mmap.mmap) -> Scan
         if first >= scan.next_offset:
             scan.take(ChunkRef(at, length, first, after))
     scan.gap_up_to(max(promised, following or base))
-    scan.lost_bytes = _unread_bytes(data, places, scan)
+    scan.lost_bytes = _unread_bytes(len(data), scan)
     return scan
 
 
@@ -82,8 +81,11 @@ def _promised(data: mmap.mmap, base: int) -> int:
     return base
 
 
-def _unread_bytes(data: mmap.mmap, places: list[int], scan: Scan) -> int:
-    """Bytes of chunks that could not be taken, up to the next chunk or the end."""
-    taken = {chunk.position for chunk in scan.chunks}
-    edges = [*places, len(data)]
-    return sum(following - at for at, following in pairwise(edges) if at not in taken)
+def _unread_bytes(size: int, scan: Scan) -> int:
+    """Bytes between the chunks around each gap, indexes that stand there included."""
+    lost, end, expected = 0, 0, scan.base
+    for chunk in scan.chunks:
+        if chunk.first > expected:
+            lost += chunk.position - end
+        end, expected = chunk.position + chunk.length, chunk.following
+    return lost + (size - end if scan.next_offset > expected else 0)

@@ -1,0 +1,103 @@
+"""`mapfold log verify` and `recover` as a person runs them."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.commands import Commands
+from tests.envelopes import envelope, payload
+
+PAYLOADS = [payload(envelope(i)) for i in range(1, 6)]
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Commands:
+    """Commands in an empty folder with a sealed log L of five events."""
+    run = Commands.in_folder(tmp_path)
+    run("import", "L", "-", stdin=b"\n".join(PAYLOADS))
+    return run
+
+
+def segment(run: Commands) -> Path:
+    return run.folder / "L" / "00000000000000000000.mcap"
+
+
+def flip(path: Path, at: int) -> None:
+    data = bytearray(path.read_bytes())
+    data[at] ^= 1
+    path.write_bytes(data)
+
+
+def test_a_good_log(run: Commands) -> None:
+    assert "all good" in run("log", "verify", "L").err
+    report = run("log", "verify", "L", "--json").json
+    assert (report["events"], report["segments"], report["findings"]) == (5, 1, [])
+    assert "nothing to recover" in run("log", "recover", "L").err
+
+
+def test_a_rotten_log(run: Commands) -> None:
+    flip(segment(run), 300)
+    findings = run("log", "verify", "L", "--json", code=3).json["findings"]
+    assert [(f["kind"], f["first_offset"], f["last_offset"]) for f in findings] == [
+        ("crc", None, None),
+        ("gap", 0, 4),
+    ]
+    assert "offsets 0 to 4" in run("log", "verify", "L", code=3).out
+    said = run("log", "cat", "L", code=1)
+    assert said.err.count("\n") == 1
+    assert "offsets 0 to 4" in said.err
+    said = run("log", "cat", "L", "--skip-damage", code=3)
+    assert (said.out, "offsets 0 to 4" in said.err) == ("", True)
+    report = run("log", "recover", "L", "--json", code=3).json
+    assert report["segments"][0]["lost_events"] == 5
+    assert report["segments"][0]["kept_copy"] == "00000000000000000000.mcap.damaged"
+    assert run("log", "info", "L", "--json").json["lost"] == 5
+    run("import", "L", "-", stdin=PAYLOADS[0])
+    assert run("log", "cat", "L", "--json", "--from", "5").lines[0]["offset"] == 5
+
+
+def test_a_flip_that_touches_no_event_loses_none(run: Commands) -> None:
+    flip(segment(run), -40)
+    assert "no event is affected" in run("log", "verify", "L", code=3).out
+    run("log", "recover", "L", code=0)
+    run("log", "verify", "L")
+    assert len(run("log", "cat", "L").out.splitlines()) == 5
+
+
+def test_a_writer_refuses_a_rotten_growing_segment_and_says_what_to_do(run: Commands) -> None:
+    active = segment(run).with_name(segment(run).name + ".active")
+    active.write_bytes(growing(run.folder / "other", PAYLOADS[:2]))
+    segment(run).unlink()
+    flip(active, 400)
+    said = run("import", "L", "-", stdin=PAYLOADS[0], code=1)
+    assert "mapfold log recover L" in said.err
+    said = run("log", "recover", "L", code=3)
+    assert "original kept as" in said.err
+    run("import", "L", "-", stdin=PAYLOADS[0])
+
+
+def growing(log: Path, payloads: list[bytes]) -> bytes:
+    """The bytes of an active segment with one event a commit."""
+    from eventsrc.log import ALWAYS, LogWriter
+
+    with LogWriter(log, fsync=ALWAYS) as writer:
+        for item in payloads:
+            writer.append("tb/detections", item)
+        return next(log.glob("*.active")).read_bytes()
+
+
+def test_no_log_is_one_line(run: Commands) -> None:
+    for command in ("info", "cat", "verify", "recover"):
+        said = run("log", command, "nowhere", code=2)
+        assert said.err.count("\n") == 1
+        assert "nowhere" in said.err
+
+
+def test_two_writers(run: Commands) -> None:
+    from eventsrc.log import LogWriter
+
+    with LogWriter(run.folder / "L"):
+        for command in (("import", "L", "-"), ("log", "recover", "L")):
+            said = run(*command, stdin=PAYLOADS[0], code=1)
+            assert "being written by process" in said.err
+    run("log", "recover", "L")
