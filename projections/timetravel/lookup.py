@@ -18,10 +18,14 @@ MOST_NAMES = 5
 
 
 class NoSuchThing(MisuseError):
-    """Nothing of this name is in the log; the message lists the nearest names."""
+    """Nothing of this name is in the history; the message lists the nearest names.
+
+    Places and objects depend on the settings, the rest on the log alone.
+    """
 
     def __init__(self, kind: str, text: str, names: Iterable[str]) -> None:
-        super().__init__(f"no {kind} {text!r} in this log; {_nearest(kind, text, list(names))}")
+        where = "under these settings" if kind in ("place", "object") else "in this log"
+        super().__init__(f"no {kind} {text!r} {where}; {_nearest(kind, text, list(names))}")
 
 
 def find_place(history: History, text: str) -> PlaceLife:
@@ -51,7 +55,7 @@ def find_keyframe(history: History, text: str) -> int:
 
 def _nearest(kind: str, text: str, names: list[str]) -> str:
     if not names:
-        return f"it has no {kind} at all"
+        return f"there is no {kind} at all"
     near = _near_numbers(text, names) or difflib.get_close_matches(text, names, MOST_NAMES, 0.6)
     if near:
         return f"near it: {', '.join(near)}"

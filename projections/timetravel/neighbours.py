@@ -5,7 +5,6 @@ when at least ``min_samples`` posed keyframes, itself included, are within ε of
 """
 
 from bisect import bisect_left
-from collections import defaultdict
 from collections.abc import Sequence
 
 import numpy as np
@@ -28,16 +27,13 @@ class Neighbours:
         self._offsets = [offset for _, offset, _ in posed]
         self._spots = np.array([(p.x_um, p.y_um) for _, _, p in posed], np.int64).reshape(-1, 2)
         self._row = {number: row for row, number in enumerate(self._numbers)}
-        cells: defaultdict[tuple[int, int], list[int]] = defaultdict(list)
-        for row, (_, _, pose) in enumerate(posed):
-            cells[self._cell(pose.x_um, pose.y_um)].append(row)
-        self._cells = {cell: np.array(rows, np.int64) for cell, rows in cells.items()}
+        self._cells = _rows_by_cell(self._spots // self._radius)
 
     def of(self, keyframe: int, end: int) -> list[int]:
         """Keyframes within ε of a posed ``keyframe``, itself too, after ``end`` events; ascending
         ordinals."""
         x, y = self._spots[self._row[keyframe]]
-        column, row = self._cell(int(x), int(y))
+        column, row = int(x) // self._radius, int(y) // self._radius
         around = [(column + i, row + j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
         rows = np.concatenate([self._cells[cell] for cell in around if cell in self._cells])
         rows = np.sort(rows[rows < bisect_left(self._offsets, end)])
@@ -72,5 +68,14 @@ class Neighbours:
         metres: NDArray[np.float64] = self._spots[[self._row[k] for k in keyframes]] / 1e6
         return metres
 
-    def _cell(self, x_um: int, y_um: int) -> tuple[int, int]:
-        return x_um // self._radius, y_um // self._radius
+
+def _rows_by_cell(cells: NDArray[np.int64]) -> dict[tuple[int, int], NDArray[np.int64]]:
+    """Which rows of ``cells``, shape (n, 2), hold which cell; ascending rows."""
+    if not len(cells):
+        return {}
+    order = np.lexsort((cells[:, 1], cells[:, 0]))  # stable, so rows stay ascending
+    found = cells[order]
+    starts = np.flatnonzero((found[1:] != found[:-1]).any(axis=1)) + 1
+    firsts = found[np.concatenate(([0], starts))]
+    keys = [(column, row) for column, row in firsts.tolist()]
+    return dict(zip(keys, np.split(order, starts), strict=True))

@@ -148,9 +148,9 @@ def test_a_pair_that_has_not_come_yet(corridor: Timeline) -> None:
 @pytest.mark.parametrize(
     ("thing", "says"),
     [
-        ("run-a_p2", "no place 'run-a_p2' in this log; near it: run-a_p1, run-a_p0"),
-        ("kitchen", "no place 'kitchen' in this log; there are run-a_p0, run-a_p1"),
-        ("obj-0000", "no object 'obj-0000' in this log; "),
+        ("run-a_p2", "no place 'run-a_p2' under these settings; near it: run-a_p1, run-a_p0"),
+        ("kitchen", "no place 'kitchen' under these settings; there are run-a_p0, run-a_p1"),
+        ("obj-0000", "no object 'obj-0000' under these settings; "),
     ],
 )
 def test_an_absent_id_lists_the_near_ones(corridor: Timeline, thing: str, says: str) -> None:
@@ -231,5 +231,5 @@ def test_an_empty_log_has_an_empty_history(tmp_path: Path) -> None:
     with Timeline(write_log(tmp_path / "log", []), RULES) as opened:
         assert opened.at().counts()["events"] == 0
         assert opened.merges() == []
-        with pytest.raises(NoSuchThing, match="it has no place at all"):
+        with pytest.raises(NoSuchThing, match="there is no place at all"):
             opened.why("run-a_p0")

@@ -1,0 +1,181 @@
+"""merges, why, diff, bisect and whatif as a person runs them: streams, exit codes, JSON."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from projections.cli import main
+from tests.commands import Commands
+from tests.envelopes import detection, envelope
+from tests.fixtures_timetravel import write_log
+
+RULES = ("--set", "eps_m=1.0", "--set", "min_samples=3")
+XS = (0.0, 1.0, 2.0, 6.0, 5.0, 4.0, 9.0, 3.0)
+"""Two places of three keyframes, one keyframe of noise, and one between the places."""
+
+
+@pytest.fixture
+def mapfold(tmp_path: Path) -> Commands:
+    """Commands beside a log whose keyframe 8, at offset 7, makes two places one."""
+    cup = detection("cup", [1.0, 0.0])
+    documents = [envelope(n, x, detections=[cup] * (n == 5)) for n, x in enumerate(XS, start=1)]
+    write_log(tmp_path / "log", documents)
+    return Commands.in_folder(tmp_path)
+
+
+def test_merges(mapfold: Commands) -> None:
+    said = mapfold("merges", "log", *RULES)
+    assert said.out.splitlines()[1].split() == [
+        *("1", "7", "2026-03-24T13:00:08.000Z", "run-a:8", "run-a_p0", "run-a_p1"),
+        *("3", "+", "3", "1", "1"),
+    ]
+    (merge,) = mapfold("merges", "log", *RULES, "--json").json
+    assert (merge["offset"], merge["run_id"], merge["keyframe_id"]) == (7, "run-a", 8)
+    assert merge["time"] == "2026-03-24T13:00:08.000Z"
+    assert (merge["survivor"], merge["absorbed"]) == ("run-a_p0", ["run-a_p1"])
+    assert mapfold("merges", "log", *RULES, "--at", "7", "--json").json == []
+    assert mapfold("merges", "log", *RULES, "--at", "7").out == (
+        "no merges: 7 events formed 2 places\n"
+    )
+
+
+def test_a_merge_shows_in_state_from_the_next_offset_on(mapfold: Commands) -> None:
+    (merge,) = mapfold("merges", "log", *RULES, "--json").json
+    for at, places in ((merge["offset"], 2), (merge["offset"] + 1, 1)):
+        state = mapfold("state", "log", *RULES, "--at", str(at), "--json").json
+        assert len(state["places"]) == places
+
+
+@pytest.mark.parametrize("suffix", ["png", "svg"])
+def test_a_merge_is_drawn(mapfold: Commands, suffix: str) -> None:
+    said = mapfold("merges", "log", *RULES, "--draw", "1", "--out", f"merge.{suffix}")
+    assert said.err == f"wrote merge.{suffix}: merge 1, before and after\n"
+    drawn = (mapfold.folder / f"merge.{suffix}").read_bytes()
+    assert drawn.startswith(b"\x89PNG" if suffix == "png" else b"<?xml")
+    mapfold("merges", "log", *RULES, "--draw", "1", "--out", f"again.{suffix}")
+    assert (mapfold.folder / f"again.{suffix}").read_bytes() == drawn
+
+
+def test_why(mapfold: Commands) -> None:
+    said = mapfold("why", "log", "run-a_p1", *RULES)
+    assert said.out.startswith("place run-a_p1: absorbed by run-a_p0 at offset 7 (2026-03-24T")
+    story = mapfold("why", "log", "run-a_p1", *RULES, "--json").json
+    assert story["stands"] is False
+    assert [entry["what"] for entry in story["entries"]] == ["founded", "ended"]
+    assert mapfold("why", "log", "run-a_p1", "--at", "7", *RULES, "--json").json["stands"] is True
+
+
+def test_why_same(mapfold: Commands) -> None:
+    said = mapfold("why", "log", "--same", "run-a:1", "run-a:4", *RULES)
+    assert said.out.startswith("run-a:1 and run-a:4: in one place since offset 7 (run-a:8, ")
+    story = mapfold("why", "log", "--same", "run-a:1", "run-a:7", *RULES, "--json").json
+    assert (story["same"], story["since"]) == (False, None)
+
+
+def test_diff(mapfold: Commands) -> None:
+    said = mapfold("diff", "log", "7", "8", *RULES)
+    assert "  - run-a_p1 (3 keyframes) into run-a_p0 at 7 (run-a:8)" in said.out.splitlines()
+    diff = mapfold("diff", "log", "run-a:7", "end", *RULES, "--json").json
+    assert (diff["from"], diff["to"], diff["same"]) == (7, 8, False)
+    assert diff["places"]["gone"][0]["into"] == "run-a_p0"
+    states = [mapfold("state", "log", *RULES, "--at", at, "--digest").out for at in ("7", "8")]
+    assert diff["digests"] == [digest.strip() for digest in states]
+    assert mapfold("diff", "log", "5", "5").out.startswith("the same map at 5 and 5: digest ")
+
+
+def test_bisect(mapfold: Commands) -> None:
+    said = mapfold("bisect", "log", "merged('run-a_p1')", *RULES)
+    assert said.out.startswith("became true at offset 7 (run-a:8, ")
+    found = mapfold("bisect", "log", "place_count < 2", "--scan", "--json", *RULES).json
+    assert found["found"]["offset"] == 7
+    assert [(turn["offset"], turn["becomes"]) for turn in found["turns"]] == [(5, False), (7, True)]
+    assert mapfold("bisect", "log", "place_count > 9", *RULES).out == (
+        "never true from --at 0 to 8\n"
+    )
+    assert mapfold("bisect", "log", "place_count < 9", *RULES).out == (
+        "true all along from --at 0 to 8\n"
+    )
+    assert mapfold("bisect", "log", "place_count == 0", *RULES).out.splitlines()[0] == (
+        "true at --at 0, then false; it does not become true again from --at 0 to 8"
+    )
+
+
+def test_bisect_points_at_what_it_cannot_read(mapfold: Commands) -> None:
+    said = mapfold("bisect", "log", "place_count < 2 and plac > 1", code=2)
+    expression, caret, message = said.err.splitlines()
+    assert expression[caret.index("^") :] == "plac > 1"
+    assert message == "mapfold: expression, column 21: no function 'plac'; did you mean 'place_of'?"
+    assert said.out == ""
+
+
+def test_whatif(mapfold: Commands) -> None:
+    said = mapfold("whatif", "log", "--base", "eps_m=1", "--set", "eps_m=0.5")
+    assert said.out.splitlines()[0].split()[:3] == ["settings", "places", "noise"]
+    assert said.out.splitlines()[2].split()[:4] == ["eps_m=0.5", "0", "8", "0"]
+    found = mapfold("whatif", "log", "--grid", "eps_m=1,1.5", "--json").json
+    assert [each["set"] for each in found["alternatives"]] == [{"eps_m": 1.0}, {}]
+    assert found["alternatives"][1]["same"] is True
+    assert found["alternatives"][1]["places_part_at"] is None
+
+
+def test_whatif_in_processes_of_its_own_says_the_same(mapfold: Commands) -> None:
+    asked = ("whatif", "log", "--grid", "eps_m=0.5,1", "--grid", "min_samples=2,3", "--json")
+    documents = [mapfold(*asked, "--processes", count).json for count in ("1", "3")]
+    for document in documents:
+        for each in [document["base"], *document["alternatives"]]:
+            del each["fold_seconds"]
+    assert documents[0] == documents[1]
+
+
+def test_whatif_with_truth_and_picture(mapfold: Commands) -> None:
+    truth = mapfold.folder / "truth.jsonl"
+    lines = [
+        {"run_id": "run-a", "keyframe_id": n, "room": "a" if x < 3 else "b", "instances": []}
+        for n, x in enumerate(XS, start=1)
+    ]
+    truth.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    said = mapfold(
+        *("whatif", "log", "--base", "eps_m=1", "--try", "min_samples=4"),
+        *("--truth", truth, "--picture", "maps.png", "--json"),
+    )
+    assert said.json["base"]["truth"]["places"]["v_measure"] < 1.0
+    assert (mapfold.folder / "maps.png").read_bytes().startswith(b"\x89PNG")
+    assert said.err.endswith("wrote maps.png: 2 maps\n")
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        (("merges", "nolog"), "no log at nolog"),
+        (("merges", "log", "--at", "99"), "99 is beyond the end"),
+        (("merges", "log", "--at", "3", "--show", "1"), "no merge number 1; there are none"),
+        (("merges", "log", *RULES, "--draw", "2"), "no merge number 2; there are 1 to 1"),
+        (("merges", "log", *RULES, "--draw", "1", "--out", "m.gif"), "m.gif: a picture is .png"),
+        (("why", "log"), "give one of PLACE_ID"),
+        (("why", "log", "run-a_p0", "--same", "a:1", "a:2"), "give one of PLACE_ID"),
+        (("why", "log", "run-a_p7", *RULES), "near it: run-a_p1, run-a_p0"),
+        (("why", "log", "--same", "run-a:1", "run-a:99"), "near it: run-a:8, run-a:7"),
+        (("diff", "log", "run-z:1", "end"), "run-z:1: log has no such keyframe"),
+        (("bisect", "log", "merged('run-a_p9')", *RULES), "column 8: no place 'run-a_p9'"),
+        (("whatif", "log"), "nothing to try"),
+        (("whatif", "log", "--set", "eps=1"), "no setting 'eps'"),
+        (("whatif", "log", "--set", "eps_m=1", "--truth", "none.jsonl"), "--truth none.jsonl"),
+    ],
+)
+def test_misuse_is_told_in_one_line(
+    mapfold: Commands,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    args: tuple[str, ...],
+    says: str,
+) -> None:
+    monkeypatch.chdir(mapfold.folder)
+    monkeypatch.setattr("sys.argv", ["mapfold", *args])
+    with pytest.raises(SystemExit) as left:
+        main()
+    said = capsys.readouterr()
+    assert left.value.code == 2
+    assert says in said.err.splitlines()[-1]
+    assert said.err.splitlines()[-1].startswith("mapfold: ")
+    assert said.out == ""

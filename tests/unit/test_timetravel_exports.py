@@ -1,0 +1,18 @@
+"""The public names of time travel, and what importing them costs."""
+
+import subprocess
+import sys
+
+import projections.timetravel
+
+
+def test_what_is_public_is_sorted_and_there() -> None:
+    names = projections.timetravel.__all__
+    assert names == sorted(names)
+    assert all(hasattr(projections.timetravel, name) for name in names)
+
+
+def test_importing_it_loads_no_drawing_and_no_database() -> None:
+    code = "import projections.timetravel, sys; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not {"matplotlib", "psycopg", "zenoh", "typer"} & set(done.stdout.split())
