@@ -10,6 +10,7 @@ from projections.postgres.embedded import EmbeddedServer
 from projections.runner import rebuild
 from projections.runner.check import CheckReport
 from projections.runner.check import check as check_projections
+from projections.sinks.roles import roles_sql
 
 from ._options import (
     DbOption,
@@ -98,6 +99,12 @@ def check(
         if wrong:
             say("rebuilt" if repair else f"to mend it run: mapfold db check --repair {log}")
     finish(findings=bool(wrong))
+
+
+@group.command()
+def roles(only: OnlyOption = None) -> None:
+    """Print SQL for two least-privilege roles: mapfold_reader and mapfold_writer."""
+    typer.echo(roles_sql(("graph", "vectors") if only is None else (only.value,)), nl=False)
 
 
 def _tell(reports: list[CheckReport]) -> None:

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import time
 from dataclasses import dataclass
 from typing import Final
 
@@ -20,6 +21,9 @@ from ._sql import statements
 
 _LOCK_NUMBERS: Final[dict[SinkName, int]] = {"graph": 1, "vectors": 2}
 _MARK: Final = "mapfold"
+LOCK_GRACE_S: Final = 1.0
+"""A server notices only after a moment that the last writer's connection has ended."""
+LOCK_POLL_S: Final = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,9 +47,14 @@ def event_hash(event: Event | None) -> str:
 def lock_writer(connection: Connection, sink: SinkName) -> None:
     """Be the only writer of a sink until the connection ends. Raises ProjectionBusy."""
     number = {"number": _LOCK_NUMBERS[sink]}
-    row = connection.execute(statements("checkpoint")["lock"], number).fetchone()
-    if row is not None and row[0]:
-        return
+    deadline = time.monotonic() + LOCK_GRACE_S
+    while True:
+        row = connection.execute(statements("checkpoint")["lock"], number).fetchone()
+        if row is not None and row[0]:
+            return
+        if time.monotonic() > deadline:
+            break
+        time.sleep(LOCK_POLL_S)
     holder = connection.execute(statements("checkpoint")["lock_holder"], number).fetchone()
     who = f" ({holder[1]}, server process {holder[0]})" if holder else ""
     raise ProjectionBusy(
