@@ -22,13 +22,17 @@ def _counts(view: MapView) -> str:
     names = ("runs", "keyframes", "observations", "objects", "places")
     text = ", ".join(_number(counts[name], name) for name in names)
     rare = {
-        "noise": "keyframes in no place",
-        "duplicates": "duplicates",
-        "conflicts": "conflicts",
-        "det_ids_reused": "det_ids used twice",
-        "foreign_embeddings": "embeddings of another space",
+        "noise": "{} in no place",
+        "duplicates": "{} seen twice",
+        "conflicts": "{} with other content ignored",
+        "det_ids_reused": "{} left out for a det_id used before",
+        "foreign_embeddings": "{} of another embedding space",
     }
-    return text + "".join(f", {counts[key]} {words}" for key, words in rare.items() if counts[key])
+    things = {"det_ids_reused": "observations", "foreign_embeddings": "observations"}
+    for key, words in rare.items():
+        if counts[key]:
+            text += ", " + words.format(_number(counts[key], things.get(key, "keyframes")))
+    return text
 
 
 def _number(count: int, plural: str) -> str:

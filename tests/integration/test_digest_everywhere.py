@@ -1,0 +1,87 @@
+"""One log, one digest: on every BLAS kernel, thread count and hash seed, in processes of their own.
+
+OpenBLAS picks a kernel by ``OPENBLAS_CORETYPE``. That the kernels differ is checked too: a plain
+float32 product has more than one result among them, or this test would prove nothing here.
+"""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.envelopes import detection, envelope, payload
+from tests.shared_data import shared_run
+
+KERNELS = ("Prescott", "Nehalem", "Haswell", "SkylakeX", "Zen")
+PLACES = [(kernel, "1", "0") for kernel in KERNELS] + [
+    ("Haswell", "2", "1"),
+    ("Prescott", "2", "12345"),
+    ("Nehalem", "2", "random"),
+]
+
+FOLD = """
+import hashlib, sys
+from pathlib import Path
+import numpy as np
+from eventsrc.ingest import ingest
+from projections.digest import map_digest
+from projections.reducers.semantic_map import SemanticMap
+from projections.settings import Settings
+from projections.view import MapView
+
+settings = Settings(eps_m=0.75, min_samples=8)
+fold, view, vectors = SemanticMap(settings), MapView(settings), []
+for offset, line in enumerate(Path(sys.argv[1]).read_bytes().splitlines()):
+    accepted = ingest(line)
+    vectors += accepted.vectors
+    view.apply_event(offset, fold.fold(offset, accepted))
+matrix = np.array(vectors[:200])
+print(map_digest(view), hashlib.sha256((matrix @ matrix[0]).tobytes()).hexdigest())
+"""
+
+
+def _synthetic_run() -> list[bytes]:
+    """A walk along a wavy corridor; looks scatter around eight things' directions."""
+    rng = np.random.default_rng(4)
+    looks = rng.normal(size=(8, 512))
+    payloads = []
+    for i in range(300):
+        which = [int(w) for w in rng.choice(8, 2, replace=False)]
+        seen = [
+            detection(f"class {w % 3}", looks[w] + rng.normal(size=512) * 0.8, det_id=f"{i}-{w}")
+            for w in which
+        ]
+        x, y = i * 0.21 % 12, float(np.sin(i / 7))
+        payloads.append(payload(envelope(i, x, y, detections=seen)))
+    return payloads
+
+
+def _fold_in(kernel: str, threads: str, seed: str, lines: Path) -> tuple[str, str]:
+    env = os.environ | {
+        "OPENBLAS_CORETYPE": kernel,
+        "OPENBLAS_NUM_THREADS": threads,
+        "PYTHONHASHSEED": seed,
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", FOLD, str(lines)],
+        env=env,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    digest, product = done.stdout.split()
+    return digest, product
+
+
+@pytest.mark.parametrize("run", ["synthetic", "house-a", "home-1"])
+def test_one_digest_on_every_kernel_thread_count_and_hash_seed(run: str, tmp_path: Path) -> None:
+    payloads = _synthetic_run() if run == "synthetic" else shared_run(run)
+    lines = tmp_path / "run.jsonl"
+    lines.write_bytes(b"\n".join(payloads))
+    results = {place: _fold_in(*place, lines) for place in PLACES}
+    assert len({digest for digest, _ in results.values()}) == 1, results
+    assert len({product for _, product in results.values()}) > 1, "all kernels are one here"
