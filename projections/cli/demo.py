@@ -25,8 +25,9 @@ def demo(
     """The whole story on one machine, each part real.
 
     A robot explores a simulated house and is recorded through a Zenoh router; the log is replayed
-    into databases; a second, lost robot asks where it is. Unless --db says otherwise the databases
-    are the demo's own, in DIR; yours are not touched.
+    into databases; a second, lost robot asks where it is. The databases are the demo's own, in DIR,
+    and yours are not touched; but in those that --db and --vector-db name, the demo's map replaces
+    the one that is there.
     """
     # Here and not above: the demo alone needs nearly everything, and that takes a while to import.
     from projections.demo import DemoOptions, run_demo

@@ -25,10 +25,8 @@ def commands(
         yield f"   . {_quoted(_near(activate))}    # puts mapfold on the path"
     if db is None:
         yield f"   export MAPFOLD_HOME={_quoted(folder.path)}    # where the databases are"
-    else:
-        yield f"   export MAPFOLD_DB={shlex.quote(db)}"
-    if vector_db is not None:
-        yield f"   export MAPFOLD_VECTOR_DB={shlex.quote(vector_db)}"
+    if db is not None or vector_db is not None:  # a URL may hold a password: not said here
+        yield "   # and MAPFOLD_DB, MAPFOLD_VECTOR_DB set to what --db and --vector-db were given"
     log, settings = _quoted(folder.log), f"--settings {_quoted(folder.settings)}"
     yield f"   mapfold state {log} {settings}"
     if merge is not None:
