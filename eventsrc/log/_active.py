@@ -169,7 +169,7 @@ class ActiveSegment:
     def _fail(self, error: OSError) -> LogError:
         """Cut off what is half written. After a failed sync nobody knows which pages are on the
         disk, and after a full disk the next write fails as well: the writer must start anew."""
-        self._failure = (
+        message = (
             f"{self.path}: {error.strerror or error}: {self.waiting} events after offset "
             f"{self.committed} could not be written; every event before it is safe. "
             "Free space or fix the disk, then start again"
@@ -177,8 +177,13 @@ class ActiveSegment:
         try:
             os.ftruncate(self._fd, self.size)
         except OSError as cut_error:
-            self._failure += f" (the torn end stays: {cut_error.strerror}; recovery ignores it)"
-        return LogError(self._failure)
+            message += f" (the torn end stays: {cut_error.strerror}; recovery ignores it)"
+        return self.refuse(message)
+
+    def refuse(self, message: str) -> LogError:
+        """From now on every append and commit raises this."""
+        self._failure = message
+        return LogError(message)
 
     def close(self) -> None:
         """Let go of the file. Does not commit."""

@@ -4,6 +4,7 @@ The file's text names the holder for whoever comes second. The text means nothin
 the lock counts, so a file left behind by a killed writer blocks nobody.
 """
 
+import contextlib
 import fcntl
 import json
 import os
@@ -33,8 +34,9 @@ class WriterLock:
             ) from None
         since = datetime.fromtimestamp(clock() / 1e9, UTC).isoformat(timespec="seconds")
         text = json.dumps({"pid": os.getpid(), "host": socket.gethostname(), "since": since})
-        os.ftruncate(self._fd, 0)
-        os.pwrite(self._fd, text.encode(), 0)
+        with contextlib.suppress(OSError):  # a full disk: the lock holds without its text
+            os.ftruncate(self._fd, 0)
+            os.pwrite(self._fd, text.encode(), 0)
 
     def release(self) -> None:
         """Let the next writer in. The file stays: deleting it would race with that writer."""

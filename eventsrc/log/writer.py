@@ -137,7 +137,7 @@ class LogWriter:
         try:
             self._begin_segment(finished.committed)
         except OSError as error:
-            raise LogError(
+            raise finished.refuse(
                 f"{self.path}: no new segment at offset {finished.committed}: "
                 f"{error.strerror or error}; every event before it is safe. "
                 "Free space or fix the disk, then start again"
@@ -152,7 +152,8 @@ class LogWriter:
             return
         self._closed = True
         try:
-            self._active.commit()
+            if self._active.waiting:
+                self._active.commit()
             self._finish_active()
         finally:
             self._active.close()

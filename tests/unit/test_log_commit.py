@@ -1,0 +1,197 @@
+"""When events are committed, when segments rotate, and what sealing may not hold up."""
+
+import os
+import threading
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from eventsrc.errors import LogError, MisuseError
+from eventsrc.log import ALWAYS, GROUP_COMMIT, NEVER, LogReader, LogWriter, _sealer, parse_fsync
+from eventsrc.log.fsync import FsyncPolicy
+from tests.fixtures_log import BY_HAND, KEY, read_log
+
+TIMEOUT_S = 30
+
+
+def test_fsync_as_people_write_it() -> None:
+    assert parse_fsync("always") == ALWAYS
+    assert parse_fsync("never") == NEVER
+    assert parse_fsync("50ms") == GROUP_COMMIT
+    assert parse_fsync("200ms").interval_ns == 200_000_000
+    for text in ("", "0ms", "ms", "-5ms", "1.5ms", "50", "50s", "sometimes", "9999999ms"):
+        with pytest.raises(MisuseError, match="50ms"):
+            parse_fsync(text)
+
+
+@pytest.fixture
+def syncs(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """One entry for each data sync."""
+    done: list[int] = []
+    real = os.fdatasync
+
+    def counted(fd: int) -> None:
+        done.append(fd)
+        real(fd)
+
+    monkeypatch.setattr(os, "fdatasync", counted)
+    return done
+
+
+@pytest.mark.parametrize(
+    ("policy", "durable", "synced"),
+    [
+        (ALWAYS, 10, 10),
+        (FsyncPolicy(interval_ns=10**18, max_events=4), 8, 2),
+        (FsyncPolicy(interval_ns=10**18, max_bytes=1), 10, 10),
+        (FsyncPolicy(interval_ns=10**18, max_events=5, syncs=False), 10, 0),
+        (BY_HAND, 0, 0),
+    ],
+)
+def test_a_policy_decides_when(
+    log_path: Path, syncs: list[int], policy: FsyncPolicy, durable: int, synced: int
+) -> None:
+    with LogWriter(log_path, fsync=policy) as writer:
+        before = len(syncs)
+        for _ in range(10):
+            writer.append(KEY, b"x")
+        assert writer.durable_offset == durable
+        assert len(syncs) - before == synced
+
+
+def test_time_makes_a_commit_due_without_another_event(log_path: Path) -> None:
+    policy = FsyncPolicy(interval_ns=20_000_000)
+    idle = threading.Event()
+    with LogWriter(log_path, fsync=policy) as writer:
+        assert not writer.commit_if_due()
+        writer.append(KEY, b"x")
+        for _ in range(1000):
+            if writer.commit_if_due():
+                break
+            idle.wait(0.001)
+        assert writer.durable_offset == 1
+        assert not writer.commit_if_due()
+
+
+@pytest.mark.parametrize(
+    "limits", [{"rotate_bytes": 1}, {"rotate_events": 1}, {"rotate_seconds": 0.0}]
+)
+def test_each_limit_rotates(log_path: Path, limits: dict[str, Any]) -> None:
+    with LogWriter(log_path, fsync=ALWAYS, **limits) as writer:
+        for _ in range(3):
+            writer.append(KEY, b"x")
+    bases = sorted(int(p.name[:20]) for p in log_path.glob("*.mcap"))
+    assert bases == [0, 1, 2]
+
+
+def test_age_rotates_an_idle_log_but_never_an_empty_segment(log_path: Path) -> None:
+    with LogWriter(log_path, fsync=BY_HAND, rotate_seconds=0.0) as writer:
+        writer.commit_if_due()
+        assert len(list(log_path.glob("*.active"))) == 1
+        writer.append(KEY, b"x")
+        writer.sync()
+        writer.commit_if_due()
+        writer.commit_if_due()
+        assert writer._active.base == 1
+
+
+def hold(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
+    """Sealing waits for this event."""
+    may_seal = threading.Event()
+    real: Callable[..., str] = _sealer.seal
+
+    def held(*args: Any) -> str:
+        assert may_seal.wait(TIMEOUT_S)
+        return real(*args)
+
+    monkeypatch.setattr(_sealer, "seal", held)
+    return may_seal
+
+
+def test_recording_and_reading_go_on_while_segments_are_sealed(
+    log_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    may_seal = hold(monkeypatch)
+    with LogWriter(log_path, fsync=ALWAYS, rotate_events=2) as writer:
+        for number in range(7):
+            writer.append(KEY, b"%d" % number)
+        assert not list(log_path.glob("*.mcap"))
+        assert len(list(log_path.glob("*.active"))) == 4
+        assert [e.payload for e in read_log(log_path)] == [b"%d" % n for n in range(7)]
+        with LogReader(log_path) as reader:
+            events = reader.read()
+            first = next(events)
+            may_seal.set()
+            writer.close()
+            assert [first, *events] == read_log(log_path)
+    assert not list(log_path.glob("*.active"))
+
+
+def test_a_disk_that_fails_to_sync_ends_the_writer(
+    log_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = LogWriter(log_path, fsync=BY_HAND)
+    writer.append(KEY, b"safe")
+    writer.sync()
+    writer.append(KEY, b"unsure")
+
+    def broken(fd: int) -> None:
+        raise OSError(5, "Input/output error")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fdatasync", broken)
+        with pytest.raises(LogError, match="Input/output error"):
+            writer.sync()
+    with pytest.raises(LogError, match="Input/output error"):
+        writer.sync()
+    assert [e.payload for e in read_log(log_path)] == [b"safe"]
+    with pytest.raises(LogError):
+        writer.close()
+    with LogWriter(log_path) as again:
+        assert again.next_offset == 1
+
+
+def test_times_out_of_bounds_are_refused(log_path: Path) -> None:
+    with LogWriter(log_path) as writer:
+        for times in ({"stamp_ns": -1}, {"logged_ns": 2**63}):
+            with pytest.raises(LogError, match="nanoseconds"):
+                writer.append(KEY, b"x", **times)
+        assert writer.next_offset == 0
+
+
+def test_the_end_of_a_long_log_is_read_without_the_rest(
+    log_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with LogWriter(log_path, rotate_bytes=2**20) as writer:
+        for number in range(3000):
+            writer.append(KEY, b"%04d" % number + b"x" * 4000)
+    total = 3000 * 4004
+    read = 0
+    real = os.pread
+
+    def counted(fd: int, length: int, at: int) -> bytes:
+        nonlocal read
+        read += length
+        return real(fd, length, at)
+
+    monkeypatch.setattr(os, "pread", counted)
+    with LogReader(log_path) as reader:
+        last = list(reader.read(reader.next_offset - 10))
+    assert [e.payload[:4] for e in last] == [b"%04d" % n for n in range(2990, 3000)]
+    assert read < total / 20
+
+
+def test_memory_does_not_grow_with_the_log(log_path: Path) -> None:
+    with LogWriter(log_path, rotate_bytes=4 * 2**20) as writer:
+        for number in range(5000):
+            writer.append(KEY, os.urandom(2000) + b"%d" % number)
+    tracemalloc.start()
+    with LogReader(log_path) as reader:
+        count = sum(1 for _ in reader.read())
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert count == 5000
+    assert peak < 5 * 2**20, f"{peak} bytes to read 10 MB"
