@@ -46,7 +46,7 @@ class Search:
 
     ``found`` is the first turn to true, None if there is none; ``turns`` are all turns when a scan
     was asked for, else those up to ``found``. ``holds`` says whether it is true at the start and at
-    the end. ``asked`` is how many maps were asked.
+    the end, ``at_end`` what it reads there. ``asked`` is how many maps were asked.
     """
 
     expression: Expression
@@ -55,6 +55,7 @@ class Search:
     holds: tuple[bool, bool]
     found: Turn | None
     turns: tuple[Turn, ...]
+    at_end: Readings
     asked: int
 
     def document(self) -> dict[str, Any]:
@@ -64,6 +65,7 @@ class Search:
             "to": self.end,
             "holds_at_start": self.holds[0],
             "holds_at_end": self.holds[1],
+            "at_end": dict(self.at_end),
             "found": None if self.found is None else self.found.document(),
             "turns": [turn.document() for turn in self.turns],
             "maps_asked": self.asked,
@@ -90,7 +92,16 @@ class Searcher:
         else:
             turns = [] if holds[0] or not holds[1] else [self._bisect(start, end)]
         found = next((turn for turn in turns if turn.becomes), None)
-        return Search(self._expression, start, end, holds, found, tuple(turns), self._asked)
+        return Search(
+            self._expression,
+            start,
+            end,
+            holds,
+            found,
+            tuple(turns),
+            self._readings(end),
+            self._asked,
+        )
 
     def _holds(self, end: int) -> bool:
         self._asked += 1

@@ -91,10 +91,10 @@ def test_bisect(mapfold: Commands) -> None:
     assert found["found"]["offset"] == 7
     assert [(turn["offset"], turn["becomes"]) for turn in found["turns"]] == [(5, False), (7, True)]
     assert mapfold("bisect", "log", "place_count > 9", *RULES).out == (
-        "never true from --at 0 to 8\n"
+        "never true from --at 0 to 8\n  place_count: 1 at the end\n"
     )
     assert mapfold("bisect", "log", "place_count < 9", *RULES).out == (
-        "true all along from --at 0 to 8\n"
+        "true all along from --at 0 to 8\n  place_count: 1 at the end\n"
     )
     assert mapfold("bisect", "log", "place_count == 0", *RULES).out.splitlines()[0] == (
         "true at --at 0, then false; it does not become true again from --at 0 to 8"

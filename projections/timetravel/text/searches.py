@@ -1,6 +1,6 @@
 """`mapfold bisect` for people."""
 
-from projections.timetravel.search import Readings, Search, Turn
+from projections.timetravel.search import Search, Turn
 
 from .table import shortened
 
@@ -10,6 +10,8 @@ def search_text(search: Search, *, most: int | None) -> str:
     lines = [_verdict(search)]
     if search.found is not None:
         lines += _values(search.found)
+    else:
+        lines += [f"  {name}: {_value(value)} at the end" for name, value in search.at_end]
     others = [turn for turn in search.turns if turn is not search.found]
     lines += shortened([_turn(turn) for turn in others], most, "--json lists all")
     return "".join(f"{line}\n" for line in lines)
@@ -50,8 +52,3 @@ def _value(value: object) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     return "none" if value is None else str(value)
-
-
-def readings_text(readings: Readings) -> str:
-    """``place_count = 3, noise_count = 0``."""
-    return ", ".join(f"{name} = {_value(value)}" for name, value in readings)
