@@ -68,6 +68,34 @@ class Missed(NamedTuple):
     missed: int
 
 
+class Asked:
+    """A question under a queryable. Answer or refuse it once, from any thread; that ends it.
+
+    ``key`` is what was asked, which may hold wildcards; ``parameters`` stand behind its ``?``.
+    """
+
+    def __init__(self, query: zenoh.Query) -> None:
+        self._query = query
+        self.key = str(query.key_expr)
+        self.parameters = _parameters(str(query.parameters))
+        self.payload = query.payload.to_bytes() if query.payload is not None else b""
+        self.ended = False
+
+    def answer(self, key: str, payload: bytes) -> None:
+        """Send the answer, under ``key``."""
+        self._end(lambda: self._query.reply(key, payload))
+
+    def refuse(self, payload: bytes) -> None:
+        """Send an error instead of an answer."""
+        self._end(lambda: self._query.reply_err(payload))
+
+    def _end(self, send: Callable[[], None]) -> None:
+        with contextlib.suppress(zenoh.ZError):  # who asked may be gone: nobody is left to tell
+            send()
+        self._query.drop()  # type: ignore[no-untyped-call]
+        self.ended = True
+
+
 class Publisher:
     """Sends bytes under one key: reliable, in order, blocking while the network is full.
 
@@ -147,7 +175,8 @@ class Session:
     ) -> Subscription:
         """Call ``handler`` for every message under ``key_expr``, from a thread of Zenoh's.
 
-        The handler must only hand over: while it works nothing else is received. With ``on_miss``
+        The handler must only hand over: while it works nothing else is received, and after five
+        seconds of that Zenoh gives up links and loses messages without a word. With ``on_miss``
         gaps in what advanced publishers send are fetched again, and told of if that fails.
         """
 
@@ -188,6 +217,27 @@ class Session:
 
         with _clear_errors(f"key {key!r} cannot be answered on"):
             return Subscription(self.raw.declare_queryable(key, reply, complete=True))
+
+    def questions(self, key: str, take: Callable[[Asked], None]) -> Subscription:
+        """Hand over every question under ``key`` to ``take``, which must not work on it itself."""
+
+        def hand_over(query: zenoh.Query) -> None:
+            take(Asked(query))
+
+        with _clear_errors(f"key {key!r} cannot be answered on"):
+            return Subscription(self.raw.declare_queryable(key, hand_over, complete=True))
+
+    def ask(
+        self, selector: str, payload: bytes | None = None, *, timeout_s: float
+    ) -> list[tuple[bool, bytes]]:
+        """Like `get`, with the refusals: (True, answer) and (False, error) as they came."""
+        with _clear_errors(f"selector {selector!r} cannot be asked"):
+            return [
+                (True, reply.ok.payload.to_bytes())
+                if reply.ok is not None
+                else (False, reply.err.payload.to_bytes() if reply.err is not None else b"")
+                for reply in self.raw.get(selector, payload=payload, timeout=timeout_s)
+            ]
 
     @property
     def linked(self) -> bool:
@@ -324,6 +374,12 @@ def _subscribe_advanced(
         lambda miss: on_miss(Missed(f"{miss.source.zid}:{miss.source.eid}", miss.nb))
     )
     return Subscription(listener, subscriber)
+
+
+def _parameters(text: str) -> dict[str, str]:
+    """Zenoh writes them ``name=value;name=value``."""
+    pairs = (part.partition("=") for part in text.split(";") if part)
+    return {name: value for name, _, value in pairs}
 
 
 def _received(sample: zenoh.Sample) -> Received:

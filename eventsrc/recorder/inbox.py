@@ -1,7 +1,11 @@
 """The bounded queue between Zenoh's thread and the writer's.
 
-Zenoh's callback only hands over: it may never wait, or the network waits with it. What does not
-fit is counted, per key, until the writer fetches the count and writes it into the log.
+Zenoh's callback only hands over. When the queue is full it waits a moment for room, because then
+the network waits with it and a publisher that blocks is slowed down to the pace of the disk; that
+loses nothing. But the wait is bounded, and shorter than the five seconds after which Zenoh gives a
+link up and loses messages without a word: a writer that makes no room for that long is stuck. From
+then on what does not fit is turned away at once and counted, per key, until the writer fetches the
+count and writes it into the log; and when half the queue is free again, so is the patience.
 """
 
 import threading
@@ -14,6 +18,8 @@ DEFAULT_QUEUE_SIZE: Final = 16_384
 """Messages. At 9 kB each about 150 MB, and two seconds of 8,000 a second."""
 DEFAULT_QUEUE_BYTES: Final = 512 * 1024 * 1024
 """Payload bytes, so that a queue of large messages does not take all memory."""
+PATIENCE_S: Final = 1.0
+"""How long a message may wait for room. Longer than a sync takes, far shorter than five seconds."""
 
 
 class Inbox:
@@ -23,12 +29,17 @@ class Inbox:
     """
 
     def __init__(
-        self, size: int = DEFAULT_QUEUE_SIZE, max_bytes: int = DEFAULT_QUEUE_BYTES
+        self,
+        size: int = DEFAULT_QUEUE_SIZE,
+        max_bytes: int = DEFAULT_QUEUE_BYTES,
+        patience_s: float = PATIENCE_S,
     ) -> None:
         if size < 1:
             raise ValueError(f"queue of {size} messages; at least 1")
         self.size = size
         self._max_bytes = max_bytes
+        self._patience_s = patience_s
+        self._patient = True
         self._bytes = 0
         self._messages: deque[Received] = deque()
         self._overflow: dict[str, int] = {}
@@ -39,19 +50,21 @@ class Inbox:
         """Messages that Zenoh says never came, since the beginning."""
         self._lock = threading.Lock()
         self._filled = threading.Condition(self._lock)
-        self._waiting = False
+        self._emptied = threading.Condition(self._lock)
+        self._taking = False
+        self._putting = 0
         self._closed = False
 
     def put(self, message: Received) -> None:
-        """Hand over one message, or count it as lost when the queue is full. Never blocks."""
+        """Hand over one message, or count it as lost when there is no room for it in time."""
         with self._lock:
-            if self._fits(len(message.payload)):
+            if self._fits(message) or self._wait_for_room(message):
                 self._messages.append(message)
                 self._bytes += len(message.payload)
             else:
                 self.overflowed += 1
                 self._overflow[message.key] = self._overflow.get(message.key, 0) + 1
-            if self._waiting:
+            if self._taking:
                 self._filled.notify()
 
     def miss(self, missed: Missed) -> None:
@@ -64,12 +77,15 @@ class Inbox:
         """Up to ``limit`` messages in order; empty when none came in time or it is closed."""
         with self._lock:
             if not self._messages and not self._closed and timeout_s > 0:
-                self._waiting = True
+                self._taking = True
                 self._filled.wait(timeout_s)
-                self._waiting = False
+                self._taking = False
             count = min(limit, len(self._messages))
             taken = [self._messages.popleft() for _ in range(count)]
             self._bytes -= sum(len(message.payload) for message in taken)
+            self._patient = self._patient or 2 * len(self._messages) <= self.size
+            if self._putting:
+                self._emptied.notify_all()
             return taken
 
     def take_overflow(self) -> dict[str, int]:
@@ -85,10 +101,12 @@ class Inbox:
             return missed
 
     def close(self) -> None:
-        """Wake the taker: nothing more will come."""
+        """Wake everybody: nothing more will come, and nobody waits for room."""
         with self._lock:
             self._closed = True
+            self._patient = False
             self._filled.notify_all()
+            self._emptied.notify_all()
 
     @property
     def closed(self) -> bool:
@@ -99,7 +117,19 @@ class Inbox:
         """How many messages wait."""
         return len(self._messages)
 
-    def _fits(self, payload_bytes: int) -> bool:
+    def _fits(self, message: Received) -> bool:
         if not self._messages:
             return True
-        return len(self._messages) < self.size and self._bytes + payload_bytes <= self._max_bytes
+        fits_in = self._bytes + len(message.payload) <= self._max_bytes
+        return fits_in and len(self._messages) < self.size
+
+    def _wait_for_room(self, message: Received) -> bool:
+        if not self._patient:
+            return False
+        self._putting += 1
+        self._emptied.wait_for(lambda: self._fits(message) or not self._patient, self._patience_s)
+        self._putting -= 1
+        fits = self._fits(message)
+        if not fits:
+            self._patient = False
+        return fits

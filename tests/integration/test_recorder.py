@@ -188,7 +188,7 @@ def test_an_ack_covers_what_is_synced_and_nothing_else(connected: Sessions, tmp_
     assert claimed == {1, 2, 3, 9}
 
 
-def test_a_full_queue_loses_loudly_and_never_blocks(connected: Sessions, tmp_path: Path) -> None:
+def test_a_queue_that_stays_full_loses_loudly(connected: Sessions, tmp_path: Path) -> None:
     """The clock is the gate: the writer stands in its first append until the gate opens."""
     entered, gate = threading.Event(), threading.Event()
     gate.set()
@@ -264,6 +264,17 @@ def test_an_older_form_is_recorded_and_counts_no_keyframes(
         running.wait_until(lambda report: (report.recorded, report.rejected) == (2, 1))
         assert running.finish().missing == 0
     assert [e.payload.decode() for e in _events(tmp_path / "log") if e.key == KEY] == [bare, bare]
+
+
+def test_a_publisher_at_full_speed_is_slowed_down_and_loses_nothing(
+    connected: Sessions, publish: Callable[..., Program], tmp_path: Path
+) -> None:
+    sent = [payload(envelope(k)).decode() for k in range(3_000)]
+    with recording(connected(), tmp_path / "log", queue_size=8) as running:
+        assert publish(KEY, *sent).wait() == 0
+        running.wait_until(lambda report: report.recorded == len(sent))
+        assert running.finish().clean
+    assert [e.payload.decode() for e in _events(tmp_path / "log")] == sent
 
 
 def test_a_gap_in_the_last_moment_is_written_before_the_end(

@@ -1,4 +1,4 @@
-"""The bounded queue: it never blocks, never holds too much, and counts what it turns away."""
+"""The bounded queue: it never holds too much, waits a little, and counts what it turns away."""
 
 import threading
 
@@ -28,7 +28,7 @@ def test_first_in_first_out_in_batches() -> None:
 
 
 def test_what_does_not_fit_is_counted_by_key_and_told_once() -> None:
-    inbox = Inbox(2)
+    inbox = Inbox(2, patience_s=0)
     for text in "abcd":
         inbox.put(_message(text))
     inbox.put(_message("e", key="tb/other"))
@@ -40,7 +40,7 @@ def test_what_does_not_fit_is_counted_by_key_and_told_once() -> None:
 
 
 def test_bytes_are_bounded_too_but_one_message_always_fits() -> None:
-    inbox = Inbox(10, max_bytes=4)
+    inbox = Inbox(10, max_bytes=4, patience_s=0)
     inbox.put(_message("larger than that"))
     inbox.put(_message("x"))
     assert inbox.overflowed == 1
@@ -79,6 +79,59 @@ def test_a_waiting_taker_is_woken_by_the_end() -> None:
     taker.join(DEADLINE_S)
     assert not taker.is_alive()
     assert inbox.closed
+
+
+def _putting(inbox: Inbox, *texts: str) -> threading.Thread:
+    def put() -> None:
+        for text in texts:
+            inbox.put(_message(text))
+
+    thread = threading.Thread(target=put)
+    thread.start()
+    return thread
+
+
+def test_a_full_queue_slows_the_sender_down_and_loses_nothing() -> None:
+    inbox = Inbox(2, patience_s=DEADLINE_S)
+    texts = [str(n) for n in range(500)]
+    sender = _putting(inbox, *texts)
+    taken: list[str] = []
+    while len(taken) < len(texts):
+        batch = inbox.take(3, DEADLINE_S)
+        assert 0 < len(batch) <= 2
+        taken += _texts(batch)
+    sender.join(DEADLINE_S)
+    assert taken == texts
+    assert inbox.overflowed == 0
+
+
+def test_patience_ends_once_and_comes_back_with_room() -> None:
+    """A sender that waits for ever would hang this test: only the first loss may take time."""
+    inbox = Inbox(4, patience_s=0.01)
+    for n in range(20_000):
+        inbox.put(_message(str(n)))
+    assert inbox.overflowed == 20_000 - 4
+    inbox.take(1, 0)
+    inbox.put(_message("fits"))
+    inbox.put(_message("three quarters full is no reason to wait"))
+    assert inbox.overflowed == 20_000 - 3
+    inbox.take(2, 0)
+    inbox._patience_s = DEADLINE_S
+    sender = _putting(inbox, "a", "b", "c")
+    assert _texts(inbox.take(4, 0))[:2] == ["3", "fits"]
+    sender.join(DEADLINE_S)
+    assert inbox.overflowed == 20_000 - 3
+
+
+def test_the_end_ends_all_waiting_for_room() -> None:
+    inbox = Inbox(1, patience_s=DEADLINE_S * 10)
+    inbox.put(_message("a"))
+    sender = _putting(inbox, "b", "c")
+    inbox.close()
+    sender.join(DEADLINE_S)
+    assert not sender.is_alive()
+    assert _texts(inbox.take(5, 0)) == ["a"]
+    assert inbox.overflowed == 2
 
 
 def test_what_waits_at_the_end_is_still_taken() -> None:
