@@ -13,8 +13,10 @@ from . import (
     draw,
     evaluate,
     merges,
+    query,
     relocalize,
     replay,
+    serve,
     state,
     status,
     tail,
@@ -40,6 +42,8 @@ db.register(app)
 state.register(app)
 relocalize.register(app)
 evaluate.register(app)
+query.register(app)
+serve.register(app)
 draw.register(app)
 merges.register(app)
 why.register(app)

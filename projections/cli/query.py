@@ -1,0 +1,149 @@
+"""`mapfold query …`: what stands where, what is near, how to get there."""
+
+import contextlib
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from eventsrc.cli._shell import emit
+from eventsrc.errors import MisuseError
+from eventsrc.log import LogReader
+from eventsrc.log.whence import resolve
+from projections.cli._options import DbOption, VectorDbOption, databases
+from projections.cli._question import QuestionArgument, question_from
+from projections.folding import fold_log
+from projections.postgres.connect import connect
+from projections.queries.ask import (
+    Asker,
+    LiveAsker,
+    ViewAsker,
+    objects_of,
+    path_between,
+    places_holding,
+    similar_objects,
+    where_is,
+)
+from projections.queries.relocalize import Reader, prepare_graph
+from projections.settings import Settings
+
+AtOption = Annotated[
+    str | None,
+    typer.Option("--at", metavar="W", help="Ask the map as of this point of --log instead."),
+]
+LogOption = Annotated[
+    Path | None, typer.Option("--log", metavar="LOG", help="The log's folder, for --at.")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="The answer as JSON on stdout.")]
+PlaceArgument = Annotated[str, typer.Argument(metavar="PLACE", help="A place's id.")]
+
+
+def similar(
+    query: QuestionArgument,
+    top: Annotated[int, typer.Option("--top", min=1, max=64, help="Objects to list.")] = 10,
+    db: DbOption = None,
+    vector_db: VectorDbOption = None,
+    json_: JsonOption = False,
+) -> None:
+    """Objects that look most like the crops of QUERY."""
+    crops = question_from(query)
+    with databases(db, vector_db) as targets, Reader(targets) as reader:
+        found = similar_objects(crops, reader.candidates(crops), top)
+    _tell(found, json_)
+
+
+def where(
+    object_id: Annotated[str, typer.Argument(metavar="OBJECT", help="An object's id.")],
+    at: AtOption = None,
+    log: LogOption = None,
+    db: DbOption = None,
+    json_: JsonOption = False,
+) -> None:
+    """Where an object is, or was at a point of the log."""
+    with _asker(db, log, at) as asker:
+        _tell(where_is(asker, object_id), json_)
+
+
+def contents(
+    place_id: PlaceArgument,
+    at: AtOption = None,
+    log: LogOption = None,
+    db: DbOption = None,
+    json_: JsonOption = False,
+) -> None:
+    """The objects located in a place."""
+    with _asker(db, log, at) as asker:
+        _tell(objects_of(asker, place_id), json_)
+
+
+def holding(
+    class_name: Annotated[str, typer.Argument(metavar="CLASS", help="A class, such as cup.")],
+    start: Annotated[str, typer.Option("--from", metavar="PLACE", help="Where to start.")],
+    hops: Annotated[int, typer.Option("--hops", min=0, help="Steps from place to place.")] = 2,
+    at: AtOption = None,
+    log: LogOption = None,
+    db: DbOption = None,
+    json_: JsonOption = False,
+) -> None:
+    """Places within some steps of a place that hold an object of a class."""
+    with _asker(db, log, at) as asker:
+        _tell(places_holding(asker, class_name, start, hops), json_)
+
+
+def path(
+    start: PlaceArgument,
+    goal: Annotated[str, typer.Argument(metavar="GOAL", help="The other place's id.")],
+    at: AtOption = None,
+    log: LogOption = None,
+    db: DbOption = None,
+    json_: JsonOption = False,
+) -> None:
+    """The places on the way from one place to another."""
+    with _asker(db, log, at) as asker:
+        _tell(path_between(asker, start, goal), json_)
+
+
+@contextlib.contextmanager
+def _asker(db: str | None, log: Path | None, at: str | None) -> Iterator[Asker]:
+    """The live graph, or the log folded to a point (with the default settings)."""
+    if log is not None:
+        with LogReader(log) as reader:
+            _, view = fold_log(reader, Settings(), resolve(reader, at or "end"))
+        yield ViewAsker(view)
+        return
+    if at is not None:
+        raise MisuseError("--at asks a past map, which only the log knows; give --log LOG too")
+    with (
+        databases(db, None) as targets,
+        connect(targets.graph_url, application="mapfold query", autocommit=True) as connection,
+    ):
+        prepare_graph(connection)
+        yield LiveAsker(connection)
+
+
+def _tell(found: Any, as_json: bool) -> None:
+    if as_json:
+        emit(found)
+        return
+    rows = found if isinstance(found, list) else [found]
+    sys.stdout.write("".join(f"{_line(row)}\n" for row in rows) or "nothing\n")
+
+
+def _line(row: dict[str, Any]) -> str:
+    return "  ".join(
+        f"{name} {value:.3f}" if isinstance(value, float) else f"{name} {value}"
+        for name, value in row.items()
+        if value is not None
+    )
+
+
+def register(app: typer.Typer) -> None:
+    """Add `query` and its questions to the program."""
+    group = typer.Typer(
+        no_args_is_help=True, help="Ask the map: similar, where, contents, holding, path."
+    )
+    for command in (similar, where, contents, holding, path):
+        group.command()(command)
+    app.add_typer(group, name="query")

@@ -1,0 +1,83 @@
+"""`mapfold serve`: answer lost robots over Zenoh and HTTP until a signal ends it."""
+
+from contextlib import ExitStack
+from typing import Annotated
+
+import typer
+
+from eventsrc._zenoh import open_session
+from eventsrc.cli._shell import say
+from eventsrc.cli._signals import stop_on_signals
+from eventsrc.cli._zenoh_options import ConfigOption, ConnectOption, ListenOption, zenoh_options
+from eventsrc.errors import MisuseError
+from projections.cli._options import DbOption, VectorDbOption
+from projections.cli._question import HfovOption, ImageOption, camera_from
+from projections.postgres.connect import open_targets
+from projections.serve import Answerer, Pools, ZenohService
+from projections.serve.answering import DEFAULT_MAX_BYTES
+
+
+def serve(
+    http: Annotated[
+        str | None,
+        typer.Option("--http", metavar="HOST:PORT", help="Serve HTTP there too (extra [serve])."),
+    ] = None,
+    zenoh: Annotated[bool, typer.Option(help="Serve mapfold/relocalize over Zenoh.")] = True,
+    connect: ConnectOption = None,
+    listen: ListenOption = None,
+    zenoh_config: ConfigOption = None,
+    workers: Annotated[
+        int, typer.Option("--workers", min=1, max=64, help="Questions answered at a time.")
+    ] = 4,
+    rate: Annotated[
+        float, typer.Option("--rate", min=0.1, help="Questions a second, in the long run.")
+    ] = 500.0,
+    max_bytes: Annotated[
+        int, typer.Option("--max-bytes", min=1000, help="Longer questions are refused.")
+    ] = DEFAULT_MAX_BYTES,
+    hfov: HfovOption = 69.4,
+    image: ImageOption = "640x400",
+    db: DbOption = None,
+    vector_db: VectorDbOption = None,
+) -> None:
+    """Answer questions from the live databases until Ctrl-C: mapfold/relocalize, mapfold/state/**.
+
+    Errors come back as replies. On SIGINT or SIGTERM open questions are answered first.
+    """
+    if http is None and not zenoh:
+        raise MisuseError("neither --zenoh nor --http: there is nothing to serve on")
+    camera, options = camera_from(hfov, image), zenoh_options(connect, listen, zenoh_config)
+    with ExitStack() as stack:
+        stop = stack.enter_context(stop_on_signals())
+        targets = stack.enter_context(open_targets(db, vector_db))
+        pools = stack.enter_context(Pools(targets, workers))
+        answerer = Answerer(pools, per_second=rate, max_bytes=max_bytes, camera=camera)
+        if zenoh:
+            session = stack.enter_context(open_session(options, mode=options.mode))
+            stack.enter_context(ZenohService(session, answerer, workers))
+            say("answering mapfold/relocalize and mapfold/state/** over Zenoh")
+        if http is not None:
+            say(f"answering http://{_serve_http(stack, http, answerer)}, described at /docs")
+        say("Ctrl-C ends it")
+        stop.wait()
+    say("service ended")
+
+
+def _serve_http(stack: ExitStack, http: str, answerer: Answerer) -> str:
+    host, colon, port = http.rpartition(":")
+    if not colon or not port.isdecimal() or int(port) > 65_535:
+        raise MisuseError(f"--http {http}: write it as HOST:PORT, such as 127.0.0.1:8080")
+    try:
+        from projections.serve.http import create_app, serving
+    except ModuleNotFoundError as error:
+        raise MisuseError(
+            f"--http needs {error.name}, which is not installed; pip install 'mapfold[serve]'"
+        ) from None
+    host = host.strip("[]") or "127.0.0.1"
+    bound = stack.enter_context(serving(create_app(answerer), host, int(port)))
+    return f"{host}:{bound}"
+
+
+def register(app: typer.Typer) -> None:
+    """Add `serve` to the program."""
+    app.command()(serve)

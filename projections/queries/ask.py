@@ -1,0 +1,167 @@
+"""The questions people ask, as documents ready for JSON: live, or of a folded map.
+
+`Asker` is what a question needs to know; the databases and a folded map are two of them.
+"""
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+from projections.errors import QuestionError
+from projections.postgres.connect import Connection
+from projections.relocalize import Candidates, Crop
+from projections.view import MapView
+
+from .graph_reads import read_holders, read_object, read_objects_of_place, read_place_graph
+from .place_graph import PlaceGraph
+
+
+class Asker(Protocol):
+    """Where answers come from."""
+
+    def place_graph(self) -> PlaceGraph:
+        """All Places and their adjacency."""
+
+    def holders(self, class_name: str) -> dict[int, int]:
+        """Objects of a class per Place ordinal."""
+
+    def thing(self, object_id: str) -> dict[str, Any] | None:
+        """An Object with its place_id."""
+
+    def contents(self, place_id: str) -> list[dict[str, Any]]:
+        """The Objects of a Place."""
+
+
+class LiveAsker:
+    """Asks the graph's database; ``connection`` was set up by `prepare_graph`."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+
+    def place_graph(self) -> PlaceGraph:
+        """All Places and their adjacency."""
+        return read_place_graph(self._connection)
+
+    def holders(self, class_name: str) -> dict[int, int]:
+        """Objects of a class per Place ordinal."""
+        return read_holders(self._connection, class_name)
+
+    def thing(self, object_id: str) -> dict[str, Any] | None:
+        """An Object with its place_id."""
+        return read_object(self._connection, object_id)
+
+    def contents(self, place_id: str) -> list[dict[str, Any]]:
+        """The Objects of a Place."""
+        return read_objects_of_place(self._connection, place_id)
+
+
+class ViewAsker:
+    """Asks a folded map."""
+
+    def __init__(self, view: MapView) -> None:
+        self._view = view
+
+    def place_graph(self) -> PlaceGraph:
+        """All Places and their adjacency."""
+        return PlaceGraph.of_view(self._view)
+
+    def holders(self, class_name: str) -> dict[int, int]:
+        """Objects of a class per Place ordinal."""
+        held: dict[int, int] = {}
+        for thing in self._view.objects:
+            if thing.class_name == class_name and thing.place is not None:
+                held[thing.place] = held.get(thing.place, 0) + 1
+        return held
+
+    def thing(self, object_id: str) -> dict[str, Any] | None:
+        """An Object with its place_id."""
+        return next(
+            (self._document(o.ordinal) for o in self._view.objects if o.object_id == object_id),
+            None,
+        )
+
+    def contents(self, place_id: str) -> list[dict[str, Any]]:
+        """The Objects of a Place."""
+        return [
+            self._document(o.ordinal)
+            for o in self._view.objects
+            if self._view.place_id(o.place) == place_id
+        ]
+
+    def _document(self, ordinal: int) -> dict[str, Any]:
+        thing = self._view.objects[ordinal]
+        return {
+            "object_id": thing.object_id,
+            "class_name": thing.class_name,
+            "mean_x": thing.mean_x,
+            "mean_y": thing.mean_y,
+            "obs_count": thing.obs_count,
+            "first_seen": thing.first_seen,
+            "last_seen": thing.last_seen,
+            "place_id": self._view.place_id(thing.place),
+        }
+
+
+def where_is(asker: Asker, object_id: str) -> dict[str, Any]:
+    """An Object and the Place it is located in. Raises QuestionError if there is none."""
+    thing = asker.thing(object_id)
+    if thing is None:
+        raise QuestionError(f"no object {object_id!r} in this map; mapfold state --json lists them")
+    return thing
+
+
+def objects_of(asker: Asker, place_id: str) -> list[dict[str, Any]]:
+    """The Objects of a Place. Raises QuestionError if there is no such Place."""
+    found = asker.contents(place_id)
+    if not found:
+        asker.place_graph().find(place_id)
+    return found
+
+
+def places_holding(asker: Asker, class_name: str, start: str, hops: int) -> list[dict[str, Any]]:
+    """Places within ``hops`` steps of ``start`` that hold a class, nearest first."""
+    graph = asker.place_graph()
+    within = graph.hops_from(graph.find(start), hops)
+    held = asker.holders(class_name)
+    order = sorted((p for p in within if p in held), key=lambda p: (within[p], p))
+    return [
+        {"place_id": graph.places[p].place_id, "hops": within[p], "objects": held[p]} for p in order
+    ]
+
+
+def path_between(asker: Asker, start: str, goal: str) -> list[dict[str, Any]]:
+    """The Places on the way, both ends included; empty if there is no way."""
+    graph = asker.place_graph()
+    way = graph.path(graph.find(start), graph.find(goal)) or []
+    return [
+        {
+            "place_id": graph.places[p].place_id,
+            "centroid_x": graph.places[p].x,
+            "centroid_y": graph.places[p].y,
+            "shared_transitions": None if i == 0 else graph.shared(way[i - 1], p),
+        }
+        for i, p in enumerate(way)
+    ]
+
+
+def similar_objects(
+    crops: Sequence[Crop], candidates: Candidates, top: int
+) -> list[dict[str, Any]]:
+    """Objects most like any of the crops, by their most similar observation."""
+    best: dict[str, dict[str, Any]] = {}
+    for row in candidates.matches[: len(crops)]:
+        for match in row:
+            if match.object_id is None:
+                continue
+            known = best.get(match.object_id)
+            if known is None or match.similarity > known["similarity"]:
+                best[match.object_id] = {
+                    "object_id": match.object_id,
+                    "class_name": match.class_name,
+                    "similarity": match.similarity,
+                    "det_id": match.det_id,
+                    "place_id": None
+                    if match.object_place is None
+                    else candidates.places[match.object_place].place_id,
+                }
+    ordered = sorted(best.values(), key=lambda o: (-o["similarity"], o["object_id"]))
+    return ordered[:top]

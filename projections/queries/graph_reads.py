@@ -1,0 +1,82 @@
+"""Reading Places and Objects from the graph's tables; every function is one round trip or two.
+
+Ids and class names are bind parameters, encoded as agtype strings; they may hold anything.
+"""
+
+import json
+from typing import Any
+
+import psycopg
+
+from projections.errors import ProjectionMissing
+from projections.postgres.connect import Connection, database_errors, place_of
+from projections.sinks.agtype import text
+
+from ._statements import statements, tables
+from .place_graph import PlaceGraph, PlaceNode
+
+_NUMBER = (1 << 48) - 1
+
+
+def read_place_graph(connection: Connection) -> PlaceGraph:
+    """All Places and their adjacency."""
+    nodes = []
+    for graphid, properties in _rows(connection, "places"):
+        place = json.loads(properties)
+        nodes.append(
+            PlaceNode(
+                _ordinal(graphid),
+                place["place_id"],
+                place["centroid_x"],
+                place["centroid_y"],
+                place["keyframe_count"],
+            )
+        )
+    edges = [
+        (_ordinal(a), _ordinal(b), json.loads(properties)["shared_transitions"])
+        for a, b, properties in _rows(connection, "edges")
+    ]
+    return PlaceGraph(nodes, edges)
+
+
+def read_object(connection: Connection, object_id: str) -> dict[str, Any] | None:
+    """An Object with its ``place_id`` (None for none); None if there is no such Object."""
+    rows = _rows(connection, "object", id=text(object_id))
+    return _thing(rows[0]) if rows else None
+
+
+def read_objects_of_place(connection: Connection, place_id: str) -> list[dict[str, Any]]:
+    """The Objects located in a Place, in founding order."""
+    return [_thing(row) for row in _rows(connection, "objects_of_place", id=text(place_id))]
+
+
+def read_holders(connection: Connection, class_name: str) -> dict[int, int]:
+    """How many Objects of a class each Place holds, by the Place's ordinal."""
+    rows = _rows(connection, "holders", id=text(class_name))
+    return {_ordinal(graphid): count for graphid, count in rows}
+
+
+def read_near(connection: Connection, kind: str, x: float, y: float, r: float) -> list[Any]:
+    """Properties of the ``places`` or ``objects`` in a square of half-width ``r`` metres."""
+    box = {"x0": x - r, "x1": x + r, "y0": y - r, "y1": y + r}
+    return [json.loads(row[0]) for row in _rows(connection, f"near_{kind}", **box)]
+
+
+def _thing(row: tuple[str, str | None]) -> dict[str, Any]:
+    place_id = None if row[1] is None else json.loads(row[1])["place_id"]
+    return {**json.loads(row[0]), "place_id": place_id}
+
+
+def _ordinal(graphid: str) -> int:
+    return (int(graphid) & _NUMBER) - 1
+
+
+def _rows(connection: Connection, name: str, **values: Any) -> list[Any]:
+    statement = statements("objects")[name].format(**tables())
+    with database_errors(connection.info.dsn):
+        try:
+            return connection.execute(statement, values).fetchall()
+        except (psycopg.errors.UndefinedTable, psycopg.errors.InvalidSchemaName):
+            raise ProjectionMissing(
+                f"{place_of(connection)}: nothing has been projected there yet; run mapfold replay"
+            ) from None

@@ -1,0 +1,55 @@
+-- Objects and Places as people ask for them. Properties come back as agtype and are read as JSON;
+-- `ag_catalog.agtype_access_operator` with a constant key is what the btree indexes serve.
+
+-- name: places
+SELECT id::text, properties FROM {place} ORDER BY id
+
+-- name: edges
+SELECT start_id::text, end_id::text, properties FROM {adjacent_to} ORDER BY id
+
+-- name: objects
+-- All Objects with the Place they are located in, if any.
+SELECT thing.properties, its.properties
+FROM {object} AS thing
+LEFT JOIN {located_in} AS located ON located.start_id = thing.id
+LEFT JOIN {place} AS its ON its.id = located.end_id
+ORDER BY thing.id
+
+-- name: object
+SELECT thing.properties, its.properties
+FROM {object} AS thing
+LEFT JOIN {located_in} AS located ON located.start_id = thing.id
+LEFT JOIN {place} AS its ON its.id = located.end_id
+WHERE ag_catalog.agtype_access_operator(VARIADIC ARRAY[thing.properties, '"object_id"'::ag_catalog.agtype])
+    = %(id)s::text::ag_catalog.agtype
+
+-- name: objects_of_place
+SELECT thing.properties, its.properties
+FROM {place} AS its
+JOIN {located_in} AS located ON located.end_id = its.id
+JOIN {object} AS thing ON thing.id = located.start_id
+WHERE ag_catalog.agtype_access_operator(VARIADIC ARRAY[its.properties, '"place_id"'::ag_catalog.agtype])
+    = %(id)s::text::ag_catalog.agtype
+ORDER BY thing.id
+
+-- name: holders
+-- Places that hold an Object of a class, with how many.
+SELECT located.end_id::text, count(*)
+FROM {object} AS thing JOIN {located_in} AS located ON located.start_id = thing.id
+WHERE ag_catalog.agtype_access_operator(VARIADIC ARRAY[thing.properties, '"class_name"'::ag_catalog.agtype])
+    = %(id)s::text::ag_catalog.agtype
+GROUP BY 1
+
+-- name: near_places
+SELECT properties FROM {place}
+WHERE ag_catalog.agtype_access_operator(VARIADIC ARRAY[properties, '"centroid_x"'::ag_catalog.agtype])::float8
+        BETWEEN %(x0)s AND %(x1)s
+  AND ag_catalog.agtype_access_operator(VARIADIC ARRAY[properties, '"centroid_y"'::ag_catalog.agtype])::float8
+        BETWEEN %(y0)s AND %(y1)s
+
+-- name: near_objects
+SELECT properties FROM {object}
+WHERE ag_catalog.agtype_access_operator(VARIADIC ARRAY[properties, '"mean_x"'::ag_catalog.agtype])::float8
+        BETWEEN %(x0)s AND %(x1)s
+  AND ag_catalog.agtype_access_operator(VARIADIC ARRAY[properties, '"mean_y"'::ag_catalog.agtype])::float8
+        BETWEEN %(y0)s AND %(y1)s

@@ -1,0 +1,7 @@
+"""Re-localisation as a service: over Zenoh, and over HTTP with the extra ``[serve]``."""
+
+from .answering import Answerer
+from .pools import Pools
+from .zenoh_side import ZenohService
+
+__all__ = ["Answerer", "Pools", "ZenohService"]

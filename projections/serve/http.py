@@ -1,0 +1,104 @@
+"""The service over HTTP: an ASGI app that describes itself at ``/openapi.json`` and ``/docs``.
+
+Needs the extra ``mapfold[serve]`` (fastapi, uvicorn). Handlers run in a thread each, because the
+databases are asked synchronously.
+"""
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import uvicorn
+from fastapi import FastAPI, Query, Request
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import JSONResponse
+
+from eventsrc.errors import MapfoldError, TransportError
+from projections.errors import QuestionError
+
+from .answering import DEFAULT_RADIUS_M, MAX_TOP, Answerer, refusal
+
+_EXAMPLE = {"crops": [{"class": "cup", "bbox": [120, 80, 250, 310], "embedding": "<base64>"}]}
+_QUESTION = {
+    "requestBody": {
+        "required": True,
+        "description": "An envelope, a list of detections, or an object with crops.",
+        "content": {"application/json": {"schema": {}, "example": _EXAMPLE}},
+    }
+}
+
+
+def create_app(answerer: Answerer) -> FastAPI:
+    """The ASGI application; it owns nothing, so closing the pools is its maker's business."""
+    app = FastAPI(title="mapfold", summary="Where is the robot, and what stands near a pose?")
+
+    @app.exception_handler(MapfoldError)
+    def refuse(_: Request, error: MapfoldError) -> JSONResponse:
+        status, document = refusal(error)
+        return JSONResponse(document, status)
+
+    @app.post(
+        "/relocalize", summary="Ranked Places, a pose and a confidence", openapi_extra=_QUESTION
+    )
+    async def relocalize(
+        request: Request,
+        top: int | None = Query(None, ge=1, le=MAX_TOP),
+        method: str | None = None,
+    ) -> dict[str, Any]:
+        payload = await _limited(request, answerer.max_bytes)
+        given = {"top": top, "method": method}
+        options = {name: str(value) for name, value in given.items() if value is not None}
+        return await run_in_threadpool(answerer.relocalize, payload, options)
+
+    @app.get("/state/{what}", summary="places or objects near a pose, nearest first")
+    def state(what: str, x: float, y: float, radius: float = DEFAULT_RADIUS_M) -> dict[str, Any]:
+        return answerer.state(what, {"x": str(x), "y": str(y), "radius": str(radius)})
+
+    @app.get("/health", summary="200 while the service answers")
+    def health() -> dict[str, str]:
+        return {"status": "ok"}
+
+    return app
+
+
+async def _limited(request: Request, most: int) -> bytes:
+    """The body; refused as soon as it is longer than ``most``, without reading on."""
+    body = bytearray()
+    async for part in request.stream():
+        body += part
+        if len(body) > most:
+            raise QuestionError(f"the question has more than {most} bytes; send fewer crops")
+    return bytes(body)
+
+
+@contextmanager
+def serving(app: FastAPI, host: str, port: int) -> Iterator[int]:
+    """Serve in a thread; yields the port. Ends gracefully: requests under way are answered."""
+    config = uvicorn.Config(app, host=host, port=port, log_level="warning", lifespan="off")
+    server = uvicorn.Server(config)
+    listener = _bind(config)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, name="http")
+    thread.start()
+    try:
+        yield int(listener.getsockname()[1])
+    finally:
+        server.should_exit = True
+        thread.join()
+        listener.close()
+
+
+def _bind(config: uvicorn.Config) -> Any:
+    import socket
+
+    family = socket.AF_INET6 if ":" in config.host else socket.AF_INET
+    listener = socket.socket(family)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((config.host, config.port))
+    except OSError as error:
+        listener.close()
+        raise TransportError(
+            f"http {config.host}:{config.port}: {error.strerror or error}; give --http another"
+        ) from None
+    return listener
