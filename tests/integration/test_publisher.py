@@ -112,6 +112,57 @@ def test_it_sends_again_until_a_recorder_answers(
     assert set(_stored(tmp_path / "log")) == {payload(envelope(1))}
 
 
+def test_only_a_window_is_under_way(endpoint: str, connected: Sessions, tmp_path: Path) -> None:
+    """The viewer never acknowledges: until the first comes again, it has seen the window alone."""
+    seen: list[int] = []
+    again, more = threading.Event(), threading.Event()
+
+    def see(message: Received) -> None:
+        seen.append(json.loads(message.payload)["keyframe_id"])
+        if seen.count(0) == 2:
+            again.set()
+        if 14 in seen:
+            more.set()
+
+    viewer = connected()
+    viewer.subscribe(KEY, see)
+    viewer.confirm()
+    options = ZenohOptions(connect=(endpoint,))
+    with EnvelopePublisher(options, tmp_path / "spool", window=10, resend_after_s=0.2) as robot:
+        for k in range(50):
+            robot.publish(envelope(k))
+        assert again.wait(DEADLINE_S)
+        assert seen[:11] == [*range(10), 0]
+        stretch = Ack(run_id="run-a", log_id="log", stretches=((0, 4),))
+        viewer.send(ack_key("run-a"), stretch.encode())
+        assert more.wait(DEADLINE_S)
+        assert max(seen) <= 14
+
+
+def test_a_router_that_comes_and_goes_loses_nothing(start: Start, tmp_path: Path) -> None:
+    """Robot and recorder stay; the router between them is restarted while the robot publishes."""
+    log = tmp_path / "log"
+    with Router(LOOPBACK) as router:
+        (endpoint,) = router.endpoints
+        robot = EnvelopePublisher(
+            ZenohOptions(connect=(endpoint,)), tmp_path / "spool", resend_after_s=0.5
+        )
+        recorder = start("record", str(log), "--connect", endpoint)
+        recorder.wait_for("recording")
+        for k in range(500):
+            robot.publish(envelope(k))
+        assert robot.flush(DEADLINE_S)
+        for k in range(500, 1_000):
+            robot.publish(envelope(k))
+    for k in range(1_000, 1_500):
+        robot.publish(envelope(k))
+    assert robot.unacknowledged >= 500
+    with robot, Router(ZenohOptions(listen=(endpoint,))):
+        assert robot.flush(DEADLINE_S)
+        assert recorder.end(signal.SIGINT) in (0, 3)
+    assert _keyframes(log) == set(range(1_500))
+
+
 def test_nonsense_on_the_ack_key_acknowledges_nothing(
     robot: EnvelopePublisher, connected: Sessions
 ) -> None:
