@@ -1,13 +1,18 @@
-"""Plane geometry in integer micrometres."""
+"""When two poses are neighbours, if not by plain distance."""
 
-import math
+from collections.abc import Callable
+from dataclasses import dataclass
 
-
-def distance_um(ax: int, ay: int, bx: int, by: int) -> int:
-    """The distance of two points, rounded down to whole micrometres."""
-    return math.isqrt((ax - bx) ** 2 + (ay - by) ** 2)
+from .deltas import Pose
 
 
-def is_within(ax: int, ay: int, bx: int, by: int, radius_um: int) -> bool:
-    """True when the two points are at most ``radius_um`` apart; exact."""
-    return (ax - bx) ** 2 + (ay - by) ** 2 <= radius_um * radius_um
+@dataclass(frozen=True, slots=True)
+class Neighbourhood:
+    """``holds(a, b)`` says whether two poses are neighbours.
+
+    It must be symmetric, pure, and false beyond ``reach_um`` in x or y. A pose is its own
+    neighbour whatever it says.
+    """
+
+    reach_um: int
+    holds: Callable[[Pose, Pose], bool]

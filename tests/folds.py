@@ -11,7 +11,7 @@ from sklearn.cluster import DBSCAN
 
 from eventsrc.ingest import Accepted, ingest
 from projections.deltas import Delta
-from projections.reducers._ruled_crowd import Neighbourhood
+from projections.geometry import Neighbourhood
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 from projections.view import MapView

@@ -7,26 +7,14 @@ many poses lie around it, though not with the length of the log. Same interface 
 """
 
 from array import array
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 
 import numpy as np
 
 from projections.deltas import Pose
+from projections.geometry import Neighbourhood
 
 from ._state import State
-
-
-@dataclass(frozen=True, slots=True)
-class Neighbourhood:
-    """``holds(a, b)`` says whether two poses are neighbours.
-
-    It must be symmetric, pure, and false beyond ``reach_um`` in x or y. A pose is its own
-    neighbour whatever it says.
-    """
-
-    reach_um: int
-    holds: Callable[[Pose, Pose], bool]
 
 
 class RuledCrowd:

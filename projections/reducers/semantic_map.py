@@ -32,10 +32,11 @@ from projections.deltas import (
     RunSeen,
 )
 from projections.exact import Units, metres_to_um, unit_vectors
+from projections.geometry import Neighbourhood
 from projections.settings import Settings
 
 from ._crowd import Crowd
-from ._ruled_crowd import Neighbourhood, RuledCrowd
+from ._ruled_crowd import RuledCrowd
 from ._seen import Seen, content_digest
 from ._spaces import Space
 from ._state import State, part, prefixed

@@ -7,8 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from projections.deltas import Pose
+from projections.geometry import Neighbourhood
 from projections.reducers._crowd import Crowd
-from projections.reducers._ruled_crowd import Neighbourhood, RuledCrowd
+from projections.reducers._ruled_crowd import RuledCrowd
 from projections.reducers.places import NOISE, Places
 from tests.folds import NaivePlaces, batch_dbscan, near_matrix
 
