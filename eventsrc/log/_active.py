@@ -18,37 +18,11 @@ from pathlib import Path
 from eventsrc.errors import LogError
 
 from . import _mcap
-from ._mcap import Channel, Header, Metadata, Schema
+from ._head import file_head, head_metadata
+from ._mcap import Channel, Schema
 from ._naming import ACTIVE, NEW, segment_path
-from ._schemas import schema_of
+from ._schemas import key_channel, schema_of
 from .fsync import FsyncPolicy, replace_durably, sync_file, write_all
-
-FORMAT = "1"
-SEGMENT_METADATA = "mapfold.segment"
-ENVELOPE_VERSION_KEY = "mapfold.envelope_version"
-
-
-def head_metadata(log_id: str, base: int, extra: dict[str, str] | None = None) -> Metadata:
-    """What stands at the head of every segment, active and sealed."""
-    values = {"format": FORMAT, "log_id": log_id, "base": str(base), **(extra or {})}
-    return _mcap.own_metadata(SEGMENT_METADATA, values)
-
-
-def file_head(metadata: Metadata) -> bytes:
-    """Magic, header and our metadata."""
-    header = Header(profile=_mcap.PROFILE, library=_mcap.LIBRARY)
-    return _mcap.MAGIC + _mcap.encode_all([header, metadata])
-
-
-def key_channel(channel_id: int, schema_id: int, key: str, version: int) -> Channel:
-    """The channel of a key whose envelopes are of ``version``."""
-    return Channel(
-        id=channel_id,
-        topic=key,
-        message_encoding="json",
-        schema_id=schema_id,
-        metadata={ENVELOPE_VERSION_KEY: str(version)},
-    )
 
 
 class ActiveSegment:

@@ -5,8 +5,9 @@ from collections.abc import Iterator
 
 from . import _mcap
 from ._scan import Scan
+from ._schemas import envelope_version
 from .event import Event
-from .segment import ChunkRef, envelope_version
+from .segment import ChunkRef
 
 
 def read_body(fd: int, chunk: ChunkRef) -> bytes:

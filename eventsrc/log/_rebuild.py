@@ -14,11 +14,10 @@ from eventsrc.envelope import ENVELOPE_VERSION
 from eventsrc.system_events import LOSS_KEY, Loss
 
 from . import _mcap
-from ._active import key_channel
 from ._mcap import Channel, Schema
 from ._raw import read_body
 from ._scan import Scan
-from ._schemas import schema_of
+from ._schemas import key_channel, schema_of
 from ._seal import SegmentPlan, seal
 from .segment import ChunkRef
 

@@ -13,11 +13,12 @@ from pathlib import Path
 
 from eventsrc.errors import LogDamaged
 
+from ._active_file import ActiveFile
 from ._naming import ACTIVE, SegmentPath, leftovers, list_segments, segment_path
 from ._scan import Scan, scan_active
 from ._seal import NO_PREVIOUS, SegmentPlan, file_sha256, seal
+from ._sealed_file import SealedFile
 from .fsync import sync_directory, unlink_quietly
-from .segment import ActiveFile, SealedFile
 
 
 @dataclass(slots=True)

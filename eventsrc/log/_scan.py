@@ -17,8 +17,9 @@ from pathlib import Path
 from eventsrc.errors import LogDamaged, NotALog
 
 from . import _mcap
+from ._head import HEAD_BYTES, read_head
 from ._mcap import BadRecord, Channel
-from .segment import ChunkRef, read_head
+from .segment import ChunkRef
 
 _NEAR = 4096
 
@@ -98,7 +99,7 @@ class _Scanner:
 
     def _read_head(self) -> None:
         try:
-            head, self._at = read_head(self._path, self._data[:_NEAR], self.result.base)
+            head, self._at = read_head(self._path, self._data[:HEAD_BYTES], self.result.base)
             self.result.log_id = head["log_id"]
         except (LogDamaged, NotALog):
             self._resync()

@@ -7,11 +7,11 @@ from pathlib import Path
 from eventsrc.errors import LogDamaged, NotALog
 
 from . import _mcap
+from ._head import HEAD_BYTES, read_head
 from ._mcap import BadRecord, Metadata
 from ._scan import Scan, chunk_extent
-from .segment import SEAL_METADATA, ChunkRef, SealedFile, read_head
-
-_HEAD_BYTES = 4096
+from ._sealed_file import SEAL_METADATA, SealedFile
+from .segment import ChunkRef
 
 
 def scan_sealed(path: Path, base: int, following: int | None) -> Scan:
@@ -51,7 +51,7 @@ def _scan(path: Path, base: int, following: int | None, data: mmap.mmap) -> Scan
 
 def _log_id(path: Path, base: int, data: mmap.mmap) -> str | None:
     try:
-        return read_head(path, data[:_HEAD_BYTES], base)[0]["log_id"]
+        return read_head(path, data[:HEAD_BYTES], base)[0]["log_id"]
     except (LogDamaged, NotALog):
         return None
 

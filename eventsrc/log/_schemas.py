@@ -1,12 +1,16 @@
-"""Which JSON schema stands behind a key, generated from the models that check the payloads."""
+"""Channels and the JSON schemas behind them, generated from the models that check the payloads."""
 
 import functools
 import json
 
 from pydantic import BaseModel
 
-from eventsrc.envelope import Envelope
+from eventsrc.envelope import ENVELOPE_VERSION, Envelope
 from eventsrc.system_events import LOSS_KEY, REJECTED_KEY, Loss, RejectedPayload, is_system_key
+
+from ._mcap import Channel
+
+ENVELOPE_VERSION_KEY = "mapfold.envelope_version"
 
 _SYSTEM_MODELS: dict[str, type[BaseModel]] = {REJECTED_KEY: RejectedPayload, LOSS_KEY: Loss}
 
@@ -24,3 +28,19 @@ def schema_of(key: str) -> tuple[str, bytes]:
 @functools.cache
 def _json_schema(model: type[BaseModel]) -> bytes:
     return json.dumps(model.model_json_schema(by_alias=True), sort_keys=True).encode()
+
+
+def key_channel(channel_id: int, schema_id: int, key: str, version: int) -> Channel:
+    """The channel of a key whose envelopes are of ``version``."""
+    return Channel(
+        id=channel_id,
+        topic=key,
+        message_encoding="json",
+        schema_id=schema_id,
+        metadata={ENVELOPE_VERSION_KEY: str(version)},
+    )
+
+
+def envelope_version(channel: Channel) -> int:
+    """The version of the envelopes on a channel; the current one where none is said."""
+    return int(channel.metadata.get(ENVELOPE_VERSION_KEY, ENVELOPE_VERSION))

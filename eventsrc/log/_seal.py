@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from . import _mcap
-from ._active import SEGMENT_METADATA, file_head, head_metadata
+from ._head import SEGMENT_METADATA, file_head, head_metadata
 from ._mcap import (
     Channel,
     ChunkIndex,
@@ -35,8 +35,8 @@ from ._mcap import (
     SummaryOffset,
 )
 from ._naming import SEALED, SEALING, segment_path
+from ._sealed_file import SEAL_METADATA
 from .fsync import replace_durably, sync_file, unlink_quietly, write_all
-from .segment import SEAL_METADATA
 
 CHUNK_BYTES = 1024 * 1024
 NO_PREVIOUS = ""

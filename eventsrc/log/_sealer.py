@@ -10,10 +10,10 @@ from pathlib import Path
 
 from eventsrc.errors import LogError, MapfoldError
 
+from ._active_file import ActiveFile
 from ._naming import ACTIVE, segment_path
 from ._seal import SegmentPlan, seal
 from .fsync import sync_directory
-from .segment import ActiveFile
 
 
 class Sealer:

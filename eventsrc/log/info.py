@@ -8,8 +8,8 @@ from eventsrc.system_events import LOSS_KEY, REJECTED_KEY
 
 from . import _mcap
 from ._losses import count_lost
+from ._sealed_file import SealedFile
 from .reader import LogReader, OpenSegment
-from .segment import SealedFile
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,9 +13,11 @@ from pathlib import Path
 
 from eventsrc.errors import LogDamaged, LogNotFound, NotALog
 
+from ._active_file import ActiveFile
 from ._naming import ACTIVE, SEALED, SegmentPath, list_segments, segment_path
+from ._sealed_file import SealedFile
 from .event import Event
-from .segment import ActiveFile, SealedFile, Unreadable, chunk_events
+from .segment import Unreadable, chunk_events
 
 _OPEN_SEGMENTS = 8
 

@@ -15,6 +15,7 @@ from eventsrc.clock import Clock, system_clock
 from eventsrc.errors import LogDamaged, LogError, NotALog
 
 from ._check import check_sealed
+from ._head import head_of
 from ._lock import WriterLock
 from ._naming import ACTIVE, DAMAGED, SEALED, SegmentPath, leftovers, list_segments, segment_path
 from ._rebuild import rebuild
@@ -23,9 +24,6 @@ from ._scan_sealed import scan_sealed
 from ._seal import NO_PREVIOUS, REPLACES, SegmentPlan, file_sha256
 from .fsync import sync_directory, unlink_quietly
 from .reader import segments_of
-from .segment import read_head
-
-_HEAD_BYTES = 4096
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,11 +146,9 @@ class _Recovery:
 def _find_log_id(segments: list[SegmentPath]) -> str:
     for segment in segments:
         try:
-            with segment.path.open("rb") as file:
-                head, _ = read_head(segment.path, file.read(_HEAD_BYTES), segment.base)
+            return head_of(segment.path, segment.base)["log_id"]
         except (LogDamaged, NotALog):
             continue
-        return head["log_id"]
     return uuid.uuid4().hex
 
 
@@ -161,11 +157,9 @@ def _replaces(following: SegmentPath | None) -> dict[str, str]:
     if following is None:
         return {}
     try:
-        with following.path.open("rb") as file:
-            head, _ = read_head(following.path, file.read(_HEAD_BYTES), following.base)
+        claim = head_of(following.path, following.base).get("previous_sha256")
     except (LogDamaged, NotALog):
         return {}
-    claim = head.get("previous_sha256")
     return {REPLACES: claim} if claim else {}
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from eventsrc.errors import LogDamaged, NotALog
 
 from ._check import check_sealed
+from ._head import head_of
 from ._lock import is_held
 from ._naming import SEALED, SegmentPath, segment_path
 from ._raw import raw_events
@@ -21,9 +22,6 @@ from ._seal import NO_PREVIOUS, REPLACES
 from ._verify_events import EventFindings
 from .findings import Finding, Kind
 from .reader import segments_of
-from .segment import read_head
-
-_HEAD_BYTES = 4096
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,8 +94,7 @@ class _Verifier:
 
     def _check_head(self, segment: SegmentPath) -> dict[str, str]:
         try:
-            with segment.path.open("rb") as file:
-                head, _ = read_head(segment.path, file.read(_HEAD_BYTES), segment.base)
+            head = head_of(segment.path, segment.base)
         except (LogDamaged, NotALog) as error:
             self._add("crc", str(error), segment.path.name)
             return {}
