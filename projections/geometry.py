@@ -1,5 +1,6 @@
-"""When two poses are neighbours, if not by plain distance."""
+"""Plane geometry in integer micrometres, and neighbourhoods other than plain distance."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -16,3 +17,8 @@ class Neighbourhood:
 
     reach_um: int
     holds: Callable[[Pose, Pose], bool]
+
+
+def distance_um(ax: int, ay: int, bx: int, by: int) -> int:
+    """The distance of two points, rounded down to whole micrometres."""
+    return math.isqrt((ax - bx) ** 2 + (ay - by) ** 2)
