@@ -76,6 +76,9 @@ def replay(
     assignments: SetOption = None,
     settings_file: SettingsOption = None,
     loader: LoaderOption = Loaders.copy,
+    no_hnsw: Annotated[
+        bool, typer.Option("--no-hnsw", help="Do not index a large table for vector search.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Rebuild the databases from LOG. Readers see the old map until the new one is whole."""
@@ -90,6 +93,7 @@ def replay(
             until=end,
             only=only_of(only),
             loader=loader_of(loader),
+            hnsw=not no_hnsw,
             progress=bar.show,
         )
     if as_json:

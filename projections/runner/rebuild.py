@@ -63,6 +63,7 @@ def rebuild(
     until: int | None = None,
     only: Only = None,
     loader: LoaderName = "copy",
+    hnsw: bool = True,
     progress: OnProgress | None = None,
 ) -> RebuildReport:
     """Fold the first ``until`` events (all for None) and put the result in the databases' place.
@@ -107,10 +108,10 @@ def rebuild(
                 for sink in store.sinks:
                     sink.swap(store.connection)
         tell(RebuildProgress("tidying", total, total))
-        hnsw, rows = _after(stores, tell, total)
+        index, rows = _after(stores, tell, total, hnsw=hnsw)
     ended = time.monotonic()
     counts = fold.view.counts()
-    return RebuildReport(total, digest, counts, rows, folded - started, ended - started, hnsw)
+    return RebuildReport(total, digest, counts, rows, folded - started, ended - started, index)
 
 
 def _fold_into(
@@ -141,16 +142,16 @@ def _finish(store: Store, fold: LiveFold, checkpoint: Checkpoint) -> None:
 
 
 def _after(
-    stores: list[Store], tell: OnProgress, total: int
+    stores: list[Store], tell: OnProgress, total: int, *, hnsw: bool
 ) -> tuple[HnswReport | None, dict[str, int]]:
-    hnsw: HnswReport | None = None
+    index: HnswReport | None = None
     rows: dict[str, int] = {}
     for store in stores:
         with database_errors(store.url):
             for sink in store.sinks:
                 sink.tidy(store.connection)
                 rows.update(sink.counts(store.connection))
-                if sink.name == "vectors":
+                if sink.name == "vectors" and hnsw:
                     tell(RebuildProgress("indexing", total, total))
-                    hnsw = build_hnsw(store.connection)
-    return hnsw, rows
+                    index = build_hnsw(store.connection)
+    return index, rows

@@ -1,0 +1,54 @@
+"""Whole rebuilds: against per-node Cypher, and against a tenfold log."""
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from eventsrc.log import LogReader
+from projections.folding import fold_log
+from projections.postgres.embedded import EmbeddedServer
+from projections.settings import Settings
+
+from .naive import write_naively
+from .world import make_log
+
+REPEATS = 3
+
+
+def command_seconds(*arguments: str) -> float:
+    """Best of three wall seconds of a whole `mapfold` command, interpreter start and all."""
+    command = [sys.executable, "-c", "from projections.cli import main; main()", *arguments]
+    times = []
+    for _ in range(REPEATS):
+        started = time.perf_counter()
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        times.append(time.perf_counter() - started)
+    return min(times)
+
+
+def against_naive(server: EmbeddedServer, folder: Path, quick: bool) -> None:
+    """2,000 keyframes with three detections: `mapfold replay` against MERGE/CREATE per node."""
+    size = 200 if quick else 2_000
+    log = make_log(folder / f"log-{size}", size)
+    ours = command_seconds("replay", str(log))
+    with LogReader(log) as reader:
+        _, view = fold_log(reader, Settings(), keep_embeddings=False)
+    plain = write_naively(server.url, view, tuned=False)
+    tuned = write_naively(server.url, view, tuned=True)
+    print(
+        f"rebuild of {size} keyframes: whole command {ours:.2f} s; per-node Cypher, graph only:"
+        f" plain {plain:.1f} s (ratio {plain / ours:.0f}), tuned {tuned:.1f} s"
+        f" (ratio {tuned / ours:.0f})"
+    )
+
+
+def growth(server: EmbeddedServer, folder: Path, quick: bool) -> None:  # noqa: ARG001
+    """time(20,000) / time(2,000); linear is 10."""
+    small, large = (200, 2_000) if quick else (2_000, 20_000)
+    times = []
+    for size in (small, large):
+        log = make_log(folder / f"log-{size}", size)
+        times.append(command_seconds("replay", str(log), "--no-hnsw"))
+    print(f"growth: {small} keyframes {times[0]:.2f} s, {large} keyframes {times[1]:.2f} s;"
+          f" ratio {times[1] / times[0]:.1f}")  # fmt: skip
