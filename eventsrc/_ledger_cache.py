@@ -10,7 +10,7 @@ from typing import Final, Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from .log import LogReader
+from .log.reader import LogReader
 from .losses import GapLedger, RunState
 
 NAME: Final = ".ledger.json"

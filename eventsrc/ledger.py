@@ -6,16 +6,15 @@ saves its ledger beside the log, so only the first reading ever is of the whole 
 """
 
 import time
-from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from . import _ledger_cache
 from .envelope import ENVELOPE_VERSION
-from .log import Event, LogReader
+from .log.event import Event
+from .log.reader import LogReader
 from .losses import DEFAULT_SETTLE_NS, Gap, GapLedger
 from .system_events import LOSS_KEY, Loss, is_system_key
 
@@ -27,31 +26,6 @@ class _Identity(BaseModel):
 
     run_id: str
     keyframe_id: int
-
-
-@dataclass(frozen=True, slots=True)
-class LossSummary:
-    """What a log lacks. ``gaps`` are open now: no later keyframe closed them. The other two are
-    messages that never reached the log, by cause, as the loss events add up."""
-
-    gaps: tuple[Gap, ...]
-    queue_full: int
-    transport_missed: int
-
-    @property
-    def missing(self) -> int:
-        """How many keyframes are missing now."""
-        return sum(gap.count for gap in self.gaps)
-
-
-def losses_of(reader: LogReader) -> LossSummary:
-    """What the log lacks now, for `status` and `log info`."""
-    counts: Counter[str] = Counter()
-    for event in reader.read(keys={LOSS_KEY}):
-        loss = Loss.model_validate_json(event.payload)
-        counts[loss.cause] += loss.count
-    gaps = tuple(ledger_of(reader).gaps())
-    return LossSummary(gaps, counts["queue_full"], counts["transport_miss"])
 
 
 def ledger_of(
@@ -89,7 +63,7 @@ def fold_ledger(events: Iterable[Event], ledger: GapLedger, now_ns: int) -> GapL
     """Take ``events`` into ``ledger``, which is also returned."""
     for event in events:
         if event.key == LOSS_KEY:
-            _take_loss(ledger, event.payload)
+            _take_loss(ledger, event.payload, now_ns)
         elif not is_system_key(event.key):
             identity = _identity(event)
             if identity is not None:
@@ -97,13 +71,13 @@ def fold_ledger(events: Iterable[Event], ledger: GapLedger, now_ns: int) -> GapL
     return ledger
 
 
-def _take_loss(ledger: GapLedger, payload: bytes) -> None:
+def _take_loss(ledger: GapLedger, payload: bytes, now_ns: int) -> None:
     try:
         loss = Loss.model_validate_json(payload)
     except ValidationError:
         return  # of a later version; what it says was lost is still seen in the keyframes
     if loss.cause == "keyframe_gap" and loss.first is not None and loss.last is not None:
-        ledger.mark_reported(Gap(loss.publisher, loss.first, loss.last))
+        ledger.assume(Gap(loss.publisher, loss.first, loss.last), now_ns)
 
 
 def _identity(event: Event) -> tuple[str, int] | None:

@@ -122,9 +122,11 @@ class GapLedger:
             index += 1
 
     def assume(self, gap: Gap, now_ns: int) -> None:
-        """Take the word of a loss event for it, without having seen the keyframes around it."""
-        self.record(gap.run_id, gap.first - 1, now_ns)
-        self.record(gap.run_id, gap.last + 1, now_ns)
+        """Take a loss event's word for it: the keyframes on both sides were recorded, this was not,
+        and it will not be reported again."""
+        for keyframe_id in (gap.first - 1, gap.last + 1):
+            if self.stretch(gap.run_id, keyframe_id) is None:
+                self.record(gap.run_id, keyframe_id, now_ns)
         self.mark_reported(gap)
 
     def due(self, now_ns: int) -> list[Gap]:

@@ -6,7 +6,7 @@ import pytest
 
 from eventsrc._ledger_cache import NAME
 from eventsrc.append import append_payload
-from eventsrc.ledger import fold_ledger, ledger_of, losses_of, save_ledger, unread_events
+from eventsrc.ledger import fold_ledger, ledger_of, save_ledger, unread_events
 from eventsrc.log import LogReader, LogWriter, log_info
 from eventsrc.losses import Gap, GapLedger
 from eventsrc.system_events import LOSS_KEY, Loss
@@ -58,13 +58,6 @@ def test_what_a_log_lacks_is_read_from_its_events(log: Path) -> None:
     ledger = _ledger(log)
     assert list(ledger.gaps()) == [Gap("run-a", 2, 4), Gap("run-a", 6, 6), Gap("run-a", 8, 8)]
     assert ledger.flush() == [Gap("run-a", 6, 6), Gap("run-a", 8, 8)], "2–4 is reported already"
-
-
-def test_the_summary_tells_gaps_and_messages_apart(log: Path) -> None:
-    with LogReader(log) as reader:
-        losses = losses_of(reader)
-    assert losses.missing == 5
-    assert (losses.queue_full, losses.transport_missed) == (7, 1)
 
 
 def test_log_info_counts_what_was_reported_less_what_came_late(log: Path) -> None:

@@ -98,7 +98,7 @@ def test_no_log_and_not_a_log_are_named(tmp_path: Path) -> None:
 def test_info_counts_sealed_and_growing_segments(log_path: Path) -> None:
     write_log(log_path, [envelope(i) for i in range(5)], rotate_events=2)
     with LogWriter(log_path, fsync=BY_HAND) as writer:
-        loss = {"publisher": "run", "first": 3, "last": 5, "count": 3, "cause": "keyframe_gap"}
+        loss = {"publisher": "run", "first": 6, "last": 8, "count": 3, "cause": "keyframe_gap"}
         writer.append("mapfold/loss", json.dumps(loss).encode(), stamp_ns=99, logged_ns=2)
         writer.sync()
         info = log_info(log_path)
