@@ -89,14 +89,14 @@ class History:
         moves: list[_Move] = []
         links: list[EdgeChange] = []
         for delta in deltas:
-            if isinstance(delta, PlacesMerged):
+            if (handle := self._apply.get(type(delta))) is not None:
+                handle(delta, cause)
+            elif isinstance(delta, PlacesMerged):
                 merges.append(delta)
             elif isinstance(delta, ObjectMoved):
                 moves.append(self._object_moved(delta))
             elif isinstance(delta, PlacesLinked):
                 links.append(self._places_linked(delta))
-            elif (handle := self._apply.get(type(delta))) is not None:
-                handle(delta, cause)
         for merge in merges:
             self._places_merged(merge, cause, moves, links)
 

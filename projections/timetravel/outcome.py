@@ -37,7 +37,6 @@ class Outcome:
     merges: int
     places: tuple[str | None, ...]
     objects: tuple[str | None, ...]
-    keyframes: tuple[tuple[str, int], ...]
     posed: Offsets
     placed_offsets: Offsets
     placed_in: Offsets
@@ -61,7 +60,6 @@ def outcome_of(view: MapView, history: History, truth: Truth | None, seconds: fl
         merges=len(history.merges),
         places=tuple(view.place_id(keyframe.place) for keyframe in view.keyframes),
         objects=tuple(None if n < 0 else view.objects[n].object_id for n in fused),
-        keyframes=tuple((k.run_id, k.keyframe_id) for k in view.keyframes),
         posed=array("q", (k.ordinal for k in view.keyframes if k.pose is not None)),
         placed_offsets=history.placed_offsets,
         placed_in=array("q", (-1 if p < 0 else numbers[p] for p in history.placed_in)),

@@ -19,7 +19,7 @@ from eventsrc.ingest import Accepted, Rejected
 from eventsrc.log import Event, LogReader
 from eventsrc.system_events import is_system_key
 from eventsrc.upcast import read_envelope
-from projections.deltas import Delta
+from projections.deltas import Delta, KeyframeAdded, KeyframePlaced, PlaceFormed, PlacesMerged
 from projections.errors import FoldError
 from projections.evaluate.truth import Truth
 from projections.exact import Units, unit_vectors
@@ -36,6 +36,8 @@ Progress = Callable[[int, int], None]
 WORTH_A_PROCESS = 20_000
 """Events times settings from which processes are started: about two seconds of folding."""
 _POLL_S = 0.2
+_OF_PLACES = frozenset({KeyframeAdded, PlaceFormed, KeyframePlaced, PlacesMerged})
+"""What a comparison of histories needs; the view knows the rest."""
 
 _done: "Synchronized[int] | None" = None
 """In a worker process: events folded by all of them together."""
@@ -78,7 +80,7 @@ def fold_several(
                 _fold_chunk(chunk, folds)
                 if progress is not None:
                     progress(chunk[-1].offset + 1, end)
-    return [fold.outcome(truth) for fold in folds]
+            return [fold.outcome(truth) for fold in folds]
 
 
 class _Fold:
@@ -98,7 +100,7 @@ class _Fold:
         else:
             deltas = self.map.fold(offset, door, units)
         self.view.apply_event(offset, deltas)
-        self.history.apply(offset, deltas)
+        self.history.apply(offset, [delta for delta in deltas if type(delta) in _OF_PLACES])
 
     def outcome(self, truth: Truth | None) -> Outcome:
         return outcome_of(self.view, self.history, truth, self.seconds)
