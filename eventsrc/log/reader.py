@@ -32,7 +32,7 @@ class LogReader:
         self.path = path
         self._open: OrderedDict[int, OpenSegment] = OrderedDict()
         self._segments = segments_of(path)
-        self._last = self.open_segment(self._segments[-1])
+        self._last = _open_segment(path, self._segments[-1])
         self.log_id = self._last.log_id
 
     @property
@@ -53,7 +53,8 @@ class LogReader:
             following = self._following()
             if following is not None:
                 self._segments.append(following)
-                self._last = self.open_segment(following)
+                self._remember(self._last)
+                self._last = _open_segment(self.path, following)
             elif isinstance(self._last, ActiveFile) and self._last.was_replaced():
                 self._reopen_last()
             else:
@@ -62,9 +63,7 @@ class LogReader:
     def _reopen_last(self) -> None:
         """A restarted writer has sealed the segment, perhaps with events that had no commit mark
         yet, or has begun an empty one anew."""
-        entry = self._segments[-1]
-        self._open.pop(entry.base, None)
-        self._last = self.open_segment(entry)
+        self._last = _open_segment(self.path, self._segments[-1])
 
     def _following(self) -> SegmentPath | None:
         """The segment that starts where the last one ends, once its writer has begun it."""
@@ -144,14 +143,18 @@ class LogReader:
         return at
 
     def open_segment(self, entry: SegmentPath) -> OpenSegment:
-        segment = self._open.get(entry.base)
-        if segment is None:
-            segment = _open_segment(self.path, entry)
-            self._open[entry.base] = segment
-            if len(self._open) > _OPEN_SEGMENTS:
-                self._open.popitem(last=False)
-        self._open.move_to_end(entry.base)
+        """One of `segments`, open. The last one is always the object that `refresh` keeps up."""
+        if entry.base == self._last.base:
+            return self._last
+        segment = self._open.get(entry.base) or _open_segment(self.path, entry)
+        self._remember(segment)
         return segment
+
+    def _remember(self, segment: OpenSegment) -> None:
+        self._open[segment.base] = segment
+        self._open.move_to_end(segment.base)
+        if len(self._open) > _OPEN_SEGMENTS:
+            self._open.popitem(last=False)
 
     def close(self) -> None:
         """Let go of the files; iterators that still run keep theirs."""

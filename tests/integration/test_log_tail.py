@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from eventsrc.errors import LogDamaged, LogError
-from eventsrc.log import Event, LogWriter, follow
+from eventsrc.log import Event, LogReader, LogWriter, follow
 from eventsrc.log._mcap import MARK_BYTES
 from tests.chaos.log_writer import payload_at
 from tests.fixtures_log import BY_HAND, KEY
@@ -134,3 +134,21 @@ def test_a_tail_gets_what_recovery_found_behind_the_last_mark(log_path: Path) ->
         with LogWriter(log_path) as writer:
             writer.append(KEY, b"two")
         assert [next_event(got).payload for _ in range(2)] == [b"one", b"two"]
+
+
+def test_a_reader_of_many_segments_keeps_the_growing_one_up_to_date(log_path: Path) -> None:
+    with LogWriter(log_path, fsync=BY_HAND, rotate_events=2) as writer:
+
+        def record(count: int) -> None:
+            for _ in range(count):
+                writer.append(KEY, payload_at(writer.next_offset))
+                writer.sync()
+
+        record(21)
+        with LogReader(log_path) as reader:
+            assert len(reader.segments) == 11
+            for _ in range(3):  # more segments than a reader keeps open
+                assert len(list(reader.read())) == reader.next_offset
+                record(3)
+                reader.refresh()
+            assert [e.offset for e in reader.read()] == list(range(30))
