@@ -3,6 +3,10 @@
 The robot drives after a carrot on its path (pure pursuit): it steers at a point ``_CARROT_M``
 ahead, stands still while it looks too far away from it, and turns while it drives otherwise. Time
 runs in ticks of 50 ms. A keyframe is due after 0.5 m or 15° since the last one.
+
+Twenty ticks of straight driving are 0.5 m but for the last bits of a sine, and those depend on the
+C library. So every threshold here is a micrometre or a microradian generous (``_SLACK``): what is
+equal in mathematics is equal everywhere.
 """
 
 import itertools
@@ -23,6 +27,7 @@ _TURN_RAD = math.radians(40.0) * _TICK_S
 _CARROT_M = 0.3
 _STAND_RAD = math.radians(35.0)
 _PAUSE_S = 0.5
+_SLACK = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,9 +61,9 @@ def keyframes(poses: Iterator[TruePose]) -> Iterator[TruePose]:
 
 
 def _due(last: TruePose, pose: TruePose) -> bool:
-    if math.hypot(pose.x - last.x, pose.y - last.y) >= KEYFRAME_M:
+    if math.hypot(pose.x - last.x, pose.y - last.y) >= KEYFRAME_M - _SLACK:
         return True
-    return abs(wrap(pose.yaw_rad - last.yaw_rad)) >= KEYFRAME_RAD
+    return abs(wrap(pose.yaw_rad - last.yaw_rad)) >= KEYFRAME_RAD - _SLACK
 
 
 class _Robot:
@@ -77,7 +82,9 @@ class _Robot:
         track = list(_densified(path))
         carrot = 0
         while True:
-            while carrot < len(track) - 1 and math.dist(self.spot, track[carrot]) < _CARROT_M:
+            while (
+                carrot < len(track) - 1 and math.dist(self.spot, track[carrot]) < _CARROT_M + _SLACK
+            ):
                 carrot += 1
             left = math.dist(self.spot, track[carrot])
             if left < 1e-6:
@@ -93,11 +100,11 @@ class _Robot:
 
     def _steer(self, target: Point, left: float) -> None:
         error = wrap(math.atan2(target[1] - self._y, target[0] - self._x) - self._yaw)
-        if left <= _STEP_M and abs(error) < math.pi / 2:
+        if left <= _STEP_M + _SLACK and abs(error) < math.pi / 2:
             self._x, self._y = target  # the last step: arrive
             return
         self._yaw = wrap(self._yaw + max(-_TURN_RAD, min(_TURN_RAD, error)))
-        if abs(error) < _STAND_RAD:
+        if abs(error) < _STAND_RAD + _SLACK:
             step = min(_STEP_M, left) * math.cos(error)
             self._x += step * math.cos(self._yaw)
             self._y += step * math.sin(self._yaw)

@@ -15,7 +15,7 @@ from eventsrc.sim import SimulatedRun, simulate_run
 from eventsrc.sim.embedding import DIM
 from eventsrc.sim.publish import truth_path, write_run
 
-WITNESS_SHA256 = "45a5c268d921134a54a40c306e465d118652dad8097208828ca489accafd0ef0"
+WITNESS_SHA256 = "f7fa2a7f157f62928c9cb2d7523f6864d724e41803640b7a022a3db96b7a131e"
 """Of run a of house 7, its payloads joined by line ends. It moves only when the simulator does."""
 
 

@@ -75,8 +75,8 @@ def test_a_look_around_sees_every_direction() -> None:
 
 def _far(a: TruePose, b: TruePose) -> bool:
     return (
-        math.hypot(b.x - a.x, b.y - a.y) >= KEYFRAME_M
-        or abs(wrap(b.yaw_rad - a.yaw_rad)) >= KEYFRAME_RAD
+        math.hypot(b.x - a.x, b.y - a.y) >= KEYFRAME_M - 1e-6
+        or abs(wrap(b.yaw_rad - a.yaw_rad)) >= KEYFRAME_RAD - 1e-6
     )
 
 
