@@ -3,8 +3,8 @@
 Below the threshold exact search is fast enough (measured: docs/projections.md) and gives the true
 answer. Above it the index is built while readers go on with exact search and no tail runs.
 
-Built by one process: pgvector before 0.8.2 can overflow a buffer in a parallel build,
-and the bundled one is 0.8.1. And with enough memory: a graph that outgrows
+Built by one process: pgvector before 0.8.2 can overflow a buffer in a parallel build
+(CVE-2026-3172), and the bundled one is 0.8.1. And with enough memory: a graph that outgrows
 ``maintenance_work_mem`` is finished on disk, many times slower.
 """
 
