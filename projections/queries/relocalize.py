@@ -104,6 +104,10 @@ class Reader:
         """The observations most like each crop, with their places."""
         return fetch(self._vectors, self._graph, crops, neighbours)
 
+    def exactly(self) -> None:
+        """From now on search without the index: slow, and never wrong."""
+        self._vectors.execute("SET enable_indexscan = off")
+
     def close(self) -> None:
         """Close the connections. May be called twice."""
         self._vectors.close()

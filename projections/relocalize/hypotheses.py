@@ -16,8 +16,8 @@ from .camera import Floats
 from .landmarks import Landmark
 from .sighting import Sighting
 
-_RING: Final = np.arange(36) * (2.0 * np.pi / 36)
-_POSES_OF_LANDMARK: Final = 24
+_RING: Final = np.arange(24) * (2.0 * np.pi / 24)
+_POSES_OF_LANDMARK: Final = 12
 _MISFIT_M: Final = 1.0
 """Two landmarks whose distance differs by more from the crops' are not the pair seen."""
 

@@ -25,7 +25,9 @@ from .model import Model
 DIRECTIONS: Final = 36
 """Directions in a landmark's table, 10° apart."""
 MAX_LANDMARKS: Final = 8
-_DEPTHS: Final = np.exp(np.linspace(np.log(0.5), np.log(6.5), 28))
+_DEPTHS: Final = np.exp(np.linspace(np.log(0.5), np.log(6.5), 20))
+_FOR_DEPTH: Final = 40
+"""The most similar matches suffice to find the size; all pairs of them are compared."""
 _AGREE_M: Final = 0.3
 _CLUSTER_M: Final = 0.35
 _REACH_M: Final = 0.8
@@ -57,7 +59,8 @@ def find_landmarks(poses: Floats, views: Views, similarity: Floats, model: Model
     weight = np.clip((similarity - model.relevant) / 0.05, 0.1, 1.0)
     weight = np.where(views.cut_x | views.cut_y | ~views.known, _CUT_WEIGHT * weight, weight)
     rays, median_px = _rays(poses, views)
-    depth = _common_depth(poses, rays, weight, model)
+    most = np.arange(min(_FOR_DEPTH, len(poses)))
+    depth = _common_depth(poses[most], rays[most], weight[most], model)
     points = poses[:, :2] + depth * rays
     found = []
     for x, y, members in _clusters(points, weight):
@@ -142,5 +145,6 @@ def _evidence(poses: Floats, x: float, y: float, similarity: Floats, model: Mode
 
 def _distances(a: Floats, b: Floats) -> Floats:
     """Euclidean distances, shape (len(a), len(b))."""
-    distances: Floats = np.hypot(a[:, None, 0] - b[None, :, 0], a[:, None, 1] - b[None, :, 1])
+    dx, dy = a[:, None, 0] - b[None, :, 0], a[:, None, 1] - b[None, :, 1]
+    distances: Floats = np.sqrt(dx * dx + dy * dy)
     return distances

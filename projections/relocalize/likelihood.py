@@ -25,23 +25,27 @@ _TURN: Final = 2.0 * np.pi
 
 def explain(sightings: Sequence[Sighting], poses: Floats, model: Model) -> tuple[Floats, Floats]:
     """(totals of shape (h,), shares of shape (crops, h)); the shares leave out the prior."""
-    shares = np.stack([_explain_crop(sighting, poses, model) for sighting in sightings])
-    total: Floats = shares.sum(0) + _driven(sightings, poses, model)
+    apart = [_squared(sighting.poses, poses) for sighting in sightings]
+    shares = np.stack(
+        [_explain_crop(s, poses, a, model) for s, a in zip(sightings, apart, strict=True)]
+    )
+    been = np.stack([a.min(0) for a in apart]).min(0)
+    total: Floats = shares.sum(0) + np.maximum(-0.5 * been / model.driven**2, -model.driven_most)
     return total, shares
 
 
-def _explain_crop(sighting: Sighting, poses: Floats, model: Model) -> Floats:
+def _explain_crop(sighting: Sighting, poses: Floats, apart: Floats, model: Model) -> Floats:
     xs = np.array([landmark.x for landmark in sighting.landmarks])[:, None]
     ys = np.array([landmark.y for landmark in sighting.landmarks])[:, None]
     dx, dy = poses[None, :, 0] - xs, poses[None, :, 1] - ys
-    reach, looking_from = np.hypot(dx, dy), np.arctan2(dy, dx)
+    reach, looking_from = np.sqrt(dx * dx + dy * dy), np.arctan2(dy, dx)
     fit = _table_lookup(sighting, looking_from)
     bearing = _wrap(looking_from + np.pi - poses[None, :, 2])
     if sighting.bearing is None:
         fit = fit + _in_view(bearing, reach, model)
     else:
         fit = fit + _box_fit(sighting, bearing, reach, model)
-    fit = np.maximum(fit + _seen_from(sighting, poses, model), _IMPOSSIBLE)
+    fit = np.maximum(fit + _seen_from(sighting, apart, model), _IMPOSSIBLE)
     explained: Floats = np.logaddexp(0.0, fit.max(0) + model.unknown_price)
     return explained
 
@@ -74,21 +78,13 @@ def _in_view(bearing: Floats, reach: Floats, model: Model) -> Floats:
     return fit
 
 
-def _seen_from(sighting: Sighting, poses: Floats, model: Model) -> Floats:
+def _seen_from(sighting: Sighting, apart: Floats, model: Model) -> Floats:
     """Distance to the nearest pose that saw the landmark, as a penalty; shape (landmarks, h)."""
     members = [landmark.members for landmark in sighting.landmarks]
-    seen = sighting.poses[np.concatenate(members)]
     starts = np.cumsum([0] + [len(m) for m in members[:-1]])
-    squared = np.minimum.reduceat(_squared(seen, poses), starts, axis=0)
+    squared = np.minimum.reduceat(apart[np.concatenate(members)], starts, axis=0)
     within = model.seen_from if sighting.bearing is not None else model.seen_from_no_box
     penalty: Floats = -0.5 * np.minimum(squared / within**2, 6.25)
-    return penalty
-
-
-def _driven(sightings: Sequence[Sighting], poses: Floats, model: Model) -> Floats:
-    been = np.unique(np.concatenate([s.poses for s in sightings])[:, :2], axis=0)
-    squared = _squared(been, poses).min(0) / model.driven**2
-    penalty: Floats = np.maximum(-0.5 * squared, -model.driven_most)
     return penalty
 
 

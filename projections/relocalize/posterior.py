@@ -19,8 +19,8 @@ from .likelihood import explain
 from .model import Model
 from .sighting import Sighting
 
-_REFINED: Final = 24
-_KEPT: Final = 300
+_REFINED: Final = 16
+_KEPT: Final = 200
 _CROWD_M: Final = 0.3
 _LOST_M: Final = 3.0
 _NEAR_M: Final = 1.0
@@ -66,9 +66,9 @@ def _likeliest(total: Floats, count: int) -> "np.ndarray[tuple[int], np.dtype[np
 
 
 def _summary(poses: Floats, total: Floats, shares: Floats) -> Posterior:
-    apart = np.hypot(
-        poses[:, 0][:, None] - poses[None, :, 0], poses[:, 1][:, None] - poses[None, :, 1]
-    )
+    dx = poses[:, 0][:, None] - poses[None, :, 0]
+    dy = poses[:, 1][:, None] - poses[None, :, 1]
+    apart = np.sqrt(dx * dx + dy * dy)
     weights = np.exp(total - total[0]) / (apart < _CROWD_M).sum(1)
     weights = weights / math.fsum(weights.tolist())
     expected = (np.minimum(apart, _LOST_M) * weights[None]).sum(1)

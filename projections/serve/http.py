@@ -29,6 +29,9 @@ _QUESTION = {
 }
 
 
+_DRAINED = 8
+
+
 def create_app(answerer: Answerer) -> FastAPI:
     """The ASGI application; it owns nothing, so closing the pools is its maker's business."""
     app = FastAPI(title="mapfold", summary="Where is the robot, and what stands near a pose?")
@@ -63,12 +66,19 @@ def create_app(answerer: Answerer) -> FastAPI:
 
 
 async def _limited(request: Request, most: int) -> bytes:
-    """The body; refused as soon as it is longer than ``most``, without reading on."""
-    body = bytearray()
+    """The body; refused when it is longer than ``most``, of which no more is kept.
+
+    Some of what is too long is still read: a client that is cut off while sending sees a broken
+    connection and not the reason.
+    """
+    body, length = bytearray(), 0
     async for part in request.stream():
-        body += part
-        if len(body) > most:
-            raise QuestionError(f"the question has more than {most} bytes; send fewer crops")
+        length += len(part)
+        body += part if length <= most else b""
+        if length > _DRAINED * most:
+            break
+    if length > most:
+        raise QuestionError(f"the question has more than {most} bytes; send fewer crops")
     return bytes(body)
 
 
@@ -96,6 +106,7 @@ def _bind(config: uvicorn.Config) -> Any:
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((config.host, config.port))
+        listener.listen(128)  # from now on clients wait instead of being refused
     except OSError as error:
         listener.close()
         raise TransportError(

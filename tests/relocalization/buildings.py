@@ -75,6 +75,8 @@ class Building:
     things: int = 60
     classes: int = 22
     look_alikes: float = 0.5
+    kin: int | None = None
+    """Buildings with the same ``kin`` share classes and what is common to all crops."""
     walls: list[tuple[float, float, float, float]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -85,6 +87,10 @@ class Building:
         self._make_walls()
         self.common = direction(rng)
         self.class_directions = [direction(rng) for _ in range(self.classes)]
+        if self.kin is not None:
+            shared = np.random.default_rng(self.kin)
+            self.common = direction(shared)
+            self.class_directions = [direction(shared) for _ in range(self.classes)]
         self.furniture: list[Thing] = []
         while len(self.furniture) < self.things:
             self._add_model(rng)

@@ -1,0 +1,88 @@
+"""`mapfold query`: live answers equal those of the folded log, whatever things are called."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from eventsrc.log import LogReader
+from projections.folding import fold_log
+from projections.postgres.connect import Targets, connect
+from projections.queries.ask import (
+    Asker,
+    LiveAsker,
+    ViewAsker,
+    objects_of,
+    path_between,
+    places_holding,
+    where_is,
+)
+from projections.queries.relocalize import prepare_graph
+from projections.runner import rebuild
+from projections.settings import Settings
+from projections.view import MapView
+from tests.commands import Commands
+from tests.logs import walk, write_log
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    return write_log(tmp_path / "log", walk(80, seed=5))
+
+
+@pytest.fixture
+def view(log: Path) -> MapView:
+    with LogReader(log) as reader:
+        return fold_log(reader, Settings())[1]
+
+
+def test_live_answers_equal_the_folded_maps(
+    log: Path, view: MapView, one_database: Targets
+) -> None:
+    rebuild(log, one_database, Settings())
+    folded: Asker = ViewAsker(view)
+    with connect(one_database.graph_url, autocommit=True) as connection:
+        prepare_graph(connection)
+        live = LiveAsker(connection)
+        for thing in view.objects:
+            assert where_is(live, thing.object_id) == where_is(folded, thing.object_id)
+        places = [p.place_id for p in view.places.values()]
+        assert len(places) > 1
+        for place in places:
+            assert objects_of(live, place) == objects_of(folded, place)
+            assert path_between(live, places[0], place) == path_between(folded, places[0], place)
+            for name in sorted({o.class_name for o in view.objects}):
+                assert places_holding(live, name, place, 1) == places_holding(
+                    folded, name, place, 1
+                )
+        assert where_is(live, view.objects[0].object_id)["place_id"] in [*places, None]
+
+
+def test_the_command_asks_a_past_map(tmp_path: Path, log: Path, view: MapView) -> None:
+    mapfold = Commands.in_folder(tmp_path)
+    thing = view.objects[0]
+    now = mapfold("query", "where", thing.object_id, "--log", log, "--json").json
+    assert now["obs_count"] == thing.obs_count
+    first = next(k.offset for k in view.keyframes if thing.observations[0] in list(k.observations))
+    then = mapfold(
+        "query", "where", thing.object_id, "--log", log, "--at", str(first + 1), "--json"
+    )
+    assert then.json["obs_count"] == 1
+    gone = mapfold("query", "where", thing.object_id, "--log", log, "--at", "0", code=2)
+    assert thing.object_id in gone.err
+    refused = mapfold("query", "where", thing.object_id, "--at", "0", code=2)
+    assert "--log" in refused.err
+
+
+def test_similar_objects_live(tmp_path: Path, log: Path, one_database: Targets) -> None:
+    rebuild(log, one_database, Settings())
+    question = tmp_path / "question.json"
+    question.write_text(json.dumps(next(d for d in walk(80, seed=5) if d["detections"])))
+    mapfold = Commands.in_folder(tmp_path, MAPFOLD_DB=one_database.graph_url)
+    found = mapfold("query", "similar", question, "--top", "3", "--json").json
+    assert 1 <= len(found) <= 3
+    assert found[0]["similarity"] == pytest.approx(1.0, abs=1e-5)
+    assert [o["similarity"] for o in found] == sorted(
+        (o["similarity"] for o in found), reverse=True
+    )
+    assert mapfold("query", "similar", question).out

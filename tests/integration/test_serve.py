@@ -1,0 +1,280 @@
+"""`mapfold serve` on real parts: a router, a database, clients that ask at the same time."""
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from eventsrc._zenoh import Session, ZenohOptions, open_session
+from eventsrc.errors import TransportError
+from projections.postgres.connect import Targets, connect
+from projections.queries.relocalize import relocalize
+from projections.relocalize import parse_question
+from projections.runner import rebuild
+from projections.serve import Answerer, Pools, ZenohService
+from projections.serve.http import create_app, serving
+from projections.serve.limits import Bucket, TooMuchError
+from projections.settings import Settings
+from tests.envelopes import detection
+from tests.logs import walk, write_log
+
+DEADLINE_S = 30.0
+OTHER_SPACE = json.dumps([detection("x", [1.0, 2.0])]).encode()
+
+
+@pytest.fixture
+def targets(tmp_path: Path, one_database: Targets) -> Targets:
+    rebuild(write_log(tmp_path / "log", walk(60, seed=3)), one_database, Settings())
+    return one_database
+
+
+@pytest.fixture
+def pools(targets: Targets) -> Iterator[Pools]:
+    with Pools(targets, 4) as pools:
+        yield pools
+
+
+@pytest.fixture
+def answerer(pools: Pools) -> Answerer:
+    return Answerer(pools, per_second=10_000.0)
+
+
+def question(number: int = 0) -> bytes:
+    documents = [d for d in walk(30, seed=9, run_id="run-b") if d["detections"]]
+    return json.dumps(documents[number % len(documents)]).encode()
+
+
+def ask(session: Session, selector: str, payload: bytes | None = None) -> tuple[bool, Any]:
+    ((good, answer),) = session.ask(selector, payload, timeout_s=DEADLINE_S)
+    return good, json.loads(answer)
+
+
+class TestZenoh:
+    """Over a router, from other sessions."""
+
+    @pytest.fixture
+    def service(
+        self, connected: Callable[[], Session], answerer: Answerer
+    ) -> Iterator[ZenohService]:
+        with ZenohService(connected(), answerer, workers=4) as service:
+            yield service
+
+    @pytest.mark.usefixtures("service")
+    def test_the_answer_is_the_librarys(
+        self, connected: Callable[[], Session], targets: Targets
+    ) -> None:
+        good, answer = ask(connected(), "mapfold/relocalize", question())
+        assert good
+        assert answer == relocalize(targets, parse_question(question())).document()
+
+    @pytest.mark.usefixtures("service")
+    @pytest.mark.parametrize(
+        ("selector", "payload", "kind"),
+        [
+            ("mapfold/relocalize", b"nonsense", "bad_question"),
+            ("mapfold/relocalize", None, "bad_question"),
+            ("mapfold/relocalize?top=0", question(), "bad_question"),
+            ("mapfold/relocalize", b"[" * 2_000_000, "bad_question"),
+            (
+                "mapfold/relocalize",
+                json.dumps([detection("x", [1.0, 2.0])]).encode(),
+                "bad_question",
+            ),
+            ("mapfold/state/places", None, "bad_question"),
+            ("mapfold/state/secrets?x=0;y=0", None, "bad_question"),
+        ],
+    )
+    def test_a_bad_question_gets_an_error_as_reply(
+        self, connected: Callable[[], Session], selector: str, payload: bytes | None, kind: str
+    ) -> None:
+        good, answer = ask(connected(), selector, payload)
+        assert not good
+        assert answer["error"]["kind"] == kind
+        assert answer["error"]["message"]
+
+    @pytest.mark.usefixtures("service")
+    def test_state_near_a_pose(self, connected: Callable[[], Session], pools: Pools) -> None:
+        session = connected()
+        good, found = ask(session, "mapfold/state/places?x=0;y=0;radius=1000")
+        assert good
+        distances = [place["distance_m"] for place in found["places"]]
+        assert distances
+        assert distances == sorted(distances)
+        x, y = (found["places"][0][f"centroid_{axis}"] for axis in "xy")
+        _, near = ask(session, f"mapfold/state/places?x={x};y={y};radius=0.01")
+        assert [p["place_id"] for p in near["places"]] == [found["places"][0]["place_id"]]
+        _, objects = ask(session, "mapfold/state/objects?x=0;y=0;radius=1000")
+        assert {"object_id", "class_name", "distance_m"} <= set(objects["objects"][0])
+
+    @pytest.mark.usefixtures("service")
+    def test_eight_clients_at_once_get_their_own_answers(
+        self, connected: Callable[[], Session], targets: Targets
+    ) -> None:
+        expected = [relocalize(targets, parse_question(question(n))).document() for n in range(8)]
+        wrong: list[object] = []
+
+        def client(session: Session, number: int) -> None:
+            for _ in range(5):
+                good, answer = ask(session, "mapfold/relocalize", question(number))
+                if not good or answer != expected[number]:
+                    wrong.append(answer)
+
+        threads = [threading.Thread(target=client, args=(connected(), n)) for n in range(8)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert wrong == []
+
+    @pytest.mark.usefixtures("service")
+    def test_a_broken_connection_costs_no_answer(
+        self, connected: Callable[[], Session], targets: Targets
+    ) -> None:
+        session = connected()
+        assert ask(session, "mapfold/relocalize", question())[0]
+        with connect(targets.graph_url, autocommit=True) as killer:
+            killer.execute(
+                "SELECT pg_terminate_backend(pid) FROM pg_stat_activity"
+                " WHERE application_name = 'mapfold serve' AND datname = current_database()"
+            )
+        assert ask(session, "mapfold/relocalize", question())[0]
+
+    def test_a_closed_service_answered_what_it_took(
+        self, connected: Callable[[], Session], answerer: Answerer
+    ) -> None:
+        session, answers = connected(), []
+        service = ZenohService(connected(), answerer, workers=1)
+        threads = [
+            threading.Thread(
+                target=lambda: answers.extend(
+                    session.ask("mapfold/relocalize", question(), timeout_s=DEADLINE_S)
+                )
+            )
+            for _ in range(4)
+        ]
+        for thread in threads:
+            thread.start()
+        service.close()
+        service.close()
+        for thread in threads:
+            thread.join()
+        assert all(json.loads(answer) for _, answer in answers)
+        assert session.ask("mapfold/relocalize", question(), timeout_s=1.0) == []
+
+
+def test_too_many_questions_are_refused_not_queued_forever(pools: Pools) -> None:
+    slow = Answerer(pools, per_second=0.01)
+    slow.relocalize(question(), {})
+    with pytest.raises(TooMuchError, match="a second"):
+        slow.relocalize(question(), {})
+
+
+def test_the_bucket_fills_with_time() -> None:
+    now = [0.0]
+    bucket = Bucket(2.0, now=lambda: now[0])
+    for _ in range(4):
+        bucket.take()
+    with pytest.raises(TooMuchError):
+        bucket.take()
+    now[0] = 0.5
+    bucket.take()
+    with pytest.raises(TooMuchError):
+        bucket.take()
+
+
+def fetch(url: str, data: bytes | None = None) -> tuple[int, Any]:
+    """Status and JSON body of one request; POST when there is data."""
+    try:
+        with urllib.request.urlopen(url, data, timeout=DEADLINE_S) as answer:
+            return answer.status, json.loads(answer.read())
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, json.loads(error.read())
+
+
+class TestHttp:
+    """The ASGI app behind a real server on a free port."""
+
+    @pytest.fixture
+    def http(self, answerer: Answerer) -> Iterator[str]:
+        with serving(create_app(answerer), "127.0.0.1", 0) as port:
+            yield f"http://127.0.0.1:{port}"
+
+    def test_the_answer_is_the_librarys(self, http: str, targets: Targets) -> None:
+        expected = relocalize(targets, parse_question(question()), top=1).document()
+        assert fetch(f"{http}/relocalize?top=1", question()) == (200, expected)
+
+    def test_it_describes_itself(self, http: str) -> None:
+        _, document = fetch(f"{http}/openapi.json")
+        assert {"/relocalize", "/state/{what}", "/health"} <= set(document["paths"])
+        assert fetch(f"{http}/health") == (200, {"status": "ok"})
+
+    @pytest.mark.parametrize(
+        ("path", "data"),
+        [
+            ("/relocalize", b"nonsense"),
+            ("/relocalize", b"x" * 2_000_000),
+            ("/relocalize?method=magic", question()),
+            ("/state/secrets?x=0&y=0", None),
+            ("/state/places?x=nan&y=0", None),
+        ],
+    )
+    def test_a_bad_question_is_400_and_says_why(
+        self, http: str, path: str, data: bytes | None
+    ) -> None:
+        status, document = fetch(f"{http}{path}", data)
+        assert status == 400
+        assert document["error"]["kind"] == "bad_question"
+
+    def test_state_near_a_pose(self, http: str) -> None:
+        status, found = fetch(f"{http}/state/places?x=0&y=0&radius=1000")
+        assert (status, bool(found["places"])) == (200, True)
+
+    def test_too_much_is_429(self, pools: Pools) -> None:
+        slow = create_app(Answerer(pools, per_second=0.01))
+        with serving(slow, "127.0.0.1", 0) as port:
+            url = f"http://127.0.0.1:{port}/relocalize"
+            assert fetch(url, question())[0] == 200
+            assert fetch(url, question())[0] == 429
+
+    def test_it_ends_with_its_block_and_frees_the_port(self, answerer: Answerer) -> None:
+        app = create_app(answerer)
+        with serving(app, "127.0.0.1", 0) as port:
+            assert fetch(f"http://127.0.0.1:{port}/health")[0] == 200
+            with pytest.raises(TransportError, match="in use"), serving(app, "127.0.0.1", port):
+                pytest.fail("two servers on one port")
+        with serving(app, "127.0.0.1", port) as again:
+            assert again == port
+
+
+def test_the_command_serves_until_sigterm(endpoint: str, targets: Targets) -> None:
+    program = subprocess.Popen(
+        [
+            *(sys.executable, "-m", "projections.cli", "serve"),
+            *("--connect", endpoint, "--db", targets.graph_url),
+        ],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert program.stderr is not None
+        while "Ctrl-C" not in (line := program.stderr.readline()):
+            assert line, "the service ended early"
+        with open_session(ZenohOptions(connect=(endpoint,)), mode="client") as session:
+            assert ask(session, "mapfold/relocalize", question())[0]
+        program.send_signal(signal.SIGTERM)
+        assert program.wait(DEADLINE_S) == 0
+        assert "service ended" in program.stderr.read()
+    finally:
+        program.kill()
+        program.wait()
+        if program.stderr is not None:
+            program.stderr.close()
