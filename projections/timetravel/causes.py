@@ -42,6 +42,16 @@ class Cause:
         """The time as ISO 8601 in UTC."""
         return None if self.time_s is None else iso_time(self.time_s)
 
+    @property
+    def when(self) -> str:
+        """Its time for people, its name where it has none."""
+        return self.time or self.name
+
+    @property
+    def title(self) -> str:
+        """Name and time, ``run:keyframe, 2026-03-24T13:00:00.000Z``."""
+        return self.name if self.time is None else f"{self.name}, {self.time}"
+
     def document(self) -> dict[str, Any]:
         """The fields every JSON answer says a cause with."""
         return {

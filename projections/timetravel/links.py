@@ -12,6 +12,8 @@ from .story import keyframe_name, listed, place_name
 
 def reason(history: History, merge: Merge) -> str:
     """Who bridged, what that made core, and the chain of core points to each absorbed place."""
+    if merge.cause.kind != "keyframe":
+        return merge.cause.name
     chains = chains_of(history, merge)
     bridge = keyframe_name(history, merge.bridge)
     if not chains:

@@ -44,7 +44,7 @@ def merge_row(history: History, merge: Merge) -> tuple[str, ...]:
     return (
         str(merge.number),
         f"{merge.cause.offset:,}",
-        merge.cause.time or "",
+        merge.cause.when,
         keyframe_name(history, merge.bridge),
         place_name(history, merge.survivor),
         ", ".join(place_name(history, place) for place in merge.absorbed),

@@ -52,7 +52,7 @@ def draw_merge(timeline: Timeline, merge: Merge, out: Path) -> None:
         said = " and ".join(names) if when == "before" else names[0]
         panel.axes.set_title(f"--at {view.next_offset}, {when}: {said}", fontsize=10)
     history = timeline.history
-    head = f"merge {merge.number}, {merge.cause.time}: {reason(history, merge)}"
+    head = f"merge {merge.number}, {merge.cause.when}: {reason(history, merge)}"
     figure.suptitle(f"{head}\n{_LEGEND}", fontsize=9.5)
     _save(figure, out)
 

@@ -101,7 +101,7 @@ def _ended(history: History, life: PlaceLife, end: int) -> str:
     now = history.survivor_of(life.formed.place, end)
     then = "" if now == merge.survivor else f"; that is part of {place_name(history, now)} now"
     by = place_name(history, merge.survivor)
-    return f"absorbed by {by} at offset {merge.cause.offset:,} ({merge.cause.time}){then}"
+    return f"absorbed by {by} at offset {merge.cause.offset:,} ({merge.cause.when}){then}"
 
 
 def _absorber(history: History, life: PlaceLife, end: int) -> dict[str, object] | None:

@@ -83,7 +83,7 @@ def _summary(history: History, first: int, second: int, since: int | None, end: 
     if since is not None:
         cause = history.cause_at(since)
         now = place_name(history, history.place_at(first, end))
-        return f"in one place since offset {since:,} ({cause.name}, {cause.time}); it is {now} now"
+        return f"in one place since offset {since:,} ({cause.title}); it is {now} now"
     return "not in one place: " + "; ".join(_where(history, k, end) for k in (first, second))
 
 

@@ -109,9 +109,12 @@ class Timeline:
             return view_at(history, self._latest, wanted, self.settings)
 
     def deltas(self, start: int = 0, end: int | None = None) -> Iterator[FoldedEvent]:
-        """What each event from ``start`` to before ``end`` changed, by a fold of its own."""
-        events = self.reader.read(0, self._end(end))
-        folded = fold_events(events, SemanticMap(self.settings), ahead=AHEAD)
+        """What each event from ``start`` to before ``end`` changed, by a fold of its own that
+        starts from the nearest snapshot."""
+        found = self._snapshots().latest(self._end(start))
+        semantic_map = SemanticMap(self.settings) if found is None else found[0]
+        events = self.reader.read(semantic_map.next_offset, self._end(end))
+        folded = fold_events(events, semantic_map, ahead=AHEAD)
         return (event for event in folded if event.offset >= start)
 
     def merges(self, end: int | None = None) -> list[Merge]:
@@ -194,10 +197,12 @@ class Timeline:
 
     def _from_snapshot(self, end: int) -> MapView | None:
         """The map at ``end`` from the nearest snapshot; None when there is none below."""
-        cache = SnapshotCache(self.reader.path, self.reader.log_id, self.settings, self._note)
-        if not any(offset <= end for offset in cache.offsets()):
+        if not any(offset <= end for offset in self._snapshots().offsets()):
             return None
         return fold_log_cached(self.reader, self.settings, end, note=self._note)[1]
+
+    def _snapshots(self) -> SnapshotCache:
+        return SnapshotCache(self.reader.path, self.reader.log_id, self.settings, self._note)
 
     def _check_names(self, expression: Expression, facts: HistoryFacts) -> None:
         """A misspelt id would make any condition quietly false; say so instead."""

@@ -38,6 +38,10 @@ def test_at_is_the_same_whatever_snapshots_are_left(
         notes: list[str] = []
         with Timeline(log, RULES, note=notes.append) as timeline:
             views = [timeline.at(end) for end in asked]
+            later = timeline.at(asked[0])
+            for event in timeline.deltas(asked[0]):
+                later.apply_event(event.offset, event.deltas)
+            assert map_digest(later) == map_digest(timeline.at())
         assert [map_digest(view) for view in views] == expected
         assert [view.next_offset for view in views] == asked
         assert all("this snapshot is not used" in note for note in notes)

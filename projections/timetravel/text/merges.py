@@ -26,7 +26,7 @@ def merge_text(history: History, merge: Merge) -> str:
     """One merge with everything that made it and that changed hands."""
     cause, after = merge.cause, merge.cause.offset + 1
     lines = [
-        f"merge {merge.number} at offset {cause.offset:,} ({cause.time}), shows from --at {after}",
+        f"merge {merge.number} at offset {cause.offset:,} ({cause.when}), shows from --at {after}",
         f"because   {reason(history, merge)}",
         f"survivor  {place_name(history, merge.survivor)}, {merge.survivor_size:,} keyframes",
     ]

@@ -21,7 +21,7 @@ def _verdict(search: Search) -> str:
     if search.found is not None:
         cause = search.found.cause
         return (
-            f"became true at offset {cause.offset:,} ({cause.name}, {cause.time}), "
+            f"became true at offset {cause.offset:,} ({cause.title}), "
             f"shows from --at {cause.offset + 1}"
         )
     span = f"from --at {search.start} to {search.end}"
@@ -45,7 +45,7 @@ def _values(turn: Turn) -> list[str]:
 def _turn(turn: Turn) -> str:
     word = "true" if turn.becomes else "false"
     cause = turn.cause
-    return f"  turned {word} at offset {cause.offset:,} ({cause.name}, {cause.time})"
+    return f"  turned {word} at offset {cause.offset:,} ({cause.title})"
 
 
 def _value(value: object) -> str:

@@ -9,6 +9,6 @@ def story_text(story: Story) -> str:
     lines = [f"{subject}: {story.summary}"]
     width = max((len(f"{e.cause.offset:,}") for e in story.entries), default=1)
     for entry in story.entries:
-        time = entry.cause.time or entry.cause.name
+        time = entry.cause.when
         lines.append(f"  {entry.cause.offset:>{width},}  {time}  {entry.text}")
     return "".join(f"{line}\n" for line in lines)

@@ -1,0 +1,73 @@
+"""A cause that is not a keyframe: what an operator's command will be, told like any other."""
+
+import pytest
+
+from projections.deltas import (
+    Delta,
+    KeyframeAdded,
+    KeyframePlaced,
+    Link,
+    PlaceChanged,
+    PlaceFormed,
+    PlacesMerged,
+    Pose,
+)
+from projections.settings import Settings
+from projections.timetravel.causes import Cause, cause_of
+from projections.timetravel.history import History
+from projections.timetravel.merge_story import merge_document, merge_row
+from projections.timetravel.place_story import place_story
+from projections.timetravel.same_story import same_story
+from projections.timetravel.text import merge_text, story_text
+
+
+def keyframe(number: int) -> list[Delta]:
+    """A keyframe and a place of its own, far from every other."""
+    return [
+        KeyframeAdded(number, number, 0, "run", number, 1.0, Pose(10**7 * number, 0, 0.0)),
+        PlaceFormed(number, number, f"run_p{number}", number),
+        KeyframePlaced(number, number, number),
+        PlaceChanged(number, number, 1, 10**7 * number, 0),
+    ]
+
+
+@pytest.fixture
+def commanded() -> History:
+    """Two places that an event without a keyframe made one."""
+    history = History(Settings())
+    history.apply(0, keyframe(0))
+    history.apply(1, keyframe(1))
+    merged = PlacesMerged(2, 0, (1,), 1, (Link(0, 1, 10**7),), 1, (1,))
+    history.apply(2, [merged, PlaceChanged(2, 0, 2, 10**7, 0)])
+    return history
+
+
+def test_the_cause_is_the_command(commanded: History) -> None:
+    (merge,) = commanded.merges
+    assert merge.cause == Cause(2, "command")
+    assert merge.cause.name == merge.cause.when == merge.cause.title == "command at offset 2"
+    assert merge_document(commanded, merge)["cause"] == "command"
+    assert merge_document(commanded, merge)["time"] is None
+
+
+def test_every_text_names_it(commanded: History) -> None:
+    (merge,) = commanded.merges
+    story = place_story(commanded, commanded.places[1], 3)
+    texts = [
+        merge_text(commanded, merge),
+        " ".join(merge_row(commanded, merge)),
+        story_text(story),
+        story_text(same_story(commanded, 0, 1, 3)),
+    ]
+    for text in texts:
+        assert "command at offset 2" in text
+        assert "None" not in text
+
+
+def test_a_command_may_say_what_it_did() -> None:
+    assert Cause(7, "command", what="kitchen was renamed").name == "kitchen was renamed"
+
+
+def test_a_keyframe_is_named_by_run_and_number() -> None:
+    cause = cause_of(3, [KeyframeAdded(3, 0, 0, "a:b", 12, 1774357200.25, None)])
+    assert cause.title == "a:b:12, 2026-03-24T13:00:00.250Z"
