@@ -17,40 +17,31 @@ import itertools
 import json
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Literal, NamedTuple, Self
+from typing import Any, Final, NamedTuple, Self
 
 import zenoh
 
+from ._zenoh_config import Mode, ZenohOptions, configure
 from ._zenoh_errors import cannot_open, plain
-from .endpoints import DEFAULT_ENDPOINT, check_endpoints
 from .errors import MisuseError, TransportError
 
-Mode = Literal["client", "peer", "router"]
+__all__ = [
+    "Asked",
+    "Missed",
+    "Mode",
+    "Publisher",
+    "Received",
+    "Session",
+    "Subscription",
+    "ZenohOptions",
+    "check_keys",
+    "open_session",
+]
 
-_OPEN_TIMEOUT_MS: Final = 5_000
 _CONFIRM_TIMEOUT_S: Final = 5.0
 _HEARTBEAT_S: Final = 0.5
-
-
-@dataclass(frozen=True, slots=True)
-class ZenohOptions:
-    """Where to connect, where to listen, and a Zenoh configuration file (JSON5) for the rest.
-
-    ``connect`` and ``listen`` go before what the file says. TLS, access control and scouting are
-    the file's business.
-    """
-
-    connect: tuple[str, ...] = ()
-    listen: tuple[str, ...] = ()
-    config_file: Path | None = None
-
-    @property
-    def mode(self) -> Literal["client", "peer"]:
-        """What a recorder or a publisher is with these options: a peer if others may call it."""
-        return "peer" if self.listen else "client"
 
 
 class Received(NamedTuple):
@@ -203,20 +194,8 @@ class Session:
 
     def get(self, selector: str, payload: bytes | None = None, *, timeout_s: float) -> list[bytes]:
         """Ask everybody who answers under ``selector``; the payloads of the good answers."""
-        with _clear_errors(f"selector {selector!r} cannot be asked"):
-            replies = self.raw.get(selector, payload=payload, timeout=timeout_s)
-            return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
-
-    def queryable(self, key: str, answer: Callable[[bytes], bytes]) -> Subscription:
-        """Answer every question under ``key``: bytes asked in, bytes answered out."""
-
-        def reply(query: zenoh.Query) -> None:
-            with query:
-                asked = query.payload.to_bytes() if query.payload is not None else b""
-                query.reply(key, answer(asked))
-
-        with _clear_errors(f"key {key!r} cannot be answered on"):
-            return Subscription(self.raw.declare_queryable(key, reply, complete=True))
+        answers = self.ask(selector, payload, timeout_s=timeout_s)
+        return [answer for good, answer in answers if good]
 
     def questions(self, key: str, take: Callable[[Asked], None]) -> Subscription:
         """Hand over every question under ``key`` to ``take``, which must not work on it itself."""
@@ -284,37 +263,13 @@ def check_keys(key_exprs: Sequence[str]) -> None:
 def open_session(options: ZenohOptions, *, mode: Mode) -> Session:
     """Open a session; raise TransportError if it cannot connect or listen as asked."""
     zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]
-    config = _config(options, mode)
+    config = _config_from_file(options.config_file)
+    configure(config, options, mode)
     connect, listen = config.get_json("connect/endpoints"), config.get_json("listen/endpoints")
     try:
         return Session(zenoh.open(config))
     except zenoh.ZError as error:
         raise cannot_open(error, json.loads(connect), json.loads(listen)) from None
-
-
-def _config(options: ZenohOptions, mode: Mode) -> zenoh.Config:
-    config = _config_from_file(options.config_file)
-    connect, listen = check_endpoints(options.connect), check_endpoints(options.listen)
-    if not connect and mode == "client" and _is_unset(config, "connect/endpoints"):
-        connect = (DEFAULT_ENDPOINT,)
-    _set(config, "mode", mode)
-    _set(config, "transport/shared_memory/enabled", False)
-    if connect:
-        _set(config, "connect/endpoints", connect)
-    if listen or options.config_file is None:
-        _set(config, "listen/endpoints", listen)
-    if _is_unset(config, "scouting/multicast/enabled"):
-        _set(config, "scouting/multicast/enabled", False)
-    if mode == "peer":  # a router starts before the routers it is linked to; a peer's error counts
-        _set(config, "connect/exit_on_failure", True)
-        _set(config, "connect/timeout_ms", _OPEN_TIMEOUT_MS)
-    if _is_unset(config, "scouting/delay") and not json.loads(
-        config.get_json("scouting/multicast/enabled")
-    ):
-        _set(config, "scouting/delay", 0)  # half a second's wait for answers nobody will give
-    if mode == "router":
-        _set(config, "adminspace/enabled", True)  # it is where `locators` come from
-    return config
 
 
 def _config_from_file(path: Path | None) -> zenoh.Config:
@@ -326,14 +281,6 @@ def _config_from_file(path: Path | None) -> zenoh.Config:
         return zenoh.Config.from_file(path)
     except zenoh.ZError as error:
         raise TransportError(f"{path}: not a Zenoh configuration: {plain(error)}") from None
-
-
-def _set(config: zenoh.Config, key: str, value: object) -> None:
-    config.insert_json5(key, json.dumps(value))
-
-
-def _is_unset(config: zenoh.Config, key: str) -> bool:
-    return json.loads(config.get_json(key)) in (None, [])
 
 
 def _declare_plain(session: zenoh.Session, key: str, _: int) -> Any:

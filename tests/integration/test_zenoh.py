@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc._zenoh import Received, Session, ZenohOptions, open_session
+from eventsrc._zenoh import Asked, Received, Session, ZenohOptions, open_session
 from eventsrc.errors import TransportError
 from eventsrc.router import Router
 from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK
@@ -71,13 +71,22 @@ def test_confirm_means_the_router_knows(connected: Sessions) -> None:
     assert arrived.wait(DEADLINE_S)
 
 
-def test_a_question_is_answered(connected: Sessions) -> None:
+def test_a_question_is_answered_or_refused(connected: Sessions) -> None:
+    def turn_around(asked: Asked) -> None:
+        if asked.payload:
+            asked.answer(asked.key, asked.payload[::-1])
+        else:
+            asked.refuse(b"nothing asked")
+
     server = connected()
-    server.queryable("mapfold/relocalize", lambda asked: asked[::-1])
+    server.questions("mapfold/relocalize", turn_around)
     server.confirm()
     asking = connected()
     assert asking.get("mapfold/relocalize", b"abc", timeout_s=DEADLINE_S) == [b"cba"]
     assert asking.get("mapfold/nobody", timeout_s=DEADLINE_S) == []
+    assert asking.get("mapfold/relocalize", timeout_s=DEADLINE_S) == [], "a refusal is no answer"
+    refused = asking.ask("mapfold/relocalize", timeout_s=DEADLINE_S)
+    assert refused == [(False, b"nothing asked")]
 
 
 def test_a_peer_can_be_called_directly() -> None:
