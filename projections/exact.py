@@ -72,8 +72,8 @@ def unit_rows(rows: NDArray[np.floating]) -> NDArray[np.float64]:
     if dim > MAX_DIMENSION:
         raise ValueError(f"an embedding of {dim} dimensions is beyond {MAX_DIMENSION}")
     bits = _component_bits(dim)
+    largest: list[float] = np.abs(rows).max(axis=1).tolist()
     scaled = rows.astype(np.float64)
-    largest: list[float] = np.abs(scaled).max(axis=1).tolist()
     # Loops over the few rows: for scalars Python is quicker than numpy, and as exact.
     scaled *= _column([math.ldexp(1.0, bits - math.frexp(value)[1]) for value in largest])
     np.rint(scaled, out=scaled)

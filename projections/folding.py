@@ -4,8 +4,8 @@ import gc
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from itertools import islice
+from typing import NamedTuple
 
 from eventsrc.ingest import Accepted, Rejected
 from eventsrc.log import Event, LogReader
@@ -28,8 +28,7 @@ WORTH_A_SNAPSHOT = 5_000
 """Events; folding fewer takes about as long as reading a snapshot of them."""
 
 
-@dataclass(frozen=True, slots=True)
-class FoldedEvent:
+class FoldedEvent(NamedTuple):
     """What the event at ``offset`` changed; mapfold's own events change nothing."""
 
     offset: int
