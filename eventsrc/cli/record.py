@@ -10,6 +10,7 @@ import typer
 from eventsrc._zenoh import check_keys, open_session
 from eventsrc.endpoints import parse_address
 from eventsrc.errors import LogDamaged
+from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES
 from eventsrc.ledger import ledger_of, unread_events
 from eventsrc.log import LogReader, LogWriter, parse_fsync
 from eventsrc.losses import GapLedger
@@ -45,6 +46,9 @@ def record(
     queue: Annotated[
         int, typer.Option(min=1, help="How many messages may wait for the disk.")
     ] = DEFAULT_QUEUE_SIZE,
+    max_payload: Annotated[
+        int, typer.Option(min=1, metavar="BYTES", help="Larger messages are rejected.")
+    ] = DEFAULT_MAX_PAYLOAD_BYTES,
     max_events: Annotated[
         int | None, typer.Option(min=1, help="Stop after so many messages.")
     ] = None,
@@ -83,6 +87,7 @@ def record(
             max_events=max_events,
             ledger=_ledger(log),
             report_gaps=gaps,
+            max_payload_bytes=max_payload,
         )
         with _measured(address, recorder, log), watching(log) as watch:
             named = ", ".join(keys)

@@ -8,6 +8,7 @@ from typing import Final
 from eventsrc._zenoh import Received, Session, check_keys
 from eventsrc.acks import ACK_PREFIX, Ack, ack_key
 from eventsrc.errors import TransportError
+from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES
 from eventsrc.log import LogWriter
 from eventsrc.losses import GapLedger
 
@@ -37,6 +38,7 @@ class Recorder:
         max_events: int | None = None,
         ledger: GapLedger | None = None,
         report_gaps: bool = True,
+        max_payload_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES,
     ) -> None:
         check_keys(keys)
         self._session = session
@@ -48,6 +50,7 @@ class Recorder:
             self._send_ack,
             max_events=max_events,
             report_gaps=report_gaps,
+            max_payload_bytes=max_payload_bytes,
         )
         self._subscriptions = [
             session.subscribe(key, self._receive, on_miss=self._inbox.miss) for key in keys

@@ -36,7 +36,7 @@ _BATCH: Final = 256
 _IDLE_S: Final = 0.25
 _UNSYNCED_S: Final = 0.005
 """How long to wait for more while a group commit is due: a tenth of the default group."""
-LOSSES_EVERY_NS: Final = 1_000_000_000
+_LOSSES_EVERY_NS: Final = 1_000_000_000
 _SAVE_EVERY_NS: Final = 60_000_000_000
 """So a recorder that was killed leaves a minute of its log to be read again, not the whole."""
 
@@ -52,8 +52,8 @@ class Writing:
         acknowledge: Acknowledge,
         *,
         max_events: int | None,
-        report_gaps: bool = True,
-        losses_every_ns: int = LOSSES_EVERY_NS,
+        report_gaps: bool,
+        max_payload_bytes: int,
     ) -> None:
         self._inbox = inbox
         self._writer = writer
@@ -62,8 +62,8 @@ class Writing:
         self._acknowledge = acknowledge
         self._room = max_events
         self._report_gaps = report_gaps
-        self._losses_every_ns = losses_every_ns
-        self._losses_due_ns = time.monotonic_ns() + losses_every_ns
+        self._max_payload_bytes = max_payload_bytes
+        self._losses_due_ns = time.monotonic_ns() + _LOSSES_EVERY_NS
         self._save_due_ns = time.monotonic_ns() + _SAVE_EVERY_NS
         self._unsynced: deque[tuple[int, _Identity | None]] = deque()
         self._recorded = self._rejected = 0
@@ -109,7 +109,7 @@ class Writing:
         self._follow_up()
         now_ns = time.monotonic_ns()
         if now_ns >= self._losses_due_ns:
-            self._losses_due_ns = now_ns + self._losses_every_ns
+            self._losses_due_ns = now_ns + _LOSSES_EVERY_NS
             self._write_losses(self._ledger.due(now_ns))
         if now_ns >= self._save_due_ns:
             self._save_due_ns = now_ns + _SAVE_EVERY_NS
@@ -119,7 +119,9 @@ class Writing:
         return bool(batch or not closed) and self._room != 0
 
     def _record(self, message: Received) -> None:
-        result = append_payload(self._writer, message.key, message.payload)
+        result = append_payload(
+            self._writer, message.key, message.payload, max_bytes=self._max_payload_bytes
+        )
         if isinstance(result, Accepted):
             offset = self._writer.next_offset - 1
             self._unsynced.append((offset, _identity(message, result)))

@@ -139,6 +139,23 @@ def test_only_a_window_is_under_way(endpoint: str, connected: Sessions, tmp_path
         assert max(seen) <= 14
 
 
+def test_two_robots_hear_their_own_acks(
+    endpoint: str, recorder: Callable[[], Program], tmp_path: Path
+) -> None:
+    recorder()
+    options = ZenohOptions(connect=(endpoint,))
+    with (
+        EnvelopePublisher(options, tmp_path / "a") as one,
+        EnvelopePublisher(options, tmp_path / "b") as other,
+    ):
+        for k in range(20):
+            one.publish(envelope(k, run_id="run-a"))
+            other.publish(envelope(k + 1_000, run_id="run-b"))
+        assert one.flush(DEADLINE_S)
+        assert other.flush(DEADLINE_S)
+    assert _keyframes(tmp_path / "log") == {*range(20), *range(1_000, 1_020)}
+
+
 def test_a_router_that_comes_and_goes_loses_nothing(start: Start, tmp_path: Path) -> None:
     """Robot and recorder stay; the router between them is restarted while the robot publishes."""
     log = tmp_path / "log"

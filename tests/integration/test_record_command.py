@@ -45,6 +45,19 @@ def test_a_signal_drains_the_queue_and_exits_0(
     assert json.loads(recorder.output())["recorded"] == 30
 
 
+def test_a_message_over_the_limit_is_rejected(
+    start: Start, publish: Start, endpoint: str, tmp_path: Path
+) -> None:
+    fits = payload(envelope(1))
+    limit = str(len(fits))
+    arguments = ("record", str(tmp_path / "log"), "--connect", endpoint, "--max-payload", limit)
+    recorder = start(*arguments, "--max-events", "2")
+    recorder.wait_for("recording")
+    publish(KEY, fits.decode(), fits.decode() + " ")
+    assert recorder.wait() == 3
+    assert "1 recorded, 1 rejected" in recorder.lines[-1]
+
+
 def test_a_rejected_payload_is_exit_3(
     start: Start, publish: Start, endpoint: str, tmp_path: Path
 ) -> None:
