@@ -49,11 +49,8 @@ def tell_replay(replayed: RebuildReport, folded: Folded, same_rows: bool) -> Ite
         f"   all made anew from the log in {replayed.total_s:.2f} s: {nodes} nodes, {edges} edges, "
         f"{replayed.rows[TABLE]} vectors;"
     )
-    digest = "the same digest" if replayed.digest == folded.digest else "ANOTHER digest"
-    yield (
-        f"   {rows} the tail wrote, and {digest} as a fold without a database: "
-        f"{folded.digest[:16]}…"
-    )
+    digest = "the same digest as" if replayed.digest == folded.digest else "ANOTHER digest than"
+    yield f"   {rows} the tail wrote, {digest} a fold without databases: {folded.digest[:16]}…"
 
 
 def tell_map(folded: Folded, other_settings: Settings, other_places: int) -> Iterator[str]:
