@@ -5,8 +5,9 @@ recording nothing.
 """
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -54,8 +55,46 @@ def serving_metrics(
 
     Raises TransportError when the address cannot be listened on.
     """
+    with _serving(address, _RecorderCollector(report, log)) as port:
+        yield port
+
+
+@dataclass(frozen=True, slots=True)
+class Number:
+    """One number to serve: a counter if it only grows, else a gauge; ``labels`` tell apart."""
+
+    name: str
+    text: str
+    value: float
+    counter: bool = False
+    labels: tuple[tuple[str, str], ...] = ()
+
+
+class _NumbersCollector(Collector):
+    def __init__(self, numbers: Callable[[], Iterable[Number]]) -> None:
+        self._numbers = numbers
+
+    def collect(self) -> Iterator[Metric]:
+        for number in self._numbers():
+            family = CounterMetricFamily if number.counter else GaugeMetricFamily
+            metric = family(number.name, number.text, labels=[name for name, _ in number.labels])
+            metric.add_metric([value for _, value in number.labels], number.value)
+            yield metric
+
+
+@contextmanager
+def serving_numbers(
+    address: tuple[str, int], numbers: Callable[[], Iterable[Number]]
+) -> Iterator[int]:
+    """Serve any other numbers in the same way; ``numbers`` is called at each scrape."""
+    with _serving(address, _NumbersCollector(numbers)) as port:
+        yield port
+
+
+@contextmanager
+def _serving(address: tuple[str, int], collector: Collector) -> Iterator[int]:
     registry = CollectorRegistry()
-    registry.register(_RecorderCollector(report, log))
+    registry.register(collector)
     host, port = address
     try:
         server, thread = start_http_server(port, host, registry)

@@ -10,6 +10,7 @@ from projections.postgres.embedded import EmbeddedServer
 from projections.runner import rebuild
 from projections.runner.check import CheckReport
 from projections.runner.check import check as check_projections
+from projections.runner.retry import retry
 from projections.sinks.roles import roles_sql
 
 from ._options import (
@@ -105,6 +106,29 @@ def check(
 def roles(only: OnlyOption = None) -> None:
     """Print SQL for two least-privilege roles: mapfold_reader and mapfold_writer."""
     typer.echo(roles_sql(("graph", "vectors") if only is None else (only.value,)), nl=False)
+
+
+@group.command(name="retry")
+def retry_command(
+    log: LogArgument,
+    db: DbOption = None,
+    vector_db: VectorDbOption = None,
+    assignments: SetOption = None,
+    settings_file: SettingsOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Try parked events again: rebuild if all of them can be folded now, else say why not."""
+    settings = settings_from(settings_file, assignments)
+    with databases(db, vector_db) as targets:
+        reports = retry(log, targets, settings)
+    if as_json:
+        emit({"sinks": [asdict(r) for r in reports]})
+    for report in () if as_json else reports:
+        done = "rebuilt" if report.rebuilt else f"{len(report.still)} still cannot be folded"
+        typer.echo(f"{report.sink}: {report.parked} parked, {done}")
+        for letter in report.still:
+            typer.echo(f"  offset {letter.offset}: {letter.reason}")
+    finish(findings=any(report.still for report in reports))
 
 
 def _tell(reports: list[CheckReport]) -> None:

@@ -5,13 +5,15 @@ import signal
 import threading
 from collections.abc import Iterator
 from dataclasses import asdict
+from pathlib import Path
 from types import FrameType
 from typing import Annotated
 
 import typer
 
 from eventsrc.cli._shell import emit, finish, say
-from projections.runner import TailReport, tail
+from eventsrc.endpoints import parse_address
+from projections.runner import TailProgress, TailReport, tail
 
 from ._options import (
     DbOption,
@@ -46,11 +48,21 @@ def tail_command(
     assignments: SetOption = None,
     settings_file: SettingsOption = None,
     loader: LoaderOption = Loaders.copy,
+    metrics: Annotated[
+        str | None,
+        typer.Option(metavar="PORT", help="Serve Prometheus metrics; PORT or HOST:PORT."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Keep the databases live while LOG grows; what cannot be folded is parked and listed."""
     settings = settings_from(settings_file, assignments)
-    with _stopped_by_signals() as stop, databases(db, vector_db) as targets:
+    address = None if metrics is None else parse_address(metrics, "--metrics")
+    progress = TailProgress()
+    with (
+        _stopped_by_signals() as stop,
+        databases(db, vector_db) as targets,
+        _metrics(address, progress, log),
+    ):
         report = tail(
             log,
             targets,
@@ -59,13 +71,31 @@ def tail_command(
             only=only_of(only),
             loader=loader_of(loader),
             stop=stop,
-            on_trouble=lambda what: say(f"mapfold: {what}; trying again"),
+            progress=progress,
+            on_trouble=lambda what: _complain(what, progress),
         )
     if as_json:
         emit(asdict(report))
     else:
         _tell(report)
     finish(findings=bool(report.parked))
+
+
+@contextlib.contextmanager
+def _metrics(address: tuple[str, int] | None, progress: TailProgress, log: Path) -> Iterator[None]:
+    if address is None:
+        yield
+        return
+    from projections.runner.metrics import serving_tail_metrics  # costs nothing unless asked for
+
+    with serving_tail_metrics(address, progress, log) as port:
+        say(f"metrics on http://{address[0]}:{port}/metrics")
+        yield
+
+
+def _complain(what: str, progress: TailProgress) -> None:
+    progress.trouble(what)
+    say(f"mapfold: {what}; trying again")
 
 
 def _tell(report: TailReport) -> None:

@@ -1,6 +1,14 @@
 """Moving a log into the databases: at once (`rebuild`) or as it grows (`tail`)."""
 
+from .progress import TailProgress, TailReport
 from .rebuild import RebuildProgress, RebuildReport, rebuild
-from .tail import TailReport, tail
+from .tail import tail
 
-__all__ = ["RebuildProgress", "RebuildReport", "TailReport", "rebuild", "tail"]
+__all__ = [
+    "RebuildProgress",
+    "RebuildReport",
+    "TailProgress",
+    "TailReport",
+    "rebuild",
+    "tail",
+]

@@ -1,15 +1,19 @@
 """One fold that several sinks listen to, each from its own offset on."""
 
-from collections.abc import Iterable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, TypeAlias
 
 from eventsrc.log import Event
 from projections.deltas import Delta
-from projections.folding import fold_event
+from projections.errors import FoldError
+from projections.folding import AHEAD, fold_events
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 from projections.sink import Sink
 from projections.view import MapView
+
+SinksOf: TypeAlias = Callable[[Event], Sequence[Sink[Any]]]
+"""Which sinks an event is for: those that do not have it yet."""
 
 
 class LiveFold:
@@ -19,18 +23,32 @@ class LiveFold:
         self.map = SemanticMap(settings)
         self.view = MapView(settings, keep_embeddings=False)
 
-    def feed(self, event: Event, sinks: Iterable[Sink[Any]]) -> None:
-        """Fold one event and tell ``sinks``. Raises FoldError, and has changed nothing then."""
-        deltas = fold_event(event, self.map)
-        self._apply(event, deltas, list(sinks))
+    def feed(self, events: Sequence[Event], sinks_of: SinksOf) -> Iterator[FoldError | None]:
+        """Fold events in order, telling each one's sinks; a step for each: None, or why it failed.
+
+        After a failed event the map is as it was before it; the event is passed over when the next
+        step is asked for. Events are read a stretch ahead, which is faster than one by one.
+        """
+        start = 0
+        while start < len(events):
+            waiting = iter(events[start:])
+            try:
+                for folded in fold_events(events[start:], self.map, ahead=AHEAD):
+                    self._apply(next(waiting), folded.deltas, sinks_of)
+                    start += 1
+                    yield None
+            except FoldError as error:
+                yield error
+                self.skip(events[start].offset)
+                start += 1
 
     def skip(self, offset: int) -> None:
         """Pass over an event that is left out."""
         self.map.skip(offset)
         self.view.advance(offset + 1)
 
-    def _apply(self, event: Event, deltas: list[Delta], sinks: list[Sink[Any]]) -> None:
-        view = self.view
+    def _apply(self, event: Event, deltas: list[Delta], sinks_of: SinksOf) -> None:
+        view, sinks = self.view, sinks_of(event)
         for delta in deltas:
             for sink in sinks:
                 sink.note(delta, event.logged_ns, view)

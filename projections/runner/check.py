@@ -9,6 +9,8 @@ keys and writes floats in its own way.
 import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias
 
@@ -25,7 +27,7 @@ from projections.sinks.labels import GRAPH, LABELS, TABLE, VERTEX_LABELS
 from projections.sinks.vector_rows import VectorRow
 from projections.sinks.vectors import VectorSink
 
-from ._fold import LiveFold
+from ._fold import LiveFold, batches
 
 Kind: TypeAlias = Literal["missing", "extra", "different"]
 Keyed: TypeAlias = tuple[int, Any]
@@ -33,6 +35,7 @@ Keyed: TypeAlias = tuple[int, Any]
 NAMED: Final = 100
 """This many differences are named; all are counted."""
 STREAM_ROWS: Final = 2_000
+BATCH_EVENTS: Final = 256
 
 _VECTORS: Final = """
 SELECT det_pk, run_id, det_id, keyframe_id, class_name, confidence, bbox, map_x, map_y, map_yaw,
@@ -181,12 +184,16 @@ def _compare_vectors(
 def _folded(
     fold: LiveFold, events: Iterable[tuple[Event, bool]], sinks: list[Sink[Any]]
 ) -> Iterator[None]:
-    for event, parked in events:
-        if parked:
-            fold.skip(event.offset)
-        else:
-            fold.feed(event, sinks)
-        yield
+    for parked, group in groupby(events, key=itemgetter(1)):
+        for batch in batches((event for event, _ in group), BATCH_EVENTS):
+            if parked:
+                for event in batch:
+                    fold.skip(event.offset)
+                continue
+            for failed in fold.feed(batch, lambda _: sinks):
+                if failed is not None:
+                    raise failed
+                yield
 
 
 def _graph_row(row: Row | tuple[Any, ...]) -> Keyed:

@@ -16,6 +16,7 @@ from typing import Final, TypeAlias
 from eventsrc.log import Event, LogReader
 from projections.digest import map_digest
 from projections.errors import FoldError
+from projections.folding import no_cycle_search
 from projections.postgres.connect import Targets, database_errors
 from projections.settings import Settings
 from projections.sink import Checkpoint
@@ -23,10 +24,10 @@ from projections.sinks import _checkpoint
 from projections.sinks.hnsw import HnswReport, build_hnsw
 from projections.sinks.loader import LoaderName
 
-from ._fold import LiveFold
+from ._fold import LiveFold, batches
 from ._stores import Only, Store, open_stores
 
-TICK_EVENTS: Final = 64
+TICK_EVENTS: Final = 256
 """Events between two looks at whether rows wait to be written and somebody wants to hear of it."""
 
 
@@ -89,7 +90,8 @@ def rebuild(
                 transactions.enter_context(store.connection.transaction())
                 for sink in store.sinks:
                     sink.begin(store.connection)
-            last = _fold_into(fold, reader.read(0, total), stores, total, tell)
+            with no_cycle_search():
+                last = _fold_into(fold, reader.read(0, total), stores, total, tell)
             folded = time.monotonic()
             tell(RebuildProgress("writing", total, total))
             digest = map_digest(fold.view)
@@ -119,19 +121,16 @@ def _fold_into(
 ) -> Event | None:
     sinks = [sink for store in stores for sink in store.sinks]
     last: Event | None = None
-    for event in events:
-        try:
-            fold.feed(event, sinks)
-        except FoldError as error:
-            raise FoldError(
-                error.offset, f"{error.reason}; the databases stay as they were"
-            ) from None
-        last = event
-        if event.offset % TICK_EVENTS == 0:
-            tell(RebuildProgress("folding", event.offset + 1, total))
-            for store in stores:
-                for sink in store.sinks:
-                    sink.stream(store.connection, fold.view)
+    for batch in batches(events, TICK_EVENTS):
+        for failed in fold.feed(batch, lambda _: sinks):
+            if failed is not None:
+                told = f"{failed.reason}; the databases stay as they were"
+                raise FoldError(failed.offset, told)
+        last = batch[-1]
+        tell(RebuildProgress("folding", last.offset + 1, total))
+        for store in stores:
+            for sink in store.sinks:
+                sink.stream(store.connection, fold.view)
     return last
 
 

@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,22 +30,12 @@ from ._dead_letters import dead_letter
 from ._fold import LiveFold, batches
 from ._stores import Only, Store, open_stores
 from ._writing import LostCommits, OnTrouble, SinkBatch, Writer
+from .progress import TailProgress, TailReport
 
 BATCH_EVENTS: Final = 500
 """At most this many events in one transaction: about half a second of work when behind."""
 HEARTBEAT_S: Final = 5.0
 ONCE_PATIENCE_S: Final = 60.0
-
-
-@dataclass(slots=True)
-class TailReport:
-    """What a tail did so far: batches and events written, where it stands, what it parked."""
-
-    next_offset: int = 0
-    events: int = 0
-    batches: int = 0
-    restarts: int = 0
-    parked: list[DeadLetter] = field(default_factory=list)
 
 
 OnBatch = Callable[[TailReport], None]
@@ -62,6 +53,7 @@ def tail(
     stop: threading.Event | None = None,
     on_batch: OnBatch | None = None,
     on_trouble: OnTrouble | None = None,
+    progress: TailProgress | None = None,
 ) -> TailReport:
     """Follow ``log`` until ``stop`` is set, or with ``once`` only to its present end.
 
@@ -76,7 +68,7 @@ def tail(
         )
         with opened as stores:
             run = _Run(log, targets, settings, stores, stop, once, report)
-            run.batch_events = batch_events
+            run.batch_events, run.progress = batch_events, progress or run.progress
             run.on_batch, run.on_trouble = on_batch or run.on_batch, on_trouble or run.on_trouble
             try:
                 run.follow()
@@ -98,6 +90,7 @@ class _Run:
     once: bool
     report: TailReport
     batch_events: int = BATCH_EVENTS
+    progress: TailProgress = field(default_factory=TailProgress)
     on_batch: OnBatch = lambda _: None
     on_trouble: OnTrouble = lambda _: None
     checkpoints: dict[str, Checkpoint] = field(default_factory=dict)
@@ -145,6 +138,7 @@ class _Run:
                     parked.update((letter.offset, letter) for letter in letters)
         self.parked = parked
         self.report.next_offset = min(c.next_offset for c in self.checkpoints.values())
+        self.progress.update(self.report)
 
     def _check(self, found: Checkpoint, sink: Sink[Any], store: Store, reader: LogReader) -> None:
         _checkpoint.refuse_other_origin(
@@ -161,24 +155,32 @@ class _Run:
 
     def _fold(self, fold: LiveFold, batch: list[Event]) -> Event | None:
         """Fold a batch; its last event, None for an empty one."""
-        sinks = [sink for store in self.stores for sink in store.sinks]
-        for event in batch:
-            due = [s for s in sinks if event.offset >= self.checkpoints[s.name].next_offset]
-            if event.offset in self.parked:
+        rest = batch
+        while rest:
+            stretch = list(takewhile(lambda event: event.offset not in self.parked, rest))
+            for event, error in zip(stretch, fold.feed(stretch, self._due), strict=True):
+                if error is not None:
+                    self._park(event, error)
+                self._check_history(event)
+            rest = rest[len(stretch) :]
+            if rest:
                 # Parked by the other sink, which is further: it has to stay out of this one too.
-                self.letters.append(self.parked[event.offset])
-                fold.skip(event.offset)
-                continue
-            try:
-                fold.feed(event, due)
-            except FoldError as error:
-                self._park(event, error, all_due=len(due) == len(sinks))
-                fold.skip(event.offset)
-            self._check_history(event, sinks)
+                self.letters.append(self.parked[rest[0].offset])
+                fold.skip(rest[0].offset)
+                rest = rest[1:]
         return batch[-1] if batch else None
 
-    def _park(self, event: Event, error: FoldError, *, all_due: bool) -> None:
-        if not all_due:
+    def _due(self, event: Event) -> list[Sink[Any]]:
+        """The sinks that do not have an event yet."""
+        return [
+            sink
+            for store in self.stores
+            for sink in store.sinks
+            if event.offset >= self.checkpoints[sink.name].next_offset
+        ]
+
+    def _park(self, event: Event, error: FoldError) -> None:
+        if any(event.offset < c.next_offset for c in self.checkpoints.values()):
             raise ProjectionMismatch(
                 f"{error}, but it is in the databases already: they were made by another version;"
                 f" {self._advice()}"
@@ -187,16 +189,15 @@ class _Run:
         self.letters.append(letter)
         self.report.parked.append(letter)
 
-    def _check_history(self, event: Event, sinks: list[Sink[Any]]) -> None:
+    def _check_history(self, event: Event) -> None:
         """The last event below a checkpoint must be the one the checkpoint was made with."""
-        for sink in sinks:
-            checkpoint = self.checkpoints[sink.name]
+        for name, checkpoint in self.checkpoints.items():
             if event.offset + 1 != checkpoint.next_offset:
                 continue
             if event_hash(event) != checkpoint.last_event:
                 raise ProjectionMismatch(
                     f"{self.log}: the event at offset {event.offset} is not the one that the"
-                    f" {sink.name} were made from; {self._advice()}"
+                    f" {name} were made from; {self._advice()}"
                 )
 
     def _write(self, fold: LiveFold, writers: list[Writer], last: Event) -> None:
@@ -224,4 +225,5 @@ class _Run:
             self.report.events += written
             self.report.batches += 1
             self.report.next_offset = next_offset
+            self.progress.update(self.report)
             self.on_batch(self.report)

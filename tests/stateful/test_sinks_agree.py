@@ -182,10 +182,8 @@ class SinksAgree(RuleBasedStateMachine):
         with LogReader(self.log) as reader:
             last = None
             for event in reader.read(self.memory.next_offset):
-                try:
-                    self.fold.feed(event, [self.memory])  # type: ignore[list-item]
-                except FoldError:
-                    self.fold.skip(event.offset)
+                for _ in self.fold.feed([event], lambda _: [self.memory]):  # type: ignore[list-item]
+                    pass
                 last = event
         if last is not None:
             self.memory.write(self.memory.take(self.fold.view), last)

@@ -1,0 +1,64 @@
+"""Trying parked events again.
+
+An event that was parked changes, once it can be folded, everything that came after it; so there is
+no writing it in later. If all parked events of a sink can be read now (by a newer mapfold), the
+sink is rebuilt to where it was. If one still cannot, nothing is changed.
+"""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from eventsrc.ingest import Rejected
+from eventsrc.log import LogReader
+from eventsrc.upcast import read_envelope
+from projections.postgres.connect import Targets, connect, database_errors
+from projections.settings import Settings
+from projections.sink import SinkName
+from projections.sinks import _checkpoint
+from projections.sinks._checkpoint import DeadLetter
+
+from .rebuild import rebuild
+
+
+@dataclass(frozen=True, slots=True)
+class RetryReport:
+    """A sink's parked events: how many there were, those that still fail, and what was done."""
+
+    sink: SinkName
+    parked: int
+    still: tuple[DeadLetter, ...]
+    rebuilt: bool
+
+
+def retry(log: Path, targets: Targets, settings: Settings) -> list[RetryReport]:
+    """Try the dead letters of both sinks."""
+    sinks: tuple[tuple[SinkName, str], ...] = (
+        ("graph", targets.graph_url),
+        ("vectors", targets.vector_url),
+    )
+    return [_retry(log, targets, settings, sink, url) for sink, url in sinks]
+
+
+def _retry(
+    log: Path, targets: Targets, settings: Settings, sink: SinkName, url: str
+) -> RetryReport:
+    with connect(url, application="mapfold retry") as connection, database_errors(url):
+        letters = _checkpoint.parked(connection, sink)
+        checkpoint = _checkpoint.load(connection, sink)
+    still = tuple(_still_failing(log, letters))
+    rebuilt = bool(letters) and not still and checkpoint is not None
+    if rebuilt and checkpoint is not None:
+        rebuild(log, targets, settings, until=checkpoint.next_offset, only=sink)
+    return RetryReport(sink, len(letters), still, rebuilt)
+
+
+def _still_failing(log: Path, letters: list[DeadLetter]) -> list[DeadLetter]:
+    failing = []
+    with LogReader(log) as reader:
+        for letter in letters:
+            (event,) = reader.read(letter.offset, letter.offset + 1)
+            judged = read_envelope(event, max_bytes=sys.maxsize)
+            if isinstance(judged, Rejected):
+                failing.append(DeadLetter(letter.offset, letter.key, letter.run_id, judged.reason))
+    return failing

@@ -1,0 +1,139 @@
+"""A tail that follows: from append to visible, drained by its stop, watched by others."""
+
+import threading
+import urllib.request
+from dataclasses import replace
+from pathlib import Path
+
+import psycopg
+import pytest
+
+from eventsrc.append import append_payload
+from eventsrc.log import ALWAYS, Event, LogWriter
+from eventsrc.upcast import read_envelope
+from projections.postgres.connect import Targets
+from projections.runner import TailProgress, TailReport, rebuild, tail
+from projections.runner.metrics import serving_tail_metrics
+from projections.runner.retry import retry
+from projections.runner.status import projection_status
+from projections.settings import Settings
+from tests.envelopes import envelope, payload
+from tests.logs import append_raw, bridge, walk, write_log
+from tests.rows import all_rows
+
+SETTINGS = Settings()
+WAIT_S = 60.0
+
+
+class Tail:
+    """A tail in a thread of its own."""
+
+    def __init__(self, log: Path, targets: Targets) -> None:
+        self.progress, self.stop = TailProgress(), threading.Event()
+        self.reports: list[TailReport] = []
+        self._thread = threading.Thread(target=self._run, args=(log, targets))
+
+    def _run(self, log: Path, targets: Targets) -> None:
+        self.reports.append(tail(log, targets, SETTINGS, stop=self.stop, progress=self.progress))
+
+    def __enter__(self) -> "Tail":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop.set()
+        self._thread.join(WAIT_S)
+        assert not self._thread.is_alive()
+
+
+def test_it_follows_across_writers_and_rotations(tmp_path: Path, one_database: Targets) -> None:
+    log = write_log(tmp_path / "log", walk(5))
+    documents = walk(60, first=5, seed=1) + list(bridge())
+    with Tail(log, one_database) as running:
+        assert running.progress.wait(5, WAIT_S)
+        for start in range(0, len(documents), 20):  # each writer seals its segment
+            with LogWriter(log, fsync=ALWAYS) as writer:
+                for document in documents[start : start + 20]:
+                    append_payload(writer, "tb/detections", payload(document))
+                assert running.progress.wait(writer.next_offset, WAIT_S)
+    assert running.reports[0].next_offset == 85
+    tailed = all_rows(one_database)
+    rebuild(log, one_database, SETTINGS)
+    assert all_rows(one_database) == tailed
+
+
+def test_status_tells_the_conditions_apart(tmp_path: Path, one_database: Targets) -> None:
+    log = write_log(tmp_path / "log", walk(20))
+
+    def conditions() -> set[str]:
+        return {s.condition for s in projection_status(log, one_database, SETTINGS).sinks}
+
+    assert conditions() == {"missing"}
+    rebuild(log, one_database, SETTINGS, until=10)
+    assert conditions() == {"behind"}
+    status = projection_status(log, one_database, SETTINGS)
+    assert [s.lag for s in status.sinks] == [10, 10]
+    assert not status.healthy
+    with Tail(log, one_database) as running:
+        assert running.progress.wait(20, WAIT_S)
+        assert conditions() == {"idle"}
+        assert projection_status(log, one_database, SETTINGS).sinks[0].writer == "mapfold tail"
+        with psycopg.connect(one_database.graph_url) as connection:
+            connection.execute(
+                "UPDATE mapfold.checkpoint SET heartbeat_at = now() - interval '1 hour'"
+            )
+        assert conditions() == {"stalled"}
+    assert conditions() == {"idle"}
+    other = SETTINGS.with_assignments(["eps_m=2"])
+    found = projection_status(log, one_database, other).sinks
+    assert {s.condition for s in found} == {"other"}
+    assert "eps_m=1.5 there, 2.0 here" in str(found[0].note)
+    away = Targets("postgresql://u@127.0.0.1:1/none", one_database.vector_url)
+    assert [s.condition for s in projection_status(log, away, SETTINGS).sinks] == [
+        "unreachable",
+        "idle",
+    ]
+
+
+def test_metrics_of_a_tail(tmp_path: Path, one_database: Targets) -> None:
+    log = write_log(tmp_path / "log", walk(12))
+    rebuild(log, one_database, SETTINGS, until=7)
+    with Tail(log, one_database) as running:
+        assert running.progress.wait(12, WAIT_S)
+        with serving_tail_metrics(("127.0.0.1", 0), running.progress, log) as port:
+            address = f"http://127.0.0.1:{port}/metrics"
+            text = urllib.request.urlopen(address, timeout=10).read().decode()
+    assert "mapfold_tail_events_total 5.0" in text
+    assert "mapfold_tail_next_offset 12.0" in text
+    assert "mapfold_tail_lag 0.0" in text
+
+
+def test_waiting_too_long_is_told() -> None:
+    assert not TailProgress().wait(1, 0.01)
+
+
+def test_parked_events_are_tried_again(
+    tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = write_log(tmp_path / "log", walk(10))
+    append_raw(log, payload({**envelope(3, run_id="odd"), "keyframe_id": 3, "detections": "none"}))
+    write_log(log, walk(10, first=10))
+    assert [d.run_id for d in tail(log, one_database, SETTINGS, once=True).parked] == ["odd"]
+    before = all_rows(one_database)
+    reports = retry(log, one_database, SETTINGS)
+    assert [(r.parked, len(r.still), r.rebuilt) for r in reports] == [(1, 1, False)] * 2
+    assert "detections" in reports[0].still[0].reason
+    assert all_rows(one_database) == before
+
+    # A newer mapfold, which can read it: here, one whose door mends it.
+    def lenient(event: Event, *, max_bytes: int) -> object:
+        mended = replace(event, payload=event.payload.replace(b'"none"', b"[]"))
+        return read_envelope(mended, max_bytes=max_bytes)
+
+    monkeypatch.setattr("projections.runner.retry.read_envelope", lenient)
+    monkeypatch.setattr("projections.folding.read_envelope", lenient)
+    reports = retry(log, one_database, SETTINGS)
+    assert [(r.still, r.rebuilt) for r in reports] == [((), True)] * 2
+    assert projection_status(log, one_database, SETTINGS).healthy
+    rows = all_rows(one_database)
+    assert len(rows[0]["Keyframe"]) == len(before[0]["Keyframe"]) + 1
