@@ -27,6 +27,13 @@ class FileCheck:
 
 def check_sealed(path: Path) -> FileCheck:
     """Read the whole file, a block at a time."""
+    try:
+        return _check(path)
+    except OSError as error:  # a bad sector
+        return FileCheck("", f"the disk cannot read it: {error.strerror or error}")
+
+
+def _check(path: Path) -> FileCheck:
     with path.open("rb") as file:
         size = os.fstat(file.fileno()).st_size
         tail = os.pread(file.fileno(), _mcap.TAIL_BYTES, max(0, size - _mcap.TAIL_BYTES))

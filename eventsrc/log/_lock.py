@@ -56,7 +56,7 @@ def is_held(log: Path) -> bool:
     """Whether a writer is at work on ``log`` right now."""
     try:
         fd = os.open(log / LOCK, os.O_RDONLY)
-    except FileNotFoundError:
+    except OSError:  # no lock, or a log of somebody else's that may only be read
         return False
     try:
         fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)

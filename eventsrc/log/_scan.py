@@ -10,13 +10,13 @@ mark or head), else behind the next commit mark. Then:
   synced once. Its offsets are known from what stands around it, and named as a gap.
 """
 
-import mmap
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from eventsrc.errors import LogDamaged, NotALog
 
 from . import _mcap
+from ._bytes import read_whatever_can_be
 from ._head import HEAD_BYTES, read_head
 from ._mcap import BadRecord, Channel
 from .segment import ChunkRef
@@ -53,7 +53,7 @@ class Scan:
             self.next_offset = offset
 
 
-def chunk_extent(data: mmap.mmap, at: int, scan: Scan) -> tuple[int, int, int]:
+def chunk_extent(data: bytes, at: int, scan: Scan) -> tuple[int, int, int]:
     """Length, first and next offset of the chunk at ``at``; BadRecord unless all of it is good."""
     head = _mcap.decode_chunk_head(data[at : at + _mcap.ZSTD_CHUNK_HEAD])
     if at + head.length > len(data):
@@ -73,16 +73,11 @@ def chunk_extent(data: mmap.mmap, at: int, scan: Scan) -> tuple[int, int, int]:
 
 def scan_active(path: Path, base: int) -> Scan:
     """Look at every byte of an active segment."""
-    with path.open("rb") as file:
-        data = file.read(1) and mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-    if not data:
-        return Scan(base, None, next_offset=base)
-    with data:
-        return _Scanner(path, base, data).run()
+    return _Scanner(path, base, read_whatever_can_be(path)).run()
 
 
 class _Scanner:
-    def __init__(self, path: Path, base: int, data: mmap.mmap) -> None:
+    def __init__(self, path: Path, base: int, data: bytes) -> None:
         self._path = path
         self._data = data
         self._at = 0

@@ -1,12 +1,12 @@
 """What can still be read of a sealed segment: by its index, or, where that is gone, by searching
 the bytes for chunks. Every chunk is decompressed and its CRC and sequence checked."""
 
-import mmap
 from pathlib import Path
 
 from eventsrc.errors import LogDamaged, NotALog
 
 from . import _mcap
+from ._bytes import read_whatever_can_be
 from ._head import HEAD_BYTES, read_head
 from ._mcap import BadRecord, Metadata
 from ._scan import Scan, chunk_extent
@@ -17,17 +17,7 @@ from .segment import ChunkRef
 def scan_sealed(path: Path, base: int, following: int | None) -> Scan:
     """Look at every chunk. ``following`` is the base of the next segment, if there is one: how far
     this one reached when its own index cannot say."""
-    with path.open("rb") as file:
-        data = file.read(1) and mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-    if not data:
-        scan = Scan(base, None, next_offset=base)
-        scan.gap_up_to(following or base)
-        return scan
-    with data:
-        return _scan(path, base, following, data)
-
-
-def _scan(path: Path, base: int, following: int | None, data: mmap.mmap) -> Scan:
+    data = read_whatever_can_be(path)
     scan = Scan(base, _log_id(path, base, data), next_offset=base)
     try:
         index = SealedFile(path, base)
@@ -49,14 +39,14 @@ def _scan(path: Path, base: int, following: int | None, data: mmap.mmap) -> Scan
     return scan
 
 
-def _log_id(path: Path, base: int, data: mmap.mmap) -> str | None:
+def _log_id(path: Path, base: int, data: bytes) -> str | None:
     try:
         return read_head(path, data[:HEAD_BYTES], base)[0]["log_id"]
     except (LogDamaged, NotALog):
         return None
 
 
-def _chunk_places(data: mmap.mmap) -> list[int]:
+def _chunk_places(data: bytes) -> list[int]:
     """Everywhere a compressed chunk seems to start."""
     places = []
     at = -1
@@ -66,7 +56,7 @@ def _chunk_places(data: mmap.mmap) -> list[int]:
     return places
 
 
-def _promised(data: mmap.mmap, base: int) -> int:
+def _promised(data: bytes, base: int) -> int:
     """How far the segment reached by its seal, if that can be found."""
     name = SEAL_METADATA.encode()
     at = data.rfind(name)

@@ -5,6 +5,7 @@ no lock and may read while a writer writes, rotates and seals. Damage stops it w
 after every event before it has been given out; `on_gap` lets it go on and be told what is missing.
 """
 
+import contextlib
 import sys
 from bisect import bisect_right
 from collections import OrderedDict
@@ -183,12 +184,14 @@ def segments_of(path: Path) -> list[SegmentPath]:
 
 def _open_segment(log: Path, entry: SegmentPath) -> OpenSegment:
     """Open it under whichever name it has by now: sealing may have renamed it since."""
-    if not entry.sealed:
-        try:
-            return ActiveFile(entry.path, entry.base)
-        except FileNotFoundError:
-            pass
-    return SealedFile(segment_path(log, entry.base, SEALED), entry.base)
+    try:
+        if not entry.sealed:
+            with contextlib.suppress(FileNotFoundError):
+                return ActiveFile(entry.path, entry.base)
+        return SealedFile(segment_path(log, entry.base, SEALED), entry.base)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise LogDamaged(f"{entry.path}: {reason}; check the file and the disk") from error
 
 
 def _stop_at_gap(log: Path) -> OnGap:

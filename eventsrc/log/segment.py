@@ -53,11 +53,14 @@ class SegmentFile:
 
     def read_chunk(self, chunk: ChunkRef) -> bytes:
         """The chunk's body, CRC checked; LogDamaged otherwise."""
-        record = os.pread(self._fd, chunk.length, chunk.position)
         try:
+            record = os.pread(self._fd, chunk.length, chunk.position)
             return _mcap.decode_chunk(record)
         except BadRecord as error:
             raise LogDamaged(f"{self.path.name} at byte {chunk.position}: {error}") from None
+        except OSError as error:  # a bad sector
+            reason = error.strerror or str(error)
+            raise LogDamaged(f"{self.path.name} at byte {chunk.position}: {reason}") from error
 
     def channels_of(self, body: bytes) -> dict[int, Channel]:
         """The channels that the messages of a chunk's body may name, by id."""

@@ -10,7 +10,17 @@ from typing import Any
 import pytest
 
 from eventsrc.errors import LogError, MisuseError
-from eventsrc.log import ALWAYS, GROUP_COMMIT, NEVER, LogReader, LogWriter, _sealer, parse_fsync
+from eventsrc.log import (
+    ALWAYS,
+    GROUP_COMMIT,
+    NEVER,
+    LogReader,
+    LogWriter,
+    _sealer,
+    log_info,
+    parse_fsync,
+    verify_log,
+)
 from eventsrc.log.fsync import FsyncPolicy
 from tests.fixtures_log import BY_HAND, KEY, read_log
 
@@ -195,3 +205,17 @@ def test_memory_does_not_grow_with_the_log(log_path: Path) -> None:
     tracemalloc.stop()
     assert count == 5000
     assert peak < 5 * 2**20, f"{peak} bytes to read 10 MB"
+
+
+def test_a_clock_that_is_set_back_changes_no_order(log_path: Path) -> None:
+    times = iter([10**9, 50, 40, 30, 10**9, 1, 2, 3, 0])
+    with LogWriter(log_path, clock=lambda: next(times), fsync=ALWAYS, rotate_events=3) as writer:
+        for number in range(8):
+            writer.append(KEY, b"%d" % number)
+    events = read_log(log_path)
+    assert [e.payload for e in events] == [b"%d" % n for n in range(8)]
+    assert [e.logged_ns for e in events] == [50, 40, 30, 10**9, 1, 2, 3, 0]
+    (finding,) = verify_log(log_path).findings[-1:]
+    info = log_info(log_path)
+    assert (info.first_logged_ns, info.last_logged_ns) == (0, 10**9)
+    assert (finding.kind, finding.first_offset) == ("time", 1)
