@@ -1,0 +1,23 @@
+"""Every relative link of README and docs leads somewhere in the repository."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [ROOT / "README.md", ROOT / "logs" / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+_LINK = re.compile(r"\]\((?!https?://|#|mailto:)([^)#\s]+)(?:#[^)]*)?\)")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page: Path) -> None:
+    for link in _LINK.findall(page.read_text("utf-8")):
+        assert (page.parent / link).exists(), link
+
+
+def test_links_are_found() -> None:
+    text = (
+        "a [page](docs/x.md), [part](y.md#there), [site](https://z), ![picture](p.png) [here](#h)"
+    )
+    assert _LINK.findall(text) == ["docs/x.md", "y.md", "p.png"]
