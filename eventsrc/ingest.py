@@ -118,11 +118,11 @@ def _vectors_of_one_kind(detections: Sequence[Detection]) -> tuple[Vector, ...] 
     sizes = {*map(len, raws)}
     if None in dims or len(dims) != 1 or sizes != {4 * dim for dim in dims if dim}:
         return None
-    matrix = np.frombuffer(b"".join(raws), dtype="<f4").reshape(len(raws), -1)
-    largest: list[float] = np.abs(matrix).max(axis=1).tolist()
-    if 0.0 in largest or not sum(largest) < math.inf:  # a NaN or infinity is in the sum as well
-        return None
-    return tuple(matrix)
+    vectors = tuple(np.frombuffer(b"".join(raws), dtype="<f4").reshape(len(raws), -1))
+    # A squared norm that is 0, infinite or NaN says that a component may be.
+    with np.errstate(over="ignore", invalid="ignore"):
+        is_sound = all(0.0 < vector.dot(vector) < math.inf for vector in vectors)
+    return vectors if is_sound else None
 
 
 def _vector(index: int, detection: Detection) -> Vector:

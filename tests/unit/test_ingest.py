@@ -205,3 +205,13 @@ def test_further_errors_are_counted() -> None:
 
 def test_a_reason_quotes_a_long_value_shortly() -> None:
     assert len(refusal(envelope(timestamp="x" * 10_000))) < 200
+
+
+@pytest.mark.parametrize("value", [3e38, 1e-40])
+def test_vectors_whose_squares_overflow_or_vanish_are_accepted(value: float) -> None:
+    document = envelope(detections=[detection(vector=[value] * 512)])
+    result = ingest(payload(document))
+    assert isinstance(result, Accepted)
+    (vector,) = result.vectors
+    assert vector is not None
+    assert vector.tolist() == [np.float32(value)] * 512
