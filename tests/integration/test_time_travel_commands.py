@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from projections.cli import main
-from tests.commands import Commands
+from tests.commands import Commands, Said
 from tests.envelopes import detection, envelope
 from tests.fixtures_timetravel import write_log
 
@@ -15,16 +15,48 @@ XS = (0.0, 1.0, 2.0, 6.0, 5.0, 4.0, 9.0, 3.0)
 """Two places of three keyframes, one keyframe of noise, and one between the places."""
 
 
-@pytest.fixture
-def mapfold(tmp_path: Path) -> Commands:
-    """Commands beside a log whose keyframe 8, at offset 7, makes two places one."""
+class Here:
+    """Runs commands in this process: as `Commands` does, but without starting Python anew."""
+
+    def __init__(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        self.folder = folder
+        self._capsys = capsys
+
+    def __call__(self, *args: str | Path, code: int = 0) -> Said:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.chdir(self.folder)
+            patch.setattr("sys.argv", ["mapfold", *map(str, args)])
+            try:
+                main()
+                left: object = 0
+            except SystemExit as error:
+                left = error.code or 0
+        out, err = self._capsys.readouterr()
+        assert left == code, f"exit {left}: {err or out}"
+        return Said(code, out, err)
+
+
+def make_log(folder: Path) -> None:
     cup = detection("cup", [1.0, 0.0])
     documents = [envelope(n, x, detections=[cup] * (n == 5)) for n, x in enumerate(XS, start=1)]
-    write_log(tmp_path / "log", documents)
-    return Commands.in_folder(tmp_path)
+    write_log(folder / "log", documents)
 
 
-def test_merges(mapfold: Commands) -> None:
+@pytest.fixture
+def mapfold(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Here:
+    """Commands beside a log whose keyframe 8, at offset 7, makes two places one."""
+    make_log(tmp_path)
+    return Here(tmp_path, capsys)
+
+
+def test_the_program_itself(tmp_path: Path) -> None:
+    make_log(tmp_path)
+    program = Commands.in_folder(tmp_path)
+    assert len(program("merges", "log", *RULES, "--json").json) == 1
+    assert program("why", "log", "run-a_p9", code=2).err.startswith("mapfold: no place 'run-a_p9'")
+
+
+def test_merges(mapfold: Here) -> None:
     said = mapfold("merges", "log", *RULES)
     assert said.out.splitlines()[1].split() == [
         *("1", "7", "2026-03-24T13:00:08.000Z", "run-a:8", "run-a_p0", "run-a_p1"),
@@ -40,7 +72,7 @@ def test_merges(mapfold: Commands) -> None:
     )
 
 
-def test_a_merge_shows_in_state_from_the_next_offset_on(mapfold: Commands) -> None:
+def test_a_merge_shows_in_state_from_the_next_offset_on(mapfold: Here) -> None:
     (merge,) = mapfold("merges", "log", *RULES, "--json").json
     for at, places in ((merge["offset"], 2), (merge["offset"] + 1, 1)):
         state = mapfold("state", "log", *RULES, "--at", str(at), "--json").json
@@ -48,7 +80,7 @@ def test_a_merge_shows_in_state_from_the_next_offset_on(mapfold: Commands) -> No
 
 
 @pytest.mark.parametrize("suffix", ["png", "svg"])
-def test_a_merge_is_drawn(mapfold: Commands, suffix: str) -> None:
+def test_a_merge_is_drawn(mapfold: Here, suffix: str) -> None:
     said = mapfold("merges", "log", *RULES, "--draw", "1", "--out", f"merge.{suffix}")
     assert said.err == f"wrote merge.{suffix}: merge 1, before and after\n"
     drawn = (mapfold.folder / f"merge.{suffix}").read_bytes()
@@ -57,7 +89,7 @@ def test_a_merge_is_drawn(mapfold: Commands, suffix: str) -> None:
     assert (mapfold.folder / f"again.{suffix}").read_bytes() == drawn
 
 
-def test_why(mapfold: Commands) -> None:
+def test_why(mapfold: Here) -> None:
     said = mapfold("why", "log", "run-a_p1", *RULES)
     assert said.out.startswith("place run-a_p1: absorbed by run-a_p0 at offset 7 (2026-03-24T")
     story = mapfold("why", "log", "run-a_p1", *RULES, "--json").json
@@ -66,14 +98,14 @@ def test_why(mapfold: Commands) -> None:
     assert mapfold("why", "log", "run-a_p1", "--at", "7", *RULES, "--json").json["stands"] is True
 
 
-def test_why_same(mapfold: Commands) -> None:
+def test_why_same(mapfold: Here) -> None:
     said = mapfold("why", "log", "--same", "run-a:1", "run-a:4", *RULES)
     assert said.out.startswith("run-a:1 and run-a:4: in one place since offset 7 (run-a:8, ")
     story = mapfold("why", "log", "--same", "run-a:1", "run-a:7", *RULES, "--json").json
     assert (story["same"], story["since"]) == (False, None)
 
 
-def test_diff(mapfold: Commands) -> None:
+def test_diff(mapfold: Here) -> None:
     said = mapfold("diff", "log", "7", "8", *RULES)
     assert "  - run-a_p1 (3 keyframes) into run-a_p0 at 7 (run-a:8)" in said.out.splitlines()
     diff = mapfold("diff", "log", "run-a:7", "end", *RULES, "--json").json
@@ -84,7 +116,7 @@ def test_diff(mapfold: Commands) -> None:
     assert mapfold("diff", "log", "5", "5").out.startswith("the same map at 5 and 5: digest ")
 
 
-def test_bisect(mapfold: Commands) -> None:
+def test_bisect(mapfold: Here) -> None:
     said = mapfold("bisect", "log", "merged('run-a_p1')", *RULES)
     assert said.out.startswith("became true at offset 7 (run-a:8, ")
     found = mapfold("bisect", "log", "place_count < 2", "--scan", "--json", *RULES).json
@@ -101,7 +133,7 @@ def test_bisect(mapfold: Commands) -> None:
     )
 
 
-def test_bisect_points_at_what_it_cannot_read(mapfold: Commands) -> None:
+def test_bisect_points_at_what_it_cannot_read(mapfold: Here) -> None:
     said = mapfold("bisect", "log", "place_count < 2 and plac > 1", code=2)
     expression, caret, message = said.err.splitlines()
     assert expression[caret.index("^") :] == "plac > 1"
@@ -109,7 +141,7 @@ def test_bisect_points_at_what_it_cannot_read(mapfold: Commands) -> None:
     assert said.out == ""
 
 
-def test_whatif(mapfold: Commands) -> None:
+def test_whatif(mapfold: Here) -> None:
     said = mapfold("whatif", "log", "--base", "eps_m=1", "--set", "eps_m=0.5")
     assert said.out.splitlines()[0].split()[:3] == ["settings", "places", "noise"]
     assert said.out.splitlines()[2].split()[:4] == ["eps_m=0.5", "0", "8", "0"]
@@ -119,7 +151,7 @@ def test_whatif(mapfold: Commands) -> None:
     assert found["alternatives"][1]["places_part_at"] is None
 
 
-def test_whatif_in_processes_of_its_own_says_the_same(mapfold: Commands) -> None:
+def test_whatif_in_processes_of_its_own_says_the_same(mapfold: Here) -> None:
     asked = ("whatif", "log", "--grid", "eps_m=0.5,1", "--grid", "min_samples=2,3", "--json")
     documents = [mapfold(*asked, "--processes", count).json for count in ("1", "3")]
     for document in documents:
@@ -128,7 +160,7 @@ def test_whatif_in_processes_of_its_own_says_the_same(mapfold: Commands) -> None
     assert documents[0] == documents[1]
 
 
-def test_whatif_with_truth_and_picture(mapfold: Commands) -> None:
+def test_whatif_with_truth_and_picture(mapfold: Here) -> None:
     truth = mapfold.folder / "truth.jsonl"
     lines = [
         {"run_id": "run-a", "keyframe_id": n, "room": "a" if x < 3 else "b", "instances": []}
@@ -163,19 +195,8 @@ def test_whatif_with_truth_and_picture(mapfold: Commands) -> None:
         (("whatif", "log", "--set", "eps_m=1", "--truth", "none.jsonl"), "--truth none.jsonl"),
     ],
 )
-def test_misuse_is_told_in_one_line(
-    mapfold: Commands,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    args: tuple[str, ...],
-    says: str,
-) -> None:
-    monkeypatch.chdir(mapfold.folder)
-    monkeypatch.setattr("sys.argv", ["mapfold", *args])
-    with pytest.raises(SystemExit) as left:
-        main()
-    said = capsys.readouterr()
-    assert left.value.code == 2
+def test_misuse_is_told_in_one_line(mapfold: Here, args: tuple[str, ...], says: str) -> None:
+    said = mapfold(*args, code=2)
     assert says in said.err.splitlines()[-1]
     assert said.err.splitlines()[-1].startswith("mapfold: ")
     assert said.out == ""
