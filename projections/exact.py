@@ -90,8 +90,11 @@ def unit_vectors(vectors: Sequence[NDArray[np.float32] | None]) -> list[Units | 
     for dim in sorted({len(vector) for vector in vectors if vector is not None}):
         indices = [i for i, v in enumerate(vectors) if v is not None and len(v) == dim]
         wide = unit_rows(np.array([vectors[i] for i in indices]))
-        for i, row, narrow in zip(indices, wide, wide.astype(np.int32), strict=True):
-            units[i] = row, narrow
+        made = zip(wide, wide.astype(np.int32), strict=True)
+        if len(indices) == len(vectors):
+            return list(made)
+        for i, unit in zip(indices, made, strict=True):
+            units[i] = unit
     return units
 
 
