@@ -54,8 +54,11 @@ class Sink(Protocol[Changes]):
     def ensure(self, connection: Connection) -> None:
         """Create what `write` needs where it is missing; refuse what is not ours."""
 
-    def write(self, connection: Connection, changes: Changes) -> int:
-        """Write what was taken; how many rows that were."""
+    def few(self, changes: Changes) -> bool:
+        """True when `write` will send plain statements only, so that they may be pipelined."""
+
+    def write(self, connection: Connection, changes: Changes) -> None:
+        """Write what was taken."""
 
     def clear(self, connection: Connection) -> None:
         """Before a rebuild's transaction (autocommit): remove what an earlier one left behind."""

@@ -126,7 +126,7 @@ def advance(
         },
     )
     after = Checkpoint(before.log_id, before.fingerprint, before.settings, next_offset, last_event)
-    if cursor.rowcount == 1:
+    if cursor.fetchone() is not None:
         return after
     found = load(connection, sink)
     raise CheckpointMoved(

@@ -57,13 +57,15 @@ class GraphSink:
             _graph_ddl.create(connection, GRAPH)
             _graph_ddl.index(connection, GRAPH)
 
-    def write(self, connection: Connection, changes: GraphChanges) -> int:
+    def few(self, changes: GraphChanges) -> bool:
+        """True when the new rows are so few that they are not worth a COPY."""
+        return sum(map(len, changes.inserted.values())) < SMALL_BATCH
+
+    def write(self, connection: Connection, changes: GraphChanges) -> None:
         """Insert, upsert and delete what was taken."""
-        few = InsertLoader()
+        loader = InsertLoader() if self.few(changes) else self._loader
         for label, rows in changes.inserted.items():
-            self._insert(
-                few if len(rows) < SMALL_BATCH else self._loader, connection, GRAPH, label, rows
-            )
+            self._insert(loader, connection, GRAPH, label, rows)
         for label, rows in changes.upserted.items():
             kind = "upsert_vertex" if label in VERTEX_LABELS else "upsert_edge"
             insert_columns(connection, kind, GRAPH, label, rows)
@@ -72,8 +74,6 @@ class GraphSink:
                 graph=sql.Identifier(GRAPH), label=sql.Identifier(label)
             )
             connection.execute(query, [[str(i) for i in ids]])
-        parts = (changes.inserted, changes.upserted, changes.deleted)
-        return sum(len(rows) for part in parts for rows in part.values())
 
     def clear(self, connection: Connection) -> None:
         """Drop a replaced graph that a reader held on to; refuse a graph that is not ours.

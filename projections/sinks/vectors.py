@@ -15,14 +15,15 @@ from projections.view import MapView
 from . import _readers
 from ._sql import statements
 from .labels import TABLE
-from .loader import Loader, LoaderName, loader_of
+from .loader import InsertLoader, Loader, LoaderName, loader_of
 from .vector_rows import VectorRow, VectorRows
 
 DEFAULT_DIMENSION: Final = 512
 PLAIN_DIMENSION: Final = 1_900
 """Up to here a row fits one page of 8 kB and can be kept out of TOAST."""
 STREAM_ROWS: Final = 2_000
-SMALL_BATCH: Final = 4
+SMALL_BATCH: Final = 20
+"""Below this many rows an INSERT, sent down the pipeline, beats COPY's extra round trips."""
 _PUBLIC: Final = "public"
 _SHADOW: Final = "mapfold"
 _MARK: Final = "mapfold"
@@ -57,15 +58,20 @@ class VectorSink:
         else:
             self._dimension = dimension
 
-    def write(self, connection: Connection, changes: Sequence[VectorRow]) -> int:
+    def few(self, changes: Sequence[VectorRow]) -> bool:
+        """True when the rows are so few that they are not worth a COPY."""
+        return len(changes) < SMALL_BATCH
+
+    def write(self, connection: Connection, changes: Sequence[VectorRow]) -> None:
         """Add the rows that were taken."""
-        if changes:
-            dimension = len(changes[0].embedding)
-            if dimension != self._dimension:
-                self._redimension(connection, _PUBLIC, dimension)
-                self._dimension = dimension
-            self._loader.vectors(connection, _PUBLIC, self._type, changes)
-        return len(changes)
+        if not changes:
+            return
+        dimension = len(changes[0].embedding)
+        if dimension != self._dimension:
+            self._redimension(connection, _PUBLIC, dimension)
+            self._dimension = dimension
+        loader = InsertLoader() if self.few(changes) else self._loader
+        loader.vectors(connection, _PUBLIC, self._type, changes)
 
     def clear(self, connection: Connection) -> None:
         """Nothing is ever left behind; refuse early if the name in use is not ours."""

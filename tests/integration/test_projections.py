@@ -305,3 +305,18 @@ def test_an_event_that_cannot_be_folded(log: Path, one_database: Targets) -> Non
         ("vectors", before.next_offset),
     ]
     assert "keyframe_id" in kept[0][2]
+
+
+@pytest.mark.parametrize("batch_events", [1, 200], ids=["pipelined", "plain"])
+def test_a_row_the_database_refuses_ends_the_tail_in_words(
+    tmp_path: Path, one_database: Targets, pg: psycopg.Connection, batch_events: int
+) -> None:
+    """Not a lost connection, so no endless trying again; and the checkpoint stays."""
+    log = write_log(tmp_path / "log", walk(40))
+    rebuild(log, one_database, SETTINGS, until=30)
+    pg.execute(
+        'INSERT INTO semantic_map."Keyframe" (id, properties) VALUES (_graphid(4, 31), %s)', ["{}"]
+    )
+    with pytest.raises(DatabaseError, match="duplicate key value"):
+        tail(log, one_database, SETTINGS, once=True, batch_events=batch_events)
+    assert pg.execute("SELECT min(next_offset) FROM mapfold.checkpoint").fetchone() == (30,)

@@ -46,6 +46,7 @@ SET next_offset = %(next_offset)s, last_event = %(last_event)s, digest = NULL,
     moved_at = now(), heartbeat_at = now()
 WHERE sink = %(sink)s AND next_offset = %(expected)s
   AND log_id = %(log_id)s AND fingerprint = %(fingerprint)s
+RETURNING next_offset
 
 -- name: replace
 -- A rebuild starts a new history, whatever was there.
