@@ -1,6 +1,6 @@
 """A picture of a map: rooms, drive, places, objects, which place is next to which.
 
-The only package that imports matplotlib, and by its objects alone: no pyplot, no global state.
+matplotlib is used through its objects alone: no pyplot, no global state.
 """
 
 from .picture import draw_map
