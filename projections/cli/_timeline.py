@@ -6,7 +6,16 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
 
 from eventsrc.cli._shell import people
 from eventsrc.log.whence import resolve
@@ -38,6 +47,13 @@ def timeline(log: Path, settings_file: Path | None, sets: list[str] | None) -> I
         yield opened
 
 
+class _Rate(ProgressColumn):
+    """Events per second."""
+
+    def render(self, task: Task) -> Text:
+        return Text("" if task.speed is None else f"{task.speed:,.0f} events/s")
+
+
 class FoldBar:
     """A bar for people while events are folded; nothing where nobody watches."""
 
@@ -46,6 +62,7 @@ class FoldBar:
             TextColumn("folding"),
             BarColumn(),
             MofNCompleteColumn(),
+            _Rate(),
             TimeRemainingColumn(),
             console=people,
             transient=True,

@@ -2,7 +2,7 @@
 
 `Timeline` answers for one log under one setting: the map at any offset, every merge and its cause,
 the chronicle of a place or an object, the difference of two moments, and the event that made a
-condition true.
+condition true. `what_if` folds the log under other settings and compares.
 """
 
 from .causes import Cause
@@ -12,6 +12,7 @@ from .lookup import NoSuchThing
 from .search import Search, Turn
 from .story import Entry, Story
 from .timeline import Progress, Timeline
+from .whatif import WhatIf, what_if
 
 __all__ = [
     "Cause",
@@ -25,4 +26,6 @@ __all__ = [
     "Story",
     "Timeline",
     "Turn",
+    "WhatIf",
+    "what_if",
 ]
