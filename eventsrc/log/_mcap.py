@@ -218,17 +218,21 @@ def marks_in(data: bytes) -> Iterator[int]:
 
 def walk(body: bytes) -> Iterator[tuple[int, int, int, int, int, int]]:
     """The messages of a chunk's body: channel, sequence, log time, publish time, and where the
-    payload starts and ends in ``body``."""
+    payload starts and ends in ``body``. BadRecord where a record does not fit."""
     at, size, unpack, message = 0, len(body), _MESSAGE.unpack_from, int(Opcode.MESSAGE)
-    while at < size:
-        opcode = body[at]
-        if opcode == message:
-            _, length, channel, sequence, log, publish = unpack(body, at)
-            end = at + 9 + length
-            yield channel, sequence, log, publish, at + 31, end
-        else:
-            end = at + 9 + _U64.unpack_from(body, at + 1)[0]
-        at = end
+    try:
+        while at < size:
+            if body[at] == message:
+                _, length, channel, sequence, log, publish = unpack(body, at)
+                end = at + 9 + length
+                if end > size or length < 22:
+                    raise BadRecord("a message does not fit its chunk")
+                yield channel, sequence, log, publish, at + 31, end
+            else:
+                end = at + 9 + _U64.unpack_from(body, at + 1)[0]
+            at = end
+    except struct.error:
+        raise BadRecord("a record is cut short in a chunk") from None
 
 
 def definitions(body: bytes, *, leading: bool = False) -> tuple[list[Schema], list[Channel]]:
@@ -237,7 +241,7 @@ def definitions(body: bytes, *, leading: bool = False) -> tuple[list[Schema], li
     schemas: list[Schema] = []
     channels: list[Channel] = []
     at = 0
-    while at < len(body):
+    while at + FRAME.size <= len(body):
         opcode, length = FRAME.unpack_from(body, at)
         start, at = at + FRAME.size, at + FRAME.size + length
         if opcode == Opcode.SCHEMA:

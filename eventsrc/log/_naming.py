@@ -51,6 +51,17 @@ def list_segments(log: Path) -> list[SegmentPath]:
     return [found[base] for base in sorted(found)]
 
 
+def list_growing(log: Path) -> list[SegmentPath]:
+    """`list_segments` beside a writer: a folder that is read while a file takes another's place may
+    show neither. Bases only ever join, so two listings with the same ones missed nothing."""
+    before = list_segments(log)
+    while True:
+        now = list_segments(log)
+        if [s.base for s in now] == [s.base for s in before]:
+            return now
+        before = now
+
+
 def leftovers(log: Path) -> list[Path]:
     """Half-made files that a crash left behind; they hold nothing that is not elsewhere."""
     return sorted(p for p in log.iterdir() if p.name.endswith((NEW, SEALING)))

@@ -15,7 +15,7 @@ from pathlib import Path
 from eventsrc.errors import LogDamaged, LogNotFound, NotALog
 
 from ._active_file import ActiveFile
-from ._naming import ACTIVE, SEALED, SegmentPath, list_segments, segment_path
+from ._naming import ACTIVE, SEALED, SegmentPath, list_growing, segment_path
 from ._sealed_file import SealedFile
 from .event import Event
 from .segment import Unreadable, chunk_events
@@ -176,7 +176,7 @@ def segments_of(path: Path) -> list[SegmentPath]:
         raise NotALog(
             f"{path} is a file; a log is a directory. `mapfold import LOG {path}` reads it in"
         )
-    segments = list_segments(path)
+    segments = list_growing(path)
     if not segments:
         raise NotALog(f"{path} holds no log segment (….mcap); check the path")
     return segments

@@ -84,15 +84,31 @@ class SegmentFile:
 def chunk_events(
     segment: SegmentFile, chunk: ChunkRef, start: int, end: int, keys: Collection[str] | None
 ) -> Iterator[Event]:
-    """The events of one chunk with offsets from ``start`` to before ``end``, in order."""
+    """The events of one chunk with offsets from ``start`` to before ``end``, in order. Raises
+    LogDamaged for bytes that are not what was written, and for a chunk that contradicts itself."""
     body = segment.read_chunk(chunk)
-    names = {c.id: c.topic for c in segment.channels_of(body).values()}
-    versions = {c.id: envelope_version(c) for c in segment.channels_of(body).values()}
+    try:
+        yield from _events(segment, chunk, body, start, end, keys)
+    except (BadRecord, KeyError) as error:
+        raise LogDamaged(f"{segment.path.name} at byte {chunk.position}: {error}") from None
+
+
+def _events(
+    segment: SegmentFile,
+    chunk: ChunkRef,
+    body: bytes,
+    start: int,
+    end: int,
+    keys: Collection[str] | None,
+) -> Iterator[Event]:
+    channels = segment.channels_of(body)
+    names = {id_: channel.topic for id_, channel in channels.items()}
+    versions = {id_: envelope_version(channel) for id_, channel in channels.items()}
     base, expected = segment.base, chunk.first
     for channel_id, sequence, log_ns, publish_ns, at, stop in _mcap.walk(body):
         offset = base + sequence
         if offset != expected:
-            raise LogDamaged(f"{segment.path.name}: offset {offset} stands in place of {expected}")
+            raise BadRecord(f"offset {offset} stands in place of {expected}")
         expected = offset + 1
         if offset < start:
             continue
@@ -103,4 +119,4 @@ def chunk_events(
             version = versions[channel_id]
             yield Event(offset, key, log_ns, publish_ns, body[at:stop], version)
     if expected != chunk.following:
-        raise LogDamaged(f"{segment.path.name}: the chunk ends before offset {expected}")
+        raise BadRecord(f"the chunk ends before offset {expected}")

@@ -9,7 +9,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from eventsrc.errors import LogDamaged, NotALog
+from eventsrc.errors import LogDamaged, LogError, NotALog
 
 from ._check import check_sealed
 from ._head import head_of
@@ -37,8 +37,14 @@ class Verification:
 
 
 def verify_log(log: Path) -> Verification:
-    """Look at everything. Raises only when there is no log at all."""
-    return _Verifier(log).run()
+    """Look at everything. Raises only when there is no log, or one that may not be read."""
+    while True:
+        try:
+            return _Verifier(log).run()
+        except FileNotFoundError:
+            continue  # a segment was sealed while we looked: look again
+        except OSError as error:
+            raise LogError(f"{log}: {error.strerror or error}; check its rights") from error
 
 
 class _Verifier:
