@@ -4,14 +4,18 @@
   begins anew at the oldest envelope that is not acknowledged.
 * At most ``window`` envelopes are under way, so that a long spool does not flood the recorder's
   queue. An ack makes room for more.
-* When acks stay away longer than the resend time, sending goes back to the oldest; each time in
-  vain doubles the pause, and the first ack that frees anything ends that.
+* When acks stay away longer than the resend time, the oldest envelope is sent again, alone, as a
+  question whether anybody is still there; each question in vain doubles the pause. Once there is an
+  answer and it does not cover the rest, sending goes back to the oldest.
+* What a recorder that stood still has missed meanwhile is still in the publisher's cache, and Zenoh
+  fetches it from there by itself. That is why the questions are few and the cache is not small.
 * Acks come in on Zenoh's thread, which only hands them over.
 """
 
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from typing import Final
 
 from pydantic import ValidationError
@@ -25,6 +29,8 @@ WINDOW: Final = 1_024
 """With a group commit every 50 ms this allows about 20,000 envelopes a second."""
 RESEND_AFTER_S: Final = 2.0
 _LONGEST_PAUSE_S: Final = 30.0
+_REST_S: Final = 0.5
+"""After the answer to a question: how long the acks of the rest may take. They come in groups."""
 _RECONNECT_S: Final = 1.0
 _LOOK_S: Final = 0.25
 """How often to look whether a recorder is still there, and how long stopping may take."""
@@ -89,7 +95,7 @@ class Sender:
                 self._rest(_RECONNECT_S)  # nobody there; the spool keeps everything meanwhile
 
     def _serve(self, session: Session) -> None:
-        publisher = session.publisher(self._key, advanced=True, cache=self._window)
+        publisher = session.publisher(self._key, advanced=True, cache=2 * self._window)
         heard: set[str] = set()
         while not self._stopping:
             if publisher.wait_for_subscriber(_LOOK_S):
@@ -98,23 +104,24 @@ class Sender:
     def _converse(self, session: Session, publisher: Publisher, heard: set[str]) -> None:
         """Send and hear acks while somebody subscribes; ``heard`` are the runs listened for."""
         cursor = 0
-        pause_s = self._resend_after_s
-        deadline = time.monotonic() + pause_s
+        patience = Patience(self._resend_after_s)
         while not self._stopping and publisher.has_subscriber:
             if self._take_acks():
-                pause_s = self._resend_after_s
-                deadline = time.monotonic() + pause_s
+                patience.answered()
             under_way = self._spool.waiting_up_to(cursor)
             batch = self._spool.after(cursor, self._window - under_way)
             if batch:
                 self._listen(session, batch, heard)
                 cursor = self._send(publisher, batch)
                 if not under_way:
-                    deadline = time.monotonic() + pause_s
-            elif under_way and time.monotonic() >= deadline:
-                cursor = 0
-                pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
-                deadline = time.monotonic() + pause_s
+                    patience.begin()
+            elif under_way and patience.is_over():
+                if patience.somebody_answered:
+                    cursor = 0
+                    patience.begin()
+                else:
+                    self._send(publisher, self._spool.after(0, 1))
+                    patience.ask()
             else:
                 self._wait(_LOOK_S)
 
@@ -128,9 +135,10 @@ class Sender:
             heard |= new
 
     def _send(self, publisher: Publisher, batch: list[Spooled]) -> int:
+        """Send ``batch`` and return where it ends."""
         for spooled in batch:
             publisher.put(spooled.payload)
-        return batch[-1].seq
+        return batch[-1].seq if batch else 0
 
     def _hear(self, message: Received) -> None:
         try:
@@ -162,3 +170,35 @@ class Sender:
         """Until the time is up, whatever is spooled meanwhile."""
         with self._changed:
             self._changed.wait_for(lambda: self._stopping, timeout_s)
+
+
+class Patience:
+    """How long to wait for acks before something is sent again."""
+
+    def __init__(self, resend_after_s: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._resend_after_s = resend_after_s
+        self._clock = clock
+        self.begin()
+
+    def begin(self) -> None:
+        """Something new is under way."""
+        self._pause_s = self._resend_after_s
+        self._asked = self.somebody_answered = False
+        self._over_s = self._clock() + self._pause_s
+
+    def ask(self) -> None:
+        """A question was sent."""
+        self._asked = True
+        self._pause_s = min(2 * self._pause_s, _LONGEST_PAUSE_S)
+        self._over_s = self._clock() + self._pause_s
+
+    def answered(self) -> None:
+        """An ack freed something."""
+        self.somebody_answered = self._asked
+        wait_s = min(_REST_S, self._resend_after_s) if self._asked else self._resend_after_s
+        self._pause_s = self._resend_after_s
+        self._over_s = self._clock() + wait_s
+
+    def is_over(self) -> bool:
+        """Whether acks have stayed away too long."""
+        return self._clock() >= self._over_s
