@@ -1,7 +1,8 @@
 """Seals finished segments beside the recording, one after the other, in a thread of its own.
 
 Compressing and hashing release the interpreter lock, so recording goes on. What fails here costs
-nothing: the active file stays, is read as before, and is sealed on the next start.
+nothing: the active file stays, is read as before, and is sealed on the next start. Nor does it cost
+anything to be stopped in the middle, so the thread keeps no process alive that forgot to close.
 """
 
 import queue
@@ -30,7 +31,7 @@ class Sealer:
     def submit(self, base: int) -> None:
         """Seal the finished active segment at ``base`` when its turn comes."""
         if self._thread is None:
-            self._thread = threading.Thread(target=self._run, name="mapfold-sealer")
+            self._thread = threading.Thread(target=self._run, name="mapfold-sealer", daemon=True)
             self._thread.start()
         self._bases.put(base)
 

@@ -11,8 +11,8 @@ from mcap.reader import SeekingReader
 from mcap.stream_reader import StreamReader
 
 from eventsrc.envelope import Envelope
-from eventsrc.errors import NotALog
-from eventsrc.log import Event, LogReader, LogWriter
+from eventsrc.errors import LogDamaged, NotALog
+from eventsrc.log import Event, LogReader, LogWriter, verify_log
 from eventsrc.system_events import LOSS_KEY, Loss
 from tests.fixtures_log import BY_HAND, KEY, envelope, read_log
 
@@ -88,6 +88,30 @@ def test_an_active_segment_made_by_hand_reads(log_path: Path) -> None:
     with LogReader(log_path) as reader:
         assert (reader.log_id, reader.next_offset) == ("hand", 503)
         assert list(reader.read(500)) == EVENTS
+
+
+@pytest.mark.parametrize(
+    ("body", "says"),
+    [
+        (message(2, 1, 1, b"x"), "3"),  # no channel 3 is defined here
+        (channel_alone() + message(3, 1, 1, b"x"), "offset 503 stands in place of 502"),
+        (channel_alone(), "ends before offset 502"),
+        (channel_alone() + record(0x05, b"short"), "cut short"),
+        (channel_alone() + message(2, 1, 1, b"x")[:-1], "does not fit"),
+        (channel_alone() + message(2, 1, 1, b"x") + b"\x05", "cut short"),
+    ],
+    ids=["no-channel", "hole", "nothing", "tiny-message", "cut-message", "cut-record"],
+)
+def test_a_chunk_that_contradicts_itself_is_damage(log_path: Path, body: bytes, says: str) -> None:
+    log_path.mkdir()
+    good = schema_and_channel() + message(0, 11, 9, b"first") + message(1, 10, 8, b"")
+    bad = chunk(body) + mark(502, 503)
+    (log_path / NAME).write_bytes(head() + chunk(good) + mark(500, 502) + bad)
+    with LogReader(log_path) as reader, pytest.raises(LogDamaged, match=says):
+        list(reader.read(500))
+    assert [(f.first_offset, f.last_offset) for f in verify_log(log_path).findings][1:2] == [
+        (502, 502)
+    ]
 
 
 def test_our_writer_makes_the_same_chunks(log_path: Path) -> None:
