@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from eventsrc.cli._shell import emit, say
+from eventsrc.cli._shell import emit, finish, say
 from eventsrc.sim import DEFAULT_SEED
 from projections.cli._options import DbOption, VectorDbOption, sigterm_unwinds
 
@@ -28,6 +28,8 @@ def demo(
     into databases; a second, lost robot asks where it is. The databases are the demo's own, in DIR,
     and yours are not touched; but in those that --db and --vector-db name, the demo's map replaces
     the one that is there.
+
+    Exit 3 when log, databases and fold do not agree.
     """
     # Here and not above: the demo alone needs nearly everything, and that takes a while to import.
     from projections.demo import DemoOptions, run_demo
@@ -36,6 +38,7 @@ def demo(
         numbers = run_demo(DemoOptions(out, seed, speed, db, vector_db), say)
     if json_:
         emit(numbers)
+    finish(findings=not numbers["sound"])
 
 
 def register(app: typer.Typer) -> None:

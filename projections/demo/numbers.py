@@ -26,12 +26,20 @@ class Played:
     folded: Folded
     lost: Lost
 
+    @property
+    def sound(self) -> bool:
+        """Whether all that must be equal is: log and run, tail and replay, databases and fold."""
+        recorded = self.recorded
+        whole = recorded.intact and not recorded.rejected and not recorded.lost
+        return whole and self.same_rows and self.replayed.digest == self.folded.digest
+
 
 def document(played: Played, seconds: dict[str, float], folder: DemoFolder) -> dict[str, Any]:
     """What ``mapfold demo --json`` prints; ``seconds`` by stage."""
     view, replayed = played.folded.view, played.replayed
     counts = view.counts()
     return {
+        "sound": played.sound,
         "seed": played.seed,
         "settings": played.settings.model_dump(),
         "record": asdict(played.recorded),

@@ -1,4 +1,4 @@
-"""The stages in order: record, map, merge, ask, draw. Each tells what it did as soon as it is done.
+"""The stages in order: record, replay, map, ask, draw. Each tells what it did when it is done.
 
 House and runs are made before the clock starts: they stand for the world, not for mapfold.
 """

@@ -63,6 +63,7 @@ def test_every_keyframe_went_through_the_router_into_the_log(played: Played) -> 
     assert (record["published"], record["recorded"]) == (len(events), len(events))
     assert record["intact"] is True
     assert (record["rejected"], record["lost"]) == (0, 0)
+    assert played.numbers["sound"] is True
     assert f"{len(events)} of {len(events)} keyframes" in "\n".join(played.story)
 
 

@@ -1,0 +1,104 @@
+"""The demo's story tells what happened, also when it went wrong."""
+
+from dataclasses import replace
+
+import pytest
+
+from projections.demo import story
+from projections.demo.following import Followed
+from projections.demo.mapping import Folded, MergeMoment, Part, most_telling
+from projections.demo.numbers import Played
+from projections.demo.recording import Recorded
+from projections.runner import RebuildReport
+from projections.settings import Settings
+from projections.sinks.labels import LABELS, TABLE
+from projections.view import MapView
+
+RECORDED = Recorded(
+    run_id="sim-1-a",
+    published=10,
+    recorded=10,
+    intact=True,
+    rejected=0,
+    lost=0,
+    drive_seconds=61.0,
+    log_bytes=2_000_000,
+    seconds=3.0,
+)
+FOLLOWED = Followed(events=10, batches=4, median_delay_s=0.04, worst_delay_s=0.09)
+FOLDED = Folded(MapView(Settings()), (), (), "abcdef0123456789" * 4, 0.1)
+REPLAYED = RebuildReport(
+    events=10,
+    digest=FOLDED.digest,
+    counts={},
+    rows=dict.fromkeys([*LABELS, TABLE], 2),
+    fold_s=0.1,
+    total_s=0.2,
+    hnsw=None,
+)
+
+
+def _merge(offset: int, one: str, other: str, smaller: int) -> MergeMoment:
+    parts = Part("sim-1-a_p0", 30, one), (Part("sim-1-a_p1", smaller, other),)
+    return MergeMoment(offset, "sim-1-a", offset + 1, "hall", *parts, places_before=5)
+
+
+def _played() -> Played:
+    return Played(1, Settings(), RECORDED, FOLLOWED, REPLAYED, True, FOLDED, lost=None)  # type: ignore[arg-type]
+
+
+def test_a_merge_across_rooms_is_told_before_a_larger_one_within_a_room() -> None:
+    within, across = _merge(3, "hall", "hall", 29), _merge(7, "hall", "study", 12)
+    assert most_telling([within, across]) is across
+    assert most_telling([within]) is within
+    assert most_telling([]) is None
+
+
+def test_no_merge_is_said_to_be_none() -> None:
+    assert list(story.tell_merges(())) == ["   no two places became one on this drive"]
+
+
+def test_a_merge_is_told_with_its_numbers() -> None:
+    told = "\n".join(story.tell_merges((_merge(7, "hall", "study", 12),)))
+    for wanted in ("p0 (30 keyframes, hall)", "p1 (12 keyframes, study)", "event 7", "5 places"):
+        assert wanted in told
+    assert "such moments" not in told
+
+
+def test_what_is_not_whole_is_said_loudly() -> None:
+    good = "\n".join(story.tell_recording(RECORDED, FOLLOWED, 5, 8, 30.0))
+    assert "byte for byte" in good
+    assert "NOT" not in good
+    torn = replace(RECORDED, recorded=9, intact=False, lost=1)
+    told = "\n".join(story.tell_recording(torn, FOLLOWED, 5, 8, 30.0))
+    assert "9 of 10" in told
+    assert "NOT byte for byte; 0 rejected, 1 lost" in told
+
+
+@pytest.mark.parametrize(("same", "says"), [(True, "the same rows as"), (False, "OTHER rows than")])
+def test_a_replay_with_other_rows_is_said_loudly(same: bool, says: str) -> None:
+    assert says in "\n".join(story.tell_replay(REPLAYED, FOLDED, same))
+
+
+def test_a_replay_with_another_digest_is_said_loudly() -> None:
+    told = "\n".join(story.tell_replay(replace(REPLAYED, digest="0" * 64), FOLDED, True))
+    assert "ANOTHER digest" in told
+
+
+def test_a_demo_is_sound_only_if_everything_agrees() -> None:
+    assert _played().sound
+    assert not replace(_played(), same_rows=False).sound
+    assert not replace(_played(), recorded=replace(RECORDED, intact=False)).sound
+    assert not replace(_played(), recorded=replace(RECORDED, lost=1)).sound
+    assert not replace(_played(), replayed=replace(REPLAYED, digest="0" * 64)).sound
+
+
+def test_lines_fit_a_terminal() -> None:
+    merges = (_merge(1234, "living room", "dining room", 120), _merge(7, "hall", "hall", 3))
+    lines = [
+        *story.tell_recording(RECORDED, FOLLOWED, 12_345, 8, 30.0),
+        *story.tell_replay(REPLAYED, FOLDED, True),
+        *story.tell_map(FOLDED, Settings(), 1),
+        *story.tell_merges(merges),
+    ]
+    assert max(map(len, lines)) <= 100
