@@ -22,7 +22,7 @@ from projections.postgres.connect import Connection, Targets, connect, database_
 from projections.settings import Settings
 from projections.sink import Checkpoint, Sink, SinkName
 from projections.sinks import _checkpoint
-from projections.sinks.graph_rows import Row, expected_rows
+from projections.sinks.graph_render import Row, expected_rows
 from projections.sinks.labels import GRAPH, LABELS, TABLE, VERTEX_LABELS
 from projections.sinks.vector_rows import VectorRow
 from projections.sinks.vectors import VectorSink

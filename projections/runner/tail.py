@@ -115,7 +115,7 @@ class _Run:
                 last = self._fold(fold, batch)
                 if last is not None:
                     self._write(fold, writers, last)
-                elif time.monotonic() - beaten > HEARTBEAT_S:
+                if time.monotonic() - beaten > HEARTBEAT_S:
                     beaten = time.monotonic()
                     for writer in writers:
                         writer.beat(list(writer.store.sinks))

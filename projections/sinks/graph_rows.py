@@ -7,9 +7,9 @@ only *which* is remembered; what they say is read from the view when the rows ar
 thousand changes of one Object in a batch are one row.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any
 
 from projections.deltas import (
     Delta,
@@ -25,21 +25,25 @@ from projections.deltas import (
     PlacesMerged,
     RunSeen,
 )
-from projections.exact import Q40, UM_PER_M
 from projections.view import MapView
 
-from .agtype import number, numbers, text
-from .labels import LABELS, Label, adjacency_number, graphid_base
-
-VertexRow = tuple[int, str]
-"""graphid, properties as agtype text."""
-EdgeRow = tuple[int, int, int, str]
-"""graphid, start, end, properties as agtype text."""
-Row = VertexRow | EdgeRow
-
-_NONE: Final = "{}"
-_BASE: Final = {label: graphid_base(label) + 1 for label in LABELS}
-"""The graphid of ordinal 0 of each label."""
+from .graph_render import (
+    BASE,
+    adjacent_to_rows,
+    has_keyframe_row,
+    has_observation_row,
+    has_pose_row,
+    in_place_rows,
+    keyframe_row,
+    located_in_rows,
+    object_row,
+    observation_row,
+    observes_row,
+    place_row,
+    pose_row,
+    run_row,
+)
+from .labels import Label, adjacency_number, graphid_base
 
 
 @dataclass(slots=True)
@@ -98,31 +102,31 @@ class GraphRows:
         keyframes, observations, observes = self._keyframes, self._observations, self._observes
         self._forget_fixed()
         rows: dict[Label, list[Any]] = {
-            "Keyframe": [_keyframe(view, k) for k in keyframes],
-            "Pose": [_pose(view, k) for k in keyframes if view.keyframes[k].pose],
-            "Observation": [_observation(view, o) for o in observations],
-            "HAS_KEYFRAME": [_has_keyframe(view, k) for k in keyframes],
-            "HAS_POSE": [_has_pose(k) for k in keyframes if view.keyframes[k].pose],
-            "HAS_OBSERVATION": [_has_observation(view, o) for o in observations],
-            "OBSERVES": [_observes(view, o) for o in observes],
+            "Keyframe": [keyframe_row(view, k) for k in keyframes],
+            "Pose": [pose_row(view, k) for k in keyframes if view.keyframes[k].pose],
+            "Observation": [observation_row(view, o) for o in observations],
+            "HAS_KEYFRAME": [has_keyframe_row(view, k) for k in keyframes],
+            "HAS_POSE": [has_pose_row(k) for k in keyframes if view.keyframes[k].pose],
+            "HAS_OBSERVATION": [has_observation_row(view, o) for o in observations],
+            "OBSERVES": [observes_row(view, o) for o in observes],
         }
         return {label: found for label, found in rows.items() if found}
 
     def _take_changing(self, view: MapView, changes: GraphChanges) -> None:
         upserted: dict[Label, list[Any]] = {
-            "Run": [_run(view, r) for r in sorted(self._runs)],
-            "Object": [_object(view, o) for o in sorted(self._objects)],
-            "Place": [_place(view, p) for p in sorted(self._places) if p in view.places],
-            "LOCATED_IN": list(_located_in(view, sorted(self._located))),
-            "IN_PLACE": list(_in_place(view, sorted(self._placed))),
-            "ADJACENT_TO": list(_adjacent_to(view, sorted(self._links))),
+            "Run": [run_row(view, r) for r in sorted(self._runs)],
+            "Object": [object_row(view, o) for o in sorted(self._objects)],
+            "Place": [place_row(view, p) for p in sorted(self._places) if p in view.places],
+            "LOCATED_IN": list(located_in_rows(view, sorted(self._located))),
+            "IN_PLACE": list(in_place_rows(view, sorted(self._placed))),
+            "ADJACENT_TO": list(adjacent_to_rows(view, sorted(self._links))),
         }
         gone = [p for p in sorted(self._places | self._absorbed) if p not in view.places]
         unlocated = [o for o in sorted(self._located) if view.objects[o].place is None]
         unlinked = [link for link in sorted(self._links) if link not in view.adjacency]
         deleted: dict[Label, list[int]] = {
-            "Place": [_BASE["Place"] + p for p in gone],
-            "LOCATED_IN": [_BASE["LOCATED_IN"] + o for o in unlocated],
+            "Place": [BASE["Place"] + p for p in gone],
+            "LOCATED_IN": [BASE["LOCATED_IN"] + o for o in unlocated],
             "ADJACENT_TO": [
                 graphid_base("ADJACENT_TO") + adjacency_number(a, b) for a, b in unlinked
             ],
@@ -154,127 +158,3 @@ class GraphRows:
         for place in delta.absorbed:
             self._absorbed.add(place)
             self._placed.update(view.all_places[place].unordered_members)
-
-
-def expected_rows(view: MapView, label: Label) -> Iterator[Row]:
-    """Every row of a label that the map has, by graphid: what a table must hold, streamed."""
-    keyframes, observations = range(len(view.keyframes)), range(len(view.observations))
-    posed = (k for k in keyframes if view.keyframes[k].pose)
-    fused = (o for o in observations if view.observations[o].object is not None)
-    rows: dict[Label, Callable[[], Iterable[Row]]] = {
-        "Run": lambda: (_run(view, r) for r in range(len(view.runs))),
-        "Keyframe": lambda: (_keyframe(view, k) for k in keyframes),
-        "Pose": lambda: (_pose(view, k) for k in posed),
-        "Observation": lambda: (_observation(view, o) for o in observations),
-        "Object": lambda: (_object(view, o) for o in range(len(view.objects))),
-        "Place": lambda: (_place(view, p) for p in sorted(view.places)),
-        "HAS_KEYFRAME": lambda: (_has_keyframe(view, k) for k in keyframes),
-        "HAS_POSE": lambda: (_has_pose(k) for k in posed),
-        "HAS_OBSERVATION": lambda: (_has_observation(view, o) for o in observations),
-        "OBSERVES": lambda: (_observes(view, o) for o in fused),
-        "LOCATED_IN": lambda: _located_in(view, range(len(view.objects))),
-        "IN_PLACE": lambda: _in_place(view, keyframes),
-        "ADJACENT_TO": lambda: _adjacent_to(view, sorted(view.adjacency)),
-    }
-    return iter(rows[label]())
-
-
-def _run(view: MapView, ordinal: int) -> VertexRow:
-    run = view.runs[ordinal]
-    properties = f'{{"run_id": {text(run.run_id)}, "started_at": {number(run.started_at)}}}'
-    return _BASE["Run"] + ordinal, properties
-
-
-def _keyframe(view: MapView, ordinal: int) -> VertexRow:
-    k = view.keyframes[ordinal]
-    return _BASE["Keyframe"] + ordinal, (
-        f'{{"run_id": {text(k.run_id)}, "keyframe_id": {k.keyframe_id},'
-        f' "timestamp": {number(k.timestamp)}}}'
-    )
-
-
-def _pose(view: MapView, ordinal: int) -> VertexRow:
-    k = view.keyframes[ordinal]
-    assert k.pose is not None  # noqa: S101 - the caller filtered
-    return _BASE["Pose"] + ordinal, (
-        f'{{"run_id": {text(k.run_id)}, "keyframe_id": {k.keyframe_id},'
-        f' "map_x": {number(k.pose.x_um / UM_PER_M)}, "map_y": {number(k.pose.y_um / UM_PER_M)},'
-        f' "map_yaw": {number(k.pose.yaw_rad)}}}'
-    )
-
-
-def _observation(view: MapView, ordinal: int) -> VertexRow:
-    o = view.observations[ordinal]
-    k = view.keyframes[o.keyframe]
-    return _BASE["Observation"] + ordinal, (
-        f'{{"det_id": {text(o.det_id)}, "class_name": {text(o.class_name)},'
-        f' "confidence": {number(o.confidence)}, "bbox": {numbers(o.bbox)},'
-        f' "run_id": {text(k.run_id)}, "keyframe_id": {k.keyframe_id}}}'
-    )
-
-
-def _object(view: MapView, ordinal: int) -> VertexRow:
-    o = view.objects[ordinal]
-    return _BASE["Object"] + ordinal, (
-        f'{{"object_id": {text(o.object_id)}, "class_name": {text(o.class_name)},'
-        f' "mean_x": {number(o.mean_x)}, "mean_y": {number(o.mean_y)}, "obs_count": {o.obs_count},'
-        f' "first_seen": {number(o.first_seen)}, "last_seen": {number(o.last_seen)}}}'
-    )
-
-
-def _place(view: MapView, ordinal: int) -> VertexRow:
-    p = view.all_places[ordinal]
-    return _BASE["Place"] + ordinal, (
-        f'{{"place_id": {text(p.place_id)}, "centroid_x": {number(p.centroid_x)},'
-        f' "centroid_y": {number(p.centroid_y)}, "keyframe_count": {p.keyframe_count}}}'
-    )
-
-
-def _has_keyframe(view: MapView, k: int) -> EdgeRow:
-    run = _BASE["Run"] + view.keyframes[k].run
-    return _BASE["HAS_KEYFRAME"] + k, run, _BASE["Keyframe"] + k, _NONE
-
-
-def _has_pose(k: int) -> EdgeRow:
-    return _BASE["HAS_POSE"] + k, _BASE["Keyframe"] + k, _BASE["Pose"] + k, _NONE
-
-
-def _has_observation(view: MapView, o: int) -> EdgeRow:
-    keyframe = _BASE["Keyframe"] + view.observations[o].keyframe
-    return _BASE["HAS_OBSERVATION"] + o, keyframe, _BASE["Observation"] + o, _NONE
-
-
-def _observes(view: MapView, ordinal: int) -> EdgeRow:
-    o = view.observations[ordinal]
-    assert o.object is not None  # noqa: S101 - ObjectSeen was applied
-    assert o.similarity_q40 is not None  # noqa: S101
-    return (
-        _BASE["OBSERVES"] + ordinal,
-        _BASE["Observation"] + ordinal,
-        _BASE["Object"] + o.object,
-        f'{{"similarity": {number(o.similarity_q40 / Q40)}}}',
-    )
-
-
-def _located_in(view: MapView, objects: Iterable[int]) -> Iterator[EdgeRow]:
-    for o in objects:
-        place = view.objects[o].place
-        if place is not None:
-            yield _BASE["LOCATED_IN"] + o, _BASE["Object"] + o, _BASE["Place"] + place, _NONE
-
-
-def _in_place(view: MapView, keyframes: Iterable[int]) -> Iterator[EdgeRow]:
-    for k in keyframes:
-        place = view.keyframes[k].place
-        if place is not None:
-            yield _BASE["IN_PLACE"] + k, _BASE["Keyframe"] + k, _BASE["Place"] + place, _NONE
-
-
-def _adjacent_to(view: MapView, links: Iterable[tuple[int, int]]) -> Iterator[EdgeRow]:
-    base = graphid_base("ADJACENT_TO")
-    for a, b in links:
-        shared = view.adjacency.get((a, b))
-        if shared is not None:
-            properties = f'{{"shared_transitions": {shared}}}'
-            edge = base + adjacency_number(a, b)
-            yield edge, _BASE["Place"] + a, _BASE["Place"] + b, properties

@@ -15,7 +15,7 @@ from projections.postgres.connect import Connection
 
 from ._binary_copy import copy_document
 from ._sql import statements
-from .graph_rows import EdgeRow, VertexRow
+from .graph_render import EdgeRow, VertexRow
 from .labels import EdgeLabel, VertexLabel
 from .vector_rows import COLUMNS, VectorRow
 

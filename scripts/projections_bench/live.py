@@ -5,10 +5,10 @@ import time
 from pathlib import Path
 
 from eventsrc.append import append_payload
-from eventsrc.log import LogWriter, parse_fsync
+from eventsrc.log import LogReader, LogWriter, parse_fsync
 from projections.postgres.connect import Targets, connect_for_cypher
 from projections.postgres.embedded import EmbeddedServer
-from projections.runner import TailReport, rebuild, tail
+from projections.runner import TailProgress, TailReport, rebuild, tail
 from projections.settings import Settings
 
 from .world import KEY, World, make_log
@@ -38,7 +38,7 @@ def latency(server: EmbeddedServer, folder: Path, quick: bool) -> None:
     seconds = 5 if quick else 30
     log = make_log(folder / "log-live", 2_000)
     targets = Targets(server.url, server.url)
-    rebuild(log, targets, Settings())
+    progress = TailProgress()
     stop, seen = threading.Event(), _Seen(server.url)
     durable: dict[int, float] = {}
 
@@ -48,9 +48,13 @@ def latency(server: EmbeddedServer, folder: Path, quick: bool) -> None:
     thread = threading.Thread(
         target=tail,
         args=(log, targets, Settings()),
-        kwargs={"stop": stop, "on_batch": on_batch},
+        kwargs={"stop": stop, "on_batch": on_batch, "progress": progress},
     )
+    with LogReader(log) as reader:
+        end = reader.next_offset
+    rebuild(log, targets, Settings(), until=end - 1)
     thread.start()
+    progress.wait(end, 120.0)  # it has folded what was there and follows now
     _publish(log, seconds, durable)
     stop.wait(1.0)
     stop.set()

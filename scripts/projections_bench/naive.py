@@ -1,9 +1,9 @@
 """The straightforward way: Cypher MERGE/CREATE per node and edge, one transaction per keyframe.
 
 What a separate graph-builder service usually does. The fold itself is not its business: it is
-handed the finished places and objects. Two kinds: ``plain`` leaves the labels to appear as they are used,
-as such services do; ``tuned`` gets everything it can be given without changing what it is: property
-indexes made up front, expressions that use them, and prepared statements.
+handed the finished places and objects. Two kinds: ``plain`` makes labels but no indexes, as such
+services do; ``tuned`` gets everything it can be given without changing what it is: property indexes
+made up front, expressions that use them, and prepared statements.
 """
 
 import json

@@ -1,0 +1,147 @@
+"""replay, tail, status and db as a person runs them, against an embedded server of their own."""
+
+import os
+import shutil
+import signal
+import subprocess
+import tempfile
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import psycopg
+import pytest
+
+from projections.postgres.embedded import EmbeddedServer
+from tests.commands import PROGRAM, Commands
+from tests.logs import append_raw, walk, write_log
+
+WAIT_S = 60
+REPLAYS = "SELECT count(*) FROM pg_stat_activity WHERE application_name = 'mapfold replay'"
+
+
+@pytest.fixture
+def mapfold() -> Iterator[Commands]:
+    folder = Path(tempfile.mkdtemp(prefix="mapfold-test-commands-"))
+    commands = Commands.in_folder(folder)
+    yield commands
+    server(commands).stop(discard_keep=True)
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture
+def log(mapfold: Commands) -> Path:
+    return write_log(mapfold.folder / "log", walk(40))
+
+
+def server(commands: Commands) -> EmbeddedServer:
+    return EmbeddedServer(Path(commands.env["MAPFOLD_HOME"]))
+
+
+def test_the_life_of_a_projection(mapfold: Commands, log: Path) -> None:
+    assert mapfold("status", log, code=3).out.count("missing") == 2
+    replayed = mapfold("replay", log, "--until", "run-a:29", "--json").json
+    assert replayed["events"] == 30
+    assert not server(mapfold).running
+    status = mapfold("status", log, "--json", code=3).json
+    assert status["sinks"]["graph"]["condition"] == "behind"
+    assert status["sinks"]["graph"]["lag"] == 10
+    tailed = mapfold("tail", log, "--once", "--json").json
+    assert (tailed["events"], tailed["next_offset"]) == (10, 40)
+    status = mapfold("status", log, "--json").json
+    assert [s["condition"] for s in status["sinks"].values()] == ["idle", "idle"]
+    assert status["sinks"]["graph"]["versions"].keys() == {"postgresql", "age", "vector"}
+    checked = mapfold("db", "check", log, "--json").json
+    assert [s["differing"] for s in checked["sinks"]] == [0, 0]
+    assert (
+        mapfold("state", log, "--digest").out.strip()
+        == mapfold("replay", log, "--json").json["digest"]
+    )
+
+
+def test_check_and_repair(mapfold: Commands, log: Path) -> None:
+    mapfold("db", "start")
+    mapfold("replay", log)
+    with psycopg.connect(mapfold("db", "url").out.strip()) as connection:
+        connection.execute("DELETE FROM detection_embeddings WHERE det_pk = 1")
+    found = mapfold("db", "check", log, code=3)
+    assert "missing detection_embeddings 1" in found.out
+    assert "db check --repair" in found.err
+    assert "rebuilt" in mapfold("db", "check", log, "--repair", code=3).err
+    mapfold("db", "check", log)
+    mapfold("db", "stop")
+    assert not server(mapfold).running
+
+
+def test_parked_events_are_findings(mapfold: Commands, log: Path) -> None:
+    append_raw(log, b"neither fish nor fowl")
+    assert "cannot be folded" in mapfold("replay", log, code=1).err
+    assert "parked: offset 40" in mapfold("tail", log, "--once", code=3).err
+    assert "parked: offset 40" in mapfold("status", log, code=3).out
+    assert "still cannot be folded" in mapfold("db", "retry", log, code=3).out
+
+
+def test_other_settings_are_refused_with_the_command_to_run(mapfold: Commands, log: Path) -> None:
+    mapfold("replay", log)
+    said = mapfold("tail", log, "--once", "--set", "eps_m=2", code=1)
+    assert "eps_m=1.5 there, 2.0 here" in said.err
+    assert f"mapfold replay {log}" in said.err
+    assert said.err.count("\n") == 1
+
+
+def test_roles_are_sql(mapfold: Commands) -> None:
+    assert "GRANT SELECT ON ALL TABLES IN SCHEMA semantic_map" in mapfold("db", "roles").out
+    assert "semantic_map" not in mapfold("db", "roles", "--only", "vectors").out
+
+
+@pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGINT])
+def test_a_live_tail_drains_and_leaves_no_server(
+    mapfold: Commands, log: Path, signum: signal.Signals
+) -> None:
+    running = subprocess.Popen(
+        [str(PROGRAM), "tail", str(log), "--metrics", "0"],
+        env=dict(mapfold.env),
+        cwd=mapfold.folder,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    watchdog = threading.Timer(WAIT_S, running.kill)
+    watchdog.start()
+    try:
+        assert running.stderr is not None
+        assert "metrics on http://127.0.0.1:" in running.stderr.readline()
+        running.send_signal(signum)
+        told = running.stderr.read()
+        assert running.wait(WAIT_S) == 0, told
+    finally:
+        watchdog.cancel()
+        running.kill()
+        running.wait()
+        if running.stderr is not None:
+            running.stderr.close()
+    assert "the databases are at offset" in told
+    assert not server(mapfold).running
+
+
+def test_sigterm_in_the_middle_of_a_replay_leaves_no_server_and_the_old_map(
+    mapfold: Commands, log: Path
+) -> None:
+    mapfold("replay", log, "--until", "20")
+    big = write_log(mapfold.folder / "log", walk(4000, first=40, detections=4))
+    running = subprocess.Popen(
+        [str(PROGRAM), "replay", str(big)], env=dict(mapfold.env), cwd=mapfold.folder,
+        stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    try:
+        with server(mapfold) as shared:  # the server is up once this returns
+            with psycopg.connect(shared.url, autocommit=True) as witness:
+                while witness.execute(REPLAYS).fetchone() == (0,):
+                    assert running.poll() is None
+            os.kill(running.pid, signal.SIGTERM)
+            assert running.wait(WAIT_S) == 128 + signal.SIGTERM
+    finally:
+        running.kill()
+        running.wait()
+    assert not server(mapfold).running
+    status = mapfold("status", log, "--json", code=3).json
+    assert status["sinks"]["graph"]["next_offset"] == 20
