@@ -44,6 +44,10 @@ class FoldError(MapfoldError):
         self.offset = offset
         self.reason = reason
 
+    def __reduce__(self) -> tuple[type["FoldError"], tuple[int, str]]:
+        """It travels between processes by what it was made of, not by its message."""
+        return FoldError, (self.offset, self.reason)
+
 
 class DatabaseError(MapfoldError):
     """A database cannot be used as asked."""

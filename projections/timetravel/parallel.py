@@ -7,14 +7,17 @@ a process takes longer than they do.
 
 import multiprocessing
 import os
+import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
 from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 
+from eventsrc.errors import MapfoldError
 from eventsrc.ingest import Accepted, Rejected
 from eventsrc.log import Event, LogReader
 from eventsrc.system_events import is_system_key
@@ -148,12 +151,20 @@ def _in_processes(
     ) as pool:
         futures = [pool.submit(_work, log, share, end, truth) for share in shares]
         _watch(futures, done, end * len(shares), progress)
-        return [future.result() for future in futures]
+        try:
+            return [future.result() for future in futures]
+        except BrokenProcessPool:
+            raise MapfoldError(
+                f"{log}: a process that folded it was killed, perhaps for want of memory; "
+                "try fewer --processes"
+            ) from None
 
 
 def _start_worker(done: "Synchronized[int]") -> None:
     global _done
     _done = done
+    # Ctrl-C reaches the whole group: the parent says so, its workers just end.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def _work(log: Path, settings: list[Settings], end: int, truth: Truth | None) -> list[Outcome]:

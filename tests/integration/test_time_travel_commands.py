@@ -8,7 +8,7 @@ import pytest
 from projections.cli import main
 from tests.commands import Commands, Said
 from tests.envelopes import detection, envelope
-from tests.fixtures_timetravel import write_log
+from tests.fixtures_timetravel import write_damaged_log, write_log
 
 RULES = ("--set", "eps_m=1.0", "--set", "min_samples=3")
 XS = (0.0, 1.0, 2.0, 6.0, 5.0, 4.0, 9.0, 3.0)
@@ -200,3 +200,20 @@ def test_misuse_is_told_in_one_line(mapfold: Here, args: tuple[str, ...], says: 
     assert says in said.err.splitlines()[-1]
     assert said.err.splitlines()[-1].startswith("mapfold: ")
     assert said.out == ""
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        ("merges",),
+        ("whatif", "--try", "eps_m=1"),
+        ("whatif", "--try", "eps_m=1", "--processes", "2"),
+    ],
+)
+def test_an_event_that_cannot_be_folded_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], args: tuple[str, ...]
+) -> None:
+    write_damaged_log(tmp_path / "log", [envelope(1), envelope(2)])
+    said = Here(tmp_path, capsys)(args[0], "log", *args[1:], code=1)
+    assert said.err.startswith("mapfold: event at offset 2 cannot be folded: not JSON")
+    assert len(said.err.splitlines()) == 1
