@@ -134,6 +134,16 @@ def test_the_same_map_gives_the_same_bytes(tmp_path: Path, suffix: str) -> None:
     assert one.read_bytes() == two.read_bytes()
 
 
+def test_keyframes_without_a_pose_are_left_out(tmp_path: Path) -> None:
+    view = _two_places()
+    view.apply(d.KeyframeAdded(10, 10, 0, "run", 10, 10.0, None))
+    with_lost, without = tmp_path / "with.svg", tmp_path / "without.svg"
+    draw_map(view, with_lost, title="t")
+    draw_map(_two_places(), without, title="t")
+    changed = with_lost.read_text("utf-8").replace("11 keyframes", "10 keyframes")
+    assert changed == without.read_text("utf-8")
+
+
 def test_a_png_is_large_enough_to_read(tmp_path: Path) -> None:
     out = tmp_path / "map.PNG"
     draw_map(_two_places(), out, title="t", floor=floor_of(build_house(7)))
