@@ -72,6 +72,9 @@ class Sink(Protocol[Changes]):
     def finish(self, connection: Connection, view: MapView) -> int:
         """Write all other rows to the shadow, index it, and check its counts against the view's."""
 
+    def lock(self, connection: Connection) -> None:
+        """Keep readers away from what `swap` replaces, until the transaction ends."""
+
     def swap(self, connection: Connection) -> None:
         """Put the shadow in the place of what readers see."""
 

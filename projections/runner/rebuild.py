@@ -25,6 +25,7 @@ from projections.sinks.hnsw import HnswReport, build_hnsw
 from projections.sinks.loader import LoaderName
 
 from ._fold import LiveFold, batches
+from ._lock_out import lock_readers_out
 from ._stores import Only, Store, open_stores
 
 TICK_EVENTS: Final = 256
@@ -107,6 +108,7 @@ def rebuild(
                 _finish(store, fold, checkpoint)
             tell(RebuildProgress("swapping", total, total))
             for store in stores:
+                lock_readers_out(store)
                 for sink in store.sinks:
                     sink.swap(store.connection)
         tell(RebuildProgress("tidying", total, total))

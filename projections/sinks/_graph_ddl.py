@@ -3,20 +3,12 @@
 AGE keeps a graph as a schema, so a graph is *ours* when the schema carries our mark as its comment.
 Anything else under our names is somebody's and is refused, never touched.
 
-The swap. Readers name the graph and AGE resolves each label's table by that name, so a reader in
-the middle of a statement must not find half of its tables before the swap and half after. Therefore
-all tables of the old graph are locked exclusively *before* any name moves: a reader that already
-has one of them is waited for; one that comes later waits at its first table, and PostgreSQL
-resolves the name again when it gets the lock. We wait for the locks only briefly and try again:
-while we wait with some of them in hand a reader may wait for us, and below the server's
-deadlock_timeout (1 s) it is always us who give way. The old graph is renamed, and dropped later,
-when every transaction that may still have its name has ended.
+The old graph is renamed by the swap, and dropped later, when every transaction that may still have
+its name has ended.
 """
 
-import time
 from typing import Final
 
-import psycopg
 from psycopg import sql
 
 from projections.errors import DatabaseError
@@ -35,8 +27,6 @@ from .labels import (
     VERTEX_LABELS,
 )
 
-LOCK_ATTEMPT_MS: Final = 200
-LOCK_SECONDS: Final = 120.0
 _MARK: Final = "mapfold"
 
 
@@ -105,12 +95,19 @@ def counts(connection: Connection, graph: str) -> dict[str, int]:
     return dict(connection.execute(sql.SQL(" UNION ALL ").join(each)).fetchall())
 
 
+def lock(connection: Connection, graph: str) -> None:
+    """Lock all tables of a graph exclusively, if it is there."""
+    if exists(connection, graph):
+        names = ["_ag_label_vertex", "_ag_label_edge", *LABELS]
+        tables = sql.SQL(", ").join(sql.Identifier(graph, name) for name in names)
+        connection.execute(statements("graph")["lock"].format(tables=tables))
+
+
 def swap_in(connection: Connection, shadow: str) -> None:
     """Give ``shadow`` the readers' name; what had it becomes the old graph."""
     _use_age(connection)
     run = statements("graph")
     if exists(connection, GRAPH):
-        _lock_all(connection, GRAPH)
         connection.execute(run["rename_graph"], {"graph": GRAPH, "new_name": OLD_GRAPH})
     connection.execute(run["rename_graph"], {"graph": shadow, "new_name": GRAPH})
 
@@ -137,26 +134,3 @@ def analyze(connection: Connection, graph: str) -> None:
 def _use_age(connection: Connection) -> None:
     """AGE's own functions find their operator classes by the search path only."""
     connection.execute("SET LOCAL search_path = ag_catalog, public")
-
-
-def _lock_all(connection: Connection, graph: str) -> None:
-    names = ["_ag_label_vertex", "_ag_label_edge", *LABELS]
-    tables = sql.SQL(", ").join(sql.Identifier(graph, name) for name in names)
-    lock = statements("graph")["lock"].format(tables=tables)
-    deadline = time.monotonic() + LOCK_SECONDS
-    while True:
-        try:
-            with connection.transaction():
-                connection.execute(
-                    sql.SQL("SET LOCAL lock_timeout = {}").format(sql.Literal(LOCK_ATTEMPT_MS))
-                )
-                connection.execute(lock)
-        except psycopg.errors.LockNotAvailable:
-            if time.monotonic() > deadline:
-                raise DatabaseError(
-                    f"{place_of(connection)}: readers kept the graph {graph} locked for"
-                    f" {LOCK_SECONDS:.0f} s; end their transactions, then run the rebuild again"
-                ) from None
-        else:
-            connection.execute("SET LOCAL lock_timeout = DEFAULT")
-            return

@@ -117,6 +117,10 @@ class GraphSink:
             )
         return written
 
+    def lock(self, connection: Connection) -> None:
+        """Keep readers away from the graph."""
+        _graph_ddl.lock(connection, GRAPH)
+
     def swap(self, connection: Connection) -> None:
         """Put the shadow in the readers' place, open to the same roles."""
         _readers.copy_privileges(connection, GRAPH, NEXT_GRAPH)

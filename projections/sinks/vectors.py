@@ -99,6 +99,11 @@ class VectorSink:
             )
         return written
 
+    def lock(self, connection: Connection) -> None:
+        """Keep readers away from the table."""
+        if self._existing(connection) is not None:
+            connection.execute(_statement("lock", _PUBLIC))
+
     def swap(self, connection: Connection) -> None:
         """Put the shadow in the readers' place, open to the same roles."""
         if self._existing(connection) is not None:

@@ -214,12 +214,44 @@ def test_between_swap_and_commit_a_reader_waits_at_its_first_table(
 def test_a_reader_that_will_not_go_stops_the_swap_in_words(
     tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("projections.sinks._graph_ddl.LOCK_SECONDS", 0.3)
+    monkeypatch.setattr("projections.runner._lock_out.PATIENCE_S", 0.3)
     log = write_log(tmp_path / "log", walk(60))
     rebuild(log, one_database, SETTINGS, until=30)
     old = all_rows(one_database)
     with connect_for_cypher(one_database.graph_url) as reader, reader.transaction():
         reader.execute(COUNT_PATHS)
-        with pytest.raises(DatabaseError, match="readers kept the graph semantic_map locked"):
+        with pytest.raises(DatabaseError, match="readers kept the map locked"):
             rebuild(log, one_database, SETTINGS)
     assert all_rows(one_database) == old
+
+
+@pytest.mark.parametrize(
+    ("first", "second"), [(COUNT_VECTORS, COUNT_PATHS), (COUNT_PATHS, COUNT_VECTORS)]
+)
+def test_a_transaction_that_reads_both_is_never_the_victim_of_a_deadlock(
+    tmp_path: Path, one_database: Targets, first: str, second: str
+) -> None:
+    log = write_log(tmp_path / "log", walk(60))
+    rebuild(log, one_database, SETTINGS, until=30)
+    swapping = threading.Event()
+
+    def tell(at: RebuildProgress) -> None:
+        if at.stage == "swapping":
+            swapping.set()
+
+    rebuilding = threading.Thread(
+        target=rebuild, args=(log, one_database, SETTINGS), kwargs={"progress": tell}
+    )
+    with connect_for_cypher(one_database.graph_url) as reader:
+        expected = single_answer(reader, first), single_answer(reader, second)
+        with reader.transaction():
+            answers = [single_answer(reader, first)]
+            rebuilding.start()
+            assert swapping.wait(WAIT_S)
+            for _ in range(50):  # long enough to meet the rebuild's locks more than once
+                answers.append(single_answer(reader, second))
+                reader.execute("SELECT pg_sleep(0.02)")
+        rebuilding.join(WAIT_S)
+        assert not rebuilding.is_alive()
+        assert answers == [expected[0], *[expected[1]] * 50]
+        assert single_answer(reader, first) != expected[0]

@@ -33,6 +33,9 @@ ALTER TABLE {schema}.detection_embeddings ALTER COLUMN embedding TYPE {vector}({
 -- name: drop
 DROP TABLE {schema}.detection_embeddings
 
+-- name: lock
+LOCK TABLE {schema}.detection_embeddings IN ACCESS EXCLUSIVE MODE
+
 -- name: move
 ALTER TABLE mapfold.detection_embeddings SET SCHEMA public
 
