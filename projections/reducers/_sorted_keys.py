@@ -26,6 +26,8 @@ class SortedKeys:
             self._keys, self._labels = [array("q", [key])], [array("i", [label])]
             self._firsts = [key]
             return None, None
+        if key > self._keys[-1][-1]:
+            return self._append(key, label), None
         block = max(bisect_right(self._firsts, key) - 1, 0)
         keys, labels = self._keys[block], self._labels[block]
         index = bisect_right(keys, key)
@@ -36,6 +38,19 @@ class SortedKeys:
         if len(keys) > _BLOCK:
             self._split(block)
         return around
+
+    def _append(self, key: int, label: int) -> int:
+        """Add a key above all others; the label of the one before."""
+        keys, labels = self._keys[-1], self._labels[-1]
+        before = labels[-1]
+        if len(keys) == _BLOCK:
+            self._keys.append(array("q", [key]))
+            self._labels.append(array("i", [label]))
+            self._firsts.append(key)
+        else:
+            keys.append(key)
+            labels.append(label)
+        return before
 
     def columns(self) -> tuple["array[int]", "array[int]"]:
         """All keys, ascending, and their labels."""
@@ -66,8 +81,7 @@ class SortedKeys:
         return self._labels[block + 1][0] if block + 1 < len(self._labels) else None
 
     def _split(self, block: int) -> None:
-        # In-order arrival leaves full blocks behind; only arrival in the middle halves one.
-        at = _BLOCK if block == len(self._keys) - 1 else _BLOCK // 2
+        at = _BLOCK // 2
         for columns in (self._keys, self._labels):
             columns.insert(block + 1, columns[block][at:])
             del columns[block][at:]

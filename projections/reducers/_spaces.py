@@ -24,8 +24,11 @@ class Space:
 
     def has(self, model: str | None, dim: int) -> bool:
         """True when a vector of this model and dimension is in the map; the first one decides."""
+        if model == self.model and dim == self.dim:
+            return True
         if not self.is_decided:
             if self._wanted_model not in (None, model) or self._wanted_dim not in (None, dim):
                 return False
             self.decide(model, dim)
-        return model == self.model and dim == self.dim
+            return True
+        return False

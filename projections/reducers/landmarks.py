@@ -91,7 +91,10 @@ class Landmarks:
             dy = landmark.sum_y_um - y_um * count
             if dx * dx + dy * dy > (self._radius_um * count) ** 2:
                 continue
-            dot = _dot(landmark, vector)
+            if count <= _MAX_IN_FLOAT:
+                dot = int(landmark.vector_sum.dot(vector))
+            else:
+                dot = int(landmark.vector_sum.astype(np.int64).dot(vector.astype(np.int64)))
             q40 = round(dot / math.sqrt(landmark.norm2 * norm2) * Q40)
             if q40 > best_q40 or (q40 == best_q40 and candidate < winner):
                 winner, best_q40, best_dot = candidate, q40, dot
@@ -170,12 +173,6 @@ class Landmarks:
     def _list(self, ordinal: int, landmark: Landmark) -> None:
         for bucket in _buckets(landmark):
             self._near.setdefault(bucket, []).append(ordinal)
-
-
-def _dot(landmark: Landmark, vector: NDArray[np.float64]) -> int:
-    if landmark.count <= _MAX_IN_FLOAT:
-        return int(landmark.vector_sum.dot(vector))
-    return int(landmark.vector_sum.astype(np.int64).dot(vector.astype(np.int64)))
 
 
 def _buckets(landmark: Landmark) -> list[Bucket]:

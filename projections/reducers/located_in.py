@@ -79,6 +79,8 @@ class LocatedIn:
     def _vote(self, seen: int, place: int) -> None:
         votes = self.votes[seen]
         votes[place] = votes.get(place, 0) + 1
+        if self.located[seen] == place and seen not in self._touched:
+            return  # it is there already, and one more vote for it cannot change that
         self.voters.setdefault(place, {})[seen] = None
         self._touched[seen] = None
 

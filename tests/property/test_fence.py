@@ -1,11 +1,14 @@
 """A fence answers as asking every point would, also for the least ε and for points on the edge."""
 
-from hypothesis import given, settings
+from decimal import Decimal, localcontext
+
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from projections.reducers._fence import Fence, turned
 from projections.reducers._grid import NEIGHBOUR_CELLS, cell_side_um
 
+EPS_UM = 1_500_000
 EPS = st.sampled_from([0, 1, 2, 3, 5, 7, 13, 50, 1000, 1_500_000, 10**9])
 
 
@@ -39,3 +42,39 @@ def test_a_fence_answers_as_all_points_would(question) -> None:
                 if (px - x) ** 2 + (py - y) ** 2 <= eps * eps
             }
             assert found in within if within else found is None
+
+
+def _meeting(a: tuple[int, int], c: tuple[int, int], eps: int) -> Decimal:
+    """Where the boundaries of two points' regions meet, in many digits: of their arcs' crossing and
+    the two edges, the one that lies on both boundaries."""
+    da, dc = Decimal(c[0] - a[0]), Decimal(c[1] - a[1])
+    squared = da * da + dc * dc
+    height = ((4 * eps * eps - squared) / squared).sqrt() / 2
+    along = (a[0] + c[0]) / Decimal(2) + dc * height
+    across = (a[1] + c[1]) / Decimal(2) - da * height
+    if across > a[1]:
+        return Decimal(a[0] + eps)
+    return Decimal(c[0] - eps) if across > c[1] else along
+
+
+@settings(max_examples=1000)
+@given(st.data(), st.sampled_from([3, 5, 7, 13, 50, 1000, 1_500_000]))
+def test_a_post_is_hidden_when_its_neighbours_meet_before_it_begins(data, eps: int) -> None:
+    last = cell_side_um(eps) - 1
+    inside = st.one_of(st.integers(0, last), st.sampled_from([0, last]))
+    a, b, c = sorted(data.draw(st.tuples(inside, inside)) for _ in range(3))
+    assume(a[0] < b[0] < c[0])
+    with localcontext(prec=80):
+        begins, ends = _meeting(a, b, eps), _meeting(b, c, eps)
+    assume(abs(begins - ends) > Decimal("1e-40"))
+    assert Fence(eps)._is_hidden(a, b, c) == (begins > ends)
+
+
+def test_the_edge_of_a_region_can_be_where_it_ends() -> None:
+    """Two of the rare cases in which the crossing of the whole circles would say otherwise."""
+    a, b, c = (786_792, 36_469), (814_764, 650_560), (944_017, 982_992)
+    mirrored = [(1_000_000 - along, across) for along, across in (c, b, a)]
+    for low, middle, high in ((a, b, c), mirrored):
+        with localcontext(prec=80):
+            is_hidden = _meeting(low, middle, EPS_UM) > _meeting(middle, high, EPS_UM)
+        assert Fence(EPS_UM)._is_hidden(low, middle, high) == is_hidden

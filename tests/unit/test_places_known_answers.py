@@ -3,6 +3,8 @@
 import random
 from array import array
 
+import pytest
+
 from projections.deltas import (
     KeyframePlaced,
     Link,
@@ -116,6 +118,16 @@ def test_a_border_point_stays_with_the_place_it_joined_first() -> None:
     assert view.keyframes[4].place == 0
     assert not view.adjacency.get((1, 0))
     assert view.adjacency == {(0, 1): 1}
+
+
+@pytest.mark.parametrize("turn", [(1, 0), (-1, 0), (0, 1), (0, -1)])
+def test_a_newcomer_between_two_places_joins_the_one_founded_first(turn: tuple[int, int]) -> None:
+    """Wherever it lies: it reaches one core point of either, and three neighbours are too few."""
+    first, second = [1.2, 1.6, 1.7, 1.8], [-1.2, -1.6, -1.7, -1.8]
+    spots = [(x * turn[0], x * turn[1]) for x in [*first, *second, 0.0]]
+    view = fold((envelope(i, x, y) for i, (x, y) in enumerate(spots)), min_samples=4).view
+    assert len(view.places) == 2
+    assert view.keyframes[8].place == 0
 
 
 def test_a_place_is_named_by_the_run_of_its_founder() -> None:
