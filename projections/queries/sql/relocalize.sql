@@ -1,6 +1,6 @@
 -- From crops to candidates: nearest observations, and from each along the graph to its Object, that
 -- Object's Place, and the Place its keyframe lies in. Ids follow from the observation's number
--- (det_pk), so every step but the search is a look-up by id. `{questions}` is a VALUES list of
+-- (det_pk), so every step but the search is a look-up of an indexed id. `{questions}` is a VALUES list of
 -- (crop, vector) bind parameters.
 
 -- name: near
@@ -19,12 +19,12 @@ FROM question CROSS JOIN LATERAL (
 SELECT seen.det_pk, thing.properties, its.id, its.properties, there.id, there.properties
 FROM unnest(%(det_pks)s::bigint[]) AS seen (det_pk)
 LEFT JOIN {observes} AS observes
-    ON observes.id = ((%(observes_base)s + seen.det_pk)::text)::ag_catalog.graphid
+    ON observes.start_id = ag_catalog._graphid(%(observation)s, seen.det_pk)
 LEFT JOIN {object} AS thing ON thing.id = observes.end_id
 LEFT JOIN {located_in} AS located ON located.start_id = thing.id
 LEFT JOIN {place} AS its ON its.id = located.end_id
 LEFT JOIN {has_observation} AS has
-    ON has.id = ((%(has_observation_base)s + seen.det_pk)::text)::ag_catalog.graphid
+    ON has.end_id = ag_catalog._graphid(%(observation)s, seen.det_pk)
 LEFT JOIN {in_place} AS in_place ON in_place.start_id = has.start_id
 LEFT JOIN {place} AS there ON there.id = in_place.end_id
 
@@ -40,11 +40,11 @@ FROM question CROSS JOIN LATERAL (
     FROM public.detection_embeddings ORDER BY embedding <=> question.wanted LIMIT %(neighbours)s
 ) AS near
 LEFT JOIN {observes} AS observes
-    ON observes.id = ((%(observes_base)s + near.det_pk)::text)::ag_catalog.graphid
+    ON observes.start_id = ag_catalog._graphid(%(observation)s, near.det_pk)
 LEFT JOIN {object} AS thing ON thing.id = observes.end_id
 LEFT JOIN {located_in} AS located ON located.start_id = thing.id
 LEFT JOIN {place} AS its ON its.id = located.end_id
 LEFT JOIN {has_observation} AS has
-    ON has.id = ((%(has_observation_base)s + near.det_pk)::text)::ag_catalog.graphid
+    ON has.end_id = ag_catalog._graphid(%(observation)s, near.det_pk)
 LEFT JOIN {in_place} AS in_place ON in_place.start_id = has.start_id
 LEFT JOIN {place} AS there ON there.id = in_place.end_id
