@@ -99,7 +99,8 @@ def tell_lost(lost: Lost, rooms: dict[str, str]) -> Iterator[str]:
     )
     for asked in lost.questions:
         yield f"   {_count(len(asked.classes), 'crop')} ({', '.join(asked.classes)})"
-        yield f"     → {_answer(asked, rooms)}"
+        yield f"     → {_places(asked, rooms)}"
+        yield f"       {_pose(asked)}"
     every = lost.everywhere
     yield (
         f"   asked once from each of its {every.asked} keyframes that show something: "
@@ -112,18 +113,21 @@ def tell_lost(lost: Lost, rooms: dict[str, str]) -> Iterator[str]:
     )
 
 
-def _answer(asked: Asked, rooms: dict[str, str]) -> str:
-    answer = asked.answer
-    places = ", ".join(
+def _places(asked: Asked, rooms: dict[str, str]) -> str:
+    return ", ".join(
         f"{_short(place.place_id)} {place.score:.2f} ({rooms.get(place.place_id, '?')})"
-        for place in answer.places
+        for place in asked.answer.places
         if place.score >= 0.005
     )
+
+
+def _pose(asked: Asked) -> str:
+    answer = asked.answer
     off = "no pose" if asked.error_m is None else f"{asked.error_m:.2f} m off"
     sure = f"confidence {answer.confidence:.2f}"
     if answer.unknown:
         sure += f", below {UNKNOWN_BELOW:g}: unknown"
-    return f"{places}; pose {off}; {sure}; {1000 * asked.seconds:.0f} ms"
+    return f"pose {off}, {sure}, {1000 * asked.seconds:.0f} ms"
 
 
 def _part(part: Part) -> str:
