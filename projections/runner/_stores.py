@@ -37,6 +37,18 @@ class Store:
         self.connection.close()
         self.connection = _open(self.url, self.application, self.sinks)
 
+    @contextlib.contextmanager
+    def aside(self) -> Iterator[Connection]:
+        """A second connection, for dropping graphs.
+
+        AGE 1.5 keeps labels of a dropped graph in the session's cache and may end the session over
+        them later; so that had better be a session without a future.
+        """
+        opened = connect(self.url, application=self.application, autocommit=True)
+        with opened as connection, database_errors(self.url):
+            connection.execute("SET client_min_messages = warning")
+            yield connection
+
     def close(self) -> None:
         """Close the connection, which gives the locks back."""
         self.connection.close()

@@ -86,8 +86,9 @@ def rebuild(
         with contextlib.ExitStack() as transactions:
             for store in stores:
                 transactions.enter_context(database_errors(store.url))
-                for sink in store.sinks:
-                    sink.clear(store.connection)
+                with store.aside() as connection:
+                    for sink in store.sinks:
+                        sink.clear(connection)
                 transactions.enter_context(store.connection.transaction())
                 for sink in store.sinks:
                     sink.begin(store.connection)
@@ -148,11 +149,11 @@ def _after(
     index: HnswReport | None = None
     rows: dict[str, int] = {}
     for store in stores:
-        with database_errors(store.url):
+        with store.aside() as connection:
             for sink in store.sinks:
-                sink.tidy(store.connection)
-                rows.update(sink.counts(store.connection))
+                sink.tidy(connection)
+                rows.update(sink.counts(connection))
                 if sink.name == "vectors" and hnsw:
                     tell(RebuildProgress("indexing", total, total))
-                    index = build_hnsw(store.connection)
+                    index = build_hnsw(connection)
     return index, rows
