@@ -7,6 +7,7 @@ fold of the same log (reading, validating, folding, applying to a view) in the s
 
 import argparse
 import base64
+import gc
 import json
 import os
 import random
@@ -114,13 +115,10 @@ def bench_timeline(timeline: Timeline, one_fold: float, asks: int) -> None:
     say("first at(end) of a process, from a snapshot", f"{first:.2f} s")
     folding, history = timed(lambda: timeline.history)
     say("folding the history, once per process", f"{folding:.2f} s, {folding / one_fold:.2f} folds")
-    chance = random.Random(2)
-    offsets = [chance.randrange(timeline.end) for _ in range(asks)]
-    spent = sorted(timed(lambda offset=offset: timeline.at(offset))[0] for offset in offsets)
-    say(
-        f"at(random offset), {asks} asked",
-        f"p50 {1e3 * statistics.median(spent):.0f} ms, p95 {1e3 * spent[int(0.95 * asks)]:.0f} ms",
-    )
+    bench_at(timeline, asks, "at(random offset)")
+    gc.freeze()
+    bench_at(timeline, asks, "the same after gc.freeze()")
+    gc.unfreeze()
     seconds, merges = timed(timeline.merges)
     say(f"merges ({len(merges)})", f"{1e3 * seconds:.1f} ms")
     for life in (history.places[0], history.places[-1]):
@@ -137,6 +135,18 @@ def bench_timeline(timeline: Timeline, one_fold: float, asks: int) -> None:
         say(f"bisect {expression!r} {how}", f"{1e3 * seconds:.0f} ms, {found.asked:,} maps asked")
     seconds, _ = timed(lambda: timeline.diff(timeline.end // 2, timeline.end))
     say("diff of the middle and the end", f"{seconds:.2f} s")
+
+
+def bench_at(timeline: Timeline, asks: int, what: str) -> None:
+    chance = random.Random(2)
+    walls, cpus = [], []
+    for _ in range(asks):
+        offset, used = chance.randrange(timeline.end), time.process_time()
+        walls.append(1e3 * timed(lambda offset=offset: timeline.at(offset))[0])
+        cpus.append(1e3 * (time.process_time() - used))
+    for spent, clock in ((sorted(walls), "wall"), (sorted(cpus), "CPU")):
+        p50, p95 = statistics.median(spent), spent[int(0.95 * asks)]
+        say(f"{what}, {asks} asked, {clock}", f"p50 {p50:.0f} ms, p95 {p95:.0f} ms")
 
 
 def bench_whatif(log: Path, one_fold: float, fold_cpu: float) -> None:
