@@ -3,7 +3,7 @@
 import pytest
 
 from projections.timetravel.expression import FUNCTIONS
-from tests.docs.console import matches
+from tests.docs.console import Command, matches, read, run
 from tests.docs.time_travel_page import DATA, FILES, PAGE, run_page
 
 
@@ -15,6 +15,16 @@ def test_its_commands_print_what_it_says() -> None:
         told = "\n".join(printed)
         assert code == 0, f"{command.text}\nexit {code}\n{told}"
         assert matches(command.prints, printed), f"{command.text}\nprinted:\n{told}"
+
+
+def test_its_commands_on_the_sample_log_need_no_trial_data() -> None:
+    parts = [
+        part for part in read(PAGE) if isinstance(part, Command) and "logs/sample" in part.text
+    ]
+    assert parts
+    for command, code, printed in run([*parts]):
+        assert code == 0
+        assert matches(command.prints, printed), "\n".join(printed)
 
 
 def test_it_names_every_function_of_a_condition() -> None:
