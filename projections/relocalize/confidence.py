@@ -14,7 +14,7 @@ from .posterior import Posterior
 UNKNOWN_BELOW: Final = 0.3
 """Below this confidence the answer is 'unknown'."""
 
-WEIGHTS: Final[tuple[float, ...]] = (-7.840, 0.365, 0.130, 0.646, 4.845, -0.495)
+WEIGHTS: Final[tuple[float, ...]] = (-7.019, 0.331, 0.113, 0.649, 4.318, -0.758)
 """Intercept, then one weight for each of `features`."""
 
 
