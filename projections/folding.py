@@ -44,7 +44,8 @@ def fold_events(
     which is quicker; with 1, each is read as it is asked for, as befits a live log.
 
     Raises FoldError at an envelope that does not validate. The map has not taken it in then; its
-    ``next_offset`` is that event's offset, and ``semantic_map.skip(offset)`` passes over it.
+    ``next_offset`` is that event's offset, and ``semantic_map.skip(offset)`` passes over it. Go on
+    from the offset after it with another call; events read ahead are gone with this one.
     """
     coming = iter(events)
     while chunk := list(islice(coming, ahead)):
