@@ -18,30 +18,18 @@ located-in (ObjectMoved), adjacency (PlacesLinked). A delta names only things th
 have introduced.
 """
 
-from dataclasses import dataclass
-from functools import partial
-from typing import Any, TypeAlias, dataclass_transform
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+
+from .frozen import frozen
 
 UnitVector: TypeAlias = NDArray[np.int32]
 """A unit vector as multiples of 2⁻²⁰, int32 of shape (dim,); see `projections.exact`."""
 
 
-@dataclass_transform(frozen_default=True)
-def _delta(cls: Any = None, *, eq: bool = True) -> Any:
-    """A frozen dataclass with slots, frozen by the type checker.
-
-    At run time it is a plain one: freezing it there makes each of the fold's ten deltas a keyframe
-    five times as slow to build, a twentieth of the whole fold.
-    """
-    if cls is None:
-        return partial(_delta, eq=eq)
-    return dataclass(slots=True, eq=eq, unsafe_hash=eq)(cls)
-
-
-@_delta
+@frozen
 class Pose:
     """The robot's pose in the map frame: micrometres, and radians as they came."""
 
@@ -60,7 +48,7 @@ class Pose:
         return self.y_um / 1_000_000
 
 
-@_delta
+@frozen
 class RunSeen:
     """A run was met for the first time, or turned out to have started earlier.
 
@@ -73,7 +61,7 @@ class RunSeen:
     started_at: float
 
 
-@_delta
+@frozen
 class KeyframeAdded:
     """A new keyframe; ``pose`` is None when the robot did not know where it was."""
 
@@ -86,7 +74,7 @@ class KeyframeAdded:
     pose: Pose | None
 
 
-@_delta(eq=False)
+@frozen(eq=False)
 class ObservationAdded:
     """A new detection of a keyframe.
 
@@ -108,7 +96,7 @@ class ObservationAdded:
     foreign_space: bool
 
 
-@_delta
+@frozen
 class EventSkipped:
     """An envelope that changes nothing: a duplicate, a conflict, or a det_id used before.
 
@@ -126,7 +114,7 @@ class EventSkipped:
     first_offset: int | None = None
 
 
-@_delta
+@frozen
 class PlaceFormed:
     """A place was founded by the keyframe that became its first core point.
 
@@ -139,7 +127,7 @@ class PlaceFormed:
     founder: int
 
 
-@_delta
+@frozen
 class Link:
     """Two core points within ε of each other that joined two places; keyframe ordinals, µm."""
 
@@ -148,7 +136,7 @@ class Link:
     distance_um: int
 
 
-@_delta
+@frozen
 class PlacesMerged:
     """Places became one. All members of ``absorbed`` belong to ``survivor`` from now on.
 
@@ -167,7 +155,7 @@ class PlacesMerged:
     absorbed_counts: tuple[int, ...]
 
 
-@_delta
+@frozen
 class KeyframePlaced:
     """A keyframe (new, or noise until now) belongs to a place."""
 
@@ -176,7 +164,7 @@ class KeyframePlaced:
     place: int
 
 
-@_delta
+@frozen
 class PlaceChanged:
     """A place's members changed: their number and the sums of their positions, in µm.
 
@@ -190,7 +178,7 @@ class PlaceChanged:
     sum_y_um: int
 
 
-@_delta
+@frozen
 class ObjectFound:
     """A new Object, founded by an observation; its position is that keyframe's pose."""
 
@@ -201,7 +189,7 @@ class ObjectFound:
     observation: int
 
 
-@_delta
+@frozen
 class ObjectSeen:
     """An observation was assigned to an Object (the founding one too); the Object's new values.
 
@@ -221,7 +209,7 @@ class ObjectSeen:
     last_seen: float
 
 
-@_delta
+@frozen
 class ObjectMoved:
     """An Object is located in another place than before, or in none (None)."""
 
@@ -230,7 +218,7 @@ class ObjectMoved:
     place: int | None
 
 
-@_delta
+@frozen
 class PlacesLinked:
     """The number of shared transitions of two places changed; ``a`` was founded before ``b``.
 
