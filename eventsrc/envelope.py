@@ -25,12 +25,12 @@ MAX_DIMENSION = 16_000
 
 
 def _clean_text(value: str) -> str:
+    if value.isprintable() and 0 < len(value) <= MAX_ID_LENGTH:
+        return value  # the quick way out: no control character is printable
     if not value:
         raise ValueError("is empty")
     if len(value) > MAX_ID_LENGTH:
         raise ValueError(f"is {len(value)} characters long, more than {MAX_ID_LENGTH}")
-    if value.isprintable():  # the quick way out: no control character is printable
-        return value
     for index, char in enumerate(value):
         if unicodedata.category(char) in ("Cc", "Cs"):
             raise ValueError(f"has the control character U+{ord(char):04X} at index {index}")

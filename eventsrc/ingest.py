@@ -7,8 +7,9 @@ the ``mapfold/rejected`` channel.
 
 import binascii
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from itertools import islice
+from typing import cast
 
 import numpy as np
 import pybase64
@@ -16,14 +17,16 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from .envelope import Detection, Envelope
+from .frozen import frozen
 from .ids import DetId, default_det_id
 
 DEFAULT_MAX_PAYLOAD_BYTES = 16 * 1024 * 1024
 
 Vector = NDArray[np.float32]
+_FLOAT32 = np.dtype("<f4")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Accepted:
     """A valid envelope with its vectors decoded.
 
@@ -37,7 +40,7 @@ class Accepted:
     vectors: tuple[Vector | None, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Rejected:
     """A payload that is not an envelope: ``reason`` names the field, its value and the rule."""
 
@@ -50,16 +53,40 @@ class _RefusalError(Exception):
 
 def ingest(payload: bytes, *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES) -> Accepted | Rejected:
     """Read one envelope. Never raises for bad input; it says Rejected and why."""
+    return ingest_all((payload,), max_bytes=max_bytes)[0]
+
+
+def ingest_all(
+    payloads: Sequence[bytes], *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES
+) -> list[Accepted | Rejected]:
+    """`ingest` of each, none dependent on another. Decoding their vectors together saves time."""
+    read = [_read(payload, max_bytes) for payload in payloads]
+    detections = [d for said in read if isinstance(said, Envelope) for d in said.detections]
+    vectors = _vectors_of_one_kind(detections)
+    if vectors is None:
+        return [_admit(said, None) for said in read]
+    coming = iter(vectors)
+    return [_admit(said, coming) for said in read]
+
+
+def _read(payload: bytes, max_bytes: int) -> Envelope | Rejected:
     if len(payload) > max_bytes:
         return Rejected(f"payload of {len(payload)} bytes is over the limit of {max_bytes}")
     try:
-        envelope = Envelope.model_validate_json(payload)
+        return Envelope.model_validate_json(payload)
     except ValidationError as error:
         return Rejected(_first_error(error))
     except RecursionError:  # nesting deeper than the parser follows
         return Rejected("not JSON that can be read: nested too deeply")
+
+
+def _admit(said: Envelope | Rejected, vectors: Iterator[Vector] | None) -> Accepted | Rejected:
+    """The last steps, which look at several fields; ``vectors`` are those to come, if decoded."""
+    if isinstance(said, Rejected):
+        return said
+    own = None if vectors is None else tuple(islice(vectors, len(said.detections)))
     try:
-        return Accepted(envelope, _det_ids(envelope), _vectors(envelope))
+        return Accepted(said, _det_ids(said), _vectors(said) if own is None else own)
     except _RefusalError as refusal:
         return Rejected(str(refusal))
 
@@ -83,14 +110,14 @@ def _first_error(error: ValidationError) -> str:
 
 
 def _det_ids(envelope: Envelope) -> tuple[DetId, ...]:
-    ids = tuple(
-        DetId(d.det_id)
-        if d.det_id is not None
-        else default_det_id(envelope.run_id, envelope.keyframe_id, index)
+    ids = [
+        default_det_id(envelope.run_id, envelope.keyframe_id, index)
+        if d.det_id is None
+        else cast("DetId", d.det_id)
         for index, d in enumerate(envelope.detections)
-    )
+    ]
     if len(set(ids)) == len(ids):
-        return ids
+        return tuple(ids)
     seen: set[DetId] = set()
     for index, det_id in enumerate(ids):
         if det_id in seen:
@@ -98,31 +125,35 @@ def _det_ids(envelope: Envelope) -> tuple[DetId, ...]:
                 f"detections.{index}.det_id: {det_id!r} stands twice in one envelope"
             )
         seen.add(det_id)
-    return ids
+    return tuple(ids)
 
 
 def _vectors(envelope: Envelope) -> tuple[Vector | None, ...]:
     detections = envelope.detections
-    return _vectors_of_one_kind(detections) or tuple(
-        None if d.embedding is None else _vector(index, d) for index, d in enumerate(detections)
+    return tuple(
+        _vectors_of_one_kind(detections)
+        or [
+            None if d.embedding is None else _vector(index, d) for index, d in enumerate(detections)
+        ]
     )
 
 
-def _vectors_of_one_kind(detections: Sequence[Detection]) -> tuple[Vector, ...] | None:
+def _vectors_of_one_kind(detections: Sequence[Detection]) -> list[Vector] | None:
     """All vectors at once if there is nothing odd about them, as a rule; None to look closer."""
     try:
-        raws = [pybase64.b64decode(d.embedding, validate=True) for d in detections]  # type: ignore[arg-type]
+        raws = [pybase64.b64decode(d.embedding, None, True) for d in detections]  # type: ignore[arg-type]
     except (TypeError, ValueError):
         return None
     dims = {d.embedding_dim for d in detections}
     sizes = {*map(len, raws)}
     if None in dims or len(dims) != 1 or sizes != {4 * dim for dim in dims if dim}:
         return None
-    vectors = tuple(np.frombuffer(b"".join(raws), dtype="<f4").reshape(len(raws), -1))
+    rows = np.frombuffer(b"".join(raws), _FLOAT32).reshape(len(raws), -1)
     # A squared norm that is 0, infinite or NaN says that a component may be.
-    with np.errstate(over="ignore", invalid="ignore"):
-        is_sound = all(0.0 < vector.dot(vector) < math.inf for vector in vectors)
-    return vectors if is_sound else None
+    for norm2 in np.einsum("ij,ij->i", rows, rows).tolist():
+        if not 0.0 < norm2 < math.inf:
+            return None
+    return list(rows)
 
 
 def _vector(index: int, detection: Detection) -> Vector:

@@ -16,13 +16,13 @@ log of that version to the tests. Never change a step that has been released.
 """
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Protocol
 
 from .envelope import ENVELOPE_VERSION
-from .ingest import DEFAULT_MAX_PAYLOAD_BYTES, Accepted, Rejected, ingest
+from .ingest import DEFAULT_MAX_PAYLOAD_BYTES, Accepted, Rejected, ingest, ingest_all
 
 BARE_LIST_VERSION = 1
 
@@ -75,6 +75,15 @@ def read_envelope(
     except (ValueError, RecursionError) as error:
         return Rejected(f"not an envelope of version {event.version}: {error}")
     return ingest(payload, max_bytes=2 * max_bytes)
+
+
+def read_envelopes(
+    events: Sequence[Recorded], *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES
+) -> list[Accepted | Rejected]:
+    """`read_envelope` of each; quicker together if all are of today's version."""
+    if any(event.version != ENVELOPE_VERSION for event in events):
+        return [read_envelope(event, max_bytes=max_bytes) for event in events]
+    return ingest_all([event.payload for event in events], max_bytes=max_bytes)
 
 
 def guess_version(payload: bytes) -> int:

@@ -28,8 +28,9 @@ from numpy.typing import NDArray
 
 from .deltas import UnitVector
 
-Units: TypeAlias = tuple[NDArray[np.float64], UnitVector]
-"""A unit vector twice: the same integers, multiples of 2⁻²⁰, in float64 and in int32."""
+Units: TypeAlias = tuple[NDArray[np.float64], UnitVector, int]
+"""A unit vector twice, the same integers, multiples of 2⁻²⁰, in float64 and in int32; and its exact
+squared norm, a multiple of 2⁻⁴⁰ near 1."""
 
 UNIT_BITS = 20
 UNIT = 1 << UNIT_BITS
@@ -71,14 +72,19 @@ def unit_rows(rows: NDArray[np.floating]) -> NDArray[np.float64]:
     dim = rows.shape[1]
     if dim > MAX_DIMENSION:
         raise ValueError(f"an embedding of {dim} dimensions is beyond {MAX_DIMENSION}")
-    bits = _component_bits(dim)
-    largest: list[float] = np.abs(rows).max(axis=1).tolist()
+    # frexp and ldexp only move exponents; √, ÷ and rint are correctly rounded, in numpy as in C.
+    exponents = np.frexp(np.abs(rows).max(axis=1))[1]
     scaled = rows.astype(np.float64)
-    # Loops over the few rows: for scalars Python is quicker than numpy, and as exact.
-    scaled *= _column([math.ldexp(1.0, bits - math.frexp(value)[1]) for value in largest])
+    scaled *= np.ldexp(1.0, _component_bits(dim) - exponents)[:, np.newaxis]
     np.rint(scaled, out=scaled)
-    scaled *= _column([UNIT / math.sqrt(row.dot(row)) for row in scaled])
+    scaled *= (UNIT / np.sqrt(squared_norms(scaled)))[:, np.newaxis]
     return np.rint(scaled, out=scaled)
+
+
+def squared_norms(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The exact squared norm of each row of integers, shape (n,); each must be below 2⁵³."""
+    norms: NDArray[np.float64] = np.einsum("ij,ij->i", rows, rows)
+    return norms
 
 
 def unit_vectors(vectors: Sequence[NDArray[np.float32] | None]) -> list[Units | None]:
@@ -90,16 +96,13 @@ def unit_vectors(vectors: Sequence[NDArray[np.float32] | None]) -> list[Units | 
     for dim in sorted({len(vector) for vector in vectors if vector is not None}):
         indices = [i for i, v in enumerate(vectors) if v is not None and len(v) == dim]
         wide = unit_rows(np.array([vectors[i] for i in indices]))
-        made = zip(wide, wide.astype(np.int32), strict=True)
+        norms: list[float] = squared_norms(wide).tolist()
+        made = zip(wide, wide.astype(np.int32), map(int, norms), strict=True)
         if len(indices) == len(vectors):
             return list(made)
         for i, unit in zip(indices, made, strict=True):
             units[i] = unit
     return units
-
-
-def _column(values: list[float]) -> NDArray[np.float64]:
-    return np.array(values)[:, np.newaxis]
 
 
 def _component_bits(dim: int) -> int:

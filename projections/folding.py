@@ -2,7 +2,7 @@
 
 import gc
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import islice
 from typing import NamedTuple
@@ -10,7 +10,7 @@ from typing import NamedTuple
 from eventsrc.ingest import Accepted, Rejected
 from eventsrc.log import Event, LogReader
 from eventsrc.system_events import is_system_key
-from eventsrc.upcast import read_envelope
+from eventsrc.upcast import read_envelopes
 
 from .deltas import Delta
 from .errors import FoldError
@@ -35,6 +35,17 @@ class FoldedEvent(NamedTuple):
     deltas: list[Delta]
 
 
+class ReadEvent(NamedTuple):
+    """An event as the fold takes it: ``door`` is None for mapfold's own events.
+
+    ``units`` runs parallel to the door's vectors; it is empty for what was refused.
+    """
+
+    offset: int
+    door: Accepted | Rejected | None
+    units: list[Units | None]
+
+
 def fold_events(
     events: Iterable[Event], semantic_map: SemanticMap, *, ahead: int = 1
 ) -> Iterator[FoldedEvent]:
@@ -49,11 +60,8 @@ def fold_events(
     """
     coming = iter(events)
     while chunk := list(islice(coming, ahead)):
-        doors = [_read(event) for event in chunk]
-        vectors = [v for a in doors if isinstance(a, Accepted) for v in a.vectors]
-        units = iter(unit_vectors(vectors))
-        for event, door in zip(chunk, doors, strict=True):
-            yield FoldedEvent(event.offset, _fold(event, door, units, semantic_map))
+        for read in read_together(chunk):
+            yield FoldedEvent(read.offset, fold_read(read, semantic_map))
 
 
 def fold_event(event: Event, semantic_map: SemanticMap) -> list[Delta]:
@@ -61,26 +69,28 @@ def fold_event(event: Event, semantic_map: SemanticMap) -> list[Delta]:
     return next(fold_events([event], semantic_map)).deltas
 
 
-def _read(event: Event) -> Accepted | Rejected | None:
-    """The envelope in an event; None for mapfold's own, which say nothing about the map."""
-    if is_system_key(event.key):
-        return None
+def read_together(events: Sequence[Event]) -> list[ReadEvent]:
+    """Read and validate events, which for sixteen or so together is quicker than one by one."""
+    said = [event for event in events if not is_system_key(event.key)]
     # The size limit belongs to the door; what is in the log was let in.
-    return read_envelope(event, max_bytes=sys.maxsize)
+    doors = read_envelopes(said, max_bytes=sys.maxsize)
+    units = iter(unit_vectors([v for a in doors if isinstance(a, Accepted) for v in a.vectors]))
+    coming, read = iter(doors), []
+    for event in events:
+        door = None if is_system_key(event.key) else next(coming)
+        count = len(door.vectors) if isinstance(door, Accepted) else 0
+        read.append(ReadEvent(event.offset, door, list(islice(units, count))))
+    return read
 
 
-def _fold(
-    event: Event,
-    door: Accepted | Rejected | None,
-    units: Iterator[Units | None],
-    semantic_map: SemanticMap,
-) -> list[Delta]:
-    if door is None:
-        semantic_map.skip(event.offset)
+def fold_read(read: ReadEvent, semantic_map: SemanticMap) -> list[Delta]:
+    """Fold what `read_together` read. Raises FoldError for what was refused; see `fold_events`."""
+    if read.door is None:
+        semantic_map.skip(read.offset)
         return []
-    if isinstance(door, Rejected):
-        raise FoldError(event.offset, door.reason)
-    return semantic_map.fold(event.offset, door, list(islice(units, len(door.vectors))))
+    if isinstance(read.door, Rejected):
+        raise FoldError(read.offset, read.door.reason)
+    return semantic_map.fold(read.offset, read.door, read.units)
 
 
 def fold_log(

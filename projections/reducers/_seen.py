@@ -8,6 +8,7 @@ matter, an id written out and the same id by default are the same.
 import hashlib
 import marshal
 from array import array
+from operator import attrgetter
 from zlib import crc32
 
 import numpy as np
@@ -17,6 +18,7 @@ from eventsrc.ingest import Accepted
 from ._state import State
 
 _DIGEST_BYTES = 16
+_said_of_it = attrgetter("class_name", "confidence", "bbox", "embedding_model")
 
 
 def content_digest(accepted: Accepted) -> bytes:
@@ -26,17 +28,20 @@ def content_digest(accepted: Accepted) -> bytes:
     tell a conflict from a duplicate in the one of 4 billion that differs in nothing but a vector.
     """
     envelope, checksum = accepted.envelope, 0
-    said: list[object] = [envelope.timestamp, envelope.map_x, envelope.map_y, envelope.map_yaw]
-    for det_id, vector, d in zip(
-        accepted.det_ids, accepted.vectors, envelope.detections, strict=True
-    ):
-        said += (det_id, d.class_name, d.confidence, d.bbox, d.embedding_model)
+    lengths: list[int | None] = []
+    for vector in accepted.vectors:
         if vector is None:
-            said.append(None)
+            lengths.append(None)
         else:
             checksum = crc32(vector.data, checksum)
-            said.append(len(vector))
-    said.append(checksum)
+            lengths.append(len(vector))
+    said = (
+        (envelope.timestamp, envelope.map_x, envelope.map_y, envelope.map_yaw),
+        accepted.det_ids,
+        [*map(_said_of_it, envelope.detections)],
+        lengths,
+        checksum,
+    )
     # Version 2 writes values and nothing of how this process holds them.
     return hashlib.blake2b(marshal.dumps(said, 2), digest_size=_DIGEST_BYTES).digest()
 

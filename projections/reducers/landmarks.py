@@ -76,20 +76,21 @@ class Landmarks:
         det_id: str,
         class_name: str,
         vector: NDArray[np.float64],
+        norm2: int,
         timestamp: float,
         x_um: int,
         y_um: int,
     ) -> list[ObjectFound | ObjectSeen]:
-        """Fuse one observation. ``vector`` is its unit vector, see `exact.unit_rows`."""
-        norm2 = int(vector.dot(vector))
-        column, row = x_um // self._radius_um, y_um // self._radius_um
+        """Fuse one observation. ``vector`` and ``norm2`` are of its unit vector, `exact.Units`."""
+        radius_um, objects = self._radius_um, self.objects
+        column, row = x_um // radius_um, y_um // radius_um
         winner, best_q40, best_dot = -1, -math.inf, 0
         for candidate in self._near.get((class_name, column, row), ()):
-            landmark = self.objects[candidate]
+            landmark = objects[candidate]
             count = landmark.count
             dx = landmark.sum_x_um - x_um * count
             dy = landmark.sum_y_um - y_um * count
-            if dx * dx + dy * dy > (self._radius_um * count) ** 2:
+            if dx * dx + dy * dy > (radius_um * count) ** 2:
                 continue
             if count <= _MAX_IN_FLOAT:
                 dot = int(landmark.vector_sum.dot(vector))
@@ -103,7 +104,7 @@ class Landmarks:
                 class_name, vector.copy(), norm2, 1, x_um, y_um, timestamp, timestamp, column, row
             )
             return self._found(offset, observation, det_id, founded)
-        landmark = self.objects[winner]
+        landmark = objects[winner]
         landmark.vector_sum += vector
         landmark.norm2 += 2 * best_dot + norm2
         self._update(winner, landmark, timestamp, x_um, y_um)

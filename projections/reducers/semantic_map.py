@@ -45,8 +45,8 @@ from .landmarks import Landmarks
 from .located_in import LocatedIn
 from .places import Places
 
-Sighting: TypeAlias = tuple[int, str, str, NDArray[np.float64]]
-"""An observation that can be fused: ordinal, det_id, class name, unit vector."""
+Sighting: TypeAlias = tuple[int, str, str, NDArray[np.float64], int]
+"""An observation that can be fused: ordinal, det_id, class name, unit vector, squared norm."""
 Reducer: TypeAlias = Seen | Places | Landmarks | LocatedIn | Adjacency
 
 
@@ -186,7 +186,7 @@ class SemanticMap:
                 )
             )
             if unit is not None and is_member:
-                sightings.append((self.observation_count, det_id, class_name, unit[0]))
+                sightings.append((self.observation_count, det_id, class_name, unit[0], unit[2]))
             self.observation_count += 1
         return sightings
 
@@ -235,9 +235,9 @@ class SemanticMap:
         deltas: list[Delta],
     ) -> None:
         x_um, y_um = pose.x_um, pose.y_um
-        for observation, det_id, class_name, vector in sightings:
+        for observation, det_id, class_name, vector, norm2 in sightings:
             fused = self.landmarks.fold(
-                offset, observation, det_id, class_name, vector, timestamp, x_um, y_um
+                offset, observation, det_id, class_name, vector, norm2, timestamp, x_um, y_um
             )
             deltas += fused
             self.located_in.object_seen(fused[-1].object, keyframe, place)

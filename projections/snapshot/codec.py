@@ -11,7 +11,7 @@ from projections.view import MapView
 from .container import NotAContainer, pack, unpack
 from .view_state import dump_view, load_view
 
-FOLD_VERSION = 1
+FOLD_VERSION = 2
 """Raise it with every change of the reducers after which the same log gives another map."""
 
 

@@ -8,7 +8,6 @@ a process takes longer than they do.
 import multiprocessing
 import os
 import signal
-import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
@@ -18,15 +17,10 @@ from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 
 from eventsrc.errors import MapfoldError
-from eventsrc.ingest import Accepted, Rejected
 from eventsrc.log import Event, LogReader
-from eventsrc.system_events import is_system_key
-from eventsrc.upcast import read_envelope
-from projections.deltas import Delta, KeyframeAdded, KeyframePlaced, PlaceFormed, PlacesMerged
-from projections.errors import FoldError
+from projections.deltas import KeyframeAdded, KeyframePlaced, PlaceFormed, PlacesMerged
 from projections.evaluate.truth import Truth
-from projections.exact import Units, unit_vectors
-from projections.folding import AHEAD, no_cycle_search
+from projections.folding import AHEAD, ReadEvent, fold_read, no_cycle_search, read_together
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 from projections.view import MapView
@@ -95,13 +89,9 @@ class _Fold:
         self.history = History(settings)
         self.seconds = 0.0
 
-    def take(self, offset: int, door: Accepted | None, units: list[Units | None]) -> None:
-        """Fold one event; None is one of mapfold's own."""
-        deltas: list[Delta] = []
-        if door is None:
-            self.map.skip(offset)
-        else:
-            deltas = self.map.fold(offset, door, units)
+    def take(self, read: ReadEvent) -> None:
+        """Fold one event."""
+        offset, deltas = read.offset, fold_read(read, self.map)
         self.view.apply_event(offset, deltas)
         self.history.apply(offset, [delta for delta in deltas if type(delta) in _OF_PLACES])
 
@@ -111,28 +101,12 @@ class _Fold:
 
 def _fold_chunk(chunk: Sequence[Event], folds: Sequence[_Fold]) -> None:
     """As `projections.folding.fold_events`, reading and validating once for all folds."""
-    doors = [_read(event) for event in chunk]
-    vectors = [v for door in doors if door is not None for v in door.vectors]
-    units = iter(unit_vectors(vectors))
-    read = [
-        (event.offset, door, [] if door is None else list(islice(units, len(door.vectors))))
-        for event, door in zip(chunk, doors, strict=True)
-    ]
+    read = read_together(chunk)
     for fold in folds:
         started = time.perf_counter()
-        for offset, door, own in read:
-            fold.take(offset, door, own)
+        for event in read:
+            fold.take(event)
         fold.seconds += time.perf_counter() - started
-
-
-def _read(event: Event) -> Accepted | None:
-    """The envelope in an event, None in one of mapfold's own."""
-    if is_system_key(event.key):
-        return None
-    accepted = read_envelope(event, max_bytes=sys.maxsize)
-    if isinstance(accepted, Rejected):
-        raise FoldError(event.offset, accepted.reason)
-    return accepted
 
 
 def _in_processes(

@@ -6,7 +6,7 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc.ingest import Accepted, Rejected, ingest
+from eventsrc.ingest import Accepted, Rejected, ingest, ingest_all
 from tests.envelopes import detection, envelope, payload
 
 TEXT = st.text(st.characters(exclude_categories=["Cc", "Cs"]), min_size=1, max_size=256)
@@ -60,3 +60,38 @@ def test_a_valid_envelope_is_accepted_unchanged(
 def test_ascii_escapes_and_plain_utf8_read_the_same(noise: bytes) -> None:
     document = envelope(run_id="r🪑", note=noise.hex())
     assert ingest(json.dumps(document).encode()) == ingest(payload(document))
+
+
+def _said(outcome: Accepted | Rejected) -> object:
+    """Something to compare that looks at the vectors bit by bit."""
+    if isinstance(outcome, Rejected):
+        return outcome.reason
+    vectors = [None if v is None else (v.shape, v.tobytes()) for v in outcome.vectors]
+    return outcome.envelope, outcome.det_ids, vectors
+
+
+VALUES = st.sampled_from([[1.0, 2.0, 3.0], [0.0, -1.0], [3.0, 4.0], [1e38, 1e38], [1e-30, 0.0]])
+ODD = st.sampled_from(
+    [
+        {"embedding": "AAAAAAAAAAA=", "embedding_dim": 2},  # the zero vector
+        {"embedding": "AADAfwAAgD8=", "embedding_dim": 2},  # NaN, 1
+        {"embedding": "AACAPwAAgD8=", "embedding_dim": 3},
+        {"embedding": "AACAPwAAgD8="},
+        {"embedding": "AACA PwAAgD8=", "embedding_dim": 2},
+        {"embedding": "é", "embedding_dim": 2},
+        {"confidence": "high"},
+        {"det_id": "twice"},
+        {"class": "a\u0000b"},
+    ]
+)
+GOOD = VALUES.map(lambda values: detection("cup", values)) | st.just(detection("cup"))
+DETECTIONS = st.lists(GOOD | ODD.map(lambda odd: {**detection("cup"), **odd}), max_size=4)
+PAYLOADS = st.binary(max_size=8) | DETECTIONS.map(
+    lambda found: payload(envelope(7, 0.0, 0.0, detections=found))
+)
+
+
+@given(st.lists(PAYLOADS, max_size=5))
+def test_together_each_is_answered_as_by_itself(payloads: list[bytes]) -> None:
+    together = ingest_all(payloads)
+    assert [_said(outcome) for outcome in together] == [_said(ingest(one)) for one in payloads]

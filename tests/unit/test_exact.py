@@ -79,9 +79,10 @@ def test_vectors_of_several_dimensions_and_none() -> None:
     assert units[1] is None
     for vector, unit in zip(vectors, units, strict=True):
         if vector is not None and unit is not None:
-            wide, narrow = unit
+            wide, narrow, norm2 = unit
             assert np.array_equal(narrow, quantise(vector))
             assert np.array_equal(wide, narrow)
+            assert norm2 == sum(int(x) ** 2 for x in narrow)
 
 
 @given(VECTORS)
