@@ -2,7 +2,7 @@
 
 from pydantic import ValidationError
 
-from eventsrc.ledger import ledger_of
+from eventsrc import ledger  # which reads logs by this package's reader, and may be importing it
 from eventsrc.system_events import LOSS_KEY, Loss
 
 from .event import Event
@@ -15,7 +15,7 @@ def count_lost(reader: LogReader) -> int:
     others = sum(loss.count for loss in losses if loss.cause != "keyframe_gap")
     if len(losses) == sum(loss.cause != "keyframe_gap" for loss in losses):
         return others
-    return others + ledger_of(reader).missing_reported()
+    return others + ledger.ledger_of(reader).missing_reported()
 
 
 def _loss(event: Event) -> Loss | None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import typer
 
-from projections.cli import app
+from projections.cli import command_line
 
 PAGE = Path(__file__).parents[2] / "docs" / "commands.md"
 
@@ -29,7 +29,7 @@ This page is made from the commands themselves by `scripts/update_docs`.
 
 def commands() -> Iterator[tuple[str, Any]]:
     """Every command that does something, with its full name, in the order of ``--help``."""
-    yield from _leaves("mapfold", typer.main.get_command(app))
+    yield from _leaves("mapfold", typer.main.get_command(command_line()))
 
 
 def _leaves(name: str, command: Any) -> Iterator[tuple[str, Any]]:

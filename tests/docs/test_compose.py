@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import typer
 
-from projections.cli import app
+from projections.cli import command_line
 
 yaml = pytest.importorskip("yaml", reason="PyYAML reads compose.yaml; it is in the dev group")
 ROOT = Path(__file__).resolve().parents[2]
@@ -56,7 +56,7 @@ def test_volumes_are_declared(compose: dict[str, Any]) -> None:
 
 
 def test_every_mapfold_command_exists_with_its_options(compose: dict[str, Any]) -> None:
-    root = typer.main.get_command(app)
+    root = typer.main.get_command(command_line())
     checked = 0
     for name, service in compose["services"].items():
         if not service["image"].startswith("mapfold:"):
