@@ -4,9 +4,11 @@ A sink first only *notes* deltas; nothing is written until the runner *takes* wh
 *writes* it inside a transaction that also moves the sink's checkpoint. What was taken is a value of
 its own, so a write that failed can be repeated with it, and writing it again does no harm.
 
-A rebuild goes another way to the same rows: `begin` a shadow, `stream` rows that can never change
-again while the fold runs, `finish` with the rest, `swap` the shadow in, all in one transaction;
-then `tidy` away what it replaced. Until the commit nobody sees anything of it.
+A rebuild goes another way to the same rows: `begin` a shadow; while the fold runs `take_final` the
+rows that can never change again and `load` them; then `take` and `load` the rest, `index`, `check`
+and `swap` the shadow in, all in one transaction; then `tidy` away what it replaced. Until then
+nobody sees anything of it. What needs the view and what needs the connection are two methods, so
+that a thread can write while the fold goes on.
 """
 
 from collections.abc import Mapping
@@ -66,11 +68,17 @@ class Sink(Protocol[Changes]):
     def begin(self, connection: Connection) -> None:
         """Create an empty shadow."""
 
-    def stream(self, connection: Connection, view: MapView) -> int:
-        """Write to the shadow those rows that are final, if enough of them wait."""
+    def take_final(self, view: MapView) -> Changes | None:
+        """Rows that can never change again, taken out if enough of them wait; else None."""
 
-    def finish(self, connection: Connection, view: MapView) -> int:
-        """Write all other rows to the shadow, index it, and check its counts against the view's."""
+    def load(self, connection: Connection, changes: Changes) -> None:
+        """Write what was taken to the shadow."""
+
+    def index(self, connection: Connection) -> None:
+        """Index the shadow, which is complete now."""
+
+    def check(self, connection: Connection, view: MapView) -> None:
+        """Compare the shadow's counts with the view's. Raises DatabaseError."""
 
     def lock(self, connection: Connection) -> None:
         """Keep readers away from what `swap` replaces, until the transaction ends."""

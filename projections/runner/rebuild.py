@@ -8,23 +8,25 @@ was replaced, statistics, the HNSW index of a large table.
 
 import contextlib
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias
 
 from eventsrc.log import Event, LogReader
 from projections.digest import map_digest
 from projections.errors import FoldError
 from projections.folding import no_cycle_search
-from projections.postgres.connect import Targets, database_errors
+from projections.postgres.connect import Connection, Targets, database_errors
 from projections.settings import Settings
-from projections.sink import Checkpoint
+from projections.sink import Checkpoint, Sink
 from projections.sinks import _checkpoint
 from projections.sinks.hnsw import HnswReport, build_hnsw
 from projections.sinks.loader import LoaderName
 
 from ._fold import LiveFold, batches
+from ._loading import Loading, short_turns
 from ._lock_out import lock_readers_out
 from ._stores import Only, Store, open_stores
 
@@ -39,6 +41,14 @@ class RebuildProgress:
     stage: str
     done: int
     total: int
+
+
+class SinkLoading(NamedTuple):
+    """A sink, the connection it writes through, and the thread that does it."""
+
+    loading: Loading
+    sink: Sink[Any]
+    connection: Connection
 
 
 OnProgress: TypeAlias = Callable[[RebuildProgress], None]
@@ -92,11 +102,16 @@ def rebuild(
                 transactions.enter_context(store.connection.transaction())
                 for sink in store.sinks:
                     sink.begin(store.connection)
-            with no_cycle_search():
-                last = _fold_into(fold, reader.read(0, total), stores, total, tell)
-            folded = time.monotonic()
-            tell(RebuildProgress("writing", total, total))
-            digest = map_digest(fold.view)
+            with no_cycle_search(), short_turns(), _loadings(stores) as loadings:
+                last = _fold_into(fold, reader.read(0, total), loadings, total, tell)
+                folded = time.monotonic()
+                tell(RebuildProgress("writing", total, total))
+                for loading, sink, connection in loadings:
+                    loading.put(partial(sink.load, connection, sink.take(fold.view)))
+                    loading.put(partial(sink.index, connection))
+                digest = map_digest(fold.view)
+                for loading, _, _ in loadings:
+                    loading.flush()
             checkpoint = Checkpoint(
                 reader.log_id,
                 settings.fingerprint(),
@@ -106,7 +121,9 @@ def rebuild(
                 digest,
             )
             for store in stores:
-                _finish(store, fold, checkpoint)
+                for sink in store.sinks:
+                    sink.check(store.connection, fold.view)
+                    _checkpoint.replace(store.connection, sink.name, checkpoint)
             tell(RebuildProgress("swapping", total, total))
             for store in stores:
                 lock_readers_out(store)
@@ -119,10 +136,28 @@ def rebuild(
     return RebuildReport(total, digest, counts, rows, folded - started, ended - started, index)
 
 
+@contextlib.contextmanager
+def _loadings(stores: list[Store]) -> Iterator[list[SinkLoading]]:
+    """A thread for each store, and which sink writes through which."""
+    with contextlib.ExitStack() as threads:
+        yield [
+            SinkLoading(loading, sink, store.connection)
+            for store, loading in [
+                (store, threads.enter_context(Loading(store.connection.cancel_safe)))
+                for store in stores
+            ]
+            for sink in store.sinks
+        ]
+
+
 def _fold_into(
-    fold: LiveFold, events: Iterable[Event], stores: list[Store], total: int, tell: OnProgress
+    fold: LiveFold,
+    events: Iterable[Event],
+    loadings: list[SinkLoading],
+    total: int,
+    tell: OnProgress,
 ) -> Event | None:
-    sinks = [sink for store in stores for sink in store.sinks]
+    sinks = [sink for _, sink, _ in loadings]
     last: Event | None = None
     for batch in batches(events, TICK_EVENTS):
         for failed in fold.feed(batch, lambda _: sinks):
@@ -131,16 +166,11 @@ def _fold_into(
                 raise FoldError(failed.offset, told)
         last = batch[-1]
         tell(RebuildProgress("folding", last.offset + 1, total))
-        for store in stores:
-            for sink in store.sinks:
-                sink.stream(store.connection, fold.view)
+        for loading, sink, connection in loadings:
+            rows = sink.take_final(fold.view)
+            if rows is not None:
+                loading.put(partial(sink.load, connection, rows))
     return last
-
-
-def _finish(store: Store, fold: LiveFold, checkpoint: Checkpoint) -> None:
-    for sink in store.sinks:
-        sink.finish(store.connection, fold.view)
-        _checkpoint.replace(store.connection, sink.name, checkpoint)
 
 
 def _after(

@@ -27,4 +27,4 @@ def number(value: float) -> str:
 
 def numbers(values: Iterable[float]) -> str:
     """A list of finite floats."""
-    return f"[{', '.join([number(value) for value in values])}]"
+    return f"[{', '.join(map(number, values))}]"

@@ -91,19 +91,24 @@ class GraphSink:
         """Create an empty shadow graph."""
         _graph_ddl.create(connection, NEXT_GRAPH)
 
-    def stream(self, connection: Connection, view: MapView) -> int:
-        """Write the rows that are final, if enough of them wait."""
+    def take_final(self, view: MapView) -> GraphChanges | None:
+        """Fixed rows, if enough of them wait."""
         if self._rows.fixed_waiting < STREAM_ROWS:
-            return 0
-        return self._load(connection, self._rows.take_fixed(view))
+            return None
+        return GraphChanges(self._rows.take_fixed(view))
 
-    def finish(self, connection: Connection, view: MapView) -> int:
-        """Write the rest to the shadow, index it, compare counts."""
-        changes = self.take(view)
-        written = self._load(connection, changes.inserted) + self._load(
-            connection, changes.upserted
-        )
+    def load(self, connection: Connection, changes: GraphChanges) -> None:
+        """Write rows to the shadow, where none of them is yet."""
+        for rows_of in (changes.inserted, changes.upserted):
+            for label, rows in rows_of.items():
+                self._insert(self._loader, connection, NEXT_GRAPH, label, rows)
+
+    def index(self, connection: Connection) -> None:
+        """Index the shadow."""
         _graph_ddl.index(connection, NEXT_GRAPH)
+
+    def check(self, connection: Connection, view: MapView) -> None:
+        """Compare counts by label."""
         found, expected = _graph_ddl.counts(connection, NEXT_GRAPH), view.counts()
         wrong = [
             f"{label}: {found[label]} rows, {expected[COUNT_KEYS[label]]} in the map"
@@ -115,7 +120,6 @@ class GraphSink:
                 f"{place_of(connection)}: the rebuilt graph does not match the map"
                 f" ({'; '.join(wrong)}); the old one stays, please report this"
             )
-        return written
 
     def lock(self, connection: Connection) -> None:
         """Keep readers away from the graph."""
@@ -136,11 +140,6 @@ class GraphSink:
     def counts(self, connection: Connection) -> Mapping[str, int]:
         """Rows by label."""
         return _graph_ddl.counts(connection, GRAPH)
-
-    def _load(self, connection: Connection, rows_of: Mapping[Label, list[object]]) -> int:
-        for label, rows in rows_of.items():
-            self._insert(self._loader, connection, NEXT_GRAPH, label, rows)
-        return sum(map(len, rows_of.values()))
 
     def _insert(
         self, loader: Loader, connection: Connection, graph: str, label: Label, rows: list[object]

@@ -5,13 +5,15 @@ change. ``det_pk`` is the observation's ordinal + 1 and ``ingested_at`` is when 
 *logged*, so a row follows from the log alone, to the last bit, whoever writes it and when.
 """
 
-from dataclasses import dataclass
+import math
+import struct
 from datetime import UTC, datetime, timedelta
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from eventsrc.frozen import frozen
 from projections.deltas import Delta, ObservationAdded
 from projections.exact import UM_PER_M, to_float32
 from projections.view import MapView
@@ -31,10 +33,12 @@ COLUMNS: Final = (
     "embedding",
     "ingested_at",
 )
+_REAL: Final = struct.Struct("f")
+_REALS: Final = struct.Struct("4f")
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class VectorRow:
     """One row. ``embedding`` is float32 of shape (dim,), ``ingested_us`` µs since the epoch.
 
@@ -78,11 +82,19 @@ class VectorRows:
     def take(self, view: MapView) -> list[VectorRow]:
         """The rows added since the last take."""
         waiting, self._waiting = self._waiting, []
-        return [_row(delta, logged_ns, view) for delta, logged_ns in waiting]
+        if not waiting:
+            return []
+        # One map has one embedding space, so the vectors fit one matrix.
+        embeddings = to_float32(np.array([delta.embedding for delta, _ in waiting]))
+        return [
+            _row(delta, logged_ns, view, embedding)
+            for (delta, logged_ns), embedding in zip(waiting, embeddings, strict=True)
+        ]
 
 
-def _row(delta: ObservationAdded, logged_ns: int, view: MapView) -> VectorRow:
-    assert delta.embedding is not None  # noqa: S101 - noted only then
+def _row(
+    delta: ObservationAdded, logged_ns: int, view: MapView, embedding: NDArray[np.float32]
+) -> VectorRow:
     pose = view.keyframes[delta.keyframe].pose
     return VectorRow(
         delta.observation + 1,
@@ -94,12 +106,22 @@ def _row(delta: ObservationAdded, logged_ns: int, view: MapView) -> VectorRow:
         _as_real(delta.bbox),
         None if pose is None else (pose.x_um / UM_PER_M, pose.y_um / UM_PER_M, pose.yaw_rad),
         delta.embedding_model,
-        to_float32(delta.embedding),
+        embedding,
         logged_ns // 1000,
     )
 
 
 def _as_real(bbox: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
-    with np.errstate(over="ignore", under="ignore"):
-        x0, y0, x1, y1 = np.array(bbox, dtype=np.float64).astype(np.float32).tolist()
+    try:
+        x0, y0, x1, y1 = _REALS.unpack(_REALS.pack(*bbox))
+    except OverflowError:
+        x0, y0, x1, y1 = (_real(value) for value in bbox)
     return x0, y0, x1, y1
+
+
+def _real(value: float) -> float:
+    try:
+        rounded: float = _REAL.unpack(_REAL.pack(value))[0]
+    except OverflowError:
+        return math.copysign(math.inf, value)
+    return rounded

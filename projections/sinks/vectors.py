@@ -83,13 +83,25 @@ class VectorSink:
         self._shadow_dimension = self._dimension
         self._create(connection, _SHADOW, self._dimension)
 
-    def stream(self, connection: Connection, view: MapView) -> int:
-        """Write the waiting rows, if they are enough."""
-        return self._load(connection, view) if self._rows.waiting >= STREAM_ROWS else 0
+    def take_final(self, view: MapView) -> list[VectorRow] | None:
+        """The waiting rows, if they are enough."""
+        return self._rows.take(view) if self._rows.waiting >= STREAM_ROWS else None
 
-    def finish(self, connection: Connection, view: MapView) -> int:
-        """Write the rest to the shadow; compare counts."""
-        written = self._load(connection, view)
+    def load(self, connection: Connection, changes: Sequence[VectorRow]) -> None:
+        """Write rows to the shadow."""
+        if not changes:
+            return
+        dimension = len(changes[0].embedding)
+        if dimension != self._shadow_dimension:
+            self._redimension(connection, _SHADOW, dimension)
+            self._shadow_dimension = dimension
+        self._loader.vectors(connection, _SHADOW, self._type, changes)
+
+    def index(self, connection: Connection) -> None:
+        """Nothing: the keys' indexes are there, HNSW comes after the swap."""
+
+    def check(self, connection: Connection, view: MapView) -> None:
+        """Compare counts."""
         found = self._count(connection, _SHADOW)
         expected = sum(o.embedding_crc is not None for o in view.observations)
         if found != expected:
@@ -97,7 +109,6 @@ class VectorSink:
                 f"{place_of(connection)}: the rebuilt table has {found} rows, the map {expected}"
                 " searchable detections; the old one stays, please report this"
             )
-        return written
 
     def lock(self, connection: Connection) -> None:
         """Keep readers away from the table."""
@@ -125,16 +136,6 @@ class VectorSink:
     def counts(self, connection: Connection) -> Mapping[str, int]:
         """Rows of the table."""
         return {TABLE: self._count(connection, _PUBLIC)}
-
-    def _load(self, connection: Connection, view: MapView) -> int:
-        rows = self._rows.take(view)
-        if rows:
-            dimension = len(rows[0].embedding)
-            if dimension != self._shadow_dimension:
-                self._redimension(connection, _SHADOW, dimension)
-                self._shadow_dimension = dimension
-            self._loader.vectors(connection, _SHADOW, self._type, rows)
-        return len(rows)
 
     def _find_type(self, connection: Connection) -> None:
         ensure_extension(connection, "vector")

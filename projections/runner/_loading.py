@@ -1,0 +1,82 @@
+"""A thread that writes to the database while the fold goes on.
+
+The fold keeps one core busy and PostgreSQL another; waiting for each other would cost the sum. Jobs
+run one after the other on one connection, which nobody else may use before `flush`. Few of them may
+wait, so memory stays bounded: who brings one more waits.
+"""
+
+import queue
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import TracebackType
+from typing import Final, Self, TypeAlias
+
+Job: TypeAlias = Callable[[], None]
+
+WAITING_JOBS: Final = 4
+SWITCH_S: Final = 0.0005
+"""How long the fold may keep the writing thread from going on; Python's own 5 ms would add up, as a
+COPY asks for its turn with every 128 kB."""
+
+
+class Loading:
+    """Use as a context manager; leaving it ends the thread.
+
+    Left by an error, it drops what was not begun and has ``cancel`` break off what was.
+    """
+
+    def __init__(self, cancel: Callable[[], None] = lambda: None) -> None:
+        self._cancel = cancel
+        self._jobs: queue.Queue[Job | None] = queue.Queue(WAITING_JOBS)
+        self._failed: BaseException | None = None
+        self._thread = threading.Thread(target=self._work, name="loading", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
+    ) -> None:
+        if error is not None and self._failed is None:
+            self._failed = error
+            self._cancel()
+        self._jobs.put(None)
+        self._thread.join()
+
+    def put(self, job: Job) -> None:
+        """Have ``job`` done. Raises what an earlier one raised."""
+        self._raise()
+        self._jobs.put(job)
+
+    def flush(self) -> None:
+        """Wait until all is done. Raises what a job raised."""
+        self._jobs.join()
+        self._raise()
+
+    def _raise(self) -> None:
+        if self._failed is not None:
+            raise self._failed
+
+    def _work(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            try:
+                if self._failed is None:
+                    job()
+            except BaseException as error:  # noqa: BLE001 - carried to whoever waits
+                self._failed = self._failed or error
+            finally:
+                self._jobs.task_done()
+
+
+@contextmanager
+def short_turns() -> Iterator[None]:
+    """Let threads take turns more often than Python does by itself."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(SWITCH_S)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)

@@ -1,0 +1,91 @@
+"""The thread that writes while the fold goes on: in order, bounded, and no error is lost."""
+
+import sys
+import threading
+from collections.abc import Callable
+
+import pytest
+
+from projections.runner._loading import WAITING_JOBS, Loading, short_turns
+
+
+def test_jobs_are_done_in_order_and_elsewhere() -> None:
+    done: list[int] = []
+    threads: set[int] = set()
+
+    def job(number: int) -> Callable[[], None]:
+        def work() -> None:
+            done.append(number)
+            threads.add(threading.get_ident())
+
+        return work
+
+    with Loading() as loading:
+        for number in range(20):
+            loading.put(job(number))
+        loading.flush()
+        assert done == list(range(20))
+    assert len(threads) == 1
+    assert threading.get_ident() not in threads
+
+
+def test_whoever_brings_more_than_may_wait_waits() -> None:
+    gate, brought = threading.Event(), threading.Semaphore(0)
+
+    def bring(loading: Loading) -> None:
+        for _ in range(WAITING_JOBS + 3):
+            loading.put(lambda: gate.wait(60) and None)
+            brought.release()
+
+    with Loading() as loading:
+        bringing = threading.Thread(target=bring, args=(loading,))
+        bringing.start()
+        for _ in range(WAITING_JOBS + 1):  # one in work, the others wait
+            assert brought.acquire(timeout=60)
+        assert not brought.acquire(timeout=0.05)
+        gate.set()
+        bringing.join(60)
+        assert not bringing.is_alive()
+        loading.flush()
+
+
+def _fail() -> None:
+    raise LookupError("the server went away")
+
+
+def test_a_failure_is_raised_where_one_waits_and_ends_the_work() -> None:
+    done: list[int] = []
+    with Loading() as loading:
+        loading.put(_fail)
+        loading.put(lambda: done.append(1))
+        with pytest.raises(LookupError, match="went away"):
+            loading.flush()
+        with pytest.raises(LookupError, match="went away"):
+            loading.put(lambda: done.append(2))
+    assert done == []
+
+
+def test_leaving_by_an_error_breaks_off_what_runs_and_drops_the_rest() -> None:
+    cancelled, begun, done = threading.Event(), threading.Event(), list[int]()
+
+    def first() -> None:
+        begun.set()
+        done.append(1 if cancelled.wait(60) else 0)
+
+    def leave() -> None:
+        with Loading(cancelled.set) as loading:
+            loading.put(first)
+            loading.put(lambda: done.append(2))
+            assert begun.wait(60)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        leave()
+    assert done == [1]
+
+
+def test_turns_are_short_only_inside() -> None:
+    before = sys.getswitchinterval()
+    with short_turns():
+        assert sys.getswitchinterval() < before
+    assert sys.getswitchinterval() == before
