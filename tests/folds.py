@@ -77,14 +77,15 @@ def near_matrix(n: int, is_near: NearTest) -> np.ndarray:
 class NaivePlaces:
     """The rules of `projections.reducers.places`, word by word, from scratch at every point.
 
-    ``labels`` is the founding number of each point's place, None for noise.
+    ``labels`` is the founding number of each point's place, None for noise; ``founders`` are the
+    points that founded the places.
     """
 
     def __init__(self, min_samples: int) -> None:
         self.min_samples = min_samples
         self.labels: list[int | None] = []
         self.cores: set[int] = set()
-        self.founded = 0
+        self.founders: list[int] = []
 
     def add(self, are_near: np.ndarray) -> None:
         """Take in the last point of the matrix."""
@@ -99,7 +100,8 @@ class NaivePlaces:
                 place = min(known)
                 renamed |= dict.fromkeys(known, place)
             else:
-                place, self.founded = self.founded, self.founded + 1
+                place = len(self.founders)
+                self.founders.append(min(part))
             for i in part:
                 self.labels[i] = place
         for i in set(range(n)) - self.cores:

@@ -186,8 +186,9 @@ class Places:
                     crowd.unite(core, cell)  # type: ignore[arg-type]
                 elif place not in touched:
                     neighbour = crowd.reach(cell, core)  # type: ignore[arg-type]
-                    if neighbour is not None:
-                        touched[place] = core, neighbour
+                    if neighbour is not None:  # a fresh one has the older ``first`` beside it
+                        pair = (neighbour, first) if neighbour in fresh else (core, neighbour)
+                        touched[place] = pair
         return touched
 
     def _earliest_in_reach(self, point: int) -> int:

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.deltas import Pose
+from projections.deltas import PlacesMerged, Pose
 from projections.geometry import Neighbourhood
 from projections.reducers._crowd import Crowd
 from projections.reducers._ruled_crowd import RuledCrowd
@@ -127,6 +127,26 @@ def test_both_crowds_tell_the_same_story(points: list[Point], least: int) -> Non
                 assert plain.crowd.is_core(link.core)
                 assert plain.crowd.is_core(link.neighbour)
                 assert link.distance_um <= EPS_UM
+
+
+@given(points=POINTS, least=st.integers(1, 6), is_ruled=st.booleans())
+def test_a_link_is_of_a_fresh_core_point_and_an_older_one_of_the_absorbed_place(
+    points: list[Point], least: int, is_ruled: bool
+) -> None:
+    rule = Neighbourhood(EPS_UM, _alike)
+    places = Places(RuledCrowd(rule, least) if is_ruled else Crowd(EPS_UM, least))
+    for n, (x, y, yaw) in enumerate(points):
+        cores = {i for i in range(n) if places.crowd.is_core(i)}
+        labels = [places.label(i) for i in range(n)]
+        for merge in places.fold(n, n, 0, "r", x, y, yaw):
+            if type(merge) is not PlacesMerged:
+                continue
+            for absorbed, link in zip(merge.absorbed, merge.links, strict=True):
+                assert link.core not in cores
+                assert places.crowd.is_core(link.core)
+                assert link.neighbour in cores
+                assert labels[link.neighbour] == absorbed
+                assert places.crowd.are_neighbours(link.core, link.neighbour)
 
 
 def _without_links(delta):

@@ -60,6 +60,16 @@ def test_a_merge_names_the_bridge_and_the_pair_that_reached_over() -> None:
     assert list(folded.view.places) == [0]
 
 
+def test_a_link_reaches_a_core_point_that_the_absorbed_place_had_before() -> None:
+    """The newcomer, 6, shares a cell with 1, an old core point; and it makes 3 core, which is near
+    6 but not near 1. The link is between 6 and 1: neither 3 nor 6 was of the absorbed place."""
+    spots = [(0, 0.6), (1.8, 0.3), (-1.5, 0.6), (0.3, 0.6), (2.4, 0.9), (1.8, -0.6), (1.5, 0.9)]
+    folded = fold(envelope(i, x, y) for i, (x, y) in enumerate(spots))
+    (merge,) = folded.all(PlacesMerged)
+    assert (merge.survivor, merge.absorbed, merge.bridge) == (0, (1,), 6)
+    assert merge.links == (Link(core=6, neighbour=1, distance_um=670_820),)
+
+
 def test_a_newcomer_that_is_not_core_can_still_merge_two_places() -> None:
     """It makes keyframes 10 and 11 core, which each reach one point of either group of five."""
     left = [(0.0, 0.0)] + [(-0.3, 0.0)] * 4

@@ -1,0 +1,241 @@
+"""The whole fold once more, as slow and plain as can be: an oracle for `SemanticMap`.
+
+It shares no line with what it checks: it reads documents, not the door's envelopes; it computes in
+fractions and Python integers; after every keyframe it counts all anew. Only the rules of DESIGN 3
+and 5 are the same, and the words of `projections.digest`, which it writes by itself.
+"""
+
+import base64
+import hashlib
+import json
+import math
+import struct
+import zlib
+from collections import Counter
+from fractions import Fraction
+from itertools import pairwise
+from typing import Any
+
+from .folds import NaivePlaces, near_matrix
+
+Q40 = 2**40
+
+
+def micrometres(metres: float) -> int:
+    """The nearest micrometre, ties to even."""
+    return round(Fraction(metres) * 1_000_000)
+
+
+def unit_vector(raw: bytes) -> list[int]:
+    """Multiples of 2⁻²⁰ in the direction of little-endian float32 values, at most 4,096 of them."""
+    values = struct.unpack(f"<{len(raw) // 4}f", raw)
+    shift = 20 - math.frexp(max(map(abs, values)))[1]
+    whole = [round(Fraction(value) * Fraction(2) ** shift) for value in values]
+    scale = 2**20 / math.sqrt(sum(v * v for v in whole))
+    return [round(v * scale) for v in whole]
+
+
+def cosine_q40(members: list[list[int]], unit: list[int]) -> int:
+    """The cosine of the members' sum and a unit vector."""
+    total = [sum(column) for column in zip(*members, strict=True)]
+    dot = sum(a * b for a, b in zip(total, unit, strict=True))
+    return round(dot / math.sqrt(sum(a * a for a in total) * sum(a * a for a in unit)) * Q40)
+
+
+class NaiveMap:
+    """Feed it documents; ask for the map's digest and what was left out."""
+
+    def __init__(self, settings: dict[str, Any]) -> None:
+        self.settings = settings
+        self.space = None, settings.get("embedding_dim")
+        self.is_space_decided = False
+        self.runs: dict[str, list[float]] = {}
+        self.keyframes: list[dict[str, Any]] = []
+        self.observations: list[dict[str, Any]] = []
+        self.objects: list[list[dict[str, Any]]] = []
+        self.places = NaivePlaces(settings["min_samples"])
+        self.left_out: Counter[str] = Counter()
+
+    def fold(self, document: dict[str, Any]) -> None:
+        """Take in one envelope."""
+        run, number = document["run_id"], document["keyframe_id"]
+        said = _content(document)
+        for old in self.keyframes:
+            if (old["run"], old["number"]) == (run, number):
+                self.left_out["duplicate" if old["said"] == said else "conflict"] += 1
+                return
+        self.runs.setdefault(run, []).append(document["timestamp"])
+        pose = None
+        if document.get("map_x") is not None:
+            pose = (micrometres(document["map_x"]), micrometres(document["map_y"]))
+        keyframe = {
+            "run": run,
+            "number": number,
+            "said": said,
+            "time": document["timestamp"],
+            "pose": pose,
+            "yaw": document.get("map_yaw"),
+        }
+        self.keyframes.append(keyframe)
+        self._cluster(pose)
+        for detection in said[1]:
+            self._observe(keyframe, *detection)
+
+    def _cluster(self, pose: tuple[int, int] | None) -> None:
+        if pose is None:
+            return
+        points = [k["pose"] for k in self.keyframes if k["pose"] is not None]
+        eps = micrometres(self.settings["eps_m"])
+
+        def is_near(i: int, j: int) -> bool:
+            (ax, ay), (bx, by) = points[i], points[j]
+            return (ax - bx) ** 2 + (ay - by) ** 2 <= eps**2
+
+        self.places.add(near_matrix(len(points), is_near))
+
+    def _observe(
+        self, keyframe: dict[str, Any], det_id: str, name: str, model: Any, raw: Any, rest: Any
+    ) -> None:
+        is_member = raw is not None and self._is_of_space(model, len(raw) // 4)
+        if any(o["det_id"] == det_id for o in self.observations):
+            self.left_out["det_id_reused"] += 1
+            return
+        observation = {
+            "keyframe": keyframe,
+            "det_id": det_id,
+            "class": name,
+            "rest": rest,
+            "model": model,
+            "unit": unit_vector(raw) if is_member else None,
+            "foreign": raw is not None and not is_member,
+            "object": None,
+            "q40": None,
+        }
+        self.observations.append(observation)
+        if is_member and keyframe["pose"] is not None:
+            self._fuse(observation)
+
+    def _is_of_space(self, model: Any, dim: int) -> bool:
+        if not self.is_space_decided and self.space[1] in (None, dim):
+            self.space, self.is_space_decided = (model, dim), True
+        return self.is_space_decided and self.space == (model, dim)
+
+    def _fuse(self, observation: dict[str, Any]) -> None:
+        x, y = observation["keyframe"]["pose"]
+        radius = micrometres(self.settings["fusion_radius_m"])
+        found = []
+        for ordinal, members in enumerate(self.objects):
+            mean_x, mean_y = (Fraction(s, len(members)) for s in _sums(members))
+            is_close = (mean_x - x) ** 2 + (mean_y - y) ** 2 <= radius**2
+            if is_close and members[0]["class"] == observation["class"]:
+                q40 = cosine_q40([m["unit"] for m in members], observation["unit"])
+                if q40 >= Fraction(self.settings["fusion_similarity"]) * Q40:
+                    found.append((-q40, ordinal))
+        if found:
+            observation["q40"], observation["object"] = -min(found)[0], min(found)[1]
+            self.objects[observation["object"]].append(observation)
+        else:
+            observation["q40"], observation["object"] = Q40, len(self.objects)
+            self.objects.append([observation])
+
+    def _labels(self) -> list[int | None]:
+        """Each keyframe's place."""
+        coming = iter(self.places.labels)
+        return [None if k["pose"] is None else next(coming) for k in self.keyframes]
+
+    def digest(self) -> str:
+        """What `projections.digest.map_digest` must say."""
+        labels = self._labels()
+        sections = {
+            "runs": [(run, min(times)) for run, times in self.runs.items()],
+            "keyframes": self._keyframe_rows(labels),
+            "observations": self._observation_rows(),
+            "objects": self._object_rows(labels),
+            "places": self._place_rows(labels),
+            "adjacency": self._adjacency_rows(labels),
+        }
+        text = "mapfold map 1\n"
+        for name, rows in sections.items():
+            text += f"{name}\n" + "".join(
+                json.dumps(row, separators=(",", ":")) + "\n" for row in rows
+            )
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def _keyframe_rows(self, labels: list[int | None]) -> list[Any]:
+        runs = list(self.runs)
+        return [
+            (
+                runs.index(k["run"]),
+                k["number"],
+                k["time"],
+                None if k["pose"] is None else (*k["pose"], k["yaw"]),
+                label,
+            )
+            for k, label in zip(self.keyframes, labels, strict=True)
+        ]
+
+    def _observation_rows(self) -> list[Any]:
+        rows = []
+        for o in self.observations:
+            unit = o["unit"]
+            crc = None if unit is None else zlib.crc32(struct.pack(f"<{len(unit)}i", *unit))
+            seen = (self.keyframes.index(o["keyframe"]), o["det_id"], o["class"], *o["rest"])
+            rows.append((*seen, o["model"], crc, o["foreign"], o["object"], o["q40"]))
+        return rows
+
+    def _object_rows(self, labels: list[int | None]) -> list[Any]:
+        rows = []
+        for members in self.objects:
+            first, times = members[0], [m["keyframe"]["time"] for m in members]
+            named = "obj-" + hashlib.sha256(first["det_id"].encode()).hexdigest()[:16]
+            votes = Counter(labels[self.keyframes.index(m["keyframe"])] for m in members)
+            del votes[None]
+            place = min(votes, key=lambda p: (-votes[p], p)) if votes else None
+            sums = _sums(members)
+            row = (named, first["class"], len(members), *sums, min(times), max(times), place)
+            rows.append(row)
+        return rows
+
+    def _place_rows(self, labels: list[int | None]) -> list[Any]:
+        posed = [i for i, k in enumerate(self.keyframes) if k["pose"] is not None]
+        counters: Counter[str] = Counter()
+        rows = []
+        for place, founder in enumerate(posed[point] for point in self.places.founders):
+            run = self.keyframes[founder]["run"]
+            members = [{"keyframe": self.keyframes[i]} for i in posed if labels[i] == place]
+            if members:
+                row = (place, f"{run}_p{counters[run]}", founder, len(members), *_sums(members))
+                rows.append(row)
+            counters[run] += 1
+        return rows
+
+    def _adjacency_rows(self, labels: list[int | None]) -> list[Any]:
+        counted: Counter[tuple[int, int]] = Counter()
+        for run in self.runs:
+            placed = sorted(
+                (k["number"], label)
+                for k, label in zip(self.keyframes, labels, strict=True)
+                if k["run"] == run and label is not None
+            )
+            for (_, a), (_, b) in pairwise(placed):
+                if a != b:
+                    counted[min(a, b), max(a, b)] += 1
+        return [(a, b, n) for (a, b), n in sorted(counted.items())]
+
+
+def _sums(members: list[dict[str, Any]]) -> tuple[int, int]:
+    poses = [m["keyframe"]["pose"] for m in members]
+    return sum(x for x, _ in poses), sum(y for _, y in poses)
+
+
+def _content(document: dict[str, Any]) -> tuple[Any, list[tuple[Any, ...]]]:
+    """What an envelope says, however it is written, and its detections one by one."""
+    head = [document.get(name) for name in ("timestamp", "map_x", "map_y", "map_yaw")]
+    seen = []
+    for index, d in enumerate(document["detections"]):
+        by_default = f"{document['run_id']}_kf{document['keyframe_id']}_d{index}"
+        raw = base64.b64decode(d["embedding"]) if "embedding" in d else None
+        rest = (d["confidence"], tuple(d["bbox"]))
+        det_id = d.get("det_id", by_default)
+        seen.append((det_id, d["class"], d.get("embedding_model"), raw, rest))
+    return head, seen
