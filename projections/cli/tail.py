@@ -73,6 +73,7 @@ def tail_command(
             stop=stop,
             progress=progress,
             on_trouble=lambda what: _complain(what, progress),
+            note=say,
         )
     if as_json:
         emit(asdict(report))

@@ -19,9 +19,14 @@ SinksOf: TypeAlias = Callable[[Event], Sequence[Sink[Any]]]
 class LiveFold:
     """The fold's state and its view. Embeddings are not kept: sinks get them with the delta."""
 
-    def __init__(self, settings: Settings) -> None:
-        self.map = SemanticMap(settings)
-        self.view = MapView(settings, keep_embeddings=False)
+    def __init__(
+        self, settings: Settings, start: tuple[SemanticMap, MapView] | None = None
+    ) -> None:
+        """``start`` is a snapshot's, to go on from; by default nothing is folded yet."""
+        self.map, self.view = start or (
+            SemanticMap(settings),
+            MapView(settings, keep_embeddings=False),
+        )
 
     def feed(self, events: Sequence[Event], sinks_of: SinksOf) -> Iterator[FoldError | None]:
         """Fold events in order, telling each one's sinks; a step for each: None, or why it failed.

@@ -1,8 +1,9 @@
 """Tail: keep the databases at the end of the log while it grows.
 
-A tail folds the log from its start (the fold's state lives nowhere else), and each sink listens
-from its own checkpoint on. A batch is what has come since the last one: one event when little
-comes, many when it is behind. Each batch is one transaction per database (`_writing`).
+A tail folds the log from its start, or from the last snapshot below the checkpoints (the fold's
+state lives nowhere else), and each sink listens from its own checkpoint on. A batch is what has
+come since the last one: one event when little comes, many when it is behind. Each batch is one
+transaction per database (`_writing`).
 
 An event that cannot be folded is parked: its offset and the reason go to the dead letters in the
 same transaction that moves past it. Parked events stay out at every later start, so that the rows
@@ -19,12 +20,14 @@ from typing import Any, Final
 
 from eventsrc.log import Event, LogReader, follow
 from projections.errors import FoldError, ProjectionMismatch
+from projections.folding import WORTH_A_SNAPSHOT
 from projections.postgres.connect import Targets, database_errors
 from projections.settings import Settings
 from projections.sink import Checkpoint, Sink
 from projections.sinks import _checkpoint
 from projections.sinks._checkpoint import DeadLetter, event_hash
 from projections.sinks.loader import LoaderName
+from projections.snapshot import SnapshotCache
 
 from ._dead_letters import dead_letter
 from ._fold import LiveFold, batches
@@ -39,6 +42,7 @@ ONCE_PATIENCE_S: Final = 60.0
 
 
 OnBatch = Callable[[TailReport], None]
+Note = Callable[[str], None]
 
 
 def tail(
@@ -53,12 +57,14 @@ def tail(
     stop: threading.Event | None = None,
     on_batch: OnBatch | None = None,
     on_trouble: OnTrouble | None = None,
+    note: Note = lambda _: None,
     progress: TailProgress | None = None,
 ) -> TailReport:
     """Follow ``log`` until ``stop`` is set, or with ``once`` only to its present end.
 
-    ``on_batch`` is called after each commit. Raises ProjectionMismatch when the databases were made
-    from another log or with other settings, ProjectionBusy, CheckpointMoved.
+    ``on_batch`` is called after each commit; ``note`` is told of snapshots that could not be used
+    or kept, which costs time and nothing else. Raises ProjectionMismatch when the databases were
+    made from another log or with other settings, ProjectionBusy, CheckpointMoved.
     """
     stop = stop or threading.Event()
     report = TailReport()
@@ -70,6 +76,7 @@ def tail(
             run = _Run(log, targets, settings, stores, stop, once, report)
             run.batch_events, run.progress = batch_events, progress or run.progress
             run.on_batch, run.on_trouble = on_batch or run.on_batch, on_trouble or run.on_trouble
+            run.note = note
             try:
                 run.follow()
             except LostCommits:
@@ -80,7 +87,7 @@ def tail(
 
 @dataclass(slots=True)
 class _Run:
-    """One pass from the start of the log; `tail` begins another when commits were lost."""
+    """One pass over the log; `tail` begins another when commits were lost."""
 
     log: Path
     targets: Targets
@@ -93,6 +100,7 @@ class _Run:
     progress: TailProgress = field(default_factory=TailProgress)
     on_batch: OnBatch = lambda _: None
     on_trouble: OnTrouble = lambda _: None
+    note: Note = lambda _: None
     checkpoints: dict[str, Checkpoint] = field(default_factory=dict)
     parked: dict[int, DeadLetter] = field(default_factory=dict)
     letters: list[DeadLetter] = field(default_factory=list)
@@ -101,9 +109,11 @@ class _Run:
         with LogReader(self.log) as reader:
             self._begin(reader)
             end = reader.next_offset
-            fold = LiveFold(self.settings)
+            cache = SnapshotCache(self.log, reader.log_id, self.settings, self.note)
+            fold = LiveFold(self.settings, cache.latest(self._start_at_most()))
+            start = fold.map.next_offset
             events: Iterable[Event | None] = (
-                reader.read(0, end) if self.once else follow(self.log, 0, stop=self.stop)
+                reader.read(start, end) if self.once else follow(self.log, start, stop=self.stop)
             )
             patience = ONCE_PATIENCE_S if self.once else None
             writers = [
@@ -120,7 +130,14 @@ class _Run:
                     for writer in writers:
                         writer.beat(list(writer.store.sinks))
                 if self.once and self.stop.is_set():
-                    return
+                    break
+            if fold.map.next_offset - start >= WORTH_A_SNAPSHOT and not self.parked:
+                cache.keep(fold.map, fold.view)
+
+    def _start_at_most(self) -> int:
+        """Up to which offset a snapshot is what this tail would fold: another command may have made
+        one with events that are parked here."""
+        return min([c.next_offset for c in self.checkpoints.values()] + list(self.parked))
 
     def _begin(self, reader: LogReader) -> None:
         """Make what is missing, read the checkpoints, refuse what does not fit."""
@@ -149,6 +166,12 @@ class _Run:
                 f"{store.place}: the {sink.name} there hold {found.next_offset} events, but"
                 f" {self.log} has only {reader.next_offset}; {self._advice()}"
             )
+        for event in reader.read(max(0, found.next_offset - 1), found.next_offset):
+            if event_hash(event) != found.last_event:
+                raise ProjectionMismatch(
+                    f"{self.log}: the event at offset {event.offset} is not the one that the"
+                    f" {sink.name} were made from; {self._advice()}"
+                )
 
     def _advice(self) -> str:
         return f"to make them anew run: mapfold replay {self.log}"
@@ -161,7 +184,6 @@ class _Run:
             for event, error in zip(stretch, fold.feed(stretch, self._due), strict=True):
                 if error is not None:
                     self._park(event, error)
-                self._check_history(event)
             rest = rest[len(stretch) :]
             if rest:
                 # Parked by the other sink, which is further: it has to stay out of this one too.
@@ -186,19 +208,9 @@ class _Run:
                 f" {self._advice()}"
             )
         letter = dead_letter(event, error.reason)
+        self.parked[letter.offset] = letter
         self.letters.append(letter)
         self.report.parked.append(letter)
-
-    def _check_history(self, event: Event) -> None:
-        """The last event below a checkpoint must be the one the checkpoint was made with."""
-        for name, checkpoint in self.checkpoints.items():
-            if event.offset + 1 != checkpoint.next_offset:
-                continue
-            if event_hash(event) != checkpoint.last_event:
-                raise ProjectionMismatch(
-                    f"{self.log}: the event at offset {event.offset} is not the one that the"
-                    f" {name} were made from; {self._advice()}"
-                )
 
     def _write(self, fold: LiveFold, writers: list[Writer], last: Event) -> None:
         next_offset = last.offset + 1

@@ -131,7 +131,10 @@ def test_parked_events_are_tried_again(
         return read_envelope(mended, max_bytes=max_bytes)
 
     monkeypatch.setattr("projections.runner.retry.read_envelope", lenient)
-    monkeypatch.setattr("projections.folding.read_envelope", lenient)
+    monkeypatch.setattr(
+        "projections.folding.read_envelopes",
+        lambda events, *, max_bytes: [lenient(event, max_bytes=max_bytes) for event in events],
+    )
     reports = retry(log, one_database, SETTINGS)
     assert [(r.still, r.rebuilt) for r in reports] == [((), True)] * 2
     assert projection_status(log, one_database, SETTINGS).healthy
