@@ -1,5 +1,7 @@
 """A map in a few lines for people, what ``mapfold state`` prints."""
 
+from eventsrc.words import counted
+
 from .settings import Settings
 from .view import MapView
 
@@ -9,7 +11,7 @@ _MOST = 40
 def state_text(view: MapView, digest: str) -> str:
     """The text, with a newline at its end."""
     lines = [
-        f"after {_number(view.next_offset, 'events')}: {_counts(view)}",
+        f"after {counted(view.next_offset, 'event')}: {_counts(view)}",
         f"settings {_settings(view.settings)}",
         f"digest   {digest}",
     ]
@@ -19,8 +21,8 @@ def state_text(view: MapView, digest: str) -> str:
 
 def _counts(view: MapView) -> str:
     counts = view.counts()
-    names = ("runs", "keyframes", "observations", "objects", "places")
-    text = ", ".join(_number(counts[name], name) for name in names)
+    words = ("run", "keyframe", "observation", "object", "place")
+    text = ", ".join(counted(counts[f"{word}s"], word) for word in words)
     rare = {
         "noise": "{} in no place",
         "duplicates": "{} seen twice",
@@ -28,15 +30,11 @@ def _counts(view: MapView) -> str:
         "det_ids_reused": "{} left out for a det_id used before",
         "foreign_embeddings": "{} of another embedding space",
     }
-    things = {"det_ids_reused": "observations", "foreign_embeddings": "observations"}
-    for key, words in rare.items():
+    things = {"det_ids_reused": "observation", "foreign_embeddings": "observation"}
+    for key, told in rare.items():
         if counts[key]:
-            text += ", " + words.format(_number(counts[key], things.get(key, "keyframes")))
+            text += ", " + told.format(counted(counts[key], things.get(key, "keyframe")))
     return text
-
-
-def _number(count: int, plural: str) -> str:
-    return f"{count} {plural if count != 1 else plural.removesuffix('s')}"
 
 
 def _settings(settings: Settings) -> str:

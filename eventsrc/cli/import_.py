@@ -25,6 +25,7 @@ from eventsrc.importers import (
 )
 from eventsrc.importers.record import Source
 from eventsrc.log import LogWriter
+from eventsrc.words import counted
 
 from ._shell import emit, finish, people, say
 
@@ -56,7 +57,7 @@ def import_(
 
 
 def _summary(log: Path, report: ImportReport) -> str:
-    parts = [f"imported {report.accepted} envelopes into {log}"]
+    parts = [f"imported {counted(report.accepted, 'envelope')} into {log}"]
     if report.next_offset > report.first_offset:
         parts.append(f"offsets {report.first_offset} to {report.next_offset - 1}")
     if report.system:

@@ -20,6 +20,7 @@ from eventsrc.log import (
     verify_log,
 )
 from eventsrc.log.whence import resolve, resolve_start
+from eventsrc.words import counted
 
 from ._event_text import event_document, event_line, iso_time
 from ._shell import emit, emit_lines, finish, say
@@ -66,7 +67,9 @@ def _info_text(report: LogInfo) -> str:
 
 def _segment_text(segment: SegmentInfo) -> str:
     state = "sealed" if segment.sealed else "active"
-    return f"{segment.name}: {segment.events} events, {segment.size_bytes:,} bytes, {state}"
+    return (
+        f"{segment.name}: {counted(segment.events, 'event')}, {segment.size_bytes:,} bytes, {state}"
+    )
 
 
 def _span(first_ns: int, last_ns: int) -> str:
@@ -127,8 +130,9 @@ def verify(log: LogArgument, json_: JsonOption = False) -> None:
     else:
         for finding in result.findings:
             sys.stdout.write(f"{_finding_text(finding)}\n")
-    size = f"{result.events} events in {result.segments} segments, {result.size_bytes:,} bytes"
-    say(f"{log}: {size}: {f'{len(result.findings)} findings' if result.findings else 'all good'}")
+    size = f"{counted(result.events, 'event')} in {counted(result.segments, 'segment')}"
+    found = counted(len(result.findings), "finding") if result.findings else "all good"
+    say(f"{log}: {size}, {result.size_bytes:,} bytes: {found}")
     finish(findings=bool(result.findings))
 
 

@@ -11,6 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from eventsrc.cli._shell import emit, people, say
 from eventsrc.log import LogReader
 from eventsrc.log.whence import resolve
+from eventsrc.words import counted
 from projections.runner import RebuildProgress, RebuildReport, rebuild
 from projections.sink import SinkName
 from projections.sinks.loader import LoaderName
@@ -106,14 +107,12 @@ def _tell(log: Path, report: RebuildReport) -> None:
     rows = sum(report.rows.values())
     rate = report.events / report.total_s if report.total_s else 0.0
     say(
-        f"{log}: {report.events} events, {rows} rows in {report.total_s:.2f} s"
-        f" ({rate:,.0f} events/s); digest {report.digest[:16]}"
+        f"{log}: {counted(report.events, 'event')}, {counted(rows, 'row')}"
+        f" in {report.total_s:.2f} s ({rate:,.0f} events/s); digest {report.digest[:16]}"
     )
     counts = report.counts
-    say(
-        f"{counts['runs']} runs, {counts['keyframes']} keyframes, {counts['observations']}"
-        f" observations, {counts['objects']} objects, {counts['places']} places"
-    )
+    words = ("run", "keyframe", "observation", "object", "place")
+    say(", ".join(counted(counts[f"{word}s"], word) for word in words))
     if report.hnsw is not None:
         say(f"vector search: {report.hnsw.reason}")
 

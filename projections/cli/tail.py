@@ -13,6 +13,7 @@ import typer
 
 from eventsrc.cli._shell import emit, finish, say
 from eventsrc.endpoints import parse_address
+from eventsrc.words import counted
 from projections.runner import TailProgress, TailReport, tail
 
 from ._options import (
@@ -101,7 +102,8 @@ def _complain(what: str, progress: TailProgress) -> None:
 
 def _tell(report: TailReport) -> None:
     say(
-        f"{report.events} events written in {report.batches} batches; the databases are at offset"
+        f"{counted(report.events, 'event')} written in {report.batches}"
+        f" {'batch' if report.batches == 1 else 'batches'}; the databases are at offset"
         f" {report.next_offset}"
     )
     for letter in report.parked:

@@ -10,10 +10,10 @@ from eventsrc.cli._shell import emit, say
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 from eventsrc.log.whence import resolve
+from eventsrc.words import counted
 from projections.evaluate.truth import read_truth
 from projections.timetravel import Timeline
 from projections.timetravel.alternatives import alternatives, assigned
-from projections.timetravel.story import counted
 from projections.timetravel.text import whatif_text
 from projections.timetravel.whatif import WhatIf, what_if
 

@@ -2,11 +2,12 @@
 
 from collections.abc import Iterator
 
+from eventsrc.words import counted
 from projections.exact import Q40, mean_m
 
 from .history import History
 from .lives import ObjectLife, count_before, last_before
-from .story import Entry, Story, counted, passed_mark, place_name, spot
+from .story import Entry, Story, passed_mark, place_name, spot
 
 
 def object_story(history: History, det_ids: list[str], life: ObjectLife, end: int) -> Story:

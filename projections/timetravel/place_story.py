@@ -3,12 +3,13 @@
 from collections import Counter
 from collections.abc import Iterator
 
+from eventsrc.words import counted
 from projections.exact import mean_m
 
 from .history import History
 from .links import reason
 from .lives import Merge, PlaceLife
-from .story import Entry, Story, counted, keyframe_name, passed_mark, place_name, spot
+from .story import Entry, Story, keyframe_name, passed_mark, place_name, spot
 
 MOST_FOUNDERS = 6
 """Founding members named; a place is founded by few, but one event may pull in many."""

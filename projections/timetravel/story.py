@@ -62,11 +62,6 @@ def spot(pose: Pose | None) -> str:
     return f"({pose.x_um / 1e6:.2f}, {pose.y_um / 1e6:.2f})"
 
 
-def counted(number: int, word: str) -> str:
-    """``1 keyframe``, ``2 keyframes``."""
-    return f"{number:,} {word}" if number == 1 else f"{number:,} {word}s"
-
-
 def listed(names: Sequence[str]) -> str:
     """``a``, ``a and b``, ``a, b and c``."""
     return " and ".join(part for part in (", ".join(names[:-1]), names[-1]) if part)

@@ -3,9 +3,9 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from eventsrc.words import counted
 from projections.timetravel.difference import Difference, object_shift_m, place_shift_m
 from projections.timetravel.rows import ObjectRow, PlaceRow
-from projections.timetravel.story import counted
 
 from .table import shortened
 

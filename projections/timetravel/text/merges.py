@@ -2,11 +2,12 @@
 
 from collections.abc import Sequence
 
+from eventsrc.words import counted
 from projections.timetravel.history import History
 from projections.timetravel.links import reason
 from projections.timetravel.lives import EdgeChange, Merge
 from projections.timetravel.merge_story import HEADER, merge_row
-from projections.timetravel.story import counted, place_name
+from projections.timetravel.story import place_name
 
 from .table import shortened, table
 
