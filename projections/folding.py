@@ -15,6 +15,7 @@ from eventsrc.upcast import read_envelopes
 from .deltas import Delta
 from .errors import FoldError
 from .exact import Units, unit_vectors
+from .geometry import Neighbourhood
 from .reducers.semantic_map import SemanticMap
 from .settings import Settings
 from .snapshot import SnapshotCache
@@ -99,9 +100,11 @@ def fold_log(
     until: int | None = None,
     *,
     keep_embeddings: bool = True,
+    neighbourhood: Neighbourhood | None = None,
 ) -> tuple[SemanticMap, MapView]:
     """Fold the first ``until`` events of a log, all of them for None."""
-    semantic_map, view = SemanticMap(settings), MapView(settings, keep_embeddings=keep_embeddings)
+    semantic_map = SemanticMap(settings, neighbourhood)
+    view = MapView(settings, keep_embeddings=keep_embeddings)
     _fold_on(reader, semantic_map, view, until)
     return semantic_map, view
 
@@ -112,15 +115,16 @@ def fold_log_cached(
     until: int | None = None,
     *,
     note: Callable[[str], None] = lambda _: None,
+    neighbourhood: Neighbourhood | None = None,
 ) -> tuple[SemanticMap, MapView]:
     """`fold_log` without embeddings, from the nearest snapshot beside the log, and leaving one.
 
     ``note`` is told of snapshots that could not be used or kept; the result is the same.
     """
     end = reader.next_offset if until is None else min(until, reader.next_offset)
-    cache = SnapshotCache(reader.path, reader.log_id, settings, note)
+    cache = SnapshotCache(reader.path, reader.log_id, settings, note, neighbourhood)
     semantic_map, view = cache.latest(end) or (
-        SemanticMap(settings),
+        SemanticMap(settings, neighbourhood),
         MapView(settings, keep_embeddings=False),
     )
     start = semantic_map.next_offset

@@ -11,10 +11,14 @@ from .deltas import Pose
 class Neighbourhood:
     """``holds(a, b)`` says whether two poses are neighbours.
 
-    It must be symmetric, pure, and false beyond ``reach_um`` in x or y. A pose is its own
-    neighbour whatever it says.
+    It must be symmetric and pure. It is asked only for two poses that differ by at most
+    ``reach_um`` in x and in y; others are none, and a pose is its own neighbour whatever it says.
+
+    ``name`` stands for all of it in `Settings.neighbourhood`, and so in the fingerprint: a rule
+    that would say otherwise of any two poses needs another name.
     """
 
+    name: str
     reach_um: int
     holds: Callable[[Pose, Pose], bool]
 

@@ -30,10 +30,14 @@ class Settings(BaseModel):
     """The map's embedding model; None takes that of the first embedded detection."""
     embedding_dim: Annotated[int, Field(ge=1, le=16_000)] | None = None
     """The map's embedding dimension; None takes that of the first embedded detection."""
+    neighbourhood: str | None = None
+    """The name of the `projections.geometry.Neighbourhood` that takes the place of plain distance,
+    and of ``eps_m``. A rule is code: only a program can give one, no command."""
 
     def fingerprint(self) -> str:
         """16 hex digits that are equal exactly when every setting is."""
-        canonical = self.model_dump_json()
+        plain = {"neighbourhood"} if self.neighbourhood is None else None
+        canonical = self.model_dump_json(exclude=plain)  # as it was before there was the setting
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
     def with_assignments(self, assignments: Iterable[str]) -> "Settings":
@@ -47,8 +51,8 @@ class Settings(BaseModel):
             name = name.strip()
             if not equals:
                 raise SettingsError(f"--set {text}: write it as name=value, such as eps_m=1.0")
-            if name not in values:
-                names = ", ".join(sorted(values))
+            if name not in values or name == "neighbourhood":
+                names = ", ".join(sorted(values.keys() - {"neighbourhood"}))
                 raise SettingsError(f"--set {text}: no setting {name!r}; there are {names}")
             values[name] = None if value.strip() in ("", "none") else value.strip()
         try:

@@ -41,7 +41,8 @@ class Folded:
         cls, settings: Settings | None = None, neighbourhood: Neighbourhood | None = None
     ) -> "Folded":
         """Nothing folded yet."""
-        settings = settings or Settings()
+        named = None if neighbourhood is None else neighbourhood.name
+        settings = (settings or Settings()).model_copy(update={"neighbourhood": named})
         return cls(SemanticMap(settings, neighbourhood), MapView(settings), [])
 
     def take(self, documents: Iterable[dict[str, Any]]) -> "Folded":

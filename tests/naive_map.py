@@ -12,6 +12,7 @@ import math
 import struct
 import zlib
 from collections import Counter
+from collections.abc import Callable
 from fractions import Fraction
 from itertools import pairwise
 from typing import Any
@@ -19,6 +20,9 @@ from typing import Any
 from .folds import NaivePlaces, near_matrix
 
 Q40 = 2**40
+
+Posed = tuple[int, int, float]
+Rule = Callable[[Posed, Posed], bool]
 
 
 def micrometres(metres: float) -> int:
@@ -43,10 +47,14 @@ def cosine_q40(members: list[list[int]], unit: list[int]) -> int:
 
 
 class NaiveMap:
-    """Feed it documents; ask for the map's digest and what was left out."""
+    """Feed it documents; ask for the map's digest and what was left out.
 
-    def __init__(self, settings: dict[str, Any]) -> None:
+    ``rule`` takes the place of plain distance; it is asked for two (x_um, y_um, yaw).
+    """
+
+    def __init__(self, settings: dict[str, Any], rule: Rule | None = None) -> None:
         self.settings = settings
+        self.rule = rule or self._is_within_eps
         self.space = None, settings.get("embedding_dim")
         self.is_space_decided = False
         self.runs: dict[str, list[float]] = {}
@@ -84,14 +92,13 @@ class NaiveMap:
     def _cluster(self, pose: tuple[int, int] | None) -> None:
         if pose is None:
             return
-        points = [k["pose"] for k in self.keyframes if k["pose"] is not None]
+        points = [(*k["pose"], k["yaw"]) for k in self.keyframes if k["pose"] is not None]
+        near = near_matrix(len(points), lambda i, j: self.rule(points[i], points[j]))
+        self.places.add(near)
+
+    def _is_within_eps(self, a: Posed, b: Posed) -> bool:
         eps = micrometres(self.settings["eps_m"])
-
-        def is_near(i: int, j: int) -> bool:
-            (ax, ay), (bx, by) = points[i], points[j]
-            return (ax - bx) ** 2 + (ay - by) ** 2 <= eps**2
-
-        self.places.add(near_matrix(len(points), is_near))
+        return (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 <= eps**2
 
     def _observe(
         self, keyframe: dict[str, Any], det_id: str, name: str, model: Any, raw: Any, rest: Any

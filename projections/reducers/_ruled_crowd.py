@@ -60,8 +60,13 @@ class RuledCrowd:
         return (self.x[a] - self.x[b]) ** 2 + (self.y[a] - self.y[b]) ** 2
 
     def are_neighbours(self, a: int, b: int) -> bool:
-        """True when the rule holds for the two."""
-        return self._rule.holds(self._poses[a], self._poses[b])
+        """True when the two are within the rule's reach and it holds for them."""
+        reach_um = self._rule.reach_um
+        return (
+            abs(self.x[a] - self.x[b]) <= reach_um
+            and abs(self.y[a] - self.y[b]) <= reach_um
+            and self._rule.holds(self._poses[a], self._poses[b])
+        )
 
     def cores_around(self, point: int) -> Iterator[tuple[int, None]]:
         """Each core point among the point's neighbours; see `_crowd.Crowd.cores_around`."""

@@ -31,6 +31,7 @@ from projections.deltas import (
     Pose,
     RunSeen,
 )
+from projections.errors import SettingsError
 from projections.exact import Units, metres_to_um, unit_vectors
 from projections.geometry import Neighbourhood
 from projections.settings import Settings
@@ -54,10 +55,12 @@ class SemanticMap:
     """The fold's state. `fold` changes it in place and is otherwise pure.
 
     ``next_offset`` is one past the last event folded or skipped. Another ``neighbourhood`` than
-    plain distance is the caller's to name beside the settings: it is not in their fingerprint.
+    plain distance must be the one that the settings name, so that whatever is kept under their
+    fingerprint (a snapshot, a checkpoint) is of that rule and no other. Raises SettingsError.
     """
 
     def __init__(self, settings: Settings, neighbourhood: Neighbourhood | None = None) -> None:
+        _check_named(settings, neighbourhood)
         self.settings = settings
         self.next_offset = 0
         self.seen = Seen()
@@ -241,6 +244,16 @@ class SemanticMap:
             )
             deltas += fused
             self.located_in.object_seen(fused[-1].object, keyframe, place)
+
+
+def _check_named(settings: Settings, neighbourhood: Neighbourhood | None) -> None:
+    given = None if neighbourhood is None else neighbourhood.name
+    if given != settings.neighbourhood:
+        raise SettingsError(
+            f"the settings name the neighbourhood {settings.neighbourhood!r}, the fold was given "
+            f"{given!r}; write SemanticMap(Settings(neighbourhood=rule.name), rule), "
+            "or neither for plain distance"
+        )
 
 
 def _pose(accepted: Accepted) -> Pose | None:

@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+from projections.geometry import Neighbourhood
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 from projections.view import MapView
@@ -24,11 +25,20 @@ _KEEP = 6
 class SnapshotCache:
     """Snapshots of one log under one set of settings. ``note`` is told what could not be used."""
 
-    def __init__(self, log: Path, log_id: str, settings: Settings, note: Note) -> None:
+    def __init__(
+        self,
+        log: Path,
+        log_id: str,
+        settings: Settings,
+        note: Note,
+        neighbourhood: Neighbourhood | None = None,
+    ) -> None:
         self.folder = log.with_name(f"{log.name}.snapshots")
         self._log_id = log_id
         self._settings = settings
         self._note = note
+        self._neighbourhood = neighbourhood
+        self._unsound: set[Path] = set()
 
     def offsets(self) -> list[int]:
         """The offsets there are snapshots for, ascending."""
@@ -44,22 +54,25 @@ class SnapshotCache:
         for offset in reversed([offset for offset in self.offsets() if offset <= until]):
             path = self._path(offset)
             try:
-                found = restore(path.read_bytes(), self._settings, self._log_id)
+                data = path.read_bytes()
+                found = restore(data, self._settings, self._log_id, self._neighbourhood)
             except (OSError, SnapshotRefused) as error:
                 self._note(f"{path}: this snapshot is not used: {error}; it is safe to delete")
+                self._unsound.add(path)
                 continue
             if found[0].next_offset == offset:
                 return found
             self._note(f"{path}: this snapshot is of another offset; it is safe to delete")
+            self._unsound.add(path)
         return None
 
     def keep(self, semantic_map: SemanticMap, view: MapView) -> None:
-        """Put a snapshot down for the map's offset, unless there is one."""
+        """Put a snapshot down for the map's offset, unless there is one that may be sound."""
         path = self._path(semantic_map.next_offset)
         beside = path.with_suffix(f".{os.getpid()}.part")
         try:
             self.folder.mkdir(exist_ok=True)
-            if not path.exists():
+            if not path.exists() or path in self._unsound:
                 beside.write_bytes(snapshot(semantic_map, view, self._log_id))
                 beside.replace(path)
                 self._thin_out()

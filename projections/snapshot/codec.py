@@ -3,6 +3,7 @@
 import zlib
 from typing import Any
 
+from projections.geometry import Neighbourhood
 from projections.reducers._state import part, prefixed
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
@@ -34,9 +35,12 @@ def snapshot(semantic_map: SemanticMap, view: MapView, log_id: str) -> bytes:
     )
 
 
-def restore(data: bytes, settings: Settings, log_id: str) -> tuple[SemanticMap, MapView]:
+def restore(
+    data: bytes, settings: Settings, log_id: str, neighbourhood: Neighbourhood | None = None
+) -> tuple[SemanticMap, MapView]:
     """The fold and the view of `snapshot`, the view without embeddings. Raises SnapshotRefused."""
-    semantic_map, view = SemanticMap(settings), MapView(settings, keep_embeddings=False)
+    semantic_map = SemanticMap(settings, neighbourhood)
+    view = MapView(settings, keep_embeddings=False)
     try:
         state = unpack(data)
         _check(part("about", state), settings, log_id)
@@ -44,9 +48,9 @@ def restore(data: bytes, settings: Settings, log_id: str) -> tuple[SemanticMap, 
         load_view(view, part("view", state))
     except (NotAContainer, zlib.error) as error:
         raise SnapshotRefused(str(error)) from None
-    except (KeyError, IndexError, TypeError, ValueError) as error:
-        if isinstance(error, SnapshotRefused):
-            raise
+    except SnapshotRefused:
+        raise
+    except (LookupError, TypeError, AttributeError, ValueError, OverflowError) as error:
         raise SnapshotRefused(f"its content does not fit together: {error!r}") from None
     return semantic_map, view
 

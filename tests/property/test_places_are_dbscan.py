@@ -105,8 +105,29 @@ def _wall(a: Pose, b: Pose) -> bool:
 def test_any_symmetric_predicate_equals_batch_dbscan(points, least, rule) -> None:
     poses = [Pose(*point) for point in points]
     matrix = near_matrix(len(points), lambda i, j: rule(poses[i], poses[j]))
-    places = Places(RuledCrowd(Neighbourhood(EPS_UM, rule), least))
+    places = Places(RuledCrowd(Neighbourhood("test", EPS_UM, rule), least))
     check_every_prefix(places, points, matrix, least)
+
+
+@given(data=st.data(), count=st.integers(0, 14), least=st.integers(1, 5))
+def test_any_relation_at_all_equals_batch_dbscan(data: st.DataObject, count: int, least) -> None:
+    """Who is near whom is drawn, pair by pair; only the reach is geometry. The yaw is a name."""
+    pairs = [(i, j) for j in range(count) for i in range(j)]
+    related = data.draw(st.sets(st.sampled_from(pairs))) if pairs else set()
+    spots = data.draw(st.lists(_lattice(EPS_UM, 1), min_size=count, max_size=count))
+    points = [(x, y, float(i)) for i, (x, y, _) in enumerate(spots)]
+
+    def holds(a: Pose, b: Pose) -> bool:
+        i, j = sorted((int(a.yaw_rad), int(b.yaw_rad)))
+        return (i, j) in related
+
+    def is_near(i: int, j: int) -> bool:
+        (ax, ay, _), (bx, by, _) = points[i], points[j]
+        is_in_reach = max(abs(ax - bx), abs(ay - by)) <= EPS_UM
+        return is_in_reach and tuple(sorted((i, j))) in related
+
+    places = Places(RuledCrowd(Neighbourhood("drawn", EPS_UM, holds), least))
+    check_every_prefix(places, points, near_matrix(count, is_near), least)
 
 
 @given(points=POINTS, least=st.integers(1, 6))
@@ -117,7 +138,7 @@ def test_both_crowds_tell_the_same_story(points: list[Point], least: int) -> Non
         return (a.x_um - b.x_um) ** 2 + (a.y_um - b.y_um) ** 2 <= EPS_UM**2
 
     plain = Places(Crowd(EPS_UM, least))
-    ruled = Places(RuledCrowd(Neighbourhood(EPS_UM, holds), least))
+    ruled = Places(RuledCrowd(Neighbourhood("test", EPS_UM, holds), least))
     for n, (x, y, yaw) in enumerate(points):
         one = plain.fold(n, n, 0, "r", x, y, yaw)
         other = ruled.fold(n, n, 0, "r", x, y, yaw)
@@ -133,7 +154,7 @@ def test_both_crowds_tell_the_same_story(points: list[Point], least: int) -> Non
 def test_a_link_is_of_a_fresh_core_point_and_an_older_one_of_the_absorbed_place(
     points: list[Point], least: int, is_ruled: bool
 ) -> None:
-    rule = Neighbourhood(EPS_UM, _alike)
+    rule = Neighbourhood("test", EPS_UM, _alike)
     places = Places(RuledCrowd(rule, least) if is_ruled else Crowd(EPS_UM, least))
     for n, (x, y, yaw) in enumerate(points):
         cores = {i for i in range(n) if places.crowd.is_core(i)}

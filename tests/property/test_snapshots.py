@@ -7,8 +7,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.deltas import Delta
+from projections.deltas import Delta, Pose
 from projections.digest import map_digest
+from projections.geometry import Neighbourhood
 from projections.settings import Settings
 from projections.snapshot import restore, snapshot
 from projections.snapshot.container import unpack
@@ -25,14 +26,24 @@ def _lists(state: dict[str, Any]) -> dict[str, Any]:
     return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in state.items()}
 
 
-@given(documents=runs(), cut=st.integers(0, 45), least=st.sampled_from([1, 2, 3, 5]))
+def _same_side(a: Pose, b: Pose) -> bool:
+    return (a.x_um < 2_500_000) == (b.x_um < 2_500_000)
+
+
+@given(
+    documents=runs(),
+    cut=st.integers(0, 45),
+    least=st.sampled_from([1, 2, 3, 5]),
+    rule=st.sampled_from([None, Neighbourhood("same side", 800_000, _same_side)]),
+)
 def test_restore_then_fold_is_fold_from_the_start(
-    documents: list[dict[str, Any]], cut: int, least: int
+    documents: list[dict[str, Any]], cut: int, least: int, rule: Neighbourhood | None
 ) -> None:
     settings = Settings(**{**SETTINGS, "min_samples": least})
-    whole = Folded.start(settings).take(documents)
-    begun = Folded.start(settings).take(documents[:cut])
-    again = Folded(*restore(snapshot(begun.map, begun.view, "log"), settings, "log"), [])
+    whole = Folded.start(settings, rule).take(documents)
+    begun = Folded.start(settings, rule).take(documents[:cut])
+    data = snapshot(begun.map, begun.view, "log")
+    again = Folded(*restore(data, begun.view.settings, "log", rule), [])
     again.take(documents[cut:])
     assert [list(map(_plain, d)) for d in again.deltas] == [
         list(map(_plain, d)) for d in whole.deltas[cut:]

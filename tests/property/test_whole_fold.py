@@ -6,11 +6,13 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
+from projections.deltas import Pose
 from projections.digest import map_digest
+from projections.geometry import Neighbourhood
 from projections.settings import Settings
 from tests.envelopes import detection, envelope
 from tests.folds import Folded
-from tests.naive_map import NaiveMap
+from tests.naive_map import NaiveMap, Posed
 
 LOOKS = [[1, 0, 0], [1, 1, 0], [3, 4, 0], [0, 1, 2], [-1, 0.3, 1e-3], [1e-30, 2e-30, 0], [1, 2]]
 
@@ -48,9 +50,20 @@ def _document(rng: random.Random) -> dict[str, Any]:
         look = rng.choice(LOOKS) if rng.random() < 0.9 else None
         detections.append(detection(rng.choice(["cup", "chair"]), look, **more))
     x = None if rng.random() < 0.1 else rng.randrange(0, 17) * 0.25 + rng.choice([0.0, 1e-7, 0.1])
-    y = rng.randrange(0, 4) * 0.25
-    fields = {"run_id": run, "timestamp": rng.choice([1.0, 2.5, 1e9 + rng.random()])}
+    y, yaw = rng.randrange(0, 4) * 0.25, rng.choice([0.0, 1.0, 2.0])
+    fields: dict[str, Any] = {"run_id": run, "timestamp": rng.choice([1.0, 2.5, 1e9])}
+    if x is not None:
+        fields["map_yaw"] = yaw
     return envelope(number, x, y, detections=detections, **fields)
+
+
+def _facing(a: Pose, b: Pose) -> bool:
+    """On one side of a wall, or looking the same way."""
+    return (a.x_um < 2_000_000) == (b.x_um < 2_000_000) or a.yaw_rad == b.yaw_rad
+
+
+def _naive_facing(a: Posed, b: Posed) -> bool:
+    return max(abs(a[0] - b[0]), abs(a[1] - b[1])) <= 600_000 and _facing(Pose(*a), Pose(*b))
 
 
 @given(world=worlds())
@@ -58,7 +71,19 @@ def test_after_every_event_the_digest_is_that_of_the_naive_map(
     world: tuple[dict[str, Any], list[dict[str, Any]]],
 ) -> None:
     settings, documents = world
-    folded, naive = Folded.start(Settings(**settings)), NaiveMap(settings)
+    check_every_prefix(Folded.start(Settings(**settings)), NaiveMap(settings), documents)
+
+
+@given(world=worlds())
+def test_and_so_it_is_under_another_neighbourhood(
+    world: tuple[dict[str, Any], list[dict[str, Any]]],
+) -> None:
+    settings, documents = world
+    folded = Folded.start(Settings(**settings), Neighbourhood("facing", 600_000, _facing))
+    check_every_prefix(folded, NaiveMap(settings, _naive_facing), documents)
+
+
+def check_every_prefix(folded: Folded, naive: NaiveMap, documents: list[dict[str, Any]]) -> None:
     for document in documents:
         folded.take([document])
         naive.fold(document)

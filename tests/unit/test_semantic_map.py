@@ -15,6 +15,8 @@ import pytest
 
 from projections.deltas import EventSkipped, KeyframeAdded, ObjectFound, ObservationAdded, RunSeen
 from projections.digest import map_digest
+from projections.errors import SettingsError
+from projections.geometry import Neighbourhood
 from projections.reducers.landmarks import object_id
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
@@ -171,6 +173,18 @@ def test_the_deltas_of_a_keyframe_come_in_the_order_of_the_contract() -> None:
         "ObjectSeen",
         "ObjectMoved",
     ]
+
+
+def test_a_fold_does_not_begin_by_another_neighbourhood_than_its_settings_name() -> None:
+    rule = Neighbourhood("walls", 1_000_000, lambda _a, _b: True)
+    for settings, given in (
+        (Settings(), rule),
+        (Settings(neighbourhood="walls"), None),
+        (Settings(neighbourhood="doors"), rule),
+    ):
+        with pytest.raises(SettingsError, match=r"name the neighbourhood .*rule\.name"):
+            SemanticMap(settings, given)
+    assert SemanticMap(Settings(neighbourhood="walls"), rule).next_offset == 0
 
 
 def test_skip_passes_over_an_offset_and_changes_nothing() -> None:

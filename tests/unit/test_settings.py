@@ -38,3 +38,18 @@ def test_the_fingerprint_tells_settings_apart() -> None:
     settings = [Settings(), Settings(eps_m=1.0), Settings(min_samples=4), Settings(embedding_dim=4)]
     assert len({s.fingerprint() for s in settings}) == len(settings)
     assert Settings(eps_m=1.5).fingerprint() == Settings().fingerprint()
+
+
+def test_a_neighbourhood_by_name_changes_the_fingerprint_and_none_leaves_it_as_it_ever_was() -> (
+    None
+):
+    """The first two were in checkpoints before the setting was there."""
+    assert Settings().fingerprint() == "4bd37ebd4fe729af"
+    assert Settings(eps_m=0.75, min_samples=8).fingerprint() == "9356e0fc03e32754"
+    rules = [None, "same side", "same side, 2 m"]
+    assert len({Settings(neighbourhood=rule).fingerprint() for rule in rules}) == len(rules)
+
+
+def test_no_command_can_name_a_neighbourhood() -> None:
+    with pytest.raises(SettingsError, match="no setting 'neighbourhood'"):
+        Settings().with_assignments(["neighbourhood=walls"])

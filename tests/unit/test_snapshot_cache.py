@@ -1,15 +1,18 @@
 """The cache beside a log: used when sound, passed over with a note when not."""
 
+import contextlib
 import zlib
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from eventsrc.log import LogReader, LogWriter
 from projections import folding
 from projections.digest import map_digest
 from projections.folding import fold_log, fold_log_cached
+from projections.geometry import Neighbourhood
 from projections.settings import Settings
 from projections.snapshot import SnapshotCache, SnapshotRefused, codec, restore, snapshot
 from projections.snapshot.container import MAGIC, NotAContainer, pack, unpack
@@ -90,6 +93,20 @@ def test_a_damaged_snapshot_is_passed_over_with_a_note(log: Path, damage: str) -
 
 
 @pytest.mark.usefixtures("eager")
+def test_a_damaged_snapshot_is_replaced_by_a_sound_one_of_the_same_offset(log: Path) -> None:
+    """Else it would cost a whole fold and a note for ever."""
+    notes: list[str] = []
+    _digest(log, 30, notes)
+    (path,) = _files(log)
+    path.write_bytes(path.read_bytes()[:-7])
+    assert _digest(log, 30, notes) == _plain_digest(log, 30)
+    assert len(notes) == 1
+    assert _digest(log, 30, notes) == _plain_digest(log, 30)
+    assert len(notes) == 1
+    assert _files(log) == [path]
+
+
+@pytest.mark.usefixtures("eager")
 def test_a_snapshot_of_another_log_or_version_is_passed_over(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -114,6 +131,25 @@ def test_settings_do_not_share_snapshots(log: Path) -> None:
     _digest(log, 30, notes)
     _digest(log, 30, notes, eps_m=0.3)
     assert len({path.name.partition("-")[0] for path in _files(log)}) == 2
+    assert notes == []
+
+
+@pytest.mark.usefixtures("eager")
+def test_a_snapshot_is_never_taken_for_one_of_another_neighbourhood(log: Path) -> None:
+    """Three folds of one log, by three rules, one after the other through one cache; then again."""
+    near = Neighbourhood("near", 1_000_000, lambda a, b: (a.x_um - b.x_um) ** 2 < 10**10)
+    wall = Neighbourhood("wall", 2_000_000, lambda a, b: (a.x_um < 2e6) == (b.x_um < 2e6))
+    found, notes = [], []
+    for rule in (None, near, wall, None, near, wall):
+        settings = Settings(neighbourhood=rule and rule.name)
+        with LogReader(log) as reader:
+            _, view = fold_log_cached(reader, settings, note=notes.append, neighbourhood=rule)
+            _, plain = fold_log(reader, settings, neighbourhood=rule)
+        assert map_digest(view) == map_digest(plain)
+        found.append(map_digest(view))
+    assert found[:3] == found[3:]
+    assert len(set(found)) == 3
+    assert len(_files(log)) == 3
     assert notes == []
 
 
@@ -146,14 +182,23 @@ def test_restore_refuses_other_settings() -> None:
     data = snapshot(folded.map, folded.view, "log")
     with pytest.raises(SnapshotRefused, match="other settings"):
         restore(data, Settings(eps_m=0.1), "log")
+    rule = Neighbourhood("everywhere", 1_000_000, lambda _a, _b: True)
+    with pytest.raises(SnapshotRefused, match="other settings"):
+        restore(data, Settings(neighbourhood=rule.name), "log", rule)
 
 
-def test_restore_refuses_content_that_does_not_fit_together() -> None:
+@pytest.mark.parametrize("instead", [None, 7, "x", [], [[1]], {}, 1 << 70, np.zeros((2, 2))])
+def test_restore_refuses_content_that_does_not_fit_together(instead: Any) -> None:
+    """Whatever stands in place of any value, by another hand: a refusal, or a map, but no crash."""
     folded = Folded.start().take(_documents(5))
     state = unpack(snapshot(folded.map, folded.view, "log"))
-    del state["map.places.joined"]
-    with pytest.raises(SnapshotRefused, match="does not fit together"):
-        restore(pack(state), Settings(), "log")
+    for name in state:
+        if not name.startswith("about."):
+            with contextlib.suppress(SnapshotRefused):
+                restore(pack(state | {name: instead}), Settings(), "log")
+    for name in ("map.places.joined", "map.seen.offsets", "view.keyframes"):
+        with pytest.raises(SnapshotRefused, match="does not fit together"):
+            restore(pack({k: v for k, v in state.items() if k != name}), Settings(), "log")
 
 
 def test_a_container_holds_no_objects() -> None:
