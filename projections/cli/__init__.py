@@ -1,10 +1,14 @@
 """The ``mapfold`` command: one composition root for both packages' commands.
 
 A command's module is imported when it is that command's turn: all of them together take a third of
-a second, longer than most commands work.
+a second, longer than most commands work. For the same reason start and end do without what nobody
+misses: searching for cycles among things that live as long as the process, and a pool of threads
+for matrix products too small to be shared out.
 """
 
+import gc
 import importlib
+import os
 import sys
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
@@ -63,5 +67,13 @@ def _of_several() -> None:  # without it typer takes a lone command's name for i
 
 def main() -> None:
     """Entry point of the ``mapfold`` program."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when numpy is imported
+    gc.disable()
     asked = sys.argv[1:2]
-    run_app(command_line(asked if asked and asked[0] in COMMANDS else COMMANDS))
+    program = command_line(asked if asked and asked[0] in COMMANDS else COMMANDS)
+    gc.freeze()
+    gc.enable()
+    try:
+        run_app(program)
+    finally:
+        gc.freeze()  # the interpreter would search all of it once more before it goes
