@@ -1,11 +1,11 @@
 """Embeddings that behave like CLIP's on object crops, made of named random directions.
 
 One crop's embedding is the normalised sum of weighted unit vectors: what all crops share, the
-class, the model, the instance, the side that shows, the session's light, and noise. The weights are
-roots of the shares below and were set so that cosines come out as measured on real crops (5th to
-95th percentile): same instance 0.82-0.92, same class but another instance 0.66-0.82, another class
-0.48-0.58. Class directions lie in a space of few dimensions, which is what makes some classes
-closer to each other than others.
+class, the model (the same in every house), the instance, the side that shows, the session's light,
+and noise. The weights are roots of the shares below and were set so that cosines come out as
+measured on real crops (5th to 95th percentile): same instance 0.82-0.92, same class but another
+instance 0.66-0.82, another class 0.48-0.58. Class directions lie in a space of few dimensions,
+which is what makes some classes closer to each other than others.
 
 The result is rounded to half precision, as a model run in fp16 gives it; rounding also hides the
 last bits in which C libraries differ.
@@ -21,7 +21,7 @@ from .chance import Vector, direction, normals, stream, unit
 
 DIM = 512
 MODEL_NAME = "mapfold-simulated-512"
-_CLASS_SPACE = 80
+_CLASS_SPACE = 160
 
 _SHARES = {
     "common": 0.512,

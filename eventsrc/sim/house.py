@@ -68,7 +68,7 @@ def build_house(seed: int) -> House:
         if things is not None and _grid(plan, things).joins(
             [room.rect.centre for room in plan.rooms]
         ):
-            return House(seed, plan, _numbered(things))
+            return House(seed, plan, _numbered(seed, things))
     raise MapfoldError(
         f"house {seed}: no furnishing leaves every room reachable; try another --seed"
     )
@@ -80,13 +80,16 @@ def _grid(plan: FloorPlan, things: tuple[Thing, ...]) -> DriveGrid:
     )
 
 
-def _numbered(things: tuple[Thing, ...]) -> tuple[Thing, ...]:
-    """Give instances of one model the names model-1, model-2 … in the order they were placed."""
+def _numbered(seed: int, things: tuple[Thing, ...]) -> tuple[Thing, ...]:
+    """Name instances of one model house7-model-1, house7-model-2 … in the order they were placed.
+
+    Two houses may have the same model of chair, never the same chair.
+    """
     counts: dict[str, int] = {}
     named: list[Thing] = []
     for thing in things:
         count = counts[thing.model.name] = counts.get(thing.model.name, 0) + 1
-        named.append(replace(thing, instance=f"{thing.model.name}-{count}"))
+        named.append(replace(thing, instance=f"house{seed}-{thing.model.name}-{count}"))
     return tuple(named)
 
 
