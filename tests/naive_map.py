@@ -43,7 +43,8 @@ def cosine_q40(members: list[list[int]], unit: list[int]) -> int:
     """The cosine of the members' sum and a unit vector."""
     total = [sum(column) for column in zip(*members, strict=True)]
     dot = sum(a * b for a, b in zip(total, unit, strict=True))
-    return round(dot / math.sqrt(sum(a * a for a in total) * sum(a * a for a in unit)) * Q40)
+    squares = sum(a * a for a in total) * sum(a * a for a in unit)
+    return round(dot / math.sqrt(squares) * Q40) if squares else 0
 
 
 class NaiveMap:

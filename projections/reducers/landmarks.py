@@ -14,7 +14,8 @@ An Object's position is the mean of the *robot's* poses, for lack of depth.
 The mean embedding is never rounded to a unit vector: the sum S of the unit vectors has the mean's
 direction, so the cosine with u is S·u / (|S||u|). S, S·u, |S|² and |u|² are exact integers;
 |S + u|² = |S|² + 2 S·u + |u|² keeps the norm up to date without touching S again. S·u is at most
-count · 2⁴⁰, so float64 multiplies exactly up to 2¹² observations, int64 beyond.
+count · 2⁴⁰; `projections.exact` says how it is multiplied exactly, and its bound. A sum of zero, of
+opposite looks, has no direction; its cosine with anything is 0.
 
 Every Object is listed in the nine grid cells of side ``fusion_radius_m`` around its mean, so one
 look-up finds all candidates however large the map is.
@@ -28,13 +29,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from projections.deltas import ObjectFound, ObjectSeen
-from projections.exact import Q40, metres_to_um
+from projections.exact import MAX_IN_A_SUM, MAX_IN_ONE_DOT, Q40, long_dot, metres_to_um
 
 from ._state import State
-
-MAX_OBSERVATIONS = 1 << 22
-"""Of one Object: S·u, a little over count · 2⁴⁰ at most, must stay below 2⁶³."""
-_MAX_IN_FLOAT = 1 << 12
 
 Bucket = tuple[str, int, int]
 
@@ -92,11 +89,12 @@ class Landmarks:
             dy = landmark.sum_y_um - y_um * count
             if dx * dx + dy * dy > (radius_um * count) ** 2:
                 continue
-            if count <= _MAX_IN_FLOAT:
+            if count <= MAX_IN_ONE_DOT:
                 dot = int(landmark.vector_sum.dot(vector))
             else:
-                dot = int(landmark.vector_sum.astype(np.int64).dot(vector.astype(np.int64)))
-            q40 = round(dot / math.sqrt(landmark.norm2 * norm2) * Q40)
+                dot = long_dot(landmark.vector_sum, vector)
+            # Both conversions, √ and ÷ are correctly rounded.
+            q40 = round(dot / math.sqrt(landmark.norm2 * norm2 or 1) * Q40)
             if q40 > best_q40 or (q40 == best_q40 and candidate < winner):
                 winner, best_q40, best_dot = candidate, q40, dot
         if winner < 0 or best_q40 < self._least_q40:
@@ -105,6 +103,11 @@ class Landmarks:
             )
             return self._found(offset, observation, det_id, founded)
         landmark = objects[winner]
+        if landmark.count >= MAX_IN_A_SUM:
+            raise OverflowError(
+                f"object {winner} of class {class_name!r} has {MAX_IN_A_SUM} observations, "
+                "the bound of its exact arithmetic"
+            )
         landmark.vector_sum += vector
         landmark.norm2 += 2 * best_dot + norm2
         self._update(winner, landmark, timestamp, x_um, y_um)
@@ -153,11 +156,6 @@ class Landmarks:
     def _update(
         self, ordinal: int, landmark: Landmark, timestamp: float, x_um: int, y_um: int
     ) -> None:
-        if landmark.count >= MAX_OBSERVATIONS:
-            raise OverflowError(
-                f"object {ordinal} of class {landmark.class_name!r} has {MAX_OBSERVATIONS} "
-                "observations, the bound of its exact arithmetic"
-            )
         landmark.count += 1
         landmark.sum_x_um += x_um
         landmark.sum_y_um += y_um

@@ -14,7 +14,8 @@ from tests.envelopes import detection, envelope
 from tests.folds import Folded
 from tests.naive_map import NaiveMap, Posed
 
-LOOKS = [[1, 0, 0], [1, 1, 0], [3, 4, 0], [0, 1, 2], [-1, 0.3, 1e-3], [1e-30, 2e-30, 0], [1, 2]]
+LOOKS = [[1, 0, 0], [1, 1, 0], [3, 4, 0], [0, 1, 2], [-1, 0.3, 1e-3], [1e-30, 2e-30, 0]]
+LOOKS += [[-1, 0, 0], [1, 2]]
 
 
 @st.composite

@@ -17,6 +17,7 @@ from projections.deltas import EventSkipped, KeyframeAdded, ObjectFound, Observa
 from projections.digest import map_digest
 from projections.errors import SettingsError
 from projections.geometry import Neighbourhood
+from projections.reducers import landmarks
 from projections.reducers.landmarks import object_id
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
@@ -140,13 +141,44 @@ def test_fusion_is_inclusive_at_its_radius_and_exclusive_beyond() -> None:
 
 
 def test_more_than_4096_sightings_stay_exact() -> None:
-    """Beyond 2¹² observations products move from float64 to int64; the cosine stays what it is."""
+    """Beyond 2¹² observations it takes two products; the cosine stays what it is."""
     folded = Folded.start(Settings())
     folded.take(envelope(i, 0.0, 0.0, detections=[detection(vector=[3, 4])]) for i in range(4100))
     assert folded.view.objects[0].obs_count == 4100
     assert {o.similarity_q40 for o in folded.view.observations} == {2**40}
     landmark = folded.map.landmarks.objects[0]
     assert landmark.norm2 == sum(int(v) ** 2 for v in landmark.vector_sum)
+
+
+def test_opposite_looks_leave_an_object_without_a_direction_and_the_fold_goes_on() -> None:
+    """At −1 everything fuses; the third look meets a sum of zero, whose cosine is 0."""
+    looks = [[3, 4], [-3, -4], [3, 4]]
+    documents = [
+        envelope(i, 0.0, 0.0, detections=[detection(vector=v)]) for i, v in enumerate(looks)
+    ]
+    view = fold(documents, fusion_similarity=-1.0).view
+    assert [o.similarity_q40 for o in view.observations] == [2**40, -(2**40), 0]
+    assert view.objects[0].obs_count == 3
+    view = fold(documents[:2], fusion_similarity=-0.999999).view
+    assert len(view.objects) == 2
+
+
+def test_an_object_seen_for_years_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Five million sightings of one chair, and at the very last the bound is said in words."""
+    folded = fold([envelope(0, 0.0, 0.0, detections=[detection(vector=[3, 4])])])
+    chair = folded.map.landmarks.objects[0]
+    times = 5_000_000
+    chair.vector_sum *= times
+    chair.norm2, chair.count = chair.norm2 * times**2, times
+    folded.take([envelope(1, 0.0, 0.0, detections=[detection(vector=[3, 4])])])
+    assert folded.view.objects[0].obs_count == times + 1
+    assert folded.view.observations[1].similarity_q40 == 2**40
+    assert chair.norm2 == sum(int(v) ** 2 for v in chair.vector_sum)
+    monkeypatch.setattr(landmarks, "MAX_IN_A_SUM", times + 1)
+    before = chair.vector_sum.copy()
+    with pytest.raises(OverflowError, match=r"object 0 of class 'cup' has 5000001 observations"):
+        folded.take([envelope(2, 0.0, 0.0, detections=[detection(vector=[3, 4])])])
+    assert (chair.vector_sum == before).all()
 
 
 def test_a_run_starts_with_its_earliest_keyframe_whenever_that_arrives() -> None:
