@@ -3,6 +3,11 @@
 A crash is a copy of the folder as another process would find it: the writer's uncommitted events
 are gone, and the growing file may be cut anywhere behind its last synced byte, with or without its
 last commit mark.
+
+Every step waits for the sealing it began: Hypothesis replays what it finds, and a step whose end
+depends on how far another thread has come does not replay. What readers see while a segment is
+being sealed is asked where the moment can be chosen (tests/unit/test_log_commit.py) and under load
+(tests/integration/test_log_tail.py).
 """
 
 import contextlib
@@ -62,6 +67,7 @@ class LogMachine(RuleBasedStateMachine):
     def append(self, key: str, payload: bytes, logged: int) -> None:
         assert self.writer is not None
         offset = self.writer.append(key, payload, logged_ns=logged, stamp_ns=logged // 2)
+        self.writer._sealer.finish()
         self.written.append(Event(offset, key, logged, logged // 2, payload))
         assert offset == len(self.written) - 1
         self.durable = self.writer.durable_offset  # a full segment is rotated, which commits
@@ -82,6 +88,7 @@ class LogMachine(RuleBasedStateMachine):
         assert self.durable == len(self.written)
         if rotate:
             self.writer.commit_if_due()  # rotates when the segment is full
+            self.writer._sealer.finish()
 
     @precondition(lambda self: self.writer is not None)
     @rule()
@@ -95,7 +102,6 @@ class LogMachine(RuleBasedStateMachine):
     @rule(half_written=st.booleans(), keep=st.floats(0, 1), without_mark=st.booleans())
     def crash(self, half_written: bool, keep: float, without_mark: bool) -> None:
         assert self.writer is not None
-        self.writer._sealer.finish()
         synced_bytes = self.writer._active.size
         has_commit = self.writer._active.committed > self.writer._active.base
         if half_written:

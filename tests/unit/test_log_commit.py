@@ -3,7 +3,7 @@
 import os
 import threading
 import tracemalloc
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from eventsrc.log import (
     parse_fsync,
     verify_log,
 )
+from eventsrc.log._seal import SegmentPlan, seal
 from eventsrc.log.fsync import FsyncPolicy
 from tests.fixtures_log import BY_HAND, KEY, read_log
 
@@ -111,7 +112,7 @@ def test_age_rotates_an_idle_log_but_never_an_empty_segment(log_path: Path) -> N
 def hold(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     """Sealing waits for this event."""
     may_seal = threading.Event()
-    real: Callable[..., str] = _sealer.seal
+    real: Callable[..., str] = seal
 
     def held(*args: Any) -> str:
         assert may_seal.wait(TIMEOUT_S)
@@ -138,6 +139,41 @@ def test_recording_and_reading_go_on_while_segments_are_sealed(
             writer.close()
             assert [first, *events] == read_log(log_path)
     assert not list(log_path.glob("*.active"))
+
+
+def test_a_segment_that_is_sealed_between_two_looks_is_seen(
+    log_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The reader asks for one name and then the other, and sealing exchanges them in between."""
+    real_seal: Callable[..., str] = seal
+    begun, may_seal = threading.Event(), threading.Event()
+
+    def held_at_two(plan: SegmentPlan, bodies: Iterable[bytes]) -> str:
+        if plan.base == 2:
+            begun.set()
+            assert may_seal.wait(TIMEOUT_S)
+        return real_seal(plan, bodies)
+
+    monkeypatch.setattr(_sealer, "seal", held_at_two)
+    real_exists = Path.exists
+
+    def slow(path: Path) -> bool:
+        there = real_exists(path)
+        if path.name == f"{2:020d}.mcap" and not may_seal.is_set():
+            may_seal.set()
+            writer._sealer.finish()
+        return there
+
+    with (
+        LogWriter(log_path, fsync=ALWAYS, rotate_events=1) as writer,
+        LogReader(log_path) as reader,
+    ):
+        for number in range(3):
+            writer.append(KEY, b"%d" % number)
+        assert begun.wait(TIMEOUT_S)
+        monkeypatch.setattr(Path, "exists", slow)
+        assert reader.refresh() == 3
+        assert may_seal.is_set()
 
 
 def test_a_disk_that_fails_to_sync_ends_the_writer(
