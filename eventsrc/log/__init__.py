@@ -1,6 +1,6 @@
 """The log: an append-only directory of MCAP segments, the only truth (docs/log-format.md)."""
 
-from .event import Event
+from .event import Event, NewEvent
 from .findings import Finding
 from .fsync import ALWAYS, GROUP_COMMIT, NEVER, FsyncPolicy, parse_fsync
 from .info import LogInfo, SegmentInfo, log_info
@@ -21,6 +21,7 @@ __all__ = [
     "LogInfo",
     "LogReader",
     "LogWriter",
+    "NewEvent",
     "RecoveryReport",
     "SegmentInfo",
     "SegmentRecovery",

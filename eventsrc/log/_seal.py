@@ -16,7 +16,7 @@ import hashlib
 import os
 import zlib
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -35,10 +35,10 @@ from ._mcap import (
     SummaryOffset,
 )
 from ._naming import SEALED, SEALING, segment_path
+from ._parts import Part, parts_of
 from ._sealed_file import SEAL_METADATA
 from .fsync import replace_durably, sync_file, unlink_quietly, write_all
 
-CHUNK_BYTES = 1024 * 1024
 NO_PREVIOUS = ""
 REPLACES = "replaces_sha256"
 """In the head of a recovered segment: the hash its successor knows its original by."""
@@ -56,16 +56,21 @@ class SegmentPlan:
 
 
 def seal(plan: SegmentPlan, bodies: Iterable[bytes]) -> str:
-    """Write the sealed segment from chunk bodies in offset order; its SHA-256.
-
-    Raises OSError when the disk refuses; nothing is left behind then.
-    """
+    """Write the sealed segment from chunk bodies in offset order and put it in its place; its
+    SHA-256. Raises OSError when the disk refuses; nothing is left behind then."""
     temporary = segment_path(plan.log, plan.base, SEALING)
+    sha256 = write_sealed(plan, bodies, temporary)
+    replace_durably(temporary, segment_path(plan.log, plan.base, SEALED))
+    return sha256
+
+
+def write_sealed(plan: SegmentPlan, bodies: Iterable[bytes], temporary: Path) -> str:
+    """Write it beside, synced but not yet in its place; see `seal`."""
     fd = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
     try:
         builder = _Builder(fd, plan)
-        for body in _merged(bodies):
-            builder.add_chunk(body)
+        for part in parts_of(bodies):
+            builder.add_chunk(part)
         builder.finish()
         sync_file(fd)
     except BaseException:
@@ -73,38 +78,7 @@ def seal(plan: SegmentPlan, bodies: Iterable[bytes]) -> str:
         raise
     finally:
         os.close(fd)
-    replace_durably(temporary, segment_path(plan.log, plan.base, SEALED))
     return builder.sha256.hexdigest()
-
-
-def _merged(bodies: Iterable[bytes]) -> Iterator[bytes]:
-    """Bodies joined or parted to about CHUNK_BYTES: what one flipped bit can cost, and what one
-    event takes to read."""
-    parts: list[bytes] = []
-    size = 0
-    for body in bodies:
-        for part in _parted(body):
-            parts.append(part)
-            size += len(part)
-            if size >= CHUNK_BYTES:
-                yield b"".join(parts)
-                parts, size = [], 0
-    if parts:
-        yield b"".join(parts)
-
-
-def _parted(body: bytes) -> Iterator[bytes]:
-    """A large body in several, each led by the same channel records."""
-    if len(body) < 2 * CHUNK_BYTES:
-        yield body
-        return
-    channels = _mcap.encode_all(_mcap.definitions(body)[1])
-    start, lead = 0, b""
-    for *_, end in _mcap.walk(body):
-        if end - start >= CHUNK_BYTES and end < len(body):
-            yield lead + body[start:end]
-            start, lead = end, channels
-    yield lead + body[start:]
 
 
 class _Builder:
@@ -115,6 +89,7 @@ class _Builder:
         self._at = 0
         self._crc = 0
         self.sha256 = hashlib.sha256()
+        self._squeeze = _mcap.compressor()
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._counts: dict[int, int] = defaultdict(int)
@@ -137,29 +112,24 @@ class _Builder:
         self._crc = zlib.crc32(data, self._crc)
         self.sha256.update(data)
 
-    def add_chunk(self, body: bytes) -> None:
+    def add_chunk(self, part: Part) -> None:
         """One chunk and the index of its messages."""
-        schemas, channels = _mcap.definitions(body)
+        schemas, channels = _mcap.definitions(part.definitions)
         self._schemas.update((s.id, s) for s in schemas)
         self._channels.update((c.id, c) for c in channels)
-        entries: dict[int, list[int]] = defaultdict(list)
-        log_ns: list[int] = []
-        stamp_ns: list[int] = []
-        for channel_id, _, log, publish, payload_at, _ in _mcap.walk(body):
-            entries[channel_id] += (log, payload_at - 31)
-            log_ns.append(log)
-            stamp_ns.append(publish)
-        self._edges.append(self._edges[-1] + len(log_ns))
-        self._log_ns += (min(log_ns), max(log_ns))
-        self._stamp_ns += (min(stamp_ns), max(stamp_ns))
+        self._edges.append(self._edges[-1] + len(part.log_ns))
+        first_ns, last_ns = min(part.log_ns), max(part.log_ns)
+        self._log_ns += (first_ns, last_ns)
+        self._stamp_ns += (min(part.stamp_ns), max(part.stamp_ns))
+        entries = part.entries()
         for channel_id, flat in entries.items():
             self._counts[channel_id] += len(flat) // 2
-        self._write_chunk(body, min(log_ns), max(log_ns), entries)
+        self._write_chunk(part.body, first_ns, last_ns, entries)
 
     def _write_chunk(
         self, body: bytes, first_ns: int, last_ns: int, entries: dict[int, list[int]]
     ) -> None:
-        chunk = _mcap.encode_chunk(body, first_ns, last_ns)
+        chunk = _mcap.encode_chunk(self._squeeze, body, first_ns, last_ns)
         start = self._at
         self._write(chunk)
         indexes_at = self._at

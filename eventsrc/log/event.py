@@ -1,6 +1,7 @@
-"""One event as it stands in a log."""
+"""One event as it stands in a log, and as it comes to one."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from eventsrc.envelope import ENVELOPE_VERSION
 
@@ -20,4 +21,14 @@ class Event:
     logged_ns: int
     stamp_ns: int
     payload: bytes
+    version: int = ENVELOPE_VERSION
+
+
+class NewEvent(NamedTuple):
+    """What an `Event` is before the log gives it an offset."""
+
+    key: str
+    payload: bytes
+    logged_ns: int
+    stamp_ns: int
     version: int = ENVELOPE_VERSION

@@ -8,6 +8,7 @@ never called recorded, and the next writer goes on behind the last good event.
 import contextlib
 import time
 import uuid
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 
@@ -16,10 +17,12 @@ from eventsrc.envelope import ENVELOPE_VERSION
 from eventsrc.errors import LogError, MapfoldError, NotALog
 
 from ._active import ActiveSegment
+from ._commits import Commits, OverlappedCommits
 from ._lock import WriterLock
 from ._naming import LOCK, leftovers, list_segments
 from ._restart import Restart, restart
 from ._sealer import Sealer
+from .event import NewEvent
 from .fsync import GROUP_COMMIT, FsyncPolicy, unlink_quietly
 
 ROTATE_BYTES = 64 * 1024 * 1024
@@ -30,7 +33,13 @@ _MAX_NS = 2**63
 
 class LogWriter:
     """A context manager; creates the log if there is none, takes its lock, recovers what a
-    predecessor left. Raises LogBusy, NotALog, LogDamaged or LogError."""
+    predecessor left. Raises LogBusy, NotALog, LogDamaged or LogError.
+
+    ``overlap`` is for much at once. A thread beside the caller's then writes and syncs one group
+    while the next is taken, so `durable_offset` moves by itself and an error shows with one of the
+    next calls (but not under ``always``, which syncs before `append` returns); and segments are
+    sealed in a process of their own.
+    """
 
     def __init__(
         self,
@@ -41,6 +50,7 @@ class LogWriter:
         rotate_bytes: int = ROTATE_BYTES,
         rotate_events: int = ROTATE_EVENTS,
         rotate_seconds: float = ROTATE_SECONDS,
+        overlap: bool = False,
     ) -> None:
         self.path = path
         self._fsync = fsync
@@ -49,6 +59,8 @@ class LogWriter:
         self._rotate_events = rotate_events
         self._rotate_ns = int(rotate_seconds * 1e9)
         self._closed = False
+        self._overlap = overlap
+        self._commits = OverlappedCommits() if overlap and fsync.max_events > 1 else Commits()
         try:
             self._open()
         except OSError as error:
@@ -62,14 +74,16 @@ class LogWriter:
         try:
             self.restart: Restart = restart(self.path)
             self.log_id = self.restart.log_id or uuid.uuid4().hex
-            self._sealer = Sealer(self.path, self.log_id, self.restart.previous_sha256)
+            self._sealer = Sealer(
+                self.path, self.log_id, self.restart.previous_sha256, aside=self._overlap
+            )
             self._begin_segment(self.restart.next_offset)
         except BaseException:
             self._lock.release()
             raise
 
     def _begin_segment(self, base: int) -> None:
-        self._active = ActiveSegment(self.path, self.log_id, base, self._fsync)
+        self._active = ActiveSegment(self.path, self.log_id, base, self._fsync, self._commits.slack)
         self._begun = time.monotonic_ns()
 
     @property
@@ -102,24 +116,34 @@ class LogWriter:
         """
         logged = self._clock() if logged_ns is None else logged_ns
         stamp = logged if stamp_ns is None else stamp_ns
-        if not (0 <= logged < _MAX_NS and 0 <= stamp < _MAX_NS):
-            raise LogError(f"times {logged} and {stamp} are not nanoseconds from 0 to 2^63 - 1")
-        offset = self._active.append(key, version, payload, logged, stamp)
-        self.commit_if_due()
-        return offset
+        return self.append_all([NewEvent(key, payload, logged, stamp, version)])
+
+    def append_all(self, events: Sequence[NewEvent]) -> int:
+        """Take several events in order; the offset of the first. Commits in between as the policy
+        says, as `append` of each would. Either all their times are in bounds or none is taken."""
+        for event in events:
+            if not (0 <= event.logged_ns < _MAX_NS and 0 <= event.stamp_ns < _MAX_NS):
+                raise LogError(
+                    f"times {event.logged_ns} and {event.stamp_ns} are not nanoseconds "
+                    "from 0 to 2^63 - 1"
+                )
+        first = self.next_offset
+        taken = 0
+        while taken < len(events):
+            taken += self._active.take(events, taken)
+            self.commit_if_due()
+        return first
 
     def commit_if_due(self) -> bool:
-        """Group commit and rotation by time; True when something was committed."""
-        due = self._active.due()
-        if due:
-            self._active.commit()
+        """Group commit and rotation by time; True when a commit was made or begun."""
+        begun = self._active.due() and self._commits.begin(self._active)
         if self._full():
             self._rotate()
-        return due
+        return begun
 
     def sync(self) -> int:
         """Commit everything appended; the durable offset, which is then `next_offset`."""
-        self._active.commit()
+        self._commits.finish(self._active)
         return self.durable_offset
 
     def _full(self) -> bool:
@@ -133,7 +157,7 @@ class LogWriter:
 
     def _rotate(self) -> None:
         finished = self._active
-        finished.commit()
+        self._commits.finish(finished)
         try:
             self._begin_segment(finished.committed)
         except OSError as error:
@@ -153,9 +177,10 @@ class LogWriter:
         self._closed = True
         try:
             if self._active.waiting:
-                self._active.commit()
+                self._commits.finish(self._active)
             self._finish_active()
         finally:
+            self._commits.close()
             self._active.close()
             self._sealer.finish()
             self._lock.release()

@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from eventsrc.errors import LogError
-from eventsrc.log import Event, LogWriter, log_info, recover_log, verify_log
-from eventsrc.log import _seal as sealing
+from eventsrc.log import Event, LogWriter, _parts, log_info, recover_log, verify_log
 from eventsrc.system_events import LOSS_KEY, Loss
 from tests.fixtures_log import BY_HAND, KEY, envelope, read_log, read_with_gaps
 
@@ -21,7 +20,7 @@ EVENTS = 6
 @pytest.fixture
 def sealed(quick_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, list[Event]]:
     """A sealed segment of one event a chunk, and its events."""
-    monkeypatch.setattr(sealing, "CHUNK_BYTES", 1)
+    monkeypatch.setattr(_parts, "CHUNK_BYTES", 1)
     log = quick_path / "log"
     with LogWriter(log, fsync=BY_HAND) as writer:
         for index in range(EVENTS):
