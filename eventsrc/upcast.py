@@ -88,6 +88,8 @@ def read_envelopes(
 
 def guess_version(payload: bytes) -> int:
     """The version of a payload that does not say: a list with an object in it is a bare list."""
+    if payload.startswith(b"{"):
+        return ENVELOPE_VERSION
     start = payload[:64].split()
     return BARE_LIST_VERSION if b"".join(start).startswith(b"[{") else ENVELOPE_VERSION
 

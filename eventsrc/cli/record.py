@@ -77,7 +77,7 @@ def record(
     with (
         stop_on_signals() as stop,
         open_session(options, mode=options.mode) as session,
-        LogWriter(log, fsync=policy) as writer,
+        LogWriter(log, fsync=policy, overlap=True) as writer,
     ):
         recorder = Recorder(
             session,
