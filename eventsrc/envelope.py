@@ -1,13 +1,15 @@
 """The envelope: one keyframe's message as it came over Zenoh (DESIGN section 3).
 
 The models say what a *valid* envelope is. They are strict: an int is not a string, NaN is not a
-number. Unknown fields are ignored here and kept in the log, which stores the payload verbatim.
-Making one from bytes, with every refusal named, is the job of `eventsrc.ingest`.
+number. Unknown fields need only be JSON; they are ignored here and kept in the log, which stores
+the payload verbatim. Making one from bytes, with every refusal named, is the job of
+`eventsrc.ingest`.
 """
 
+import json
 import unicodedata
 from decimal import Decimal
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
@@ -44,9 +46,23 @@ Int64 = Annotated[int, Field(ge=-(2**63), lt=2**63)]
 Position = Annotated[float, Field(ge=-MAX_POSITION_M, le=MAX_POSITION_M)]
 
 
+def _checked_and_forgotten(value: object) -> None:
+    """Refuse NaN and infinity anywhere in an unknown field: JSON has no word for them, and whoever
+    reads the log as JSON would stumble. The value is then forgotten here; the log has it."""
+    try:
+        json.dumps(value, allow_nan=False)
+    except ValueError:
+        raise ValueError("holds NaN or infinity") from None
+
+
+Unknown = Annotated[Any, AfterValidator(_checked_and_forgotten)]
+
+
 class _Model(BaseModel):
+    __pydantic_extra__: dict[str, Unknown]
+    # "allow" is what has unknown fields checked; it costs nothing where there are none.
     model_config = ConfigDict(
-        strict=True, frozen=True, extra="ignore", allow_inf_nan=False, populate_by_name=True
+        strict=True, frozen=True, extra="allow", allow_inf_nan=False, populate_by_name=True
     )
 
 

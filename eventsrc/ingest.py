@@ -177,6 +177,16 @@ def _vector(index: int, detection: Detection) -> Vector:
 
 def _base64(place: str, text: str) -> bytes:
     try:
-        return binascii.a2b_base64(text, strict_mode=True)  # slower, but says what is wrong
-    except (binascii.Error, ValueError) as error:
-        raise _RefusalError(f"{place}: not base64: {error}") from None
+        return pybase64.b64decode(text, None, True)
+    except ValueError:
+        raise _RefusalError(f"{place}: not base64: {_base64_fault(text)}") from None
+
+
+def _base64_fault(text: str) -> str:
+    """What is wrong with it, in the words of the standard library, which not every version of it
+    says of too much padding; so it is never the judge."""
+    try:
+        binascii.a2b_base64(text, strict_mode=True)
+    except ValueError as error:
+        return str(error)
+    return "Excess padding"

@@ -46,6 +46,23 @@ def test_unknown_fields_are_let_through() -> None:
     accepted(envelope(battery=0.4, detections=[detection(track=7)]))
 
 
+@pytest.mark.parametrize("odd", [float("nan"), float("-inf"), [0.1, {"deep": [float("inf")]}]])
+def test_unknown_fields_must_be_json_too(odd: Any) -> None:
+    """Python would read it; the log is read by others as well, who would not."""
+    assert refusal(envelope(covariance=odd)).startswith("covariance: holds NaN or infinity (got ")
+    seen = [detection(), detection(depth=odd)]
+    assert refusal(envelope(detections=seen)).startswith(
+        "detections.1.depth: holds NaN or infinity"
+    )
+
+
+def test_an_unknown_field_named_like_one_of_ours_changes_nothing() -> None:
+    odd = dict.fromkeys(("stamp_ns", "model_config", "model_dump", "__class__", ""), 7)
+    read = accepted(envelope(**odd))
+    assert read.envelope.stamp_ns == 1_774_357_201_000_000_000
+    assert isinstance(read.envelope.model_dump(), dict)
+
+
 def test_a_robot_without_a_pose_is_heard() -> None:
     assert accepted(envelope(x=None)).envelope.map_x is None
     assert accepted(envelope(map_x=None, map_y=None, map_yaw=None)).envelope.map_x is None
@@ -143,7 +160,9 @@ def test_numbers_must_be_finite(field: str, number: str) -> None:
 @pytest.mark.parametrize(
     ("fields", "says"),
     [
-        ({"embedding": "***"}, "not base64"),
+        ({"embedding": "***"}, "not base64: Only base64 data is allowed"),
+        ({"embedding": "AACAPw==="}, "not base64: Excess"),
+        ({"embedding": "AACA="}, "not base64: "),
         ({"embedding_dim": 5}, "16 bytes do not match embedding_dim 5, which takes 20"),
         ({"embedding_dim": None}, "required beside an embedding"),
         ({"embedding_dim": 0}, "embedding_dim"),
