@@ -65,7 +65,7 @@ def latency(log: Path, fsync: FsyncPolicy, seconds: float) -> Latency:
     with program(ROUTER) as router:
         endpoint = said(router)
         with (
-            LogWriter(log, fsync=fsync) as writer,
+            LogWriter(log, fsync=fsync, overlap=True) as writer,
             open_session(ZenohOptions(connect=(endpoint,)), mode="client") as session,
         ):
             recorder = Recorder(session, writer, [KEY], max_events=count)

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from eventsrc.log.fsync import FsyncPolicy
 from eventsrc.recorder import Recorder
 
 from .payloads import KEY
+from .plain import PlainFile
 
 ROUTER = """
 import sys
@@ -27,21 +29,26 @@ PUBLISHER = """
 import sys, time
 from eventsrc._zenoh import ZenohOptions, open_session
 from tests.bench.log.payloads import KEY, Payloads
-endpoint, rate, count = sys.argv[1], float(sys.argv[2]), int(sys.argv[3])
+endpoint, rate, seconds = sys.argv[1], float(sys.argv[2]), float(sys.argv[3])
 payloads = Payloads()
 with open_session(ZenohOptions(connect=(endpoint,)), mode="client") as session:
     publisher = session.publisher(KEY)
     assert publisher.wait_for_subscriber(30.0)
     start = time.perf_counter()
-    for number in range(count):
-        ahead = start + number / rate - time.perf_counter()
+    number = 0
+    while (now := time.perf_counter() - start) < seconds:
+        ahead = number / rate - now
         if ahead > 0.002:
             time.sleep(ahead)
         publisher.put(payloads[number])
+        number += 1
     session.confirm()
-    print(count / (time.perf_counter() - start), flush=True)
+    print(number, flush=True)
     sys.stdin.read()
 """
+UNPACED = float("inf")
+"""As fast as the network takes it: a reliable publisher that blocks is slowed down, and loses
+nothing, when who receives cannot keep up."""
 ROOT = Path(__file__).parents[3]
 
 
@@ -65,12 +72,15 @@ def said(process: "subprocess.Popen[str]") -> str:
 
 @dataclass(frozen=True)
 class Recording:
-    """``lost`` are messages published and not recorded; rates are events a second."""
+    """``lost`` are messages published and not recorded; the rate is events a second, from the first
+    one's logging to the last one's. ``unsealed`` segments were left when that was done, and sealing
+    them took ``sealing_s`` more."""
 
     published: int
     recorded: int
-    published_per_s: float
-    recorded_per_s: float
+    per_s: float
+    unsealed: int
+    sealing_s: float
 
     @property
     def lost(self) -> int:
@@ -78,24 +88,66 @@ class Recording:
         return self.published - self.recorded
 
 
+class _Until:
+    """Sets ``stop`` when all that a publisher says it published has come, or after a while."""
+
+    def __init__(self, publisher: "subprocess.Popen[str]", seconds: float) -> None:
+        self.stop = threading.Event()
+        self.published = 0
+        self._give_up = threading.Timer(seconds * 2 + 20, self.stop.set)
+        self._give_up.start()
+        self._listener = threading.Thread(target=self._listen, args=(publisher,))
+        self._listener.start()
+
+    def _listen(self, publisher: "subprocess.Popen[str]") -> None:
+        self.published = int(said(publisher))
+
+    def look(self, arrived: int) -> None:
+        """Called now and then with what has come so far."""
+        if self.published and arrived >= self.published:
+            self.stop.set()
+
+    def end(self) -> None:
+        """Nobody waits any more."""
+        self._give_up.cancel()
+        self._listener.join()
+
+
 def record(log: Path, fsync: FsyncPolicy, rate: float, seconds: float) -> Recording:
-    """Publish at ``rate`` for ``seconds`` and record all of it."""
-    count = int(rate * seconds)
-    stop = threading.Event()
+    """Publish at ``rate`` for ``seconds`` and record all of it, as `mapfold record` does."""
     with program(ROUTER) as router:
         endpoint = said(router)
         with (
-            LogWriter(log, fsync=fsync) as writer,
+            LogWriter(log, fsync=fsync, overlap=True) as writer,
             open_session(ZenohOptions(connect=(endpoint,)), mode="client") as session,
         ):
-            recorder = Recorder(session, writer, [KEY], max_events=count)
-            with program(PUBLISHER, endpoint, str(rate), str(count)) as publisher:
-                give_up = threading.Timer(seconds * 2 + 10, stop.set)
-                give_up.start()
-                report = recorder.run(stop)
-                give_up.cancel()
-                published_per_s = float(said(publisher))
-    return Recording(count, report.recorded, published_per_s, _logged_per_s(log))
+            recorder = Recorder(session, writer, [KEY])
+            with program(PUBLISHER, endpoint, str(rate), str(seconds)) as publisher:
+                until = _Until(publisher, seconds)
+                report = recorder.run(
+                    until.stop, every_s=0.05, watch=lambda now: until.look(now.recorded)
+                )
+                until.end()
+            unsealed = len(list(log.glob("*.active"))) - 1
+            begun = time.perf_counter()
+    sealing_s = time.perf_counter() - begun
+    return Recording(until.published, report.recorded, _logged_per_s(log), unsealed, sealing_s)
+
+
+def subscribe_plain(path: Path, seconds: float) -> float:
+    """What Zenoh itself takes: the same bytes through such a router to a plain file, with the same
+    syncs and nothing else; events a second."""
+    with program(ROUTER) as router, PlainFile(path) as file:
+        endpoint = said(router)
+        with open_session(ZenohOptions(connect=(endpoint,)), mode="client") as session:
+            session.subscribe(KEY, lambda message: file.append(message.payload))
+            session.confirm()
+            with program(PUBLISHER, endpoint, str(UNPACED), str(seconds)) as publisher:
+                until = _Until(publisher, seconds)
+                while not until.stop.wait(0.05):
+                    until.look(file.count)
+                until.end()
+            return file.per_s
 
 
 def _logged_per_s(log: Path) -> float:
