@@ -148,6 +148,7 @@ def no_cycle_search() -> Iterator[None]:
     """Keep the garbage collector from searching for cycles: a fold makes none, and only ever adds.
 
     The search looks at all records again and again as a map grows, a fifth of the whole time.
+    Afterwards what is there counts as old, or the next search would look at all of it as news.
     """
     was_on = gc.isenabled()
     gc.disable()
@@ -155,4 +156,6 @@ def no_cycle_search() -> Iterator[None]:
         yield
     finally:
         if was_on:
+            gc.freeze()
+            gc.unfreeze()
             gc.enable()
