@@ -75,10 +75,10 @@ class Sink(Protocol[Changes]):
         """Write what was taken to the shadow."""
 
     def index(self, connection: Connection) -> None:
-        """Index the shadow, which is complete now."""
+        """Index the shadow, which is complete now, and gather its statistics."""
 
-    def check(self, connection: Connection, view: MapView) -> None:
-        """Compare the shadow's counts with the view's. Raises DatabaseError."""
+    def check(self, connection: Connection, view: MapView) -> Mapping[str, int]:
+        """Rows of the shadow, by label or table. Raises DatabaseError if the view has others."""
 
     def lock(self, connection: Connection) -> None:
         """Keep readers away from what `swap` replaces, until the transaction ends."""
@@ -87,7 +87,4 @@ class Sink(Protocol[Changes]):
         """Put the shadow in the place of what readers see."""
 
     def tidy(self, connection: Connection) -> None:
-        """After the commit (autocommit): remove what was replaced, gather statistics."""
-
-    def counts(self, connection: Connection) -> Mapping[str, int]:
-        """How many rows readers see, by label or table."""
+        """After the commit (autocommit): remove what was replaced."""

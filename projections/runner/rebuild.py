@@ -86,6 +86,7 @@ def rebuild(
     started = time.monotonic()
     tell = progress or (lambda _: None)
     with (
+        no_cycle_search(),
         LogReader(log) as reader,
         open_stores(
             targets, settings, only=only, application="mapfold replay", loader=loader
@@ -93,16 +94,8 @@ def rebuild(
     ):
         total = reader.next_offset if until is None else min(until, reader.next_offset)
         fold = LiveFold(settings)
-        with contextlib.ExitStack() as transactions:
-            for store in stores:
-                transactions.enter_context(database_errors(store.url))
-                with store.aside() as connection:
-                    for sink in store.sinks:
-                        sink.clear(connection)
-                transactions.enter_context(store.connection.transaction())
-                for sink in store.sinks:
-                    sink.begin(store.connection)
-            with no_cycle_search(), short_turns(), _loadings(stores) as loadings:
+        with _transactions(stores):
+            with short_turns(), _loadings(stores) as loadings:
                 last = _fold_into(fold, reader.read(0, total), loadings, total, tell)
                 folded = time.monotonic()
                 tell(RebuildProgress("writing", total, total))
@@ -120,34 +113,47 @@ def rebuild(
                 _checkpoint.event_hash(last),
                 digest,
             )
-            for store in stores:
-                for sink in store.sinks:
-                    sink.check(store.connection, fold.view)
-                    _checkpoint.replace(store.connection, sink.name, checkpoint)
+            rows = _check(stores, fold, checkpoint)
             tell(RebuildProgress("swapping", total, total))
             for store in stores:
                 lock_readers_out(store)
                 for sink in store.sinks:
                     sink.swap(store.connection)
         tell(RebuildProgress("tidying", total, total))
-        index, rows = _after(stores, tell, total, hnsw=hnsw)
-    ended = time.monotonic()
-    counts = fold.view.counts()
-    return RebuildReport(total, digest, counts, rows, folded - started, ended - started, index)
+        index = _after(stores, tell, total, hnsw=hnsw)
+        ended = time.monotonic()
+        counts = fold.view.counts()
+        return RebuildReport(total, digest, counts, rows, folded - started, ended - started, index)
+
+
+@contextlib.contextmanager
+def _transactions(stores: list[Store]) -> Iterator[None]:
+    """A transaction in each store, of which either all are committed or, unless one fails, none."""
+    with contextlib.ExitStack() as transactions:
+        for store in stores:
+            transactions.enter_context(database_errors(store.url))
+            transactions.enter_context(store.connection.transaction())
+        yield
 
 
 @contextlib.contextmanager
 def _loadings(stores: list[Store]) -> Iterator[list[SinkLoading]]:
-    """A thread for each store, and which sink writes through which."""
+    """A thread for each store, which begins its shadows, and which sink writes through which."""
     with contextlib.ExitStack() as threads:
-        yield [
-            SinkLoading(loading, sink, store.connection)
-            for store, loading in [
-                (store, threads.enter_context(Loading(store.connection.cancel_safe)))
-                for store in stores
-            ]
-            for sink in store.sinks
-        ]
+        loadings = []
+        for store in stores:
+            loading = threads.enter_context(Loading(store.connection.cancel_safe))
+            loading.put(partial(_begin, store))
+            loadings += [SinkLoading(loading, sink, store.connection) for sink in store.sinks]
+        yield loadings
+
+
+def _begin(store: Store) -> None:
+    with store.aside() as connection:
+        for sink in store.sinks:
+            sink.clear(connection)
+    for sink in store.sinks:
+        sink.begin(store.connection)
 
 
 def _fold_into(
@@ -173,17 +179,23 @@ def _fold_into(
     return last
 
 
-def _after(
-    stores: list[Store], tell: OnProgress, total: int, *, hnsw: bool
-) -> tuple[HnswReport | None, dict[str, int]]:
-    index: HnswReport | None = None
+def _check(stores: list[Store], fold: LiveFold, checkpoint: Checkpoint) -> dict[str, int]:
+    """Compare, and put the checkpoints down; how many rows there are, by label and table."""
     rows: dict[str, int] = {}
+    for store in stores:
+        for sink in store.sinks:
+            rows.update(sink.check(store.connection, fold.view))
+            _checkpoint.replace(store.connection, sink.name, checkpoint)
+    return rows
+
+
+def _after(stores: list[Store], tell: OnProgress, total: int, *, hnsw: bool) -> HnswReport | None:
+    index: HnswReport | None = None
     for store in stores:
         with store.aside() as connection:
             for sink in store.sinks:
                 sink.tidy(connection)
-                rows.update(sink.counts(connection))
                 if sink.name == "vectors" and hnsw:
                     tell(RebuildProgress("indexing", total, total))
                     index = build_hnsw(connection)
-    return index, rows
+    return index

@@ -7,6 +7,7 @@ The old graph is renamed by the swap, and dropped later, when every transaction 
 its name has ended.
 """
 
+from collections.abc import Collection
 from typing import Final
 
 from psycopg import sql
@@ -25,6 +26,7 @@ from .labels import (
     MATCHED,
     OLD_GRAPH,
     VERTEX_LABELS,
+    Label,
 )
 
 _MARK: Final = "mapfold"
@@ -61,13 +63,15 @@ def create(connection: Connection, graph: str) -> None:
         )
 
 
-def index(connection: Connection, graph: str) -> None:
+def index(
+    connection: Connection, graph: str, labels: Collection[Label] = frozenset(LABELS)
+) -> None:
     """The indexes of our queries and upserts, but for those that AGE has made itself."""
     run = statements("graph")
     rows = connection.execute(run["indexed"], {"graph": graph}).fetchall()
     unique = {(table, column): is_unique for table, column, is_unique in rows}
     schema = sql.Identifier(graph)
-    for label in LABELS:
+    for label in filter(labels.__contains__, LABELS):
         table = sql.Identifier(label)
         if (label in VERTEX_LABELS or label in CHANGING_EDGES) and not unique.get((label, "id")):
             column = sql.Identifier("id")
@@ -77,10 +81,12 @@ def index(connection: Connection, graph: str) -> None:
                 column = sql.Identifier(end)
                 connection.execute(run["index"].format(graph=schema, label=table, column=column))
     for vertex, key in KEYS.items():
+        if vertex not in labels:
+            continue
         literal = sql.Literal(f'"{key}"')
         table = sql.Identifier(vertex)
         connection.execute(run["index_key"].format(graph=schema, label=table, key=literal))
-    for vertex in MATCHED:
+    for vertex in filter(labels.__contains__, MATCHED):
         connection.execute(run["index_match"].format(graph=schema, label=sql.Identifier(vertex)))
 
 
@@ -122,7 +128,11 @@ def drop(connection: Connection, graph: str) -> None:
 
 
 def analyze(connection: Connection, graph: str) -> None:
-    """Gather statistics, so that the planner knows which labels are large."""
+    """Gather statistics, so that the planner knows which labels are large.
+
+    Inside a transaction. What readers look up is all but unique, which a small sample shows.
+    """
+    connection.execute(statements("graph")["sample"])
     for label in LABELS:
         connection.execute(
             statements("graph")["analyze"].format(

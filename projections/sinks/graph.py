@@ -26,9 +26,13 @@ from .labels import (
 )
 from .loader import InsertLoader, Loader, LoaderName, insert_columns, loader_of
 
-STREAM_ROWS: Final = 20_000
+STREAM_ROWS: Final = 4_000
 """Keyframes and observations that wait before a rebuild writes them: enough to make COPY's round
-trips vanish, few enough to keep memory small."""
+trips vanish, few enough that the server has something to do from early on."""
+EARLY: Final[frozenset[Label]] = frozenset({"Observation"})
+"""Labels that a rebuild indexes before it writes them. That costs the server more than afterwards,
+but it has the time while the fold goes on; afterwards everybody would wait."""
+LATE: Final = frozenset(LABELS) - EARLY
 SMALL_BATCH: Final = 200
 """Below this many rows an INSERT, sent down the pipeline, beats COPY's extra round trips."""
 
@@ -88,8 +92,9 @@ class GraphSink:
                 _graph_ddl.drop(connection, graph)
 
     def begin(self, connection: Connection) -> None:
-        """Create an empty shadow graph."""
+        """Create an empty shadow graph, its early indexes with it."""
         _graph_ddl.create(connection, NEXT_GRAPH)
+        _graph_ddl.index(connection, NEXT_GRAPH, EARLY)
 
     def take_final(self, view: MapView) -> GraphChanges | None:
         """Fixed rows, if enough of them wait."""
@@ -104,10 +109,11 @@ class GraphSink:
                 self._insert(self._loader, connection, NEXT_GRAPH, label, rows)
 
     def index(self, connection: Connection) -> None:
-        """Index the shadow."""
-        _graph_ddl.index(connection, NEXT_GRAPH)
+        """Index the shadow and gather its statistics."""
+        _graph_ddl.index(connection, NEXT_GRAPH, LATE)
+        _graph_ddl.analyze(connection, NEXT_GRAPH)
 
-    def check(self, connection: Connection, view: MapView) -> None:
+    def check(self, connection: Connection, view: MapView) -> Mapping[str, int]:
         """Compare counts by label."""
         found, expected = _graph_ddl.counts(connection, NEXT_GRAPH), view.counts()
         wrong = [
@@ -120,6 +126,7 @@ class GraphSink:
                 f"{place_of(connection)}: the rebuilt graph does not match the map"
                 f" ({'; '.join(wrong)}); the old one stays, please report this"
             )
+        return found
 
     def lock(self, connection: Connection) -> None:
         """Keep readers away from the graph."""
@@ -131,15 +138,10 @@ class GraphSink:
         _graph_ddl.swap_in(connection, NEXT_GRAPH)
 
     def tidy(self, connection: Connection) -> None:
-        """Drop the replaced graph once its last reader is gone; gather statistics."""
-        _graph_ddl.analyze(connection, GRAPH)
+        """Drop the replaced graph once its last reader is gone."""
         if _swap_guard.earlier_transactions_ended(connection):
             with connection.transaction():
                 _graph_ddl.drop(connection, OLD_GRAPH)
-
-    def counts(self, connection: Connection) -> Mapping[str, int]:
-        """Rows by label."""
-        return _graph_ddl.counts(connection, GRAPH)
 
     def _insert(
         self, loader: Loader, connection: Connection, graph: str, label: Label, rows: list[object]

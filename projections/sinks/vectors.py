@@ -98,9 +98,11 @@ class VectorSink:
         self._loader.vectors(connection, _SHADOW, self._type, changes)
 
     def index(self, connection: Connection) -> None:
-        """Nothing: the keys' indexes are there, HNSW comes after the swap."""
+        """Only statistics: the keys' indexes are there, HNSW comes after the swap."""
+        connection.execute(statements("vectors")["sample"])
+        connection.execute(_statement("analyze", _SHADOW))
 
-    def check(self, connection: Connection, view: MapView) -> None:
+    def check(self, connection: Connection, view: MapView) -> Mapping[str, int]:
         """Compare counts."""
         found = self._count(connection, _SHADOW)
         expected = sum(o.embedding_crc is not None for o in view.observations)
@@ -109,6 +111,7 @@ class VectorSink:
                 f"{place_of(connection)}: the rebuilt table has {found} rows, the map {expected}"
                 " searchable detections; the old one stays, please report this"
             )
+        return {TABLE: found}
 
     def lock(self, connection: Connection) -> None:
         """Keep readers away from the table."""
@@ -130,12 +133,7 @@ class VectorSink:
         self._dimension = self._shadow_dimension
 
     def tidy(self, connection: Connection) -> None:
-        """Gather statistics."""
-        connection.execute("ANALYZE public.detection_embeddings (det_pk, det_id, run_id)")
-
-    def counts(self, connection: Connection) -> Mapping[str, int]:
-        """Rows of the table."""
-        return {TABLE: self._count(connection, _PUBLIC)}
+        """Nothing: what was replaced went with the swap."""
 
     def _find_type(self, connection: Connection) -> None:
         ensure_extension(connection, "vector")
