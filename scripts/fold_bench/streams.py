@@ -55,12 +55,13 @@ def keyframes(count: int, detections: int) -> Iterator[Accepted]:
 
 
 def _accepted(index: int, x: float, y: float, seen: list[int], vectors: np.ndarray) -> Accepted:
+    left, top = 120.0 + index % 64, 80.0 + index % 48  # objects of their own, as JSON gives them
     detections = tuple(
         Detection.model_construct(
             det_id=None,
             class_name=f"class {which % 20}",
-            confidence=0.875,
-            bbox=(120.0, 80.0, 250.0, 310.0),
+            confidence=0.5 + which / 128,
+            bbox=(left + which, top + which, left + which + 130.0, top + which + 230.0),
             embedding=None,
             embedding_dim=DIM,
             embedding_model=MODEL,

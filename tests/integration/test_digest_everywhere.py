@@ -27,17 +27,25 @@ import hashlib, sys
 from pathlib import Path
 import numpy as np
 from eventsrc.ingest import ingest
+from eventsrc.log import Event
 from projections.digest import map_digest
+from projections.folding import AHEAD, fold_events
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 from projections.view import MapView
 
 settings = Settings(eps_m=0.75, min_samples=8)
 fold, view, vectors = SemanticMap(settings), MapView(settings), []
-for offset, line in enumerate(Path(sys.argv[1]).read_bytes().splitlines()):
+lines = Path(sys.argv[1]).read_bytes().splitlines()
+for offset, line in enumerate(lines):
     accepted = ingest(line)
     vectors += accepted.vectors
     view.apply_event(offset, fold.fold(offset, accepted))
+ahead = MapView(settings)
+events = (Event(offset, "tb/detections", 0, 0, line) for offset, line in enumerate(lines))
+for folded in fold_events(events, SemanticMap(settings), ahead=AHEAD):
+    ahead.apply_event(folded.offset, folded.deltas)
+assert map_digest(ahead) == map_digest(view)
 matrix = np.array(vectors[:200])
 print(map_digest(view), hashlib.sha256((matrix @ matrix[0]).tobytes()).hexdigest())
 """

@@ -18,6 +18,7 @@ from projections.digest import map_digest
 from projections.errors import SettingsError
 from projections.geometry import Neighbourhood
 from projections.reducers import landmarks
+from projections.reducers._seen import content_digest
 from projections.reducers.landmarks import object_id
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
@@ -56,6 +57,13 @@ def test_other_content_under_the_same_number_is_a_conflict_and_the_first_stands(
     folded = fold([first, {**first, **change}])
     assert folded.deltas[1] == [EventSkipped(1, "conflict", "run-a", 7, None, 0)]
     assert map_digest(folded.view) == map_digest(fold([first]).view)
+
+
+def test_the_digest_of_a_content_is_the_same_in_every_process_and_python() -> None:
+    """It is kept in snapshots. The same in CPython 3.10 to 3.13."""
+    seen = [detection("cup", [1, 2], det_id="x"), detection("é")]
+    digest = content_digest(accepted(envelope(7, 1.0, 2.0, detections=seen)))
+    assert digest.hex() == "bc7dbc8e3a8bb14f42cb6364f81a2b2d"
 
 
 def test_a_det_id_of_an_earlier_keyframe_is_left_out_and_the_rest_folded() -> None:
