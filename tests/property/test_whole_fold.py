@@ -10,6 +10,7 @@ from projections.deltas import Pose
 from projections.digest import map_digest
 from projections.geometry import Neighbourhood
 from projections.settings import Settings
+from projections.snapshot import restore, snapshot
 from tests.envelopes import detection, envelope
 from tests.folds import Folded
 from tests.naive_map import NaiveMap, Posed
@@ -82,6 +83,21 @@ def test_and_so_it_is_under_another_neighbourhood(
     settings, documents = world
     folded = Folded.start(Settings(**settings), Neighbourhood("facing", 600_000, _facing))
     check_every_prefix(folded, NaiveMap(settings, _naive_facing), documents)
+
+
+@given(world=worlds())
+def test_and_so_it_is_when_every_event_is_folded_by_a_restored_map(
+    world: tuple[dict[str, Any], list[dict[str, Any]]],
+) -> None:
+    raw, documents = world
+    settings, naive = Settings(**raw), NaiveMap(raw)
+    folded = Folded.start(settings)
+    for document in documents:
+        folded.take([document])
+        naive.fold(document)
+        assert map_digest(folded.view) == naive.digest()
+        folded = Folded(*restore(snapshot(folded.map, folded.view, "log"), settings, "log"), [])
+    assert folded.view.skipped == {kind: naive.left_out[kind] for kind in folded.view.skipped}
 
 
 def check_every_prefix(folded: Folded, naive: NaiveMap, documents: list[dict[str, Any]]) -> None:
