@@ -159,8 +159,10 @@ class Landmarks:
         landmark.count += 1
         landmark.sum_x_um += x_um
         landmark.sum_y_um += y_um
-        landmark.first_seen = min(landmark.first_seen, timestamp)
-        landmark.last_seen = max(landmark.last_seen, timestamp)
+        if timestamp > landmark.last_seen:
+            landmark.last_seen = timestamp
+        elif timestamp < landmark.first_seen:
+            landmark.first_seen = timestamp
         side = self._radius_um * landmark.count
         column, row = landmark.sum_x_um // side, landmark.sum_y_um // side
         if (column, row) != (landmark.column, landmark.row):
