@@ -1,4 +1,4 @@
-"""mapfold commands in processes of their own, none of which outlives the demo."""
+"""mapfold commands in processes of their own, none of which outlives the demo, killed or not."""
 
 import subprocess
 import sys
@@ -26,8 +26,8 @@ class Children:
         """Start ``mapfold *arguments``; its stderr goes to the file ``said``."""
         with said.open("wb") as errors:
             self._running[name] = subprocess.Popen(  # noqa: S603  # our own program and arguments
-                [sys.executable, "-m", "projections.cli", *arguments],
-                stdin=subprocess.DEVNULL,
+                [sys.executable, "-m", "projections.demo.child", *arguments],
+                stdin=subprocess.PIPE,  # closed by our end, see `child`
                 stdout=subprocess.DEVNULL,
                 stderr=errors,
             )
@@ -80,3 +80,5 @@ class Children:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
+            if process.stdin is not None:  # only now: its end would be a second, harsher request
+                process.stdin.close()
