@@ -5,7 +5,9 @@
 One commit is: write one uncompressed chunk, sync it, write its commit mark. The mark is what a
 reader in another process goes by: a chunk without one may not be on the disk yet and is not shown.
 The mark itself needs no sync, for it says something only while the bytes before it are there; and
-recovery, which has no writer to race with, takes every chunk whose CRC holds, mark or not.
+recovery, which has no writer to race with, takes every chunk whose CRC holds, mark or not. Only the
+last mark of a segment is synced before the next segment begins: without it a reader would find the
+next one's events and not those before them.
 
 A commit that fails leaves the file at the last good byte, and the segment refuses further work.
 """
@@ -102,6 +104,11 @@ class ActiveSegment:
             raise self._fail(error) from error
         self.size += len(head) + len(body) + len(mark)
         self.committed = group.following
+
+    def sync_last_mark(self) -> None:
+        """Make the mark of the last commit survive a power cut. Raises OSError."""
+        if self._syncs:
+            sync_file(self._fd)
 
     def _check(self) -> None:
         if self._failure is not None:

@@ -37,8 +37,9 @@ class Sealer:
         self._thread: threading.Thread | None = None
         self.error: LogError | None = None
 
-    def submit(self, base: int) -> None:
+    def submit(self, base: int, *, last: bool = False) -> None:
         """Seal the finished active segment at ``base`` when its turn comes."""
+        self._finishing = last  # too late for a process that is not there yet
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name="mapfold-sealer", daemon=True)
             self._thread.start()
@@ -46,7 +47,6 @@ class Sealer:
 
     def finish(self) -> None:
         """Wait until everything submitted is sealed or has failed; `error` says which."""
-        self._finishing = True  # too late for a process that is not there yet
         if self._thread is not None:
             self._bases.put(None)
             self._thread.join()

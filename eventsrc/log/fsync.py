@@ -59,6 +59,17 @@ def sync_directory(path: Path) -> None:
         os.close(fd)
 
 
+def make_directory_durably(path: Path) -> None:
+    """Make ``path``, and what it stands in, so that a power cut takes none of them. One that is
+    there already may have been made a moment before a power cut: its name is synced all the same.
+    """
+    if not path.parent.exists():
+        make_directory_durably(path.parent)
+    path.mkdir(exist_ok=True)
+    with contextlib.suppress(PermissionError):  # it stands in a folder that is not for us to read
+        sync_directory(path.parent)
+
+
 def write_all(fd: int, data: bytes) -> None:
     """Write every byte; the system may take fewer at a time."""
     view = memoryview(data)

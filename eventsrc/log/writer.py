@@ -23,7 +23,7 @@ from ._naming import LOCK, leftovers, list_segments
 from ._restart import Restart, restart
 from ._sealer import Sealer
 from .event import NewEvent
-from .fsync import GROUP_COMMIT, FsyncPolicy, unlink_quietly
+from .fsync import GROUP_COMMIT, FsyncPolicy, make_directory_durably, unlink_quietly
 
 ROTATE_BYTES = 64 * 1024 * 1024
 ROTATE_EVENTS = 1_000_000
@@ -159,6 +159,7 @@ class LogWriter:
         finished = self._active
         self._commits.finish(finished)
         try:
+            finished.sync_last_mark()
             self._begin_segment(finished.committed)
         except OSError as error:
             raise finished.refuse(
@@ -190,7 +191,7 @@ class LogWriter:
     def _finish_active(self) -> None:
         """An empty segment stays only where it is all there is: it carries the log's id."""
         if self._active.committed > self._active.base:
-            self._sealer.submit(self._active.base)
+            self._sealer.submit(self._active.base, last=True)
         elif self._active.base > 0:
             unlink_quietly(self._active.path)
 
@@ -213,7 +214,7 @@ class LogWriter:
 def _make_log_directory(path: Path) -> None:
     if path.exists() and not path.is_dir():
         raise NotALog(f"{path} is a file; a log is a directory, choose another name")
-    path.mkdir(parents=True, exist_ok=True)
+    make_directory_durably(path)
     if list_segments(path) or (path / LOCK).exists():
         return
     ours = set(leftovers(path))
