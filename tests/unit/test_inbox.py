@@ -10,7 +10,7 @@ from tests.fixtures_zenoh import DEADLINE_S
 
 
 def _message(text: str, key: str = "tb/detections") -> Received:
-    return Received(key, text.encode(), None)
+    return Received(key, text.encode())
 
 
 def _texts(messages: list[Received]) -> list[str]:
