@@ -1,0 +1,56 @@
+"""Run as a program: kill a rebuild at its n-th step, for every STRIDE-th n there is.
+
+Steps are those of `crash_driver`. After each kill the database must hold exactly the old map, or
+the new one if the swap was through, and the next rebuild must make the new one. Prints one line.
+"""
+
+import json
+import os
+import sys
+from pathlib import Path
+
+from projections.postgres.connect import Targets
+from projections.runner import rebuild
+from tests.chaos.crash_driver import SETTINGS, Bomb
+from tests.rows import all_rows
+
+OLD = 12
+STRIDE = 7
+"""Prime, so that kills are spread over kinds of statements that come in groups."""
+
+
+def killed_at(step: int, log: Path, targets: Targets) -> bool:
+    """Rebuild in a child that dies at ``step``; False when it came to its end before that."""
+    child = os.fork()
+    if child == 0:
+        Bomb(step).arm()
+        rebuild(log, targets, SETTINGS)
+        os._exit(0)
+    _, status = os.waitpid(child, 0)
+    return os.WIFSIGNALED(status)
+
+
+def main() -> None:
+    log, targets = Path(sys.argv[1]), Targets(sys.argv[2], sys.argv[3])
+    rebuild(log, targets, SETTINGS)
+    new = all_rows(targets)
+    step, wrong, served = 0, [], {"old": 0, "new": 0}
+    while True:
+        rebuild(log, targets, SETTINGS, until=OLD)
+        old = all_rows(targets)
+        killed = killed_at(step, log, targets)
+        found = all_rows(targets)
+        if found not in (old, new):
+            wrong.append(step)
+        served["old" if found == old else "new"] += 1
+        rebuild(log, targets, SETTINGS)
+        if all_rows(targets) != new:
+            wrong.append(step)
+        if not killed:
+            break
+        step += STRIDE
+    sys.stdout.write(json.dumps({"steps": step, "wrong": wrong, **served}) + "\n")
+
+
+if __name__ == "__main__":
+    main()

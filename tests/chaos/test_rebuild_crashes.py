@@ -1,0 +1,167 @@
+"""Whatever dies or fails while a rebuild is at work, a whole map is served; the next one works."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import psycopg
+import pytest
+from psycopg import sql
+
+from projections.errors import DatabaseError, DatabaseUnavailable
+from projections.postgres.connect import Targets, connect, ensure_extension
+from projections.postgres.embedded import EmbeddedServer
+from projections.runner import RebuildProgress, rebuild
+from projections.settings import Settings
+from projections.sinks.loader import CopyLoader
+from tests.logs import bridge, walk, write_log
+from tests.rows import all_rows
+
+SETTINGS = Settings()
+WAIT_S = 240.0
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def own_server() -> Iterator[EmbeddedServer]:
+    """A server that a test may kill."""
+    home = Path(tempfile.mkdtemp(prefix="mapfold-test-kill-"))
+    server = EmbeddedServer(home)
+    try:
+        with server, connect(server.url, autocommit=True) as connection:
+            ensure_extension(connection, "age")
+            ensure_extension(connection, "vector")
+            connection.close()
+            yield server
+    finally:
+        server.stop()
+        shutil.rmtree(home, ignore_errors=True)
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    """A log of a rebuild that is worth a hundred statements."""
+    return write_log(tmp_path / "log", walk(60) + list(bridge()))
+
+
+def in_small_streams(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have the thread write while the fold goes on, also for a small log."""
+    monkeypatch.setattr("projections.sinks.graph.STREAM_ROWS", 20)
+    monkeypatch.setattr("projections.sinks.vectors.STREAM_ROWS", 10)
+    # The package's name for it is the function.
+    monkeypatch.setattr(sys.modules["projections.runner.rebuild"], "TICK_EVENTS", 8)
+
+
+def at_stage(stage: str, act: Callable[[], None]) -> Callable[[RebuildProgress], None]:
+    """Do something once when a rebuild gets there."""
+    done: list[str] = []
+
+    def tell(at: RebuildProgress) -> None:
+        if at.stage == stage and at.done > 0 and not done:
+            done.append(stage)
+            act()
+
+    return tell
+
+
+@pytest.mark.parametrize("kind", ["one_database", "two_databases"])
+def test_killed_at_statements_all_through(
+    log: Path, kind: str, request: pytest.FixtureRequest
+) -> None:
+    targets: Targets = request.getfixturevalue(kind)
+    result = subprocess.run(
+        [
+            sys.executable, "-m", "tests.chaos.rebuild_killer",
+            str(log), targets.graph_url, targets.vector_url,
+        ],
+        cwd=ROOT, capture_output=True, text=True, timeout=WAIT_S, check=False,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    found = json.loads(result.stdout)
+    assert found["wrong"] == []
+    assert found["old"] > 10
+    assert found["new"] >= 1
+
+
+@pytest.mark.parametrize("stage", ["folding", "writing", "swapping"])
+def test_a_session_that_is_ended_ends_the_rebuild_in_words(
+    log: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch, stage: str
+) -> None:
+    in_small_streams(monkeypatch)
+    rebuild(log, one_database, SETTINGS, until=30)
+    old = all_rows(one_database)
+
+    def end_sessions() -> None:
+        with connect(one_database.graph_url, autocommit=True) as admin:
+            admin.execute(
+                "SELECT pg_terminate_backend(pid, 10000) FROM pg_stat_activity"
+                " WHERE datname = current_database() AND application_name = 'mapfold replay'"
+            )
+
+    with pytest.raises(DatabaseUnavailable):
+        rebuild(log, one_database, SETTINGS, progress=at_stage(stage, end_sessions))
+    assert all_rows(one_database) == old
+    rebuild(log, one_database, SETTINGS)
+    assert all_rows(one_database) != old
+
+
+def test_rows_the_server_refuses_in_the_middle_of_the_stream(
+    log: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    in_small_streams(monkeypatch)
+    rebuild(log, one_database, SETTINGS, until=30)
+    old = all_rows(one_database)
+    calls: list[int] = []
+
+    def twice_the_second_time(
+        self: CopyLoader,
+        connection: psycopg.Connection,
+        schema: str,
+        vector: sql.Composable,
+        rows: Sequence[Any],
+    ) -> None:
+        calls.append(len(rows))
+        vectors(self, connection, schema, vector, [*rows, *rows] if len(calls) == 2 else rows)
+
+    vectors = CopyLoader.vectors
+    with monkeypatch.context() as patched:
+        patched.setattr(CopyLoader, "vectors", twice_the_second_time)
+        with pytest.raises(DatabaseError, match="duplicate key"):
+            rebuild(log, one_database, SETTINGS)
+    assert len(calls) == 2
+    assert all_rows(one_database) == old
+    rebuild(log, one_database, SETTINGS)
+    assert all_rows(one_database) != old
+
+
+def test_postgres_itself_is_killed_in_the_middle(
+    log: Path, own_server: EmbeddedServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    in_small_streams(monkeypatch)
+    targets = Targets(own_server.url, own_server.url, own_server)
+    rebuild(log, targets, SETTINGS, until=30)
+    with connect(own_server.url, autocommit=True) as admin:
+        admin.execute("CHECKPOINT")  # what is asked here is not what a crash may take back
+    old = all_rows(targets)
+
+    def kill() -> None:
+        with psycopg.connect(own_server.url, autocommit=True) as witness:
+            os.kill(
+                int((own_server.data / "postmaster.pid").read_text().split()[0]), signal.SIGKILL
+            )
+            with pytest.raises(psycopg.OperationalError):
+                list(witness.notifies(timeout=WAIT_S))
+
+    with pytest.raises(DatabaseUnavailable):
+        rebuild(log, targets, SETTINGS, progress=at_stage("folding", kill))
+    own_server.start()
+    assert all_rows(targets) == old
+    rebuild(log, targets, SETTINGS)
+    assert all_rows(targets) != old
