@@ -55,6 +55,9 @@ def create(connection: Connection, graph: str) -> None:
         connection.execute(run["create_vlabel"], {"graph": graph, "label": label})
     for edge in EDGE_LABELS:
         connection.execute(run["create_elabel"], {"graph": graph, "label": edge})
+    for name in LABELS:
+        table = sql.Identifier(graph, name)
+        connection.execute(run["no_statistics"].format(table=table))
     found: dict[str, int] = dict(connection.execute(run["label_ids"], {"graph": graph}).fetchall())
     if any(found.get(label) != number for label, number in LABEL_IDS.items()):
         raise DatabaseError(

@@ -8,7 +8,6 @@ back to the same bits. Strings are escaped as JSON has it: quote, backslash and 
 Nothing here is query text. The result is a *value*: a bind parameter or a field of COPY data.
 """
 
-import math
 from collections.abc import Iterable
 from json.encoder import encode_basestring
 
@@ -20,9 +19,10 @@ def text(value: str) -> str:
 
 def number(value: float) -> str:
     """A finite float, -0.0 and 1e22 included; ints are written by ``str``."""
-    if not math.isfinite(value):
+    written = repr(float(value))
+    if written[-1] in "fn":  # inf, nan
         raise ValueError(f"{value} is no number a graph can hold")
-    return repr(float(value))
+    return written
 
 
 def numbers(values: Iterable[float]) -> str:
