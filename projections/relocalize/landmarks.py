@@ -3,8 +3,8 @@
 Matches of one crop show one thing or look-alikes of it, so they share one size (pixel metres, see
 `camera`), and with a size every observation alone gives a point: bearing and depth from its pose.
 The right size is the one under which observations from different poses agree on points; it is
-searched on a grid. Points within reach of each other are one landmark. Neither wrong fusions nor
-split Objects matter here, because only observations are looked at.
+searched on a grid. Points that agree within their errors are one landmark (`clusters`). Neither
+wrong fusions nor split Objects matter here, because only observations are looked at.
 
 Each landmark carries a table: how well its members' similarities fit, for a robot that looks at it
 from each direction (`_evidence`). From the side that was seen before a crop must be more similar
@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .camera import Floats, Views
+from .clusters import Indices, clusters, points_of, settle
 from .model import Model
 
 DIRECTIONS: Final = 36
@@ -29,21 +29,23 @@ _DEPTHS: Final = np.exp(np.linspace(np.log(0.5), np.log(6.5), 20))
 _FOR_DEPTH: Final = 40
 """The most similar matches suffice to find the size; all pairs of them are compared."""
 _AGREE_M: Final = 0.3
-_CLUSTER_M: Final = 0.35
-_REACH_M: Final = 0.8
 _CUT_WEIGHT: Final = 0.2
-
-Indices = NDArray[np.intp]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Landmark:
-    """A thing that may be the crop. ``members`` index the crop's posed matches."""
+    """A thing that may be the crop. ``members`` index the crop's posed matches.
+
+    ``spread`` (xx, xy, yy in m²) and ``slide`` (metres per unit of log size) say how unsure its
+    place is, see `clusters`.
+    """
 
     x: float
     y: float
     members: Indices
     table: Floats
+    spread: tuple[float, float, float]
+    slide: tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,6 +54,7 @@ class Landmarks:
 
     items: tuple[Landmark, ...]
     size: float
+    sigma_log_size: float
 
 
 def find_landmarks(poses: Floats, views: Views, similarity: Floats, model: Model) -> Landmarks:
@@ -60,14 +63,16 @@ def find_landmarks(poses: Floats, views: Views, similarity: Floats, model: Model
     weight = np.where(views.cut_x | views.cut_y | ~views.known, _CUT_WEIGHT * weight, weight)
     rays, median_px = _rays(poses, views)
     most = np.arange(min(_FOR_DEPTH, len(poses)))
-    depth = _common_depth(poses[most], rays[most], weight[most], model)
-    points = poses[:, :2] + depth * rays
+    depth, sigma = _common_depth(poses[most], rays[most], weight[most], model)
+    cut = views.cut_x | views.cut_y | ~views.known
+    points = points_of(poses[:, :2], depth * rays, cut, sigma, model)
     found = []
-    for x, y, members in _clusters(points, weight):
-        table = _evidence(poses[members], x, y, similarity[members], model)
-        found.append(Landmark(x, y, members, table))
+    for members in clusters(points, weight, 3 * MAX_LANDMARKS, model):
+        spot = settle(points.of(members), model)
+        table = _evidence(poses[members], spot.x, spot.y, similarity[members], model)
+        found.append(Landmark(spot.x, spot.y, members, table, spot.spread, spot.slide))
     found.sort(key=lambda landmark: (-float(landmark.table.max()), int(landmark.members[0])))
-    return Landmarks(tuple(found[:MAX_LANDMARKS]), depth * median_px)
+    return Landmarks(tuple(found[:MAX_LANDMARKS]), depth * median_px, sigma)
 
 
 def _rays(poses: Floats, views: Views) -> tuple[Floats, float]:
@@ -80,8 +85,11 @@ def _rays(poses: Floats, views: Views) -> tuple[Floats, float]:
     return (ahead + views.slope[:, None] * left) * relative[:, None], median_px
 
 
-def _common_depth(poses: Floats, rays: Floats, weight: Floats, model: Model) -> float:
-    """The depth of the median height under which points from different poses agree best."""
+def _common_depth(poses: Floats, rays: Floats, weight: Floats, model: Model) -> tuple[float, float]:
+    """The depth of the median height under which points from different poses agree best.
+
+    With it the standard error of its logarithm, the score taken for a log-likelihood.
+    """
     dp = poses[:, None, :2] - poses[None, :, :2]
     dr = rays[:, None] - rays[None]
     pp, pr, rr = (dp * dp).sum(2), (dp * dr).sum(2), (dr * dr).sum(2)
@@ -92,7 +100,7 @@ def _common_depth(poses: Floats, rays: Floats, weight: Floats, model: Model) -> 
     agreed = 2.0 * (apart * np.exp(squared / (-2.0 * _AGREE_M**2))).sum(1)
     usual = (np.log(_DEPTHS / model.usual_depth) / model.usual_depth_spread) ** 2
     score = 6.0 * agreed / max(1.0, float(weight.sum())) - 0.5 * usual
-    return _peak(score)
+    return _peak(score), max(model.sigma_size_least, _width(score))
 
 
 def _peak(score: Floats) -> float:
@@ -106,22 +114,13 @@ def _peak(score: Floats) -> float:
     return float(_DEPTHS[best] * (_DEPTHS[1] / _DEPTHS[0]) ** shift)
 
 
-def _clusters(points: Floats, weight: Floats) -> list[tuple[float, float, Indices]]:
-    """Points grouped around the densest one, then around the densest of the rest, and so on."""
-    between = _distances(points, points)
-    near = np.exp(between * between / (-2.0 * _CLUSTER_M**2))
-    free = np.ones(len(points), dtype=bool)
-    clusters: list[tuple[float, float, Indices]] = []
-    while free.any() and len(clusters) < 3 * MAX_LANDMARKS:
-        support = (near * (weight * free)).sum(1)
-        centre = int(np.argmax(np.where(free, support, -1.0)))
-        pull = near[centre] * free * (between[centre] < _REACH_M)
-        mean = (points * pull[:, None]).sum(0) / pull.sum()
-        mine = free & (np.hypot(points[:, 0] - mean[0], points[:, 1] - mean[1]) < _REACH_M)
-        mine[centre] = True
-        clusters.append((float(mean[0]), float(mean[1]), np.flatnonzero(mine)))
-        free &= ~mine
-    return clusters
+def _width(score: Floats) -> float:
+    """The standard deviation of log depth under exp(score)."""
+    share = np.exp(score - score.max())
+    share = share / share.sum()
+    logs = np.log(_DEPTHS)
+    off = logs - float((share * logs).sum())
+    return float(np.sqrt((share * off * off).sum()))
 
 
 def _evidence(poses: Floats, x: float, y: float, similarity: Floats, model: Model) -> Floats:
@@ -141,10 +140,3 @@ def _evidence(poses: Floats, x: float, y: float, similarity: Floats, model: Mode
     if float(similarity.max()) > model.usual_best + model.same_crop:
         table = table + model.same_crop_worth
     return table
-
-
-def _distances(a: Floats, b: Floats) -> Floats:
-    """Euclidean distances, shape (len(a), len(b))."""
-    dx, dy = a[:, None, 0] - b[None, :, 0], a[:, None, 1] - b[None, :, 1]
-    distances: Floats = np.sqrt(dx * dx + dy * dy)
-    return distances

@@ -21,6 +21,8 @@ from .sighting import Sighting
 
 _IMPOSSIBLE: Final = -30.0
 _TURN: Final = 2.0 * np.pi
+_USUAL_DET: Final = (0.15 * 0.08) ** 2
+"""The error ellipse of log depth and bearing against which a landmark is vague or sharp."""
 
 
 def explain(sightings: Sequence[Sighting], poses: Floats, model: Model) -> tuple[Floats, Floats]:
@@ -44,7 +46,7 @@ def _explain_crop(sighting: Sighting, poses: Floats, apart: Floats, model: Model
     if sighting.bearing is None:
         fit = fit + _in_view(bearing, reach, model)
     else:
-        fit = fit + _box_fit(sighting, bearing, reach, model)
+        fit = fit + _box_fit(sighting, dx, dy, reach, bearing, model)
     fit = np.maximum(fit + _seen_from(sighting, apart, model), _IMPOSSIBLE)
     explained: Floats = np.logaddexp(0.0, fit.max(0) + model.unknown_price)
     return explained
@@ -57,18 +59,42 @@ def _table_lookup(sighting: Sighting, looking_from: Floats) -> Floats:
     return values
 
 
-def _box_fit(sighting: Sighting, bearing: Floats, reach: Floats, model: Model) -> Floats:
-    counts = np.array([len(landmark.members) for landmark in sighting.landmarks])[:, None]
-    unsure_m = model.sigma_landmark + model.sigma_landmark_single / counts
+def _box_fit(
+    sighting: Sighting, dx: Floats, dy: Floats, reach: Floats, bearing: Floats, model: Model
+) -> Floats:
+    """A Gaussian in log depth and bearing, whose errors the landmark's place and size share."""
+    a, b, c = _box_errors(sighting, dx, dy, reach, model)
     off = _wrap(bearing - (sighting.bearing or 0.0))
-    width = model.sigma_bearing**2 + (unsure_m / np.maximum(reach, 0.6)) ** 2
-    width = width + (model.sigma_bearing_cut**2 if sighting.cut_x else 0.0)
     depth = np.maximum(reach * np.maximum(np.cos(bearing), 0.1), 0.1)
     ratio = np.log(depth / sighting.depth)
-    spread = model.sigma_log_depth**2 + (unsure_m / sighting.depth) ** 2
-    spread = spread + (model.sigma_log_depth_cut**2 if sighting.cut_y else 0.0)
-    fit: Floats = -0.5 * (off * off / width + ratio * ratio / spread)
+    det = a * c - b * b
+    chi = (c * ratio * ratio - 2.0 * b * ratio * off + a * off * off) / det
+    fit: Floats = -0.5 * (chi + model.vague * np.log(det / _USUAL_DET))
     return fit
+
+
+def _box_errors(
+    sighting: Sighting, dx: Floats, dy: Floats, reach: Floats, model: Model
+) -> tuple[Floats, Floats, Floats]:
+    """Covariance of (log depth, bearing): log depth's variance, the mixed term, bearing's."""
+    spreads = np.array([landmark.spread for landmark in sighting.landmarks])[:, :, None]
+    slides = np.array([landmark.slide for landmark in sighting.landmarks])[:, :, None]
+    r = np.maximum(reach, 0.6)
+    ux, uy, square = -dx / r, -dy / r, r * r
+    xx, xy, yy = spreads[:, 0], spreads[:, 1], spreads[:, 2]
+    along = (xx * ux * ux + 2.0 * xy * ux * uy + yy * uy * uy) / square
+    across = (xx * uy * uy - 2.0 * xy * ux * uy + yy * ux * ux) / square
+    mixed = ((yy - xx) * ux * uy + xy * (ux * ux - uy * uy)) / square
+    size = sighting.sigma_log_size**2
+    outward = (slides[:, 0] * ux + slides[:, 1] * uy) / r - 1.0  # the crop's depth moves with it
+    sideways = (slides[:, 1] * ux - slides[:, 0] * uy) / r
+    depth = model.sigma_log_depth**2 + (model.sigma_log_depth_cut**2 if sighting.cut_y else 0.0)
+    turn = model.sigma_bearing**2 + (model.sigma_bearing_cut**2 if sighting.cut_x else 0.0)
+    return (
+        along + size * outward * outward + depth,
+        mixed + size * outward * sideways,
+        across + size * sideways * sideways + turn,
+    )
 
 
 def _in_view(bearing: Floats, reach: Floats, model: Model) -> Floats:

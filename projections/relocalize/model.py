@@ -38,12 +38,23 @@ class Model:
     """Less similar observations show another model and are not looked at."""
     unknown_price: float = 7.0
     """Log-likelihood a perfect match has over 'this crop is not in the map'."""
-    sigma_bearing: float = 0.06
+    sigma_bearing: float = 0.04
     sigma_bearing_cut: float = 0.08
     sigma_log_depth: float = 0.15
     sigma_log_depth_cut: float = 0.3
     sigma_landmark: float = 0.1
-    sigma_landmark_single: float = 0.4
+    vague: float = 0.5
+    """How much of the log of the error ellipse's area counts: a landmark whose place is vague fits
+    everything a little, which must not be worth as much as one that fits sharply."""
+    map_bearing: float = 0.02
+    map_bearing_cut: float = 0.08
+    map_log_depth: float = 0.08
+    map_log_depth_cut: float = 0.3
+    map_least: float = 0.06
+    """Errors of the boxes a landmark is made of, radians and log; and metres on top."""
+    sigma_size_least: float = 0.05
+    gate: float = 5.0
+    """χ² below which a point belongs to a landmark."""
     half_view: float = 0.55
     """Without boxes: the half of the field of view in which objects are expected."""
     usual_depth: float = 2.6

@@ -20,7 +20,8 @@ class Sighting:
     """A crop and its landmarks. ``poses`` of shape (n, 3) are those its landmarks' members index.
 
     ``bearing`` (radians, left positive) and ``depth`` (metres ahead) are None without a box;
-    ``cut_x`` and ``cut_y`` say that the picture's edge cut the box.
+    ``cut_x`` and ``cut_y`` say that the picture's edge cut the box, ``sigma_log_size`` how unsure
+    the size is that depth and landmarks share.
     """
 
     landmarks: tuple[Landmark, ...]
@@ -29,6 +30,7 @@ class Sighting:
     depth: float
     cut_x: bool
     cut_y: bool
+    sigma_log_size: float
 
     @property
     def in_robot_frame(self) -> tuple[float, float]:
@@ -75,4 +77,5 @@ def _sighting(
         min(max(depth, _NEAREST_M), _FARTHEST_M),
         bool(own.cut_x[0]),
         bool(own.cut_y[0]),
+        landmarks.sigma_log_size,
     )
