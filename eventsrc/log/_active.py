@@ -118,8 +118,8 @@ class ActiveSegment:
         """Cut off what is half written. After a failed sync nobody knows which pages are on the
         disk, and after a full disk the next write fails as well: the writer must start anew."""
         message = (
-            f"{self.path}: {error.strerror or error}: {self.waiting} events after offset "
-            f"{self.committed} could not be written; every event before it is safe. "
+            f"{self.path}: {error.strerror or error}: {self.waiting} events from offset "
+            f"{self.committed} on could not be written; every event before it is safe. "
             "Free space or fix the disk, then start again"
         )
         try:

@@ -102,7 +102,7 @@ def test_a_disk_that_fails_in_the_other_thread_ends_the_writer(
         slow(disk, patch)
         disk.broken = True
         disk.let_through.release(99)
-        with pytest.raises(LogError, match="offset 4 could not be written"):
+        with pytest.raises(LogError, match="from offset 4 on could not be written"):
             append_for_ever(writer)
         with pytest.raises(LogError, match="Input/output error"):
             writer.commit_if_due()
