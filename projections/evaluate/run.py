@@ -12,6 +12,7 @@ from projections.relocalize import DEFAULT_CAMERA, Camera, Method
 from projections.settings import Settings
 from projections.view import MapView
 
+from .floor_plan import FloorPlan
 from .map_scores import object_scores, place_scores
 from .questions import DEFAULT_SEED, check_truth, make_questions, read_keyframes
 from .summary import summarise
@@ -50,7 +51,8 @@ def evaluate(
     keyframes = list(read_keyframes(query_logs))
     if query_logs:
         check_truth(keyframes, truth)
-    examiner = Examiner(view, truth, camera=camera, method=method)
+    plan = FloorPlan(list(read_keyframes([map_log])), keyframes, truth)
+    examiner = Examiner(view, truth, camera=camera, method=method, plan=plan)
     trials = {n: examiner.ask(make_questions(keyframes, truth, n, seed)) for n in CROPS}
     scores = {
         "places": place_scores(view, truth),

@@ -35,6 +35,8 @@ def summarise(trials: Sequence[Trial]) -> dict[str, Any]:
         "top1_contains_room": _share(roomed, lambda t: any(t.contains[:1])),
         "top3_contains_room": _share(roomed, lambda t: any(t.contains[:3])),
         "pose_room": _share(roomed, lambda t: t.question.room == t.room_of_pose),
+        "room_at_pose": _share(roomed, lambda t: t.question.room == t.room_at_pose),
+        "room_ceiling": _share(roomed, lambda t: t.room_has_place),
         "nearest_place": _share(
             [t for t in known if t.nearest_place is not None], lambda t: bool(t.nearest_place)
         ),

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from projections.relocalize import Answer, Camera, ExactIndex, Method, rank
 from projections.view import MapView
 
+from .floor_plan import FloorPlan
 from .map_scores import instances_of
 from .questions import Question
 from .truth import Truth
@@ -19,7 +20,10 @@ class Trial:
     """One question's outcome. Lengths in metres; None where the truth or the answer has nothing.
 
     ``known`` says that at least one of the crops' true instances is in the map. A place *is* a room
-    when most of its keyframes are in it, and *contains* it when any is.
+    when most of its keyframes are in it, and *contains* it when any is. ``room_has_place`` says
+    that some place contains the true room: without one no place can be the right answer.
+    ``room_of_pose`` is the room of the mapped keyframe nearest to the pose, ``room_at_pose`` the
+    room there by the `FloorPlan`, None without one.
     """
 
     question: Question
@@ -29,6 +33,8 @@ class Trial:
     yaw_error_rad: float | None
     centroid_error_m: float | None
     room_of_pose: str | None
+    room_at_pose: str | None
+    room_has_place: bool
     rooms_of_places: tuple[str | None, ...]
     contains: tuple[bool, ...]
     nearest_place: bool | None
@@ -38,7 +44,16 @@ class Trial:
 class Examiner:
     """Puts questions to a folded map by exact search, and knows the map's own truth."""
 
-    def __init__(self, view: MapView, truth: Truth, *, camera: Camera, method: Method) -> None:
+    def __init__(
+        self,
+        view: MapView,
+        truth: Truth,
+        *,
+        camera: Camera,
+        method: Method,
+        plan: FloorPlan | None = None,
+    ) -> None:
+        self._plan = plan
         self._index = ExactIndex(view)
         self._camera, self._method = camera, method
         self._instances = {i for _, i in instances_of(view, truth) if i is not None}
@@ -52,6 +67,8 @@ class Examiner:
             if room is not None and place_id is not None:
                 self._rooms[place_id][room] += 1
             self._drive.append((keyframe.pose.x_um / 1e6, keyframe.pose.y_um / 1e6, room, place_id))
+
+        self._entered = {room for rooms in self._rooms.values() for room in rooms}
 
     def ask(self, questions: Iterable[Question]) -> list[Trial]:
         """One trial for each question, three places asked for."""
@@ -75,6 +92,10 @@ class Examiner:
             if places
             else None,
             None if pose is None else self._nearest(pose.x, pose.y)[2],
+            None
+            if pose is None or self._plan is None
+            else self._plan.room(pose.x, pose.y, question.key),
+            question.room in self._entered,
             tuple(self._room_of(place.place_id) for place in places),
             tuple((question.room or "") in self._rooms[place.place_id] for place in places),
             None if here[3] is None or not places else places[0].place_id == here[3],

@@ -14,7 +14,7 @@ from .posterior import Posterior
 UNKNOWN_BELOW: Final = 0.3
 """Below this confidence the answer is 'unknown'."""
 
-WEIGHTS: Final[tuple[float, ...]] = (-7.019, 0.331, 0.113, 0.649, 4.318, -0.758)
+WEIGHTS: Final[tuple[float, ...]] = (-6.144, 0.159, 0.105, 0.740, 4.466, -0.776)
 """Intercept, then one weight for each of `features`."""
 
 

@@ -78,6 +78,14 @@ def test_the_scores_have_their_shape_and_sense(mapfold: Commands, runs: list[str
     assert three["auroc"] > 0.9
 
 
+def test_a_pose_may_lie_in_a_room_the_map_never_entered(mapfold: Commands, runs: list[str]) -> None:
+    half = mapfold("evaluate", *runs, "--at", "25", "--json").json["relocalization"]["3"]
+    whole = mapfold("evaluate", *runs, "--json").json["relocalization"]["3"]
+    assert half["room_ceiling"] < whole["room_ceiling"]
+    assert half["pose_room"] <= half["room_ceiling"]
+    assert whole["room_at_pose"] > 0.8
+
+
 def test_it_is_deterministic_but_for_the_clock(mapfold: Commands, runs: list[str]) -> None:
     one, other = (mapfold("evaluate", *runs, "--json").json for _ in range(2))
     for scores in (one, other):

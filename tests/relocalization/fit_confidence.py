@@ -1,6 +1,6 @@
 """Fit the weights of `projections.relocalize.confidence` on generated buildings; print them.
 
-Buildings 0 … 5 are fitted on; 6 and 7 are held out and reported beside them. Each is asked with one
+Buildings 0 … 9 are fitted on; 10 … 13 are held out and reported beside them. Each is asked with one
 to three crops, mapped whole and by its first third only, by its own second session and by another
 building's. Plain gradient descent (Newton's), so that nothing but numpy is needed.
 
@@ -24,20 +24,20 @@ from tests.relocalization.buildings import Building, Keyframe
 from tests.relocalization.drives import drive
 from tests.relocalization.rooms import crops_of, fold
 
-FITTED, HELD_OUT = range(6), range(6, 8)
+FITTED, HELD_OUT = range(10), range(10, 14)
 WITHIN_M = 1.5
 RIDGE = 0.1
-Row = tuple[tuple[float, ...], bool, bool]
-"""Features, whether the answer was right, whether the question was known."""
+Row = tuple[tuple[float, ...], bool, bool, int]
+"""Features, whether the answer was right, whether the question was known, number of crops."""
 
 
 def runs_of(seed: int) -> tuple[list[Keyframe], list[Keyframe]]:
     """A building's exploring run, 700 keyframes, and a second session of 400."""
     building = Building(
         seed,
-        columns=3 + seed % 2,
+        columns=2 + seed % 3,
         rows=2 + seed // 2 % 2,
-        things=50 + 10 * (seed % 4),
+        things=50 + 10 * (seed % 5),
         look_alikes=0.3 + 0.225 * (seed % 3),
     )
     return (
@@ -66,10 +66,10 @@ def _row(index: ExactIndex, instances: set[str], keyframe: Keyframe, drawn: list
     known = any(keyframe.instances[i] in instances for i in drawn)
     posterior = weigh(crops, index.search(crops), Camera(), MODEL)
     if posterior is None:
-        return (0.0,) * (len(WEIGHTS) - 1), False, known
+        return (0.0,) * (len(WEIGHTS) - 1), False, known, len(crops)
     envelope = keyframe.accepted.envelope
     error = math.hypot(posterior.x - (envelope.map_x or 0), posterior.y - (envelope.map_y or 0))
-    return features(posterior, len(crops)), known and error <= WITHIN_M, known
+    return features(posterior, len(crops)), known and error <= WITHIN_M, known, len(crops)
 
 
 def fit(x: NDArray[np.float64], y: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -115,7 +115,9 @@ def main() -> None:
     fitted = [row for seed in FITTED for row in rows[seed]]
     weights = fit(np.array([row[0] for row in fitted]), np.array([row[1] for row in fitted]))
     report("fitted", fitted, weights)
-    report("held out", [row for seed in HELD_OUT for row in rows[seed]], weights)
+    held_out = [row for seed in HELD_OUT for row in rows[seed]]
+    for crops in (1, 2, 3):
+        report(f"held out, {crops} crops", [row for row in held_out if row[3] == crops], weights)
     print(f"WEIGHTS = ({', '.join(f'{w:.3f}' for w in weights)})")
 
 
