@@ -28,33 +28,48 @@ _LEAST_PULL = 0.05
 class Points:
     """Points (n, 2) with the rays (n, 2) that lead to them from where they were seen, in metres.
 
-    ``along`` and ``across`` (n,) are their standard errors in and square to the ray's direction.
+    ``along`` and ``across`` (n,) are their standard errors in and square to the ray's direction,
+    whose unit vectors ``ahead`` holds (2, n). ``moments`` (7, n) are what weighted sums are made
+    of: the inverse of a point's covariance (xx, xy, yy), that times the point, and that times the
+    ray.
     """
 
     at: Floats
     ray: Floats
     along: Floats
     across: Floats
-
-    @property
-    def ahead(self) -> tuple[Floats, Floats]:
-        """Unit vectors of the rays, x and y; a ray of no length counts as one along x."""
-        length = np.sqrt(self.ray[:, 0] ** 2 + self.ray[:, 1] ** 2)
-        safe = np.where(length > 0, length, 1.0)
-        return np.where(length > 0, self.ray[:, 0] / safe, 1.0), self.ray[:, 1] / safe
+    ahead: Floats
+    moments: Floats
 
     def of(self, index: Indices) -> "Points":
         """Those at ``index``."""
-        return Points(self.at[index], self.ray[index], self.along[index], self.across[index])
+        return Points(
+            self.at[index],
+            self.ray[index],
+            self.along[index],
+            self.across[index],
+            self.ahead[:, index],
+            self.moments[:, index],
+        )
 
 
 def points_of(origin: Floats, ray: Floats, cut: Flags, sigma_size: float, model: Model) -> Points:
     """Points at the ends of the rays; ``cut`` marks boxes that are cut off or missing."""
-    reach = _reach(ray)
+    length = np.sqrt(ray[:, 0] ** 2 + ray[:, 1] ** 2)
+    reach = np.maximum(length, _LEAST_REACH_M)
     depth = np.where(cut, model.map_log_depth_cut, model.map_log_depth)
     bearing = np.where(cut, model.map_bearing_cut, model.map_bearing)
     along = np.sqrt(depth * depth + sigma_size**2) * reach + model.map_least
-    return Points(origin + ray, ray, along, bearing * reach + model.map_least)
+    across = bearing * reach + model.map_least
+    safe = np.where(length > 0, length, 1.0)
+    ux, uy = np.where(length > 0, ray[:, 0] / safe, 1.0), ray[:, 1] / safe  # no length: along x
+    a, b = 1.0 / (along * along), 1.0 / (across * across)
+    at = origin + ray
+    xx, xy, yy = a * ux * ux + b * uy * uy, (a - b) * ux * uy, a * uy * uy + b * ux * ux
+    rows = [xx, xy, yy]
+    for x, y in (at.T, ray.T):
+        rows += [xx * x + xy * y, xy * x + yy * y]
+    return Points(at, ray, along, across, np.stack((ux, uy)), np.stack(rows))
 
 
 def clusters(points: Points, weight: Floats, most: int, model: Model) -> list[Indices]:
@@ -88,17 +103,11 @@ def settle(points: Points, model: Model) -> Settled:
     """The place of the thing that all ``points`` show, outliers counting little."""
     centre = np.array(_mean(points, np.ones(len(points.at))))
     pull = np.maximum(np.exp(-0.5 * _misfit(points, centre)), _LEAST_PULL)
-    xx, xy, yy = _information(points, pull)
-    x, y = _solve(xx, xy, yy, points.at)
-    sxx, sxy, syy = float(xx.sum()), float(xy.sum()), float(yy.sum())
+    sxx, sxy, syy, x, y, ray_x, ray_y = (points.moments * pull).sum(1).tolist()
     det, least = sxx * syy - sxy * sxy, model.sigma_landmark**2
     spread = (syy / det + least, -sxy / det, sxx / det + least)
-    return Settled(x, y, spread, _solve(xx, xy, yy, points.ray))
-
-
-def _reach(ray: Floats) -> Floats:
-    reach: Floats = np.maximum(np.sqrt(ray[:, 0] ** 2 + ray[:, 1] ** 2), _LEAST_REACH_M)
-    return reach
+    at = _solve(sxx, sxy, syy, x, y)
+    return Settled(*at, spread, _solve(sxx, sxy, syy, ray_x, ray_y))
 
 
 def _misfit(points: Points, to: Floats) -> Floats:
@@ -110,24 +119,12 @@ def _misfit(points: Points, to: Floats) -> Floats:
     return chi
 
 
-def _information(points: Points, weight: Floats) -> tuple[Floats, Floats, Floats]:
-    ux, uy = points.ahead
-    along, across = weight / points.along**2, weight / points.across**2
-    return (
-        along * ux * ux + across * uy * uy,
-        (along - across) * ux * uy,
-        along * uy * uy + across * ux * ux,
-    )
-
-
 def _mean(points: Points, weight: Floats) -> tuple[float, float]:
-    return _solve(*_information(points, weight), points.at)
+    """The mean place, weighted by information too."""
+    return _solve(*(points.moments[:5] * weight).sum(1).tolist())
 
 
-def _solve(xx: Floats, xy: Floats, yy: Floats, vectors: Floats) -> tuple[float, float]:
-    """The mean of ``vectors`` weighted by 2 × 2 information matrices."""
-    sxx, sxy, syy = float(xx.sum()), float(xy.sum()), float(yy.sum())
-    bx = float((xx * vectors[:, 0] + xy * vectors[:, 1]).sum())
-    by = float((xy * vectors[:, 0] + yy * vectors[:, 1]).sum())
-    det = sxx * syy - sxy * sxy
-    return (syy * bx - sxy * by) / det, (sxx * by - sxy * bx) / det
+def _solve(xx: float, xy: float, yy: float, x: float, y: float) -> tuple[float, float]:
+    """The vector that the symmetric matrix takes to (x, y)."""
+    det = xx * yy - xy * xy
+    return (yy * x - xy * y) / det, (xx * y - xy * x) / det

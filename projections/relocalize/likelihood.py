@@ -80,11 +80,13 @@ def _box_errors(
     spreads = np.array([landmark.spread for landmark in sighting.landmarks])[:, :, None]
     slides = np.array([landmark.slide for landmark in sighting.landmarks])[:, :, None]
     r = np.maximum(reach, 0.6)
-    ux, uy, square = -dx / r, -dy / r, r * r
+    ux, uy = -dx / r, -dy / r
+    uxx, uxy, uyy, square = ux * ux, ux * uy, uy * uy, r * r
     xx, xy, yy = spreads[:, 0], spreads[:, 1], spreads[:, 2]
-    along = (xx * ux * ux + 2.0 * xy * ux * uy + yy * uy * uy) / square
-    across = (xx * uy * uy - 2.0 * xy * ux * uy + yy * ux * ux) / square
-    mixed = ((yy - xx) * ux * uy + xy * (ux * ux - uy * uy)) / square
+    skew = 2.0 * xy * uxy
+    along = (xx * uxx + skew + yy * uyy) / square
+    across = (xx * uyy - skew + yy * uxx) / square
+    mixed = ((yy - xx) * uxy + xy * (uxx - uyy)) / square
     size = sighting.sigma_log_size**2
     outward = (slides[:, 0] * ux + slides[:, 1] * uy) / r - 1.0  # the crop's depth moves with it
     sideways = (slides[:, 1] * ux - slides[:, 0] * uy) / r
