@@ -9,19 +9,18 @@ in silence.
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from eventsrc.envelope import ENVELOPE_VERSION
-from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES, Accepted, Rejected
+from eventsrc.envelope import ENVELOPE_VERSION, Envelope
+from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES, Rejected
 from eventsrc.log import LogWriter, NewEvent
 from eventsrc.system_events import REJECTED_KEY, RejectedPayload, is_system_key
-from eventsrc.upcast import Arrival, guess_version, read_envelopes
+from eventsrc.upcast import Arrival, check_envelopes, guess_version
 
 
 class Judged(NamedTuple):
-    """What the door said to one payload that came in ``version``, and what gets into the log."""
+    """What gets into the log for one payload, and what the door said to it."""
 
     event: NewEvent
-    outcome: Accepted | Rejected
-    version: int
+    verdict: Envelope | Rejected
 
 
 def append_payload(
@@ -31,14 +30,14 @@ def append_payload(
     *,
     logged_ns: int | None = None,
     max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES,
-) -> Accepted | Rejected:
+) -> Envelope | Rejected:
     """Append ``payload``, which came under ``key``; what the door said.
 
     ``logged_ns`` is when it was received, if that was earlier and elsewhere; otherwise now.
     """
     (judged,) = judge_payloads(writer, [(key, payload)], logged_ns=logged_ns, max_bytes=max_bytes)
     writer.append_all([judged.event])
-    return judged.outcome
+    return judged.verdict
 
 
 def judge_payloads(
@@ -58,19 +57,16 @@ def judge_payloads(
         Arrival(offset, key, logged, payload, guess_version(payload))
         for offset, (key, payload) in enumerate(messages, writer.next_offset)
     ]
-    outcomes = _judge(arrivals, max_bytes)
-    return [
-        Judged(_event(arrival, outcome), outcome, arrival.version)
-        for arrival, outcome in zip(arrivals, outcomes, strict=True)
-    ]
+    verdicts = _judge(arrivals, max_bytes)
+    return [Judged(_event(*both), both[1]) for both in zip(arrivals, verdicts, strict=True)]
 
 
-def _event(arrival: Arrival, outcome: Accepted | Rejected) -> NewEvent:
-    logged = arrival.stamp_ns
-    if isinstance(outcome, Rejected):
-        return _rejected(arrival.key, arrival.payload, outcome.reason, logged)
-    stamp = outcome.envelope.stamp_ns if arrival.version == ENVELOPE_VERSION else logged
-    return NewEvent(arrival.key, arrival.payload, logged, stamp, arrival.version)
+def _event(arrival: Arrival, verdict: Envelope | Rejected) -> NewEvent:
+    _, key, logged, payload, version = arrival
+    if isinstance(verdict, Rejected):
+        return _rejected(key, payload, verdict.reason, logged)
+    stamp = verdict.stamp_ns if version == ENVELOPE_VERSION else logged
+    return NewEvent(key, payload, logged, stamp, version)
 
 
 def _rejected(key: str, payload: bytes, reason: str, logged_ns: int) -> NewEvent:
@@ -78,11 +74,11 @@ def _rejected(key: str, payload: bytes, reason: str, logged_ns: int) -> NewEvent
     return NewEvent(REJECTED_KEY, record, logged_ns, logged_ns)
 
 
-def _judge(arrivals: Sequence[Arrival], max_bytes: int) -> list[Accepted | Rejected]:
+def _judge(arrivals: Sequence[Arrival], max_bytes: int) -> list[Envelope | Rejected]:
     """What the door says, but for keys that nobody may send under."""
-    outcomes = read_envelopes(arrivals, max_bytes=max_bytes)
+    verdicts = check_envelopes(arrivals, max_bytes=max_bytes)
     for index, arrival in enumerate(arrivals):
         if is_system_key(arrival.key):
             reason = f"key {arrival.key!r} is reserved for mapfold's own events"
-            outcomes[index] = Rejected(reason)
-    return outcomes
+            verdicts[index] = Rejected(reason)
+    return verdicts

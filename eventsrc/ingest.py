@@ -16,7 +16,7 @@ import pybase64
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from .envelope import Detection, Envelope
+from .envelope import Detection, Envelope, fault
 from .frozen import frozen
 from .ids import DetId, default_det_id
 
@@ -61,12 +61,26 @@ def ingest_all(
 ) -> list[Accepted | Rejected]:
     """`ingest` of each, none dependent on another. Decoding their vectors together saves time."""
     read = [_read(payload, max_bytes) for payload in payloads]
-    detections = [d for said in read if isinstance(said, Envelope) for d in said.detections]
-    vectors = _vectors_of_one_kind(detections)
-    if vectors is None:
+    rows = _rows_of_one_kind(_detections(read))
+    if rows is None:
         return [_admit(said, None) for said in read]
-    coming = iter(vectors)
+    coming = iter(list(rows))
     return [_admit(said, coming) for said in read]
+
+
+def check_all(
+    payloads: Sequence[bytes], *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES
+) -> list[Envelope | Rejected]:
+    """What `ingest_all` says to each, without its vectors and ids: for who only keeps the bytes."""
+    read = [_read(payload, max_bytes) for payload in payloads]
+    if _rows_of_one_kind(_detections(read)) is not None:
+        return [_check_det_ids(said) for said in read]
+    admitted = [_admit(said, None) for said in read]
+    return [said if isinstance(said, Rejected) else said.envelope for said in admitted]
+
+
+def _detections(read: Sequence[Envelope | Rejected]) -> list[Detection]:
+    return [d for said in read if isinstance(said, Envelope) for d in said.detections]
 
 
 def _read(payload: bytes, max_bytes: int) -> Envelope | Rejected:
@@ -100,13 +114,23 @@ def _first_error(error: ValidationError) -> str:
     if first["type"] == "model_type" and not first["loc"]:
         return f"not a JSON object but {type(first['input']).__name__}"
     place = ".".join(str(part) for part in first["loc"]) or "envelope"
-    message = first["msg"].removeprefix("Value error, ")
+    message = fault(first)
     more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
     if first["type"] == "missing":
         return f"{place}: required field is missing{more}"
     value = repr(first["input"])
     value = value if len(value) <= 80 else value[:77] + "..."
     return f"{place}: {message} (got {value}){more}" if first["loc"] else f"{message}{more}"
+
+
+def _check_det_ids(said: Envelope | Rejected) -> Envelope | Rejected:
+    if isinstance(said, Rejected) or not any(d.det_id is not None for d in said.detections):
+        return said  # the ids that mapfold gives differ from one another
+    try:
+        _det_ids(said)
+    except _RefusalError as refusal:
+        return Rejected(str(refusal))
+    return said
 
 
 def _det_ids(envelope: Envelope) -> tuple[DetId, ...]:
@@ -130,16 +154,17 @@ def _det_ids(envelope: Envelope) -> tuple[DetId, ...]:
 
 def _vectors(envelope: Envelope) -> tuple[Vector | None, ...]:
     detections = envelope.detections
+    rows = _rows_of_one_kind(detections)
+    if rows is not None:
+        return tuple(rows)
     return tuple(
-        _vectors_of_one_kind(detections)
-        or [
-            None if d.embedding is None else _vector(index, d) for index, d in enumerate(detections)
-        ]
+        None if d.embedding is None else _vector(index, d) for index, d in enumerate(detections)
     )
 
 
-def _vectors_of_one_kind(detections: Sequence[Detection]) -> list[Vector] | None:
-    """All vectors at once if there is nothing odd about them, as a rule; None to look closer."""
+def _rows_of_one_kind(detections: Sequence[Detection]) -> Vector | None:
+    """All vectors, shape (len(detections), dim), if there is nothing odd about them, as a rule;
+    None to look closer."""
     try:
         raws = [pybase64.b64decode(d.embedding, None, True) for d in detections]  # type: ignore[arg-type]
     except (TypeError, ValueError):
@@ -153,7 +178,7 @@ def _vectors_of_one_kind(detections: Sequence[Detection]) -> list[Vector] | None
     for norm2 in np.einsum("ij,ij->i", rows, rows).tolist():
         if not 0.0 < norm2 < math.inf:
             return None
-    return list(rows)
+    return rows
 
 
 def _vector(index: int, detection: Detection) -> Vector:

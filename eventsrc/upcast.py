@@ -17,12 +17,18 @@ log of that version to the tests. Never change a step that has been released.
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
-from .envelope import ENVELOPE_VERSION
-from .ingest import DEFAULT_MAX_PAYLOAD_BYTES, Accepted, Rejected, ingest, ingest_all
+from .envelope import ENVELOPE_VERSION, Envelope
+from .ingest import (
+    DEFAULT_MAX_PAYLOAD_BYTES,
+    Accepted,
+    Rejected,
+    check_all,
+    ingest,
+    ingest_all,
+)
 
 BARE_LIST_VERSION = 1
 
@@ -46,8 +52,7 @@ Step = Callable[[Any, Recorded], Any]
 """From the JSON value of one version to that of the next. Raises ValueError for what is none."""
 
 
-@dataclass(frozen=True, slots=True)
-class Arrival:
+class Arrival(NamedTuple):
     """A payload that is about to be recorded, as far as a step may know it."""
 
     offset: int
@@ -84,6 +89,16 @@ def read_envelopes(
     if any(event.version != ENVELOPE_VERSION for event in events):
         return [read_envelope(event, max_bytes=max_bytes) for event in events]
     return ingest_all([event.payload for event in events], max_bytes=max_bytes)
+
+
+def check_envelopes(
+    events: Sequence[Recorded], *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES
+) -> list[Envelope | Rejected]:
+    """What `read_envelopes` says to each, without its vectors and ids."""
+    if any(event.version != ENVELOPE_VERSION for event in events):
+        read = [read_envelope(event, max_bytes=max_bytes) for event in events]
+        return [said if isinstance(said, Rejected) else said.envelope for said in read]
+    return check_all([event.payload for event in events], max_bytes=max_bytes)
 
 
 def guess_version(payload: bytes) -> int:

@@ -87,7 +87,10 @@ class GroupBuilder:
             parts.append(encode_message_head(channel, sequence, logged_ns, stamp_ns, length))
             parts.append(payload)
             sequence += 1
-            first_ns, last_ns = min(first_ns, logged_ns), max(last_ns, logged_ns)
+            if logged_ns < first_ns:
+                first_ns = logged_ns
+            elif logged_ns > last_ns:
+                last_ns = logged_ns
             size += MESSAGE_HEAD + length
             if size >= self._most_bytes:
                 break

@@ -8,6 +8,7 @@
   `judge_payloads` rejects such a message like any other that is no envelope.
 """
 
+import itertools
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable
@@ -15,9 +16,9 @@ from typing import Final, Literal, NamedTuple
 
 from eventsrc._zenoh import Received
 from eventsrc.acks import Ack
-from eventsrc.append import judge_payloads
+from eventsrc.append import Judged, judge_payloads
 from eventsrc.envelope import ENVELOPE_VERSION
-from eventsrc.ingest import Accepted, Rejected
+from eventsrc.ingest import Rejected
 from eventsrc.ledger import save_ledger
 from eventsrc.log import LogWriter
 from eventsrc.losses import Gap, GapLedger
@@ -49,13 +50,14 @@ class _Unsynced(NamedTuple):
     run_id: str | None
     keyframe_id: int
 
-    @classmethod
-    def of(cls, offset: int, outcome: Accepted | Rejected, version: int) -> "_Unsynced":
-        if isinstance(outcome, Rejected):
-            return cls(offset, False, None, 0)
-        if version != ENVELOPE_VERSION:
-            return cls(offset, True, None, 0)
-        return cls(offset, True, outcome.envelope.run_id, outcome.envelope.keyframe_id)
+
+def _unsynced(offset: int, judged: Judged) -> _Unsynced:
+    event, verdict = judged
+    if isinstance(verdict, Rejected):
+        return _Unsynced(offset, False, None, 0)
+    if event.version != ENVELOPE_VERSION:
+        return _Unsynced(offset, True, None, 0)
+    return _Unsynced(offset, True, verdict.run_id, verdict.keyframe_id)
 
 
 class Writing:
@@ -136,15 +138,10 @@ class Writing:
         return bool(batch or not closed) and self._room != 0
 
     def _record(self, messages: list[Received]) -> None:
-        judged = judge_payloads(
-            self._writer,
-            [(message.key, message.payload) for message in messages],
-            max_bytes=self._max_payload_bytes,
-        )
+        judged = judge_payloads(self._writer, messages, max_bytes=self._max_payload_bytes)
         # Noted first: should appending fail in the middle, what was synced by then still counts.
-        for offset, (_, outcome, version) in enumerate(judged, self._writer.next_offset):
-            self._unsynced.append(_Unsynced.of(offset, outcome, version))
-        self._writer.append_all([one.event for one in judged])
+        self._unsynced.extend(map(_unsynced, itertools.count(self._writer.next_offset), judged))
+        self._writer.append_all([event for event, _ in judged])
 
     def _follow_up(self) -> None:
         """Everything synced since the last call: recorded, counted, acknowledged."""

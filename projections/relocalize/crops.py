@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from eventsrc.envelope import MAX_DIMENSION, Text
+from eventsrc.envelope import MAX_DIMENSION, Text, fault
 from projections.errors import QuestionError
 from projections.exact import quantise, to_float32
 
@@ -108,7 +108,7 @@ def _validated(items: list[Any]) -> list[_CropModel]:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         place = ".".join(str(part) for part in first["loc"] if not str(part).endswith("]"))
-        raise QuestionError(f"crops.{place}: {first['msg'].lower()}") from None
+        raise QuestionError(f"crops.{place}: {fault(first).lower()}") from None
 
 
 def _crop(index: int, model: _CropModel) -> Crop:

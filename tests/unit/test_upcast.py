@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from eventsrc.append import append_payload
-from eventsrc.envelope import ENVELOPE_VERSION
+from eventsrc.envelope import ENVELOPE_VERSION, Envelope
 from eventsrc.ingest import Accepted, Rejected
 from eventsrc.log import Event, LogReader, LogWriter
 from eventsrc.upcast import LADDER, guess_version, read_envelope
@@ -64,8 +64,8 @@ def test_guessing(payload: bytes, version: int) -> None:
 
 def test_a_log_of_both_forms_keeps_the_bytes_and_folds(log_path: Path) -> None:
     with LogWriter(log_path) as writer:
-        assert isinstance(append_payload(writer, KEY, envelope(1)), Accepted)
-        assert isinstance(append_payload(writer, KEY, BARE, logged_ns=10**9), Accepted)
+        assert isinstance(append_payload(writer, KEY, envelope(1)), Envelope)
+        assert isinstance(append_payload(writer, KEY, BARE, logged_ns=10**9), Envelope)
         assert isinstance(append_payload(writer, KEY, b'[{"class": "cup"}]'), Rejected)
     events = read_log(log_path)
     assert [e.version for e in events[:2]] == [2, 1]
