@@ -9,7 +9,7 @@ from .recover import RecoveryReport, SegmentRecovery, recover_log
 from .segment import Unreadable
 from .tail import follow
 from .verify import Verification, verify_log
-from .writer import LogWriter
+from .writer import LogWriter, Sealing
 
 __all__ = [
     "ALWAYS",
@@ -23,6 +23,7 @@ __all__ = [
     "LogWriter",
     "NewEvent",
     "RecoveryReport",
+    "Sealing",
     "SegmentInfo",
     "SegmentRecovery",
     "Unreadable",

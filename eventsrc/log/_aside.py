@@ -8,6 +8,9 @@ the segment at hand and puts nothing anywhere. It is started at a lower priority
 terminal's process group, so that Ctrl-C leaves it to the writer to end it.
 
 One JSON document a line: a plan comes in, ``{"sha256": …, "temporary": …}`` or the error goes out.
+
+The process imports from where its parent does and nowhere else: a file in the current folder that
+happens to be named like a module must not get into it.
 """
 
 import contextlib
@@ -27,7 +30,10 @@ from .fsync import replace_durably, unlink_quietly
 
 _NICE: Final = 10
 """Recording goes first, but not so far that sealing starves on a busy machine."""
-_ENTRY: Final = "from eventsrc.log._aside import serve; serve()"
+_ENTRY: Final = (
+    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
+    "from eventsrc.log._aside import serve; serve()"
+)
 
 
 class ProcessGone(Exception):
@@ -40,7 +46,7 @@ class SealingProcess:
     def __init__(self) -> None:
         try:
             self._process = subprocess.Popen(  # noqa: S603 (our own code, no input in it)
-                [sys.executable, "-c", _ENTRY],
+                [sys.executable, "-P", "-c", _ENTRY, json.dumps(sys.path)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
@@ -76,6 +82,7 @@ class SealingProcess:
             answer: dict[str, Any] = json.loads(self._from.readline())
         except (OSError, ValueError) as error:
             self.close()
+            unlink_quietly(_temporary(question, self._process.pid))
             raise ProcessGone(str(error)) from error
         return answer
 
@@ -92,17 +99,21 @@ def serve() -> None:
     os.nice(_NICE)
     for line in sys.stdin:
         question = json.loads(line)
-        plan = SegmentPlan(Path(question.pop("log")), **question)
-        temporary = segment_path(plan.log, plan.base, f".{os.getpid()}{SEALING}")
-        answer = json.dumps(_answer(plan, temporary))
+        temporary = _temporary(question, os.getpid())
         try:
-            print(answer, flush=True)
+            print(json.dumps(answer(question, temporary)), flush=True)
         except OSError:  # the writer is gone, and this is nobody's file
             unlink_quietly(temporary)
             os._exit(1)
 
 
-def _answer(plan: SegmentPlan, temporary: Path) -> dict[str, Any]:
+def _temporary(question: dict[str, Any], pid: int) -> Path:
+    return segment_path(Path(question["log"]), question["base"], f".{pid}{SEALING}")
+
+
+def answer(question: dict[str, Any], temporary: Path) -> dict[str, Any]:
+    """Write the segment asked for to ``temporary``; what to say of it."""
+    plan = SegmentPlan(**{**question, "log": Path(question["log"])})
     try:
         file = ActiveFile(segment_path(plan.log, plan.base, ACTIVE), plan.base)
         sha256 = write_sealed(plan, (file.read_chunk(c) for c in file.chunks), temporary)

@@ -20,9 +20,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from eventsrc.errors import LogDamaged
+
 from . import _mcap
 from ._head import SEGMENT_METADATA, file_head, head_metadata
 from ._mcap import (
+    BadRecord,
     Channel,
     ChunkIndex,
     DataEnd,
@@ -34,7 +37,7 @@ from ._mcap import (
     Statistics,
     SummaryOffset,
 )
-from ._naming import SEALED, SEALING, segment_path
+from ._naming import ACTIVE, SEALED, SEALING, segment_path
 from ._parts import Part, parts_of
 from ._sealed_file import SEAL_METADATA
 from .fsync import replace_durably, sync_file, unlink_quietly, write_all
@@ -65,7 +68,8 @@ def seal(plan: SegmentPlan, bodies: Iterable[bytes]) -> str:
 
 
 def write_sealed(plan: SegmentPlan, bodies: Iterable[bytes], temporary: Path) -> str:
-    """Write it beside, synced but not yet in its place; see `seal`."""
+    """Write it beside, synced but not yet in its place; see `seal`. Raises OSError, and LogDamaged
+    for bodies that are not what a writer makes."""
     fd = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
     try:
         builder = _Builder(fd, plan)
@@ -73,6 +77,9 @@ def write_sealed(plan: SegmentPlan, bodies: Iterable[bytes], temporary: Path) ->
             builder.add_chunk(part)
         builder.finish()
         sync_file(fd)
+    except BadRecord as error:
+        unlink_quietly(temporary)
+        raise LogDamaged(f"{segment_path(plan.log, plan.base, ACTIVE)}: {error}") from None
     except BaseException:
         unlink_quietly(temporary)
         raise

@@ -4,12 +4,13 @@ Compressing and hashing release the interpreter lock, so recording goes on; for 
 thread has a process do the work (`_aside`), and does it itself when there is none to be had.
 Sealing may fall behind a recording that is faster; that costs disk (a segment waits at its full
 size), and no more. What fails here costs nothing either: the active file stays, is read as before,
-and is sealed on the next start. Nor does it cost anything to be stopped in the middle, so the
-thread keeps no process alive that forgot to close.
+and is tried again, on the next start at the latest. Nor does it cost anything to be stopped in the
+middle, so the thread keeps no process alive that forgot to close.
 """
 
 import queue
 import threading
+from collections import deque
 from pathlib import Path
 
 from eventsrc.errors import LogError, MapfoldError
@@ -31,11 +32,19 @@ class Sealer:
         self._aside = aside
         self._process: SealingProcess | None = None
         self._log_id = log_id
-        self._previous_sha256 = previous_sha256
-        self._bases: queue.Queue[int | None] = queue.Queue()
+        self._previous_sha256 = self._sealed_sha256 = previous_sha256
+        self._submitted: queue.Queue[int | None] = queue.Queue()
         self._finishing = False
+        self._damaged = False
         self._thread: threading.Thread | None = None
+        self._count = self._sealed = 0
         self.error: LogError | None = None
+        """Why the segment at hand is not sealed; None again once it is."""
+
+    @property
+    def waiting(self) -> int:
+        """Segments submitted and not sealed."""
+        return self._count - self._sealed
 
     def submit(self, base: int, *, last: bool = False) -> None:
         """Seal the finished active segment at ``base`` when its turn comes."""
@@ -43,37 +52,54 @@ class Sealer:
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name="mapfold-sealer", daemon=True)
             self._thread.start()
-        self._bases.put(base)
+        self._count += 1
+        self._submitted.put(base)
 
     def finish(self) -> None:
         """Wait until everything submitted is sealed or has failed; `error` says which."""
         if self._thread is not None:
-            self._bases.put(None)
+            self._submitted.put(None)
             self._thread.join()
             self._thread = None
 
     def _run(self) -> None:
-        while (base := self._bases.get()) is not None:
-            if self.error is not None:
-                continue  # a later segment carries the hash of this one, so order must hold
-            try:
-                self._seal(base)
-            except OSError as error:
-                self.error = LogError(
-                    f"{segment_path(self._log, base, ACTIVE)} could not be sealed: "
-                    f"{error.strerror or error}; its events are safe and readable, and the next "
-                    "start seals it"
-                )
-            except MapfoldError as error:
-                self.error = LogError(f"{error}; run `mapfold log recover {self._log}`")
+        waiting: deque[int] = deque()
+        while (base := self._submitted.get()) is not None:
+            waiting.append(base)
+            self._work_off(waiting)
+        self._work_off(waiting)
         if self._process is not None:
             self._process.close()
 
+    def _work_off(self, waiting: deque[int]) -> None:
+        """Seal in order, for a segment carries the hash of the one before it. A disk that refused
+        is tried again when the next segment comes; damage stays."""
+        while waiting and not self._damaged:
+            path = segment_path(self._log, waiting[0], ACTIVE)
+            try:
+                self._seal(waiting[0])
+            except OSError as error:
+                self.error = LogError(
+                    f"{path} could not be sealed: {error.strerror or error}; its events are safe "
+                    "and readable. It is tried again with the next segment and on the next start"
+                )
+                return
+            except MapfoldError as error:
+                self._damaged = True
+                self.error = LogError(f"{error}; run `mapfold log recover {self._log}`")
+            else:
+                self.error = None
+                self._sealed += 1
+                waiting.popleft()
+
     def _seal(self, base: int) -> None:
-        plan = SegmentPlan(self._log, self._log_id, base, self._previous_sha256)
-        self._previous_sha256 = self._seal_aside(plan) or self._seal_here(plan)
-        segment_path(self._log, base, ACTIVE).unlink()
+        active = segment_path(self._log, base, ACTIVE)
+        if active.exists():  # else only the folder's sync failed, the time before
+            plan = SegmentPlan(self._log, self._log_id, base, self._previous_sha256)
+            self._sealed_sha256 = self._seal_aside(plan) or self._seal_here(plan)
+            active.unlink()
         sync_directory(self._log)
+        self._previous_sha256 = self._sealed_sha256
 
     def _seal_here(self, plan: SegmentPlan) -> str:
         file = ActiveFile(segment_path(self._log, plan.base, ACTIVE), plan.base)

@@ -6,11 +6,13 @@ never called recorded, and the next writer goes on behind the last good event.
 """
 
 import contextlib
+import errno
 import time
 import uuid
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
+from typing import NamedTuple
 
 from eventsrc.clock import Clock, system_clock
 from eventsrc.envelope import ENVELOPE_VERSION
@@ -29,6 +31,14 @@ ROTATE_BYTES = 64 * 1024 * 1024
 ROTATE_EVENTS = 1_000_000
 ROTATE_SECONDS = 3600.0
 _MAX_NS = 2**63
+
+
+class Sealing(NamedTuple):
+    """``waiting`` segments are finished and not sealed yet. ``error`` says why the first of them is
+    not, if it was tried; that costs disk and loses nothing."""
+
+    waiting: int
+    error: LogError | None
 
 
 class LogWriter:
@@ -64,9 +74,7 @@ class LogWriter:
         try:
             self._open()
         except OSError as error:
-            raise LogError(
-                f"{path}: {error.strerror or error}; check the folder's rights"
-            ) from error
+            raise LogError(f"{path}: {error.strerror or error}; {_way_out(error)}") from error
 
     def _open(self) -> None:
         _make_log_directory(self.path)
@@ -95,6 +103,11 @@ class LogWriter:
     def durable_offset(self) -> int:
         """Every event below it is synced, and visible to readers."""
         return self._active.committed
+
+    @property
+    def sealing(self) -> Sealing:
+        """How far the sealing of finished segments is behind."""
+        return Sealing(self._sealer.waiting, self._sealer.error)
 
     def now_ns(self) -> int:
         """The writer's clock."""
@@ -209,6 +222,12 @@ class LogWriter:
             return
         with contextlib.suppress(MapfoldError):  # the first error is the one to tell
             self.close()
+
+
+def _way_out(error: OSError) -> str:
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return "free space on its disk and start again"
+    return "check the folder's rights and its disk"
 
 
 def _make_log_directory(path: Path) -> None:

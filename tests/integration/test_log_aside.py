@@ -125,6 +125,32 @@ def test_a_short_recording_starts_no_process(
     assert len(list(log_path.glob("*.mcap"))) == 1
 
 
+def test_a_process_that_dies_at_work_leaves_no_half_made_file(tmp_path: Path) -> None:
+    plan = growing(tmp_path / "log")
+    process = SealingProcess()
+    half_made = plan.log / f"{0:020d}.{process._process.pid}.mcap.sealing"
+    half_made.write_bytes(b"half")
+    process._process.kill()
+    with pytest.raises(ProcessGone):
+        process.seal(plan)
+    assert not half_made.exists()
+
+
+def test_it_imports_nothing_from_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = growing(tmp_path / "log")
+    stranger = tmp_path / "folder"
+    for module in ("json.py", "queue.py", "eventsrc/__init__.py"):
+        (stranger / module).parent.mkdir(parents=True, exist_ok=True)
+        (stranger / module).write_text(f"open({str(tmp_path / 'executed')!r}, 'w')")
+    monkeypatch.chdir(stranger)
+    process = SealingProcess()
+    process.seal(plan)
+    process.close()
+    assert not (tmp_path / "executed").exists()
+
+
 def test_errors_come_back_as_they_were(tmp_path: Path) -> None:
     plan = growing(tmp_path / "log")
     process = SealingProcess()

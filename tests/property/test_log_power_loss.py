@@ -2,17 +2,22 @@
 been called recorded is read back, none is made up, and the log is written on."""
 
 import shutil
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from eventsrc.errors import LogError
-from eventsrc.log import LogReader, LogWriter, recover_log
+from eventsrc.log import LogReader, LogWriter, _sealer, recover_log
+from eventsrc.log._aside import SealingProcess, answer
+from eventsrc.log._seal import SegmentPlan
 from eventsrc.log.fsync import ALWAYS, FsyncPolicy
 from tests.fixtures_log import BY_HAND, KEY, read_log
 from tests.power_loss import Call, Tracer, power_cuts
 
+TIMEOUT_S = 30
 THREE = FsyncPolicy(interval_ns=10**18, max_events=3)
 
 
@@ -43,11 +48,34 @@ def one_life(tracer: Tracer, policy: FsyncPolicy) -> None:
     tracer.promise = 10
 
 
+class TracedProcess(SealingProcess):
+    """The sealing process's work, done where it can be traced."""
+
+    done = threading.Event()
+
+    def __init__(self) -> None:
+        """No process."""
+
+    def seal(self, plan: SegmentPlan) -> str:
+        sha256 = super().seal(plan)
+        self.done.set()
+        return sha256
+
+    def _ask(self, question: dict[str, Any]) -> dict[str, Any]:
+        return answer(question, Path(question["log"]) / f"{question['base']:020d}.7.mcap.sealing")
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
 def overlapped_life(tracer: Tracer) -> None:
-    """Commits in another thread. No rotation: who would seal then is a process, and not traced."""
-    with LogWriter(tracer.folder, fsync=THREE, overlap=True) as writer:
-        append(tracer, writer, 8)
-        tracer.promise = writer.sync()
+    """Commits in another thread and seals as in another process."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_sealer, "SealingProcess", TracedProcess)
+        with LogWriter(tracer.folder, fsync=THREE, overlap=True, rotate_events=6) as writer:
+            append(tracer, writer, 8)
+            tracer.promise = writer.sync()
+            assert TracedProcess.done.wait(TIMEOUT_S)
     tracer.promise = 8
 
 

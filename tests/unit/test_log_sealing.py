@@ -1,0 +1,136 @@
+"""Sealing that fails is told at once, costs nothing, and is tried again."""
+
+import errno
+import os
+import zlib
+from pathlib import Path
+
+import pytest
+
+from eventsrc.errors import LogError
+from eventsrc.log import ALWAYS, LogReader, LogWriter, _mcap, _sealer, verify_log
+from eventsrc.log._head import file_head, head_metadata
+from eventsrc.log._naming import ACTIVE, SEALED, segment_path
+from eventsrc.log._sealer import Sealer
+from tests.fixtures_log import KEY, read_log
+
+
+class Disk:
+    """A disk that refuses sealed segments while it is full."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.full = True
+        real = _sealer.seal
+
+        def seal(*args: object) -> str:
+            if self.full:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            return real(*args)  # type: ignore[arg-type]
+
+        monkeypatch.setattr(_sealer, "seal", seal)
+
+
+def segments(path: Path, count: int) -> Sealer:
+    """Finished segments of one event each, and who seals them."""
+    writer = LogWriter(path, fsync=ALWAYS, rotate_events=1)
+    writer._sealer.submit = lambda *_, **__: None  # type: ignore[method-assign]
+    for number in range(count):
+        writer.append(KEY, b"%d" % number)
+    writer.close()
+    return Sealer(path, writer.log_id, "")
+
+
+def test_a_disk_that_was_full_for_a_while_is_tried_again(
+    log_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sealer = segments(log_path, 3)
+    disk = Disk(monkeypatch)
+    sealer.submit(0)
+    sealer.submit(1)
+    sealer.finish()
+    assert sealer.waiting == 2
+    assert sealer.error is not None
+    assert "No space left on device; its events are safe" in str(sealer.error)
+    assert len(read_log(log_path)) == 3
+
+    disk.full = False
+    sealer = Sealer(log_path, LogReader(log_path).log_id, "")
+    for base in range(3):
+        sealer.submit(base)
+    sealer.finish()
+    assert (sealer.waiting, sealer.error) == (0, None)
+    assert not list(log_path.glob("*.active"))
+    assert {f.kind for f in verify_log(log_path).findings} == {"schema"}
+
+
+def test_a_segment_that_waited_goes_before_the_next_one(
+    log_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk = Disk(monkeypatch)
+    with LogWriter(log_path, fsync=ALWAYS, rotate_events=1) as writer:
+        writer.append(KEY, b"0")
+        writer.append(KEY, b"1")
+        assert writer.sealing.waiting > 0
+        disk.full = False
+    assert writer.sealing == (0, None)
+    assert {f.kind for f in verify_log(log_path).findings} == {"schema"}  # the chain holds
+    assert [e.payload for e in read_log(log_path)] == [b"0", b"1"]
+
+
+def test_a_folder_that_cannot_be_synced_is_tried_again(
+    log_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sealer = segments(log_path, 2)
+    real = _sealer.sync_directory
+    failures = [OSError(errno.EIO, os.strerror(errno.EIO))]
+
+    def sync_directory(path: Path) -> None:
+        if failures:
+            raise failures.pop()
+        real(path)
+
+    monkeypatch.setattr(_sealer, "sync_directory", sync_directory)
+    sealer.submit(0)
+    sealer.submit(1)
+    sealer.finish()
+    assert (sealer.waiting, sealer.error) == (0, None)
+    assert {f.kind for f in verify_log(log_path).findings} == {"schema"}
+
+
+@pytest.mark.parametrize("aside", [False, True])
+def test_a_segment_that_contradicts_itself_is_told_and_kept(log_path: Path, aside: bool) -> None:
+    """Its CRC holds, so only who takes it apart can tell."""
+    sealer = segments(log_path, 2)
+    sealer = Sealer(log_path, LogReader(log_path).log_id, "", aside=aside)
+    active = segment_path(log_path, 0, ACTIVE)
+    active.write_bytes(with_a_cut_message(active.read_bytes()))
+    sealer.submit(0)
+    sealer.submit(1)
+    sealer.finish()
+    assert sealer.waiting == 2
+    with pytest.raises(LogError, match=r"does not fit its chunk; run `mapfold log recover"):
+        raise sealer.error or AssertionError("nothing said")
+    assert {p.name for p in log_path.glob("*.mcap*")} == {
+        segment_path(log_path, base, ACTIVE).name for base in (0, 1)
+    }
+    assert not segment_path(log_path, 0, SEALED).exists()
+
+
+def with_a_cut_message(data: bytes) -> bytes:
+    """The last byte of the message goes, and every length and checksum around it is made right."""
+    at = len(file_head(head_metadata("0" * 32, 0)))
+    head = _mcap.decode_chunk_head(data[at:])
+    body = _mcap.decode_chunk(data[at : at + head.length])[:-1]
+    made = _mcap.encode_plain_chunk_head(len(body), zlib.crc32(body), 0, 0)
+    return data[:at] + made + body + data[at + head.length :]
+
+
+def test_a_full_disk_is_no_question_of_rights(
+    log_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("eventsrc.log._active.sync_file", refuse)
+    with pytest.raises(LogError, match="No space left on device; free space on its disk"):
+        LogWriter(log_path)
