@@ -70,11 +70,13 @@ class TracedProcess(SealingProcess):
 
 def overlapped_life(tracer: Tracer) -> None:
     """Commits in another thread and seals as in another process."""
+    TracedProcess.done.clear()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_sealer, "SealingProcess", TracedProcess)
         with LogWriter(tracer.folder, fsync=THREE, overlap=True, rotate_events=6) as writer:
-            append(tracer, writer, 8)
+            append(tracer, writer, 7)
             tracer.promise = writer.sync()
+            append(tracer, writer, 1)
             assert TracedProcess.done.wait(TIMEOUT_S)
     tracer.promise = 8
 
