@@ -1,24 +1,32 @@
 """Bringing a log that was left in the middle of things back in order.
 
-On the next start, by itself: half-made files go, and every left-over active segment is sealed with
-all events whose CRC holds, synced or not. A torn end is what a crash leaves and is cut off without
+On the next start, by itself: half-made files go, and every left-over active segment keeps all
+events whose CRC holds, synced or not. A torn end is what a crash leaves and is cut off without
 asking: nothing in it was ever called recorded. Rot is not: the writer refuses to start and names
 `mapfold log recover`, which a person must run.
+
+Sealing takes a second for each segment, and a recorder that restarts must listen at once. So a
+left-over is *finished* first, which is quick: its torn end is cut off, and a last chunk that was
+written but not marked gets its mark. Then it is like any segment behind a rotation, and is sealed
+in the background as those are. One that cannot be brought into that form (a mark has rotted, or a
+sealed segment stands behind it) is sealed at once, and with it all the others.
 
 An active file is deleted only after the sealed one that replaces it is synced under its name.
 """
 
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from eventsrc.errors import LogDamaged
 
+from . import _mcap
 from ._active_file import ActiveFile
 from ._naming import ACTIVE, SegmentPath, leftovers, list_segments, segment_path
 from ._scan import Scan, scan_active
 from ._seal import NO_PREVIOUS, SegmentPlan, file_sha256, seal
 from ._sealed_file import SealedFile
-from .fsync import sync_directory, unlink_quietly
+from .fsync import sync_directory, sync_file, unlink_quietly, write_all
 
 
 @dataclass(slots=True)
@@ -35,38 +43,83 @@ class Restart:
     recovered_events: int = 0
     torn_bytes: int = 0
     torn_events: int = 0
+    unsealed: list[int] = field(default_factory=list)
+    """Bases of the left-over segments that are finished and still to be sealed, in order."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Leftover:
+    segment: SegmentPath
+    scan: Scan
+    marked: int
+    """How many of the chunks that the scan found have their marks, one behind the other."""
+    position: int
+    """Where these end."""
+
+    @property
+    def finishable(self) -> bool:
+        """Whether at most a last chunk lacks its mark."""
+        chunks = self.scan.chunks
+        if self.marked + 1 < len(chunks):
+            return False
+        return self.marked == len(chunks) or chunks[-1].position == self.position
 
 
 def restart(log: Path) -> Restart:
-    """Seal what is left over. The caller holds the writer lock."""
+    """Put in order what is left over. The caller holds the writer lock."""
     for path in leftovers(log):
         unlink_quietly(path)
     segments = list_segments(log)
-    state = Restart()
-    for index, segment in enumerate(segments):
-        reach = segments[index + 1].base if index + 1 < len(segments) else segment.base
+    for segment in segments:
         if segment.sealed:
             unlink_quietly(segment_path(log, segment.base, ACTIVE))
-        else:
-            _seal_leftover(log, segment, reach, state)
-    _read_end(log, state)
+    state = Restart()
+    found = _look_at_leftovers(log, segments, state)
+    last_sealed = max((s.base for s in segments if s.sealed), default=-1)
+    if all(left.finishable and left.segment.base > last_sealed for left in found):
+        for left in found:
+            _finish(left)
+            state.unsealed.append(left.segment.base)
+    else:
+        for left in found:
+            _seal_now(log, left)
+    _read_end(log, state, found)
     return state
 
 
-def _seal_leftover(log: Path, segment: SegmentPath, reach: int, state: Restart) -> None:
+def _look_at_leftovers(log: Path, segments: list[SegmentPath], state: Restart) -> list[_Leftover]:
+    """Those with events; what holds none is deleted."""
+    found = []
+    for index, segment in enumerate(segments):
+        if segment.sealed:
+            continue
+        reach = segments[index + 1].base if index + 1 < len(segments) else segment.base
+        left = _look_at(segment, reach)
+        state.torn_bytes += left.scan.lost_bytes
+        state.torn_events += left.scan.torn_events
+        state.log_id = state.log_id or left.scan.log_id
+        if left.scan.chunks:
+            state.recovered_segments += 1
+            state.recovered_events += left.scan.next_offset - segment.base
+            found.append(left)
+        else:
+            segment.path.unlink()
+            sync_directory(log)
+    return found
+
+
+def _look_at(segment: SegmentPath, reach: int) -> _Leftover:
     """``reach`` is the base of the next segment: this one was whole before that was begun."""
     scan = scan_active(segment.path, segment.base)
     scan.gap_up_to(reach)
     _refuse_rot(segment.path, scan)
-    state.torn_bytes += scan.lost_bytes
-    state.torn_events += scan.torn_events
-    state.log_id = state.log_id or scan.log_id
-    if scan.chunks:
-        _seal_active(log, segment, scan)
-        state.recovered_segments += 1
-        state.recovered_events += scan.next_offset - segment.base
-    segment.path.unlink()
-    sync_directory(log)
+    if not scan.chunks:
+        return _Leftover(segment, scan, 0, 0)
+    file = ActiveFile(segment.path, segment.base)
+    places = [chunk.position for chunk in file.chunks]
+    file.close()
+    marked = len(places) if places == [c.position for c in scan.chunks[: len(places)]] else -1
+    return _Leftover(segment, scan, marked, file.position)
 
 
 def _refuse_rot(path: Path, scan: Scan) -> None:
@@ -78,21 +131,39 @@ def _refuse_rot(path: Path, scan: Scan) -> None:
         )
 
 
-def _seal_active(log: Path, segment: SegmentPath, scan: Scan) -> None:
-    before = [s for s in list_segments(log) if s.base < segment.base]
+def _finish(left: _Leftover) -> None:
+    """Leave marked chunks and nothing else. A chunk is synced before its mark says so."""
+    last = left.scan.chunks[-1]
+    fd = os.open(left.segment.path, os.O_RDWR | os.O_APPEND)
+    try:
+        if left.marked < len(left.scan.chunks):
+            os.ftruncate(fd, last.position + last.length)
+            sync_file(fd)
+            write_all(fd, _mcap.encode_mark(last.first, last.following))
+        elif os.fstat(fd).st_size > left.position:
+            os.ftruncate(fd, left.position)
+        sync_file(fd)
+    finally:
+        os.close(fd)
+
+
+def _seal_now(log: Path, left: _Leftover) -> None:
+    before = [s for s in list_segments(log) if s.base < left.segment.base]
     previous = file_sha256(before[-1].path) if before else NO_PREVIOUS
-    file = ActiveFile(segment.path, segment.base)
-    plan = SegmentPlan(log, file.log_id, segment.base, previous)
-    seal(plan, (file.read_chunk(chunk) for chunk in scan.chunks))
+    file = ActiveFile(left.segment.path, left.segment.base)
+    plan = SegmentPlan(log, file.log_id, left.segment.base, previous)
+    seal(plan, (file.read_chunk(chunk) for chunk in left.scan.chunks))
+    left.segment.path.unlink()
+    sync_directory(log)
 
 
-def _read_end(log: Path, state: Restart) -> None:
-    """Fill in where the log ends, now that every segment is sealed."""
-    segments = list_segments(log)
-    if not segments:
-        return
-    last = segments[-1]
-    file = SealedFile(last.path, last.base)
-    state.log_id = file.log_id
-    state.next_offset = file.next_offset
-    state.previous_sha256 = file_sha256(last.path)
+def _read_end(log: Path, state: Restart, found: list[_Leftover]) -> None:
+    """Fill in where the log ends and what the next segment to be sealed carries on from."""
+    sealed = [segment for segment in list_segments(log) if segment.sealed]
+    if sealed:
+        last = SealedFile(sealed[-1].path, sealed[-1].base)
+        state.log_id = last.log_id
+        state.next_offset = last.next_offset
+        state.previous_sha256 = file_sha256(sealed[-1].path)
+    if state.unsealed:
+        state.next_offset = found[-1].scan.next_offset

@@ -86,6 +86,8 @@ class LogWriter:
                 self.path, self.log_id, self.restart.previous_sha256, aside=self._overlap
             )
             self._begin_segment(self.restart.next_offset)
+            for base in self.restart.unsealed:
+                self._sealer.submit(base)
         except BaseException:
             self._lock.release()
             raise
