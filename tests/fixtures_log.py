@@ -41,6 +41,13 @@ def write_log(path: Path, payloads: Sequence[bytes], **options: Any) -> None:
             writer.append(KEY, payload, stamp_ns=index, logged_ns=1000 + index)
 
 
+def flip(path: Path, at: int) -> None:
+    """One bit of a file rots."""
+    data = bytearray(path.read_bytes())
+    data[at] ^= 1
+    path.write_bytes(data)
+
+
 def read_log(path: Path, start: int = 0, end: int | None = None) -> list[Event]:
     """All durable events."""
     with LogReader(path) as reader:

@@ -97,19 +97,19 @@ def cat(
     gaps: list[Unreadable] = []
 
     def note(gap: Unreadable) -> None:
+        if any(known.first <= gap.first and gap.last <= known.last for known in gaps):
+            return  # met before, on the way to --from or --to
         gaps.append(gap)
         say(f"{log}: offsets {gap.first} to {gap.last} cannot be read: {gap.reason}")
 
     with LogReader(log) as reader:
-        start, end = resolve_start(reader, from_), resolve(reader, to)
+        on_gap = note if skip_damage else None
+        start = resolve_start(reader, from_, on_gap=on_gap)
+        end = resolve(reader, to, on_gap=on_gap)
         if start > end:
             raise MisuseError(f"--from {from_} is offset {start}, behind --to {to}, which is {end}")
-        events = reader.read(
-            start,
-            None if to == "end" else end,
-            keys=key or None,
-            on_gap=note if skip_damage else None,
-        )
+        until = None if to == "end" else end
+        events = reader.read(start, until, keys=key or None, on_gap=on_gap)
         if json_:
             emit_lines(map(event_document, events))
         else:

@@ -2,7 +2,8 @@
 
 An event that is gone leaves a ``mapfold/loss`` event at its offset, cause ``rot``: offsets are what
 checkpoints, maps and people point at, so none may move, and a loss that stands in the log is seen
-by everybody who reads it.
+by everybody who reads it. It has the times of the event before it, or else of the one behind it:
+when the log was recovered says nothing about when that was which is lost.
 """
 
 import os
@@ -15,6 +16,7 @@ from eventsrc.system_events import LOSS_KEY, Loss
 
 from . import _mcap
 from ._mcap import Channel, Schema
+from ._moment import Moment, moments
 from ._raw import read_body
 from ._scan import Scan
 from ._schemas import key_channel, schema_of
@@ -56,44 +58,48 @@ class _Definitions:
         return _mcap.encode_all([*self.schemas.values(), *self.channels.values()])
 
 
-def rebuild(plan: SegmentPlan, source: Path | None, scan: Scan) -> str:
-    """Seal the good chunks of ``source`` and losses for the gaps; the new file's SHA-256."""
+def rebuild(plan: SegmentPlan, source: Path | None, scan: Scan, nearby: Moment) -> str:
+    """Seal the good chunks of ``source`` and losses for the gaps; the new file's SHA-256. The
+    losses are dated ``nearby`` where there is no good chunk to go by."""
     if source is None:
-        return seal(plan, _bodies(-1, scan))
+        return seal(plan, _bodies(-1, scan, nearby))
     fd = os.open(source, os.O_RDONLY)
     try:
-        return seal(plan, _bodies(fd, scan))
+        return seal(plan, _bodies(fd, scan, nearby))
     finally:
         os.close(fd)
 
 
-def _bodies(fd: int, scan: Scan) -> Iterator[bytes]:
+def _bodies(fd: int, scan: Scan, nearby: Moment) -> Iterator[bytes]:
     definitions = _Definitions(dict(scan.channels))
     for chunk in scan.chunks:
         definitions.learn(read_body(fd, chunk))
     loss_channel = definitions.loss_channel() if scan.gaps else 0
     prelude = definitions.encode()
-    logged_ns = 0
+    if scan.chunks:
+        nearby = moments(read_body(fd, scan.chunks[0]))[0]
     pieces: list[tuple[int, ChunkRef | int]] = [(c.first, c) for c in scan.chunks]
     pieces += scan.gaps
     for first, rest in sorted(pieces, key=lambda piece: piece[0]):
         if isinstance(rest, ChunkRef):
             body = read_body(fd, rest)
-            logged_ns = max(message[2] for message in _mcap.walk(body))
+            nearby = moments(body)[1]
             yield prelude + body
             prelude = b""
         else:
             for start in range(first, rest + 1, _BATCH):
                 upto = min(start + _BATCH, rest + 1)
-                yield prelude + _losses(scan.base, loss_channel, start, upto, logged_ns)
+                yield prelude + _losses(scan.base, loss_channel, start, upto, nearby)
                 prelude = b""
 
 
-def _losses(base: int, channel: int, first: int, following: int, logged_ns: int) -> bytes:
+def _losses(base: int, channel: int, first: int, following: int, when: Moment) -> bytes:
     parts: list[bytes] = []
     for offset in range(first, following):
         loss = Loss(publisher="log", first=offset, last=offset, count=1, cause="rot")
         payload = loss.model_dump_json().encode()
-        head = _mcap.encode_message_head(channel, offset - base, logged_ns, logged_ns, len(payload))
+        head = _mcap.encode_message_head(
+            channel, offset - base, when.logged_ns, when.stamp_ns, len(payload)
+        )
         parts += (head, payload)
     return b"".join(parts)

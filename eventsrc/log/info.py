@@ -1,4 +1,4 @@
-"""What `mapfold log info` tells: counted from the indexes, without reading the events."""
+"""What `mapfold log info` tells: counted from the indexes, hardly reading any events."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -7,9 +7,12 @@ from pathlib import Path
 from eventsrc.system_events import LOSS_KEY, REJECTED_KEY
 
 from . import _mcap
+from ._active_file import ActiveFile
 from ._losses import count_lost
+from ._naming import SegmentPath
 from ._sealed_file import SealedFile
-from .reader import LogReader, OpenSegment
+from ._stamps import RobotStamps, robots_of
+from .reader import LogReader
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,8 +29,9 @@ class SegmentInfo:
 @dataclass(frozen=True, slots=True)
 class LogInfo:
     """A log at a glance. Times are int nanoseconds, None while the log is empty; the first is the
-    earliest and the last the latest, whatever their order in the log. ``lost`` is what the log says
-    was lost, less the keyframes that came late after all."""
+    earliest and the last the latest, whatever their order in the log; stamps are those of the
+    robots' events, not of our own. ``lost`` is what the log says was lost, less the keyframes that
+    came late after all."""
 
     log_id: str
     path: Path
@@ -47,14 +51,15 @@ class LogInfo:
 class _Tally:
     keys: Counter[str]
     logged: list[int]
-    stamps: list[int]
+    stamps: RobotStamps
 
 
 def log_info(path: Path) -> LogInfo:
     """Count a log. Raises LogNotFound, NotALog or LogDamaged."""
-    tally = _Tally(Counter(), [], [])
+    tally = _Tally(Counter(), [], RobotStamps())
     with LogReader(path) as reader:
-        segments = tuple(_count(reader.open_segment(entry), tally) for entry in reader.segments)
+        segments = tuple(_count(reader, entry, tally) for entry in reader.segments)
+        tally.stamps.settle(reader)
         return LogInfo(
             log_id=reader.log_id,
             path=path,
@@ -66,22 +71,18 @@ def log_info(path: Path) -> LogInfo:
             lost=count_lost(reader) if tally.keys[LOSS_KEY] else 0,
             first_logged_ns=min(tally.logged, default=None),
             last_logged_ns=max(tally.logged, default=None),
-            first_stamp_ns=min(tally.stamps, default=None),
-            last_stamp_ns=max(tally.stamps, default=None),
+            first_stamp_ns=tally.stamps.first,
+            last_stamp_ns=tally.stamps.last,
         )
 
 
-def _count(segment: OpenSegment, tally: _Tally) -> SegmentInfo:
+def _count(reader: LogReader, entry: SegmentPath, tally: _Tally) -> SegmentInfo:
+    segment = reader.open_segment(entry)
     if isinstance(segment, SealedFile):
         _count_sealed(segment, tally)
+        tally.stamps.take_sealed(entry, segment)
     else:
-        for chunk in segment.chunks:
-            body = segment.read_chunk(chunk)
-            channels = segment.channels_of(body)
-            for channel, _, log_ns, stamp_ns, _, _ in _mcap.walk(body):
-                tally.keys[channels[channel].topic] += 1
-                tally.logged.append(log_ns)
-                tally.stamps.append(stamp_ns)
+        _count_growing(segment, tally)
     return SegmentInfo(
         name=segment.path.name,
         base=segment.base,
@@ -96,4 +97,15 @@ def _count_sealed(segment: SealedFile, tally: _Tally) -> None:
     for channel, count in statistics.channel_message_counts.items():
         tally.keys[segment.channels[channel].topic] += count
     tally.logged += (statistics.message_start_time, statistics.message_end_time)
-    tally.stamps += (int(segment.seal["first_stamp_ns"]), int(segment.seal["last_stamp_ns"]))
+
+
+def _count_growing(segment: ActiveFile, tally: _Tally) -> None:
+    for chunk in segment.chunks:
+        body = segment.read_chunk(chunk)
+        channels = segment.channels_of(body)
+        robots = robots_of(channels)
+        for channel, _, log_ns, stamp_ns, _, _ in _mcap.walk(body):
+            tally.keys[channels[channel].topic] += 1
+            tally.logged.append(log_ns)
+            if channel in robots:
+                tally.stamps.take(stamp_ns)

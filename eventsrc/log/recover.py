@@ -17,6 +17,7 @@ from eventsrc.errors import LogDamaged, LogError, NotALog
 from ._check import check_sealed
 from ._head import head_of
 from ._lock import WriterLock
+from ._moment import moment_between
 from ._naming import ACTIVE, DAMAGED, SEALED, SegmentPath, leftovers, list_segments, segment_path
 from ._rebuild import rebuild
 from ._scan import Scan, scan_active
@@ -73,7 +74,7 @@ class _Recovery:
         self._log = log
         self._done: list[SegmentRecovery] = []
         self._next = 0
-        self._previous: Path | None = None
+        self._previous: SegmentPath | None = None
 
     def run(self) -> RecoveryReport:
         for path in leftovers(self._log):
@@ -100,7 +101,7 @@ class _Recovery:
             scan = scan_sealed(segment.path, segment.base, reach)
             if not scan.gaps and check_sealed(segment.path).fault is None:
                 self._next = scan.next_offset
-                self._previous = segment.path
+                self._previous = segment
                 return
         else:
             scan = scan_active(segment.path, segment.base)
@@ -116,16 +117,20 @@ class _Recovery:
                 self._log,
                 self._log_id,
                 scan.base,
-                file_sha256(self._previous) if self._previous else NO_PREVIOUS,
+                file_sha256(self._previous.path) if self._previous else NO_PREVIOUS,
                 _replaces(following),
             )
-            rebuild(plan, segment.path if segment else None, scan)
-            self._previous = segment_path(self._log, scan.base, SEALED)
+            nearby = moment_between(self._previous, following)
+            rebuild(plan, segment.path if segment else None, scan, nearby)
+            self._previous = self._sealed(scan.base)
         if segment is not None and (not segment.sealed or scan.next_offset == scan.base):
             segment.path.unlink()
             sync_directory(self._log)
         self._next = scan.next_offset
         self._done.append(_told(segment, scan, copy))
+
+    def _sealed(self, base: int) -> SegmentPath:
+        return SegmentPath(segment_path(self._log, base, SEALED), base, True)
 
     def _keep_copy(self, segment: SegmentPath | None, scan: Scan) -> str | None:
         if segment is None or not (segment.sealed or scan.gaps):

@@ -9,6 +9,11 @@
 Times are the robot's (stamp_ns): a log imported today of a run of last week is asked in last
 week's times. Stamps may run backwards between runs and when a clock is set; "the last event at or
 before" includes every event of that time or earlier, wherever it stands.
+
+mapfold's own events are stamped when we wrote them, so they do not say where a time is, and events
+that cannot be read do not either. Both count as stamped like the robots' event before them, and at
+the head of the log as earlier than all. So damage lies in a range that ends at a time if what is
+before it does, or anything behind it; and who then reads that range meets the damage.
 """
 
 import re
@@ -21,7 +26,8 @@ from eventsrc.errors import MisuseError
 from eventsrc.system_events import is_system_key
 
 from .event import Event
-from .reader import LogReader
+from .reader import LogReader, OnGap
+from .segment import Unreadable
 
 _KEYFRAME = re.compile(rb'"keyframe_id"\s*:\s*(-?\d+)')
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -32,8 +38,11 @@ class _Identity(BaseModel):
     keyframe_id: int
 
 
-def resolve(reader: LogReader, text: str) -> int:
-    """The number of events that ``text`` means; MisuseError when the log has no such point."""
+def resolve(reader: LogReader, text: str, *, on_gap: OnGap | None = None) -> int:
+    """The number of events that ``text`` means; MisuseError when the log has no such point.
+
+    Damage on the way to a keyframe raises LogDamaged, or is told to ``on_gap``.
+    """
     if text == "end":
         return reader.next_offset
     if text.isascii() and text.isdecimal():
@@ -43,21 +52,25 @@ def resolve(reader: LogReader, text: str) -> int:
         return _at_time(reader, time_ns)
     run_id, colon, keyframe = text.rpartition(":")
     if colon and run_id and re.fullmatch(r"-?\d+", keyframe):
-        return _at_keyframe(reader, run_id, int(keyframe))
+        return _at_keyframe(reader, run_id, int(keyframe), on_gap)
     raise MisuseError(
         f"{text!r} is no point in a log; give an offset, a time such as 2026-03-24T13:00:00Z, "
         "RUN:KEYFRAME or end"
     )
 
 
-def resolve_start(reader: LogReader, text: str) -> int:
+def resolve_start(reader: LogReader, text: str, *, on_gap: OnGap | None = None) -> int:
     """The offset to start at so that what ``text`` names is included: an offset is itself, a
-    keyframe its own event, a time the first event stamped then or later."""
+    keyframe its own event, a time the robots' first event stamped then or later.
+
+    Damage on the way to a keyframe or a time raises LogDamaged, or is told to ``on_gap``.
+    """
     time_ns = None if text.isdecimal() else _time(text)
     if time_ns is not None:
-        later = (e.offset for e in reader.read() if e.stamp_ns >= time_ns)
+        events = (e for e in reader.read(on_gap=on_gap) if not is_system_key(e.key))
+        later = (e.offset for e in events if e.stamp_ns >= time_ns)
         return next(later, reader.next_offset)
-    count = resolve(reader, text)
+    count = resolve(reader, text, on_gap=on_gap)
     return count if text == "end" or text.isdecimal() else count - 1
 
 
@@ -84,14 +97,23 @@ def _time(text: str) -> int | None:
 
 def _at_time(reader: LogReader, time_ns: int) -> int:
     included = 0
-    for event in reader.read():
-        if event.stamp_ns <= time_ns:
+    in_time = True
+
+    def take_in(gap: Unreadable) -> None:
+        nonlocal included
+        if in_time:
+            included = gap.last + 1
+
+    for event in reader.read(on_gap=take_in):
+        if not is_system_key(event.key):
+            in_time = event.stamp_ns <= time_ns
+        if in_time:
             included = event.offset + 1
     return included
 
 
-def _at_keyframe(reader: LogReader, run_id: str, keyframe_id: int) -> int:
-    for event in _mentioning(reader, keyframe_id):
+def _at_keyframe(reader: LogReader, run_id: str, keyframe_id: int, on_gap: OnGap | None) -> int:
+    for event in _mentioning(reader, keyframe_id, on_gap):
         try:
             identity = _Identity.model_validate_json(event.payload)
         except ValidationError:
@@ -104,10 +126,10 @@ def _at_keyframe(reader: LogReader, run_id: str, keyframe_id: int) -> int:
     )
 
 
-def _mentioning(reader: LogReader, keyframe_id: int) -> Iterator[Event]:
+def _mentioning(reader: LogReader, keyframe_id: int, on_gap: OnGap | None) -> Iterator[Event]:
     """Events whose text has that keyframe id somewhere: parsing all of them takes 20 times as
     long."""
-    for event in reader.read():
+    for event in reader.read(on_gap=on_gap):
         if not is_system_key(event.key) and any(
             int(m[1]) == keyframe_id for m in _KEYFRAME.finditer(event.payload)
         ):

@@ -6,6 +6,7 @@ import pytest
 
 from tests.commands import Commands
 from tests.envelopes import envelope, payload
+from tests.fixtures_log import flip
 
 PAYLOADS = [payload(envelope(i)) for i in range(1, 6)]
 
@@ -20,12 +21,6 @@ def run(tmp_path: Path) -> Commands:
 
 def segment(run: Commands) -> Path:
     return run.folder / "L" / "00000000000000000000.mcap"
-
-
-def flip(path: Path, at: int) -> None:
-    data = bytearray(path.read_bytes())
-    data[at] ^= 1
-    path.write_bytes(data)
 
 
 def test_a_good_log(run: Commands) -> None:

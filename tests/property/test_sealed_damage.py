@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from eventsrc.errors import LogError
-from eventsrc.log import Event, LogWriter, _parts, log_info, recover_log, verify_log
-from eventsrc.system_events import LOSS_KEY, Loss
-from tests.fixtures_log import BY_HAND, KEY, envelope, read_log, read_with_gaps
+from eventsrc.log import Event, LogReader, LogWriter, _parts, log_info, recover_log, verify_log
+from eventsrc.system_events import LOSS_KEY, REJECTED_KEY, Loss
+from tests.fixtures_log import BY_HAND, KEY, envelope, flip, read_log, read_with_gaps
 
 MEMORY_DISK = Path("/dev/shm")
 EVENTS = 6
@@ -104,6 +104,62 @@ def test_a_missing_segment_becomes_losses(quick_path: Path) -> None:
     assert [f.kind for f in verify_log(log).findings] == ["loss"]
     with LogWriter(log) as writer:
         assert writer.next_offset == EVENTS
+
+
+def test_what_is_lost_has_the_times_of_its_neighbours(quick_path: Path) -> None:
+    log = quick_path / "log"
+    with LogWriter(log, rotate_events=2, fsync=BY_HAND) as writer:
+        for index in range(8):
+            writer.append(KEY, envelope(index), stamp_ns=1000 + index, logged_ns=2000 + index)
+            if index % 2:
+                writer.sync()
+                writer.commit_if_due()
+    for base in (0, 4):
+        (log / f"{base:020d}.mcap").unlink()
+    recover_log(log)
+    near = [2, 2, 2, 3, 3, 3, 6, 7]
+    assert [(e.stamp_ns, e.logged_ns) for e in read_log(log)] == [
+        (1000 + n, 2000 + n) for n in near
+    ]
+    info = log_info(log)
+    assert (info.first_logged_ns, info.first_stamp_ns, info.last_stamp_ns) == (2002, 1002, 1007)
+
+
+def test_a_loss_in_a_segment_has_the_times_of_the_event_before_it(
+    sealed: tuple[Path, list[Event]],
+) -> None:
+    with LogReader(sealed[0].parent) as reader:
+        chunks = reader.open_segment(reader.segments[0]).chunks
+    for number in (0, 3):
+        flip(sealed[0], chunks[number].position + chunks[number].length // 2)
+    recover_log(sealed[0].parent)
+    assert [e.stamp_ns for e in read_log(sealed[0].parent)] == [1, 1, 2, 2, 4, 5]
+
+
+@pytest.mark.parametrize("rotate_events", [2, 1000])
+@pytest.mark.parametrize("still_open", [True, False])
+def test_our_own_events_do_not_stretch_the_time_a_log_was_stamped(
+    quick_path: Path, rotate_events: int, still_open: bool
+) -> None:
+    log = quick_path / "log"
+    writer = LogWriter(log, rotate_events=rotate_events, fsync=BY_HAND)
+    keys = [LOSS_KEY, KEY, REJECTED_KEY, KEY, KEY, KEY, LOSS_KEY, LOSS_KEY]
+    for stamp_ns, key in zip([1, 20, 90, 40, 30, 50, 10, 80], keys, strict=True):
+        writer.append(key, envelope(stamp_ns), stamp_ns=stamp_ns)
+        writer.sync()
+        writer.commit_if_due()
+    if still_open:
+        assert (log_info(log).first_stamp_ns, log_info(log).last_stamp_ns) == (20, 50)
+    writer.close()
+    assert (log_info(log).first_stamp_ns, log_info(log).last_stamp_ns) == (20, 50)
+
+
+def test_a_log_of_nothing_but_our_own_events_has_no_stamps(quick_path: Path) -> None:
+    with LogWriter(quick_path / "log") as writer:
+        writer.append(LOSS_KEY, b"{}")
+    info = log_info(quick_path / "log")
+    assert (info.first_stamp_ns, info.last_stamp_ns) == (None, None)
+    assert info.first_logged_ns is not None
 
 
 def test_the_chain_notices_a_segment_put_in_anothers_place(quick_path: Path) -> None:

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import MisuseError
-from eventsrc.log import LogReader, LogWriter
+from eventsrc.errors import LogDamaged, MisuseError
+from eventsrc.log import LogReader, LogWriter, Unreadable, _parts
 from eventsrc.log.whence import resolve, resolve_start
-from tests.fixtures_log import KEY, envelope
+from tests.fixtures_log import BY_HAND, KEY, envelope, flip
 
 SECOND = 1_000_000_000
 
@@ -59,3 +59,82 @@ def test_what_is_not_there_is_named(reader: LogReader, text: str) -> None:
         with pytest.raises(MisuseError) as caught:
             ask(reader, text)
         assert text in str(caught.value)
+
+
+@pytest.fixture
+def ours(log_path: Path) -> Iterator[LogReader]:
+    """Imported in the year 2001: a loss; keyframe 1 at second 10; a reject; keyframe 2 at second
+    20; a loss stamped at second 1; keyframe 3 at second 30; a reject."""
+    year_2001 = 10**9 * SECOND
+    with LogWriter(log_path, clock=lambda: year_2001) as writer:
+        writer.append("mapfold/loss", b"{}")
+        writer.append(KEY, envelope(1), stamp_ns=10 * SECOND)
+        writer.append("mapfold/rejected", b"{}")
+        writer.append(KEY, envelope(2), stamp_ns=20 * SECOND)
+        writer.append("mapfold/loss", b"{}", stamp_ns=1 * SECOND)
+        writer.append(KEY, envelope(3), stamp_ns=30 * SECOND)
+        writer.append("mapfold/rejected", b"{}")
+    with LogReader(log_path) as reader:
+        yield reader
+
+
+@pytest.mark.parametrize(
+    ("time", "count", "start"),
+    [
+        ("1970-01-01T00:00:01Z", 1, 1),
+        ("1970-01-01T00:00:10Z", 3, 1),
+        ("1970-01-01T00:00:15Z", 3, 3),
+        ("1970-01-01T00:00:20Z", 5, 3),
+        ("1970-01-01T00:00:30Z", 7, 5),
+        ("1999-12-31T00:00:00Z", 7, 7),
+        ("2001-09-09T01:46:40Z", 7, 7),
+    ],
+)
+def test_our_own_events_do_not_say_where_a_time_is(
+    ours: LogReader, time: str, count: int, start: int
+) -> None:
+    assert resolve(ours, time) == count
+    assert resolve_start(ours, time) == start
+
+
+def _at(second: int) -> str:
+    return f"1970-01-01T00:00:{second:02d}Z"
+
+
+@pytest.fixture
+def rotten(log_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[LogReader]:
+    """Keyframes 0 to 8 at seconds 0 to 8, in chunks of three; 3, 4 and 5 cannot be read."""
+    monkeypatch.setattr(_parts, "CHUNK_BYTES", 9000)
+    with LogWriter(log_path, fsync=BY_HAND) as writer:
+        for second in range(9):
+            payload = envelope(second, note="x" * 3000)
+            writer.append(KEY, payload, stamp_ns=second * SECOND)
+            if second % 3 == 2:
+                writer.sync()
+    with LogReader(log_path) as reader:
+        (segment,) = reader.segments
+        chunks = reader.open_segment(segment).chunks
+        assert [chunk.first for chunk in chunks] == [0, 3, 6]
+        flip(segment.path, chunks[1].position + chunks[1].length // 2)
+        yield reader
+
+
+@pytest.mark.parametrize(("second", "count"), [(0, 1), (1, 2), (2, 6), (4, 6), (6, 7), (20, 9)])
+def test_damage_is_in_a_range_that_ends_at_a_time_only_if_it_stands_inside(
+    rotten: LogReader, second: int, count: int
+) -> None:
+    assert resolve(rotten, _at(second)) == count
+    for text in ("run:1", "2", "end"):
+        resolve(rotten, text)
+
+
+def test_damage_on_the_way_stops_the_search_or_is_named(rotten: LogReader) -> None:
+    assert resolve_start(rotten, _at(2)) == 2
+    for text in (_at(3), _at(7), "run:7"):
+        with pytest.raises(LogDamaged, match="offsets 3 to 5 cannot be read"):
+            resolve_start(rotten, text)
+    met: list[Unreadable] = []
+    for text, start in ((_at(3), 6), (_at(7), 7), (_at(20), 9), ("run:7", 7)):
+        assert resolve_start(rotten, text, on_gap=met.append) == start
+    assert resolve(rotten, "run:7", on_gap=met.append) == 8
+    assert [(gap.first, gap.last) for gap in met] == [(3, 5)] * 5
