@@ -5,8 +5,9 @@
 * An envelope leaves the spool when a recorder's ack covers it, and an ack covers what is synced in
   a log. Until then it is sent again. So it may arrive more than once, which the fold absorbs: the
   first one counts.
-* What no recorder would accept is refused here, by the same door (`eventsrc.ingest`); otherwise it
-  would be sent again for ever.
+* What no recorder would accept is refused here, by the same door (`eventsrc.ingest`). A recorder
+  may have narrower rules (`--max-payload`) or older ones; what it refuses, with the bytes and the
+  reason in its log, is set aside and no longer sent: see `EnvelopePublisher.refused`.
 """
 
 import json
@@ -16,20 +17,23 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from ._set_aside import Refused
 from ._zenoh import ZenohOptions
 from .endpoints import check_endpoints
-from .errors import InvalidEnvelope
+from .errors import InvalidEnvelope, MisuseError
 from .ingest import Rejected, ingest
 from .sending import RESEND_AFTER_S, WINDOW, Sender
 from .spool import DEFAULT_SPOOL_BYTES, Spool
+from .system_events import RESERVED_PREFIX, is_system_key
 
 
 class EnvelopePublisher:
     """Publishes one robot's envelopes under ``key``; a context manager, usable from any thread.
 
     The constructor opens the spool and begins to send what an earlier process left in it. It raises
-    SpoolError if the spool cannot be used and TransportError if an endpoint is malformed, but not
-    when nobody answers there: the sending thread tries until somebody does.
+    SpoolError if the spool cannot be used, MisuseError if the key is one of mapfold's own and
+    TransportError if an endpoint is malformed, but not when nobody answers there: the sending
+    thread tries until somebody does.
     """
 
     def __init__(
@@ -42,6 +46,11 @@ class EnvelopePublisher:
         window: int = WINDOW,
         resend_after_s: float = RESEND_AFTER_S,
     ) -> None:
+        if is_system_key(key):
+            raise MisuseError(
+                f"key {key!r}: every recorder refuses envelopes under {RESERVED_PREFIX}; "
+                "choose another"
+            )
         check_endpoints((*options.connect, *options.listen))
         self._spool = Spool(spool, max_spool_bytes)
         self._sender = Sender(
@@ -69,15 +78,36 @@ class EnvelopePublisher:
 
     @property
     def unacknowledged(self) -> int:
-        """How many envelopes no recorder has acknowledged yet."""
+        """How many envelopes wait for a recorder's answer."""
         return len(self._spool)
 
+    @property
+    def refused_count(self) -> int:
+        """How many envelopes a recorder has refused; they are set aside in the spool."""
+        return self._spool.refused_count
+
+    def refused(self, limit: int = 100) -> list[Refused]:
+        """The oldest envelopes that were refused: which, by the recorder of which log, and why."""
+        return self._spool.refused(limit)
+
+    def retry_refused(self) -> int:
+        """Send what was refused once more, for a recorder that was mended; how many envelopes.
+        Those whose bytes gave way to new envelopes stay `refused`; the log named there has them."""
+        retried = self._spool.retry_refused()
+        self._sender.wake()
+        return retried
+
+    def discard_refused(self) -> int:
+        """Forget what was refused; how many envelopes that were."""
+        return self._spool.discard_refused()
+
     def flush(self, timeout_s: float) -> bool:
-        """Wait until everything published is acknowledged; False when it was not in time."""
-        return self._sender.wait_until_acknowledged(timeout_s)
+        """Wait until everything published is answered. True when all of it is acknowledged; False
+        when it was not in time, or when envelopes are set aside as `refused`."""
+        return self._sender.wait_until_answered(timeout_s) and not self.refused_count
 
     def close(self, timeout_s: float = 0.0) -> int:
-        """`flush`, then stop. How many envelopes stay in the spool, for the next process."""
+        """`flush`, then stop. How many envelopes wait in the spool, for the next process."""
         if self._left is None:
             if timeout_s > 0:
                 self.flush(timeout_s)

@@ -9,7 +9,10 @@
   answer and it does not cover the rest, sending goes back to the oldest.
 * What a recorder that stood still has missed meanwhile is still in the publisher's cache, and Zenoh
   fetches it from there by itself. That is why the questions are few and the cache is not small.
-* Acks come in on Zenoh's thread, which only hands them over.
+* What a recorder says it has refused is set aside: it would be refused for ever, and hold up all
+  that comes after it.
+* Answers come in on Zenoh's thread, which only hands them over. They are taken whether or not
+  anybody subscribes: a recorder's last acks arrive when it has just unsubscribed.
 """
 
 import threading
@@ -23,6 +26,7 @@ from pydantic import ValidationError
 from ._zenoh import Publisher, Received, Session, ZenohOptions, open_session
 from .acks import Ack, ack_key
 from .errors import SpoolError, TransportError
+from .refusals import Refusals, refusal_key
 from .spool import Spool, Spooled
 
 WINDOW: Final = 1_024
@@ -54,7 +58,8 @@ class Sender:
         self._window = window
         self._resend_after_s = resend_after_s
         self._changed = threading.Condition()
-        self._acks: deque[Ack] = deque()
+        self._answers: deque[Ack | Refusals] = deque()
+        self._sent = 0  # the last seq that was ever sent
         self._news = self._stopping = False
         self._failure: SpoolError | None = None
 
@@ -75,8 +80,8 @@ class Sender:
         if self._failure is not None:
             raise self._failure
 
-    def wait_until_acknowledged(self, timeout_s: float) -> bool:
-        """Wait until the spool is empty; False when it was not in time."""
+    def wait_until_answered(self, timeout_s: float) -> bool:
+        """Wait until nothing waits in the spool; False when it was not so in time."""
         with self._changed:
             self._changed.wait_for(lambda: not len(self._spool) or self._failure, timeout_s)
         self.raise_failure()
@@ -96,17 +101,22 @@ class Sender:
 
     def _serve(self, session: Session) -> None:
         publisher = session.publisher(self._key, advanced=True, cache=2 * self._window)
+        session.subscribe(refusal_key(self._key), lambda said: self._hear(said, Refusals))
         heard: set[str] = set()
-        while not self._stopping:
-            if publisher.wait_for_subscriber(_LOOK_S):
-                self._converse(session, publisher, heard)
+        try:
+            while not self._stopping:
+                self._take_answers()
+                if publisher.wait_for_subscriber(_LOOK_S):
+                    self._converse(session, publisher, heard)
+        finally:
+            self._take_answers()
 
     def _converse(self, session: Session, publisher: Publisher, heard: set[str]) -> None:
         """Send and hear acks while somebody subscribes; ``heard`` are the runs listened for."""
         cursor = 0
         patience = Patience(self._resend_after_s)
         while not self._stopping and publisher.has_subscriber:
-            if self._take_acks():
+            if self._take_answers():
                 patience.answered()
             under_way = self._spool.waiting_up_to(cursor)
             batch = self._spool.after(cursor, self._window - under_way)
@@ -129,7 +139,7 @@ class Sender:
         """Subscribe to the acks of every run in ``batch`` before any of it is sent."""
         new = {spooled.run_id for spooled in batch} - heard
         for run_id in sorted(new):
-            session.subscribe(ack_key(run_id), self._hear)
+            session.subscribe(ack_key(run_id), lambda said: self._hear(said, Ack))
         if new:
             session.confirm()
             heard |= new
@@ -138,27 +148,33 @@ class Sender:
         """Send ``batch`` and return where it ends."""
         for spooled in batch:
             publisher.put(spooled.payload)
+            self._sent = max(self._sent, spooled.seq)
         return batch[-1].seq if batch else 0
 
-    def _hear(self, message: Received) -> None:
+    def _hear(self, message: Received, kind: type[Ack] | type[Refusals]) -> None:
         try:
-            ack = Ack.decode(message.payload)
+            answer = kind.decode(message.payload)
         except ValidationError:
-            return  # not from a recorder we understand, so nothing is acknowledged
+            return  # not from a recorder we understand, so nothing is answered
         with self._changed:
-            self._acks.append(ack)
+            self._answers.append(answer)
             self._news = True
             self._changed.notify_all()
 
-    def _take_acks(self) -> bool:
-        """Let go of what was acknowledged; True when that was anything."""
+    def _take_answers(self) -> bool:
+        """Let go of what was answered; True when that was anything."""
         freed = 0
-        while self._acks:
-            freed += self._spool.acknowledge(self._acks.popleft())
+        while self._answers:
+            freed += self._take(self._answers.popleft())
         if freed:
             with self._changed:
                 self._changed.notify_all()
         return freed > 0
+
+    def _take(self, answer: Ack | Refusals) -> int:
+        if isinstance(answer, Ack):
+            return self._spool.acknowledge(answer)
+        return self._spool.refuse(answer, up_to=self._sent)
 
     def _wait(self, timeout_s: float) -> None:
         """Until there is news, or the time is up."""

@@ -1,8 +1,11 @@
 """A robot's bounded spool on disk: what is published and not yet acknowledged.
 
-One SQLite file, one owner. A published envelope is in the file before anything is sent, so it
-outlives the robot's process; write-ahead logging without a sync per envelope means that a power
-cut may take the last moments, and never more. The order is the order of publishing.
+* One SQLite file, one owner. A published envelope is in the file before anything is sent, so it
+  outlives the robot's process; write-ahead logging without a sync per envelope means that a power
+  cut may take the last moments, and never more. The order is the order of publishing.
+* What a recorder has refused waits no more. It is set aside in the same file, within the same
+  bound, and gives way to new envelopes (`eventsrc._set_aside`). An ack frees it too: then another
+  recorder has it.
 """
 
 import sqlite3
@@ -12,8 +15,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from ._set_aside import Refused, SetAside
 from .acks import Ack
 from .errors import SpoolError, SpoolFull
+from .refusals import Refusals, fingerprint
 
 DEFAULT_SPOOL_BYTES: Final = 1024 * 1024 * 1024
 """Payload bytes. At 9 kB an envelope and two envelopes a second, sixteen hours without a link."""
@@ -61,13 +66,14 @@ class Spool:
         self._db.execute("pragma journal_mode = wal")
         self._db.execute("pragma synchronous = normal")
         self._db.executescript(_SCHEMA)
+        self._aside = SetAside(self._db)
         row = self._db.execute("select count(*), coalesce(sum(length(payload)), 0) from spooled")
         self._count, self._bytes = row.fetchone()
 
     def add(self, run_id: str, keyframe_id: int, payload: bytes) -> None:
         """Keep one envelope until it is acknowledged. Raises SpoolFull if there is no room."""
         with self._clear_errors(), self._lock:
-            if self._bytes + len(payload) > self.max_bytes:
+            if not self._make_room(len(payload)):
                 raise SpoolFull(
                     f"{self.path}: {self._count} envelopes ({self._bytes} bytes) wait for a "
                     f"recorder's acknowledgement and {self.max_bytes} bytes are the limit; "
@@ -79,6 +85,13 @@ class Spool:
             )
             self._count += 1
             self._bytes += len(payload)
+
+    def _make_room(self, size: int) -> bool:
+        """Whether ``size`` bytes fit, once what was refused has given way."""
+        if self._bytes + size > self.max_bytes:
+            return False
+        too_much = self._bytes + self._aside.size + size - self.max_bytes
+        return too_much <= 0 or self._aside.make_way(too_much)
 
     def after(self, seq: int, limit: int) -> list[Spooled]:
         """The oldest envelopes after ``seq``, in order, at most ``limit``."""
@@ -97,7 +110,7 @@ class Spool:
             return int(count)
 
     def acknowledge(self, ack: Ack) -> int:
-        """Let go of what ``ack`` covers; how many envelopes that were."""
+        """Let go of what ``ack`` covers; how many envelopes wait no more."""
         removed = 0
         with self._clear_errors(), self._lock:
             for first, last in ack.stretches:
@@ -108,8 +121,60 @@ class Spool:
                 ).fetchall()
                 removed += len(rows)
                 self._bytes -= sum(size for (size,) in rows)
+                self._aside.forget(ack.run_id, first, last)
             self._count -= removed
         return removed
+
+    def refuse(self, refusals: Refusals, up_to: int) -> int:
+        """Set aside what ``refusals`` name among the envelopes up to the seq ``up_to``; how many
+        envelopes wait no more."""
+        reasons = {(said.size, said.sha256): said.reason for said in refusals.refused}
+        sizes = {size for size, _ in reasons}
+        moved = 0
+        with self._clear_errors(), self._lock, self._transaction():
+            rows = self._db.execute(
+                "select seq, length(payload) from spooled where seq <= ?", (up_to,)
+            ).fetchall()
+            for seq, size in rows:
+                reason = reasons.get((size, self._fingerprint(seq))) if size in sizes else None
+                if reason is not None:
+                    self._set_aside(seq, size, refusals.log_id, reason)
+                    moved += 1
+        return moved
+
+    def _fingerprint(self, seq: int) -> str:
+        ((payload,),) = self._db.execute("select payload from spooled where seq = ?", (seq,))
+        return fingerprint(payload)
+
+    def _set_aside(self, seq: int, size: int, log_id: str, reason: str) -> None:
+        self._aside.take(seq, log_id, reason, size)
+        self._db.execute("delete from spooled where seq = ?", (seq,))
+        self._count -= 1
+        self._bytes -= size
+
+    @property
+    def refused_count(self) -> int:
+        """How many envelopes are set aside."""
+        return self._aside.count
+
+    def refused(self, limit: int) -> list[Refused]:
+        """The oldest that are set aside, in order, at most ``limit``."""
+        with self._clear_errors(), self._lock:
+            return self._aside.rows(limit)
+
+    def retry_refused(self) -> int:
+        """Let everything set aside whose bytes are still here wait again, behind the others; how
+        many envelopes that were."""
+        with self._clear_errors(), self._lock, self._transaction():
+            count, size = self._aside.put_back()
+            self._count += count
+            self._bytes += size
+        return count
+
+    def discard_refused(self) -> int:
+        """Forget everything that is set aside; how many envelopes that were."""
+        with self._clear_errors(), self._lock:
+            return self._aside.clear()
 
     def __len__(self) -> int:
         return self._count
@@ -118,6 +183,14 @@ class Spool:
         """Let another process use the file. What waits stays in it."""
         with self._lock:
             self._db.close()
+
+    @contextmanager
+    def _transaction(self) -> Iterator[None]:
+        """All or nothing, in the file. After an error the numbers here may be wrong; every error
+        is final for the sender, and the next process counts anew."""
+        with self._db:
+            self._db.execute("begin immediate")
+            yield
 
     @contextmanager
     def _clear_errors(self) -> Iterator[None]:

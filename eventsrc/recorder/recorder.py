@@ -6,7 +6,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Final
 
 from eventsrc._zenoh import Received, Session, check_keys
-from eventsrc.acks import ACK_PREFIX, Ack, ack_key
+from eventsrc.acks import ACK_PREFIX
 from eventsrc.errors import TransportError
 from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES
 from eventsrc.log import LogWriter
@@ -47,7 +47,7 @@ class Recorder:
             self._inbox,
             writer,
             ledger,
-            self._send_ack,
+            self._answer,
             max_events=max_events,
             report_gaps=report_gaps,
             max_payload_bytes=max_payload_bytes,
@@ -67,7 +67,8 @@ class Recorder:
         """Record until ``stop`` is set, then drain the queue and sync.
 
         ``watch`` is called in this thread about every ``every_s`` seconds. Raises what ended the
-        writing early, a LogError; ``stop`` is set then too, and when ``max_events`` is reached.
+        writing early, a LogError, and `report` then says what was lost with it; ``stop`` is set
+        then too, and when ``max_events`` is reached.
         """
         with ThreadPoolExecutor(1, thread_name_prefix="log-writer") as thread:
             writing = thread.submit(self._writing.run)
@@ -99,13 +100,13 @@ class Recorder:
         writing.result()
 
     def _receive(self, message: Received) -> None:
-        # Under `**` a recorder hears its own acks and those of others. They are answers, not data.
+        # Under `**` a recorder hears acks and refusals, its own too. They are answers, not data.
         if not message.key.startswith(ACK_PREFIX):
             self._inbox.put(message)
 
-    def _send_ack(self, ack: Ack) -> None:
+    def _answer(self, key: str, payload: bytes) -> None:
         try:
-            self._session.send(ack_key(ack.run_id), ack.encode())
+            self._session.send(key, payload)
         except TransportError:
-            # No way to tell the robot now. It will send again, and the next ack will cover that.
+            # No way to tell the robot now. It will send again, and be answered again.
             return

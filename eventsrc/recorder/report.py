@@ -11,7 +11,9 @@ class RecorderReport:
     ``mapfold/rejected``. ``queue_full`` and ``transport_missed`` are messages that were sent and
     are not in the log. ``missing`` are the keyframes that the log's runs lack now, whatever the
     cause and whichever recorder lost them, and ``missing_before`` were lacking when this one
-    began; a message lost in the queue is usually missing as well.
+    began; a message lost in the queue is usually missing as well. ``unwritten`` are messages that
+    were received and not written, because the log could not be written any more: if the next start
+    finds some of them on the disk all the same, the better.
     """
 
     recorded: int
@@ -23,11 +25,12 @@ class RecorderReport:
     queue_depth: int
     queue_size: int
     next_offset: int
+    unwritten: int = 0
 
     @property
     def lost(self) -> int:
         """Messages that were sent and are not in the log."""
-        return self.queue_full + self.transport_missed
+        return self.queue_full + self.transport_missed + self.unwritten
 
     @property
     def clean(self) -> bool:

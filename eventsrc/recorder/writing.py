@@ -2,7 +2,9 @@
 
 * One thread owns the LogWriter. It takes batches from the inbox, appends, and lets the log commit.
 * Nothing follows from an event before it is synced: only then does it enter the gap ledger, count
-  as recorded, and get acknowledged to its robot.
+  as recorded, and is its robot told: acknowledged, or refused.
+* When the log cannot be written any more, what was received and is not known to be synced is
+  counted: being written, taken, or still in the queue.
 * Losses are written about once a second, not one by one: a queue that overflows is busy enough.
 * Keys under ``mapfold/`` are our own. From the network they could forge a loss or a command, so
   `judge_payloads` rejects such a message like any other that is no envelope.
@@ -10,24 +12,24 @@
 
 import itertools
 import time
-from collections import defaultdict, deque
+from collections import deque
 from collections.abc import Callable
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal
 
 from eventsrc._zenoh import Received
-from eventsrc.acks import Ack
-from eventsrc.append import Judged, judge_payloads
-from eventsrc.envelope import ENVELOPE_VERSION
-from eventsrc.ingest import Rejected
+from eventsrc.append import judge_payloads
+from eventsrc.errors import LogError
 from eventsrc.ledger import save_ledger
 from eventsrc.log import LogWriter
 from eventsrc.losses import Gap, GapLedger
 from eventsrc.system_events import LOSS_KEY, Loss
 
+from .answers import Answers, Unsynced, unsynced
 from .inbox import Inbox
 from .report import RecorderReport
 
-Acknowledge = Callable[[Ack], None]
+Answer = Callable[[str, bytes], None]
+"""Sends a payload under a key."""
 Cause = Literal["queue_full", "transport_miss"]
 
 _BATCH: Final = 256
@@ -41,25 +43,6 @@ _SAVE_EVERY_NS: Final = 60_000_000_000
 """So a recorder that was killed leaves a minute of its log to be read again, not the whole."""
 
 
-class _Unsynced(NamedTuple):
-    """What follows from an event once it is synced. ``run_id`` is None for what counts no
-    keyframes: a rejected payload, or a form older than the envelope."""
-
-    offset: int
-    accepted: bool
-    run_id: str | None
-    keyframe_id: int
-
-
-def _unsynced(offset: int, judged: Judged) -> _Unsynced:
-    event, verdict = judged
-    if isinstance(verdict, Rejected):
-        return _Unsynced(offset, False, None, 0)
-    if event.version != ENVELOPE_VERSION:
-        return _Unsynced(offset, True, None, 0)
-    return _Unsynced(offset, True, verdict.run_id, verdict.keyframe_id)
-
-
 class Writing:
     """The work of the writer's thread: `run` is its whole life."""
 
@@ -68,7 +51,7 @@ class Writing:
         inbox: Inbox,
         writer: LogWriter,
         ledger: GapLedger | None,
-        acknowledge: Acknowledge,
+        answer: Answer,
         *,
         max_events: int | None,
         report_gaps: bool,
@@ -78,13 +61,15 @@ class Writing:
         self._writer = writer
         self._ledger = GapLedger() if ledger is None else ledger
         self._saves = ledger is not None  # one that does not know the whole log is not its ledger
-        self._acknowledge = acknowledge
+        self._answer = answer
         self._room = max_events
         self._report_gaps = report_gaps
         self._max_payload_bytes = max_payload_bytes
         self._losses_due_ns = time.monotonic_ns() + _LOSSES_EVERY_NS
         self._save_due_ns = time.monotonic_ns() + _SAVE_EVERY_NS
-        self._unsynced: deque[_Unsynced] = deque()
+        self._unsynced: deque[Unsynced] = deque()
+        self._in_hand = 0  # taken from the inbox and not yet given to the log
+        self._failed = False
         self._recorded = self._rejected = 0
         self._missing = self._missing_before = self._ledger.missing if report_gaps else 0
 
@@ -99,6 +84,9 @@ class Writing:
             self._sync()
             self._write_losses(self._ledger.flush())
             self._save()
+        except LogError:
+            self._failed = True
+            raise
         finally:
             self._follow_up()  # what was synced before an error is recorded all the same
 
@@ -114,7 +102,13 @@ class Writing:
             queue_depth=self._inbox.depth(),
             queue_size=self._inbox.size,
             next_offset=self._writer.next_offset,
+            unwritten=self._unwritten(),
         )
+
+    def _unwritten(self) -> int:
+        if not self._failed:
+            return 0
+        return len(self._unsynced) + self._in_hand + self._inbox.depth()
 
     def _step(self) -> bool:
         """One batch and what follows from it; False when there will be no more."""
@@ -122,6 +116,7 @@ class Writing:
         closed = self._inbox.closed  # before taking: what came before the closing is still taken
         waiting = self._writer.durable_offset < self._writer.next_offset
         batch = self._inbox.take(limit, _UNSYNCED_S if waiting else _IDLE_S)
+        self._in_hand = len(batch)
         for start in range(0, len(batch), _TOGETHER):
             self._record(batch[start : start + _TOGETHER])
         self._writer.commit_if_due()
@@ -140,28 +135,28 @@ class Writing:
     def _record(self, messages: list[Received]) -> None:
         judged = judge_payloads(self._writer, messages, max_bytes=self._max_payload_bytes)
         # Noted first: should appending fail in the middle, what was synced by then still counts.
-        self._unsynced.extend(map(_unsynced, itertools.count(self._writer.next_offset), judged))
+        offsets = itertools.count(self._writer.next_offset)
+        self._unsynced.extend(map(unsynced, offsets, messages, judged))
+        self._in_hand -= len(messages)
         self._writer.append_all([event for event, _ in judged])
 
     def _follow_up(self) -> None:
-        """Everything synced since the last call: recorded, counted, acknowledged."""
+        """Everything synced since the last call: recorded, counted, answered."""
         durable = self._writer.durable_offset
-        unsynced = self._unsynced
-        if not unsynced or unsynced[0].offset >= durable:
+        waiting = self._unsynced
+        if not waiting or waiting[0].offset >= durable:
             return
         now_ns = time.monotonic_ns()
-        synced: defaultdict[str, list[int]] = defaultdict(list)
-        while unsynced and unsynced[0].offset < durable:
-            _, accepted, run_id, keyframe_id = unsynced.popleft()
-            self._recorded += accepted
-            self._rejected += not accepted
-            if run_id is not None:
-                self._ledger.record(run_id, keyframe_id, now_ns)
-                synced[run_id].append(keyframe_id)
-        for run_id, keyframe_ids in synced.items():
-            stretches = _stretches(self._ledger, run_id, keyframe_ids)
-            ack = Ack(run_id=run_id, log_id=self._writer.log_id, stretches=stretches)
-            self._acknowledge(ack)
+        answers = Answers()
+        while waiting and waiting[0].offset < durable:
+            event = waiting.popleft()
+            self._recorded += event.refusal is None
+            self._rejected += event.refusal is not None
+            if event.run_id is not None:
+                self._ledger.record(event.run_id, event.keyframe_id, now_ns)
+            answers.note(event)
+        for key, payload in answers.messages(self._writer.log_id, self._ledger):
+            self._answer(key, payload)
 
     def _sync(self) -> int:
         """Make everything durable, so that the ledger is that of the whole log; its end."""
@@ -195,17 +190,3 @@ class Writing:
 
     def _append_loss(self, loss: Loss) -> None:
         self._writer.append(LOSS_KEY, loss.model_dump_json().encode())
-
-
-def _stretches(
-    ledger: GapLedger, run_id: str, keyframe_ids: list[int]
-) -> tuple[tuple[int, int], ...]:
-    """The recorded stretches these keyframes lie in, in order, each once."""
-    found: list[tuple[int, int]] = []
-    for keyframe_id in sorted(keyframe_ids):
-        if found and keyframe_id <= found[-1][1]:
-            continue
-        stretch = ledger.stretch(run_id, keyframe_id)
-        if stretch is not None:
-            found.append(stretch)
-    return tuple(found)

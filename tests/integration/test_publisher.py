@@ -10,10 +10,12 @@ import pytest
 
 from eventsrc._zenoh import Received, Session, ZenohOptions
 from eventsrc.acks import Ack, ack_key
-from eventsrc.errors import InvalidEnvelope, SpoolFull, TransportError
+from eventsrc.errors import InvalidEnvelope, MisuseError, SpoolFull, TransportError
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.publisher import EnvelopePublisher
+from eventsrc.refusals import Refusal, Refusals, refusal_key
 from eventsrc.router import Router
+from eventsrc.system_events import REJECTED_KEY
 from tests.envelopes import envelope, payload
 from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK, Program
 
@@ -205,6 +207,109 @@ def test_what_no_recorder_accepts_is_refused_here(robot: EnvelopePublisher, bad:
     with pytest.raises(InvalidEnvelope, match="envelope not published: "):
         robot.publish(bad)  # type: ignore[arg-type]
     assert robot.unacknowledged == 0
+
+
+def test_what_a_recorder_refuses_holds_nothing_up(
+    start: Start, endpoint: str, tmp_path: Path
+) -> None:
+    """More envelopes are refused than may be under way, before and between good ones."""
+    log = tmp_path / "log"
+    recorder = start("record", str(log), "--connect", endpoint, "--max-payload", "1000")
+    recorder.wait_for("recording")
+    options = ZenohOptions(connect=(endpoint,))
+    too_large = {*range(12), 20}
+    with EnvelopePublisher(options, tmp_path / "spool", window=8, resend_after_s=0.2) as robot:
+        for k in range(25):
+            robot.publish(envelope(k, note="x" * (1_000 if k in too_large else 10)))
+        assert not robot.flush(DEADLINE_S), "not everything was acknowledged"
+        assert robot.unacknowledged == 0
+        assert robot.refused_count == len(too_large)
+        refused = robot.refused()
+        assert {one.keyframe_id for one in refused} == too_large
+        assert {one.run_id for one in refused} == {"run-a"}
+        assert all("over the limit of 1000" in one.reason for one in refused)
+    assert recorder.end(signal.SIGINT) == 3
+    assert _keyframes(log) == set(range(25)) - too_large
+    with LogReader(log) as reader:
+        assert len(list(reader.read(keys={REJECTED_KEY}))) == len(too_large), "each sent once"
+        assert {one.log_id for one in refused} == {reader.log_id}
+
+
+def test_what_was_refused_is_kept_and_can_be_sent_to_a_recorder_that_was_mended(
+    start: Start, endpoint: str, tmp_path: Path
+) -> None:
+    options = ZenohOptions(connect=(endpoint,))
+    log = str(tmp_path / "log")
+    strict = start("record", log, "--connect", endpoint, "--max-payload", "10")
+    strict.wait_for("recording")
+    with EnvelopePublisher(options, tmp_path / "spool") as robot:
+        robot.publish(envelope(1))
+        assert not robot.flush(DEADLINE_S)
+    assert strict.end(signal.SIGINT) == 3
+    start("record", log, "--connect", endpoint).wait_for("recording")
+    with EnvelopePublisher(options, tmp_path / "spool") as robot:
+        assert not robot.flush(DEADLINE_S), "it is still known in the next process"
+        assert robot.retry_refused() == 1
+        assert robot.flush(DEADLINE_S)
+        assert robot.refused() == []
+    assert _stored(tmp_path / "log") == [payload(envelope(1))]
+
+
+def test_only_the_very_bytes_that_were_sent_are_refused(
+    robot: EnvelopePublisher, connected: Sessions
+) -> None:
+    """Nonsense, other bytes of the same size, and another robot's key change nothing."""
+    arrived = threading.Semaphore(0)
+    viewer = connected()
+    viewer.subscribe(KEY, lambda _: arrived.release())
+    viewer.confirm()
+    mine, others = payload(envelope(1)), payload(envelope(2))
+    assert len(mine) == len(others)
+    robot.publish(mine)
+    assert arrived.acquire(timeout=DEADLINE_S)
+
+    def refuse(key: str, message: bytes) -> None:
+        said = Refusals(log_id="log", refused=(Refusal.of(message, "too blue"),))
+        viewer.send(refusal_key(key), said.encode())
+
+    viewer.send(refusal_key(KEY), b"{}")
+    refuse(KEY, others)
+    refuse("tb/other", mine)
+    assert arrived.acquire(timeout=DEADLINE_S), "it is sent again"
+    assert arrived.acquire(timeout=DEADLINE_S)
+    assert (robot.unacknowledged, robot.refused_count) == (1, 0)
+    refuse(KEY, mine)
+    assert not robot.flush(DEADLINE_S)
+    assert [one.reason for one in robot.refused()] == ["too blue"]
+    assert robot.discard_refused() == 1
+    assert robot.flush(DEADLINE_S)
+
+
+def test_an_ack_that_comes_when_the_recorder_has_left_is_taken(
+    robot: EnvelopePublisher, connected: Sessions
+) -> None:
+    """As a recorder leaves it unsubscribes, syncs what it has, and acknowledges that."""
+    arrived = threading.Semaphore(0)
+    recorder = connected()
+    subscription = recorder.subscribe(KEY, lambda _: arrived.release())
+    recorder.confirm()
+    for k in range(10):
+        robot.publish(envelope(k))
+    for _ in range(10):
+        assert arrived.acquire(timeout=DEADLINE_S)
+    subscription.close()
+    viewer = connected()
+    watch = viewer.publisher(KEY)
+    while watch.has_subscriber:
+        viewer.confirm()
+    ack = Ack(run_id="run-a", log_id="log", stretches=((0, 9),))
+    recorder.send(ack_key("run-a"), ack.encode())
+    assert robot.flush(DEADLINE_S)
+
+
+def test_a_key_of_our_own_is_refused_at_once(tmp_path: Path) -> None:
+    with pytest.raises(MisuseError, match="every recorder refuses envelopes under mapfold/"):
+        EnvelopePublisher(ZenohOptions(), tmp_path / "spool", "mapfold/detections")
 
 
 def test_a_full_spool_is_the_callers_to_decide(endpoint: str, tmp_path: Path) -> None:

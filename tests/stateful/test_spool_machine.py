@@ -1,4 +1,4 @@
-"""The spool against a list: publish, acknowledge, look, and reopen in any order."""
+"""The spool against two lists: publish, acknowledge, refuse, retry, look, reopen in any order."""
 
 import shutil
 import tempfile
@@ -8,8 +8,10 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
+from eventsrc._set_aside import Refused
 from eventsrc.acks import Ack
 from eventsrc.errors import SpoolFull
+from eventsrc.refusals import Refusal, Refusals
 from eventsrc.spool import Spool, Spooled
 
 MAX_BYTES = 60
@@ -23,6 +25,7 @@ class SpoolMachine(RuleBasedStateMachine):
         self.folder = Path(tempfile.mkdtemp())
         self.spool = self._open()
         self.waiting: list[tuple[int, str, int, bytes]] = []
+        self.aside: list[tuple[int, str, int, bytes | None]] = []
         self.last_seq = 0
 
     def _open(self) -> Spool:
@@ -37,8 +40,40 @@ class SpoolMachine(RuleBasedStateMachine):
             assert len(payload) > room
             return
         assert len(payload) <= room
+        self._make_room(room - len(payload))
         self.last_seq += 1
         self.waiting.append((self.last_seq, run_id, keyframe_id, payload))
+
+    def _make_room(self, room: int) -> None:
+        """The oldest payloads set aside go until what is left fits ``room`` bytes."""
+        for index, (seq, run_id, keyframe_id, _) in enumerate(self.aside):
+            if sum(len(entry[3] or b"") for entry in self.aside) <= room:
+                break
+            self.aside[index] = (seq, run_id, keyframe_id, None)
+
+    @rule(data=st.data(), up_to=st.integers(0, 30))
+    def refuse(self, data: st.DataObject, up_to: int) -> None:
+        known = [entry[3] for entry in self.waiting] or [b"nothing"]
+        refused = data.draw(st.lists(st.sampled_from(known), min_size=1, max_size=3))
+        said = tuple(Refusal.of(payload, "too blue") for payload in refused)
+        moved = [e for e in self.waiting if e[3] in refused and e[0] <= up_to]
+        assert self.spool.refuse(Refusals(log_id="log", refused=said), up_to) == len(moved)
+        self.waiting = [e for e in self.waiting if e not in moved]
+        self.aside = sorted([*self.aside, *moved], key=lambda entry: entry[0])
+
+    @rule()
+    def retry(self) -> None:
+        kept = [(r, k, payload) for _, r, k, payload in self.aside if payload is not None]
+        assert self.spool.retry_refused() == len(kept)
+        self.aside = [entry for entry in self.aside if entry[3] is None]
+        for run_id, keyframe_id, payload in kept:
+            self.last_seq += 1
+            self.waiting.append((self.last_seq, run_id, keyframe_id, payload))
+
+    @rule()
+    def discard(self) -> None:
+        assert self.spool.discard_refused() == len(self.aside)
+        self.aside = []
 
     @rule(run_id=runs, ends=st.lists(st.tuples(keyframes, keyframes), min_size=1, max_size=3))
     def acknowledge(self, run_id: str, ends: list[tuple[int, int]]) -> None:
@@ -46,6 +81,7 @@ class SpoolMachine(RuleBasedStateMachine):
         kept = [e for e in self.waiting if not (e[1] == run_id and ack.covers(e[2]))]
         assert self.spool.acknowledge(ack) == len(self.waiting) - len(kept)
         self.waiting = kept
+        self.aside = [e for e in self.aside if not (e[1] == run_id and ack.covers(e[2]))]
 
     @rule(seq=st.integers(0, 30), limit=st.integers(0, 5))
     def look(self, seq: int, limit: int) -> None:
@@ -61,6 +97,11 @@ class SpoolMachine(RuleBasedStateMachine):
     @invariant()
     def counts_what_waits(self) -> None:
         assert len(self.spool) == len(self.waiting)
+        assert self.spool.refused_count == len(self.aside)
+        assert self.spool.refused(100) == [
+            Refused(run_id, keyframe_id, "log", "too blue")
+            for _, run_id, keyframe_id, _ in self.aside
+        ]
 
     def teardown(self) -> None:
         self.spool.close()

@@ -8,13 +8,19 @@ from pathlib import Path
 
 import pytest
 
+from eventsrc._set_aside import Refused
 from eventsrc.acks import Ack
 from eventsrc.errors import SpoolError, SpoolFull
+from eventsrc.refusals import Refusal, Refusals
 from eventsrc.spool import Spool, Spooled
 
 
 def _ack(*stretches: tuple[int, int], run_id: str = "run-a") -> Ack:
     return Ack(run_id=run_id, log_id="log", stretches=stretches)
+
+
+def _refusals(*payloads: bytes) -> Refusals:
+    return Refusals(log_id="log", refused=tuple(Refusal.of(p, "too blue") for p in payloads))
 
 
 def _payloads(spool: Spool) -> list[bytes]:
@@ -59,6 +65,53 @@ def test_it_is_bounded_and_an_ack_makes_room(spool: Spool) -> None:
     spool.acknowledge(_ack((1, 1)))
     spool.add("run-a", 3, b"x" * 60)
     assert len(spool) == 2
+
+
+def test_what_was_refused_is_set_aside_with_its_reason(spool: Spool) -> None:
+    for k, message in enumerate((b"a", b"b", b"c", b"a")):
+        spool.add("run-a", k, message)
+    assert spool.refuse(_refusals(b"a", b"c", b"nobody's"), up_to=3) == 2
+    assert _payloads(spool) == [b"b", b"a"], "what came after it was not sent yet"
+    assert (len(spool), spool.refused_count) == (2, 2)
+    assert spool.refused(10) == [
+        Refused("run-a", 0, "log", "too blue"),
+        Refused("run-a", 2, "log", "too blue"),
+    ]
+    assert spool.refused(1) == spool.refused(10)[:1]
+    assert spool.refuse(_refusals(b"a", b"c"), up_to=3) == 0
+    spool.close()
+    with closing(Spool(spool.path)) as again:
+        assert (len(again), again.refused_count) == (2, 2)
+        assert again.discard_refused() == 2
+        assert again.refused(10) == []
+
+
+def test_an_ack_frees_what_was_refused_too(spool: Spool) -> None:
+    """Of two recorders one refuses and the other does not."""
+    for k in range(3):
+        spool.add("run-a", k, b"%d" % k)
+    spool.refuse(_refusals(b"0", b"1"), up_to=3)
+    assert spool.acknowledge(_ack((1, 2))) == 1, "one of them was waiting"
+    assert [one.keyframe_id for one in spool.refused(10)] == [0]
+
+
+def test_what_was_refused_gives_way_but_is_not_forgotten(spool: Spool) -> None:
+    for k in range(3):
+        spool.add("run-a", k, b"%d" % k * 30)
+    spool.refuse(_refusals(b"0" * 30, b"1" * 30), up_to=3)
+    spool.add("run-a", 3, b"3" * 30)
+    assert [one.keyframe_id for one in spool.refused(10)] == [0, 1]
+    assert spool.retry_refused() == 1, "the bytes of keyframe 0 are gone here"
+    assert _payloads(spool) == [b"2" * 30, b"3" * 30, b"1" * 30]
+    assert [one.keyframe_id for one in spool.refused(10)] == [0]
+    with pytest.raises(SpoolFull):
+        spool.add("run-a", 4, b"x" * 11)
+    spool.close()
+    with closing(Spool(spool.path, max_bytes=100)) as again:
+        assert (len(again), again.refused_count) == (3, 1)
+        again.add("run-a", 4, b"x" * 10)
+        with pytest.raises(SpoolFull):
+            again.add("run-a", 5, b"x")
 
 
 def test_what_waits_is_there_for_the_next_process(tmp_path: Path) -> None:
