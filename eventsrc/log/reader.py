@@ -96,10 +96,14 @@ class LogReader:
         report = on_gap or _stop_at_gap(self.path)
         at = max(start, 0)
         for entry, following in self._entries_from(at):
+            if at < min(entry.base, stop):  # the log's first segment is gone
+                last = min(entry.base, stop) - 1
+                report(Unreadable(at, last, f"missing before {entry.path.name}"))
+                at = entry.base
             if at >= stop:
                 break
             upto = min(stop, following)
-            at = yield from self._read_segment(entry, max(at, entry.base), upto, keys, report)
+            at = yield from self._read_segment(entry, at, upto, keys, report)
             if at < upto:
                 report(Unreadable(at, upto - 1, f"missing after {entry.path.name}"))
                 at = upto

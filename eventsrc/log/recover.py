@@ -4,13 +4,15 @@ Nothing is changed in place. Each segment that needs it is written anew beside, 
 an original in which anything recorded is damaged is kept as ``….damaged`` for a person to look at.
 A torn end that was never synced is cut off, as on any restart. Lost offsets become losses (see
 `_rebuild`). A rewritten segment notes the hash that its successor knows its original by, so the
-chain can still be followed.
+chain can still be followed. A ledger saved beside the log goes first: it may know events that the
+log is about to lose.
 """
 
 import uuid
 from dataclasses import dataclass
 from pathlib import Path
 
+from eventsrc import _ledger_cache  # which reads logs by this package's reader
 from eventsrc.clock import Clock, system_clock
 from eventsrc.errors import LogDamaged, LogError, NotALog
 
@@ -111,6 +113,7 @@ class _Recovery:
     def _rewrite(
         self, segment: SegmentPath | None, scan: Scan, following: SegmentPath | None
     ) -> None:
+        _ledger_cache.forget(self._log)
         copy = self._keep_copy(segment, scan)
         if scan.next_offset > scan.base:
             plan = SegmentPlan(

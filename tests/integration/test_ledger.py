@@ -1,16 +1,19 @@
 """The ledger of a log: what a log lacks, from its events or from a saved ledger and the rest."""
 
+import shutil
 from pathlib import Path
 
 import pytest
 
 from eventsrc._ledger_cache import NAME
 from eventsrc.append import append_payload
+from eventsrc.errors import LogDamaged
 from eventsrc.ledger import fold_ledger, ledger_of, save_ledger, unread_events
-from eventsrc.log import LogReader, LogWriter, log_info
+from eventsrc.log import NEVER, LogReader, LogWriter, _parts, log_info, recover, recover_log
 from eventsrc.losses import Gap, GapLedger
 from eventsrc.system_events import LOSS_KEY, Loss
 from tests.envelopes import detection, envelope, payload
+from tests.fixtures_log import BY_HAND, flip
 
 KEY = "tb/detections"
 SAVED_AT = 7
@@ -86,7 +89,7 @@ def test_a_saved_ledger_is_gone_on_from(log: Path) -> None:
     assert ledger.stretch("run-b", 7) is None, "the log before the saved offset is not read"
 
 
-@pytest.mark.parametrize("spoil", ["other log", "longer than the log", "recovered", "torn"])
+@pytest.mark.parametrize("spoil", ["other log", "longer than the log", "torn"])
 def test_a_saved_ledger_that_cannot_be_believed_is_not(log: Path, spoil: str) -> None:
     if spoil == "other log":
         _save(log, log_id="0" * 32)
@@ -94,12 +97,142 @@ def test_a_saved_ledger_that_cannot_be_believed_is_not(log: Path, spoil: str) ->
         _save(log, next_offset=1_000)
     else:
         _save(log)
-    if spoil == "recovered":
-        (log / "00000000000000000000.mcap.damaged").touch()
-    elif spoil == "torn":
+    if spoil == "torn":
         (log / NAME).write_text((log / NAME).read_text()[:-9])
     assert _ledger(log).stretch("from-the-cache", 1) is None
     assert _ledger(log).missing == 5
+
+
+LONG = 12
+
+
+@pytest.fixture
+def long_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Keyframes 0 to 11 of run-a, an event a chunk, in segments of four events."""
+    monkeypatch.setattr(_parts, "CHUNK_BYTES", 1)
+    path = tmp_path / "log"
+    with LogWriter(path, fsync=BY_HAND, rotate_events=4) as writer:
+        for k in range(LONG):
+            append_payload(writer, KEY, payload(envelope(k)))
+            if k % 4 == 3:
+                writer.sync()
+                writer.commit_if_due()
+    return path
+
+
+def _segment(log: Path, base: int) -> Path:
+    return log / f"{base:020d}.mcap"
+
+
+def _rot_the_event(log: Path, offset: int) -> None:
+    with LogReader(log) as reader:
+        (entry,) = (s for s in reader.segments if s.base <= offset < s.base + 4)
+        chunk = reader.open_segment(entry).chunks[offset - entry.base]
+        assert chunk.first == offset
+    flip(entry.path, chunk.position + chunk.length // 2)
+
+
+def _saved(log: Path) -> GapLedger:
+    """The ledger of the whole log, saved as a recorder saves it."""
+    ledger = _ledger(log)
+    with LogReader(log) as reader:
+        save_ledger(log, reader.log_id, reader.next_offset, ledger)
+        assert unread_events(reader) == 0
+    return ledger
+
+
+@pytest.mark.parametrize("copies", ["kept", "deleted"])
+def test_no_recovery_leaves_a_ledger_that_knows_more_than_the_log(
+    long_log: Path, copies: str
+) -> None:
+    for lost, offset in enumerate((1, 2, 9), start=1):
+        _saved(long_log)
+        _rot_the_event(long_log, offset)
+        recover_log(long_log)
+        if copies == "deleted":
+            for copy in long_log.glob("*.damaged*"):
+                copy.unlink()
+        assert _ledger(long_log).missing == lost
+    assert _saved(long_log).missing == 3
+
+
+@pytest.mark.parametrize(("base", "missing"), [(0, 0), (4, 4)])
+def test_a_segment_that_is_gone_takes_the_saved_ledger_with_it(
+    long_log: Path, base: int, missing: int
+) -> None:
+    _saved(long_log)
+    _segment(long_log, base).unlink()
+    with LogReader(long_log) as reader:
+        assert unread_events(reader) == LONG
+    with pytest.raises(LogDamaged, match=f"offsets {base} to {base + 3}"):
+        _ledger(long_log)
+    recover_log(long_log)
+    ledger = _ledger(long_log)
+    assert ledger.missing == missing
+    assert ledger.stretch("run-a", base) is None
+
+
+def test_recovery_deletes_the_saved_ledger_before_it_replaces_anything(
+    long_log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _saved(long_log)
+    _rot_the_event(long_log, 5)
+    before = _segment(long_log, 4).read_bytes()
+
+    def crash(*_: object) -> None:
+        raise RuntimeError("as if killed")
+
+    monkeypatch.setattr(recover, "rebuild", crash)
+    with pytest.raises(RuntimeError):
+        recover_log(long_log)
+    assert _segment(long_log, 4).read_bytes() == before
+    assert not (long_log / NAME).exists()
+
+
+@pytest.mark.parametrize("base", [0, 4, 8])
+def test_another_segment_in_the_place_of_one_is_noticed_without_recovery(
+    long_log: Path, base: int
+) -> None:
+    """As when a folder is put together again from copies."""
+    _saved(long_log)
+    saved = (long_log / NAME).read_bytes()
+    _rot_the_event(long_log, base + 1)
+    recover_log(long_log)
+    (long_log / NAME).write_bytes(saved)
+    assert _ledger(long_log).stretch("run-a", base + 1) is None
+
+
+def test_a_power_cut_that_took_unsynced_events_takes_their_ledger(tmp_path: Path) -> None:
+    """Under --fsync never a log may come back shorter, and grow again by other events."""
+    log, copy = tmp_path / "log", tmp_path / "copy"
+    with LogWriter(log, fsync=NEVER) as writer:
+        for k in range(3):
+            append_payload(writer, KEY, payload(envelope(k)))
+            writer.sync()
+        shutil.copytree(log, copy)  # what will be on the disk
+        append_payload(writer, KEY, payload(envelope(3)))
+        writer.sync()
+        _saved(log)
+        shutil.copy(log / NAME, copy)
+    with LogWriter(copy) as writer:
+        append_payload(writer, KEY, payload(envelope(7)))
+        writer.sync()
+        with LogReader(copy) as reader:
+            assert unread_events(reader) == 4
+        assert list(_ledger(copy).gaps()) == [Gap("run-a", 3, 6)]
+
+
+def test_sealing_leaves_the_saved_ledger_as_good_as_it_was(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    with LogWriter(log, fsync=BY_HAND) as writer:
+        append_payload(writer, KEY, payload(envelope(1)))
+        writer.sync()
+        _saved(log)
+    with LogWriter(log) as writer:
+        append_payload(writer, KEY, payload(envelope(2)))
+    assert len(list(log.glob("*.mcap"))) == 2
+    with LogReader(log) as reader:
+        assert unread_events(reader) == 1
 
 
 def test_saving_and_going_on_equals_reading_everything(log: Path) -> None:

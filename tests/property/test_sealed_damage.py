@@ -106,6 +106,26 @@ def test_a_missing_segment_becomes_losses(quick_path: Path) -> None:
         assert writer.next_offset == EVENTS
 
 
+def test_a_missing_first_segment_is_named(quick_path: Path) -> None:
+    log = quick_path / "log"
+    with LogWriter(log, rotate_events=2, fsync=BY_HAND) as writer:
+        for index in range(4):
+            writer.append(KEY, envelope(index))
+            if index % 2:
+                writer.sync()
+                writer.commit_if_due()
+    (log / "00000000000000000000.mcap").unlink()
+    with pytest.raises(LogError, match="offsets 0 to 1 cannot be read: missing before"):
+        read_log(log)
+    with pytest.raises(LogError, match="offsets 1 to 1 cannot be read"):
+        read_log(log, 1)
+    with pytest.raises(LogError, match="offsets 0 to 0 cannot be read"):
+        read_log(log, 0, 1)
+    shown, named = read_with_gaps(log)
+    assert ([event.offset for event in shown], named) == ([2, 3], {0, 1})
+    assert [event.offset for event in read_log(log, 2)] == [2, 3]
+
+
 def test_what_is_lost_has_the_times_of_its_neighbours(quick_path: Path) -> None:
     log = quick_path / "log"
     with LogWriter(log, rotate_events=2, fsync=BY_HAND) as writer:
