@@ -15,7 +15,7 @@ from . import _ledger_cache
 from .envelope import ENVELOPE_VERSION
 from .log.event import Event
 from .log.reader import LogReader
-from .losses import DEFAULT_SETTLE_NS, Gap, GapLedger
+from .losses import DEFAULT_SETTLE_NS, GapLedger, gap_of
 from .system_events import LOSS_KEY, Loss, is_system_key
 
 
@@ -76,8 +76,9 @@ def _take_loss(ledger: GapLedger, payload: bytes, now_ns: int) -> None:
         loss = Loss.model_validate_json(payload)
     except ValidationError:
         return  # of a later version; what it says was lost is still seen in the keyframes
-    if loss.cause == "keyframe_gap" and loss.first is not None and loss.last is not None:
-        ledger.assume(Gap(loss.publisher, loss.first, loss.last), now_ns)
+    gap = gap_of(loss)
+    if gap is not None:
+        ledger.assume(gap, now_ns)
 
 
 def _identity(event: Event) -> tuple[str, int] | None:

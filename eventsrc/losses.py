@@ -23,6 +23,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
+from .system_events import Loss
+
 DEFAULT_SETTLE_NS: Final = 5_000_000_000
 """Longer than a publisher waits before it sends again, so a resent keyframe is no reported gap."""
 
@@ -43,6 +45,13 @@ class Gap:
     def count(self) -> int:
         """How many keyframes are missing."""
         return self.last - self.first + 1
+
+
+def gap_of(loss: Loss) -> Gap | None:
+    """The gap that a loss event reports; None for a loss of another kind."""
+    if loss.cause != "keyframe_gap" or loss.first is None or loss.last is None:
+        return None
+    return Gap(loss.publisher, loss.first, loss.last) if loss.first <= loss.last else None
 
 
 @dataclass(slots=True, eq=False)
@@ -143,10 +152,16 @@ class GapLedger:
             for hole in run.holes:
                 yield Gap(run.run_id, hole.first, hole.last)
 
+    def reported_gaps(self) -> Iterator[Gap]:
+        """What is missing now and has been reported, in the order the runs began."""
+        for run in self._runs.values():
+            for hole in run.holes:
+                if hole.reported:
+                    yield Gap(run.run_id, hole.first, hole.last)
+
     def missing_reported(self) -> int:
         """How many of the missing keyframes have been reported."""
-        holes = (hole for run in self._runs.values() for hole in run.holes)
-        return sum(hole.count for hole in holes if hole.reported)
+        return sum(gap.count for gap in self.reported_gaps())
 
     def stretch(self, run_id: str, keyframe_id: int) -> tuple[int, int] | None:
         """The longest stretch of recorded keyframes around this one; None if it is missing."""

@@ -3,6 +3,7 @@
 from pydantic import ValidationError
 
 from eventsrc import ledger  # which reads logs by this package's reader, and may be importing it
+from eventsrc.losses import gap_of
 from eventsrc.system_events import LOSS_KEY, Loss
 
 from .event import Event
@@ -12,10 +13,10 @@ from .reader import LogReader
 def count_lost(reader: LogReader) -> int:
     """Reads the losses, and for gaps of keyframes, which may be closed, the log's gap ledger."""
     losses = [loss for event in reader.read(keys={LOSS_KEY}) if (loss := _loss(event)) is not None]
-    others = sum(loss.count for loss in losses if loss.cause != "keyframe_gap")
-    if len(losses) == sum(loss.cause != "keyframe_gap" for loss in losses):
-        return others
-    return others + ledger.ledger_of(reader).missing_reported()
+    others = [loss.count for loss in losses if gap_of(loss) is None]
+    if len(others) == len(losses):
+        return sum(others)
+    return sum(others) + ledger.ledger_of(reader).missing_reported()
 
 
 def _loss(event: Event) -> Loss | None:

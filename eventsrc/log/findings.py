@@ -20,8 +20,8 @@ class Finding:
     torn       an end that was being written when its writer died; never recorded
     schema     an event the fold cannot read
     duplicate  a keyframe that stands more than once (the fold takes the first)
-    time       a clock that ran backwards
-    loss       what the log says never came, or was lost to rot
+    time       a clock that ran backwards, or was set while a robot drove
+    loss       what the log says never came and did not come late either, or was lost to rot
     """
 
     kind: Kind

@@ -217,11 +217,69 @@ def test_verify_tells_what_no_checksum_knows(quick_path: Path) -> None:
     assert log_info(log).lost == 3
 
 
+def _gap(first: int, last: int, run_id: str = "r") -> bytes:
+    count = last - first + 1
+    loss = Loss(publisher=run_id, first=first, last=last, count=count, cause="keyframe_gap")
+    return loss.model_dump_json().encode()
+
+
 def test_a_late_keyframe_closes_its_gap(quick_path: Path) -> None:
     log = quick_path / "log"
-    loss = {"publisher": "r", "first": 2, "last": 4, "count": 3, "cause": "keyframe_gap"}
     with LogWriter(log) as writer:
-        writer.append(LOSS_KEY, json.dumps(loss).encode())
-        writer.append(KEY, envelope(3, "r"))
+        writer.append(LOSS_KEY, _gap(2, 4))
+        writer.append(KEY, envelope(3, "r"), stamp_ns=3)
         writer.append(KEY, envelope(2, "other"))
     assert log_info(log).lost == 2
+    (finding,) = verify_log(log).findings
+    assert (finding.kind, finding.count, finding.first_offset) == ("loss", 2, 0)
+    with LogWriter(log) as writer:
+        writer.append(KEY, envelope(4, "r"), stamp_ns=4)
+        writer.append(KEY, envelope(2, "r"), stamp_ns=2)
+    assert log_info(log).lost == 0
+    assert verify_log(log).findings == ()
+
+
+def test_a_gap_is_told_by_the_reports_that_are_still_open(quick_path: Path) -> None:
+    log = quick_path / "log"
+    with LogWriter(log) as writer:
+        for keyframe_id in (1, 4, 6, 10):
+            writer.append(KEY, envelope(keyframe_id, "r"), stamp_ns=keyframe_id)
+        for first, last in ((2, 3), (5, 5), (7, 9)):
+            writer.append(LOSS_KEY, _gap(first, last))
+        nonsense = _gap(5, 5).replace(b'"first":5', b'"first":99')
+        writer.append(LOSS_KEY, nonsense)
+        for keyframe_id in (8, 3, 2):
+            writer.append(KEY, envelope(keyframe_id, "r"), stamp_ns=keyframe_id)
+    findings = verify_log(log).findings
+    told = [(f.kind, f.first_offset, f.last_offset, f.count) for f in findings]
+    assert told == [("loss", 5, 7, 4)]
+    assert "lost by keyframe_gap of r (4, first at offset 5)" in findings[0].message
+    assert log_info(log).lost == 4
+
+
+DAY = 24 * 3600 * 10**9
+
+
+@pytest.mark.parametrize(
+    ("keyframes", "odd"),
+    [
+        ([(1, 10), (2, 20), (6, 60), (4, 40), (3, 30), (5, 50)], []),
+        ([(3, 30), (2, 20), (1, 10)], []),
+        ([(1, 10), (2, 10), (3, DAY + 10)], []),
+        ([(1, 10), (2, 20), (3, 19), (4, 21)], [(2, 2, 1)]),
+        ([(1, 10), (4, 40), (3, 45), (2, 20), (5, 50)], [(1, 1, 1)]),
+        ([(1, 9), (2, 8), (3, 7)], [(1, 2, 2)]),
+        ([(1, 10), (2, 20), (3, 9000 * DAY), (4, 9000 * DAY + 10)], [(2, 2, 1)]),
+        ([(2, 20), (3, 9000 * DAY), (1, 10), (4, 5)], [(1, 1, 1), (3, 3, 1)]),
+    ],
+    ids=["late", "reversed", "a day", "back", "late and back", "backwards", "set", "set twice"],
+)
+def test_stamps_are_odd_by_the_numbers_of_their_keyframes(
+    quick_path: Path, keyframes: list[tuple[int, int]], odd: list[tuple[int, int, int]]
+) -> None:
+    with LogWriter(quick_path / "log") as writer:
+        for keyframe_id, stamp_ns in keyframes:
+            writer.append(KEY, envelope(keyframe_id), stamp_ns=stamp_ns)
+    findings = verify_log(quick_path / "log").findings
+    assert {f.kind for f in findings} <= {"time"}
+    assert [(f.first_offset, f.last_offset, f.count) for f in findings] == odd
