@@ -29,6 +29,7 @@ _GAUGES: Final = (
     ("queue_depth", "Messages that wait for the log's writer."),
     ("queue_size", "How many may wait."),
     ("next_offset", "Events in the log."),
+    ("unsealed", "Finished segments that wait to be sealed."),
 )
 
 
@@ -43,6 +44,8 @@ class _RecorderCollector(Collector):
             yield CounterMetricFamily(f"mapfold_recorder_{name}", text, getattr(report, name))
         for name, text in _GAUGES:
             yield GaugeMetricFamily(f"mapfold_recorder_{name}", text, getattr(report, name))
+        failing = report.sealing_error is not None
+        yield GaugeMetricFamily("mapfold_recorder_sealing_failing", "1 while it fails.", failing)
         free = shutil.disk_usage(self._log).free
         yield GaugeMetricFamily("mapfold_recorder_disk_free_bytes", "Room where the log is.", free)
 

@@ -14,6 +14,8 @@ from eventsrc.recorder import RecorderReport
 from ._shell import people, say
 
 EVERY_S = 1.0
+_FEW_UNSEALED = 3
+"""So many segments may wait to be sealed without anybody being told: sealing runs behind."""
 
 
 class RecorderLine:
@@ -24,6 +26,7 @@ class RecorderLine:
         self._clock = clock
         self._at_s = clock()
         self._recorded = self._lost = self._rejected = 0
+        self._sealing_error: str | None = None
 
     def line(self, report: RecorderReport, free_bytes: int) -> str:
         """The status line; the rate is that since the call before."""
@@ -34,15 +37,16 @@ class RecorderLine:
             f"{rate:,.0f}/s · {report.recorded:,} recorded · {report.rejected:,} rejected · "
             f"{report.lost:,} lost · {report.missing:,} missing · "
             f"queue {report.queue_depth:,} · "
-            f"{free_bytes / 1e9:,.1f} GB free"
+            f"{free_bytes / 1e9:,.1f} GB free{_unsealed(report)}"
         )
 
     def complaints(self, report: RecorderReport) -> list[str]:
         """A line for whatever has grown since the call before."""
         lines = []
-        if report.lost > self._lost:
+        lost = report.queue_full + report.transport_missed
+        if lost > self._lost:
             lines.append(
-                f"LOST {report.lost - self._lost} messages ({report.queue_full} in a full queue, "
+                f"LOST {lost - self._lost} messages ({report.queue_full} in a full queue, "
                 f"{report.transport_missed} on the way, in all); see mapfold/loss in {self._log}"
             )
         if report.rejected > self._rejected:
@@ -50,8 +54,17 @@ class RecorderLine:
                 f"rejected {report.rejected - self._rejected} payloads; "
                 f"see mapfold/rejected in {self._log}"
             )
-        self._lost, self._rejected = report.lost, report.rejected
+        if report.sealing_error not in (None, self._sealing_error):
+            lines.append(f"sealing fails: {report.sealing_error}")
+        self._lost, self._rejected = lost, report.rejected
+        self._sealing_error = report.sealing_error
         return lines
+
+
+def _unsealed(report: RecorderReport) -> str:
+    if report.sealing_error is not None:
+        return f" · sealing fails, {report.unsealed:,} unsealed"
+    return f" · {report.unsealed:,} unsealed" if report.unsealed > _FEW_UNSEALED else ""
 
 
 @contextmanager

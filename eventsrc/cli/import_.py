@@ -27,6 +27,7 @@ from eventsrc.importers.record import Source
 from eventsrc.log import LogWriter
 from eventsrc.words import counted
 
+from ._restart_line import restart_as_json, say_restart
 from ._shell import emit, finish, people, say
 
 
@@ -49,9 +50,10 @@ def import_(
     """
     check_sources(files)
     with LogWriter(log, fsync=LAZY_COMMIT) as writer, _progress() as show:
+        say_restart(log, writer)
         report = import_files(writer, files, key=key, progress=show)
     if json_:
-        emit({"log": str(log), **asdict(report)})
+        emit({"log": str(log), **asdict(report), **restart_as_json(writer)})
     say(_summary(log, report))
     finish(findings=report.rejected > 0)
 

@@ -14,10 +14,12 @@ from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES
 from eventsrc.ledger import ledger_of, unread_events
 from eventsrc.log import LogReader, LogWriter, parse_fsync
 from eventsrc.losses import GapLedger
-from eventsrc.recorder import DEFAULT_KEYS, DEFAULT_QUEUE_SIZE, Recorder, RecorderReport
+from eventsrc.recorder import DEFAULT_KEYS, DEFAULT_QUEUE_SIZE, Recorder
 
+from ._recorder_end import RecorderEnd
 from ._recorder_line import EVERY_S, watching
-from ._shell import emit, finish, say
+from ._restart_line import say_restart
+from ._shell import say
 from ._signals import stop_on_signals
 from ._zenoh_options import ConfigOption, ConnectOption, ListenOption, zenoh_options
 
@@ -75,10 +77,12 @@ def record(
     check_keys(keys)
     address = None if metrics is None else parse_address(metrics, "--metrics")
     with (
+        RecorderEnd(log, json=json) as end,
         stop_on_signals() as stop,
         open_session(options, mode=options.mode) as session,
         LogWriter(log, fsync=policy, overlap=True) as writer,
     ):
+        say_restart(log, writer)
         recorder = Recorder(
             session,
             writer,
@@ -89,14 +93,12 @@ def record(
             report_gaps=gaps,
             max_payload_bytes=max_payload,
         )
+        end.watch(writer, recorder)
         with _measured(address, recorder, log), watching(log) as watch:
             named = ", ".join(keys)
             say(f"recording {named} to {log} from offset {writer.next_offset}; Ctrl-C ends it")
-            report = recorder.run(stop, every_s=EVERY_S, watch=watch)
-    say(summary(log, report))
-    if json:
-        emit(as_json(report))
-    finish(findings=not report.clean)
+            recorder.run(stop, every_s=EVERY_S, watch=watch)
+    end.finish()
 
 
 def _ledger(log: Path) -> GapLedger | None:
@@ -121,26 +123,6 @@ def _measured(address: tuple[str, int] | None, recorder: Recorder, log: Path) ->
     with serving_metrics(address, recorder.report, log) as port:
         say(f"metrics on http://{address[0]}:{port}/metrics")
         yield
-
-
-def summary(log: Path, report: RecorderReport) -> str:
-    """The last line for people."""
-    return (
-        f"{log}: {report.recorded} recorded, {report.rejected} rejected, {report.lost} lost, "
-        f"{report.missing} keyframes missing; {report.next_offset} events in the log"
-    )
-
-
-def as_json(report: RecorderReport) -> dict[str, int]:
-    """The final numbers for programs."""
-    return {
-        "recorded": report.recorded,
-        "rejected": report.rejected,
-        "queue_full": report.queue_full,
-        "transport_missed": report.transport_missed,
-        "missing": report.missing,
-        "next_offset": report.next_offset,
-    }
 
 
 def register(app: typer.Typer) -> None:

@@ -13,7 +13,9 @@ class RecorderReport:
     cause and whichever recorder lost them, and ``missing_before`` were lacking when this one
     began; a message lost in the queue is usually missing as well. ``unwritten`` are messages that
     were received and not written, because the log could not be written any more: if the next start
-    finds some of them on the disk all the same, the better.
+    finds some of them on the disk all the same, the better. ``unsealed`` segments are finished and
+    wait to be sealed, ``sealing_error`` says why if that fails; it costs room on the disk and loses
+    nothing.
     """
 
     recorded: int
@@ -26,6 +28,8 @@ class RecorderReport:
     queue_size: int
     next_offset: int
     unwritten: int = 0
+    unsealed: int = 0
+    sealing_error: str | None = None
 
     @property
     def lost(self) -> int:

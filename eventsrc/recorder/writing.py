@@ -92,6 +92,7 @@ class Writing:
 
     def report(self) -> RecorderReport:
         """The numbers now; may be asked for from any thread."""
+        sealing = self._writer.sealing
         return RecorderReport(
             recorded=self._recorded,
             rejected=self._rejected,
@@ -103,6 +104,8 @@ class Writing:
             queue_size=self._inbox.size,
             next_offset=self._writer.next_offset,
             unwritten=self._unwritten(),
+            unsealed=sealing.waiting,
+            sealing_error=None if sealing.error is None else str(sealing.error),
         )
 
     def _unwritten(self) -> int:

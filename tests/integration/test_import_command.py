@@ -53,6 +53,10 @@ def test_import_says_what_it_did(run: Commands) -> None:
         "skipped": 0,
         "first_offset": 0,
         "next_offset": 6,
+        "recovered_segments": 0,
+        "recovered_events": 0,
+        "torn_bytes": 0,
+        "torn_events": 0,
     }
 
 

@@ -11,7 +11,7 @@ from eventsrc.recorder import RecorderReport
 from tests.envelopes import envelope, payload
 from tests.fixtures_zenoh import Program, scrape
 
-REPORT = RecorderReport(12, 3, 4, 5, 6, 0, 7, 100, 15)
+REPORT = RecorderReport(12, 3, 4, 5, 6, 0, 7, 100, 15, unsealed=8, sealing_error="disk is on fire")
 
 
 def test_every_number_is_scraped_as_it_is_at_that_moment(tmp_path: Path) -> None:
@@ -27,6 +27,8 @@ def test_every_number_is_scraped_as_it_is_at_that_moment(tmp_path: Path) -> None
         "mapfold_recorder_queue_depth": 7,
         "mapfold_recorder_queue_size": 100,
         "mapfold_recorder_next_offset": 15,
+        "mapfold_recorder_unsealed": 8,
+        "mapfold_recorder_sealing_failing": 1,
     }
 
 
@@ -63,3 +65,4 @@ def test_the_record_command_serves_them(
     scraped = scrape(port)
     assert scraped["mapfold_recorder_recorded_total"] == 1
     assert scraped["mapfold_recorder_rejected_total"] == 1
+    assert scraped["mapfold_recorder_sealing_failing"] == 0

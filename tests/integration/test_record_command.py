@@ -1,8 +1,10 @@
 """`mapfold record` in a process of its own: what it says, how it ends, what it refuses."""
 
 import json
+import os
 import random
 import signal
+import socket
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -42,7 +44,21 @@ def test_a_signal_drains_the_queue_and_exits_0(
     assert recorder.lines[-1].endswith(
         "30 recorded, 0 rejected, 0 lost, 0 keyframes missing; 30 events in the log"
     )
-    assert json.loads(recorder.output())["recorded"] == 30
+    assert json.loads(recorder.output()) == {
+        "recorded": 30,
+        "rejected": 0,
+        "queue_full": 0,
+        "transport_missed": 0,
+        "unwritten": 0,
+        "missing": 0,
+        "next_offset": 30,
+        "unsealed": 0,
+        "sealing_error": None,
+        "recovered_segments": 0,
+        "recovered_events": 0,
+        "torn_bytes": 0,
+        "torn_events": 0,
+    }
 
 
 def test_a_message_over_the_limit_is_rejected(
@@ -118,7 +134,8 @@ def test_a_second_recorder_is_told_who_holds_the_log(
         assert recorder.wait() == 1
     (line,) = recorder.lines
     assert line.startswith("mapfold: ")
-    assert str(tmp_path / "log") in line
+    holder = f"process {os.getpid()} on {socket.gethostname()} since 20"
+    assert f"{tmp_path / 'log'} is being written by {holder}" in line
 
 
 def test_a_folder_that_is_no_log_is_one_line_and_exit_2(
@@ -156,8 +173,9 @@ main()
 """
 
 
+@pytest.mark.parametrize("fsync", ["always", "50ms"])
 def test_a_full_disk_is_one_line_and_what_is_synced_stays(
-    start_code: Start, endpoint: str, connected: Sessions, tmp_path: Path
+    start_code: Start, endpoint: str, connected: Sessions, tmp_path: Path, fsync: str
 ) -> None:
     """A limit on the size of files is the disk here: some of 20 envelopes fit."""
     log = tmp_path / "log"
@@ -167,18 +185,22 @@ def test_a_full_disk_is_one_line_and_what_is_synced_stays(
     def hear(message: Received) -> None:
         for first, last in Ack.decode(message.payload).stretches:
             acked.update(range(first, last + 1))
-        heard.set()
+        if len(acked) >= 3:
+            heard.set()
 
     watcher = connected()
     watcher.subscribe(ack_key("run-a"), hear)
     watcher.confirm()
-    arguments = ("record", str(log), "--connect", endpoint, "--fsync", "always")
+    arguments = ("record", str(log), "--connect", endpoint, "--fsync", fsync, "--json")
     recorder = start_code(_ON_A_SMALL_DISK, *arguments)
     recorder.wait_for("recording")
     publisher = connected().publisher(KEY)
     assert publisher.wait_for_subscriber(DEADLINE_S)
     sent = [payload(envelope(k, note="x" * 10_000)) for k in range(20)]
-    for message in sent:
+    for message in sent[:3]:
+        publisher.put(message)
+    assert heard.wait(DEADLINE_S)
+    for message in sent[3:]:
         publisher.put(message)
     assert recorder.wait() == 1
     line = recorder.lines[-1]
@@ -188,8 +210,50 @@ def test_a_full_disk_is_one_line_and_what_is_synced_stays(
     assert not any("Traceback" in said for said in recorder.lines)
     stored = _stored(log)
     assert stored == sent[: len(stored)]
-    assert heard.wait(DEADLINE_S)
     assert max(acked) < len(stored)
+    numbers = json.loads(recorder.output())
+    assert numbers["recorded"] == len(stored)
+    assert 0 < numbers["unwritten"] <= len(sent) - len(stored)
+    lost, summary = recorder.lines[-3:-1]
+    assert lost.startswith(f"LOST {numbers['unwritten']} message")
+    assert f"{len(stored)} recorded, 0 rejected, {numbers['unwritten']} lost" in summary
+
+
+def _leave_torn(log: Path) -> None:
+    """What a recorder leaves that is killed in the middle of writing its fourth event."""
+    last = payload(envelope(3))
+    with LogWriter(log) as writer:
+        for k in range(4):
+            append_payload(writer, KEY, payload(envelope(k)))
+            writer.sync()
+        (active,) = log.glob("*.active")
+        whole = active.read_bytes()
+    (sealed,) = log.glob("*.mcap")
+    sealed.unlink()
+    active.write_bytes(whole[: whole.index(last) + 20])
+
+
+@pytest.mark.parametrize("command", ["record", "import"])
+def test_what_a_killed_writer_left_is_told(
+    start: Start, endpoint: str, tmp_path: Path, command: str
+) -> None:
+    log, nothing = tmp_path / "log", tmp_path / "nothing.jsonl"
+    nothing.touch()
+    _leave_torn(log)
+    if command == "record":
+        program = start("record", str(log), "--connect", endpoint, "--json")
+        program.wait_for("from offset 3")
+        assert program.end(signal.SIGINT) == 0
+    else:
+        program = start("import", str(log), str(nothing), "--json")
+        assert program.wait() == 0
+    numbers = json.loads(program.output())
+    assert (numbers["recovered_segments"], numbers["recovered_events"]) == (1, 3)
+    assert (numbers["torn_bytes"] > 20, numbers["torn_events"]) == (True, 1)
+    assert program.lines[0] == (
+        f"{log}: the last writer did not finish; recovered 1 segment with 3 events, cut off "
+        f"{numbers['torn_bytes']} torn bytes with 1 event that never counted as recorded"
+    )
 
 
 def test_a_place_where_no_log_can_be_is_one_line(

@@ -370,6 +370,38 @@ def test_a_log_that_cannot_be_written_ends_the_recording(
             running._done.result(DEADLINE_S)
 
 
+def test_what_was_received_and_could_not_be_written_is_counted(
+    connected: Sessions, tmp_path: Path
+) -> None:
+    """The clock is the gate, and what breaks the log: the first message stands before the log, ten
+    in the queue, and then an impossible time comes."""
+    entered, gate = threading.Event(), threading.Event()
+    times = itertools.chain([system_clock()], itertools.repeat(-1))
+
+    def breaking_clock() -> int:
+        now_ns = next(times)
+        if now_ns < 0:
+            entered.set()
+            assert gate.wait(DEADLINE_S)
+        return now_ns
+
+    publisher = connected().publisher(KEY)
+    with LogWriter(tmp_path / "log", clock=breaking_clock) as writer:
+        running = Running(Recorder(connected(), writer, [KEY]))
+        assert publisher.wait_for_subscriber(DEADLINE_S)
+        first, *others = _keyframes(*range(11))
+        publisher.put(first)
+        assert entered.wait(DEADLINE_S)
+        for message in others:
+            publisher.put(message)
+        running.wait_until(lambda report: report.queue_depth == 10)
+        gate.set()
+        with pytest.raises(LogError, match="not nanoseconds"):
+            running._done.result(DEADLINE_S)
+    report = running._recorder.report()
+    assert (report.recorded, report.unwritten, report.lost, report.clean) == (0, 11, 11, False)
+
+
 @pytest.mark.parametrize("keys", [["tb/*", "tb/detections"], ["**", "a"], ["a", "a"]])
 def test_overlapping_keys_would_record_twice(
     connected: Sessions, tmp_path: Path, keys: list[str]

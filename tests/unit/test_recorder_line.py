@@ -49,8 +49,22 @@ def test_rejections_are_told_too() -> None:
     assert line == "rejected 3 payloads; see mapfold/rejected in logs/run-7"
 
 
+def test_sealing_is_spoken_of_only_when_it_is_behind_or_fails() -> None:
+    status = _line(*range(9))
+    assert "unsealed" not in status.line(dataclasses.replace(NOTHING, unsealed=3), 0)
+    behind = dataclasses.replace(NOTHING, unsealed=1_004)
+    assert status.line(behind, 0).endswith(" GB free · 1,004 unsealed")
+    assert status.complaints(behind) == []
+    failing = dataclasses.replace(NOTHING, unsealed=1, sealing_error="no room; free space")
+    assert status.line(failing, 0).endswith(" · sealing fails, 1 unsealed")
+    assert status.complaints(failing) == ["sealing fails: no room; free space"]
+    assert status.complaints(failing) == [], "once"
+    assert status.complaints(NOTHING) == []
+    assert status.complaints(failing) == ["sealing fails: no room; free space"], "it fails again"
+
+
 def test_clean_means_that_this_recorder_lost_nothing() -> None:
     assert NOTHING.clean
     assert dataclasses.replace(NOTHING, missing=4, missing_before=4).clean
-    for name in ("rejected", "queue_full", "transport_missed", "missing"):
+    for name in ("rejected", "queue_full", "transport_missed", "unwritten", "missing"):
         assert not dataclasses.replace(NOTHING, **{name: 1}).clean, name
