@@ -16,6 +16,7 @@ from eventsrc import _ledger_cache  # which reads logs by this package's reader
 from eventsrc.clock import Clock, system_clock
 from eventsrc.errors import LogDamaged, LogError, NotALog
 
+from ._active import ActiveSegment
 from ._check import check_sealed
 from ._head import head_of
 from ._lock import WriterLock
@@ -25,7 +26,7 @@ from ._rebuild import rebuild
 from ._scan import Scan, scan_active
 from ._scan_sealed import scan_sealed
 from ._seal import NO_PREVIOUS, REPLACES, SegmentPlan, file_sha256
-from .fsync import sync_directory, unlink_quietly
+from .fsync import GROUP_COMMIT, sync_directory, unlink_quietly
 from .reader import segments_of
 
 
@@ -108,6 +109,8 @@ class _Recovery:
         else:
             scan = scan_active(segment.path, segment.base)
             scan.gap_up_to(reach or segment.base)
+            if segment.base == 0 and scan.log_id and scan == Scan(0, scan.log_id):
+                return  # an empty log, and whole
         self._rewrite(segment, scan, following)
 
     def _rewrite(
@@ -126,11 +129,21 @@ class _Recovery:
             nearby = moment_between(self._previous, following)
             rebuild(plan, segment.path if segment else None, scan, nearby)
             self._previous = self._sealed(scan.base)
-        if segment is not None and (not segment.sealed or scan.next_offset == scan.base):
-            segment.path.unlink()
-            sync_directory(self._log)
+        if segment is not None:
+            self._remove_original(segment, scan)
         self._next = scan.next_offset
         self._done.append(_told(segment, scan, copy))
+
+    def _remove_original(self, segment: SegmentPath, scan: Scan) -> None:
+        """Unless what takes its place has its name. A log without any event still has a segment,
+        for that carries its id."""
+        replaced = segment.sealed and scan.next_offset > scan.base
+        if scan.next_offset == 0:
+            ActiveSegment(self._log, self._log_id, 0, GROUP_COMMIT).close()
+            replaced = not segment.sealed
+        if not replaced:
+            segment.path.unlink()
+            sync_directory(self._log)
 
     def _sealed(self, base: int) -> SegmentPath:
         return SegmentPath(segment_path(self._log, base, SEALED), base, True)

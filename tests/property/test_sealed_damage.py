@@ -126,6 +126,38 @@ def test_a_missing_first_segment_is_named(quick_path: Path) -> None:
     assert [event.offset for event in read_log(log, 2)] == [2, 3]
 
 
+def test_recovering_a_log_without_events_leaves_one(quick_path: Path) -> None:
+    log = quick_path / "log"
+    LogWriter(log).close()
+    with LogReader(log) as reader:
+        log_id = reader.log_id
+    assert recover_log(log).segments == ()
+    (active,) = log.glob("*.active")
+    active.write_bytes(active.read_bytes() + b"torn")
+    (segment,) = recover_log(log).segments
+    assert (segment.kept_events, segment.lost_bytes, segment.kept_copy) == (0, 4, None)
+    assert recover_log(log).segments == ()
+    assert read_log(log) == []
+    with LogWriter(log) as writer:
+        assert (writer.log_id, writer.next_offset) == (log_id, 0)
+
+
+def test_recovering_a_log_of_which_nothing_is_left_leaves_an_empty_one(
+    sealed: tuple[Path, list[Event]],
+) -> None:
+    file, _ = sealed
+    with LogReader(file.parent) as reader:
+        log_id, start = reader.log_id, reader.open_segment(reader.segments[0]).head_bytes
+    data = file.read_bytes()
+    file.write_bytes(data[:start] + bytes(len(data) - start))
+    (segment,) = recover_log(file.parent).segments
+    assert segment.kept_copy == f"{file.name}.damaged"
+    assert recover_log(file.parent).segments == ()
+    assert read_log(file.parent) == []
+    with LogWriter(file.parent) as writer:
+        assert (writer.log_id, writer.next_offset) == (log_id, 0)
+
+
 def test_what_is_lost_has_the_times_of_its_neighbours(quick_path: Path) -> None:
     log = quick_path / "log"
     with LogWriter(log, rotate_events=2, fsync=BY_HAND) as writer:

@@ -4,10 +4,14 @@ A crash is a copy of the folder as another process would find it: the writer's u
 are gone, and the growing file may be cut anywhere behind its last synced byte, with or without its
 last commit mark.
 
+A writer that overlaps commits in a thread of its own, so what is durable moves by itself: what it
+was before a crash must be there after it, and what is shown may be ahead of it by a group.
+
 Every step waits for the sealing it began: Hypothesis replays what it finds, and a step whose end
 depends on how far another thread has come does not replay. What readers see while a segment is
 being sealed is asked where the moment can be chosen (tests/unit/test_log_commit.py) and under load
-(tests/integration/test_log_tail.py).
+(tests/integration/test_log_tail.py). Sealing in a process is left out, for starting one takes
+longer than all else here; tests/integration/test_log_aside.py has it.
 """
 
 import contextlib
@@ -16,17 +20,34 @@ import tempfile
 import threading
 from pathlib import Path
 
+import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from eventsrc.errors import LogError
-from eventsrc.log import Event, LogReader, LogWriter, follow, log_info, verify_log
+from eventsrc.log import (
+    Event,
+    FsyncPolicy,
+    LogReader,
+    LogWriter,
+    _sealer,
+    follow,
+    log_info,
+    recover_log,
+    verify_log,
+)
+from eventsrc.log._aside import ProcessGone
 from eventsrc.log._mcap import MARK_BYTES
 from tests.fixtures_log import BY_HAND, MEMORY_DISK
 
 KEYS = ["tb/detections", "other/key", "mapfold/loss"]
 PAYLOADS = st.binary(max_size=40)
+IN_THREES = FsyncPolicy(interval_ns=10**18, max_events=3)
+
+
+def _no_process() -> None:
+    raise ProcessGone("not here")
 
 
 class LogMachine(RuleBasedStateMachine):
@@ -41,21 +62,49 @@ class LogMachine(RuleBasedStateMachine):
         self.written: list[Event] = []
         self.durable = 0
         self.stop = threading.Event()
+        self.patch = pytest.MonkeyPatch()
+        self.patch.setattr(_sealer, "SealingProcess", _no_process)
 
-    @initialize(rotate_events=st.sampled_from([1, 5, 1000]))
-    def begin(self, rotate_events: int) -> None:
+    @initialize(rotate_events=st.sampled_from([1, 5, 1000]), overlap=st.booleans())
+    def begin(self, rotate_events: int, overlap: bool) -> None:
         self.rotate_events = rotate_events
+        self.overlap = overlap
         self.writer: LogWriter | None = None
         self.open_writer()
         self.tail = follow(self.path, 0, stop=self.stop)
         self.tailed = 0
 
     def open_writer(self) -> None:
-        self.writer = LogWriter(self.path, fsync=BY_HAND, rotate_events=self.rotate_events)
+        self.writer = LogWriter(
+            self.path,
+            fsync=IN_THREES if self.overlap else BY_HAND,
+            rotate_events=self.rotate_events,
+            overlap=self.overlap,
+        )
+        self.writer._sealer.finish()  # of what its predecessor left
         assert self.durable <= self.writer.next_offset <= len(self.written)
         self.written = self.written[: self.writer.next_offset]
         self.durable = self.writer.durable_offset
         assert self.durable == len(self.written)
+
+    def note_durable(self) -> None:
+        """What the writer says now: never less than before, never more than was appended."""
+        assert self.writer is not None
+        durable = self.writer.durable_offset
+        assert self.durable <= durable <= len(self.written)
+        self.durable = durable
+
+    @precondition(lambda self: self.writer is None)
+    @rule()
+    def recover(self) -> None:
+        report = recover_log(self.path)
+        assert not any(segment.gaps or segment.kept_copy for segment in report.segments)
+        assert self.durable <= report.events <= len(self.written)
+        self.written = self.written[: report.events]
+        self.durable = report.events
+        with LogReader(self.path) as reader:
+            assert list(reader.read()) == self.written
+        assert recover_log(self.path).segments == ()
 
     @precondition(lambda self: self.writer is None)
     @rule()
@@ -70,7 +119,7 @@ class LogMachine(RuleBasedStateMachine):
         self.writer._sealer.finish()
         self.written.append(Event(offset, key, logged, logged // 2, payload))
         assert offset == len(self.written) - 1
-        self.durable = self.writer.durable_offset  # a full segment is rotated, which commits
+        self.note_durable()  # a full segment is rotated, which commits
 
     @precondition(lambda self: self.writer is not None)
     @rule(commits=st.lists(st.integers(1, 3), min_size=2, max_size=6), key=st.sampled_from(KEYS))
@@ -102,6 +151,7 @@ class LogMachine(RuleBasedStateMachine):
     @rule(half_written=st.booleans(), keep=st.floats(0, 1), without_mark=st.booleans())
     def crash(self, half_written: bool, keep: float, without_mark: bool) -> None:
         assert self.writer is not None
+        self.note_durable()
         synced_bytes = self.writer._active.size
         has_commit = self.writer._active.committed > self.writer._active.base
         if half_written:
@@ -130,7 +180,9 @@ class LogMachine(RuleBasedStateMachine):
         keys = data.draw(st.none() | st.sets(st.sampled_from(KEYS)))
         with LogReader(self.path) as reader:
             shown = self.written[: reader.next_offset]
-            assert reader.next_offset <= self.durable or self.writer is None
+            if self.writer is not None:
+                ahead = len(self.written) if self.overlap else self.durable
+                assert self.durable <= reader.next_offset <= ahead
             expected = [e for e in shown[start:end] if keys is None or e.key in keys]
             assert list(reader.read(start, end, keys=keys)) == expected
 
@@ -142,7 +194,8 @@ class LogMachine(RuleBasedStateMachine):
             assert event == self.written[self.tailed]
             self.tailed += 1
         if self.writer is not None:
-            assert self.tailed == self.durable
+            assert self.tailed >= self.durable
+            assert self.tailed == self.durable or self.overlap
 
     @precondition(lambda self: self.writer is None)
     @rule()
@@ -154,13 +207,16 @@ class LogMachine(RuleBasedStateMachine):
     @invariant()
     def nothing_durable_is_gone(self) -> None:
         if self.writer is not None:
-            assert self.writer.durable_offset == self.durable
+            before = self.durable
+            self.note_durable()
+            assert self.durable == before or self.overlap
 
     def teardown(self) -> None:
         self.stop.set()
         self.tail.close()
         if self.writer is not None:
             self.writer.close()
+        self.patch.undo()
         shutil.rmtree(self.folder)
 
 
