@@ -5,13 +5,13 @@ A sink first only *notes* deltas; nothing is written until the runner *takes* wh
 its own, so a write that failed can be repeated with it, and writing it again does no harm.
 
 A rebuild goes another way to the same rows: `begin` a shadow; while the fold runs `take_final` the
-rows that can never change again and `load` them; then `take` and `load` the rest, `index`, `check`
-and `swap` the shadow in, all in one transaction; then `tidy` away what it replaced. Until then
-nobody sees anything of it. What needs the view and what needs the connection are two methods, so
-that a thread can write while the fold goes on.
+rows that can never change again and `load` them; then `take_rest` and `load` the rest, `index`,
+`check` and `swap` the shadow in, all in one transaction; then `tidy` away what it replaced. Until
+then nobody sees anything of it. What needs the view and what needs the connection are two methods,
+so that a thread can write while the fold goes on.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol, TypeAlias, TypeVar
 
@@ -47,8 +47,12 @@ class Sink(Protocol[Changes]):
     def name(self) -> SinkName:
         """Under which the checkpoint and the locks know it."""
 
-    def note(self, delta: Delta, logged_ns: int, view: MapView) -> None:
-        """Remember that ``delta`` changes something; ``view`` has not applied it yet."""
+    @property
+    def rebuilds_from_view(self) -> bool:
+        """True when a rebuild need not `note`: all that it will write is in the view."""
+
+    def note(self, deltas: Sequence[Delta], logged_ns: int, view: MapView) -> None:
+        """Remember what an event's deltas change; ``view`` has not applied them yet."""
 
     def take(self, view: MapView) -> Changes:
         """What changed since the last take, as ``view`` has it now."""
@@ -70,6 +74,9 @@ class Sink(Protocol[Changes]):
 
     def take_final(self, view: MapView) -> Changes | None:
         """Rows that can never change again, taken out if enough of them wait; else None."""
+
+    def take_rest(self, view: MapView) -> Changes:
+        """All rows that `take_final` has not given out yet; the fold is over."""
 
     def load(self, connection: Connection, changes: Changes) -> None:
         """Write what was taken to the shadow."""

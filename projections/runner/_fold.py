@@ -53,12 +53,9 @@ class LiveFold:
         self.view.advance(offset + 1)
 
     def _apply(self, event: Event, deltas: list[Delta], sinks_of: SinksOf) -> None:
-        view, sinks = self.view, sinks_of(event)
-        for delta in deltas:
-            for sink in sinks:
-                sink.note(delta, event.logged_ns, view)
-            view.apply(delta)
-        view.advance(event.offset + 1)
+        for sink in sinks_of(event):
+            sink.note(deltas, event.logged_ns, self.view)
+        self.view.apply_event(event.offset, deltas)
 
 
 def batches(events: Iterable[Event | None], size: int) -> Iterator[list[Event]]:

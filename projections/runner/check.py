@@ -204,10 +204,10 @@ def _graph_row(row: Row | tuple[Any, ...]) -> Keyed:
 
 
 def _vector_row(row: VectorRow) -> Keyed:
-    pose = row.pose or (None, None, None)
+    pose, added = row.pose or (None, None, None), row.added
     return row.det_pk, (
-        row.run_id, row.det_id, row.keyframe_id, row.class_name, row.confidence, list(row.bbox),
-        *pose, row.embedding_model, row.embedding.tolist(), row.ingested_us,
+        added.run_id, added.det_id, added.keyframe_id, added.class_name, added.confidence,
+        list(row.bbox), *pose, added.embedding_model, row.embedding.tolist(), row.ingested_us,
     )  # fmt: skip
 
 

@@ -100,7 +100,7 @@ def rebuild(
                 folded = time.monotonic()
                 tell(RebuildProgress("writing", total, total))
                 for loading, sink, connection in loadings:
-                    loading.put(partial(sink.load, connection, sink.take(fold.view)))
+                    loading.put(partial(sink.load, connection, sink.take_rest(fold.view)))
                     loading.put(partial(sink.index, connection))
                 digest = map_digest(fold.view)
                 for loading, _, _ in loadings:
@@ -163,10 +163,10 @@ def _fold_into(
     total: int,
     tell: OnProgress,
 ) -> Event | None:
-    sinks = [sink for _, sink, _ in loadings]
+    told_of = [sink for _, sink, _ in loadings if not sink.rebuilds_from_view]
     last: Event | None = None
     for batch in batches(events, TICK_EVENTS):
-        for failed in fold.feed(batch, lambda _: sinks):
+        for failed in fold.feed(batch, lambda _: told_of):
             if failed is not None:
                 told = f"{failed.reason}; the databases stay as they were"
                 raise FoldError(failed.offset, told)

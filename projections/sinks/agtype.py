@@ -8,7 +8,6 @@ back to the same bits. Strings are escaped as JSON has it: quote, backslash and 
 Nothing here is query text. The result is a *value*: a bind parameter or a field of COPY data.
 """
 
-from collections.abc import Iterable
 from json.encoder import encode_basestring
 
 
@@ -23,8 +22,3 @@ def number(value: float) -> str:
     if written[-1] in "fn":  # inf, nan
         raise ValueError(f"{value} is no number a graph can hold")
     return written
-
-
-def numbers(values: Iterable[float]) -> str:
-    """A list of finite floats."""
-    return f"[{', '.join(map(number, values))}]"

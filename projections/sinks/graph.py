@@ -1,6 +1,6 @@
 """The sink that writes the map as an Apache AGE graph."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 from psycopg import sql
@@ -13,7 +13,7 @@ from projections.view import MapView
 
 from . import _graph_ddl, _readers, _swap_guard
 from ._sql import statements
-from .graph_rows import GraphChanges, GraphRows
+from .graph_rows import GraphChanges, GraphRows, WholeGraph
 from .labels import (
     COUNT_KEYS,
     EDGE_LABELS,
@@ -41,14 +41,16 @@ class GraphSink:
     """Implements `projections.sink.Sink` for the graph ``semantic_map``."""
 
     name: Final[SinkName] = "graph"
+    rebuilds_from_view: Final = True
 
     def __init__(self, loader: LoaderName = "copy") -> None:
         self._loader: Loader = loader_of(loader)
         self._rows = GraphRows()
+        self._whole = WholeGraph()
 
-    def note(self, delta: Delta, logged_ns: int, view: MapView) -> None:  # noqa: ARG002 - the port
-        """Remember what ``delta`` changes."""
-        self._rows.note(delta, view)
+    def note(self, deltas: Sequence[Delta], logged_ns: int, view: MapView) -> None:  # noqa: ARG002 - the port
+        """Remember what ``deltas`` change."""
+        self._rows.note(deltas, view)
 
     def take(self, view: MapView) -> GraphChanges:
         """What changed since the last take."""
@@ -98,15 +100,16 @@ class GraphSink:
 
     def take_final(self, view: MapView) -> GraphChanges | None:
         """Fixed rows, if enough of them wait."""
-        if self._rows.fixed_waiting < STREAM_ROWS:
-            return None
-        return GraphChanges(self._rows.take_fixed(view))
+        return self._whole.take_fixed(view) if self._whole.waiting(view) >= STREAM_ROWS else None
+
+    def take_rest(self, view: MapView) -> GraphChanges:
+        """All rows that are still missing."""
+        return self._whole.take_rest(view)
 
     def load(self, connection: Connection, changes: GraphChanges) -> None:
         """Write rows to the shadow, where none of them is yet."""
-        for rows_of in (changes.inserted, changes.upserted):
-            for label, rows in rows_of.items():
-                self._insert(self._loader, connection, NEXT_GRAPH, label, rows)
+        for label, rows in changes.inserted.items():
+            self._insert(self._loader, connection, NEXT_GRAPH, label, rows)
 
     def index(self, connection: Connection) -> None:
         """Index the shadow and gather its statistics."""

@@ -1,12 +1,17 @@
-"""What a row of the graph says: its graphid, its ends, and its properties as agtype text."""
+"""What a row of the graph says: its graphid, its ends, and its properties as agtype text.
+
+The bulk of a map's floats is written by ``repr``, which is what `agtype.number` does for a float.
+They are finite: the envelope lets nothing else in, and the server would refuse it.
+"""
 
 from collections.abc import Callable, Iterable, Iterator
 from typing import Final
 
 from projections.exact import Q40, UM_PER_M
+from projections.records import KeyframeRecord
 from projections.view import MapView
 
-from .agtype import number, numbers, text
+from .agtype import number, text
 from .labels import LABELS, Label, adjacency_number, graphid_base
 
 VertexRow = tuple[int, str]
@@ -23,111 +28,122 @@ BASE: Final = {label: graphid_base(label) + 1 for label in LABELS}
 def expected_rows(view: MapView, label: Label) -> Iterator[Row]:
     """Every row of a label that the map has, by graphid: what a table must hold, streamed."""
     keyframes, observations = range(len(view.keyframes)), range(len(view.observations))
-    posed = (k for k in keyframes if view.keyframes[k].pose)
-    fused = (o for o in observations if view.observations[o].object is not None)
-    rows: dict[Label, Callable[[], Iterable[Row]]] = {
-        "Run": lambda: (run_row(view, r) for r in range(len(view.runs))),
-        "Keyframe": lambda: (keyframe_row(view, k) for k in keyframes),
-        "Pose": lambda: (pose_row(view, k) for k in posed),
-        "Observation": lambda: (observation_row(view, o) for o in observations),
-        "Object": lambda: (object_row(view, o) for o in range(len(view.objects))),
-        "Place": lambda: (place_row(view, p) for p in sorted(view.places)),
-        "HAS_KEYFRAME": lambda: (has_keyframe_row(view, k) for k in keyframes),
-        "HAS_POSE": lambda: (has_pose_row(k) for k in posed),
-        "HAS_OBSERVATION": lambda: (has_observation_row(view, o) for o in observations),
-        "OBSERVES": lambda: (observes_row(view, o) for o in fused),
-        "LOCATED_IN": lambda: located_in_rows(view, range(len(view.objects))),
+    objects = range(len(view.objects))
+    rows: dict[Label, Callable[[], Iterator[Row]]] = {
+        "Run": lambda: run_rows(view, range(len(view.runs))),
+        "Keyframe": lambda: keyframe_rows(view, keyframes),
+        "Pose": lambda: pose_rows(view, keyframes),
+        "Observation": lambda: observation_rows(view, observations),
+        "Object": lambda: object_rows(view, objects),
+        "Place": lambda: place_rows(view, sorted(view.places)),
+        "HAS_KEYFRAME": lambda: has_keyframe_rows(view, keyframes),
+        "HAS_POSE": lambda: has_pose_rows(view, keyframes),
+        "HAS_OBSERVATION": lambda: has_observation_rows(view, observations),
+        "OBSERVES": lambda: observes_rows(view, observations),
+        "LOCATED_IN": lambda: located_in_rows(view, objects),
         "IN_PLACE": lambda: in_place_rows(view, keyframes),
         "ADJACENT_TO": lambda: adjacent_to_rows(view, sorted(view.adjacency)),
     }
-    return iter(rows[label]())
+    return rows[label]()
 
 
-def run_row(view: MapView, ordinal: int) -> VertexRow:
-    """A Run."""
-    run = view.runs[ordinal]
-    properties = f'{{"run_id": {text(run.run_id)}, "started_at": {number(run.started_at)}}}'
-    return BASE["Run"] + ordinal, properties
+def run_rows(view: MapView, runs: Iterable[int]) -> Iterator[VertexRow]:
+    """Runs."""
+    for i in runs:
+        run = view.runs[i]
+        properties = f'{{"run_id": {text(run.run_id)}, "started_at": {number(run.started_at)}}}'
+        yield BASE["Run"] + i, properties
 
 
-def keyframe_row(view: MapView, ordinal: int) -> VertexRow:
-    """A Keyframe."""
-    k = view.keyframes[ordinal]
-    return BASE["Keyframe"] + ordinal, (
-        f'{{"run_id": {text(k.run_id)}, "keyframe_id": {k.keyframe_id},'
-        f' "timestamp": {number(k.timestamp)}}}'
-    )
+def keyframe_rows(view: MapView, keyframes: Iterable[int]) -> Iterator[VertexRow]:
+    """Keyframes."""
+    base = BASE["Keyframe"]
+    for i in keyframes:
+        k = view.keyframes[i]
+        yield base + i, f'{{{_said_by(k)}, "timestamp": {k.timestamp!r}}}'
 
 
-def pose_row(view: MapView, ordinal: int) -> VertexRow:
-    """The Pose of a keyframe that has one."""
-    k = view.keyframes[ordinal]
-    assert k.pose is not None  # noqa: S101 - the caller filtered
-    return BASE["Pose"] + ordinal, (
-        f'{{"run_id": {text(k.run_id)}, "keyframe_id": {k.keyframe_id},'
-        f' "map_x": {number(k.pose.x_um / UM_PER_M)}, "map_y": {number(k.pose.y_um / UM_PER_M)},'
-        f' "map_yaw": {number(k.pose.yaw_rad)}}}'
-    )
+def pose_rows(view: MapView, keyframes: Iterable[int]) -> Iterator[VertexRow]:
+    """The Poses of those keyframes that have one."""
+    base = BASE["Pose"]
+    for i in keyframes:
+        k = view.keyframes[i]
+        if (pose := k.pose) is not None:
+            properties = (
+                f'{{{_said_by(k)}, "map_x": {pose.x_um / UM_PER_M!r},'
+                f' "map_y": {pose.y_um / UM_PER_M!r}, "map_yaw": {pose.yaw_rad!r}}}'
+            )
+            yield base + i, properties
 
 
-def observation_row(view: MapView, ordinal: int) -> VertexRow:
-    """An Observation."""
-    o = view.observations[ordinal]
-    k = view.keyframes[o.keyframe]
-    return BASE["Observation"] + ordinal, (
-        f'{{"det_id": {text(o.det_id)}, "class_name": {text(o.class_name)},'
-        f' "confidence": {number(o.confidence)}, "bbox": {numbers(o.bbox)},'
-        f' "run_id": {text(k.run_id)}, "keyframe_id": {k.keyframe_id}}}'
-    )
+def observation_rows(view: MapView, observations: Iterable[int]) -> Iterator[VertexRow]:
+    """Observations."""
+    base, keyframe, said = BASE["Observation"], -1, ""
+    for i in observations:
+        o = view.observations[i]
+        if o.keyframe != keyframe:
+            keyframe, said = o.keyframe, _said_by(view.keyframes[o.keyframe])
+        x0, y0, x1, y1 = o.bbox
+        properties = (
+            f'{{"det_id": {text(o.det_id)}, "class_name": {text(o.class_name)},'
+            f' "confidence": {o.confidence!r}, "bbox": [{x0!r}, {y0!r}, {x1!r}, {y1!r}], {said}}}'
+        )
+        yield base + i, properties
 
 
-def object_row(view: MapView, ordinal: int) -> VertexRow:
-    """An Object."""
-    o = view.objects[ordinal]
-    return BASE["Object"] + ordinal, (
-        f'{{"object_id": {text(o.object_id)}, "class_name": {text(o.class_name)},'
-        f' "mean_x": {number(o.mean_x)}, "mean_y": {number(o.mean_y)}, "obs_count": {o.obs_count},'
-        f' "first_seen": {number(o.first_seen)}, "last_seen": {number(o.last_seen)}}}'
-    )
+def object_rows(view: MapView, objects: Iterable[int]) -> Iterator[VertexRow]:
+    """Objects."""
+    base = BASE["Object"]
+    for i in objects:
+        o = view.objects[i]
+        properties = (
+            f'{{"object_id": {text(o.object_id)}, "class_name": {text(o.class_name)},'
+            f' "mean_x": {o.mean_x!r}, "mean_y": {o.mean_y!r}, "obs_count": {o.obs_count},'
+            f' "first_seen": {o.first_seen!r}, "last_seen": {o.last_seen!r}}}'
+        )
+        yield base + i, properties
 
 
-def place_row(view: MapView, ordinal: int) -> VertexRow:
-    """A Place, also one that was absorbed."""
-    p = view.all_places[ordinal]
-    return BASE["Place"] + ordinal, (
-        f'{{"place_id": {text(p.place_id)}, "centroid_x": {number(p.centroid_x)},'
-        f' "centroid_y": {number(p.centroid_y)}, "keyframe_count": {p.keyframe_count}}}'
-    )
+def place_rows(view: MapView, places: Iterable[int]) -> Iterator[VertexRow]:
+    """Places, also those that were absorbed."""
+    base = BASE["Place"]
+    for i in places:
+        p = view.all_places[i]
+        properties = (
+            f'{{"place_id": {text(p.place_id)}, "centroid_x": {number(p.centroid_x)},'
+            f' "centroid_y": {number(p.centroid_y)}, "keyframe_count": {p.keyframe_count}}}'
+        )
+        yield base + i, properties
 
 
-def has_keyframe_row(view: MapView, k: int) -> EdgeRow:
-    """The edge from its run to keyframe ``k``."""
-    run = BASE["Run"] + view.keyframes[k].run
-    return BASE["HAS_KEYFRAME"] + k, run, BASE["Keyframe"] + k, _NONE
+def has_keyframe_rows(view: MapView, keyframes: Iterable[int]) -> Iterator[EdgeRow]:
+    """The edges from their runs to keyframes."""
+    edge, run, keyframe = BASE["HAS_KEYFRAME"], BASE["Run"], BASE["Keyframe"]
+    return ((edge + k, run + view.keyframes[k].run, keyframe + k, _NONE) for k in keyframes)
 
 
-def has_pose_row(k: int) -> EdgeRow:
-    """The edge from keyframe ``k`` to its pose."""
-    return BASE["HAS_POSE"] + k, BASE["Keyframe"] + k, BASE["Pose"] + k, _NONE
+def has_pose_rows(view: MapView, keyframes: Iterable[int]) -> Iterator[EdgeRow]:
+    """The edges to the poses of those keyframes that have one."""
+    edge, keyframe, pose = BASE["HAS_POSE"], BASE["Keyframe"], BASE["Pose"]
+    posed = (k for k in keyframes if view.keyframes[k].pose is not None)
+    return ((edge + k, keyframe + k, pose + k, _NONE) for k in posed)
 
 
-def has_observation_row(view: MapView, o: int) -> EdgeRow:
-    """The edge from its keyframe to observation ``o``."""
-    keyframe = BASE["Keyframe"] + view.observations[o].keyframe
-    return BASE["HAS_OBSERVATION"] + o, keyframe, BASE["Observation"] + o, _NONE
+def has_observation_rows(view: MapView, observations: Iterable[int]) -> Iterator[EdgeRow]:
+    """The edges from their keyframes to observations."""
+    edge, keyframe, seen = BASE["HAS_OBSERVATION"], BASE["Keyframe"], BASE["Observation"]
+    records = view.observations
+    return ((edge + o, keyframe + records[o].keyframe, seen + o, _NONE) for o in observations)
 
 
-def observes_row(view: MapView, ordinal: int) -> EdgeRow:
-    """The edge from a fused observation to its object."""
-    o = view.observations[ordinal]
-    assert o.object is not None  # noqa: S101 - ObjectSeen was applied
-    assert o.similarity_q40 is not None  # noqa: S101
-    return (
-        BASE["OBSERVES"] + ordinal,
-        BASE["Observation"] + ordinal,
-        BASE["Object"] + o.object,
-        f'{{"similarity": {number(o.similarity_q40 / Q40)}}}',
-    )
+def observes_rows(view: MapView, observations: Iterable[int]) -> Iterator[EdgeRow]:
+    """The edges from those observations that were fused to their objects."""
+    edge, seen, fused = BASE["OBSERVES"], BASE["Observation"], BASE["Object"]
+    for i in observations:
+        o = view.observations[i]
+        if o.object is not None and o.similarity_q40 is not None:
+            properties = f'{{"similarity": {o.similarity_q40 / Q40!r}}}'
+            yield edge + i, seen + i, fused + o.object, properties
 
 
 def located_in_rows(view: MapView, objects: Iterable[int]) -> Iterator[EdgeRow]:
@@ -155,3 +171,7 @@ def adjacent_to_rows(view: MapView, links: Iterable[tuple[int, int]]) -> Iterato
             properties = f'{{"shared_transitions": {shared}}}'
             edge = base + adjacency_number(a, b)
             yield edge, BASE["Place"] + a, BASE["Place"] + b, properties
+
+
+def _said_by(keyframe: KeyframeRecord) -> str:
+    return f'"run_id": {text(keyframe.run_id)}, "keyframe_id": {keyframe.keyframe_id}'

@@ -1,15 +1,19 @@
 """From deltas to rows of the graph: which rows changed, and what they say now.
 
 Two kinds of rows. *Fixed* ones are written once, when their event is folded: Keyframe, Pose,
-Observation and the edges HAS_KEYFRAME, HAS_POSE, HAS_OBSERVATION, OBSERVES. *Changing* ones say
-something else later: Run, Object, Place and the edges LOCATED_IN, IN_PLACE, ADJACENT_TO. For those
-only *which* is remembered; what they say is read from the view when the rows are taken, so a
-thousand changes of one Object in a batch are one row.
+Observation and the edges HAS_KEYFRAME, HAS_POSE, HAS_OBSERVATION, OBSERVES (an observation is fused
+by the event that adds it, or never). *Changing* ones say something else later: Run, Object, Place
+and the edges LOCATED_IN, IN_PLACE, ADJACENT_TO. For those only *which* is remembered; what they say
+is read from the view when the rows are taken, so a thousand changes of one Object in a batch are
+one row.
+
+A tail asks `GraphRows` what changed. A rebuild wants everything, once: `WholeGraph` needs no deltas
+for that, only the view.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 from projections.deltas import (
     Delta,
@@ -30,20 +34,30 @@ from projections.view import MapView
 from .graph_render import (
     BASE,
     adjacent_to_rows,
-    has_keyframe_row,
-    has_observation_row,
-    has_pose_row,
+    expected_rows,
+    has_keyframe_rows,
+    has_observation_rows,
+    has_pose_rows,
     in_place_rows,
-    keyframe_row,
+    keyframe_rows,
     located_in_rows,
-    object_row,
-    observation_row,
-    observes_row,
-    place_row,
-    pose_row,
-    run_row,
+    object_rows,
+    observation_rows,
+    observes_rows,
+    place_rows,
+    pose_rows,
+    run_rows,
 )
 from .labels import Label, adjacency_number, graphid_base
+
+CHANGING: Final[tuple[Label, ...]] = (
+    "Run",
+    "Object",
+    "Place",
+    "LOCATED_IN",
+    "IN_PLACE",
+    "ADJACENT_TO",
+)
 
 
 @dataclass(slots=True)
@@ -60,6 +74,49 @@ class GraphChanges:
         )
 
 
+def fixed_rows(
+    view: MapView, keyframes: Sequence[int], observations: Sequence[int]
+) -> dict[Label, list[Any]]:
+    """The rows of these keyframes and observations that can never change again."""
+    rows: dict[Label, list[Any]] = {
+        "Keyframe": list(keyframe_rows(view, keyframes)),
+        "Pose": list(pose_rows(view, keyframes)),
+        "Observation": list(observation_rows(view, observations)),
+        "HAS_KEYFRAME": list(has_keyframe_rows(view, keyframes)),
+        "HAS_POSE": list(has_pose_rows(view, keyframes)),
+        "HAS_OBSERVATION": list(has_observation_rows(view, observations)),
+        "OBSERVES": list(observes_rows(view, observations)),
+    }
+    return {label: found for label, found in rows.items() if found}
+
+
+class WholeGraph:
+    """Every row of a growing map, once: the fixed ones in stretches, the changing ones last."""
+
+    def __init__(self) -> None:
+        self._keyframes = 0
+        self._observations = 0
+
+    def waiting(self, view: MapView) -> int:
+        """How many keyframes and observations `take_fixed` would write."""
+        return len(view.keyframes) - self._keyframes + len(view.observations) - self._observations
+
+    def take_fixed(self, view: MapView) -> GraphChanges:
+        """The fixed rows that have come since the last time."""
+        keyframes = range(self._keyframes, len(view.keyframes))
+        observations = range(self._observations, len(view.observations))
+        self._keyframes, self._observations = keyframes.stop, observations.stop
+        return GraphChanges(fixed_rows(view, keyframes, observations))
+
+    def take_rest(self, view: MapView) -> GraphChanges:
+        """All rows that are still missing, when nothing more will come."""
+        changes = self.take_fixed(view)
+        for label in CHANGING:
+            if rows := list(expected_rows(view, label)):
+                changes.inserted[label] = rows
+        return changes
+
+
 class GraphRows:
     """Collects what a stream of deltas changed. `note` each delta *before* the view applies it."""
 
@@ -71,7 +128,7 @@ class GraphRows:
             KeyframeAdded: lambda d, _: self._keyframes.append(d.keyframe),
             ObservationAdded: lambda d, _: self._observations.append(d.observation),
             ObjectFound: lambda d, _: self._objects.add(d.object),
-            ObjectSeen: self._object_seen,
+            ObjectSeen: lambda d, _: self._objects.add(d.object),
             ObjectMoved: lambda d, _: self._located.add(d.object),
             PlaceFormed: lambda d, _: self._places.add(d.place),
             PlaceChanged: lambda d, _: self._places.add(d.place),
@@ -80,43 +137,25 @@ class GraphRows:
             PlacesLinked: lambda d, _: self._links.add((d.a, d.b)),
         }
 
-    def note(self, delta: Delta, view: MapView) -> None:
-        """Remember what ``delta`` will change; ``view`` has not applied it yet."""
-        noter = self._noters.get(type(delta))
-        if noter is not None:
-            noter(delta, view)
-
-    @property
-    def fixed_waiting(self) -> int:
-        """How many observations and keyframes `take_fixed` would write."""
-        return len(self._keyframes) + len(self._observations)
+    def note(self, deltas: Iterable[Delta], view: MapView) -> None:
+        """Remember what an event's deltas will change; ``view`` has not applied them yet."""
+        for delta in deltas:
+            noter = self._noters.get(type(delta))
+            if noter is not None:
+                noter(delta, view)
 
     def take(self, view: MapView) -> GraphChanges:
         """All rows that changed since the last take, as ``view`` has them now."""
-        changes = GraphChanges(self.take_fixed(view))
+        changes = GraphChanges(fixed_rows(view, self._keyframes, self._observations))
+        self._forget_fixed()
         self._take_changing(view, changes)
         return changes
 
-    def take_fixed(self, view: MapView) -> dict[Label, list[Any]]:
-        """Only the rows that can never change again; the rest stays remembered."""
-        keyframes, observations, observes = self._keyframes, self._observations, self._observes
-        self._forget_fixed()
-        rows: dict[Label, list[Any]] = {
-            "Keyframe": [keyframe_row(view, k) for k in keyframes],
-            "Pose": [pose_row(view, k) for k in keyframes if view.keyframes[k].pose],
-            "Observation": [observation_row(view, o) for o in observations],
-            "HAS_KEYFRAME": [has_keyframe_row(view, k) for k in keyframes],
-            "HAS_POSE": [has_pose_row(k) for k in keyframes if view.keyframes[k].pose],
-            "HAS_OBSERVATION": [has_observation_row(view, o) for o in observations],
-            "OBSERVES": [observes_row(view, o) for o in observes],
-        }
-        return {label: found for label, found in rows.items() if found}
-
     def _take_changing(self, view: MapView, changes: GraphChanges) -> None:
         upserted: dict[Label, list[Any]] = {
-            "Run": [run_row(view, r) for r in sorted(self._runs)],
-            "Object": [object_row(view, o) for o in sorted(self._objects)],
-            "Place": [place_row(view, p) for p in sorted(self._places) if p in view.places],
+            "Run": list(run_rows(view, sorted(self._runs))),
+            "Object": list(object_rows(view, sorted(self._objects))),
+            "Place": list(place_rows(view, sorted(self._places & view.places.keys()))),
             "LOCATED_IN": list(located_in_rows(view, sorted(self._located))),
             "IN_PLACE": list(in_place_rows(view, sorted(self._placed))),
             "ADJACENT_TO": list(adjacent_to_rows(view, sorted(self._links))),
@@ -138,7 +177,6 @@ class GraphRows:
     def _forget_fixed(self) -> None:
         self._keyframes: list[int] = []
         self._observations: list[int] = []
-        self._observes: list[int] = []
 
     def _forget_changing(self) -> None:
         self._runs: set[int] = set()
@@ -148,10 +186,6 @@ class GraphRows:
         self._absorbed: set[int] = set()
         self._placed: set[int] = set()
         self._links: set[tuple[int, int]] = set()
-
-    def _object_seen(self, delta: ObjectSeen, _view: MapView) -> None:
-        self._objects.add(delta.object)
-        self._observes.append(delta.observation)
 
     def _places_merged(self, delta: PlacesMerged, view: MapView) -> None:
         self._places.add(delta.survivor)

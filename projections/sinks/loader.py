@@ -13,16 +13,19 @@ from psycopg import sql
 
 from projections.postgres.connect import Connection
 
-from ._binary_copy import copy_document
+from ._binary_copy import COPIED, copy_document
 from ._sql import statements
 from .graph_render import EdgeRow, VertexRow
 from .labels import EdgeLabel, VertexLabel
-from .vector_rows import COLUMNS, VectorRow
+from .vector_rows import VectorRow
 
 LoaderName: TypeAlias = Literal["copy", "insert"]
 INSERT_CHUNK: Final = 5_000
 """Rows of one INSERT: a statement's parameters are held in memory whole, on both sides."""
 VECTOR_CHUNK: Final = 500
+COPY_CHUNK: Final = 60
+"""Vectors made and sent together: 128 kB, as psycopg sends it. Larger ones are slower, as their
+memory is asked of the system anew each time."""
 
 
 class Loader(Protocol):
@@ -70,12 +73,12 @@ class CopyLoader:
     ) -> None:
         """Add rows of ``detection_embeddings``."""
         statement = sql.SQL("COPY {}.detection_embeddings ({}) FROM STDIN (FORMAT binary)").format(
-            sql.Identifier(schema), sql.SQL(", ").join(map(sql.Identifier, COLUMNS))
+            sql.Identifier(schema), sql.SQL(", ").join(map(sql.Identifier, COPIED))
         )
         with connection.cursor() as cursor, cursor.copy(statement) as copy:
-            for start in range(0, len(rows), VECTOR_CHUNK):
-                last = start + VECTOR_CHUNK >= len(rows)
-                copy.write(copy_document(rows[start : start + VECTOR_CHUNK], start == 0, last))
+            for start in range(0, len(rows), COPY_CHUNK):
+                last = start + COPY_CHUNK >= len(rows)
+                copy.write(copy_document(rows[start : start + COPY_CHUNK], start == 0, last))
 
     def _copy(
         self, connection: Connection, statement: str, graph: str, label: str, lines: list[str]
@@ -141,7 +144,8 @@ def _vector_fields(row: VectorRow) -> tuple[object, ...]:
     pose = row.pose or (None, None, None)
     bbox = "{" + ",".join(map(repr, row.bbox)) + "}"
     embedding = "[" + ",".join(map(repr, row.embedding.tolist())) + "]"
+    added = row.added
     return (
-        row.det_pk, row.run_id, row.det_id, row.keyframe_id, row.class_name, row.confidence, bbox,
-        *pose, row.embedding_model, embedding, row.ingested_at,
+        row.det_pk, added.run_id, added.det_id, added.keyframe_id, added.class_name,
+        added.confidence, bbox, *pose, added.embedding_model, embedding, row.ingested_at,
     )  # fmt: skip

@@ -4,6 +4,7 @@ It holds exactly what the databases hold, in plain dictionaries, and takes the s
 has after a series of batches is what the real sinks must have.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 from eventsrc.log import Event
@@ -25,10 +26,10 @@ class MemorySink:
         self._graph_rows = GraphRows()
         self._vector_rows = VectorRows()
 
-    def note(self, delta: Delta, logged_ns: int, view: MapView) -> None:
-        """Remember what ``delta`` changes."""
-        self._graph_rows.note(delta, view)
-        self._vector_rows.note(delta, logged_ns)
+    def note(self, deltas: Sequence[Delta], logged_ns: int, view: MapView) -> None:
+        """Remember what ``deltas`` change."""
+        self._graph_rows.note(deltas, view)
+        self._vector_rows.note(deltas, logged_ns)
 
     def take(self, view: MapView) -> tuple[GraphChanges, list[VectorRow]]:
         """What changed since the last take."""

@@ -7,6 +7,7 @@ change. ``det_pk`` is the observation's ordinal + 1 and ``ingested_at`` is when 
 
 import math
 import struct
+from collections.abc import Iterable
 from datetime import UTC, datetime, timedelta
 from typing import Final
 
@@ -14,25 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eventsrc.frozen import frozen
-from projections.deltas import Delta, ObservationAdded
+from projections.deltas import Delta, ObservationAdded, Pose, UnitVector
 from projections.exact import UM_PER_M, to_float32
 from projections.view import MapView
 
-COLUMNS: Final = (
-    "det_pk",
-    "run_id",
-    "det_id",
-    "keyframe_id",
-    "class_name",
-    "confidence",
-    "bbox",
-    "map_x",
-    "map_y",
-    "map_yaw",
-    "embedding_model",
-    "embedding",
-    "ingested_at",
-)
 _REAL: Final = struct.Struct("f")
 _REALS: Final = struct.Struct("4f")
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
@@ -40,26 +26,54 @@ _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 
 @frozen(eq=False)
 class VectorRow:
-    """One row. ``embedding`` is float32 of shape (dim,), ``ingested_us`` µs since the epoch.
+    """One row, as the delta that adds it says it; what the columns hold is worked out when asked.
 
-    ``bbox`` is rounded to float32 already, as ``real[]`` holds it; a corner beyond float32 is ±inf.
+    ``at`` is the keyframe's pose; the event was logged at ``logged_ns``.
     """
 
-    det_pk: int
-    run_id: str
-    det_id: str
-    keyframe_id: int
-    class_name: str
-    confidence: float
-    bbox: tuple[float, float, float, float]
-    pose: tuple[float, float, float] | None
-    embedding_model: str | None
-    embedding: NDArray[np.float32]
-    ingested_us: int
+    added: ObservationAdded
+    at: Pose | None
+    logged_ns: int
+
+    @property
+    def det_pk(self) -> int:
+        """The key: the observation's ordinal + 1."""
+        return self.added.observation + 1
+
+    @property
+    def bbox(self) -> tuple[float, float, float, float]:
+        """Rounded to float32, as ``real[]`` holds it; a corner beyond float32 is ±inf."""
+        try:
+            x0, y0, x1, y1 = _REALS.unpack(_REALS.pack(*self.added.bbox))
+        except OverflowError:
+            x0, y0, x1, y1 = map(_real, self.added.bbox)
+        return x0, y0, x1, y1
+
+    @property
+    def pose(self) -> tuple[float, float, float] | None:
+        """Metres and radians; None when the robot had no pose."""
+        at = self.at
+        return None if at is None else (at.x_um / UM_PER_M, at.y_um / UM_PER_M, at.yaw_rad)
+
+    @property
+    def unit(self) -> UnitVector:
+        """The embedding as the fold has it. Only what has one is a row."""
+        assert self.added.embedding is not None  # noqa: S101 - see `VectorRows.note`
+        return self.added.embedding
+
+    @property
+    def embedding(self) -> NDArray[np.float32]:
+        """The embedding as the table has it, shape (dim,)."""
+        return to_float32(self.unit)
+
+    @property
+    def ingested_us(self) -> int:
+        """µs since the epoch."""
+        return self.logged_ns // 1000
 
     @property
     def ingested_at(self) -> datetime:
-        """``ingested_us`` as PostgreSQL's timestamptz has it."""
+        """The same as PostgreSQL's timestamptz has it."""
         return _EPOCH + timedelta(microseconds=self.ingested_us)
 
 
@@ -69,10 +83,11 @@ class VectorRows:
     def __init__(self) -> None:
         self._waiting: list[tuple[ObservationAdded, int]] = []
 
-    def note(self, delta: Delta, logged_ns: int) -> None:
-        """Remember ``delta`` if it adds a row; its event was logged at ``logged_ns``."""
-        if type(delta) is ObservationAdded and delta.embedding is not None:
-            self._waiting.append((delta, logged_ns))
+    def note(self, deltas: Iterable[Delta], logged_ns: int) -> None:
+        """Remember those of ``deltas`` that add a row; their event was logged at ``logged_ns``."""
+        for delta in deltas:
+            if type(delta) is ObservationAdded and delta.embedding is not None:
+                self._waiting.append((delta, logged_ns))
 
     @property
     def waiting(self) -> int:
@@ -82,41 +97,8 @@ class VectorRows:
     def take(self, view: MapView) -> list[VectorRow]:
         """The rows added since the last take."""
         waiting, self._waiting = self._waiting, []
-        if not waiting:
-            return []
-        # One map has one embedding space, so the vectors fit one matrix.
-        embeddings = to_float32(np.array([delta.embedding for delta, _ in waiting]))
-        return [
-            _row(delta, logged_ns, view, embedding)
-            for (delta, logged_ns), embedding in zip(waiting, embeddings, strict=True)
-        ]
-
-
-def _row(
-    delta: ObservationAdded, logged_ns: int, view: MapView, embedding: NDArray[np.float32]
-) -> VectorRow:
-    pose = view.keyframes[delta.keyframe].pose
-    return VectorRow(
-        delta.observation + 1,
-        delta.run_id,
-        delta.det_id,
-        delta.keyframe_id,
-        delta.class_name,
-        delta.confidence,
-        _as_real(delta.bbox),
-        None if pose is None else (pose.x_um / UM_PER_M, pose.y_um / UM_PER_M, pose.yaw_rad),
-        delta.embedding_model,
-        embedding,
-        logged_ns // 1000,
-    )
-
-
-def _as_real(bbox: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
-    try:
-        x0, y0, x1, y1 = _REALS.unpack(_REALS.pack(*bbox))
-    except OverflowError:
-        x0, y0, x1, y1 = (_real(value) for value in bbox)
-    return x0, y0, x1, y1
+        keyframes = view.keyframes
+        return [VectorRow(added, keyframes[added.keyframe].pose, ns) for added, ns in waiting]
 
 
 def _real(value: float) -> float:

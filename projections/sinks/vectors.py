@@ -33,6 +33,7 @@ class VectorSink:
     """Implements `projections.sink.Sink` for the table. The declared dimension is the map's."""
 
     name: Final[SinkName] = "vectors"
+    rebuilds_from_view: Final = False
 
     def __init__(self, loader: LoaderName = "copy", *, dimension: int | None = None) -> None:
         self._loader: Loader = loader_of(loader)
@@ -41,9 +42,9 @@ class VectorSink:
         self._rows = VectorRows()
         self._type: sql.Composable = sql.Identifier("vector")
 
-    def note(self, delta: Delta, logged_ns: int, view: MapView) -> None:  # noqa: ARG002 - the port
-        """Remember the row that ``delta`` adds, if it does."""
-        self._rows.note(delta, logged_ns)
+    def note(self, deltas: Sequence[Delta], logged_ns: int, view: MapView) -> None:  # noqa: ARG002 - the port
+        """Remember the rows that ``deltas`` add."""
+        self._rows.note(deltas, logged_ns)
 
     def take(self, view: MapView) -> list[VectorRow]:
         """The rows added since the last take."""
@@ -66,7 +67,7 @@ class VectorSink:
         """Add the rows that were taken."""
         if not changes:
             return
-        dimension = len(changes[0].embedding)
+        dimension = len(changes[0].unit)
         if dimension != self._dimension:
             self._redimension(connection, _PUBLIC, dimension)
             self._dimension = dimension
@@ -87,11 +88,15 @@ class VectorSink:
         """The waiting rows, if they are enough."""
         return self._rows.take(view) if self._rows.waiting >= STREAM_ROWS else None
 
+    def take_rest(self, view: MapView) -> list[VectorRow]:
+        """The rows that still wait."""
+        return self._rows.take(view)
+
     def load(self, connection: Connection, changes: Sequence[VectorRow]) -> None:
         """Write rows to the shadow."""
         if not changes:
             return
-        dimension = len(changes[0].embedding)
+        dimension = len(changes[0].unit)
         if dimension != self._shadow_dimension:
             self._redimension(connection, _SHADOW, dimension)
             self._shadow_dimension = dimension

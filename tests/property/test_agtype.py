@@ -54,7 +54,8 @@ def test_what_is_written_comes_back(
     values: list[tuple[str, float, int, list[float]]],
 ) -> None:
     texts = [
-        f'{{"s": {agtype.text(s)}, "f": {agtype.number(f)}, "i": {i}, "l": {agtype.numbers(many)}}}'
+        f'{{"s": {agtype.text(s)}, "f": {agtype.number(f)}, "i": {i},'
+        f' "l": [{", ".join(map(repr, many))}]}}'
         for s, f, i, many in values
     ]
     for text, (s, f, i, many) in zip(trip(connection, loader, texts), values, strict=True):
