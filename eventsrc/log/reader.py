@@ -71,8 +71,8 @@ class LogReader:
         base = self.next_offset
         if base == self._last.base:
             return None
-        # In this order: sealed between the two looks, it is seen by the second.
-        for suffix, sealed in ((ACTIVE, False), (SEALED, True)):
+        # Sealed between the first two looks, it is seen by the third.
+        for suffix, sealed in ((SEALED, True), (ACTIVE, False), (SEALED, True)):
             path = segment_path(self.path, base, suffix)
             if path.exists():
                 return SegmentPath(path, base, sealed)

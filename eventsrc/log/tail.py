@@ -1,6 +1,6 @@
 """Following a log as it grows: every event once, across rotations, milliseconds after its commit.
 
-Polls the file's commit marks: one `pread` of some 80 bytes, and four `stat` for the next segment,
+Polls the file's commit marks: one `pread` of some 80 bytes, and five `stat` for the next segment,
 each 5 ms while nothing comes. That costs one to two percent of a core (58 to 86 µs a poll, most of
 it waking up), needs nothing from the platform, and works when the writer is another process.
 """
