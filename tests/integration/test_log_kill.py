@@ -1,6 +1,7 @@
 """kill -9 at random moments: nothing acknowledged is lost, nothing stands twice.
 
-`scripts/chaos_log` does the same for as long as one likes.
+`scripts/chaos_log` does the same for as long as one likes. `mapfold record` is killed in
+`tests/chaos/test_recorder_kills.py`.
 """
 
 import random
