@@ -92,7 +92,8 @@ class Writing:
 
     def report(self) -> RecorderReport:
         """The numbers now; may be asked for from any thread."""
-        sealing = self._writer.sealing
+        writer = self._writer
+        sealing = writer.sealing
         return RecorderReport(
             recorded=self._recorded,
             rejected=self._rejected,
@@ -102,7 +103,7 @@ class Writing:
             missing_before=self._missing_before,
             queue_depth=self._inbox.depth(),
             queue_size=self._inbox.size,
-            next_offset=self._writer.next_offset,
+            next_offset=writer.durable_offset if self._failed else writer.next_offset,
             unwritten=self._unwritten(),
             unsealed=sealing.waiting,
             sealing_error=None if sealing.error is None else str(sealing.error),

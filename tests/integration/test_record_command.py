@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import resource
 import signal
 import socket
 import threading
@@ -212,11 +213,36 @@ def test_a_full_disk_is_one_line_and_what_is_synced_stays(
     assert stored == sent[: len(stored)]
     assert max(acked) < len(stored)
     numbers = json.loads(recorder.output())
-    assert numbers["recorded"] == len(stored)
+    assert numbers["recorded"] == numbers["next_offset"] == len(stored)
     assert 0 < numbers["unwritten"] <= len(sent) - len(stored)
     lost, summary = recorder.lines[-3:-1]
     assert lost.startswith(f"LOST {numbers['unwritten']} message")
     assert f"{len(stored)} recorded, 0 rejected, {numbers['unwritten']} lost" in summary
+
+
+def test_a_segment_that_cannot_be_sealed_is_told_with_the_numbers(
+    start: Start, endpoint: str, connected: Sessions, tmp_path: Path
+) -> None:
+    """The disk fills up when all is synced: there is no room for the sealed segment."""
+    log = tmp_path / "log"
+    recorder = start("record", str(log), "--connect", endpoint, "--fsync", "always", "--json")
+    recorder.wait_for("recording")
+    covered = threading.Event()
+    watcher = connected()
+    watcher.subscribe(ack_key("run-a"), lambda said: covered.set())
+    watcher.confirm()
+    publisher = connected().publisher(KEY)
+    assert publisher.wait_for_subscriber(DEADLINE_S)
+    noise = random.Random(1).randbytes(50_000).hex()
+    publisher.put(payload(envelope(1, note=noise)))
+    assert covered.wait(DEADLINE_S)
+    resource.prlimit(recorder.process.pid, resource.RLIMIT_FSIZE, (20_000, 20_000))
+    assert recorder.end(signal.SIGINT) == 1
+    numbers = json.loads(recorder.output())
+    assert (numbers["recorded"], numbers["unwritten"], numbers["unsealed"]) == (1, 0, 1)
+    assert "could not be sealed: File too large" in numbers["sealing_error"]
+    assert recorder.lines[-1] == f"mapfold: {numbers['sealing_error']}"
+    assert len(_stored(log)) == 1
 
 
 def _leave_torn(log: Path) -> None:
