@@ -6,16 +6,17 @@ misses: searching for cycles among things that live as long as the process, and 
 for matrix products too small to be shared out.
 """
 
+import contextlib
 import gc
-import importlib
 import os
+import signal
 import sys
-from collections.abc import Iterable, Mapping
-from types import MappingProxyType
+from collections.abc import Iterable, Iterator, Mapping
+from types import FrameType, MappingProxyType
+from typing import TYPE_CHECKING
 
-import typer
-
-from eventsrc.cli._shell import run_app
+if TYPE_CHECKING:
+    import typer
 
 COMMANDS: Mapping[str, str] = MappingProxyType(
     {
@@ -45,35 +46,44 @@ COMMANDS: Mapping[str, str] = MappingProxyType(
 """The module of each command, in the order ``--help`` lists them; its ``register`` adds it."""
 
 
-def command_line(names: Iterable[str] = tuple(COMMANDS)) -> typer.Typer:
+def command_line(names: Iterable[str] = tuple(COMMANDS)) -> "typer.Typer":
     """The program with these commands."""
-    app = typer.Typer(
-        name="mapfold",
-        help="A robot's semantic map as a deterministic fold over an append-only log.",
-        no_args_is_help=True,
-        add_completion=False,
-        pretty_exceptions_enable=False,
-        rich_markup_mode=None,
-    )
-    app.callback()(_of_several)
-    for name in names:
-        importlib.import_module(COMMANDS[name]).register(app)
-    return app
+    from ._program import compose  # here, so that `main` is there before typer is
 
-
-def _of_several() -> None:  # without it typer takes a lone command's name for its argument
-    pass
+    return compose(names, COMMANDS)
 
 
 def main() -> None:
-    """Entry point of the ``mapfold`` program."""
+    """Entry point of the ``mapfold`` program; it ends by SystemExit."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when numpy is imported
     gc.disable()
     asked = sys.argv[1:2]
-    program = command_line(asked if asked and asked[0] in COMMANDS else COMMANDS)
+    with _starting():
+        from eventsrc.cli._program import run_app
+
+        program = command_line(asked if asked and asked[0] in COMMANDS else COMMANDS)
     gc.freeze()
     gc.enable()
     try:
         run_app(program)
     finally:
         gc.freeze()  # the interpreter would search all of it once more before it goes
+
+
+@contextlib.contextmanager
+def _starting() -> Iterator[None]:
+    """Ctrl-C ends a program that only imports at once: an exception might end up anywhere."""
+    usual = signal.getsignal(signal.SIGINT)
+    if usual is not signal.default_int_handler:  # ignored, or in the hands of who calls `main`
+        yield
+        return
+    signal.signal(signal.SIGINT, _leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, usual)
+
+
+def _leave(_number: int, _frame: FrameType | None) -> None:
+    os.write(2, b"mapfold: interrupted\n")
+    os._exit(130)

@@ -9,9 +9,10 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from itertools import islice
 from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
@@ -123,7 +124,8 @@ def _in_processes(
     with ProcessPoolExecutor(
         len(shares), mp_context=context, initializer=_start_worker, initargs=(done,)
     ) as pool:
-        futures = [pool.submit(_work, log, share, end, truth) for share in shares]
+        with _no_ctrl_c():
+            futures = [pool.submit(_work, log, share, end, truth) for share in shares]
         _watch(futures, done, end * len(shares), progress)
         try:
             return [future.result() for future in futures]
@@ -134,11 +136,22 @@ def _in_processes(
             ) from None
 
 
+@contextmanager
+def _no_ctrl_c() -> Iterator[None]:
+    """Hold Ctrl-C back: what is started inside does so too, until it says what is to happen."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _start_worker(done: "Synchronized[int]") -> None:
     global _done
     _done = done
     # Ctrl-C reaches the whole group: the parent says so, its workers just end.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
 def _work(log: Path, settings: list[Settings], end: int, truth: Truth | None) -> list[Outcome]:

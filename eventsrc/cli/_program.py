@@ -1,0 +1,86 @@
+"""Running the commands as a program: what ends it early, and what it exits with.
+
+typer would answer Ctrl-C with an empty line and a closed pipe with exit 1, before anybody else
+hears of them; `Program` hands both through to `run_app` as what they are.
+
+Exit codes: 0 done · 1 failed · 2 misuse · 3 done, with loss or findings · 130 interrupted ·
+141 the reader of stdout left before everything was printed · 143 terminated.
+"""
+
+import contextlib
+import os
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any, Final, NoReturn
+
+from typer.core import TyperGroup
+
+from eventsrc.errors import MapfoldError
+
+from ._shell import EXIT_FAILED, people
+
+EXIT_INTERRUPTED: Final = 130
+EXIT_READER_GONE: Final = 141
+"""What a shell shows of a program that writes to a closed pipe: neither done nor failed."""
+
+
+class _Interrupted(Exception):
+    """Ctrl-C."""
+
+
+class _ReaderGone(Exception):
+    """`mapfold log cat L | head`: the reader has seen enough."""
+
+
+@contextlib.contextmanager
+def _handed_through() -> Iterator[None]:
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise _Interrupted from None
+    except BrokenPipeError:
+        raise _ReaderGone from None
+
+
+class Program(TyperGroup):
+    """The group of all commands."""
+
+    def make_context(self, *args: Any, **kwargs: Any) -> Any:
+        """As typer does it; ``--help`` prints from in here."""
+        with _handed_through():
+            return super().make_context(*args, **kwargs)
+
+    def invoke(self, ctx: Any) -> Any:
+        """As typer does it."""
+        with _handed_through():
+            return super().invoke(ctx)
+
+
+def run_app(app: Callable[..., Any]) -> NoReturn:
+    """Run a typer app made of `Program`, and exit: our errors are one line for people."""
+    code = _exit_code(app)
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        # Point stdout elsewhere so that the interpreter's own flush at exit does not fail again.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(error, BrokenPipeError):
+            people.print(f"mapfold: stdout: {error.strerror}; nobody has got all of the output")
+            code = EXIT_FAILED
+    sys.exit(code)
+
+
+def _exit_code(app: Callable[..., Any]) -> int:
+    try:
+        app()
+    except SystemExit as ended:  # how typer ends, also when all is well
+        return ended.code if isinstance(ended.code, int) else 0
+    except MapfoldError as error:
+        people.print(f"mapfold: {error}")
+        return error.exit_code
+    except _ReaderGone:
+        return EXIT_READER_GONE
+    except (_Interrupted, KeyboardInterrupt):
+        people.print("mapfold: interrupted")
+        return EXIT_INTERRUPTED
+    return 0

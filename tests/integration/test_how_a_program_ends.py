@@ -1,0 +1,138 @@
+"""Ctrl-C, readers that leave, --version: how the program itself ends, whatever the command."""
+
+import os
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+from eventsrc.cli._program import EXIT_INTERRUPTED, EXIT_READER_GONE
+from tests.commands import PROGRAM, TIMEOUT_S, Commands
+from tests.docs.console import ROOT
+from tests.fixtures_timetravel import write_damaged_log, write_log
+from tests.logs import walk
+
+_CTRL_C_AT_IMPORT = """
+import importlib.abc, signal, sys
+module = sys.argv.pop(1)
+
+class CtrlC(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name == module:
+            signal.raise_signal(signal.SIGINT)
+
+sys.meta_path.insert(0, CtrlC())
+from projections.cli import main
+main()
+"""
+_CTRL_C_IN_A_WORKER = """
+import os, signal, sys
+if "--multiprocessing-fork" in sys.orig_argv:
+    os.kill(os.getpid(), signal.SIGINT)
+"""
+
+
+@pytest.fixture
+def mapfold(tmp_path: Path) -> Commands:
+    write_log(tmp_path / "log", walk(500))
+    return Commands.in_folder(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("module", "args"),
+    [
+        ("typer", ("state", "log")),
+        ("projections.cli.state", ("state", "log")),
+        ("numpy", ("state", "log")),
+        ("projections.demo", ("demo",)),  # imported when the command runs already
+    ],
+)
+def test_ctrl_c_is_one_line_and_130(tmp_path: Path, module: str, args: tuple[str, ...]) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _CTRL_C_AT_IMPORT, module, *args],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (EXIT_INTERRUPTED, "mapfold: interrupted\n")
+
+
+def test_ctrl_c_while_a_worker_starts_shows_nothing_of_it(mapfold: Commands) -> None:
+    (mapfold.folder / "sitecustomize.py").write_text(_CTRL_C_IN_A_WORKER)
+    env = {**mapfold.env, "PYTHONPATH": str(mapfold.folder)}
+    said = Commands(mapfold.folder, env)(
+        "whatif", "log", "--grid", "eps_m=1.0,2.0", "--processes", "2", code=1
+    )
+    (line,) = said.err.splitlines()
+    assert "a process that folded it was killed" in line
+
+
+def _into_closed_pipe(mapfold: Commands, *args: str, stream: str = "stdout") -> tuple[int, str]:
+    """Exit code and the other stream of a command whose ``stream`` nobody reads any more."""
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    env = {k: v for k, v in mapfold.env.items() if k != "PYTHONUNBUFFERED"}
+    done = subprocess.run(
+        [str(PROGRAM), *args],
+        cwd=mapfold.folder,
+        env=env,
+        timeout=TIMEOUT_S,
+        check=False,
+        stdout=write_end if stream == "stdout" else subprocess.PIPE,
+        stderr=write_end if stream == "stderr" else subprocess.PIPE,
+    )
+    os.close(write_end)
+    return done.returncode, (done.stdout or done.stderr or b"").decode()
+
+
+@pytest.mark.parametrize(
+    ("args", "code"),
+    [
+        (("state", "log"), 0),  # little: the command is done before anything is written
+        (("--help",), EXIT_READER_GONE),
+        (("log", "cat", "log", "--json"), EXIT_READER_GONE),
+    ],
+)
+def test_a_reader_that_leaves_is_no_failure(
+    mapfold: Commands, args: tuple[str, ...], code: int
+) -> None:
+    assert _into_closed_pipe(mapfold, *args) == (code, "")
+
+
+def test_findings_show_also_when_nobody_reads_them(mapfold: Commands) -> None:
+    write_damaged_log(mapfold.folder / "damaged", walk(3))
+    code, err = _into_closed_pipe(mapfold, "log", "verify", "damaged")
+    assert code == 3
+    assert "finding" in err
+
+
+def test_the_work_is_done_also_when_nobody_reads_the_news(mapfold: Commands) -> None:
+    (mapfold.folder / "in.jsonl").write_text("not JSON\n")
+    args = ("import", "new", "in.jsonl", "--json")
+    code, out = _into_closed_pipe(mapfold, *args, stream="stderr")
+    assert code == 3
+    assert '"rejected": 1' in out
+
+
+def test_output_that_finds_no_room_is_a_failure(mapfold: Commands) -> None:
+    env = {k: v for k, v in mapfold.env.items() if k != "PYTHONUNBUFFERED"}
+    with Path("/dev/full").open("wb") as full:
+        done = subprocess.run(
+            [str(PROGRAM), "state", "log"],
+            cwd=mapfold.folder,
+            env=env,
+            stdout=full,
+            stderr=subprocess.PIPE,
+            check=False,
+        )
+    assert done.returncode == 1
+    assert done.stderr.startswith(b"mapfold: stdout: No space left on device")
+
+
+def test_the_version(mapfold: Commands) -> None:
+    assert mapfold("--version").out == f"mapfold {version('mapfold')}\n"
