@@ -25,6 +25,7 @@ import zenoh
 
 from ._zenoh_config import Mode, ZenohOptions, configure
 from ._zenoh_errors import cannot_open, plain
+from .endpoints import check_endpoints
 from .errors import MisuseError, TransportError
 
 __all__ = [
@@ -260,8 +261,18 @@ def check_keys(key_exprs: Sequence[str]) -> None:
             )
 
 
+def check_options(options: ZenohOptions) -> None:
+    """Raise MisuseError for what `open_session` would refuse wherever the network is."""
+    check_endpoints((*options.connect, *options.listen))
+    _config_from_file(options.config_file)
+
+
 def open_session(options: ZenohOptions, *, mode: Mode) -> Session:
-    """Open a session; raise TransportError if it cannot connect or listen as asked."""
+    """Open a session.
+
+    Raises MisuseError when ``options`` are wrong in themselves, TransportError when it cannot
+    connect or listen as asked.
+    """
     zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]
     config = _config_from_file(options.config_file)
     configure(config, options, mode)
@@ -276,11 +287,11 @@ def _config_from_file(path: Path | None) -> zenoh.Config:
     if path is None:
         return zenoh.Config()
     if not path.is_file():
-        raise TransportError(f"{path}: no such Zenoh configuration file; check --zenoh-config")
+        raise MisuseError(f"{path}: no such Zenoh configuration file; check --zenoh-config")
     try:
         return zenoh.Config.from_file(path)
     except zenoh.ZError as error:
-        raise TransportError(f"{path}: not a Zenoh configuration: {plain(error)}") from None
+        raise MisuseError(f"{path}: not a Zenoh configuration: {plain(error)}") from None
 
 
 def _declare_plain(session: zenoh.Session, key: str, _: int) -> Any:

@@ -42,7 +42,7 @@ class Config(Protocol):
 
 
 def configure(config: Config, options: ZenohOptions, mode: Mode) -> None:
-    """Apply ``options`` and the rules to ``config``; raises TransportError for a bad endpoint."""
+    """Apply ``options`` and the rules to ``config``; raises MisuseError for a bad endpoint."""
     connect, listen = check_endpoints(options.connect), check_endpoints(options.listen)
     if not connect and mode == "client" and _is_unset(config, "connect/endpoints"):
         connect = (DEFAULT_ENDPOINT,)

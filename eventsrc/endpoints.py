@@ -7,7 +7,7 @@ router that runs very well. So endpoints are checked here, before a session is o
 from collections.abc import Iterable
 from typing import Final
 
-from .errors import MisuseError, TransportError
+from .errors import MisuseError
 
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 """Where `mapfold router` listens and every other command connects unless told otherwise."""
@@ -18,15 +18,15 @@ _EXAMPLE: Final = f"write it as <protocol>/<host>:<port>, for example {DEFAULT_E
 
 
 def check_endpoint(text: str) -> str:
-    """Return ``text`` if it is an endpoint; raise TransportError that says what is wrong if not."""
+    """Return ``text`` if it is an endpoint; raise MisuseError that says what is wrong if not."""
     protocol, slash, rest = text.partition("/")
     if not slash:
-        raise TransportError(f"endpoint {text!r} has no protocol; {_EXAMPLE}")
+        raise MisuseError(f"endpoint {text!r} has no protocol; {_EXAMPLE}")
     if protocol not in _WITH_PORT + _WITHOUT_PORT:
-        raise TransportError(f"endpoint {text!r}: {protocol!r} is no Zenoh protocol; {_EXAMPLE}")
+        raise MisuseError(f"endpoint {text!r}: {protocol!r} is no Zenoh protocol; {_EXAMPLE}")
     address = rest.partition("#")[0].partition("?")[0]
     if not address:
-        raise TransportError(f"endpoint {text!r} has no address; {_EXAMPLE}")
+        raise MisuseError(f"endpoint {text!r} has no address; {_EXAMPLE}")
     if protocol in _WITH_PORT:
         _check_host_and_port(text, address)
     return text
@@ -52,6 +52,6 @@ def _is_port(text: str) -> bool:
 def _check_host_and_port(text: str, address: str) -> None:
     host, colon, port = address.rpartition(":")
     if not colon or not host:
-        raise TransportError(f"endpoint {text!r} has no port; {_EXAMPLE}")
+        raise MisuseError(f"endpoint {text!r} has no port; {_EXAMPLE}")
     if not _is_port(port):
-        raise TransportError(f"endpoint {text!r}: {port!r} is no port (0 to 65535); {_EXAMPLE}")
+        raise MisuseError(f"endpoint {text!r}: {port!r} is no port (0 to 65535); {_EXAMPLE}")

@@ -18,8 +18,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from ._set_aside import Refused
-from ._zenoh import ZenohOptions
-from .endpoints import check_endpoints
+from ._zenoh import ZenohOptions, check_options
 from .errors import InvalidEnvelope, MisuseError
 from .ingest import Rejected, ingest
 from .sending import RESEND_AFTER_S, WINDOW, Sender
@@ -31,9 +30,9 @@ class EnvelopePublisher:
     """Publishes one robot's envelopes under ``key``; a context manager, usable from any thread.
 
     The constructor opens the spool and begins to send what an earlier process left in it. It raises
-    SpoolError if the spool cannot be used, MisuseError if the key is one of mapfold's own and
-    TransportError if an endpoint is malformed, but not when nobody answers there: the sending
-    thread tries until somebody does.
+    SpoolError if the spool cannot be used, and MisuseError if the key is one of mapfold's own, an
+    endpoint malformed or the configuration file none; but nothing when nobody answers there: the
+    sending thread tries until somebody does.
     """
 
     def __init__(
@@ -51,7 +50,7 @@ class EnvelopePublisher:
                 f"key {key!r}: every recorder refuses envelopes under {RESERVED_PREFIX}; "
                 "choose another"
             )
-        check_endpoints((*options.connect, *options.listen))
+        check_options(options)
         self._spool = Spool(spool, max_spool_bytes)
         self._sender = Sender(
             options, key, self._spool, window=window, resend_after_s=resend_after_s

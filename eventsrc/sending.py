@@ -25,7 +25,7 @@ from pydantic import ValidationError
 
 from ._zenoh import Publisher, Received, Session, ZenohOptions, open_session
 from .acks import Ack, ack_key
-from .errors import SpoolError, TransportError
+from .errors import MisuseError, SpoolError, TransportError
 from .refusals import Refusals, refusal_key
 from .spool import Spool, Spooled
 
@@ -96,8 +96,8 @@ class Sender:
             except SpoolError as failure:
                 self._failure = failure
                 self.stop()
-            except TransportError:
-                self._rest(_RECONNECT_S)  # nobody there; the spool keeps everything meanwhile
+            except (TransportError, MisuseError):  # nobody there, or the configuration file is not
+                self._rest(_RECONNECT_S)  # any more; the spool keeps everything meanwhile
 
     def _serve(self, session: Session) -> None:
         publisher = session.publisher(self._key, advanced=True, cache=2 * self._window)

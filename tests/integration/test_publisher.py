@@ -10,7 +10,7 @@ import pytest
 
 from eventsrc._zenoh import Received, Session, ZenohOptions
 from eventsrc.acks import Ack, ack_key
-from eventsrc.errors import InvalidEnvelope, MisuseError, SpoolFull, TransportError
+from eventsrc.errors import InvalidEnvelope, MisuseError, SpoolFull
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.publisher import EnvelopePublisher
 from eventsrc.refusals import Refusal, Refusals, refusal_key
@@ -322,9 +322,18 @@ def test_a_full_spool_is_the_callers_to_decide(endpoint: str, tmp_path: Path) ->
         assert robot.unacknowledged == 1
 
 
-def test_a_malformed_endpoint_is_refused_at_once(tmp_path: Path) -> None:
-    with pytest.raises(TransportError, match="has no protocol"):
-        EnvelopePublisher(ZenohOptions(connect=("localhost",)), tmp_path / "spool")
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        (ZenohOptions(connect=("localhost",)), "has no protocol"),
+        (ZenohOptions(config_file=Path("no-file")), "no such Zenoh configuration"),
+    ],
+)
+def test_options_that_can_never_work_are_refused_at_once(
+    tmp_path: Path, options: ZenohOptions, complaint: str
+) -> None:
+    with pytest.raises(MisuseError, match=complaint):
+        EnvelopePublisher(options, tmp_path / "spool")
 
 
 def test_kill_9_loses_nothing_that_was_acknowledged_and_resending_fills_the_rest(

@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 
 from eventsrc._zenoh import Asked, Received, Session, ZenohOptions, open_session
-from eventsrc.errors import TransportError
+from eventsrc.errors import MapfoldError, MisuseError, TransportError
 from eventsrc.router import Router
 from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK
 
 Sessions = Callable[[], Session]
 
 
-def _one_line(error: TransportError) -> str:
+def _one_line(error: MapfoldError) -> str:
     text = str(error)
     assert "\n" not in text
     assert ".rs:" not in text
@@ -130,7 +130,7 @@ def test_one_of_two_routers_is_enough(endpoint: str) -> None:
 
 @pytest.mark.parametrize("mode", ["client", "peer", "router"])
 def test_a_malformed_endpoint_is_refused_before_anything_is_opened(mode: str) -> None:
-    with pytest.raises(TransportError, match="has no protocol"):
+    with pytest.raises(MisuseError, match="has no protocol"):
         open_session(ZenohOptions(connect=("127.0.0.1:7447",)), mode=mode)  # type: ignore[arg-type]
 
 
@@ -169,7 +169,7 @@ def test_a_bad_configuration_file_is_named(tmp_path: Path, text: str | None) -> 
     file = tmp_path / "zenoh.json5"
     if text is not None:
         file.write_text(text)
-    with pytest.raises(TransportError) as caught:
+    with pytest.raises(MisuseError) as caught:
         open_session(ZenohOptions(config_file=file), mode="client")
     assert str(file) in _one_line(caught.value)
 

@@ -3,7 +3,7 @@
 import pytest
 
 from eventsrc.endpoints import check_endpoint, check_endpoints, parse_address
-from eventsrc.errors import MisuseError, TransportError
+from eventsrc.errors import MisuseError
 
 
 @pytest.mark.parametrize(
@@ -36,7 +36,7 @@ def test_an_endpoint_passes_unchanged(endpoint: str) -> None:
     ],
 )
 def test_a_malformed_endpoint_is_named(text: str, complaint: str) -> None:
-    with pytest.raises(TransportError) as caught:
+    with pytest.raises(MisuseError) as caught:
         check_endpoint(text)
     assert complaint in str(caught.value)
     assert repr(text) in str(caught.value)
