@@ -11,6 +11,10 @@ written but not marked gets its mark. Then it is like any segment behind a rotat
 in the background as those are. One that cannot be brought into that form (a mark has rotted, or a
 sealed segment stands behind it) is sealed at once, and with it all the others.
 
+The last left-over is read byte by byte, for a crash may have torn it. Those before it were whole
+when it was begun: where their marks say so they are taken at their word, for a recorder that was
+killed under load leaves many. Should one have rotted since, sealing finds it and says so.
+
 An active file is deleted only after the sealed one that replaces it is synced under its name.
 """
 
@@ -18,7 +22,7 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from eventsrc.errors import LogDamaged
+from eventsrc.errors import LogDamaged, NotALog
 
 from . import _mcap
 from ._active_file import ActiveFile
@@ -93,7 +97,7 @@ def _look_at_leftovers(log: Path, segments: list[SegmentPath], state: Restart) -
     for index, segment in enumerate(segments):
         if segment.sealed:
             continue
-        reach = segments[index + 1].base if index + 1 < len(segments) else segment.base
+        reach = segments[index + 1].base if index + 1 < len(segments) else None
         left = _look_at(segment, reach)
         state.torn_bytes += left.scan.lost_bytes
         state.torn_events += left.scan.torn_events
@@ -108,10 +112,13 @@ def _look_at_leftovers(log: Path, segments: list[SegmentPath], state: Restart) -
     return found
 
 
-def _look_at(segment: SegmentPath, reach: int) -> _Leftover:
+def _look_at(segment: SegmentPath, reach: int | None) -> _Leftover:
     """``reach`` is the base of the next segment: this one was whole before that was begun."""
+    finished = None if reach is None else _finished(segment, reach)
+    if finished is not None:
+        return finished
     scan = scan_active(segment.path, segment.base)
-    scan.gap_up_to(reach)
+    scan.gap_up_to(reach or segment.base)
     _refuse_rot(segment.path, scan)
     if not scan.chunks:
         return _Leftover(segment, scan, 0, 0)
@@ -120,6 +127,19 @@ def _look_at(segment: SegmentPath, reach: int) -> _Leftover:
     file.close()
     marked = len(places) if places == [c.position for c in scan.chunks[: len(places)]] else -1
     return _Leftover(segment, scan, marked, file.position)
+
+
+def _finished(segment: SegmentPath, reach: int) -> _Leftover | None:
+    """A segment whose marks reach the next one, taken at their word; None for one to look into."""
+    try:
+        file = ActiveFile(segment.path, segment.base)
+    except (LogDamaged, NotALog):
+        return None
+    file.close()
+    if file.next_offset != reach:
+        return None
+    scan = Scan(segment.base, file.log_id, chunks=file.chunks, next_offset=reach)
+    return _Leftover(segment, scan, len(file.chunks), file.position)
 
 
 def _refuse_rot(path: Path, scan: Scan) -> None:

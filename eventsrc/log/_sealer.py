@@ -2,16 +2,19 @@
 
 Compressing and hashing release the interpreter lock, so recording goes on; for a recorder the
 thread has a process do the work (`_aside`), and does it itself when there is none to be had.
-Sealing may fall behind a recording that is faster; that costs disk (a segment waits at its full
-size), and no more. What fails here costs nothing either: the active file stays, is read as before,
-and is tried again, on the next start at the latest. Nor does it cost anything to be stopped in the
-middle, so the thread keeps no process alive that forgot to close.
+Recording goes first: while it is in a hurry sealing waits, until so many segments wait that it is
+their turn, and it may fall behind anyway. That costs disk (a segment waits at its full size), and
+no more. What fails here costs nothing either: the active file stays, is read as before, and is
+tried again, on the next start at the latest. Nor does it cost anything to be stopped in the middle,
+so the thread keeps no process alive that forgot to close.
 """
 
 import queue
+import shutil
 import threading
 from collections import deque
 from pathlib import Path
+from typing import Final
 
 from eventsrc.errors import LogError, MapfoldError
 
@@ -20,6 +23,12 @@ from ._aside import ProcessGone, SealingProcess
 from ._naming import ACTIVE, segment_path
 from ._seal import SegmentPlan, seal
 from .fsync import sync_directory
+
+_MOST_WAITING: Final = 256
+"""Segments that wait at most for the sake of a recording in a hurry, 16 GiB …"""
+_FREE_DISK_SHARE: Final = 4
+"""… and never more than this part of the disk that is free."""
+_LOOK_AGAIN_S: Final = 0.25
 
 
 class Sealer:
@@ -35,6 +44,8 @@ class Sealer:
         self._previous_sha256 = self._sealed_sha256 = previous_sha256
         self._submitted: queue.Queue[int | None] = queue.Queue()
         self._finishing = False
+        self._at_leisure = threading.Event()
+        self._at_leisure.set()
         self._damaged = False
         self._thread: threading.Thread | None = None
         self._count = self._sealed = 0
@@ -55,8 +66,16 @@ class Sealer:
         self._count += 1
         self._submitted.put(base)
 
+    def hurry(self, on: bool) -> None:
+        """Put sealing off, or no longer."""
+        if on:
+            self._at_leisure.clear()
+        else:
+            self._at_leisure.set()
+
     def finish(self) -> None:
         """Wait until everything submitted is sealed or has failed; `error` says which."""
+        self._at_leisure.set()
         if self._thread is not None:
             self._submitted.put(None)
             self._thread.join()
@@ -76,6 +95,7 @@ class Sealer:
         is tried again when the next segment comes; damage stays."""
         while waiting and not self._damaged:
             path = segment_path(self._log, waiting[0], ACTIVE)
+            self._wait_for_leisure(path)
             try:
                 self._seal(waiting[0])
             except OSError as error:
@@ -91,6 +111,15 @@ class Sealer:
                 self.error = None
                 self._sealed += 1
                 waiting.popleft()
+
+    def _wait_for_leisure(self, next_one: Path) -> None:
+        while self.waiting < _MOST_WAITING and not self._at_leisure.wait(_LOOK_AGAIN_S):
+            try:
+                size, free = next_one.stat().st_size, shutil.disk_usage(self._log).free
+            except OSError:  # sealing will say it
+                return
+            if size * self.waiting * _FREE_DISK_SHARE > free:
+                return
 
     def _seal(self, base: int) -> None:
         active = segment_path(self._log, base, ACTIVE)

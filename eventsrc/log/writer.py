@@ -111,6 +111,11 @@ class LogWriter:
         """How far the sealing of finished segments is behind."""
         return Sealing(self._sealer.waiting, self._sealer.error)
 
+    def hurry(self, on: bool) -> None:
+        """Say whether more comes than can be taken. Sealing then waits, within bounds, for it takes
+        a processor and a disk that recording needs."""
+        self._sealer.hurry(on)
+
     def now_ns(self) -> int:
         """The writer's clock."""
         return self._clock()

@@ -5,7 +5,16 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.log import ALWAYS, LogReader, LogWriter, _mcap, _sealer, verify_log
+from eventsrc.errors import LogDamaged, LogError
+from eventsrc.log import (
+    ALWAYS,
+    LogReader,
+    LogWriter,
+    _mcap,
+    _sealer,
+    recover_log,
+    verify_log,
+)
 from eventsrc.log._naming import ACTIVE, SEALED, segment_path
 from tests.fixtures_log import BY_HAND, KEY, read_log
 
@@ -119,3 +128,31 @@ def test_where_a_mark_has_rotted_all_is_sealed_at_once(
         assert [e.payload for e in reader.read()] == [b"%d" % n for n in range(5)]
     writer.close()
     assert {f.kind for f in verify_log(log_path).findings} == {"schema"}
+
+
+def test_rot_in_a_finished_segment_keeps_no_recorder_from_starting(log_path: Path) -> None:
+    """It is found when that is sealed, and nothing behind it is sealed then; nor is it lost."""
+    killed(log_path, 5, rotate_events=2)
+    active = segment_path(log_path, 0, ACTIVE)
+    data = bytearray(active.read_bytes())
+    data[data.index(_mcap.MARK_PATTERN) - 1] ^= 1
+    active.write_bytes(data)
+    writer = LogWriter(log_path, fsync=ALWAYS)
+    assert writer.append(KEY, b"5") == 5
+    with pytest.raises(LogError, match=r"CRC; run `mapfold log recover"):
+        writer.close()
+    with LogReader(log_path) as reader, pytest.raises(LogDamaged):
+        list(reader.read())
+    recover_log(log_path)
+    kept = [e.payload for e in read_log(log_path) if e.key == KEY]
+    assert kept == [b"1", b"2", b"3", b"4", b"5"]
+
+
+def test_rot_in_the_last_segment_is_not_passed_over(log_path: Path) -> None:
+    killed(log_path, 5, rotate_events=100)
+    active = segment_path(log_path, 0, ACTIVE)
+    data = bytearray(active.read_bytes())
+    data[data.index(_mcap.MARK_PATTERN) - 1] ^= 1
+    active.write_bytes(data)
+    with pytest.raises(LogDamaged, match="offsets 0 to 0 were recorded and cannot be read"):
+        LogWriter(log_path)

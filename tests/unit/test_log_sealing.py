@@ -2,6 +2,8 @@
 
 import errno
 import os
+import shutil
+import threading
 import zlib
 from pathlib import Path
 
@@ -13,6 +15,8 @@ from eventsrc.log._head import file_head, head_metadata
 from eventsrc.log._naming import ACTIVE, SEALED, segment_path
 from eventsrc.log._sealer import Sealer
 from tests.fixtures_log import KEY, read_log
+
+TIMEOUT_S = 30
 
 
 class Disk:
@@ -134,3 +138,52 @@ def test_a_full_disk_is_no_question_of_rights(
     monkeypatch.setattr("eventsrc.log._active.sync_file", refuse)
     with pytest.raises(LogError, match="No space left on device; free space on its disk"):
         LogWriter(log_path)
+
+
+def test_a_recording_in_a_hurry_is_not_disturbed_until_too_much_waits(
+    log_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_sealer, "_MOST_WAITING", 3)
+    monkeypatch.setattr(_sealer, "_LOOK_AGAIN_S", 0.001)
+    real, sealed = _sealer.seal, threading.Semaphore(0)
+
+    def seal(*args: object) -> str:
+        sha256 = real(*args)  # type: ignore[arg-type]
+        sealed.release()
+        return sha256
+
+    monkeypatch.setattr(_sealer, "seal", seal)
+    with LogWriter(log_path, fsync=ALWAYS, rotate_events=1) as writer:
+        writer.hurry(True)
+        writer.append(KEY, b"0")
+        writer.append(KEY, b"1")
+        assert not sealed.acquire(timeout=0.05)
+        writer.append(KEY, b"2")
+        assert sealed.acquire(timeout=TIMEOUT_S)  # three waited
+        assert not sealed.acquire(timeout=0.05)
+        writer.hurry(False)
+        assert sealed.acquire(timeout=TIMEOUT_S)
+        writer.hurry(True)
+        writer.append(KEY, b"3")
+    assert writer.sealing == (0, None)  # closing waits for all
+
+
+def test_a_disk_that_gets_full_is_a_reason_to_seal(
+    log_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = shutil.disk_usage(log_path.parent)
+    sealed = threading.Event()
+    real = _sealer.seal
+
+    def seal(*args: object) -> str:
+        sealed.set()
+        return real(*args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(_sealer, "seal", seal)
+    monkeypatch.setattr(_sealer, "_LOOK_AGAIN_S", 0.001)
+    with LogWriter(log_path, fsync=ALWAYS, rotate_events=1) as writer:
+        writer.hurry(True)
+        writer.append(KEY, b"0")
+        assert not sealed.wait(0.05)
+        monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1000))
+        assert sealed.wait(TIMEOUT_S)
