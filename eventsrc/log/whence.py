@@ -13,7 +13,8 @@ before" includes every event of that time or earlier, wherever it stands.
 mapfold's own events are stamped when we wrote them, so they do not say where a time is, and events
 that cannot be read do not either. Both count as stamped like the robots' event before them, and at
 the head of the log as earlier than all. So damage lies in a range that ends at a time if what is
-before it does, or anything behind it; and who then reads that range meets the damage.
+before it does, or anything behind it; and who then reads that range meets the damage. Only at the
+end of a growing segment there is nothing to read behind it, so it is met here.
 """
 
 import re
@@ -41,7 +42,8 @@ class _Identity(BaseModel):
 def resolve(reader: LogReader, text: str, *, on_gap: OnGap | None = None) -> int:
     """The number of events that ``text`` means; MisuseError when the log has no such point.
 
-    Damage on the way to a keyframe raises LogDamaged, or is told to ``on_gap``.
+    Damage on the way to a keyframe, or at the end of a range up to a time, raises LogDamaged, or
+    is told to ``on_gap``.
     """
     if text == "end":
         return reader.next_offset
@@ -49,7 +51,7 @@ def resolve(reader: LogReader, text: str, *, on_gap: OnGap | None = None) -> int
         return _within(reader, int(text))
     time_ns = _time(text)
     if time_ns is not None:
-        return _at_time(reader, time_ns)
+        return _at_time(reader, time_ns, on_gap)
     run_id, colon, keyframe = text.rpartition(":")
     if colon and run_id and re.fullmatch(r"-?\d+", keyframe):
         return _at_keyframe(reader, run_id, int(keyframe), on_gap)
@@ -95,7 +97,7 @@ def _time(text: str) -> int | None:
     return (since.days * 86_400 + since.seconds) * 1_000_000_000 + since.microseconds * 1000
 
 
-def _at_time(reader: LogReader, time_ns: int) -> int:
+def _at_time(reader: LogReader, time_ns: int, on_gap: OnGap | None) -> int:
     included = 0
     in_time = True
 
@@ -109,7 +111,9 @@ def _at_time(reader: LogReader, time_ns: int) -> int:
             in_time = event.stamp_ns <= time_ns
         if in_time:
             included = event.offset + 1
-    return included
+    if included > reader.next_offset:  # more was recorded than the growing segment still shows
+        list(reader.read(reader.next_offset, on_gap=on_gap))
+    return min(included, reader.next_offset)
 
 
 def _at_keyframe(reader: LogReader, run_id: str, keyframe_id: int, on_gap: OnGap | None) -> int:

@@ -138,3 +138,24 @@ def test_damage_on_the_way_stops_the_search_or_is_named(rotten: LogReader) -> No
         assert resolve_start(rotten, text, on_gap=met.append) == start
     assert resolve(rotten, "run:7", on_gap=met.append) == 8
     assert [(gap.first, gap.last) for gap in met] == [(3, 5)] * 5
+
+
+def test_rot_in_the_growing_segment_is_met_by_a_range_that_it_ends(log_path: Path) -> None:
+    with LogWriter(log_path, fsync=BY_HAND) as writer, LogReader(log_path) as reader:
+        for second in range(9):
+            writer.append(KEY, envelope(second), stamp_ns=second * SECOND)
+            if second % 3 == 2:
+                writer.sync()
+        reader.refresh()
+        (segment,) = reader.segments
+        flip(segment.path, reader.open_segment(segment).chunks[1].position + 5)
+        with LogReader(log_path) as rotten:
+            assert rotten.next_offset == 3
+            assert resolve(rotten, _at(1)) == 2
+            for second in (2, 4, 20):
+                with pytest.raises(LogDamaged, match="offsets 3 to 8 cannot be read"):
+                    resolve(rotten, _at(second))
+            met: list[Unreadable] = []
+            assert resolve(rotten, _at(4), on_gap=met.append) == 3
+            assert [(gap.first, gap.last) for gap in met] == [(3, 8)]
+        flip(segment.path, reader.open_segment(segment).chunks[1].position + 5)
