@@ -19,6 +19,7 @@ from eventsrc.ledger import ledger_of
 from eventsrc.log import Event, FsyncPolicy, LogReader, LogWriter
 from eventsrc.losses import Gap
 from eventsrc.recorder import Recorder, RecorderReport
+from eventsrc.refusals import Refusal, Refusals, refusal_key
 from eventsrc.router import Router
 from eventsrc.system_events import LOSS_KEY, REJECTED_KEY, Loss, RejectedPayload
 from tests.envelopes import detection, envelope, payload
@@ -186,6 +187,37 @@ def test_an_ack_covers_what_is_synced_and_nothing_else(connected: Sessions, tmp_
     assert {ack.run_id for ack in acks} == {run_id}
     claimed = {k for ack in acks for first, last in ack.stretches for k in range(first, last + 1)}
     assert claimed == {1, 2, 3, 9}
+
+
+def test_a_refusal_follows_when_the_rejected_bytes_are_synced(
+    connected: Sessions, tmp_path: Path
+) -> None:
+    log = tmp_path / "log"
+    in_the_log: list[list[bytes]] = []
+    heard: list[Refusals] = []
+    told = threading.Event()
+
+    def hear(message: Received) -> None:
+        heard.append(Refusals.decode(message.payload))
+        kept = (RejectedPayload.model_validate_json(e.payload) for e in _events(log))
+        in_the_log.append([one.raw for one in kept])
+        told.set()
+
+    watcher = connected()
+    watcher.subscribe(refusal_key(KEY), hear)
+    watcher.confirm()
+    with recording(connected(), log) as running:
+        publisher = connected().publisher(KEY)
+        assert publisher.wait_for_subscriber(DEADLINE_S)
+        publisher.put(b"no envelope, nor any run")
+        assert told.wait(DEADLINE_S)
+        running.finish()
+    ((refusal,),) = (said.refused for said in heard)
+    assert refusal == Refusal.of(b"no envelope, nor any run", refusal.reason)
+    assert "not JSON" in refusal.reason
+    assert in_the_log == [[b"no envelope, nor any run"]]
+    with LogReader(log) as reader:
+        assert heard[0].log_id == reader.log_id
 
 
 def test_a_queue_that_stays_full_loses_loudly(connected: Sessions, tmp_path: Path) -> None:
