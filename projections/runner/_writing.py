@@ -9,24 +9,28 @@ the batch is kept, the connection is made anew (with growing pauses), and the ch
 * it stands before: the server lost commits it had not yet flushed (``synchronous_commit = off``);
   the rows went with it, so fold again from there (`LostCommits`)
 * anything else: somebody else writes; stop (CheckpointMoved)
+
+A heartbeat that finds the connection lost is a batch of nothing: the same is asked after it, of
+every sink of the store, so that no commit that was lost while nothing came goes unnoticed.
 """
 
 import contextlib
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, Final, TypeAlias
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
 
 from projections.errors import CheckpointMoved, DatabaseUnavailable
 from projections.postgres.connect import database_errors
-from projections.sink import Checkpoint, Sink
+from projections.sink import Checkpoint, Sink, SinkName
 from projections.sinks import _checkpoint
 from projections.sinks._checkpoint import DeadLetter
 
+from ._backoff import Backoff, OnTrouble
 from ._stores import Store
 
-FIRST_PAUSE_S: Final = 0.1
-LONGEST_PAUSE_S: Final = 5.0
+Found: TypeAlias = dict[SinkName, Checkpoint | None]
+"""The checkpoints of a store's sinks; None where there is none."""
 
 
 class LostCommits(Exception):
@@ -45,17 +49,16 @@ class SinkBatch:
     last_event: str
 
 
-OnTrouble: TypeAlias = Callable[[str], None]
-
-
 @dataclass(slots=True)
 class Writer:
     """Writes to one store. ``revive`` restarts a server that is ours; ``trouble`` is told of it.
 
+    ``checkpoints`` are where the sinks stand as far as we know; who calls `write` moves them.
     Gives up after ``patience_s`` without a connection; None never does.
     """
 
     store: Store
+    checkpoints: dict[SinkName, Checkpoint]
     revive: Callable[[], None]
     stop: threading.Event
     trouble: OnTrouble
@@ -69,20 +72,26 @@ class Writer:
                     return self._transaction(batch)
             except DatabaseUnavailable as error:
                 self.trouble(str(error))
-            self._reconnect()
-            committed = self._committed(batch)
-            if committed is not None:
-                return committed
+            found = self._reconnect()
+            if not self._unchanged(found):
+                return self._committed(batch, found)
 
-    def beat(self, sinks: list[Sink[Any]]) -> None:
-        """Say that the tail lives; a lost connection is made again."""
-        try:
-            with database_errors(self.store.url):
-                for sink in sinks:
-                    _checkpoint.beat(self.store.connection, sink.name)
-        except DatabaseUnavailable as error:
-            self.trouble(str(error))
-            self._reconnect()
+    def beat(self) -> None:
+        """Say that the tail lives; a lost connection is made again.
+
+        Raises LostCommits when the server came back without what it had committed.
+        """
+        while True:
+            try:
+                with database_errors(self.store.url):
+                    for sink in self.store.sinks:
+                        _checkpoint.beat(self.store.connection, sink.name)
+                    return
+            except DatabaseUnavailable as error:
+                self.trouble(str(error))
+            found = self._reconnect()
+            if not self._unchanged(found):
+                self._committed([], found)
 
     def _transaction(self, batch: list[SinkBatch]) -> list[Checkpoint]:
         connection = self.store.connection
@@ -101,43 +110,46 @@ class Writer:
                 for part in batch
             ]
 
-    def _reconnect(self) -> None:
-        pause, waited = FIRST_PAUSE_S, 0.0
+    def _reconnect(self) -> Found:
+        """A new connection, and what the checkpoints are there."""
+        backoff = Backoff(self.store.place, self.stop, self.trouble, self.patience_s)
         while True:
-            if self.stop.wait(pause):
-                raise DatabaseUnavailable(
-                    f"{self.store.place}: stopped while the database was away; what was not"
-                    " written yet is in the log and comes with the next start"
-                )
+            backoff.wait()
             try:
                 self.revive()
                 self.store.reconnect()
-                # What a rolled back transaction had made is not there, whatever the sinks think.
-                with database_errors(self.store.url), self.store.connection.transaction():
-                    for sink in self.store.sinks:
-                        sink.ensure(self.store.connection)
+                return self._look()
             except DatabaseUnavailable as error:
-                waited += pause
-                if self.patience_s is not None and waited > self.patience_s:
-                    raise
-                self.trouble(str(error))
-                pause = min(pause * 2, LONGEST_PAUSE_S)
-            else:
-                return
+                backoff.failed(error)
 
-    def _committed(self, batch: list[SinkBatch]) -> list[Checkpoint] | None:
-        """The checkpoints if the batch is in, None if it has to be written again."""
-        with database_errors(self.store.url):
-            found = [_checkpoint.load(self.store.connection, part.sink.name) for part in batch]
-        if all(f == part.before for f, part in zip(found, batch, strict=True)):
-            return None
-        for checkpoint, part in zip(found, batch, strict=True):
-            if checkpoint is None or checkpoint.next_offset < part.before.next_offset:
+    def _look(self) -> Found:
+        connection, found = self.store.connection, Found()
+        with database_errors(self.store.url), connection.transaction():
+            for sink in self.store.sinks:
+                # What a rolled back transaction had made is not there, whatever the sink thinks.
+                sink.ensure(connection)
+                found[sink.name] = _checkpoint.load(connection, sink.name)
+        return found
+
+    def _unchanged(self, found: Found) -> bool:
+        return all(_same(found[s.name], self.checkpoints[s.name]) for s in self.store.sinks)
+
+    def _committed(self, batch: list[SinkBatch], found: Found) -> list[Checkpoint]:
+        """The checkpoints of a batch that is in, in its order."""
+        ends = {part.sink.name: part.next_offset for part in batch}
+        for sink in self.store.sinks:
+            before, now = self.checkpoints[sink.name], found[sink.name]
+            if now is None or now.next_offset < before.next_offset:
                 raise LostCommits
-            if checkpoint.next_offset != part.next_offset:
+            if now.next_offset != ends.get(sink.name, before.next_offset):
                 raise CheckpointMoved(
                     f"{self.store.place}: after the connection was lost the checkpoint of the"
-                    f" {part.sink.name} is at {checkpoint.next_offset}, which this tail never"
-                    " wrote: something else writes there; stop it, then start again"
+                    f" {sink.name} is at {now.next_offset:,}, which this tail never wrote:"
+                    " something else writes there; stop it, then start again"
                 )
-        return [checkpoint for checkpoint in found if checkpoint is not None]
+        return [now for part in batch if (now := found[part.sink.name]) is not None]
+
+
+def _same(found: Checkpoint | None, ours: Checkpoint) -> bool:
+    """Whether a checkpoint is ours; only a rebuild notes the digest, and it changes nothing."""
+    return found is not None and replace(found, digest=ours.digest) == ours

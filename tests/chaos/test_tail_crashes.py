@@ -9,16 +9,20 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import psycopg
 import pytest
 
 from projections.errors import CheckpointMoved, DatabaseUnavailable
-from projections.postgres.connect import Targets, connect, ensure_extension
+from projections.postgres.connect import Connection, Targets, connect, ensure_extension
 from projections.postgres.embedded import EmbeddedServer
-from projections.runner import TailReport, rebuild, tail
+from projections.runner import TailProgress, TailReport, rebuild, tail
 from projections.settings import Settings
+from projections.sink import Checkpoint, SinkName
+from projections.sinks import _checkpoint
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows
 
@@ -143,6 +147,82 @@ def test_commits_the_server_lost_are_made_again(tmp_path: Path, one_database: Ta
     tailed = all_rows(one_database)
     rebuild(log, one_database, SETTINGS)
     assert all_rows(one_database) == tailed
+
+
+def test_commits_lost_while_nothing_comes_are_made_again(
+    tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is the heartbeat that finds the connection lost, and no batch is at hand to compare."""
+    monkeypatch.setattr("projections.runner._tail_pass.HEARTBEAT_S", 0.0)
+    log = write_log(tmp_path / "log", walk(40))
+    progress, stop, lost = TailProgress(), threading.Event(), threading.Event()
+
+    def go_back(_: str) -> None:
+        if not lost.is_set():
+            rebuild(log, one_database, SETTINGS, until=13)
+            lost.set()
+
+    with ThreadPoolExecutor(1) as pool:
+        running = pool.submit(
+            tail, log, one_database, SETTINGS, stop=stop, progress=progress, on_trouble=go_back
+        )
+        try:
+            assert progress.wait(40, WAIT_S)
+            cut_connections(one_database.graph_url)
+            assert lost.wait(WAIT_S)
+            write_log(log, list(bridge()))
+            assert progress.wait(60, WAIT_S)
+        finally:
+            stop.set()
+        assert running.result(WAIT_S).restarts == 1
+    tailed = all_rows(one_database)
+    rebuild(log, one_database, SETTINGS)
+    assert all_rows(one_database) == tailed
+
+
+@pytest.mark.parametrize("again", [1, 3])
+def test_a_connection_cut_again_while_it_asks_what_is_in(
+    tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch, again: int
+) -> None:
+    log = write_log(tmp_path / "log", walk(40))
+    load, cuts = _checkpoint.load, []
+
+    def cut_first(connection: Connection, sink: SinkName) -> Checkpoint | None:
+        if cuts and len(cuts) <= again:
+            cuts.append(None)
+            cut_connections(one_database.graph_url)
+        return load(connection, sink)
+
+    def cut(report: TailReport) -> None:
+        if not cuts:
+            cuts.append(None)
+            cut_connections(one_database.graph_url)
+
+    monkeypatch.setattr("projections.sinks._checkpoint.load", cut_first)
+    report = tail(log, one_database, SETTINGS, once=True, batch_events=10, on_batch=cut)
+    assert (report.next_offset, len(cuts)) == (40, again + 1)
+
+
+def test_a_database_away_when_a_new_pass_begins_is_waited_for(
+    tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = write_log(tmp_path / "log", walk(40))
+    begin, cuts = _checkpoint.begin, []
+
+    def go_back(report: TailReport) -> None:
+        if report.next_offset == 30 and not report.restarts:
+            cut_connections(one_database.graph_url)
+            rebuild(log, one_database, SETTINGS, until=13)
+            monkeypatch.setattr("projections.sinks._checkpoint.begin", cut_first)
+
+    def cut_first(*args: Any) -> None:
+        if len(cuts) < 2:
+            cuts.append(None)
+            cut_connections(one_database.graph_url)
+        begin(*args)
+
+    report = tail(log, one_database, SETTINGS, once=True, batch_events=10, on_batch=go_back)
+    assert (report.next_offset, report.restarts, len(cuts)) == (40, 1, 2)
 
 
 def test_a_checkpoint_moved_by_somebody_else_stops_the_tail(

@@ -1,0 +1,220 @@
+"""One pass of a tail over the log: from the checkpoints on, to its end or for as long as it grows.
+
+A batch is what has come since the last one: one event when little comes, many when it is behind.
+Each batch is one transaction per database (`_writing`).
+
+An event that cannot be folded is parked: its offset and the reason go to the dead letters in the
+same transaction that moves past it. Parked events stay out at every later start, so that the rows
+remain what the fold says, until a rebuild tries them again.
+"""
+
+import threading
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from itertools import takewhile
+from pathlib import Path
+from typing import Any, Final, TypeAlias
+
+from eventsrc.log import Event, LogReader, follow
+from projections.errors import FoldError, ProjectionMismatch
+from projections.folding import WORTH_A_SNAPSHOT
+from projections.postgres.connect import Targets, database_errors
+from projections.settings import Settings
+from projections.sink import Checkpoint, Sink, SinkName
+from projections.sinks import _checkpoint
+from projections.sinks._checkpoint import DeadLetter, event_hash
+from projections.snapshot import SnapshotCache
+
+from ._backoff import OnTrouble
+from ._dead_letters import dead_letter
+from ._fold import LiveFold, batches
+from ._stores import Store
+from ._writing import SinkBatch, Writer
+from .progress import TailProgress, TailReport
+
+HEARTBEAT_S: Final = 5.0
+
+OnBatch: TypeAlias = Callable[[TailReport], None]
+Note: TypeAlias = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class TailPlan:
+    """What a tail was asked to do, and who wants to hear of it; see `tail`."""
+
+    log: Path
+    targets: Targets
+    settings: Settings
+    once: bool
+    stop: threading.Event
+    patience_s: float | None
+    batch_events: int
+    on_fold: Callable[[int], None]
+    on_batch: OnBatch
+    on_trouble: OnTrouble
+    note: Note
+    progress: TailProgress
+
+
+@dataclass(slots=True)
+class TailPass:
+    """One pass; `tail` begins another when commits were lost. `begin`, then `follow`."""
+
+    plan: TailPlan
+    stores: list[Store]
+    report: TailReport
+    checkpoints: dict[SinkName, Checkpoint] = field(default_factory=dict)
+    parked: dict[int, DeadLetter] = field(default_factory=dict)
+    letters: list[DeadLetter] = field(default_factory=list)
+
+    def follow(self, reader: LogReader) -> None:
+        """Fold and write what comes. Raises LostCommits, CheckpointMoved, ProjectionMismatch."""
+        plan = self.plan
+        cache = SnapshotCache(plan.log, reader.log_id, plan.settings, plan.note)
+        fold = LiveFold(plan.settings, cache.latest(self._start_at_most()))
+        start = fold.map.next_offset
+        writers = self._writers()
+        beaten = time.monotonic()
+        plan.on_fold(start)
+        for batch in batches(self._events(reader, start), plan.batch_events):
+            last = self._fold(fold, batch)
+            if last is not None:
+                self._write(fold, writers, last)
+                plan.on_fold(last.offset + 1)
+            if time.monotonic() - beaten > HEARTBEAT_S:
+                beaten = time.monotonic()
+                for writer in writers:
+                    writer.beat()
+            if plan.once and plan.stop.is_set():
+                break
+        if fold.map.next_offset - start >= WORTH_A_SNAPSHOT and not self.parked:
+            cache.keep(fold.map, fold.view)
+
+    def _events(self, reader: LogReader, start: int) -> Iterable[Event | None]:
+        if self.plan.once:
+            return reader.read(start, reader.next_offset)
+        return follow(self.plan.log, start, stop=self.plan.stop)
+
+    def _writers(self) -> list[Writer]:
+        plan = self.plan
+        return [
+            Writer(
+                store,
+                self.checkpoints,
+                plan.targets.revive,
+                plan.stop,
+                plan.on_trouble,
+                plan.patience_s,
+            )
+            for store in self.stores
+        ]
+
+    def _start_at_most(self) -> int:
+        """Up to which offset a snapshot is what this tail would fold: another command may have made
+        one with events that are parked here."""
+        return min([c.next_offset for c in self.checkpoints.values()] + list(self.parked))
+
+    def begin(self, reader: LogReader) -> None:
+        """Make what is missing, read the checkpoints, refuse what does not fit."""
+        plan = self.plan
+        parked: dict[int, DeadLetter] = {}
+        for store in self.stores:
+            with database_errors(store.url), store.connection.transaction():
+                for sink in store.sinks:
+                    sink.ensure(store.connection)
+                    _checkpoint.begin(store.connection, sink.name, reader.log_id, plan.settings)
+                    found = _checkpoint.load(store.connection, sink.name)
+                    assert found is not None  # noqa: S101 - begun in this transaction
+                    self._check(found, sink, store, reader)
+                    # At once: from here on the lock says that a tail is at work.
+                    _checkpoint.beat(store.connection, sink.name)
+                    self.checkpoints[sink.name] = found
+                    letters = _checkpoint.parked(store.connection, sink.name)
+                    parked.update((letter.offset, letter) for letter in letters)
+        self.parked = parked
+        self.report.next_offset = min(c.next_offset for c in self.checkpoints.values())
+        self.plan.progress.update(self.report)
+
+    def _check(self, found: Checkpoint, sink: Sink[Any], store: Store, reader: LogReader) -> None:
+        _checkpoint.refuse_other_origin(
+            found, sink.name, store.place, reader.log_id, self.plan.settings, self._advice()
+        )
+        if found.next_offset > reader.next_offset:
+            raise ProjectionMismatch(
+                f"{store.place}: the {sink.name} there hold {found.next_offset} events, but"
+                f" {self.plan.log} has only {reader.next_offset}; {self._advice()}"
+            )
+        for event in reader.read(max(0, found.next_offset - 1), found.next_offset):
+            if event_hash(event) != found.last_event:
+                raise ProjectionMismatch(
+                    f"{self.plan.log}: the event at offset {event.offset} is not the one that the"
+                    f" {sink.name} were made from; {self._advice()}"
+                )
+
+    def _advice(self) -> str:
+        return f"to make them anew run: mapfold replay {self.plan.log}"
+
+    def _fold(self, fold: LiveFold, batch: list[Event]) -> Event | None:
+        """Fold a batch; its last event, None for an empty one."""
+        rest = batch
+        while rest:
+            stretch = list(takewhile(lambda event: event.offset not in self.parked, rest))
+            for event, error in zip(stretch, fold.feed(stretch, self._due), strict=True):
+                if error is not None:
+                    self._park(event, error)
+            rest = rest[len(stretch) :]
+            if rest:
+                # Parked by the other sink, which is further: it has to stay out of this one too.
+                self.letters.append(self.parked[rest[0].offset])
+                fold.skip(rest[0].offset)
+                rest = rest[1:]
+        return batch[-1] if batch else None
+
+    def _due(self, event: Event) -> list[Sink[Any]]:
+        """The sinks that do not have an event yet."""
+        return [
+            sink
+            for store in self.stores
+            for sink in store.sinks
+            if event.offset >= self.checkpoints[sink.name].next_offset
+        ]
+
+    def _park(self, event: Event, error: FoldError) -> None:
+        if any(event.offset < c.next_offset for c in self.checkpoints.values()):
+            raise ProjectionMismatch(
+                f"{error}, but it is in the databases already: they were made by another version;"
+                f" {self._advice()}"
+            )
+        letter = dead_letter(event, error.reason)
+        self.parked[letter.offset] = letter
+        self.letters.append(letter)
+        self.report.parked.append(letter)
+
+    def _write(self, fold: LiveFold, writers: list[Writer], last: Event) -> None:
+        next_offset = last.offset + 1
+        written = 0
+        for writer in writers:
+            parts = [
+                SinkBatch(
+                    sink,
+                    sink.take(fold.view),
+                    tuple(d for d in self.letters if d.offset >= at.next_offset),
+                    at,
+                    next_offset,
+                    event_hash(last),
+                )
+                for sink in writer.store.sinks
+                if (at := self.checkpoints[sink.name]).next_offset < next_offset
+            ]
+            if parts:
+                for part, after in zip(parts, writer.write(parts), strict=True):
+                    written = max(written, after.next_offset - part.before.next_offset)
+                    self.checkpoints[part.sink.name] = after
+        self.letters.clear()
+        if written:
+            self.report.events += written
+            self.report.batches += 1
+            self.report.next_offset = next_offset
+            self.plan.progress.update(self.report)
+            self.plan.on_batch(self.report)
