@@ -40,24 +40,45 @@ class Settings(BaseModel):
         canonical = self.model_dump_json(exclude=plain)  # as it was before there was the setting
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
-    def with_assignments(self, assignments: Iterable[str]) -> "Settings":
-        """These settings changed by ``name=value`` texts, as ``--set`` takes them.
+    def with_assignments(self, assignments: Iterable[str], option: str = "--set") -> "Settings":
+        """These settings changed by ``name=value`` texts, as ``option`` takes them.
 
-        Raises SettingsError that names the setting and the rule it breaks.
+        Raises SettingsError that names the option, the setting and the rule it breaks.
         """
         values: dict[str, Any] = self.model_dump()
         for text in assignments:
             name, equals, value = text.partition("=")
             name = name.strip()
             if not equals:
-                raise SettingsError(f"--set {text}: write it as name=value, such as eps_m=1.0")
+                raise SettingsError(f"{option} {text}: write it as name=value, such as eps_m=1.0")
             if name not in values or name == "neighbourhood":
-                names = ", ".join(sorted(values.keys() - {"neighbourhood"}))
-                raise SettingsError(f"--set {text}: no setting {name!r}; there are {names}")
+                raise SettingsError(f"{option} {text}: {_no_setting(name)}")
             values[name] = None if value.strip() in ("", "none") else value.strip()
         try:
             return Settings.model_validate(values)
         except ValidationError as error:
             first = error.errors()[0]
-            field = ".".join(str(part) for part in first["loc"])
-            raise SettingsError(f"--set {field}={first['input']}: {first['msg'].lower()}") from None
+            told = f"{first['loc'][0]}={first['input']}: {first['msg'].lower()}"
+            raise SettingsError(f"{option} {told}") from None
+
+    @classmethod
+    def from_document(cls, document: object) -> "Settings":
+        """Settings out of parsed JSON. Raises SettingsError that says what is wrong, not where."""
+        if not isinstance(document, dict):
+            raise SettingsError('no JSON object; write one such as {"eps_m": 1.0}')
+        try:
+            settings = cls.model_validate(document)
+        except ValidationError as error:
+            first = error.errors()[0]
+            name = str(first["loc"][0])
+            if first["type"] == "extra_forbidden":
+                raise SettingsError(_no_setting(name)) from None
+            raise SettingsError(f"{name} is {first['input']!r}: {first['msg'].lower()}") from None
+        if settings.neighbourhood is not None:
+            raise SettingsError(_no_setting("neighbourhood"))
+        return settings
+
+
+def _no_setting(name: str) -> str:
+    names = ", ".join(sorted(Settings.model_fields.keys() - {"neighbourhood"}))
+    return f"no setting {name!r}; there are {names}"

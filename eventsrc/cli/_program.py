@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Any, Final, NoReturn
 
+import typer
 from typer.core import TyperGroup
 
 from eventsrc.errors import MapfoldError
@@ -40,6 +41,9 @@ def _handed_through() -> Iterator[None]:
         raise _Interrupted from None
     except BrokenPipeError:
         raise _ReaderGone from None
+    except typer.BadParameter as error:
+        error.message = error.message.removeprefix("Value error, ")  # typer's inside showing
+        raise
 
 
 class Program(TyperGroup):

@@ -7,10 +7,9 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-from pydantic import ValidationError
 
 from projections.errors import SettingsError
 from projections.postgres.connect import Targets, open_targets
@@ -52,14 +51,13 @@ def settings_from(file: Path | None, assignments: list[str] | None) -> Settings:
 
 def _settings_of_file(file: Path) -> Settings:
     try:
-        document: Any = json.loads(file.read_text("utf-8"))
-        return Settings.model_validate(document)
+        return Settings.from_document(json.loads(file.read_text("utf-8")))
     except OSError as error:
         raise SettingsError(f"--settings {file}: {error.strerror}") from None
+    except SettingsError as error:
+        raise SettingsError(f"--settings {file}: {error}") from None
     except ValueError as error:
-        what = error.errors()[0] if isinstance(error, ValidationError) else None
-        told = f"{'.'.join(map(str, what['loc']))}: {what['msg']}" if what else str(error)
-        raise SettingsError(f"--settings {file}: {told}; give a JSON object of settings") from None
+        raise SettingsError(f"--settings {file}: not JSON: {error}") from None
 
 
 @contextlib.contextmanager

@@ -81,7 +81,7 @@ def whatif(
     base of one single place. With --truth, V is the V-measure against rooms and instances: 1 is
     perfect.
     """
-    common = assigned(settings_from(settings_file, None), base)
+    common = assigned(settings_from(settings_file, None), base, "--base")
     others = alternatives(common, set_ or (), try_ or (), grid or ())
     if not others:
         raise MisuseError("nothing to try; give --set eps_m=1.0, --try or --grid eps_m=0.5,1.0")
@@ -109,7 +109,7 @@ def _draw(log: Path, found: WhatIf, out: Path) -> None:
             title = f"{each.name}: {counted(counts['places'], 'place')}, {counts['noise']} noise"
             maps.append((title, opened.at(found.end)))
     draw_maps(maps, out)
-    say(f"wrote {out}: {len(maps)} maps")
+    say(f"wrote {out}: {counted(len(maps), 'map')}")
 
 
 def register(app: typer.Typer) -> None:

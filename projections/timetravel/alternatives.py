@@ -26,15 +26,16 @@ def alternatives(
     if size > MOST_ALTERNATIVES:
         raise SettingsError(f"--grid: {size:,} combinations; try at most {MOST_ALTERNATIVES}")
     found = [common] if sets and not axes else []
-    found += [assigned(base, text) for text in tries]
+    found += [assigned(base, text, "--try") for text in tries]
     if axes:
-        found += [common.with_assignments(combination) for combination in product(*axes)]
+        found += [common.with_assignments(each, "--grid") for each in product(*axes)]
     return list(dict.fromkeys(found))
 
 
-def assigned(settings: Settings, text: str) -> Settings:
-    """``settings`` changed by several assignments in one text, parted by spaces or commas."""
-    return settings.with_assignments(text.replace(",", " ").split())
+def assigned(settings: Settings, text: str, option: str) -> Settings:
+    """``settings`` changed by several assignments in the text of an option, parted by spaces or
+    commas."""
+    return settings.with_assignments(text.replace(",", " ").split(), option)
 
 
 def _axis(text: str) -> list[str]:

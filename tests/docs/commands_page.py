@@ -18,9 +18,9 @@ HEAD = """\
 # Commands
 
 Data goes to stdout (`--json` gives one JSON document or JSON lines), what is for people to stderr.
-Exit codes: 0 done · 1 failed · 2 misuse · 3 done, with loss or findings · 130 interrupted (Ctrl-C) ·
-141 the reader of stdout left before everything was printed (`… | head`) · 143 terminated (SIGTERM).
-A command that works until it is told to stop, such as `record`, exits with 0 or 3 when it is told so.
+Exit codes: 0 done · 1 failed · 2 misuse · 3 done, with loss or findings · 130 interrupted (Ctrl-C)
+· 141 the reader of stdout left before everything was printed (`… | head`) · 143 terminated
+(SIGTERM). What works until it is told to stop, such as `record`, exits with 0 or 3 when told so.
 
 `W` is a point in a log: an offset, an ISO time, `run:keyframe`, or `end`. `--at N` means after the
 first N events; a time or a keyframe means including it.

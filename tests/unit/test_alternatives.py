@@ -41,6 +41,11 @@ def test_nothing_to_try() -> None:
     assert names([], [], []) == []
 
 
+def test_a_bad_try_is_refused_as_one() -> None:
+    with pytest.raises(SettingsError, match=r"^--try eps=1: no setting 'eps'"):
+        alternatives(BASE, [], ["eps=1"], [])
+
+
 @pytest.mark.parametrize(
     ("grid", "says"),
     [
@@ -52,6 +57,6 @@ def test_nothing_to_try() -> None:
     ],
 )
 def test_a_bad_grid_is_refused(grid: list[str], says: str) -> None:
-    with pytest.raises(SettingsError, match="--") as caught:
+    with pytest.raises(SettingsError, match=r"^--grid") as caught:
         alternatives(BASE, [], [], grid)
     assert says in str(caught.value)

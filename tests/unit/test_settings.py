@@ -34,6 +34,33 @@ def test_a_wrong_assignment_is_refused_in_words(text: str, says: str) -> None:
     assert caught.value.exit_code == 2
 
 
+def test_the_option_that_was_given_is_named() -> None:
+    for text in ("eps", "eps=1", "eps_m=wide"):
+        with pytest.raises(SettingsError, match=r"^--try eps"):
+            Settings().with_assignments([text], "--try")
+
+
+def test_settings_out_of_a_document() -> None:
+    assert Settings.from_document({"eps_m": 1}) == Settings(eps_m=1.0)
+    saved = Settings(min_samples=8).model_dump(mode="json")
+    assert Settings.from_document(saved) == Settings(min_samples=8)
+
+
+@pytest.mark.parametrize(
+    ("document", "says"),
+    [
+        ([1], 'no JSON object; write one such as {"eps_m": 1.0}'),
+        ({"eps": 1}, "no setting 'eps'; there are embedding_dim, embedding_model, eps_m"),
+        ({"eps_m": "wide"}, "eps_m is 'wide': input should be a valid number"),
+        ({"neighbourhood": "walls"}, "no setting 'neighbourhood'; there are"),
+    ],
+)
+def test_a_wrong_document_is_refused_in_words(document: object, says: str) -> None:
+    with pytest.raises(SettingsError) as caught:
+        Settings.from_document(document)
+    assert str(caught.value).startswith(says)
+
+
 def test_the_fingerprint_tells_settings_apart() -> None:
     settings = [Settings(), Settings(eps_m=1.0), Settings(min_samples=4), Settings(embedding_dim=4)]
     assert len({s.fingerprint() for s in settings}) == len(settings)

@@ -1,0 +1,45 @@
+"""A call that is wrong: which option, what value, what would be right; exit 2."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.commands import Commands
+from tests.fixtures_timetravel import write_log
+from tests.logs import walk
+
+
+@pytest.fixture
+def mapfold(tmp_path: Path) -> Commands:
+    write_log(tmp_path / "log", walk(3))
+    (tmp_path / "settings.json").write_text(json.dumps({"eps": 1}))
+    (tmp_path / "broken.json").write_text("{")
+    return Commands.in_folder(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        (("whatif", "log", "--try", "eps=1"), "--try eps=1: no setting 'eps'; there are"),
+        (("whatif", "log", "--grid", "eps_m=1,x"), "--grid eps_m=x: input should be a valid"),
+        (("whatif", "log", "--base", "eps=1"), "--base eps=1: no setting 'eps'; there are"),
+        (
+            ("state", "log", "--settings", "settings.json"),
+            "--settings settings.json: no setting 'eps'; there are embedding_dim",
+        ),
+        (("state", "log", "--settings", "broken.json"), "--settings broken.json: not JSON: "),
+        (
+            ("state", "log", "--settings", "none.json"),
+            "--settings none.json: No such file or directory",
+        ),
+    ],
+)
+def test_our_own_errors_are_one_line(mapfold: Commands, args: tuple[str, ...], says: str) -> None:
+    (line,) = mapfold(*args, code=2).err.splitlines()
+    assert line.startswith(f"mapfold: {says}")
+
+
+def test_a_value_that_is_not_offered(mapfold: Commands) -> None:
+    said = mapfold("replay", "log", "--only", "foo", code=2).err
+    assert "Invalid value for '--only': 'foo' is not one of 'graph', 'vectors'" in said
