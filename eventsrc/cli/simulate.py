@@ -9,6 +9,7 @@ from eventsrc._zenoh import ZenohOptions, open_session
 from eventsrc.errors import MisuseError
 from eventsrc.sim import DEFAULT_SEED, SimulatedRun, simulate_run
 from eventsrc.sim.publish import publish_run, write_run
+from eventsrc.words import counted
 
 from ._shell import emit, finish, say
 from ._signals import stop_on_signals
@@ -53,7 +54,7 @@ def simulate(
     document = _numbers(simulated)
     if out is not None:
         truth = write_run(simulated, out)
-        say(f"{_summary(document)}: wrote {out}, truth in {truth.name}")
+        say(f"{_summary(document)}: wrote {out}, truth in {truth}")
         document |= {"out": str(out), "truth": str(truth)}
     else:
         options = zenoh_options(connect, listen, zenoh_config)
@@ -82,8 +83,8 @@ def _numbers(simulated: SimulatedRun) -> dict[str, Any]:
 
 def _summary(document: dict[str, Any]) -> str:
     return (
-        f"{document['run_id']}: {document['keyframes']} keyframes, "
-        f"{document['detections']} detections in {document['seconds']} s of driving"
+        f"{document['run_id']}: {counted(document['keyframes'], 'keyframe')}, "
+        f"{counted(document['detections'], 'detection')} in {document['seconds']} s of driving"
     )
 
 

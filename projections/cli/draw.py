@@ -8,6 +8,7 @@ import typer
 from eventsrc.cli._shell import say
 from eventsrc.log import LogReader
 from eventsrc.log.whence import resolve
+from eventsrc.words import counted
 from projections.cli._options import SetOption, SettingsOption, settings_from
 from projections.folding import fold_events
 from projections.reducers.semantic_map import SemanticMap
@@ -57,12 +58,13 @@ def draw(
     draw_map(
         view,
         out,
-        title=f"{log.name} after {view.next_offset} events",
+        title=f"{log.name} after {counted(view.next_offset, 'event')}",
         floor=None if house is None else floor_of(build_house(house)),
         bridges=bridges_of(view, merged) if merges else (),
         min_observations=min_observations,
     )
-    say(f"wrote {out}: {len(view.places)} places, {len(view.objects)} objects")
+    places, objects = counted(len(view.places), "place"), counted(len(view.objects), "object")
+    say(f"wrote {out}: {places}, {objects}")
 
 
 def register(app: typer.Typer) -> None:

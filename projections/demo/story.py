@@ -58,8 +58,8 @@ def tell_map(folded: Folded, other_settings: Settings, other_places: int) -> Ite
     counts, settings = folded.view.counts(), folded.view.settings
     transitions = sum(count for _, _, count in folded.view.edges())
     yield (
-        f"   {counts['places']} places from {counts['keyframes']} keyframes ({counts['noise']} in "
-        f"none), {counts['objects']} objects from {counts['observations']} observations,"
+        f"   {_count(counts['places'], 'place')} from {counts['keyframes']} keyframes "
+        f"({counts['noise']} in none), {counts['objects']} objects from {counts['observations']} observations,"
     )
     yield (
         f"   {transitions} transitions between {counts['adjacency']} pairs of neighbouring places; "

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from eventsrc.errors import MisuseError
+from eventsrc.words import counted
 from projections.view import MapView
 
 from . import palette
@@ -81,8 +82,9 @@ def _numbers(view: MapView, min_observations: int) -> str:
     counts, settings = view.counts(), view.settings
     shown = sum(found.obs_count >= min_observations for found in view.objects)
     return (
-        f"{counts['keyframes']} keyframes ({counts['noise']} in no place)  ·  "
-        f"{counts['places']} places  ·  {counts['objects']} objects, {shown} of them shown: seen "
+        f"{counted(counts['keyframes'], 'keyframe')} ({counts['noise']} in no place)  ·  "
+        f"{counted(counts['places'], 'place')}  ·  "
+        f"{counted(counts['objects'], 'object')}, {shown} of them shown: seen "
         f"{min_observations} times or more  ·  ε {settings.eps_m:g} m, "
         f"min_samples {settings.min_samples}"
     )

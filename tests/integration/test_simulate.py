@@ -54,6 +54,7 @@ def test_a_file_is_written_with_its_numbers(tmp_path: Path) -> None:
     assert Path(numbers["out"]).exists()
     assert Path(numbers["truth"]).name == "run.truth.jsonl.gz"
     assert f"{len(run.envelopes)} keyframes" in done.stderr
+    assert f"truth in {tmp_path / 'run.truth.jsonl.gz'}" in done.stderr
 
 
 @pytest.mark.parametrize("name", ["", "two\nlines", "x" * 101])

@@ -29,10 +29,10 @@ def merge_text(history: History, merge: Merge) -> str:
     lines = [
         f"merge {merge.number} at offset {cause.offset:,} ({cause.when}), shows from --at {after}",
         f"because   {reason(history, merge)}",
-        f"survivor  {place_name(history, merge.survivor)}, {merge.survivor_size:,} keyframes",
+        f"survivor  {place_name(history, merge.survivor)}, {counted(merge.survivor_size, 'keyframe')}",
     ]
     for place, size in zip(merge.absorbed, merge.absorbed_sizes, strict=True):
-        lines.append(f"absorbed  {place_name(history, place)}, {size:,} keyframes")
+        lines.append(f"absorbed  {place_name(history, place)}, {counted(size, 'keyframe')}")
     objects = [history.objects[number] for number in merge.objects]
     named = [f"object    {o.object_id} ({o.found.class_name})" for o in objects]
     lines += shortened(named, MOST, "--json lists all")
