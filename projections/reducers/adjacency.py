@@ -66,15 +66,15 @@ class Adjacency:
         return linked
 
     def dump(self) -> State:
-        """Everything, for a snapshot."""
-        columns = {run: placed.columns() for run, placed in self.placed.items()}
+        """Everything, for a snapshot: the same for equal states, whichever way they came about."""
+        columns = {run: placed.columns() for run, placed in sorted(self.placed.items())}
         edges = [[a, b, n] for a, row in self.edges.items() for b, n in row.items() if a < b]
         return {
             "placed": [[run, len(keys)] for run, (keys, _) in columns.items()],
             "keys": np.array([k for keys, _ in columns.values() for k in keys], np.int64),
             "labels": np.array([p for _, labels in columns.values() for p in labels], np.int32),
-            "survivors": list(map(list, self.survivors.items())),
-            "edges": edges,
+            "survivors": sorted(map(list, self.survivors.items())),
+            "edges": sorted(edges),
         }
 
     def load(self, state: State) -> None:

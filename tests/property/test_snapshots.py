@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from projections.deltas import Delta, Pose
 from projections.digest import map_digest
 from projections.geometry import Neighbourhood
+from projections.reducers.adjacency import Adjacency
 from projections.settings import Settings
 from projections.snapshot import restore, snapshot
 from projections.snapshot.container import unpack
@@ -58,3 +59,14 @@ def test_a_restored_fold_gives_the_same_snapshot(documents: list[dict[str, Any]]
     data = snapshot(folded.map, folded.view, "log")
     again = restore(data, folded.view.settings, "log")
     assert _lists(unpack(data)) == _lists(unpack(snapshot(*again, "log")))
+
+
+def test_a_dump_does_not_tell_in_which_order_edges_came_and_went() -> None:
+    adjacency = Adjacency()
+    for run, keyframe_id, place in ((0, 0, 3), (0, 10, 8), (1, 0, 4), (1, 1, 9), (0, 5, 5)):
+        adjacency.keyframe_placed(run, keyframe_id, place)
+    dumped = adjacency.dump()
+    again = Adjacency()
+    again.load(dumped)
+    assert _lists(again.dump()) == _lists(dumped)
+    assert dumped["edges"] == [[3, 5, 1], [4, 9, 1], [5, 8, 1]]
