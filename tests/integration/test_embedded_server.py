@@ -18,7 +18,8 @@ WAIT_S = 60
 
 HOLDER = """
 import sys, signal
-from pathlib import Path
+# A shell that runs the tests in its background has its children ignore Ctrl-C.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 from projections.cli._options import databases
 with databases(None, None) as targets:
     print(targets.graph_url, flush=True)
