@@ -59,7 +59,8 @@ def tell_map(folded: Folded, other_settings: Settings, other_places: int) -> Ite
     transitions = sum(count for _, _, count in folded.view.edges())
     yield (
         f"   {_count(counts['places'], 'place')} from {counts['keyframes']} keyframes "
-        f"({counts['noise']} in none), {counts['objects']} objects from {counts['observations']} observations,"
+        f"({counts['noise']} in none), {counts['objects']} objects from {counts['observations']} "
+        f"observations,"
     )
     yield (
         f"   {transitions} transitions between {counts['adjacency']} pairs of neighbouring places; "

@@ -64,22 +64,26 @@ def _places(diff: Difference) -> tuple[str, str, list[list[str]]]:
     return "places", _parts(parts), groups
 
 
+def _size(row: PlaceRow) -> str:
+    return counted(row.keyframe_count, "keyframe")
+
+
 def _place(row: PlaceRow) -> str:
     x, y = row.centroid_x, row.centroid_y
-    return f"{row.place_id}: {counted(row.keyframe_count, 'keyframe')} around ({x:.2f}, {y:.2f})"
+    return f"{row.place_id}: {_size(row)} around ({x:.2f}, {y:.2f})"
 
 
 def _into(diff: Difference, row: PlaceRow) -> str:
     if row.place_id not in diff.absorbed:
-        return f" ({counted(row.keyframe_count, 'keyframe')})"
+        return f" ({_size(row)})"
     survivor, cause = diff.absorbed[row.place_id]
-    return f" ({counted(row.keyframe_count, 'keyframe')}) into {survivor} at {cause.offset:,} ({cause.name})"
+    return f" ({_size(row)}) into {survivor} at {cause.offset:,} ({cause.name})"
 
 
 def _place_change(before: PlaceRow, after: PlaceRow) -> str:
     moved = place_shift_m(before, after)
     shift = f", centre moved {moved:.2f} m" if moved >= _MOVED_M else ""
-    return f"{after.place_id}: {before.keyframe_count:,} → {counted(after.keyframe_count, 'keyframe')}{shift}"
+    return f"{after.place_id}: {before.keyframe_count:,} → {_size(after)}{shift}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,15 +29,19 @@ def merge_text(history: History, merge: Merge) -> str:
     lines = [
         f"merge {merge.number} at offset {cause.offset:,} ({cause.when}), shows from --at {after}",
         f"because   {reason(history, merge)}",
-        f"survivor  {place_name(history, merge.survivor)}, {counted(merge.survivor_size, 'keyframe')}",
+        f"survivor  {_place(history, merge.survivor, merge.survivor_size)}",
     ]
     for place, size in zip(merge.absorbed, merge.absorbed_sizes, strict=True):
-        lines.append(f"absorbed  {place_name(history, place)}, {counted(size, 'keyframe')}")
+        lines.append(f"absorbed  {_place(history, place, size)}")
     objects = [history.objects[number] for number in merge.objects]
     named = [f"object    {o.object_id} ({o.found.class_name})" for o in objects]
     lines += shortened(named, MOST, "--json lists all")
     lines += shortened([_edge_text(history, e) for e in merge.edges], MOST, "--json lists all")
     return "".join(f"{line}\n" for line in lines)
+
+
+def _place(history: History, place: int, size: int) -> str:
+    return f"{place_name(history, place)}, {counted(size, 'keyframe')}"
 
 
 def _edge_text(history: History, edge: EdgeChange) -> str:
