@@ -105,7 +105,7 @@ def cat(
     with LogReader(log) as reader:
         on_gap = note if skip_damage else None
         start = resolve_start(reader, from_, on_gap=on_gap)
-        end = resolve(reader, to, on_gap=on_gap)
+        end = reader.next_offset if to == "end" else resolve(reader, to, on_gap=on_gap)
         if start > end:
             raise MisuseError(f"--from {from_} is offset {start}, behind --to {to}, which is {end}")
         until = None if to == "end" else end

@@ -42,11 +42,11 @@ class _Identity(BaseModel):
 def resolve(reader: LogReader, text: str, *, on_gap: OnGap | None = None) -> int:
     """The number of events that ``text`` means; MisuseError when the log has no such point.
 
-    Damage on the way to a keyframe, or at the end of a range up to a time, raises LogDamaged, or
-    is told to ``on_gap``.
+    Damage on the way to a keyframe, and rot that a growing segment ends in where the range goes up
+    to there, raise LogDamaged, or are told to ``on_gap``.
     """
     if text == "end":
-        return reader.next_offset
+        return _at_end(reader, on_gap)
     if text.isascii() and text.isdecimal():
         return _within(reader, int(text))
     time_ns = _time(text)
@@ -111,9 +111,13 @@ def _at_time(reader: LogReader, time_ns: int, on_gap: OnGap | None) -> int:
             in_time = event.stamp_ns <= time_ns
         if in_time:
             included = event.offset + 1
-    if included > reader.next_offset:  # more was recorded than the growing segment still shows
-        list(reader.read(reader.next_offset, on_gap=on_gap))
-    return min(included, reader.next_offset)
+    return _at_end(reader, on_gap) if included > reader.next_offset else included
+
+
+def _at_end(reader: LogReader, on_gap: OnGap | None) -> int:
+    """Where there are no more events, unless more was recorded than the growing segment shows."""
+    list(reader.read(reader.next_offset, on_gap=on_gap))
+    return reader.next_offset
 
 
 def _at_keyframe(reader: LogReader, run_id: str, keyframe_id: int, on_gap: OnGap | None) -> int:

@@ -155,7 +155,10 @@ def test_rot_in_the_growing_segment_is_met_by_a_range_that_it_ends(log_path: Pat
             for second in (2, 4, 20):
                 with pytest.raises(LogDamaged, match="offsets 3 to 8 cannot be read"):
                     resolve(rotten, _at(second))
+            with pytest.raises(LogDamaged, match="offsets 3 to 8 cannot be read"):
+                resolve(rotten, "end")
             met: list[Unreadable] = []
             assert resolve(rotten, _at(4), on_gap=met.append) == 3
-            assert [(gap.first, gap.last) for gap in met] == [(3, 8)]
+            assert resolve(rotten, "end", on_gap=met.append) == 3
+            assert [(gap.first, gap.last) for gap in met] == [(3, 8)] * 2
         flip(segment.path, reader.open_segment(segment).chunks[1].position + 5)
