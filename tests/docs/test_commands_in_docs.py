@@ -1,12 +1,13 @@
 """Every command in these documents runs and prints what they say."""
 
+import re
 from pathlib import Path
 
 import pytest
 
 from tests.docs.console import ROOT, Command, matches, read, run
 
-DOCUMENTS = ("README.md", "docs/simulator.md")
+DOCUMENTS = ("README.md", "docs/simulator.md", "docs/time-travel.md")
 
 
 @pytest.mark.parametrize("name", DOCUMENTS)
@@ -17,6 +18,16 @@ def test_commands_print_what_the_document_says(name: str) -> None:
         told = "\n".join(printed)
         assert code == 0, f"{command.text}\nexit {code}\n{told}"
         assert matches(command.prints, printed), f"{command.text}\nprinted:\n{told}"
+
+
+@pytest.mark.parametrize("name", DOCUMENTS)
+def test_who_follows_a_document_leaves_nothing_that_git_would_show(name: str) -> None:
+    for part in read(ROOT / name):
+        if isinstance(part, Command):
+            written = re.findall(r"(?:> (?!\d)|--out |--picture |mapfold import )(\S+)", part.text)
+        else:
+            written = [part.name]
+        assert all(path.startswith("logs/") for path in written), part
 
 
 def test_a_difference_is_seen_and_a_time_is_not() -> None:
