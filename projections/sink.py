@@ -94,4 +94,5 @@ class Sink(Protocol[Changes]):
         """Put the shadow in the place of what readers see."""
 
     def tidy(self, connection: Connection) -> None:
-        """After the commit (autocommit): remove what was replaced."""
+        """After the commit (autocommit): have what was replaced removed. Nobody need wait for it;
+        ``connection`` may be closed and its session be at work for a while."""

@@ -23,6 +23,7 @@ from projections.postgres.connect import Targets, database_errors
 from projections.settings import Settings
 from projections.sink import Checkpoint, Sink, SinkName
 from projections.sinks import _checkpoint
+from projections.sinks._advice import remake
 from projections.sinks._checkpoint import DeadLetter, event_hash
 from projections.snapshot import SnapshotCache
 
@@ -142,18 +143,18 @@ class TailPass:
         )
         if found.next_offset > reader.next_offset:
             raise ProjectionMismatch(
-                f"{store.place}: the {sink.name} there hold {found.next_offset} events, but"
-                f" {self.plan.log} has only {reader.next_offset}; {self._advice()}"
+                f"{store.place}: {found.next_offset:,} events are in the {sink.name} there, but"
+                f" {self.plan.log} has only {reader.next_offset:,}; {self._advice()}"
             )
         for event in reader.read(max(0, found.next_offset - 1), found.next_offset):
             if event_hash(event) != found.last_event:
                 raise ProjectionMismatch(
-                    f"{self.plan.log}: the event at offset {event.offset} is not the one that the"
-                    f" {sink.name} were made from; {self._advice()}"
+                    f"{self.plan.log}: the event at offset {event.offset:,} is not the one that is"
+                    f" in the {sink.name}; {self._advice()}"
                 )
 
     def _advice(self) -> str:
-        return f"to make them anew run: mapfold replay {self.plan.log}"
+        return remake(self.plan.log, self.plan.settings)
 
     def _fold(self, fold: LiveFold, batch: list[Event]) -> Event | None:
         """Fold a batch; its last event, None for an empty one."""

@@ -22,6 +22,7 @@ from projections.postgres.connect import Connection, Targets, connect, database_
 from projections.settings import Settings
 from projections.sink import Checkpoint, Sink, SinkName
 from projections.sinks import _checkpoint
+from projections.sinks._advice import command, remake
 from projections.sinks.graph_render import Row, expected_rows
 from projections.sinks.labels import GRAPH, LABELS, TABLE, VERTEX_LABELS
 from projections.sinks.vector_rows import VectorRow
@@ -87,9 +88,10 @@ def _check(log: Path, sink: SinkName, url: str, settings: Settings) -> CheckRepo
             checkpoint = _checkpoint.load(connection, sink)
             if checkpoint is None:
                 raise ProjectionMissing(
-                    f"{place(url)}: no {sink} have been projected there; run: mapfold replay {log}"
+                    f"{place(url)}: no {sink} have been projected there;"
+                    f" run: {command('replay', log, settings)}"
                 )
-            advice = f"to make them anew run: mapfold replay {log}"
+            advice = remake(log, settings)
             _checkpoint.refuse_other_origin(
                 checkpoint, sink, place(url), reader.log_id, settings, advice
             )

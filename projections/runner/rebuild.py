@@ -192,10 +192,11 @@ def _check(stores: list[Store], fold: LiveFold, checkpoint: Checkpoint) -> dict[
 def _after(stores: list[Store], tell: OnProgress, total: int, *, hnsw: bool) -> HnswReport | None:
     index: HnswReport | None = None
     for store in stores:
-        with store.aside() as connection:
-            for sink in store.sinks:
+        for sink in store.sinks:
+            with store.aside() as connection:
                 sink.tidy(connection)
-                if sink.name == "vectors" and hnsw:
-                    tell(RebuildProgress("indexing", total, total))
-                    index = build_hnsw(connection)
+        if hnsw and any(sink.name == "vectors" for sink in store.sinks):
+            tell(RebuildProgress("indexing", total, total))
+            with store.aside() as connection:
+                index = build_hnsw(connection)
     return index

@@ -1,8 +1,9 @@
 """Where the databases stand beside a log: lag, liveness, dead letters, versions.
 
-A sink is *idle* when it has every event, *following* when it is behind and a tail that lives holds
-it, *stalled* when the tail that holds it has not been heard of for a while, *behind* when nobody
-works on it, *other* when it was made from another log or with other settings.
+A sink is *following* when a tail that lives holds it, whether it has every event or not yet,
+*stalled* when the tail that holds it has not been heard of for a while, *rebuilding* when a replay
+is at work on it; with nobody on it, it is *idle* when it has every event and *behind* when not. It
+is *other* when it was made from another log or with other settings.
 """
 
 from dataclasses import dataclass
@@ -22,17 +23,23 @@ from projections.postgres.connect import (
 from projections.settings import Settings
 from projections.sink import Checkpoint, SinkName
 from projections.sinks import _checkpoint
+from projections.sinks._advice import command, remake
 from projections.sinks._checkpoint import DeadLetter
 
 STALLED_S: Final = 20.0
 """A living tail says so every 5 s."""
 
-Condition = Literal["missing", "other", "idle", "following", "stalled", "behind", "unreachable"]
+Condition = Literal[
+    "missing", "other", "idle", "following", "rebuilding", "stalled", "behind", "unreachable"
+]
 
 
 @dataclass(frozen=True, slots=True)
 class SinkStatus:
-    """One sink. Ages are seconds; ``note`` explains ``other`` and ``unreachable``."""
+    """One sink. Ages are seconds; ``note`` explains ``other`` and ``unreachable``.
+
+    ``lag`` is None when it was made from another log, or a longer one: there is nothing to count.
+    """
 
     sink: SinkName
     place: str
@@ -59,7 +66,7 @@ class Status:
     @property
     def healthy(self) -> bool:
         """True when nothing is missing, stalled, of another origin, or parked."""
-        good = ("idle", "following")
+        good = ("idle", "following", "rebuilding")
         return all(s.condition in good and not s.dead_letters for s in self.sinks)
 
 
@@ -93,7 +100,7 @@ def _look(
     versions = _versions(connection)
     found = _checkpoint.load(connection, sink)
     if found is None:
-        advice = f"nothing has been projected there; run: mapfold replay {log}"
+        advice = f"nothing has been projected there; run: {command('replay', log, settings)}"
         return SinkStatus(sink, where, "missing", note=advice, versions=versions)
     moved, beaten = _checkpoint.ages(connection, sink)
     writer = _checkpoint.writer_of(connection, sink)
@@ -104,7 +111,7 @@ def _look(
         condition,
         note,
         found.next_offset,
-        end - found.next_offset,
+        end - found.next_offset if found.log_id == log_id and found.next_offset <= end else None,
         round(moved, 3),
         None if beaten is None else round(beaten, 3),
         writer,
@@ -125,20 +132,20 @@ def _condition(
     writer: str | None,
     beaten: float | None,
 ) -> tuple[Condition, str | None]:
-    advice = f"to make them anew run: mapfold replay {log}"
+    advice = remake(log, settings)
     try:
         _checkpoint.refuse_other_origin(found, sink, where, log_id, settings, advice)
     except ProjectionMismatch as error:
         return "other", str(error)
     if found.next_offset > end:
-        return "other", f"the log has only {end} events; {advice}"
+        return "other", f"the log has only {end:,} events; {advice}"
     if writer == "mapfold tail" and (beaten is None or beaten > STALLED_S):
         return "stalled", "a tail holds it but has not been heard of; look at that process"
+    if writer is not None:
+        return "following" if writer == "mapfold tail" else "rebuilding", None
     if found.next_offset == end:
         return "idle", None
-    if writer is not None:
-        return "following", None
-    return "behind", f"nobody writes it; run: mapfold tail {log}"
+    return "behind", f"nobody writes it; run: {command('tail', log, settings)}"
 
 
 def _versions(connection: Connection) -> dict[str, str]:

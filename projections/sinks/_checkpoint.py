@@ -17,10 +17,12 @@ from projections.postgres.connect import Connection, place_of
 from projections.settings import Settings
 from projections.sink import Checkpoint, SinkName
 
+from ._advice import differences, fitting
 from ._sql import statements
 
 _LOCK_NUMBERS: Final[dict[SinkName, int]] = {"graph": 1, "vectors": 2}
 _MARK: Final = "mapfold"
+_WAS: Final[dict[SinkName, str]] = {"graph": "was", "vectors": "were"}
 LOCK_GRACE_S: Final = 1.0
 """A server notices only after a moment that the last writer's connection has ended."""
 LOCK_POLL_S: Final = 0.02
@@ -56,7 +58,8 @@ def lock_writer(connection: Connection, sink: SinkName) -> None:
             break
         time.sleep(LOCK_POLL_S)
     holder = connection.execute(statements("checkpoint")["lock_holder"], number).fetchone()
-    who = f" ({holder[1]}, server process {holder[0]})" if holder else ""
+    # The writer itself may run on any machine; what the database knows is its session.
+    who = f" ({holder[1]}; PostgreSQL serves it in process {holder[0]})" if holder else ""
     raise ProjectionBusy(
         f"{place_of(connection)}: another rebuild or tail{who} is writing the {sink} there;"
         " wait for it or stop it"
@@ -131,8 +134,8 @@ def advance(
     found = load(connection, sink)
     raise CheckpointMoved(
         f"{place_of(connection)}: the checkpoint of the {sink} was expected at offset"
-        f" {before.next_offset} of log {before.log_id}, but is"
-        f" {f'at {found.next_offset} of log {found.log_id}' if found else 'gone'}: something else"
+        f" {before.next_offset:,} of log {before.log_id}, but is"
+        f" {f'at {found.next_offset:,} of log {found.log_id}' if found else 'gone'}: something else"
         " writes there; stop it, then start again"
     )
 
@@ -193,21 +196,13 @@ def refuse_other_origin(
     """Raise ProjectionMismatch when a checkpoint is of another log or other settings."""
     if found.log_id != log_id:
         raise ProjectionMismatch(
-            f"{where}: the {sink} there were made from log {found.log_id}, not from {log_id};"
-            f" {advice}"
+            f"{where}: the {sink} there {_WAS[sink]} made from log {found.log_id}, not from"
+            f" {log_id}; {advice}"
         )
     if found.fingerprint != settings.fingerprint():
+        options = fitting(found.settings, settings)
         raise ProjectionMismatch(
-            f"{where}: the {sink} there were made with other settings"
-            f" ({', '.join(_differences(found.settings, settings))}); {advice}"
+            f"{where}: the {sink} there {_WAS[sink]} made with other settings"
+            f" ({', '.join(differences(found.settings, settings))});"
+            f"{f' to go on with them add {options};' if options else ''} {advice}"
         )
-
-
-def _differences(before: str, settings: Settings) -> list[str]:
-    old, new = json.loads(before), json.loads(settings.model_dump_json())
-    names = sorted(old.keys() | new.keys())
-    return [
-        f"{name}={old.get(name)} there, {new.get(name)} here"
-        for name in names
-        if old.get(name) != new.get(name)
-    ] or ["made by another version"]

@@ -4,7 +4,7 @@ AGE keeps a graph as a schema, so a graph is *ours* when the schema carries our 
 Anything else under our names is somebody's and is refused, never touched.
 
 The old graph is renamed by the swap, and dropped later, when every transaction that may still have
-its name has ended.
+its name has ended (see `_leaving`).
 """
 
 from collections.abc import Collection
@@ -15,6 +15,7 @@ from psycopg import sql
 from projections.errors import DatabaseError
 from projections.postgres.connect import Connection, place_of
 
+from . import _leaving
 from ._sql import statements
 from .labels import (
     CHANGING_EDGES,
@@ -128,6 +129,15 @@ def drop(connection: Connection, graph: str) -> None:
         with connection.cursor() as cursor:
             cursor.execute("SET LOCAL client_min_messages = warning")
             cursor.execute(statements("graph")["drop_graph"], {"graph": graph})
+
+
+def leave_dropping(connection: Connection, graph: str) -> None:
+    """Have the server drop a graph of ours, if it is there; closes the connection then."""
+    if exists(connection, graph):
+        connection.execute("SET search_path = ag_catalog, public")
+        _leaving.leave_with(
+            connection, statements("graph")["drop_named"].format(graph=sql.Literal(graph))
+        )
 
 
 def analyze(connection: Connection, graph: str) -> None:

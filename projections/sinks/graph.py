@@ -11,7 +11,7 @@ from projections.postgres.connect import Connection, ensure_extension, place_of
 from projections.sink import SinkName
 from projections.view import MapView
 
-from . import _graph_ddl, _readers, _swap_guard
+from . import _graph_ddl, _leaving, _readers, _swap_guard
 from ._sql import statements
 from .graph_rows import GraphChanges, GraphRows, WholeGraph
 from .labels import (
@@ -89,9 +89,10 @@ class GraphSink:
         """
         ensure_extension(connection, "age")
         _graph_ddl.exists(connection, GRAPH)
-        for graph in (OLD_GRAPH, NEXT_GRAPH):
-            with connection.transaction():
-                _graph_ddl.drop(connection, graph)
+        if _leaving.may_drop(connection, self.name):
+            for graph in (OLD_GRAPH, NEXT_GRAPH):
+                with connection.transaction():
+                    _graph_ddl.drop(connection, graph)
 
     def begin(self, connection: Connection) -> None:
         """Create an empty shadow graph, its early indexes with it."""
@@ -133,6 +134,7 @@ class GraphSink:
 
     def lock(self, connection: Connection) -> None:
         """Keep readers away from the graph."""
+        _leaving.wait_for_drop(connection, self.name)
         _graph_ddl.lock(connection, GRAPH)
 
     def swap(self, connection: Connection) -> None:
@@ -141,10 +143,11 @@ class GraphSink:
         _graph_ddl.swap_in(connection, NEXT_GRAPH)
 
     def tidy(self, connection: Connection) -> None:
-        """Drop the replaced graph once its last reader is gone."""
-        if _swap_guard.earlier_transactions_ended(connection):
-            with connection.transaction():
-                _graph_ddl.drop(connection, OLD_GRAPH)
+        """Have the replaced graph dropped once its last reader is gone."""
+        if _swap_guard.earlier_transactions_ended(connection) and _leaving.may_drop(
+            connection, self.name
+        ):
+            _graph_ddl.leave_dropping(connection, OLD_GRAPH)
 
     def _insert(
         self, loader: Loader, connection: Connection, graph: str, label: Label, rows: list[object]

@@ -12,7 +12,7 @@ from projections.postgres.connect import Connection, ensure_extension, place_of
 from projections.sink import SinkName
 from projections.view import MapView
 
-from . import _readers
+from . import _leaving, _readers
 from ._sql import statements
 from .labels import TABLE
 from .loader import InsertLoader, Loader, LoaderName, loader_of
@@ -75,9 +75,11 @@ class VectorSink:
         loader.vectors(connection, _PUBLIC, self._type, changes)
 
     def clear(self, connection: Connection) -> None:
-        """Nothing is ever left behind; refuse early if the name in use is not ours."""
+        """Drop a replaced table that was left; refuse early if the name in use is not ours."""
         self._find_type(connection)
         self._existing(connection)
+        if self._has_old(connection) and _leaving.may_drop(connection, self.name):
+            connection.execute(statements("vectors")["drop_old"])
 
     def begin(self, connection: Connection) -> None:
         """Create an empty shadow table."""
@@ -120,6 +122,7 @@ class VectorSink:
 
     def lock(self, connection: Connection) -> None:
         """Keep readers away from the table."""
+        _leaving.wait_for_drop(connection, self.name)
         if self._existing(connection) is not None:
             connection.execute(_statement("lock", _PUBLIC))
 
@@ -127,18 +130,35 @@ class VectorSink:
         """Put the shadow in the readers' place, open to the same roles."""
         if self._existing(connection) is not None:
             _readers.copy_privileges(connection, _PUBLIC, _SHADOW, table=TABLE)
-            try:
-                connection.execute(_statement("drop", _PUBLIC))
-            except psycopg.errors.DependentObjectsStillExist as error:
-                raise DatabaseError(
-                    f"{place_of(connection)}: something else depends on {TABLE}"
-                    f" ({error.diag.message_detail}); drop it, then run the rebuild again"
-                ) from None
+            self._refuse_dependents(connection)
+            connection.execute(statements("vectors")["put_aside"])
         connection.execute(statements("vectors")["move"])
         self._dimension = self._shadow_dimension
 
     def tidy(self, connection: Connection) -> None:
-        """Nothing: what was replaced went with the swap."""
+        """Have the replaced table dropped."""
+        if self._has_old(connection) and _leaving.may_drop(connection, self.name):
+            _leaving.leave_with(connection, statements("vectors")["drop_old"].format())
+
+    def _refuse_dependents(self, connection: Connection) -> None:
+        try:
+            with connection.transaction(force_rollback=True):
+                connection.execute(_statement("drop", _PUBLIC))
+        except psycopg.errors.DependentObjectsStillExist as error:
+            raise DatabaseError(
+                f"{place_of(connection)}: something else depends on {TABLE}"
+                f" ({error.diag.message_detail}); drop it, then run the rebuild again"
+            ) from None
+
+    def _has_old(self, connection: Connection) -> bool:
+        """Whether there is a replaced table. Refuses somebody else's schema of that name."""
+        row = connection.execute(statements("vectors")["old_state"]).fetchone()
+        if row is not None and not str(row[0]).startswith(_MARK):
+            raise DatabaseError(
+                f"{place_of(connection)}: has a schema mapfold_old that mapfold did not make;"
+                " rename or drop it, or use another database"
+            )
+        return row is not None
 
     def _find_type(self, connection: Connection) -> None:
         ensure_extension(connection, "vector")

@@ -8,9 +8,10 @@ import psycopg
 import pytest
 
 from projections.errors import DatabaseError, ProjectionBusy
-from projections.postgres.connect import Targets, connect_for_cypher
+from projections.postgres.connect import Targets, connect, connect_for_cypher
 from projections.runner import RebuildProgress, rebuild, tail
 from projections.settings import Settings
+from projections.sinks._leaving import wait_for_drop
 from projections.sinks.vectors import VectorSink
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows
@@ -57,6 +58,13 @@ class Reader(threading.Thread):
                 self.answers.append(str(row[0]))
 
 
+def wait_for_drops(targets: Targets) -> None:
+    """Until the server has dropped what a rebuild replaced: its sessions hold these locks."""
+    with connect(targets.graph_url) as connection:
+        wait_for_drop(connection, "graph")
+        wait_for_drop(connection, "vectors")
+
+
 def single_answer(connection: psycopg.Connection, query: str) -> str:
     row = connection.execute(query).fetchone()  # type: ignore[arg-type]
     assert row is not None
@@ -93,8 +101,10 @@ def test_readers_see_one_map_or_the_other_and_never_an_error(
         assert reader.errors == []
         assert set(reader.answers) <= allowed[reader.query]
         assert len(reader.answers) > REBUILDS
+    wait_for_drops(one_database)
     names = pg.execute("SELECT name::text FROM ag_graph").fetchall()
     assert names == [("semantic_map",)]
+    assert pg.execute("SELECT to_regnamespace('mapfold_old')").fetchone() == (None,)
 
 
 def test_a_reader_in_a_long_transaction_keeps_its_graph_and_the_next_rebuild_clears_it(
@@ -113,6 +123,7 @@ def test_a_reader_in_a_long_transaction_keeps_its_graph_and_the_next_rebuild_cle
         graphs = reader.execute("SELECT name::text FROM ag_graph ORDER BY 1").fetchall()
         assert graphs == [("semantic_map",), ("semantic_map_old",)]
     rebuild(log, one_database, SETTINGS)
+    wait_for_drops(one_database)
     with connect_for_cypher(one_database.graph_url) as reader:
         graphs = reader.execute("SELECT name::text FROM ag_graph").fetchall()
         assert graphs == [("semantic_map",)]

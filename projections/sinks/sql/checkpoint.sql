@@ -82,6 +82,9 @@ DELETE FROM mapfold.dead_letter WHERE sink = %(sink)s
 -- One writer per sink and database. The numbers are 'mapf' and the sink's own.
 SELECT pg_try_advisory_lock(1835102310, %(number)s)
 
+-- name: wait_for_lock
+SELECT pg_advisory_xact_lock(1835102310, %(number)s)
+
 -- name: lock_holder
 SELECT a.pid, coalesce(nullif(a.application_name, ''), 'unknown')
 FROM pg_locks l JOIN pg_stat_activity a USING (pid)

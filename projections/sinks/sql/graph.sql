@@ -69,6 +69,10 @@ SELECT ag_catalog.alter_graph(%(graph)s::name, 'RENAME', %(new_name)s::name)
 -- name: drop_graph
 SELECT ag_catalog.drop_graph(%(graph)s::name, true)
 
+-- name: drop_named
+-- The same without a parameter, for a statement that is only sent; the name is one of our constants.
+SELECT ag_catalog.drop_graph({graph}, true)
+
 -- name: indexed
 -- Columns that an index already leads with, and whether it is unique: newer versions of AGE make
 -- some indexes themselves.

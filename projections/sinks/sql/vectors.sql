@@ -36,6 +36,18 @@ DROP TABLE {schema}.detection_embeddings
 -- name: lock
 LOCK TABLE {schema}.detection_embeddings IN ACCESS EXCLUSIVE MODE
 
+-- name: old_state
+-- NULL when there is no such schema, else its comment.
+SELECT coalesce(obj_description(oid, 'pg_namespace'), '') FROM pg_namespace WHERE nspname = 'mapfold_old'
+
+-- name: put_aside
+CREATE SCHEMA mapfold_old;
+COMMENT ON SCHEMA mapfold_old IS 'mapfold: replaced, about to be dropped';
+ALTER TABLE public.detection_embeddings SET SCHEMA mapfold_old
+
+-- name: drop_old
+DROP SCHEMA mapfold_old CASCADE
+
 -- name: move
 ALTER TABLE mapfold.detection_embeddings SET SCHEMA public
 

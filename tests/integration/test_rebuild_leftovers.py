@@ -1,0 +1,96 @@
+"""What a swap replaced is dropped by the server on its own, if need be by the next rebuild."""
+
+from pathlib import Path
+
+import psycopg
+import pytest
+from psycopg import sql
+
+from projections.errors import DatabaseError
+from projections.postgres.connect import Connection, Targets, connect
+from projections.runner import RebuildProgress, rebuild
+from projections.settings import Settings
+from projections.sinks._leaving import may_drop, wait_for_drop
+from tests.logs import walk, write_log
+from tests.rows import all_rows
+
+SETTINGS = Settings()
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    return write_log(tmp_path / "log", walk(60))
+
+
+def wait_for_drops(targets: Targets) -> None:
+    """Until the sessions that drop have ended."""
+    with connect(targets.graph_url) as connection:
+        wait_for_drop(connection, "graph")
+        wait_for_drop(connection, "vectors")
+
+
+def left_over(pg: psycopg.Connection) -> set[str]:
+    """What there is of replaced and of unfinished maps."""
+    rows = pg.execute(
+        "SELECT nspname FROM pg_namespace"
+        " WHERE nspname IN ('semantic_map_old', 'semantic_map_next', 'mapfold_old')"
+    ).fetchall()
+    return {name for (name,) in rows}
+
+
+def nobody_drops(connection: Connection, statement: sql.Composed) -> None:
+    """Stands for a server that was stopped before it got there."""
+    connection.close()
+
+
+def test_nothing_is_left_when_the_server_is_through(
+    log: Path, one_database: Targets, pg: psycopg.Connection
+) -> None:
+    for until in (30, None):
+        rebuild(log, one_database, SETTINGS, until=until)
+    wait_for_drops(one_database)
+    assert left_over(pg) == set()
+
+
+def test_what_the_server_could_not_drop_the_next_rebuild_drops(
+    log: Path, one_database: Targets, pg: psycopg.Connection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rebuild(log, one_database, SETTINGS, until=30)
+    with monkeypatch.context() as patched:
+        patched.setattr("projections.sinks._leaving.leave_with", nobody_drops)
+        rebuild(log, one_database, SETTINGS)
+    rows = all_rows(one_database)
+    assert left_over(pg) == {"semantic_map_old", "mapfold_old"}
+    rebuild(log, one_database, SETTINGS)
+    wait_for_drops(one_database)
+    assert left_over(pg) == set()
+    assert all_rows(one_database) == rows
+
+
+def test_a_rebuild_waits_for_the_drop_before_its_swap_only(
+    log: Path, one_database: Targets
+) -> None:
+    rebuild(log, one_database, SETTINGS, until=30)
+    wait_for_drops(one_database)
+    dropping = connect(one_database.graph_url, autocommit=True)
+    assert may_drop(dropping, "graph")
+    assert may_drop(dropping, "vectors")
+    seen: list[str] = []
+
+    def tell(at: RebuildProgress) -> None:
+        seen.append(at.stage)
+        if at.stage == "swapping":
+            dropping.close()
+
+    rebuild(log, one_database, SETTINGS, progress=tell)
+    assert "tidying" in seen
+    assert dropping.closed
+
+
+def test_a_schema_of_somebody_else_stays(
+    log: Path, one_database: Targets, pg: psycopg.Connection
+) -> None:
+    pg.execute("CREATE SCHEMA mapfold_old")
+    with pytest.raises(DatabaseError, match="schema mapfold_old that mapfold did not make"):
+        rebuild(log, one_database, SETTINGS)
+    assert left_over(pg) == {"mapfold_old"}
