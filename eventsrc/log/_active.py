@@ -38,22 +38,25 @@ class ActiveSegment:
         self.path = segment_path(log, base, ACTIVE)
         self.base = base
         self.committed = base
+        self.size = 0
+        self._temporary = segment_path(log, base, NEW)
+        self._head = file_head(head_metadata(log_id, base))
         self._syncs = policy.syncs
         self._group = GroupBuilder(base, policy, slack)
         self._failure: str | None = None
-        self.size = self._create(segment_path(log, base, NEW), log_id)
-        self._fd = os.open(self.path, os.O_WRONLY | os.O_APPEND)
+        self._fd = -1
 
-    def _create(self, temporary: Path, log_id: str) -> int:
-        data = file_head(head_metadata(log_id, self.base))
-        fd = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+    def create(self) -> None:
+        """Make the file, before the first `write`; events may be taken earlier. Raises OSError."""
+        fd = os.open(self._temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
         try:
-            write_all(fd, data)
+            write_all(fd, self._head)
             sync_file(fd)
         finally:
             os.close(fd)
-        replace_durably(temporary, self.path)
-        return len(data)
+        replace_durably(self._temporary, self.path)
+        self._fd = os.open(self.path, os.O_WRONLY | os.O_APPEND)
+        self.size = len(self._head)
 
     @property
     def next_offset(self) -> int:
@@ -105,10 +108,14 @@ class ActiveSegment:
         self.size += len(head) + len(body) + len(mark)
         self.committed = group.following
 
-    def sync_last_mark(self) -> None:
-        """Make the mark of the last commit survive a power cut. Raises OSError."""
+    def end(self, rest: Group) -> None:
+        """Write the last group, and make the mark of the last commit survive a power cut. Raises
+        LogError, or OSError when it is only the mark."""
+        if rest.following > rest.first:
+            self.write(rest)
         if self._syncs:
             sync_file(self._fd)
+        self.close()
 
     def _check(self) -> None:
         if self._failure is not None:

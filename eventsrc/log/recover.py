@@ -139,7 +139,9 @@ class _Recovery:
         for that carries its id."""
         replaced = segment.sealed and scan.next_offset > scan.base
         if scan.next_offset == 0:
-            ActiveSegment(self._log, self._log_id, 0, GROUP_COMMIT).close()
+            empty = ActiveSegment(self._log, self._log_id, 0, GROUP_COMMIT)
+            empty.create()
+            empty.close()
             replaced = not segment.sealed
         if not replaced:
             segment.path.unlink()

@@ -85,16 +85,17 @@ class LogWriter:
             self._sealer = Sealer(
                 self.path, self.log_id, self.restart.previous_sha256, aside=self._overlap
             )
-            self._begin_segment(self.restart.next_offset)
+            self._active = self._ending = self._next_segment(self.restart.next_offset)
+            self._active.create()
             for base in self.restart.unsealed:
                 self._sealer.submit(base)
         except BaseException:
             self._lock.release()
             raise
 
-    def _begin_segment(self, base: int) -> None:
-        self._active = ActiveSegment(self.path, self.log_id, base, self._fsync, self._commits.slack)
+    def _next_segment(self, base: int) -> ActiveSegment:
         self._begun = time.monotonic_ns()
+        return ActiveSegment(self.path, self.log_id, base, self._fsync, self._commits.slack)
 
     @property
     def next_offset(self) -> int:
@@ -104,7 +105,8 @@ class LogWriter:
     @property
     def durable_offset(self) -> int:
         """Every event below it is synced, and visible to readers."""
-        return self._active.committed
+        ending = self._ending.committed  # all of it is, when it has come to the next one's base
+        return ending if ending < self._active.base else self._active.committed
 
     @property
     def sealing(self) -> Sealing:
@@ -176,19 +178,9 @@ class LogWriter:
         )
 
     def _rotate(self) -> None:
-        finished = self._active
-        self._commits.finish(finished)
-        try:
-            finished.sync_last_mark()
-            self._begin_segment(finished.committed)
-        except OSError as error:
-            raise finished.refuse(
-                f"{self.path}: no new segment at offset {finished.committed}: "
-                f"{error.strerror or error}; every event before it is safe. "
-                "Free space or fix the disk, then start again"
-            ) from error
-        finished.close()
-        self._sealer.submit(finished.base)
+        ending, following = self._active, self._next_segment(self._active.next_offset)
+        self._ending, self._active = ending, following  # first: if this fails, both refuse
+        self._commits.rotate(ending, following, lambda: self._sealer.submit(ending.base))
 
     def close(self) -> None:
         """Commit, seal, let the next writer in. Raises LogError when the last events or the seal
@@ -197,11 +189,13 @@ class LogWriter:
             return
         self._closed = True
         try:
+            self._commits.settle()
             if self._active.waiting:
                 self._commits.finish(self._active)
             self._finish_active()
         finally:
             self._commits.close()
+            self._ending.close()
             self._active.close()
             self._sealer.finish()
             self._lock.release()

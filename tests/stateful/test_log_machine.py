@@ -81,11 +81,20 @@ class LogMachine(RuleBasedStateMachine):
             rotate_events=self.rotate_events,
             overlap=self.overlap,
         )
+        self.base = self.writer._active.base
         self.writer._sealer.finish()  # of what its predecessor left
         assert self.durable <= self.writer.next_offset <= len(self.written)
         self.written = self.written[: self.writer.next_offset]
         self.durable = self.writer.durable_offset
         assert self.durable == len(self.written)
+
+    def let_seal(self) -> None:
+        """Wait for the rotation that was begun, if one was, and for the sealing behind it."""
+        assert self.writer is not None
+        if self.writer._active.base > self.base:
+            self.base = self.writer._active.base
+            self.writer._commits.settle()
+            self.writer._sealer.finish()
 
     def note_durable(self) -> None:
         """What the writer says now: never less than before, never more than was appended."""
@@ -116,7 +125,7 @@ class LogMachine(RuleBasedStateMachine):
     def append(self, key: str, payload: bytes, logged: int) -> None:
         assert self.writer is not None
         offset = self.writer.append(key, payload, logged_ns=logged, stamp_ns=logged // 2)
-        self.writer._sealer.finish()
+        self.let_seal()
         self.written.append(Event(offset, key, logged, logged // 2, payload))
         assert offset == len(self.written) - 1
         self.note_durable()  # a full segment is rotated, which commits
@@ -137,7 +146,7 @@ class LogMachine(RuleBasedStateMachine):
         assert self.durable == len(self.written)
         if rotate:
             self.writer.commit_if_due()  # rotates when the segment is full
-            self.writer._sealer.finish()
+            self.let_seal()
 
     @precondition(lambda self: self.writer is not None)
     @rule()

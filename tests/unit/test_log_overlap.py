@@ -1,5 +1,7 @@
 """Committing beside the thread that appends: the same log, and nothing counts before its sync."""
 
+import contextlib
+import errno
 import os
 import threading
 from collections.abc import Callable
@@ -11,6 +13,7 @@ from hypothesis import strategies as st
 
 from eventsrc.errors import LogError
 from eventsrc.log import ALWAYS, GROUP_COMMIT, LogReader, LogWriter, NewEvent
+from eventsrc.log._active import ActiveSegment
 from eventsrc.log._commits import SLACK
 from eventsrc.log.fsync import FsyncPolicy
 from tests.fixtures_log import BY_HAND, KEY, read_log
@@ -84,6 +87,50 @@ def test_a_disk_that_does_not_keep_up_makes_the_writer_wait(
         late.join(TIMEOUT_S)
         assert not late.is_alive()
     assert len(read_log(log_path)) == 4 + most
+
+
+def test_a_rotation_stops_nobody_and_nothing_counts_before_its_sync(
+    log_path: Path, disk: Disk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with LogWriter(log_path, fsync=FOUR, overlap=True, rotate_events=4) as writer:
+        writer.append_all(new(b"a", b"b", b"c", b"d"))
+        assert writer.sync() == 4
+        slow(disk, monkeypatch)
+        writer.append_all(new(b"e"))  # into the full segment, which ends with it
+        assert disk.asked.acquire(timeout=TIMEOUT_S)
+        writer.append_all(new(b"f", b"g"))
+        assert (writer.next_offset, writer.durable_offset) == (7, 4)
+        assert [e.payload for e in read_log(log_path)] == [b"a", b"b", b"c", b"d"]
+        disk.let_through.release(99)
+        assert writer.sync() == 7
+        assert [e.payload for e in read_log(log_path)] == [b"%c" % c for c in b"abcdefg"]
+    assert [int(path.stem) for path in sorted(log_path.glob("*.mcap"))] == [0, 5]
+
+
+@pytest.mark.parametrize("overlap", [False, True])
+def test_a_next_segment_that_cannot_be_made_ends_the_writer(
+    log_path: Path, overlap: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = LogWriter(log_path, fsync=FOUR, overlap=overlap, rotate_events=4)
+    writer.append_all(new(b"s", b"a", b"f"))
+    with monkeypatch.context() as patch:
+        patch.setattr(ActiveSegment, "create", refuse)
+        with pytest.raises(LogError, match=r"no new segment at offset \d+: No space left"):
+            append_for_ever(writer)
+        with pytest.raises(LogError, match="no new segment"):
+            writer.append(KEY, b"never")
+        kept = writer.durable_offset
+        assert kept >= 4
+        with contextlib.suppress(LogError):
+            writer.close()
+    assert len(read_log(log_path)) == kept
+    with LogWriter(log_path) as again:
+        assert again.next_offset == kept
+
+
+def refuse(_: ActiveSegment) -> None:
+    """A disk that is full."""
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def append_for_ever(writer: LogWriter) -> None:
