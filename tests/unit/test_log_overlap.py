@@ -92,19 +92,19 @@ def test_a_disk_that_does_not_keep_up_makes_the_writer_wait(
 def test_a_rotation_stops_nobody_and_nothing_counts_before_its_sync(
     log_path: Path, disk: Disk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with LogWriter(log_path, fsync=FOUR, overlap=True, rotate_events=4) as writer:
-        writer.append_all(new(b"a", b"b", b"c", b"d"))
-        assert writer.sync() == 4
+    with LogWriter(log_path, fsync=FOUR, overlap=True, rotate_events=3) as writer:
+        writer.append_all(new(b"a", b"b", b"c"))
+        assert writer.sync() == 3
         slow(disk, monkeypatch)
-        writer.append_all(new(b"e"))  # into the full segment, which ends with it
+        writer.append_all(new(b"d"))  # into the full segment, which ends with it
         assert disk.asked.acquire(timeout=TIMEOUT_S)
-        writer.append_all(new(b"f", b"g"))
-        assert (writer.next_offset, writer.durable_offset) == (7, 4)
-        assert [e.payload for e in read_log(log_path)] == [b"a", b"b", b"c", b"d"]
+        writer.append_all(new(b"e", b"f"))
+        assert (writer.next_offset, writer.durable_offset) == (6, 3)
+        assert [e.payload for e in read_log(log_path)] == [b"a", b"b", b"c"]
         disk.let_through.release(99)
-        assert writer.sync() == 7
-        assert [e.payload for e in read_log(log_path)] == [b"%c" % c for c in b"abcdefg"]
-    assert [int(path.stem) for path in sorted(log_path.glob("*.mcap"))] == [0, 5]
+        assert writer.sync() == 6
+        assert [e.payload for e in read_log(log_path)] == [b"%c" % c for c in b"abcdef"]
+    assert [int(path.stem) for path in sorted(log_path.glob("*.mcap"))] == [0, 4]
 
 
 @pytest.mark.parametrize("overlap", [False, True])
