@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from eventsrc.cli._shell import emit, finish, say
+from eventsrc.words import counted
 from projections.postgres.embedded import EmbeddedServer
 from projections.runner import rebuild
 from projections.runner.check import CheckReport
@@ -64,13 +65,14 @@ def start(as_json: JsonOption = False) -> None:
 def stop(as_json: JsonOption = False) -> None:
     """Stop the embedded server, unless another command is using it right now."""
     server = EmbeddedServer()
+    ran = server.running
     still = server.stop(discard_keep=True)
     if as_json:
         emit({"data": str(server.data), "running": still, "kept": False})
     elif still:
         say("another command is using the server; it stops when that command ends")
     else:
-        say("stopped")
+        say("stopped" if ran else "it was not running")
 
 
 @group.command()
@@ -127,15 +129,15 @@ def retry_command(
         done = "rebuilt" if report.rebuilt else f"{len(report.still)} still cannot be folded"
         typer.echo(f"{report.sink}: {report.parked} parked, {done}")
         for letter in report.still:
-            typer.echo(f"  offset {letter.offset}: {letter.reason}")
+            typer.echo(f"  offset {letter.offset:,}: {letter.reason}")
     finish(findings=any(report.still for report in reports))
 
 
 def _tell(reports: list[CheckReport]) -> None:
     for report in reports:
         typer.echo(
-            f"{report.sink}: {report.rows} rows at offset {report.next_offset},"
-            f" {report.differing} differ"
+            f"{report.sink}: {counted(report.rows, 'row')} at offset {report.next_offset:,},"
+            f" {report.differing:,} differ"
         )
         for difference in report.differences:
             typer.echo(
@@ -143,4 +145,4 @@ def _tell(reports: list[CheckReport]) -> None:
                 f" expected {difference.expected}, found {difference.found}"
             )
         if report.differing > len(report.differences):
-            typer.echo(f"  and {report.differing - len(report.differences)} more")
+            typer.echo(f"  and {report.differing - len(report.differences):,} more")

@@ -6,16 +6,16 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from eventsrc.cli._shell import emit, people, say
+from eventsrc.cli._shell import emit, say
 from eventsrc.log import LogReader
 from eventsrc.log.whence import resolve
 from eventsrc.words import counted
-from projections.runner import RebuildProgress, RebuildReport, rebuild
+from projections.runner import RebuildReport, rebuild
 from projections.sink import SinkName
 from projections.sinks.loader import LoaderName
 
+from ._bar import Bar
 from ._options import (
     DbOption,
     SetOption,
@@ -86,7 +86,7 @@ def replay(
     settings = settings_from(settings_file, assignments)
     with LogReader(log) as reader:
         end = resolve(reader, until)
-    with databases(db, vector_db) as targets, _Bar() as bar:
+    with databases(db, vector_db) as targets, Bar() as bar:
         report = rebuild(
             log,
             targets,
@@ -95,7 +95,7 @@ def replay(
             only=only_of(only),
             loader=loader_of(loader),
             hnsw=not no_hnsw,
-            progress=bar.show,
+            progress=lambda at: bar.show(at.stage, at.done, at.total),
         )
     if as_json:
         emit(asdict(report))
@@ -115,35 +115,3 @@ def _tell(log: Path, report: RebuildReport) -> None:
     say(", ".join(counted(counts[f"{word}s"], word) for word in words))
     if report.hnsw is not None:
         say(f"vector search: {report.hnsw.reason}")
-
-
-class _Bar:
-    """A progress bar with rate and time left on a terminal, silence elsewhere."""
-
-    def __init__(self) -> None:
-        self._progress = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]}"),
-            TimeRemainingColumn(),
-            console=people,
-            transient=True,
-            disable=not people.is_terminal,
-        )
-        self._task = self._progress.add_task("folding", total=None, rate="")
-
-    def __enter__(self) -> "_Bar":
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-
-    def show(self, at: RebuildProgress) -> None:
-        """Show where a rebuild is."""
-        speed = self._progress.tasks[0].speed
-        rate = f"{speed:,.0f} events/s" if speed else ""
-        self._progress.update(
-            self._task, description=at.stage, completed=at.done, total=at.total, rate=rate
-        )

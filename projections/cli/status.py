@@ -6,6 +6,7 @@ import typer
 
 from eventsrc.cli._shell import emit, finish, say
 from eventsrc.log import LogInfo, log_info
+from eventsrc.words import counted
 from projections.runner.status import SinkStatus, Status, projection_status
 
 from ._options import (
@@ -56,7 +57,8 @@ def status(
 
 def _tell(info: LogInfo, found: Status) -> None:
     typer.echo(
-        f"log      {info.log_id}: {info.events} events, {info.rejected} rejected, {info.lost} lost"
+        f"log      {info.log_id}: {counted(info.events, 'event')}, {info.rejected:,} rejected,"
+        f" {info.lost:,} lost"
     )
     for sink in found.sinks:
         typer.echo(f"{sink.sink:<8} {_line(sink)}")
@@ -64,14 +66,12 @@ def _tell(info: LogInfo, found: Status) -> None:
             say(f"         {sink.note}")
         for letter in sink.dead_letters:
             run = f" (run {letter.run_id})" if letter.run_id else ""
-            typer.echo(f"         parked: offset {letter.offset}{run}: {letter.reason}")
+            typer.echo(f"         parked: offset {letter.offset:,}{run}: {letter.reason}")
 
 
 def _line(sink: SinkStatus) -> str:
     versions = ", ".join(f"{name} {number}" for name, number in (sink.versions or {}).items())
     if sink.next_offset is None:
         return f"{sink.condition} · {sink.place}" + (f" · {versions}" if versions else "")
-    return (
-        f"{sink.condition} at offset {sink.next_offset}, {sink.lag} behind · {sink.place}"
-        f" · {versions}"
-    )
+    lag = "" if sink.lag is None else f", {sink.lag:,} behind"
+    return f"{sink.condition} at offset {sink.next_offset:,}{lag} · {sink.place} · {versions}"

@@ -13,9 +13,11 @@ import typer
 
 from eventsrc.cli._shell import emit, finish, say
 from eventsrc.endpoints import parse_address
+from eventsrc.log import LogReader
 from eventsrc.words import counted
 from projections.runner import TailProgress, TailReport, tail
 
+from ._bar import Bar
 from ._options import (
     DbOption,
     SetOption,
@@ -59,10 +61,13 @@ def tail_command(
     settings = settings_from(settings_file, assignments)
     address = None if metrics is None else parse_address(metrics, "--metrics")
     progress = TailProgress()
+    with LogReader(log) as reader:
+        end = reader.next_offset
     with (
         _stopped_by_signals() as stop,
         databases(db, vector_db) as targets,
         _metrics(address, progress, log),
+        Bar() as bar,
     ):
         report = tail(
             log,
@@ -73,6 +78,7 @@ def tail_command(
             loader=loader_of(loader),
             stop=stop,
             progress=progress,
+            on_fold=_CatchingUp(log, end, bar, once).show,
             on_trouble=lambda what: _complain(what, progress),
             note=say,
         )
@@ -100,14 +106,33 @@ def _complain(what: str, progress: TailProgress) -> None:
     say(f"mapfold: {what}; trying again")
 
 
+class _CatchingUp:
+    """Shows how far the tail is until it has what was in the log at its start, and says so then."""
+
+    def __init__(self, log: Path, end: int, bar: Bar, once: bool) -> None:
+        self._log, self._end, self._bar = log, end, bar
+        self._once, self._done = once, False
+
+    def show(self, folded: int) -> None:
+        """``folded`` events are through."""
+        if self._done:
+            return
+        self._bar.show("catching up", folded, self._end)
+        if folded >= self._end:
+            self._done = True
+            self._bar.stop()
+            if not self._once:
+                say(f"following {self._log} from offset {folded:,} on; Ctrl-C ends it")
+
+
 def _tell(report: TailReport) -> None:
     say(
-        f"{counted(report.events, 'event')} written in {report.batches}"
+        f"{counted(report.events, 'event')} written in {report.batches:,}"
         f" {'batch' if report.batches == 1 else 'batches'}; the databases are at offset"
-        f" {report.next_offset}"
+        f" {report.next_offset:,}"
     )
     for letter in report.parked:
-        say(f"parked: offset {letter.offset}: {letter.reason}")
+        say(f"parked: offset {letter.offset:,}: {letter.reason}")
 
 
 @contextlib.contextmanager

@@ -21,7 +21,7 @@ from psycopg.rows import TupleRow
 from eventsrc.errors import MisuseError
 from projections.errors import DatabaseError, DatabaseUnavailable, ExtensionMissing
 
-from .embedded import EmbeddedServer
+from .embedded import EmbeddedServer, embedded_log
 
 Connection = psycopg.Connection[TupleRow]
 
@@ -90,7 +90,8 @@ def connect(url: str, *, application: str = "mapfold", autocommit: bool = False)
             connect_timeout=CONNECT_SECONDS,
         )
     except psycopg.OperationalError as error:
-        raise DatabaseUnavailable(f"{place(url)}: {_first_line(error)}; {_advice(error)}") from None
+        told = f"{_first_line(error)}; {_advice(error, url)}"
+        raise DatabaseUnavailable(f"{place(url)}: {told}") from None
 
 
 def connect_for_cypher(url: str, *, application: str = "mapfold query") -> Connection:
@@ -182,7 +183,7 @@ def database_errors(url: str) -> Iterator[None]:
         yield
     except psycopg.OperationalError as error:
         raise DatabaseUnavailable(
-            f"{place(url)}: {_first_line(error)}; {_advice(error)}"
+            f"{place(url)}: {_first_line(error)}; {_advice(error, url)}"
         ) from error
     except psycopg.errors.InsufficientPrivilege as error:
         raise DatabaseError(
@@ -199,8 +200,11 @@ def _missing(name: str, where: str) -> str:
     )
 
 
-def _advice(error: psycopg.OperationalError) -> str:
+def _advice(error: psycopg.OperationalError, url: str) -> str:
     text = str(error)
+    log = embedded_log(url)
+    if log is not None:
+        return f"the embedded server went away (its log: {log}); the next command starts it again"
     if "password" in text or "authentication" in text or "pg_hba" in text:
         return "check user and password in the URL"
     if "does not exist" in text and "database" in text:

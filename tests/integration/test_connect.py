@@ -73,6 +73,15 @@ def test_a_server_that_is_down() -> None:
     assert "database db at 127.0.0.1" in message
 
 
+def test_trouble_with_the_embedded_server_is_not_about_urls(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MAPFOLD_HOME", str(tmp_path))
+    with pytest.raises(DatabaseUnavailable, match=r"embedded server went away .*server\.log") as no:
+        connect(EmbeddedServer(tmp_path).url)
+    assert "--db" not in str(no.value)
+
+
 def test_a_database_that_is_not_there(pg_server: EmbeddedServer) -> None:
     with pytest.raises(DatabaseUnavailable, match=r'"nowhere" does not exist; create it with'):
         connect(pg_server.url_of("nowhere"))

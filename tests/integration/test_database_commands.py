@@ -1,6 +1,8 @@
 """replay, tail, status and db as a person runs them, against an embedded server of their own."""
 
 import os
+import pty
+import shlex
 import shutil
 import signal
 import subprocess
@@ -87,6 +89,76 @@ def test_other_settings_are_refused_with_the_command_to_run(mapfold: Commands, l
     assert "eps_m=1.5 there, 2.0 here" in said.err
     assert f"mapfold replay {log}" in said.err
     assert said.err.count("\n") == 1
+
+
+def advised(said: str) -> list[str]:
+    """The arguments of the command that a message tells to run."""
+    return shlex.split(said[said.rindex("run: mapfold ") :].splitlines()[0])[2:]
+
+
+def test_what_status_advises_works(mapfold: Commands, log: Path) -> None:
+    own = ("--set", "eps_m=0.75", "--set", "min_samples=4")
+    assert advised(mapfold("status", log, *own, code=3).err)[2:] == list(own)
+    mapfold("replay", log, *own, "--until", "20")
+    status = mapfold("status", log, *own, code=3)
+    assert mapfold(*advised(status.err), "--once").code == 0
+    mapfold("status", log, *own)
+
+
+def test_a_refusal_names_the_settings_that_fit(mapfold: Commands, log: Path) -> None:
+    mapfold("replay", log, "--set", "eps_m=0.75")
+    said = mapfold("tail", log, "--once", "--set", "min_samples=4", code=1).err
+    assert "the graph there was made with other settings" in said
+    fitting = said.partition("to go on with them add ")[2].partition(";")[0]
+    assert fitting == "--set eps_m=0.75 --set min_samples=3"
+    mapfold("tail", log, "--once", "--set", "min_samples=4", *fitting.split())
+    assert advised(said) == ["replay", str(log), "--set", "min_samples=4"]
+
+
+def test_another_log_is_not_so_and_so_far_behind(mapfold: Commands, log: Path) -> None:
+    mapfold("replay", log)
+    other = write_log(mapfold.folder / "other", walk(5))
+    said = mapfold("status", other, code=3)
+    assert "graph    other at offset 40 · " in said.out
+    assert "behind" not in said.out
+    assert "the graph there was made from log" in said.err
+    assert "the vectors there were made from log" in said.err
+
+
+def test_db_stop_says_whether_anything_ran(mapfold: Commands) -> None:
+    assert mapfold("db", "stop").err == "it was not running\n"
+    mapfold("db", "start")
+    assert mapfold("db", "stop").err == "stopped\n"
+
+
+def test_a_live_tail_says_when_it_follows(mapfold: Commands, log: Path) -> None:
+    running = subprocess.Popen(
+        [str(PROGRAM), "tail", str(log)], env=dict(mapfold.env), cwd=mapfold.folder,
+        stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        assert running.stderr is not None
+        assert running.stderr.readline() == f"following {log} from offset 40 on; Ctrl-C ends it\n"
+    finally:
+        running.terminate()
+        _, rest = running.communicate(timeout=WAIT_S)
+    assert "the databases are at offset 40" in rest
+
+
+def test_a_tail_that_catches_up_shows_how_far_it_is_on_a_terminal(
+    mapfold: Commands, log: Path
+) -> None:
+    ours, theirs = pty.openpty()
+    with os.fdopen(ours, "rb", buffering=0) as screen:
+        done = subprocess.run(
+            [str(PROGRAM), "tail", str(log), "--once"],
+            env={**mapfold.env, "TERM": "xterm"}, cwd=mapfold.folder, stderr=theirs, check=False,
+        )  # fmt: skip
+        os.close(theirs)
+        shown = screen.read(65_536).decode()
+    assert done.returncode == 0, shown
+    assert "catching up" in shown
+    assert "40/40" in shown
 
 
 def test_roles_are_sql(mapfold: Commands) -> None:

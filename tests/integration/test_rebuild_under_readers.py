@@ -164,7 +164,7 @@ def test_a_rebuild_refuses_to_run_beside_a_tail_and_the_other_way_round(
     refused = []
 
     def try_others(_: object) -> None:
-        with pytest.raises(ProjectionBusy, match=r"\(mapfold (tail|replay), server process \d+\)"):
+        with pytest.raises(ProjectionBusy, match=r"\(mapfold (tail|replay); PostgreSQL"):
             rebuild(log, one_database, SETTINGS)
         with pytest.raises(ProjectionBusy, match="is writing the graph there"):
             tail(log, one_database, SETTINGS, once=True)

@@ -11,6 +11,7 @@ import pytest
 from eventsrc.append import append_payload
 from eventsrc.log import ALWAYS, Event, LogWriter
 from eventsrc.upcast import read_envelope
+from projections.errors import ProjectionBusy
 from projections.postgres.connect import Targets
 from projections.runner import TailProgress, TailReport, rebuild, tail
 from projections.runner.metrics import serving_tail_metrics
@@ -76,7 +77,7 @@ def test_status_tells_the_conditions_apart(tmp_path: Path, one_database: Targets
     assert not status.healthy
     with Tail(log, one_database) as running:
         assert running.progress.wait(20, WAIT_S)
-        assert conditions() == {"idle"}
+        assert conditions() == {"following"}
         assert projection_status(log, one_database, SETTINGS).sinks[0].writer == "mapfold tail"
         with psycopg.connect(one_database.graph_url) as connection:
             connection.execute(
@@ -93,6 +94,43 @@ def test_status_tells_the_conditions_apart(tmp_path: Path, one_database: Targets
         "unreachable",
         "idle",
     ]
+
+
+def test_a_tail_lives_from_its_first_moment_on(tmp_path: Path, one_database: Targets) -> None:
+    """Its first heartbeat is not what an earlier tail left, long ago."""
+    log = write_log(tmp_path / "log", walk(20))
+    tail(log, one_database, SETTINGS, once=True)
+    with psycopg.connect(one_database.graph_url) as connection:
+        connection.execute("UPDATE mapfold.checkpoint SET heartbeat_at = now() - interval '1 hour'")
+    with Tail(log, one_database) as running:
+        assert running.progress.wait(20, WAIT_S)
+        found = projection_status(log, one_database, SETTINGS)
+        assert {s.condition for s in found.sinks} == {"following"}
+        assert found.healthy
+
+
+def test_a_replay_at_work_is_no_tail(tmp_path: Path, one_database: Targets) -> None:
+    log = write_log(tmp_path / "log", walk(20))
+    rebuild(log, one_database, SETTINGS, until=10)
+    seen = []
+
+    def look(_: object) -> None:
+        seen.append({s.condition for s in projection_status(log, one_database, SETTINGS).sinks})
+
+    rebuild(log, one_database, SETTINGS, progress=look)
+    assert seen[0] == {"rebuilding"}
+
+
+def test_who_is_told_to_wait_learns_what_the_number_is(
+    tmp_path: Path, one_database: Targets
+) -> None:
+    log = write_log(tmp_path / "log", walk(5))
+    with Tail(log, one_database) as running:
+        assert running.progress.wait(5, WAIT_S)
+        with pytest.raises(
+            ProjectionBusy, match=r"\(mapfold tail; PostgreSQL serves it in process"
+        ):
+            rebuild(log, one_database, SETTINGS)
 
 
 def test_metrics_of_a_tail(tmp_path: Path, one_database: Targets) -> None:
