@@ -1,10 +1,12 @@
-"""Ending a long-running command: the first SIGINT or SIGTERM asks, the second one insists."""
+"""Ending a long-running command: the first SIGINT or SIGTERM asks, the second one insists; or
+Ctrl-C ends it, but between two steps."""
 
 import contextlib
 import signal
 import threading
 from collections.abc import Iterator
-from types import FrameType
+from types import FrameType, TracebackType
+from typing import Self
 
 
 @contextlib.contextmanager
@@ -33,3 +35,49 @@ def stop_on_signals() -> Iterator[threading.Event]:
         yield stop
     finally:
         restore()
+
+
+class Steps:
+    """A context manager for each step of a work that Ctrl-C may end only between two steps.
+
+    Inside it Ctrl-C is held back until the step is done. A second Ctrl-C does not wait.
+    """
+
+    def __init__(self) -> None:
+        self._busy = False
+        self._asked = False
+
+    def __enter__(self) -> Self:
+        self._busy = True
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
+        self._busy = False
+        if self._asked and error is None:
+            raise KeyboardInterrupt
+
+    def interrupt(self, _number: int, _frame: FrameType | None) -> None:
+        """The handler of SIGINT."""
+        if not self._busy or self._asked:
+            raise KeyboardInterrupt
+        self._asked = True
+
+
+@contextlib.contextmanager
+def ctrl_c_between_steps() -> Iterator[Steps]:
+    """Where Ctrl-C would raise KeyboardInterrupt anywhere, let it do so outside of steps only."""
+    steps = Steps()
+    usual = signal.getsignal(signal.SIGINT)
+    if usual is not signal.default_int_handler:  # ignored, or somebody else's
+        yield steps
+        return
+    signal.signal(signal.SIGINT, steps.interrupt)
+    try:
+        yield steps
+    finally:
+        signal.signal(signal.SIGINT, usual)

@@ -7,6 +7,7 @@ import typer
 
 from eventsrc._zenoh import ZenohOptions, open_session
 from eventsrc.errors import MisuseError
+from eventsrc.keys import check_key
 from eventsrc.sim import DEFAULT_SEED, SimulatedRun, simulate_run
 from eventsrc.sim.publish import publish_run, write_run
 from eventsrc.words import counted
@@ -50,6 +51,7 @@ def simulate(
         raise MisuseError(
             f"--run {run!r}: give a name of 1 to {_LONGEST_NAME} printable characters"
         )
+    check_key(key, "--key")
     simulated = simulate_run(seed, run)
     document = _numbers(simulated)
     if out is not None:

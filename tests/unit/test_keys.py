@@ -1,0 +1,34 @@
+"""Which keys messages can bear."""
+
+import pytest
+
+from eventsrc.errors import MisuseError
+from eventsrc.keys import check_key
+
+
+@pytest.mark.parametrize("key", ["k", "tb/detections", "robot-7/küche/é", "@a/b", "a:b/c.d"])
+def test_a_key(key: str) -> None:
+    assert check_key(key, "--key") == key
+
+
+@pytest.mark.parametrize(
+    ("key", "says"),
+    [
+        ("a b/*", "a pattern for many keys"),
+        ("tb/**", "a pattern for many keys"),
+        ("a$b", "a pattern for many keys"),
+        ("tb/x?y", "a pattern for many keys"),
+        ("a b", "white space"),
+        ("a\tb", "white space"),
+        ("a\x00b", "white space"),
+        ("", "a part of it is empty"),
+        ("/tb", "a part of it is empty"),
+        ("tb//x", "a part of it is empty"),
+        ("mapfold/loss", "mapfold's own"),
+    ],
+)
+def test_no_key(key: str, says: str) -> None:
+    with pytest.raises(MisuseError, match="--key") as caught:
+        check_key(key, "--key")
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
