@@ -1,5 +1,6 @@
 """The log: an append-only directory of MCAP segments, the only truth (docs/log-format.md)."""
 
+from ._lineage import lineage, still_holds
 from .event import Event, NewEvent
 from .findings import Finding
 from .fsync import ALWAYS, GROUP_COMMIT, NEVER, FsyncPolicy, parse_fsync
@@ -29,8 +30,10 @@ __all__ = [
     "Unreadable",
     "Verification",
     "follow",
+    "lineage",
     "log_info",
     "parse_fsync",
     "recover_log",
+    "still_holds",
     "verify_log",
 ]

@@ -1,15 +1,18 @@
 """The cache of snapshots beside a log: ``<log>.snapshots/<fingerprint>-<offset>.map``.
 
 Files appear whole (written beside, then renamed) and are never changed. Anything that goes wrong
-with the cache is a note and a slower fold, never an error. It keeps a few snapshots for each
+with the cache is a note and a slower fold, never an error; a snapshot of events that the log has
+lost since, by recovery or deletion, is not used. It keeps a few snapshots for each
 setting: the newest, and others spread out below it.
 """
 
 import os
 import re
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
+from eventsrc.log import lineage
 from projections.geometry import Neighbourhood
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
@@ -34,6 +37,7 @@ class SnapshotCache:
         neighbourhood: Neighbourhood | None = None,
     ) -> None:
         self.folder = log.with_name(f"{log.name}.snapshots")
+        self._lineage = partial(lineage, log)
         self._log_id = log_id
         self._settings = settings
         self._note = note
@@ -55,7 +59,9 @@ class SnapshotCache:
             path = self._path(offset)
             try:
                 data = path.read_bytes()
-                found = restore(data, self._settings, self._log_id, self._neighbourhood)
+                found = restore(
+                    data, self._settings, self._log_id, self._neighbourhood, self._lineage
+                )
             except (OSError, SnapshotRefused) as error:
                 self._note(f"{path}: this snapshot is not used: {error}; it is safe to delete")
                 self._unsound.add(path)
@@ -73,7 +79,8 @@ class SnapshotCache:
         try:
             self.folder.mkdir(exist_ok=True)
             if not path.exists() or path in self._unsound:
-                beside.write_bytes(snapshot(semantic_map, view, self._log_id))
+                segments = self._lineage(semantic_map.next_offset)
+                beside.write_bytes(snapshot(semantic_map, view, self._log_id, segments))
                 beside.replace(path)
                 self._thin_out()
         except OSError as error:

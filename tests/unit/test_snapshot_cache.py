@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from eventsrc.log import LogReader, LogWriter
+from eventsrc.log import ALWAYS, LogReader, LogWriter, recover_log
 from projections import folding
 from projections.digest import map_digest
 from projections.folding import fold_log, fold_log_cached
@@ -175,6 +175,41 @@ def test_few_are_kept_the_newest_among_them(log: Path) -> None:
 def test_a_short_fold_leaves_nothing_behind(log: Path) -> None:
     _digest(log, 60, [])
     assert not log.with_name("log.snapshots").exists()
+
+
+@pytest.mark.usefixtures("eager")
+def test_a_snapshot_of_events_that_the_log_has_lost_is_not_used(tmp_path: Path) -> None:
+    """Else the map would show what nobody can read any more."""
+    log = tmp_path / "log"
+    with LogWriter(log, fsync=ALWAYS, rotate_events=20) as writer:
+        for document in _documents(60):
+            writer.append(KEY, payload(document))
+    notes: list[str] = []
+    before = _digest(log, 60, notes)
+    assert _digest(log, 60, notes) == before
+    assert notes == []
+    middle = sorted(log.glob("*.mcap"))[1]
+    data = bytearray(middle.read_bytes())
+    data[len(data) // 3] ^= 1
+    middle.write_bytes(data)
+    assert recover_log(log).segments[0].gaps
+    after = _digest(log, 60, notes)
+    assert after == _plain_digest(log, 60) != before
+    assert "the log has lost events since it was made" in notes[0]
+
+
+@pytest.mark.usefixtures("eager")
+def test_a_snapshot_outlives_the_sealing_of_its_segment(tmp_path: Path) -> None:
+    path = tmp_path / "growing"
+    notes: list[str] = []
+    with LogWriter(path, fsync=ALWAYS) as writer:
+        for document in _documents(30):
+            writer.append(KEY, payload(document))
+        _digest(path, 30, notes)
+    with LogReader(path) as reader:
+        cache = SnapshotCache(path, reader.log_id, Settings(), notes.append)
+        assert cache.latest(30) is not None
+    assert notes == []
 
 
 def test_restore_refuses_other_settings() -> None:
