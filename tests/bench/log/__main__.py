@@ -40,19 +40,21 @@ def bench_record(folder: Path, seconds: float, rate: float) -> None:
     """Through Zenoh at a pace and as fast as it goes, without Zenoh, and bare loops around it."""
     payloads = Payloads()
     short = min(seconds, 5)
-    with fresh(folder, "plain") as path:
-        before = append_plain(path, payloads, short)
+    loops = Loops(folder, payloads, short)
+    loops.run(GROUP_COMMIT.max_events)
     with fresh(folder, "recorded") as path:
         say_recording(f"recorded for {seconds:.0f} s", record(path, GROUP_COMMIT, rate, seconds))
     with fresh(folder, "recorded") as path:
         fastest = record(path, GROUP_COMMIT, UNPACED, seconds / 2)
-    with fresh(folder, "plain") as path:
-        after = append_plain(path, payloads, short)
+    together = max(GROUP_COMMIT.max_events, fastest.recorded // fastest.syncs)
+    loops.run(GROUP_COMMIT.max_events)
+    loops.run(together)
     say_recording(f"as fast as it goes for {seconds / 2:.0f} s", fastest)
     say("  segments left to seal, and how long that took", sealing(fastest), "")
-    plain = max(before, after)  # whichever the disk disturbed less: the harder to compare with
+    say("  events a sync of the recorder", f"{together:,}", "")
+    plain = max(loops.per_s)  # whichever the disk disturbed least: the hardest to compare with
     say("bare file loop / recording as fast as it goes", f"{plain / fastest.per_s:.2f}", "≤ 4")
-    say("  bare file loop before and after", f"{before:,.0f} {after:,.0f}/s", "")
+    say("  the loops, the last with as few syncs as the recorder", str(loops), "")
     with fresh(folder, "plain") as path:
         subscribed = subscribe_plain(path, 2 * short)
     say("  bare file loop / bare Zenoh subscriber", f"{plain / subscribed:.2f}", "")
@@ -60,6 +62,25 @@ def bench_record(folder: Path, seconds: float, rate: float) -> None:
         appended, sealed = append_log(path, payloads, short)
     say("  bare file loop / LogWriter alone", f"{plain / appended:.2f}", "")
     say("  bare file loop / LogWriter alone, sealed", f"{plain / sealed:.2f}", "")
+
+
+class Loops:
+    """Bare loops, one after the other: events a second."""
+
+    def __init__(self, folder: Path, payloads: Payloads, seconds: float) -> None:
+        self._folder = folder
+        self._payloads = payloads
+        self._seconds = seconds
+        self.per_s: list[float] = []
+
+    def run(self, events_a_sync: int) -> None:
+        """One more."""
+        with fresh(self._folder, "plain") as path:
+            per_s = append_plain(path, self._payloads, self._seconds, events_a_sync)
+        self.per_s.append(per_s)
+
+    def __str__(self) -> str:
+        return " ".join(f"{per_s:,.0f}" for per_s in self.per_s) + "/s"
 
 
 def say_recording(what: str, done: Recording) -> None:

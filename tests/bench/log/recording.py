@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from eventsrc._zenoh import ZenohOptions, open_session
-from eventsrc.log import LogWriter, log_info
+from eventsrc.log import LogWriter, _active, log_info
 from eventsrc.log.fsync import FsyncPolicy
 from eventsrc.recorder import Recorder
 
@@ -73,12 +73,13 @@ def said(process: "subprocess.Popen[str]") -> str:
 @dataclass(frozen=True)
 class Recording:
     """``lost`` are messages published and not recorded; the rate is events a second, from the first
-    one's logging to the last one's. ``unsealed`` segments were left when that was done, and sealing
-    them took ``sealing_s`` more."""
+    one's logging to the last one's. ``syncs`` are those of events; ``unsealed`` segments were left
+    when that was done, and sealing them took ``sealing_s`` more."""
 
     published: int
     recorded: int
     per_s: float
+    syncs: int
     unsealed: int
     sealing_s: float
 
@@ -118,6 +119,7 @@ def record(log: Path, fsync: FsyncPolicy, rate: float, seconds: float) -> Record
     with program(ROUTER) as router:
         endpoint = said(router)
         with (
+            counted_syncs() as syncs,
             LogWriter(log, fsync=fsync, overlap=True) as writer,
             open_session(ZenohOptions(connect=(endpoint,)), mode="client") as session,
         ):
@@ -131,7 +133,25 @@ def record(log: Path, fsync: FsyncPolicy, rate: float, seconds: float) -> Record
             unsealed = len(list(log.glob("*.active"))) - 1
             begun = time.perf_counter()
     sealing_s = time.perf_counter() - begun
-    return Recording(until.published, report.recorded, _logged_per_s(log), unsealed, sealing_s)
+    per_s = _logged_per_s(log)
+    return Recording(until.published, report.recorded, per_s, len(syncs), unsealed, sealing_s)
+
+
+@contextmanager
+def counted_syncs() -> Iterator[list[int]]:
+    """Grows by one with each sync of a growing segment in this process; few are not of events."""
+    syncs: list[int] = []
+    real = _active.sync_file
+
+    def sync_file(fd: int) -> None:
+        real(fd)
+        syncs.append(fd)
+
+    _active.sync_file = sync_file  # type: ignore[attr-defined]
+    try:
+        yield syncs
+    finally:
+        _active.sync_file = real  # type: ignore[attr-defined]
 
 
 def subscribe_plain(path: Path, seconds: float) -> float:
