@@ -8,6 +8,7 @@ Messages name host, port and database, never a password.
 """
 
 import contextlib
+import logging
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -24,6 +25,10 @@ from projections.errors import DatabaseError, DatabaseUnavailable, ExtensionMiss
 from .embedded import EmbeddedServer, embedded_log
 
 Connection = psycopg.Connection[TupleRow]
+
+# What goes wrong comes as an exception and is told once, in our words. Without a handler Python
+# would print what psycopg and its pool log about it too.
+logging.getLogger("psycopg").addHandler(logging.NullHandler())
 
 CONNECT_SECONDS: Final = 10
 _PACKAGES: Final[Mapping[str, str]] = {"age": "Apache AGE", "vector": "pgvector"}

@@ -74,6 +74,11 @@ class Answerer:
             return {"objects": self._pools.on_graph(lambda c: objects_near(c, x, y, radius))}
         raise QuestionError(f"no state called {what!r}; there are places and objects")
 
+    def health(self) -> dict[str, str]:
+        """``{"status": "ok"}``. Raises DatabaseError when questions cannot be answered now."""
+        self._pools.check()
+        return {"status": "ok"}
+
 
 def refusal(error: MapfoldError) -> tuple[int, dict[str, Any]]:
     """An HTTP status and the error as JSON."""

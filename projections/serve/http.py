@@ -12,7 +12,9 @@ from typing import Any
 import uvicorn
 from fastapi import FastAPI, Query, Request
 from fastapi.concurrency import run_in_threadpool
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
 
 from eventsrc.errors import MapfoldError, TransportError
 from projections.errors import QuestionError
@@ -29,17 +31,29 @@ _QUESTION = {
 }
 
 
+_REFUSED: dict[int | str, dict[str, Any]] = {
+    status: {
+        "description": text,
+        "content": {
+            "application/json": {"example": {"error": {"kind": kind, "message": "what and why"}}}
+        },
+    }
+    for status, text, kind in (
+        ("4XX", "A question that cannot be answered, or too many of them", "bad_question"),
+        ("5XX", "The database cannot be asked just now", "database"),
+    )
+}
 _DRAINED = 8
 
 
 def create_app(answerer: Answerer) -> FastAPI:
     """The ASGI application; it owns nothing, so closing the pools is its maker's business."""
-    app = FastAPI(title="mapfold", summary="Where is the robot, and what stands near a pose?")
-
-    @app.exception_handler(MapfoldError)
-    def refuse(_: Request, error: MapfoldError) -> JSONResponse:
-        status, document = refusal(error)
-        return JSONResponse(document, status)
+    app = FastAPI(
+        title="mapfold",
+        summary="Where is the robot, and what stands near a pose?",
+        responses=_REFUSED,
+    )
+    _refuse_in_our_words(app)
 
     @app.post(
         "/relocalize", summary="Ranked Places, a pose and a confidence", openapi_extra=_QUESTION
@@ -58,11 +72,34 @@ def create_app(answerer: Answerer) -> FastAPI:
     def state(what: str, x: float, y: float, radius: float = DEFAULT_RADIUS_M) -> dict[str, Any]:
         return answerer.state(what, {"x": str(x), "y": str(y), "radius": str(radius)})
 
-    @app.get("/health", summary="200 while the service answers")
+    @app.get("/health", summary="200 while questions can be answered, else 503")
     def health() -> dict[str, str]:
-        return {"status": "ok"}
+        return answerer.health()
 
     return app
+
+
+def _refuse_in_our_words(app: FastAPI) -> None:
+    """Every refusal has the same form, whoever finds the question wrong."""
+
+    @app.exception_handler(MapfoldError)
+    def refuse(_: Request, error: MapfoldError) -> JSONResponse:
+        status, document = refusal(error)
+        return JSONResponse(document, status)
+
+    @app.exception_handler(RequestValidationError)
+    def refuse_parameter(_: Request, error: RequestValidationError) -> JSONResponse:
+        first = error.errors()[0]
+        found = "missing" if first["type"] == "missing" else repr(first["input"])
+        said = f"{first['loc'][-1]} is {found}; {first['msg'].lower()}"
+        status, document = refusal(QuestionError(said))
+        return JSONResponse(document, status)
+
+    @app.exception_handler(HTTPException)
+    def refuse_path(request: Request, error: HTTPException) -> JSONResponse:
+        said = f"{request.method} {request.url.path}: {error.detail}; /docs tells what there is"
+        _, document = refusal(QuestionError(said))
+        return JSONResponse(document, error.status_code, headers=error.headers)
 
 
 async def _limited(request: Request, most: int) -> bytes:

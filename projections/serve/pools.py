@@ -1,30 +1,52 @@
 """Connection pools to the live databases, ready for searching.
 
-A connection that the server has dropped is noticed when it is used: the question is asked once more
-on a fresh one, so a restart of the database costs no answer.
+A connection that the server has dropped is noticed when it is used. Then the server is brought
+back if it is ours, waited for a little if not, and the question is asked once more on a fresh
+connection; so a restart of the database costs no answer. Of a server that stays away questions hear
+at once.
 """
 
 import contextlib
+import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Self, TypeVar
+from typing import Final, Self, TypeVar
 
 from psycopg_pool import ConnectionPool, PoolTimeout
 
-from projections.errors import DatabaseUnavailable
-from projections.postgres.connect import CONNECT_SECONDS, Connection, Targets, connect, place
+from projections.errors import DatabaseUnavailable, ProjectionMissing
+from projections.postgres.connect import Connection, Targets, connect, database_errors, place
 from projections.queries.relocalize import fetch, prepare_graph, prepare_vectors
 from projections.relocalize import Candidates, Crop
+from projections.sink import SinkName
+from projections.sinks import _checkpoint
+
+from .outage import Outage
 
 Result = TypeVar("Result")
 
+FIRST_WAIT_S: Final = 9.0
+LAST_WAIT_S: Final = 1.0
+RETRY_S: Final = 0.1
+GIVE_UP_S: Final = 0.5
+"""Left alone a pool tries again after ever longer pauses, minutes in the end; so it gives up soon,
+and the next question makes it try."""
+
+
+class _NoneFreeError(DatabaseUnavailable):
+    """Every connection of the pool was in use for too long."""
+
 
 class Pools:
-    """One pool when graph and vectors share a database, else two. Use in a ``with`` block."""
+    """One pool when graph and vectors share a database, else two. Use in a ``with`` block.
 
-    def __init__(self, targets: Targets, size: int) -> None:
-        for url in (targets.graph_url, targets.vector_url):
-            connect(url).close()  # a clear error at once, where a pool would try on in silence
-        self._targets = targets
+    ``tell`` gets a line when a database goes away and one when it is back.
+    """
+
+    def __init__(
+        self, targets: Targets, size: int, tell: Callable[[str], None] = lambda _: None
+    ) -> None:
+        self._targets, self._size, self._outage = targets, size, Outage(tell)
+        self.check()  # a clear error at once, where a pool would try on in silence
         self._vectors = _pool(targets.vector_url, size, self._prepare_vectors)
         self._graph = self._vectors
         if not targets.one_database:
@@ -34,42 +56,75 @@ class Pools:
         prepare_vectors(connection)
         prepare_graph(connection)
 
+    def check(self) -> None:
+        """Bring the server back if it is ours and died. Raises DatabaseError unless there is a map.
+
+        Asked on connections of its own, so that an answer says how things are now.
+        """
+        self._targets.revive()
+        _see("graph", self._targets.graph_url)
+        _see("vectors", self._targets.vector_url)
+
     def candidates(self, crops: Sequence[Crop]) -> Candidates:
         """`projections.queries.relocalize.fetch` over pooled connections."""
-        return self._twice(lambda: self._candidates(crops))
+        return self._ask(lambda wait_s: self._candidates(crops, wait_s))
 
     def on_graph(self, ask: Callable[[Connection], Result]) -> Result:
         """Ask the graph's database something."""
 
-        def once() -> Result:
-            with self._borrow(self._graph, self._targets.graph_url) as connection:
+        def once(wait_s: float) -> Result:
+            with self._borrow(self._graph, self._targets.graph_url, wait_s) as connection:
                 return ask(connection)
 
-        return self._twice(once)
+        return self._ask(once)
 
-    def _candidates(self, crops: Sequence[Crop]) -> Candidates:
-        with self._borrow(self._vectors, self._targets.vector_url) as vectors:
+    def _candidates(self, crops: Sequence[Crop], wait_s: float) -> Candidates:
+        with self._borrow(self._vectors, self._targets.vector_url, wait_s) as vectors:
             if self._graph is self._vectors:
                 return fetch(vectors, vectors, crops)
-            with self._borrow(self._graph, self._targets.graph_url) as graph:
+            with self._borrow(self._graph, self._targets.graph_url, wait_s) as graph:
                 return fetch(vectors, graph, crops)
 
-    def _twice(self, ask: Callable[[], Result]) -> Result:
+    def _ask(self, ask: Callable[[float], Result]) -> Result:
+        if self._outage.is_on:
+            self._mend()
         try:
-            return ask()
-        except DatabaseUnavailable:
-            for pool in {self._vectors, self._graph}:
-                pool.check()
-            return ask()
+            return ask(FIRST_WAIT_S)
+        except _NoneFreeError:  # too much to do, or away for all of that time
+            self._mend()
+            return ask(LAST_WAIT_S)
+        except DatabaseUnavailable as error:
+            self._outage.begin(error)
+            self._mend()
+            return ask(FIRST_WAIT_S)
+
+    def _mend(self) -> None:
+        """Have the server back, or raise what is wrong with it."""
+        while True:
+            try:
+                self.check()
+            except DatabaseUnavailable as error:
+                self._outage.begin(error)
+                if not self._outage.worth_waiting:
+                    raise
+                time.sleep(RETRY_S)
+            else:
+                break
+        for pool in {self._vectors, self._graph}:
+            pool.check()
+        self._outage.end()
 
     @contextlib.contextmanager
-    def _borrow(self, pool: "ConnectionPool[Connection]", url: str) -> Iterator[Connection]:
+    def _borrow(
+        self, pool: "ConnectionPool[Connection]", url: str, wait_s: float
+    ) -> Iterator[Connection]:
         try:
-            with pool.connection(timeout=CONNECT_SECONDS) as connection:
+            with pool.connection(timeout=wait_s) as connection, database_errors(url):
                 yield connection
         except PoolTimeout:
-            raise DatabaseUnavailable(
-                f"{place(url)}: no connection within {CONNECT_SECONDS} s; is the server running?"
+            raise _NoneFreeError(
+                f"{place(url)}: none of the {self._size} connections came free within"
+                f" {FIRST_WAIT_S + LAST_WAIT_S:.0f} s; ask again later, or give --workers more"
             ) from None
 
     def close(self) -> None:
@@ -84,6 +139,19 @@ class Pools:
         self.close()
 
 
+def _see(sink: SinkName, url: str) -> None:
+    """Raise DatabaseError unless the server answers and has a map."""
+    with (
+        connect(url, application="mapfold serve", autocommit=True) as connection,
+        database_errors(url),
+    ):
+        if _checkpoint.load(connection, sink) is None:
+            raise ProjectionMissing(
+                f"{place(url)}: no {sink} there: nothing has been projected yet; run mapfold"
+                " replay LOG"
+            )
+
+
 def _pool(
     url: str, size: int, prepare: Callable[[Connection], None]
 ) -> "ConnectionPool[Connection]":
@@ -93,5 +161,6 @@ def _pool(
         max_size=size,
         open=True,
         configure=prepare,
+        reconnect_timeout=GIVE_UP_S,
         kwargs={"autocommit": True, "application_name": "mapfold serve"},
     )

@@ -1,14 +1,8 @@
 """Whatever dies while a tail is at work, the end equals a rebuild, row by row."""
 
-import contextlib
 import json
-import os
-import select
-import shutil
-import signal
 import subprocess
 import sys
-import tempfile
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -19,7 +13,7 @@ import psycopg
 import pytest
 
 from projections.errors import CheckpointMoved, DatabaseUnavailable
-from projections.postgres.connect import Connection, Targets, connect, ensure_extension
+from projections.postgres.connect import Connection, Targets, connect
 from projections.postgres.embedded import EmbeddedServer
 from projections.runner import TailProgress, TailReport, rebuild, tail
 from projections.settings import Settings
@@ -27,6 +21,7 @@ from projections.sink import Checkpoint, SinkName
 from projections.sinks import _checkpoint
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows
+from tests.servers import kill_postgres, server_to_kill
 
 SETTINGS = Settings()
 WAIT_S = 120.0
@@ -55,34 +50,8 @@ def test_killed_between_any_two_statements(
 @pytest.fixture
 def own_server() -> Iterator[EmbeddedServer]:
     """A server that a test may kill."""
-    home = Path(tempfile.mkdtemp(prefix="mapfold-test-kill-"))
-    server = EmbeddedServer(home)
-    try:
-        with server, connect(server.url, autocommit=True) as connection:
-            ensure_extension(connection, "age")
-            ensure_extension(connection, "vector")
-            connection.close()
-            yield server
-    finally:
-        server.stop()
-        shutil.rmtree(home, ignore_errors=True)
-
-
-def kill_postgres(server: EmbeddedServer) -> None:
-    """SIGKILL to the postmaster; returns when all of its sessions have ended.
-
-    Each notices by itself, some later than others, and serves its client until then.
-    """
-    with psycopg.connect(server.url, autocommit=True) as witness, contextlib.ExitStack() as stack:
-        sessions = []
-        for (pid,) in witness.execute("SELECT pid FROM pg_stat_activity").fetchall():
-            sessions.append(os.pidfd_open(pid))
-            stack.callback(os.close, sessions[-1])
-        os.kill(int((server.data / "postmaster.pid").read_text().split()[0]), signal.SIGKILL)
-        while sessions:
-            ended, _, _ = select.select(sessions, [], [], WAIT_S)
-            assert ended, "a session outlives its server"
-            sessions = [session for session in sessions if session not in ended]
+    with server_to_kill() as server:
+        yield server
 
 
 def test_postgres_itself_is_killed_again_and_again(

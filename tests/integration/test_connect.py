@@ -1,6 +1,8 @@
 """Which database a command uses, and the one line it says when that database fails it."""
 
 import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -80,6 +82,31 @@ def test_trouble_with_the_embedded_server_is_not_about_urls(
     with pytest.raises(DatabaseUnavailable, match=r"embedded server went away .*server\.log") as no:
         connect(EmbeddedServer(tmp_path).url)
     assert "--db" not in str(no.value)
+
+
+CUT = """
+import sys
+from projections.postgres.connect import connect, database_errors
+from projections.errors import DatabaseUnavailable
+url = sys.argv[1]
+with connect(url, autocommit=True) as killer, connect(url) as connection:
+    try:
+        with database_errors(url), connection.pipeline():
+            connection.execute("SELECT 1")
+            killer.execute("SELECT pg_terminate_backend(%s, 10000)", [connection.info.backend_pid])
+            connection.execute("SELECT 2")
+    except DatabaseUnavailable as error:
+        print(error)
+"""
+
+
+def test_a_lost_connection_is_told_once_and_by_us(pg_url: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", CUT, pg_url], capture_output=True, text=True, check=True
+    )
+    assert done.stderr == ""
+    assert done.stdout.count("\n") == 1
+    assert done.stdout.startswith("database ")
 
 
 def test_a_database_that_is_not_there(pg_server: EmbeddedServer) -> None:

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -15,7 +16,9 @@ import pytest
 
 from eventsrc._zenoh import Session, ZenohOptions, open_session
 from eventsrc.errors import TransportError
-from projections.postgres.connect import Targets, connect
+from projections.errors import DatabaseUnavailable, ProjectionMissing
+from projections.postgres.connect import Connection, Targets, connect
+from projections.postgres.embedded import EmbeddedServer
 from projections.queries.relocalize import relocalize
 from projections.relocalize import parse_question
 from projections.runner import rebuild
@@ -25,6 +28,7 @@ from projections.serve.limits import Bucket, TooMuchError
 from projections.settings import Settings
 from tests.envelopes import detection
 from tests.logs import walk, write_log
+from tests.servers import kill_postgres, server_to_kill
 
 DEADLINE_S = 30.0
 OTHER_SPACE = json.dumps([detection("x", [1.0, 2.0])]).encode()
@@ -225,6 +229,10 @@ class TestHttp:
             ("/relocalize?method=magic", question()),
             ("/state/secrets?x=0&y=0", None),
             ("/state/places?x=nan&y=0", None),
+            ("/relocalize?top=abc", question()),
+            ("/relocalize?top=0", question()),
+            ("/state/places", None),
+            ("/state/places?x=here&y=0", None),
         ],
     )
     def test_a_bad_question_is_400_and_says_why(
@@ -233,6 +241,16 @@ class TestHttp:
         status, document = fetch(f"{http}{path}", data)
         assert status == 400
         assert document["error"]["kind"] == "bad_question"
+
+    def test_what_is_not_there_is_refused_in_the_same_form(self, http: str) -> None:
+        status, document = fetch(f"{http}/nothing")
+        assert (status, document["error"]["kind"]) == (404, "bad_question")
+        status, document = fetch(f"{http}/relocalize")
+        assert (status, document["error"]["kind"]) == (405, "bad_question")
+
+    def test_it_promises_no_refusal_that_it_never_gives(self, http: str) -> None:
+        _, document = fetch(f"{http}/openapi.json")
+        assert "422" not in document["paths"]["/relocalize"]["post"]["responses"]
 
     def test_state_near_a_pose(self, http: str) -> None:
         status, found = fetch(f"{http}/state/places?x=0&y=0&radius=1000")
@@ -278,3 +296,98 @@ def test_the_command_serves_until_sigterm(endpoint: str, targets: Targets) -> No
         program.wait()
         if program.stderr is not None:
             program.stderr.close()
+
+
+class TestKilledServer:
+    """PostgreSQL dies under the service."""
+
+    @pytest.fixture
+    def server(self, tmp_path: Path) -> Iterator[EmbeddedServer]:
+        with server_to_kill() as server:
+            targets = Targets(server.url, server.url)
+            rebuild(write_log(tmp_path / "log", walk(60, seed=3)), targets, Settings())
+            yield server
+
+    def test_our_own_is_started_again(self, server: EmbeddedServer) -> None:
+        told: list[str] = []
+        with Pools(Targets(server.url, server.url, server), 4, told.append) as pools:
+            answerer = Answerer(pools, per_second=10_000.0)
+            before = answerer.relocalize(question(), {})
+            for _ in range(2):
+                kill_postgres(server)
+                assert answerer.relocalize(question(), {}) == before
+            kill_postgres(server)
+            assert answerer.health() == {"status": "ok"}
+            assert answerer.relocalize(question(), {}) == before
+        assert [line.endswith("trying again") for line in told[:4]] == [True, False, True, False]
+
+    def test_another_is_waited_for_a_little_and_missed_at_once_after_that(
+        self, server: EmbeddedServer, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("projections.serve.outage.PATIENCE_S", 0.5)
+        told: list[str] = []
+        with Pools(Targets(server.url, server.url), 4, told.append) as pools:
+            answerer = Answerer(pools, per_second=10_000.0)
+            answerer.relocalize(question(), {})
+            kill_postgres(server)
+            with serving(create_app(answerer), "127.0.0.1", 0) as port:
+                for path, data in (("relocalize", question()), ("health", None)):
+                    status, document = fetch(f"http://127.0.0.1:{port}/{path}", data)
+                    assert (status, document["error"]["kind"]) == (503, "database")
+            begun = time.monotonic()
+            with pytest.raises(DatabaseUnavailable, match="start the server"):
+                answerer.relocalize(question(), {})
+            assert time.monotonic() - begun < 5.0
+            assert len(told) == 1
+            server.start()
+            assert answerer.relocalize(question(), {})["places"]
+        assert told[1:] == ["the database answers again"]
+
+
+def test_connections_all_in_use_are_no_outage(
+    targets: Targets, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("FIRST_WAIT_S", "LAST_WAIT_S"):
+        monkeypatch.setattr(f"projections.serve.pools.{name}", 0.5)
+    told: list[str] = []
+    with Pools(targets, 1, told.append) as pools:
+
+        def ask_too(_: Connection) -> None:
+            with pytest.raises(DatabaseUnavailable, match="none of the 1 connections came free"):
+                pools.on_graph(lambda _: None)
+
+        pools.on_graph(ask_too)
+    assert told == []
+
+
+def test_it_does_not_begin_to_answer_without_a_map(one_database: Targets) -> None:
+    with pytest.raises(ProjectionMissing, match="run mapfold replay"):
+        Pools(one_database, 1)
+
+
+def test_people_hear_of_a_cut_connection_in_our_words_only(targets: Targets) -> None:
+    program = subprocess.Popen(
+        [
+            *(sys.executable, "-m", "projections.cli", "serve", "--no-zenoh"),
+            *("--http", "127.0.0.1:0", "--db", targets.graph_url),
+        ],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert program.stderr is not None
+        url = program.stderr.readline().split()[1].rstrip(",")
+        assert fetch(f"{url}/relocalize", question())[0] == 200
+        with connect(targets.graph_url, autocommit=True) as killer:
+            killer.execute(
+                "SELECT pg_terminate_backend(pid, 10000) FROM pg_stat_activity"
+                " WHERE application_name = 'mapfold serve' AND datname = current_database()"
+            )
+        assert fetch(f"{url}/relocalize", question())[0] == 200
+    finally:
+        program.terminate()
+        _, said = program.communicate(timeout=DEADLINE_S)
+    lines = said.splitlines()
+    assert lines[0] == "Ctrl-C ends it"
+    assert lines[1].startswith("mapfold: database ")
+    assert lines[2:] == ["mapfold: the database answers again", "service ended"]
