@@ -6,7 +6,7 @@ databases to answer. What the ranking does with the candidates is `projections.r
 
 import contextlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, Self
 
@@ -37,10 +37,13 @@ from projections.relocalize import (
 from projections.relocalize.exact_search import check_space
 from projections.sinks.labels import LABEL_IDS
 
+from ._origin import refuse_mixed
 from ._statements import statements, tables
 
 _LABELS = {"observation": LABEL_IDS["Observation"]}
 _NUMBER = (1 << 48) - 1
+_NEAR = 12
+"""Columns of the statement ``near``; the last two: the embedding's model, and the origin."""
 _EF_SEARCH = max(100, NEIGHBOURS)
 
 
@@ -133,13 +136,19 @@ def fetch(
             {**_LABELS, "neighbours": neighbours, **_bound(crops)},
         ).fetchall()
     _check_spaces(crops, rows)
-    near = [(*row[:10],) for row in rows]
-    if one:
-        return _assemble(len(crops), near, {row[1]: row[10:] for row in rows})
+    near = [(*row[:_NEAR],) for row in rows]
+    along = {row[1]: row[_NEAR:] for row in rows} if one else _along(graph, near)
+    if near:
+        first = along.get(near[0][1], (None,))
+        refuse_mixed(near[0][-1], first[-1], place_of(vectors), place_of(graph))
+    return _assemble(len(crops), near, along)
+
+
+def _along(graph: Connection, near: Sequence[Sequence[Any]]) -> dict[int, tuple[Any, ...]]:
     det_pks = sorted({row[1] for row in near})
     with _clear_errors(graph):
-        along = graph.execute(_statement("along", 0), {**_LABELS, "det_pks": det_pks}).fetchall()
-    return _assemble(len(crops), near, {row[0]: row[1:] for row in along})
+        rows = graph.execute(_statement("along", 0), {**_LABELS, "det_pks": det_pks}).fetchall()
+    return {row[0]: row[1:] for row in rows}
 
 
 @lru_cache(maxsize=128)
@@ -157,17 +166,18 @@ def _bound(crops: Sequence[Crop]) -> dict[str, Any]:
 
 
 def _assemble(
-    crops: int, near: Sequence[Sequence[Any]], along: dict[int, Sequence[Any]]
+    crops: int, near: Sequence[Sequence[Any]], along: Mapping[int, Sequence[Any]]
 ) -> Candidates:
     matches: list[list[Match]] = [[] for _ in range(crops)]
     places: dict[int, Spot] = {}
-    for crop, det_pk, det_id, similarity, class_name, bbox, x, y, yaw, _ in near:
-        thing, its_id, its, there_id, there = along.get(det_pk, (None,) * 5)
+    for crop, det_pk, det_id, run_id, similarity, class_name, bbox, x, y, yaw, *_ in near:
+        thing, its_id, its, there_id, there, _ = along.get(det_pk, (None,) * 6)
         found = None if thing is None else _properties(thing)
         matches[crop].append(
             Match(
                 det_pk - 1,
                 det_id,
+                run_id,
                 similarity,
                 None if x is None else (x, y, yaw),
                 (bbox[0], bbox[1], bbox[2], bbox[3]),
@@ -198,7 +208,7 @@ def _properties(agtype: str) -> dict[str, Any]:
 
 
 def _check_spaces(crops: Sequence[Crop], rows: Sequence[Sequence[Any]]) -> None:
-    model = next((row[9] for row in rows), None)
+    model = next((row[_NEAR - 2] for row in rows), None)
     for crop in crops:
         check_space(crop, len(crop.vector), model)
 

@@ -18,7 +18,7 @@ Pose = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """An observation in the map that looks like a crop.
+    """An observation in the map that looks like a crop; ``run_id`` is the run that made it.
 
     ``pose`` is that of its keyframe in metres and radians, None if the robot had none.
     ``object_place`` is where its Object is located and ``keyframe_place`` where the robot was:
@@ -27,6 +27,7 @@ class Match:
 
     observation: int
     det_id: str
+    run_id: str
     similarity: float
     pose: Pose | None
     bbox: Box | None

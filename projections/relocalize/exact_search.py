@@ -54,6 +54,7 @@ class ExactIndex:
         return Match(
             ordinal,
             seen.det_id,
+            keyframe.run_id,
             similarity,
             None if pose is None else (pose.x_um / 1e6, pose.y_um / 1e6, pose.yaw_rad),
             seen.bbox,

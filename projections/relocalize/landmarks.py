@@ -21,6 +21,7 @@ import numpy as np
 from .camera import Floats, Views
 from .clusters import Indices, clusters, points_of, settle
 from .model import Model
+from .sessions import Sessions, settled
 
 DIRECTIONS: Final = 36
 """Directions in a landmark's table, 10° apart."""
@@ -57,7 +58,9 @@ class Landmarks:
     sigma_log_size: float
 
 
-def find_landmarks(poses: Floats, views: Views, similarity: Floats, model: Model) -> Landmarks:
+def find_landmarks(
+    poses: Floats, views: Views, similarity: Floats, sessions: Sessions, model: Model
+) -> Landmarks:
     """``poses`` of shape (n, 3) in metres and radians, ``similarity`` of shape (n,); n ≥ 1."""
     weight = np.clip((similarity - model.relevant) / 0.05, 0.1, 1.0)
     weight = np.where(views.cut_x | views.cut_y | ~views.known, _CUT_WEIGHT * weight, weight)
@@ -69,7 +72,8 @@ def find_landmarks(poses: Floats, views: Views, similarity: Floats, model: Model
     found = []
     for members in clusters(points, weight, 3 * MAX_LANDMARKS, model):
         spot = settle(points.of(members), model)
-        table = _evidence(poses[members], spot.x, spot.y, similarity[members], model)
+        of_runs = sessions.of(members)
+        table = _evidence(poses[members], spot.x, spot.y, similarity[members], of_runs, model)
         found.append(Landmark(spot.x, spot.y, members, table, spot.spread, spot.slide))
     found.sort(key=lambda landmark: (-float(landmark.table.max()), int(landmark.members[0])))
     return Landmarks(tuple(found[:MAX_LANDMARKS]), depth * median_px, sigma)
@@ -123,20 +127,23 @@ def _width(score: Floats) -> float:
     return float(np.sqrt((share * off * off).sum()))
 
 
-def _evidence(poses: Floats, x: float, y: float, similarity: Floats, model: Model) -> Floats:
+def _evidence(
+    poses: Floats, x: float, y: float, similarity: Floats, sessions: Sessions, model: Model
+) -> Floats:
     """Log-likelihood (up to a constant) per direction from which the robot looks at the thing."""
     directions = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS)
     seen_from = np.arctan2(poses[:, 1] - y, poses[:, 0] - x)
     apart = np.cos(directions[:, None] - seen_from[None])
     expected = model.floor + model.side * np.exp(model.kappa * (apart - 1.0))
     error = np.minimum(similarity, model.usual_best)[None] - expected
+    error, paid = settled(error, sessions, model) if sessions.several else (error, 0.0)
     mean = error.mean(1)
     count = min(float(len(similarity)), model.independent)
     scatter = ((error - mean[:, None]) ** 2).mean(1) * (count / model.sigma_observation**2)
     offset = mean * mean / (model.sigma_instance**2 + model.sigma_observation**2 / count)
     offset = np.where(mean > 0, np.minimum(offset, model.too_similar), offset)
     degrees = min(len(similarity) - 1.0, model.independent)
-    table: Floats = np.minimum(-0.5 * (scatter - 0.5 * degrees + offset), 1.5)
+    table: Floats = np.minimum(-0.5 * (scatter - 0.5 * degrees + offset) - paid, 1.5)
     if float(similarity.max()) > model.usual_best + model.same_crop:
         table = table + model.same_crop_worth
     return table

@@ -32,8 +32,13 @@ class Model:
     same_crop_worth: float = 15.0
     """… which decides between look-alikes."""
     usual_third: float = 0.875
-    """A third best match above this tells that the question's session is the map's own: then all
-    cosines are higher, and are shifted down."""
+    """A third best match in a run above this tells that the run is of the question's own session:
+    then all cosines against it are higher, and are shifted down (`sessions`)."""
+    session: float = 0.048
+    """By how much cosines within a session are higher than between two: 0.911 against 0.863 from
+    the same side, in house-a and house-b as in home-1 and home-2."""
+    session_price: float = 1.0
+    """Log-likelihood that a landmark loses for each run it takes for the question's own session."""
     relevant: float = 0.72
     """Less similar observations show another model and are not looked at."""
     unknown_price: float = 7.0

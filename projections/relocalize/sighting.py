@@ -11,6 +11,7 @@ from .candidates import Match
 from .crops import Crop
 from .landmarks import Landmark, find_landmarks
 from .model import Model
+from .sessions import Sessions, session_shifts, sessions_of, unshifted
 
 _NEAREST_M, _FARTHEST_M = 0.5, 6.0
 
@@ -42,31 +43,26 @@ def sightings(
     crops: Sequence[Crop], matches: Sequence[Sequence[Match]], camera: Camera, model: Model
 ) -> tuple[Sighting, ...]:
     """Sightings of the crops that have a relevant match with a pose; maybe none."""
-    shift = _session_shift(matches, model)
-    found = []
+    shifts, found = session_shifts(matches, model), []
     for crop, row in zip(crops, matches, strict=True):
-        relevant = [m for m in row if m.pose is not None and m.similarity - shift > model.relevant]
+        relevant = [
+            m
+            for m in unshifted(row, shifts)
+            if m.pose is not None and m.similarity > model.relevant
+        ]
         if relevant:
-            found.append(_sighting(crop, relevant, shift, camera, model))
+            sessions = sessions_of(relevant, shifts, model)
+            found.append(_sighting(crop, relevant, sessions, camera, model))
     return tuple(found)
 
 
-def _session_shift(matches: Sequence[Sequence[Match]], model: Model) -> float:
-    """By how much all cosines are higher than usual, as they are within one session.
-
-    The third best match tells, not the best: a crop that *is* in the map says nothing about others.
-    """
-    third = [row[min(2, len(row) - 1)].similarity for row in matches if row]
-    return max(0.0, max(third, default=0.0) - model.usual_third)
-
-
 def _sighting(
-    crop: Crop, matches: Sequence[Match], shift: float, camera: Camera, model: Model
+    crop: Crop, matches: Sequence[Match], sessions: Sessions, camera: Camera, model: Model
 ) -> Sighting:
     poses = np.array([m.pose for m in matches], dtype=np.float64)
-    similarity = np.array([m.similarity for m in matches], dtype=np.float64) - shift
+    similarity = np.array([m.similarity for m in matches], dtype=np.float64)
     seen = views(camera, [m.bbox for m in matches])
-    landmarks = find_landmarks(poses, seen, similarity, model)
+    landmarks = find_landmarks(poses, seen, similarity, sessions, model)
     own = views(camera, [crop.bbox])
     known = bool(own.known[0])
     depth = landmarks.size / float(own.height_px[0])

@@ -8,7 +8,7 @@ import psycopg
 import pytest
 
 from eventsrc.log import LogReader
-from projections.errors import ProjectionMissing, QuestionError
+from projections.errors import ProjectionMismatch, ProjectionMissing, QuestionError
 from projections.folding import fold_log
 from projections.postgres.connect import Targets
 from projections.queries.relocalize import Reader, relocalize
@@ -25,7 +25,9 @@ SETTINGS = Settings()
 
 @pytest.fixture
 def log(tmp_path: Path) -> Path:
-    return write_log(tmp_path / "log", walk(60, seed=3))
+    """Two runs, since matches of different runs are treated differently."""
+    other = walk(30, seed=4, run_id="run-c")
+    return write_log(tmp_path / "log", [*walk(60, seed=3), *other])
 
 
 @pytest.fixture
@@ -50,7 +52,16 @@ def questions() -> Iterator[tuple[Crop, ...]]:
 def found(candidates: Candidates) -> list[list[tuple[object, ...]]]:
     return [
         [
-            (m.det_id, m.pose, m.class_name, m.object_id, m.object_place, m.keyframe_place)
+            (
+                m.det_id,
+                m.run_id,
+                m.pose,
+                m.bbox,
+                m.class_name,
+                m.object_id,
+                m.object_place,
+                m.keyframe_place,
+            )
             for m in sorted(row, key=lambda m: m.observation)
         ]
         for row in candidates.matches
@@ -64,6 +75,7 @@ def test_candidates_are_those_of_exact_search(targets: Targets, view: MapView) -
         for crops in questions():
             live, exact = reader.candidates(crops, 200), index.search(crops, 200)
             assert found(live) == found(exact)
+            assert {m.run_id for row in live.matches for m in row} == {"run-a", "run-c"}
             places = {m.object_place for row in live.matches for m in row} - {None}
             assert all(live.places[p] == exact.places[p] for p in places if p is not None)
             for ours, theirs in zip(live.matches, exact.matches, strict=True):
@@ -88,6 +100,24 @@ def test_another_embedding_space_is_refused(targets: Targets) -> None:
     other = detection("cup", [1.0] * 8, embedding_model="another/model")
     with pytest.raises(QuestionError, match="another/model"):
         relocalize(targets, read_crops([other]))
+
+
+@pytest.mark.parametrize("targets", ["one_database", "two_databases"])
+@pytest.mark.parametrize("other", ["log", "settings"])
+def test_graph_and_vectors_of_different_origin_are_refused(
+    request: pytest.FixtureRequest, targets: str, other: str, log: Path, tmp_path: Path
+) -> None:
+    found: Targets = request.getfixturevalue(targets)
+    second = write_log(tmp_path / "second", walk(60, seed=3)) if other == "log" else log
+    settings = SETTINGS if other == "log" else Settings.model_validate({"eps_m": 1.0})
+    rebuild(log, found, SETTINGS, only="graph")
+    rebuild(second, found, settings, only="vectors")
+    said = {"log": "the graph from log", "settings": "with other settings than the graph"}[other]
+    with pytest.raises(ProjectionMismatch, match=rf"{said}.* run mapfold replay LOG") as told:
+        relocalize(found, next(questions()))
+    assert len(str(told.value).splitlines()) == 1
+    rebuild(second, found, settings, only="graph")
+    assert relocalize(found, next(questions())).places
 
 
 def test_an_empty_database_says_what_to_do(one_database: Targets) -> None:

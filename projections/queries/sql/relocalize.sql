@@ -1,22 +1,24 @@
 -- From crops to candidates: nearest observations, and from each along the graph to its Object, that
 -- Object's Place, and the Place its keyframe lies in. Ids follow from the observation's number
 -- (det_pk), so every step but the search is a look-up of an indexed id. `{questions}` is a VALUES list of
--- (crop, vector) bind parameters.
+-- (crop, vector) bind parameters. Each half ends with what it was made from: log and settings.
 
 -- name: near
 -- The nearest `%(neighbours)s` observations of each crop, from the vectors' database.
 WITH question (crop, wanted) AS ({questions})
-SELECT question.crop, near.det_pk, near.det_id, 1 - near.distance, near.class_name, near.bbox,
-       near.map_x, near.map_y, near.map_yaw, near.embedding_model
+SELECT question.crop, near.det_pk, near.det_id, near.run_id, 1 - near.distance, near.class_name,
+       near.bbox, near.map_x, near.map_y, near.map_yaw, near.embedding_model,
+       (SELECT log_id || ' ' || fingerprint FROM mapfold.checkpoint WHERE sink = 'vectors')
 FROM question CROSS JOIN LATERAL (
-    SELECT det_pk, det_id, class_name, bbox, map_x, map_y, map_yaw, embedding_model,
+    SELECT det_pk, det_id, run_id, class_name, bbox, map_x, map_y, map_yaw, embedding_model,
            embedding <=> question.wanted AS distance
     FROM public.detection_embeddings ORDER BY embedding <=> question.wanted LIMIT %(neighbours)s
 ) AS near
 
 -- name: along
 -- Object, its Place and the keyframe's Place of observations, from the graph's database.
-SELECT seen.det_pk, thing.properties, its.id, its.properties, there.id, there.properties
+SELECT seen.det_pk, thing.properties, its.id, its.properties, there.id, there.properties,
+       (SELECT log_id || ' ' || fingerprint FROM mapfold.checkpoint WHERE sink = 'graph')
 FROM unnest(%(det_pks)s::bigint[]) AS seen (det_pk)
 LEFT JOIN {observes} AS observes
     ON observes.start_id = ag_catalog._graphid(%(observation)s, seen.det_pk)
@@ -31,11 +33,13 @@ LEFT JOIN {place} AS there ON there.id = in_place.end_id
 -- name: near_and_along
 -- Both in one round trip and one snapshot, when they share a database.
 WITH question (crop, wanted) AS ({questions})
-SELECT question.crop, near.det_pk, near.det_id, 1 - near.distance, near.class_name, near.bbox,
-       near.map_x, near.map_y, near.map_yaw, near.embedding_model,
-       thing.properties, its.id, its.properties, there.id, there.properties
+SELECT question.crop, near.det_pk, near.det_id, near.run_id, 1 - near.distance, near.class_name,
+       near.bbox, near.map_x, near.map_y, near.map_yaw, near.embedding_model,
+       (SELECT log_id || ' ' || fingerprint FROM mapfold.checkpoint WHERE sink = 'vectors'),
+       thing.properties, its.id, its.properties, there.id, there.properties,
+       (SELECT log_id || ' ' || fingerprint FROM mapfold.checkpoint WHERE sink = 'graph')
 FROM question CROSS JOIN LATERAL (
-    SELECT det_pk, det_id, class_name, bbox, map_x, map_y, map_yaw, embedding_model,
+    SELECT det_pk, det_id, run_id, class_name, bbox, map_x, map_y, map_yaw, embedding_model,
            embedding <=> question.wanted AS distance
     FROM public.detection_embeddings ORDER BY embedding <=> question.wanted LIMIT %(neighbours)s
 ) AS near

@@ -1,0 +1,80 @@
+"""Cosines of each run made comparable: which runs are shifted, by how much, and which stay open."""
+
+import numpy as np
+import pytest
+
+from projections.relocalize import Match
+from projections.relocalize.model import MODEL
+from projections.relocalize.sessions import (
+    Sessions,
+    session_shifts,
+    sessions_of,
+    settled,
+    unshifted,
+)
+
+
+def row(**runs: list[float]) -> list[Match]:
+    """A crop's matches from the similarities with each run, most similar first."""
+    pairs = sorted(((s, run) for run, found in runs.items() for s in found), reverse=True)
+    return [
+        Match(i, f"d{i}", run, s, (0.0, 0.0, 0.0), None, "cup") for i, (s, run) in enumerate(pairs)
+    ]
+
+
+def test_each_run_has_a_shift_of_its_own() -> None:
+    shifts = session_shifts([row(own=[0.93, 0.92, 0.91], other=[0.88, 0.87, 0.86])], MODEL)
+    assert shifts == {"own": pytest.approx(0.91 - MODEL.usual_third), "other": 0.0}
+
+
+def test_the_crop_that_tells_most_tells_for_all() -> None:
+    rows = [row(own=[0.85, 0.84, 0.83]), row(own=[0.92, 0.915, 0.91], other=[0.8])]
+    assert session_shifts(rows, MODEL)["own"] == pytest.approx(0.91 - MODEL.usual_third)
+
+
+def test_the_very_crop_says_nothing_about_others() -> None:
+    assert session_shifts([row(own=[1.0, 0.87, 0.86])], MODEL) == {"own": 0.0}
+
+
+def test_a_run_with_too_few_matches_is_left_alone() -> None:
+    rows = [row(own=[1.0, 0.95], other=[0.87, 0.86, 0.85])] * 2
+    shifts = session_shifts(rows, MODEL)
+    assert shifts == {"own": 0.0, "other": 0.0}
+    assert unshifted(rows[0], shifts) == rows[0]
+
+
+def test_only_the_own_runs_matches_move_and_the_order_follows() -> None:
+    crop = row(own=[0.9375, 0.875], other=[0.9, 0.8125])
+    moved = unshifted(crop, {"own": 0.0625, "other": 0.0})
+    assert [(m.run_id, m.similarity) for m in moved] == [
+        ("other", 0.9),
+        ("own", 0.875),
+        ("own", 0.8125),
+        ("other", 0.8125),
+    ]
+    assert moved[2].observation < moved[3].observation
+
+
+def test_what_a_shift_lacks_of_a_whole_sessions() -> None:
+    crop = row(own=[0.9], other=[0.8])
+    found = sessions_of(crop, {"own": 0.03, "other": 0.0, "else": 0.1}, MODEL)
+    assert found.several
+    assert not found.of(np.array([0])).several
+    assert found.lacks.tolist() == pytest.approx([MODEL.session - 0.03, MODEL.session])
+
+
+def test_a_run_that_is_too_similar_from_behind_is_the_own_session() -> None:
+    """Seen from the first direction run 1 is as much too similar as a session makes it."""
+    run = np.array([1, 0, 1, 0, 1, 0])
+    error = np.array([[MODEL.session * (r == 1) for r in run], [-0.02] * 6])
+    less, paid = settled(error, Sessions(run, np.full(6, MODEL.session)), MODEL)
+    assert less[0].tolist() == pytest.approx([0.0] * 6)
+    assert less[1].tolist() == error[1].tolist()
+    assert paid.tolist() == [MODEL.session_price, 0.0]
+
+
+def test_a_run_whose_shift_is_told_whole_is_not_open() -> None:
+    error = np.full((3, 4), 0.05)
+    less, paid = settled(error, Sessions(np.array([0, 0, 1, 1]), np.zeros(4)), MODEL)
+    assert less.tolist() == error.tolist()
+    assert paid.tolist() == [0.0] * 3
