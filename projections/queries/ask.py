@@ -14,6 +14,18 @@ from projections.view import MapView
 from .graph_reads import read_holders, read_object, read_objects_of_place, read_place_graph
 from .place_graph import PlaceGraph
 
+_THING = (
+    "object_id",
+    "class_name",
+    "mean_x",
+    "mean_y",
+    "obs_count",
+    "first_seen",
+    "last_seen",
+    "place_id",
+)
+"""What is told of an Object, in this order wherever it comes from; agtype has its own order."""
+
 
 class Asker(Protocol):
     """Where answers come from."""
@@ -47,11 +59,12 @@ class LiveAsker:
 
     def thing(self, object_id: str) -> dict[str, Any] | None:
         """An Object with its place_id."""
-        return read_object(self._connection, object_id)
+        found = read_object(self._connection, object_id)
+        return None if found is None else _ordered(found)
 
     def contents(self, place_id: str) -> list[dict[str, Any]]:
         """The Objects of a Place."""
-        return read_objects_of_place(self._connection, place_id)
+        return [_ordered(thing) for thing in read_objects_of_place(self._connection, place_id)]
 
 
 class ViewAsker:
@@ -99,6 +112,10 @@ class ViewAsker:
             "last_seen": thing.last_seen,
             "place_id": self._view.place_id(thing.place),
         }
+
+
+def _ordered(thing: dict[str, Any]) -> dict[str, Any]:
+    return {name: thing[name] for name in _THING}
 
 
 def where_is(asker: Asker, object_id: str) -> dict[str, Any]:
