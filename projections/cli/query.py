@@ -12,7 +12,14 @@ from eventsrc.cli._shell import emit
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 from eventsrc.log.whence import resolve
-from projections.cli._options import DbOption, VectorDbOption, databases
+from projections.cli._options import (
+    DbOption,
+    SetOption,
+    SettingsOption,
+    VectorDbOption,
+    databases,
+)
+from projections.cli._past import past_settings, say_defaults
 from projections.cli._question import QuestionArgument, question_from
 from projections.folding import fold_log
 from projections.postgres.connect import connect
@@ -34,7 +41,8 @@ AtOption = Annotated[
     typer.Option("--at", metavar="W", help="Ask the map as of this point of --log instead."),
 ]
 LogOption = Annotated[
-    Path | None, typer.Option("--log", metavar="LOG", help="The log's folder, for --at.")
+    Path | None,
+    typer.Option("--log", metavar="LOG", help="Ask this log, folded, instead of the live map."),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="The answer as JSON on stdout.")]
 PlaceArgument = Annotated[str, typer.Argument(metavar="PLACE", help="A place's id.")]
@@ -58,11 +66,13 @@ def where(
     object_id: Annotated[str, typer.Argument(metavar="OBJECT", help="An object's id.")],
     at: AtOption = None,
     log: LogOption = None,
+    set_: SetOption = None,
+    settings_file: SettingsOption = None,
     db: DbOption = None,
     json_: JsonOption = False,
 ) -> None:
     """Where an object is, or was at a point of the log."""
-    with _asker(db, log, at) as asker:
+    with _asker(db, log, at, past_settings(log, settings_file, set_)) as asker:
         _tell(where_is(asker, object_id), json_)
 
 
@@ -70,11 +80,13 @@ def contents(
     place_id: PlaceArgument,
     at: AtOption = None,
     log: LogOption = None,
+    set_: SetOption = None,
+    settings_file: SettingsOption = None,
     db: DbOption = None,
     json_: JsonOption = False,
 ) -> None:
     """The objects located in a place."""
-    with _asker(db, log, at) as asker:
+    with _asker(db, log, at, past_settings(log, settings_file, set_)) as asker:
         _tell(objects_of(asker, place_id), json_)
 
 
@@ -84,11 +96,13 @@ def holding(
     hops: Annotated[int, typer.Option("--hops", min=0, help="Steps from place to place.")] = 2,
     at: AtOption = None,
     log: LogOption = None,
+    set_: SetOption = None,
+    settings_file: SettingsOption = None,
     db: DbOption = None,
     json_: JsonOption = False,
 ) -> None:
     """Places within some steps of a place that hold an object of a class."""
-    with _asker(db, log, at) as asker:
+    with _asker(db, log, at, past_settings(log, settings_file, set_)) as asker:
         _tell(places_holding(asker, class_name, start, hops), json_)
 
 
@@ -97,20 +111,23 @@ def path(
     goal: Annotated[str, typer.Argument(metavar="GOAL", help="The other place's id.")],
     at: AtOption = None,
     log: LogOption = None,
+    set_: SetOption = None,
+    settings_file: SettingsOption = None,
     db: DbOption = None,
     json_: JsonOption = False,
 ) -> None:
     """The places on the way from one place to another."""
-    with _asker(db, log, at) as asker:
+    with _asker(db, log, at, past_settings(log, settings_file, set_)) as asker:
         _tell(path_between(asker, start, goal), json_)
 
 
 @contextlib.contextmanager
-def _asker(db: str | None, log: Path | None, at: str | None) -> Iterator[Asker]:
-    """The live graph, or the log folded to a point (with the default settings)."""
+def _asker(db: str | None, log: Path | None, at: str | None, settings: Settings) -> Iterator[Asker]:
+    """The live graph, or the log folded to a point with ``settings``."""
     if log is not None:
         with LogReader(log) as reader:
-            _, view = fold_log(reader, Settings(), resolve(reader, at or "end"))
+            _, view = fold_log(reader, settings, resolve(reader, at or "end"))
+        say_defaults(settings)
         yield ViewAsker(view)
         return
     if at is not None:

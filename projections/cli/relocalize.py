@@ -14,8 +14,8 @@ from projections.cli._options import (
     SettingsOption,
     VectorDbOption,
     databases,
-    settings_from,
 )
+from projections.cli._past import past_settings, say_defaults
 from projections.cli._question import (
     HfovOption,
     ImageOption,
@@ -41,7 +41,8 @@ def relocalize(
         ),
     ] = None,
     log: Annotated[
-        Path | None, typer.Option("--log", metavar="LOG", help="The log's folder, for --as-of.")
+        Path | None,
+        typer.Option("--log", metavar="LOG", help="Ask this log, folded, instead of the live map."),
     ] = None,
     method: Annotated[
         str, typer.Option("--method", help="joint, or plain: similarities summed per Place.")
@@ -56,13 +57,15 @@ def relocalize(
 ) -> None:
     """Ranked Places with evidence, a pose hypothesis and a confidence, from object crops."""
     how, camera, crops = method_from(method), camera_from(hfov, image), question_from(query)
-    if as_of is None:
-        answer = _live(crops, top, how, camera, db, vector_db)
-    elif log is None:
+    if as_of is not None and log is None:
         raise MisuseError("--as-of asks a past map, which only the log knows; give --log LOG too")
+    settings = past_settings(log, settings_file, set_)
+    if log is None:
+        answer = _live(crops, top, how, camera, db, vector_db)
     else:
-        settings = settings_from(settings_file, set_)
-        answer = relocalize_as_of(log, as_of, settings, crops, top=top, method=how, camera=camera)
+        then = as_of or "end"
+        answer = relocalize_as_of(log, then, settings, crops, top=top, method=how, camera=camera)
+        say_defaults(settings)
     _tell(answer, json_)
 
 

@@ -77,6 +77,29 @@ def test_the_command_asks_a_past_map(tmp_path: Path, log: Path, view: MapView) -
     assert "--log" in refused.err
 
 
+def test_a_past_map_is_folded_with_the_settings_given(tmp_path: Path, log: Path) -> None:
+    wide = Settings.model_validate({"eps_m": 20.0})
+    with LogReader(log) as reader:
+        place = next(iter(fold_log(reader, wide)[1].places.values())).place_id
+    mapfold = Commands.in_folder(tmp_path)
+    asked = ("query", "contents", place, "--json", "--log", log)
+    plain, given = mapfold(*asked), mapfold(*asked, "--set", "eps_m=20.0")
+    assert len(given.json) > len(plain.json) > 0
+    assert "default settings" in plain.err
+    assert "default settings" not in given.err
+    file = tmp_path / "settings.json"
+    file.write_text(json.dumps({"eps_m": 20.0}))
+    assert mapfold(*asked, "--settings", file).json == given.json
+
+
+@pytest.mark.parametrize("question", ["where", "contents"])
+def test_settings_without_a_log_are_refused(tmp_path: Path, question: str) -> None:
+    """The live map has its own; taking them and not using them would be a lie."""
+    refused = Commands.in_folder(tmp_path)("query", question, "x", "--set", "eps_m=1.0", code=2)
+    assert "--log LOG" in refused.err
+    assert len(refused.err.strip().splitlines()) == 1
+
+
 def test_similar_objects_live(tmp_path: Path, log: Path, one_database: Targets) -> None:
     rebuild(log, one_database, Settings())
     question = tmp_path / "question.json"

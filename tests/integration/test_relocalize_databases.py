@@ -174,6 +174,15 @@ class TestCommand:
         assert nothing["pose"] is None
         assert nothing["confidence"] == 0.0
 
+    def test_settings_are_those_given_or_told_to_be_the_default(
+        self, mapfold: Commands, log: Path, question: Path
+    ) -> None:
+        asked = ("relocalize", question, "--log", log, "--json")
+        plain, given = mapfold(*asked), mapfold(*asked, "--set", "eps_m=20.0")
+        assert len(given.json["places"]) < len(plain.json["places"])
+        assert "default settings" in plain.err
+        assert "default settings" not in given.err
+
     def test_plain_and_text(self, mapfold: Commands, log: Path, question: Path) -> None:
         said = mapfold("relocalize", question, "--log", log, "--as-of", "end", "--method", "plain")
         assert "run-a_p" in said.out
@@ -182,6 +191,7 @@ class TestCommand:
         ("arguments", "said"),
         [
             (["--as-of", "end"], "--log"),
+            (["--set", "eps_m=1.0"], "--log LOG"),
             (["--method", "magic"], "joint and plain"),
             (["--image", "big"], "--image"),
             (["--hfov", "0"], "field of view"),
