@@ -12,10 +12,12 @@ from eventsrc.log import LogReader
 from eventsrc.log.whence import resolve
 from eventsrc.words import counted
 from projections.runner import RebuildReport, rebuild
+from projections.settings import Settings
 from projections.sink import SinkName
 from projections.sinks.loader import LoaderName
 
 from ._bar import Bar
+from ._left_out import left_out
 from ._options import (
     DbOption,
     SetOption,
@@ -100,10 +102,10 @@ def replay(
     if as_json:
         emit(asdict(report))
     else:
-        _tell(log, report)
+        _tell(log, settings, report)
 
 
-def _tell(log: Path, report: RebuildReport) -> None:
+def _tell(log: Path, settings: Settings, report: RebuildReport) -> None:
     rows = sum(report.rows.values())
     rate = report.events / report.total_s if report.total_s else 0.0
     say(
@@ -115,3 +117,6 @@ def _tell(log: Path, report: RebuildReport) -> None:
     say(", ".join(counted(counts[f"{word}s"], word) for word in words))
     if report.hnsw is not None:
         say(f"vector search: {report.hnsw.reason}")
+    missing = left_out(log, settings, report)
+    if missing is not None:
+        say(missing)

@@ -1,10 +1,12 @@
 """Moving a log into the databases: at once (`rebuild`) or as it grows (`tail`)."""
 
+from ._foreign import ForeignEmbedding
 from .progress import TailProgress, TailReport
 from .rebuild import RebuildProgress, RebuildReport, rebuild
 from .tail import tail
 
 __all__ = [
+    "ForeignEmbedding",
     "RebuildProgress",
     "RebuildReport",
     "TailProgress",

@@ -26,6 +26,7 @@ from projections.sinks.hnsw import HnswReport, build_hnsw
 from projections.sinks.loader import LoaderName
 
 from ._fold import LiveFold, batches
+from ._foreign import ForeignEmbedding, first_foreign
 from ._loading import Loading, short_turns
 from ._lock_out import lock_readers_out
 from ._stores import Only, Store, open_stores
@@ -56,7 +57,10 @@ OnProgress: TypeAlias = Callable[[RebuildProgress], None]
 
 @dataclass(frozen=True, slots=True)
 class RebuildReport:
-    """What a rebuild did. ``rows`` is by graph label and table; times are seconds."""
+    """What a rebuild did. ``rows`` is by graph label and table; times are seconds.
+
+    ``foreign`` is the first of the embeddings that were left out for their space.
+    """
 
     events: int
     digest: str
@@ -65,6 +69,7 @@ class RebuildReport:
     fold_s: float
     total_s: float
     hnsw: HnswReport | None
+    foreign: ForeignEmbedding | None = None
 
 
 def rebuild(
@@ -122,8 +127,16 @@ def rebuild(
         tell(RebuildProgress("tidying", total, total))
         index = _after(stores, tell, total, hnsw=hnsw)
         ended = time.monotonic()
-        counts = fold.view.counts()
-        return RebuildReport(total, digest, counts, rows, folded - started, ended - started, index)
+        return RebuildReport(
+            total,
+            digest,
+            fold.view.counts(),
+            rows,
+            folded - started,
+            ended - started,
+            index,
+            first_foreign(fold, reader),
+        )
 
 
 @contextlib.contextmanager

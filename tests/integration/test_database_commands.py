@@ -16,6 +16,7 @@ import pytest
 
 from projections.postgres.embedded import EmbeddedServer
 from tests.commands import PROGRAM, Commands
+from tests.envelopes import MODEL, detection, envelope
 from tests.logs import append_raw, walk, write_log
 
 WAIT_S = 60
@@ -123,6 +124,31 @@ def test_another_log_is_not_so_and_so_far_behind(mapfold: Commands, log: Path) -
     assert "behind" not in said.out
     assert "the graph there was made from log" in said.err
     assert "the vectors there were made from log" in said.err
+
+
+def test_a_replay_says_what_it_left_out(mapfold: Commands) -> None:
+    first = envelope(0, detections=[detection("cup", [1.0] * 8)])
+    others = walk(6, first=1, dim=16, detections=3)
+    again = {**others[0], "map_x": 77.0}
+    reused = envelope(90, detections=[detection("cup", det_id="run-a_kf0_d0")])
+    log = write_log(mapfold.folder / "mixed", [first, *others, first, again, reused])
+    many = sum("embedding" in d for document in others for d in document["detections"])
+    line = mapfold("replay", log).err.splitlines()[-1]
+    assert line.startswith("left out: 1 keyframe that came twice; 1 keyframe that came again with")
+    assert "1 observation with the det_id of an earlier keyframe" in line
+    assert f"{many} embeddings of another space: the map's are of {MODEL} with 8 dimensions" in line
+    assert f"is of {MODEL} with 16 dimensions" in line
+    assert advised(line) == ["replay", str(log), "--set", "embedding_dim=16"]
+    line = mapfold(*advised(line)).err.splitlines()[-1]
+    assert "1 embedding of another space" in line
+    assert f"{MODEL} with 16 dimensions, as the settings say, but" in line
+    document = mapfold("replay", log, "--set", "embedding_dim=3", "--json").json
+    assert document["foreign"]["map_dim"] is None
+    assert document["counts"]["foreign_embeddings"] == many + 1
+
+
+def test_a_replay_of_everything_leaves_nothing_to_say(mapfold: Commands, log: Path) -> None:
+    assert "left out" not in mapfold("replay", log).err
 
 
 def test_db_stop_says_whether_anything_ran(mapfold: Commands) -> None:
