@@ -24,6 +24,7 @@ from eventsrc.words import counted
 
 from ._event_text import event_document, event_line, iso_time
 from ._shell import emit, emit_lines, finish, say
+from ._watch import Watch
 
 LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="The log's folder.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Data as JSON on stdout.")]
@@ -109,11 +110,14 @@ def cat(
         if start > end:
             raise MisuseError(f"--from {from_} is offset {start}, behind --to {to}, which is {end}")
         until = None if to == "end" else end
-        events = reader.read(start, until, keys=key or None, on_gap=on_gap)
+        watch = Watch(from_, to, key or ())
+        events = watch.over(reader.read(start, until, keys=key or None, on_gap=on_gap))
         if json_:
             emit_lines(map(event_document, events))
         else:
             sys.stdout.writelines(f"{event_line(event)}\n" for event in events)
+    for line in watch.told(log):
+        say(line)
     finish(findings=bool(gaps))
 
 
@@ -155,19 +159,24 @@ def recover(log: LogArgument, json_: JsonOption = False) -> None:
         emit({**asdict(report), "path": str(log)})
     for segment in report.segments:
         say(_recovery_text(segment))
-    say(f"{log}: {report.events} events" if report.segments else f"{log}: nothing to recover")
+    say(
+        f"{log}: {counted(report.events, 'event')}"
+        if report.segments
+        else f"{log}: nothing to recover"
+    )
     finish(findings=report.lost)
 
 
 def _recovery_text(segment: SegmentRecovery) -> str:
-    parts = [f"{segment.name}: kept {segment.kept_events} events ({segment.kept_bytes:,} bytes)"]
+    kept = counted(segment.kept_events, "event")
+    parts = [f"{segment.name}: kept {kept} ({segment.kept_bytes:,} bytes)"]
     if segment.lost_events:
         gaps = ", ".join(f"{first} to {last}" for first, last in segment.gaps)
-        parts.append(f"lost {segment.lost_events} recorded events (offsets {gaps})")
+        parts.append(f"lost {counted(segment.lost_events, 'recorded event')} (offsets {gaps})")
     if segment.lost_bytes:
         parts.append(f"left out {segment.lost_bytes:,} bytes")
     if segment.torn_events:
-        parts.append(f"with {segment.torn_events} events that were never synced")
+        parts.append(f"with {counted(segment.torn_events, 'event')} never synced")
     if segment.kept_copy:
         parts.append(f"original kept as {segment.kept_copy}")
     return ", ".join(parts)

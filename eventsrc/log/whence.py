@@ -18,19 +18,22 @@ end of a growing segment there is nothing to read behind it, so it is met here.
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 
 from pydantic import BaseModel, ValidationError
 
 from eventsrc.errors import MisuseError
 from eventsrc.system_events import is_system_key
+from eventsrc.words import counted
 
 from .event import Event
 from .reader import LogReader, OnGap
 from .segment import Unreadable
 
+_KEYFRAME_OF_RUN = re.compile(r"(.+):(-?\d+)", re.DOTALL)
 _KEYFRAME = re.compile(rb'"keyframe_id"\s*:\s*(-?\d+)')
+_LIKE_A_TIME = re.compile(r"[\dT:.,+Z -]+")
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
@@ -39,9 +42,16 @@ class _Identity(BaseModel):
     keyframe_id: int
 
 
-def resolve(reader: LogReader, text: str, *, on_gap: OnGap | None = None) -> int:
+Note = Callable[[str], None]
+"""Takes one line for people."""
+
+
+def resolve(
+    reader: LogReader, text: str, *, on_gap: OnGap | None = None, note: Note | None = None
+) -> int:
     """The number of events that ``text`` means; MisuseError when the log has no such point.
 
+    ``note`` is told when events stamped later than a time are in the range up to it.
     Damage on the way to a keyframe, and rot that a growing segment ends in where the range goes up
     to there, raise LogDamaged, or are told to ``on_gap``.
     """
@@ -49,15 +59,37 @@ def resolve(reader: LogReader, text: str, *, on_gap: OnGap | None = None) -> int
         return _at_end(reader, on_gap)
     if text.isascii() and text.isdecimal():
         return _within(reader, int(text))
-    time_ns = _time(text)
+    time_ns = time_of(text)
     if time_ns is not None:
-        return _at_time(reader, time_ns, on_gap)
-    run_id, colon, keyframe = text.rpartition(":")
-    if colon and run_id and re.fullmatch(r"-?\d+", keyframe):
-        return _at_keyframe(reader, run_id, int(keyframe), on_gap)
-    raise MisuseError(
-        f"{text!r} is no point in a log; give an offset, a time such as 2026-03-24T13:00:00Z, "
-        "RUN:KEYFRAME or end"
+        included, later = _at_time(reader, time_ns, on_gap)
+        if later and note is not None:
+            note(
+                f"{reader.path}: of the {counted(included, 'event')} up to {text}, {later:,} "
+                f"{'is' if later == 1 else 'are'} stamped later: stamps run backwards in this log; "
+                "an offset or RUN:KEYFRAME says what you mean"
+            )
+        return included
+    keyframe = _KEYFRAME_OF_RUN.fullmatch(text)
+    found = keyframe and _at_keyframe(reader, keyframe[1], int(keyframe[2]), on_gap)
+    if found:
+        return found
+    raise MisuseError(_no_point(reader, text, named=keyframe is not None))
+
+
+def _no_point(reader: LogReader, text: str, *, named: bool) -> str:
+    if not named:
+        return (
+            f"{text!r} is no point in a log; give an offset, a time such as 2026-03-24T13:00:00Z, "
+            "RUN:KEYFRAME or end"
+        )
+    no_time = (
+        ", nor is this a time, which is written with its date, such as 2026-03-24T13:00:00Z"
+        if _LIKE_A_TIME.fullmatch(text)
+        else ""
+    )
+    return (
+        f"{text}: {reader.path} has no such keyframe{no_time}; "
+        f"`mapfold log cat {reader.path}` lists what it has"
     )
 
 
@@ -67,7 +99,7 @@ def resolve_start(reader: LogReader, text: str, *, on_gap: OnGap | None = None) 
 
     Damage on the way to a keyframe or a time raises LogDamaged, or is told to ``on_gap``.
     """
-    time_ns = None if text.isdecimal() else _time(text)
+    time_ns = time_of(text)
     if time_ns is not None:
         events = (e for e in reader.read(on_gap=on_gap) if not is_system_key(e.key))
         later = (e.offset for e in events if e.stamp_ns >= time_ns)
@@ -79,15 +111,15 @@ def resolve_start(reader: LogReader, text: str, *, on_gap: OnGap | None = None) 
 def _within(reader: LogReader, offset: int) -> int:
     if offset > reader.next_offset:
         raise MisuseError(
-            f"{offset} is beyond the end of {reader.path}, which holds {reader.next_offset} "
-            "events; use end"
+            f"{offset} is beyond the end of {reader.path}, which holds "
+            f"{counted(reader.next_offset, 'event')}; use end"
         )
     return offset
 
 
-def _time(text: str) -> int | None:
-    """Int nanoseconds of an ISO 8601 time; None when it is none."""
-    if not re.match(r"\d{4}-?\d{2}-?\d{2}", text):
+def time_of(text: str) -> int | None:
+    """Int nanoseconds of an ISO 8601 time; None when it is none, or an offset (``20260324``)."""
+    if text.isdecimal() or not re.match(r"\d{4}-?\d{2}-?\d{2}", text):
         return None
     try:
         moment = datetime.fromisoformat(text)
@@ -97,8 +129,9 @@ def _time(text: str) -> int | None:
     return (since.days * 86_400 + since.seconds) * 1_000_000_000 + since.microseconds * 1000
 
 
-def _at_time(reader: LogReader, time_ns: int, on_gap: OnGap | None) -> int:
-    included = 0
+def _at_time(reader: LogReader, time_ns: int, on_gap: OnGap | None) -> tuple[int, int]:
+    """How many events are included, and how many of them are the robots' of a later time."""
+    included = later = later_included = 0
     in_time = True
 
     def take_in(gap: Unreadable) -> None:
@@ -109,9 +142,12 @@ def _at_time(reader: LogReader, time_ns: int, on_gap: OnGap | None) -> int:
     for event in reader.read(on_gap=take_in):
         if not is_system_key(event.key):
             in_time = event.stamp_ns <= time_ns
+            later += not in_time
         if in_time:
-            included = event.offset + 1
-    return _at_end(reader, on_gap) if included > reader.next_offset else included
+            included, later_included = event.offset + 1, later
+    if included > reader.next_offset:
+        included = _at_end(reader, on_gap)
+    return included, later_included
 
 
 def _at_end(reader: LogReader, on_gap: OnGap | None) -> int:
@@ -120,7 +156,9 @@ def _at_end(reader: LogReader, on_gap: OnGap | None) -> int:
     return reader.next_offset
 
 
-def _at_keyframe(reader: LogReader, run_id: str, keyframe_id: int, on_gap: OnGap | None) -> int:
+def _at_keyframe(
+    reader: LogReader, run_id: str, keyframe_id: int, on_gap: OnGap | None
+) -> int | None:
     for event in _mentioning(reader, keyframe_id, on_gap):
         try:
             identity = _Identity.model_validate_json(event.payload)
@@ -128,10 +166,7 @@ def _at_keyframe(reader: LogReader, run_id: str, keyframe_id: int, on_gap: OnGap
             continue
         if (identity.run_id, identity.keyframe_id) == (run_id, keyframe_id):
             return event.offset + 1
-    raise MisuseError(
-        f"{run_id}:{keyframe_id}: {reader.path} has no such keyframe; "
-        f"`mapfold log cat {reader.path}` lists what it has"
-    )
+    return None
 
 
 def _mentioning(reader: LogReader, keyframe_id: int, on_gap: OnGap | None) -> Iterator[Event]:

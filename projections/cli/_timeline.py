@@ -17,7 +17,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from eventsrc.cli._shell import people
+from eventsrc.cli._shell import people, say
 from eventsrc.log.whence import resolve
 from projections.cli._options import settings_from
 from projections.settings import Settings
@@ -85,4 +85,4 @@ class FoldBar:
 
 def point(opened: Timeline, text: str) -> int:
     """The number of events that W means in this log."""
-    return resolve(opened.reader, text)
+    return resolve(opened.reader, text, note=say)

@@ -53,7 +53,7 @@ def draw(
     settings = settings_from(settings_file, set_)
     view = MapView(settings, keep_embeddings=False)
     with LogReader(log) as reader:
-        events = reader.read(0, resolve(reader, at))
+        events = reader.read(0, resolve(reader, at, note=say))
         merged = fold_with_merges(fold_events(events, SemanticMap(settings)), view)
     draw_map(
         view,

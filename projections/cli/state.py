@@ -37,7 +37,7 @@ def state(
         raise MisuseError("--json and --digest together: --json holds the digest already")
     settings = settings_from(settings_file, set_)
     with LogReader(log) as reader:
-        _, view = fold_log_cached(reader, settings, resolve(reader, at), note=say)
+        _, view = fold_log_cached(reader, settings, resolve(reader, at, note=say), note=say)
     hexdigits = map_digest(view)
     if json_:
         emit(state_document(view, hexdigits))

@@ -87,7 +87,7 @@ def whatif(
         raise MisuseError("nothing to try; give --set eps_m=1.0, --try or --grid eps_m=0.5,1.0")
     scored = read_truth(truth) if truth else None
     with LogReader(log) as reader:
-        end = resolve(reader, at)
+        end = resolve(reader, at, note=say)
     with FoldBar() as bar:
         found = what_if(log, common, others, end, truth=scored, processes=processes, progress=bar)
     if picture is not None:

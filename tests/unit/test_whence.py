@@ -61,6 +61,40 @@ def test_what_is_not_there_is_named(reader: LogReader, text: str) -> None:
         assert text in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (
+            "09:02:06",
+            "09:02:06: {} has no such keyframe, nor is this a time, which is written with",
+        ),
+        ("2026-13-01T09:02", "2026-13-01T09:02: {} has no such keyframe, nor is this a time"),
+        ("2026-13-01", "'2026-13-01' is no point in a log; give an offset, a time such as 2026"),
+        ("b:007", "b:007: {} has no such keyframe; `mapfold log cat {}` lists what it has"),
+    ],
+)
+def test_what_is_not_there_is_named_as_it_was_written(
+    reader: LogReader, text: str, says: str
+) -> None:
+    with pytest.raises(MisuseError) as caught:
+        resolve(reader, text)
+    assert says.replace("{}", str(reader.path)) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("second", "told"), [(9, None), (10, None), (15, "of the 5 events"), (20, "of the 6 events")]
+)
+def test_later_events_in_a_range_up_to_a_time_are_told(
+    reader: LogReader, second: int, told: str | None
+) -> None:
+    lines: list[str] = []
+    resolve(reader, _at(second), note=lines.append)
+    assert len(lines) == (told is not None)
+    for line in lines:
+        assert f"{told} up to {_at(second)}, " in line
+        assert ("2 are stamped later" if second == 15 else "1 is stamped later") in line
+
+
 @pytest.fixture
 def ours(log_path: Path) -> Iterator[LogReader]:
     """Imported in the year 2001: a loss; keyframe 1 at second 10; a reject; keyframe 2 at second
