@@ -209,7 +209,7 @@ def _advice(error: psycopg.OperationalError, url: str) -> str:
     text = str(error)
     log = embedded_log(url)
     if log is not None:
-        return f"the embedded server went away (its log: {log}); the next command starts it again"
+        return f"the embedded server went away; its log: {log}"
     if "password" in text or "authentication" in text or "pg_hba" in text:
         return "check user and password in the URL"
     if "does not exist" in text and "database" in text:
