@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 from rich.progress import (
@@ -19,24 +19,31 @@ from rich.progress import (
 from eventsrc.importers import (
     DEFAULT_KEY,
     LAZY_COMMIT,
+    ImportCut,
     ImportReport,
     check_sources,
     import_files,
 )
 from eventsrc.importers.record import Source
+from eventsrc.keys import check_key
 from eventsrc.log import LogWriter
 from eventsrc.words import counted
 
 from ._restart_line import restart_as_json, say_restart
 from ._shell import emit, finish, people, say
+from ._signals import ctrl_c_between_steps
+
+_MOST_REJECTS: Final = 5
 
 
 def import_(
-    log: Annotated[Path, typer.Argument(help="The log to append to; made if there is none.")],
+    log: Annotated[
+        Path, typer.Argument(metavar="LOG", help="The log to append to; made if there is none.")
+    ],
     files: Annotated[
         list[str],
         typer.Argument(
-            metavar="FILE…",
+            metavar="FILE",
             help="JSON lines (plain or gzip), logger records, MCAP files, other logs; - is stdin.",
         ),
     ],
@@ -46,16 +53,54 @@ def import_(
     """Append recorded envelopes to a log, in the order of the files.
 
     What is no envelope is kept with its bytes and the reason under mapfold/rejected, and makes the
-    command exit with 3.
+    command exit with 3. Ctrl-C keeps what is in the log by then and says how far that is.
     """
     check_sources(files)
-    with LogWriter(log, fsync=LAZY_COMMIT) as writer, _progress() as show:
-        say_restart(log, writer)
-        report = import_files(writer, files, key=key, progress=show)
+    check_key(key, "--key")
+    rejects = _Rejects()
+    try:
+        with LogWriter(log, fsync=LAZY_COMMIT) as writer, _progress() as show:
+            say_restart(log, writer)
+            with ctrl_c_between_steps() as step:
+                report = import_files(
+                    writer, files, key=key, progress=show, on_reject=rejects.say, step=step
+                )
+    except ImportCut as cut:
+        rejects.say_rest()
+        say(_cut(log, cut))
+        raise
+    rejects.say_rest()
     if json_:
         emit({"log": str(log), **asdict(report), **restart_as_json(writer)})
     say(_summary(log, report))
     finish(findings=report.rejected > 0)
+
+
+class _Rejects:
+    """Says the first few rejects as they come, and how many more there were."""
+
+    def __init__(self) -> None:
+        self._count = 0
+
+    def say(self, place: str, reason: str) -> None:
+        self._count += 1
+        if self._count <= _MOST_REJECTS:
+            say(f"{place}: rejected: {reason}")
+
+    def say_rest(self) -> None:
+        if self._count > _MOST_REJECTS:
+            say(f"… and {self._count - _MOST_REJECTS:,} more rejected")
+
+
+def _cut(log: Path, cut: ImportCut) -> str:
+    report = cut.report
+    if cut.place is None:
+        return f"{log}: nothing was imported"
+    kept = counted(report.next_offset - report.first_offset, "event")
+    return (
+        f"{log}: kept {kept}, offsets {report.first_offset} to {report.next_offset - 1}, up to "
+        f"{cut.place}; import only what comes after that, or the log holds the rest twice"
+    )
 
 
 def _summary(log: Path, report: ImportReport) -> str:
@@ -63,9 +108,9 @@ def _summary(log: Path, report: ImportReport) -> str:
     if report.next_offset > report.first_offset:
         parts.append(f"offsets {report.first_offset} to {report.next_offset - 1}")
     if report.system:
-        parts.append(f"{report.system} rejects and losses taken over")
+        parts.append(f"{counted(report.system, 'event')} of mapfold's own taken over")
     if report.skipped:
-        parts.append(f"{report.skipped} messages that are not JSON passed over")
+        parts.append(f"{counted(report.skipped, 'message')} other than JSON passed over")
     parts.append(f"{report.rejected} rejected")
     hint = f"; `mapfold log cat {log} --key mapfold/rejected` shows them" if report.rejected else ""
     return ", ".join(parts) + hint

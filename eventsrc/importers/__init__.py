@@ -1,5 +1,12 @@
 """Getting messages that others kept into a log."""
 
-from .run import DEFAULT_KEY, LAZY_COMMIT, ImportReport, check_sources, import_files
+from .run import DEFAULT_KEY, LAZY_COMMIT, ImportCut, ImportReport, check_sources, import_files
 
-__all__ = ["DEFAULT_KEY", "LAZY_COMMIT", "ImportReport", "check_sources", "import_files"]
+__all__ = [
+    "DEFAULT_KEY",
+    "LAZY_COMMIT",
+    "ImportCut",
+    "ImportReport",
+    "check_sources",
+    "import_files",
+]

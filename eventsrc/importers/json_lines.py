@@ -19,6 +19,8 @@ class JsonLines:
 
     def __init__(self, name: str, file: BinaryIO, size_bytes: int | None, start: bytes) -> None:
         self.name = name
+        self.unit = "line"
+        self.at: int | None = None
         self.size_bytes = size_bytes
         self.skipped = 0
         self._file = file
@@ -41,6 +43,7 @@ class JsonLines:
                 self._read += len(line)
                 self._check_length(number, line)
                 if line := line.strip(b" \t\r\n"):
+                    self.at = number
                     yield read_line(line)
         except (EOFError, gzip.BadGzipFile, zlib.error) as error:
             raise MapfoldError(

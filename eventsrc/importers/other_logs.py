@@ -19,6 +19,8 @@ class McapFile:
 
     def __init__(self, name: str, file: BinaryIO, size_bytes: int | None) -> None:
         self.name = name
+        self.unit = "message"
+        self.at: int | None = None
         self.size_bytes = size_bytes
         self.skipped = 0
         self._file = file
@@ -31,7 +33,8 @@ class McapFile:
     def records(self) -> Iterator[Imported]:
         """The JSON messages."""
         try:
-            for message in foreign_messages(self._file):
+            for number, message in enumerate(foreign_messages(self._file), start=1):
+                self.at = number
                 self._read += len(message.payload)
                 if message.encoding == "json":
                     yield Imported(
@@ -50,6 +53,8 @@ class OtherLog:
 
     def __init__(self, path: Path) -> None:
         self.name = str(path)
+        self.unit = "offset"
+        self.at: int | None = None
         self._reader = LogReader(path)
         self.size_bytes: int | None = None
         self.skipped = 0
@@ -63,5 +68,6 @@ class OtherLog:
         """Its events, system events included."""
         with self._reader as reader:
             for event in reader.read():
+                self.at = event.offset
                 self._read += len(event.payload)
                 yield Imported(event.payload, event.key, event.logged_ns, event.stamp_ns)

@@ -20,6 +20,10 @@ class Source(Protocol):
     """Something to import from."""
 
     name: str
+    unit: str
+    """What `at` counts: ``line``, ``message``, ``offset``."""
+    at: int | None
+    """Where the message that `records` gave last stands."""
     size_bytes: int | None
     skipped: int
     """Messages passed over because they are no JSON by their own declaration."""

@@ -6,7 +6,7 @@ keyframe it has seen for a duplicate, so the map is the same.
 
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -29,6 +29,8 @@ LAZY_COMMIT = FsyncPolicy(interval_ns=500_000_000, max_events=4096)
 _PROGRESS_EVERY = 64
 
 Progress = Callable[[Source], None]
+OnReject = Callable[[str, str], None]
+"""Takes where a message stands (``run.jsonl: line 17``) and why it is no envelope."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,40 +46,92 @@ class ImportReport:
     next_offset: int
 
 
+class ImportCut(KeyboardInterrupt):
+    """Ctrl-C. ``report`` says what is in the log, synced; ``place`` where its last message stands,
+    None when there is none."""
+
+    def __init__(self, report: ImportReport, place: str | None) -> None:
+        super().__init__()
+        self.report = report
+        self.place = place
+
+
 def import_files(
     writer: LogWriter,
     names: Sequence[str],
     *,
     key: str = DEFAULT_KEY,
     progress: Progress | None = None,
+    on_reject: OnReject | None = None,
+    step: AbstractContextManager[object] | None = None,
 ) -> ImportReport:
-    """Append every message of ``names`` in order. Messages that name no key get ``key``."""
-    first = writer.next_offset
-    accepted = rejected = system = skipped = 0
-    with ExitStack() as files:
-        for name in names:
-            source = open_source(name, files)
-            for number, record in enumerate(source.records()):
-                if record.key == REJECTED_KEY or record.key == LOSS_KEY:
-                    _take_over(writer, record.key, record)
-                    system += 1
-                elif _append(writer, record, key):
-                    accepted += 1
-                else:
-                    rejected += 1
-                if progress is not None and number % _PROGRESS_EVERY == 0:
-                    progress(source)
-            skipped += source.skipped
-    return ImportReport(accepted, rejected, system, skipped, first, writer.sync())
+    """Append every message of ``names`` in order. Messages that name no key get ``key``.
+
+    ``step`` is entered for each message: what holds Ctrl-C back in it makes `ImportCut` exact.
+    """
+    run = _Import(writer, key, on_reject or (lambda _place, _reason: None))
+    try:
+        with ExitStack() as files:
+            for name in names:
+                source = open_source(name, files)
+                for number, record in enumerate(source.records()):
+                    with step or nullcontext():
+                        run.take(source, record)
+                    if progress is not None and number % _PROGRESS_EVERY == 0:
+                        progress(source)
+                run.skipped += source.skipped
+    except KeyboardInterrupt:
+        raise ImportCut(run.report(), run.place) from None
+    return run.report()
 
 
-def _append(writer: LogWriter, record: Imported, key: str) -> bool:
-    outcome = append_payload(writer, record.key or key, record.payload, logged_ns=record.logged_ns)
-    return not isinstance(outcome, Rejected)
+class _Import:
+    """What has been appended so far, and from where the last of it came."""
 
+    def __init__(self, writer: LogWriter, key: str, on_reject: OnReject) -> None:
+        self._writer = writer
+        self._key = key
+        self._on_reject = on_reject
+        self._first = writer.next_offset
+        self._last: tuple[Source, int | None] | None = None
+        self.accepted = self.rejected = self.system = self.skipped = 0
 
-def _take_over(writer: LogWriter, key: str, record: Imported) -> None:
-    writer.append(key, record.payload, logged_ns=record.logged_ns, stamp_ns=record.stamp_ns)
+    def take(self, source: Source, record: Imported) -> None:
+        """Append one message."""
+        if record.key == REJECTED_KEY or record.key == LOSS_KEY:
+            self._take_over(record.key, record)
+        else:
+            self._append(source, record)
+        self._last = source, source.at
+
+    def _take_over(self, key: str, record: Imported) -> None:
+        self._writer.append(
+            key, record.payload, logged_ns=record.logged_ns, stamp_ns=record.stamp_ns
+        )
+        self.system += 1
+
+    def _append(self, source: Source, record: Imported) -> None:
+        outcome = append_payload(
+            self._writer, record.key or self._key, record.payload, logged_ns=record.logged_ns
+        )
+        if isinstance(outcome, Rejected):
+            self.rejected += 1
+            self._on_reject(f"{source.name}: {source.unit} {source.at}", outcome.reason)
+        else:
+            self.accepted += 1
+
+    @property
+    def place(self) -> str | None:
+        """``line 17 of run.jsonl``."""
+        if self._last is None:
+            return None
+        source, at = self._last
+        return f"{source.unit} {at} of {source.name}"
+
+    def report(self) -> ImportReport:
+        """All of it, synced."""
+        counts = (self.accepted, self.rejected, self.system, self.skipped)
+        return ImportReport(*counts, self._first, self._writer.sync())
 
 
 def check_sources(names: Sequence[str]) -> None:

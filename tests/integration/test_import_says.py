@@ -1,0 +1,89 @@
+"""What `mapfold import` tells people: what was rejected and where, and how far a cut import got."""
+
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from eventsrc.cli._signals import ctrl_c_between_steps
+from eventsrc.importers import ImportCut, ImportReport, import_files
+from eventsrc.log import LogWriter
+from tests.commands import PROGRAM, TIMEOUT_S, Commands
+from tests.envelopes import envelope, payload
+from tests.fixtures_log import read_log
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Commands:
+    """Commands in an empty folder."""
+    return Commands.in_folder(tmp_path)
+
+
+def _lines(first: int, count: int) -> list[bytes]:
+    return [payload(envelope(k)) for k in range(first, first + count)]
+
+
+def test_rejects_are_told_with_file_line_and_reason_and_the_rest_counted(run: Commands) -> None:
+    (run.folder / "a.jsonl").write_bytes(b"\n".join([*_lines(0, 2), b"", b"junk", b"[1]"]))
+    (run.folder / "b.jsonl").write_bytes(b"{}\n" * 8)
+    said = run("import", "L", "a.jsonl", "b.jsonl", code=3).err.splitlines()
+    assert said[0].startswith("a.jsonl: line 4: rejected: not JSON: ")
+    assert said[1] == "a.jsonl: line 5: rejected: not a JSON object but list"
+    assert [line.partition(": rejected: ")[0] for line in said[2:5]] == [
+        f"b.jsonl: line {n}" for n in (1, 2, 3)
+    ]
+    assert said[5] == "… and 5 more rejected"
+    assert said[6].startswith("imported 2 envelopes into L, offsets 0 to 11, 10 rejected; ")
+    assert len(said) == 7
+    said = run("import", "again", "-", stdin=b"\njunk", code=3).err.splitlines()
+    assert said[0].startswith("standard input: line 2: rejected: not JSON")
+    assert len(said) == 2
+
+
+def test_ctrl_c_says_what_is_kept_and_how_far_that_is(run: Commands) -> None:
+    program = subprocess.Popen(
+        [PROGRAM, "import", "L", "-"],
+        cwd=run.folder,
+        env=dict(run.env),
+        stdin=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    assert program.stdin is not None
+    assert program.stderr is not None
+    program.stdin.write(b"\n".join([*_lines(0, 3), b"", b"junk", b"the next line is under way"]))
+    program.stdin.flush()
+    assert b"line 5: rejected" in program.stderr.readline()  # so the lines before it are in
+    program.send_signal(signal.SIGINT)
+    _, said = program.communicate(timeout=TIMEOUT_S)
+    assert program.returncode == 130
+    assert said.decode().splitlines() == [
+        "L: kept 4 events, offsets 0 to 3, up to line 5 of standard input; "
+        + "import only what comes after that, or the log holds the rest twice",
+        "mapfold: interrupted",
+    ]
+    assert len(read_log(run.folder / "L")) == 4
+
+
+def test_a_cut_is_exact_also_in_the_midst_of_a_message(tmp_path: Path) -> None:
+    """Ctrl-C comes while a message that is refused is being appended."""
+    files = [str(tmp_path / name) for name in ("a.jsonl", "b.jsonl")]
+    Path(files[0]).write_bytes(b"\n".join(_lines(0, 100)))
+    Path(files[1]).write_bytes(b"\n".join([*_lines(100, 64), b"junk", *_lines(164, 9)]))
+
+    def interrupt(_place: str, _reason: str) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    with LogWriter(tmp_path / "L") as writer:
+        with pytest.raises(ImportCut) as caught, ctrl_c_between_steps() as step:
+            import_files(writer, files, on_reject=interrupt, step=step)
+        assert writer.durable_offset == 165
+    assert caught.value.place == f"line 65 of {files[1]}"
+    assert caught.value.report == ImportReport(164, 1, 0, 0, 0, 165)
+    assert len(read_log(tmp_path / "L")) == 165
+
+
+def test_a_key_that_nothing_can_be_published_under_is_misuse(run: Commands) -> None:
+    said = run("import", "L", "-", "--key", "a b/*", stdin=b"", code=2)
+    assert said.err.startswith("mapfold: --key 'a b/*': ")
+    assert not (run.folder / "L").exists()
