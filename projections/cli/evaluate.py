@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from eventsrc.cli._shell import emit
+from eventsrc.cli._shell import emit, say
 from projections.cli._options import SetOption, SettingsOption, settings_from
 from projections.cli._question import HfovOption, ImageOption, camera_from
 from projections.cli.relocalize import method_from
@@ -52,6 +52,7 @@ def evaluate(
         method=method_from(method),
         camera=camera_from(hfov, image),
         seed=seed,
+        note=say,
     )
     if json_:
         emit(result.scores)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from eventsrc.log import LogReader
-from eventsrc.log.whence import resolve
+from eventsrc.log.whence import Note, resolve
 from projections.folding import fold_log
 from projections.relocalize import DEFAULT_CAMERA, Camera, Method
 from projections.settings import Settings
@@ -41,13 +41,15 @@ def evaluate(
     method: Method = "joint",
     camera: Camera = DEFAULT_CAMERA,
     seed: int = DEFAULT_SEED,
+    note: Note | None = None,
 ) -> Evaluation:
     """Score the map of ``map_log`` (folded to ``until``) and questions from ``query_logs``.
 
+    ``note`` is told what a reader of ``until`` might wonder about (`eventsrc.log.whence.resolve`).
     Deterministic but for ``latency_ms``, which is of exact search in memory plus the ranking.
     """
     with LogReader(map_log) as reader:
-        _, view = fold_log(reader, settings, resolve(reader, until))
+        _, view = fold_log(reader, settings, resolve(reader, until, note=note))
     keyframes = list(read_keyframes(query_logs))
     if query_logs:
         check_truth(keyframes, truth)

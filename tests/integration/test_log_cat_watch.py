@@ -52,7 +52,13 @@ def test_a_map_of_a_time_says_what_is_later_in_it(run: Commands) -> None:
     (line,) = said.err.splitlines()
     assert line.startswith(f"L: of the 9 events up to {at(2)}, 5 are stamped later: stamps run")
     assert run("state", "L", "--at", "old:2", "--digest").out == said.out
-    for command in (("diff", "L", "0"), ("bisect", "L", "place_count > 9", "--to")):
+    for command in (
+        ("diff", "L", "0"),
+        ("bisect", "L", "place_count > 9", "--to"),
+        ("whatif", "L", "--set", "eps_m=1.0", "--at"),
+        ("draw", "L", "--out", "map.svg", "--at"),
+        ("evaluate", "--map", "L", "--at"),
+    ):
         assert "5 are stamped later" in run(*command, at(2)).err
 
 
