@@ -79,7 +79,7 @@ def test_trouble_with_the_embedded_server_is_not_about_urls(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MAPFOLD_HOME", str(tmp_path))
-    with pytest.raises(DatabaseUnavailable, match=r"embedded server went away; .*server\.log") as no:
+    with pytest.raises(DatabaseUnavailable, match=r"server went away; .*server\.log") as no:
         connect(EmbeddedServer(tmp_path).url)
     assert "--db" not in str(no.value)
 
