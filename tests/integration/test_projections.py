@@ -231,7 +231,7 @@ def test_a_log_that_was_cut_or_continued_differently_is_refused(
     rebuild(long, one_database, SETTINGS)
     with psycopg.connect(one_database.graph_url) as connection:
         connection.execute("UPDATE mapfold.checkpoint SET next_offset = 31")
-    with pytest.raises(ProjectionMismatch, match="31 events are in the graph .* only 30"):
+    with pytest.raises(ProjectionMismatch, match=r"31 events are in the graph .* only 30"):
         tail(long, one_database, SETTINGS, once=True)
     with psycopg.connect(one_database.graph_url) as connection:
         connection.execute("UPDATE mapfold.checkpoint SET next_offset = 29")
