@@ -1,6 +1,5 @@
 """A tail begins at the nearest snapshot that is surely of its own fold, and leaves one."""
 
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -108,7 +107,7 @@ def test_nothing_beyond_a_parked_event_is_taken_from_a_snapshot(
 def test_it_leaves_one_if_it_folded_much(
     log: Path, one_database: Targets, folded: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys.modules["projections.runner.tail"], "WORTH_A_SNAPSHOT", 50)
+    monkeypatch.setattr("projections.runner._tail_pass.WORTH_A_SNAPSHOT", 50)
     report = tail(log, one_database, SETTINGS, once=True)
     assert cache_of(log).offsets() == [report.next_offset]
     write_log(log, walk(10, run_id="run-d"))
