@@ -41,6 +41,8 @@ def session_shifts(matches: Sequence[Sequence[Match]], model: Model) -> dict[str
 
 def unshifted(row: Sequence[Match], shifts: Mapping[str, float]) -> list[Match]:
     """A crop's matches without their runs' shifts, most similar first, ties by ordinal."""
+    if not any(shifts.values()):
+        return list(row)
     taken = [_without(match, shifts[match.run_id]) for match in row]
     return sorted(taken, key=lambda match: (-match.similarity, match.observation))
 

@@ -1,9 +1,11 @@
 """Cosines of each run made comparable: which runs are shifted, by how much, and which stay open."""
 
+import math
+
 import numpy as np
 import pytest
 
-from projections.relocalize import Match
+from projections.relocalize import Camera, Crop, Match
 from projections.relocalize.model import MODEL
 from projections.relocalize.sessions import (
     Sessions,
@@ -12,6 +14,7 @@ from projections.relocalize.sessions import (
     settled,
     unshifted,
 )
+from projections.relocalize.sighting import sightings
 
 
 def row(**runs: list[float]) -> list[Match]:
@@ -78,3 +81,30 @@ def test_a_run_whose_shift_is_told_whole_is_not_open() -> None:
     less, paid = settled(error, Sessions(np.array([0, 0, 1, 1]), np.zeros(4)), MODEL)
     assert less.tolist() == error.tolist()
     assert paid.tolist() == [0.0] * 3
+
+
+def looks_at_the_origin(number: int, run: str, x: float, y: float, similarity: float) -> Match:
+    """A thing 1 m high at the origin, seen in the middle of the picture."""
+    half = 0.5 * 462.0 / math.hypot(x, y)
+    box = (320.0 - half, 200.0 - half, 320.0 + half, 200.0 + half)
+    return Match(number, f"d{number}", run, similarity, (x, y, math.atan2(-y, -x)), box, "cup")
+
+
+def test_a_landmark_two_runs_have_seen_is_known_from_the_side_the_other_run_saw() -> None:
+    """The own session saw it from behind, as similar as another session's from the flank.
+
+    As one run these views say: from neither side does it look as it should.
+    """
+    behind = MODEL.floor + MODEL.side * math.exp(-2.0 * MODEL.kappa) + MODEL.session
+    front = MODEL.floor + MODEL.side
+    wide = (-0.6, -0.3, 0.0, 0.3, 0.6)
+    crop = Crop(np.ones(4, dtype=np.float32) / 2, (260.0, 140.0, 380.0, 260.0))
+    tables = {}
+    for own in ("own", "other"):
+        seen = [looks_at_the_origin(i, "other", 2.5, y, front) for i, y in enumerate(wide)]
+        seen += [looks_at_the_origin(9 + i, own, -2.5, y, behind) for i, y in enumerate(wide)]
+        found = sightings([crop], [seen], Camera(), MODEL)[0].landmarks
+        assert [len(landmark.members) for landmark in found] == [10]
+        tables[own] = found[0].table
+    assert tables["own"][0] > tables["other"][0] + 1.0
+    assert abs(math.remainder(int(tables["own"].argmax()), len(tables["own"]))) <= 2
