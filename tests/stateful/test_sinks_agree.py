@@ -151,7 +151,7 @@ class SinksAgree(RuleBasedStateMachine):
             for label in ORDER
         }
         vectors = [
-            (r.det_pk, r.det_id, r.class_name, list(r.bbox), r.ingested_at)
+            (r.det_pk, r.added.det_id, r.added.class_name, list(r.bbox), r.ingested_at)
             for _, r in sorted(self.memory.vectors.items())
         ]
         for name, targets in self.targets.items():
