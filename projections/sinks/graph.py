@@ -26,7 +26,7 @@ from .labels import (
 )
 from .loader import InsertLoader, Loader, LoaderName, insert_columns, loader_of
 
-STREAM_ROWS: Final = 4_000
+STREAM_ROWS: Final = 2_000
 """Keyframes and observations that wait before a rebuild writes them: enough to make COPY's round
 trips vanish, few enough that the server has something to do from early on."""
 EARLY: Final[frozenset[Label]] = frozenset({"Observation"})

@@ -21,7 +21,7 @@ from .vector_rows import VectorRow, VectorRows
 DEFAULT_DIMENSION: Final = 512
 PLAIN_DIMENSION: Final = 1_900
 """Up to here a row fits one page of 8 kB and can be kept out of TOAST."""
-STREAM_ROWS: Final = 2_000
+STREAM_ROWS: Final = 1_000
 SMALL_BATCH: Final = 20
 """Below this many rows an INSERT, sent down the pipeline, beats COPY's extra round trips."""
 _PUBLIC: Final = "public"

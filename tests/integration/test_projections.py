@@ -14,9 +14,9 @@ from projections.folding import fold_log
 from projections.postgres.connect import Targets
 from projections.runner import rebuild, tail
 from projections.settings import Settings
-from projections.sinks._leaving import wait_for_drop
 from projections.sinks.loader import LoaderName
 from projections.view import MapView
+from tests.drops import wait_for_drops
 from tests.envelopes import detection, envelope
 from tests.logs import WEIRD, append_raw, bridge, walk, write_log
 from tests.rows import all_rows, expected_graph, graph_rows, vector_rows
@@ -248,7 +248,7 @@ def test_what_a_user_has_in_the_database_stays(
     for _ in range(2):
         rebuild(log, one_database, SETTINGS)
     assert pg.execute("SELECT n FROM public.mine").fetchone() == (1,)
-    wait_for_drop(pg, "graph")
+    wait_for_drops(one_database)
     names = pg.execute("SELECT name::text FROM ag_graph ORDER BY 1").fetchall()
     assert names == [("my_graph",), ("semantic_map",)]
 

@@ -10,7 +10,8 @@ from projections.errors import DatabaseError
 from projections.postgres.connect import Connection, Targets, connect
 from projections.runner import RebuildProgress, rebuild
 from projections.settings import Settings
-from projections.sinks._leaving import may_drop, wait_for_drop
+from projections.sinks._leaving import may_drop
+from tests.drops import wait_for_drops
 from tests.logs import walk, write_log
 from tests.rows import all_rows
 
@@ -20,13 +21,6 @@ SETTINGS = Settings()
 @pytest.fixture
 def log(tmp_path: Path) -> Path:
     return write_log(tmp_path / "log", walk(60))
-
-
-def wait_for_drops(targets: Targets) -> None:
-    """Until the sessions that drop have ended."""
-    with connect(targets.graph_url) as connection:
-        wait_for_drop(connection, "graph")
-        wait_for_drop(connection, "vectors")
 
 
 def left_over(pg: psycopg.Connection) -> set[str]:

@@ -8,11 +8,11 @@ import psycopg
 import pytest
 
 from projections.errors import DatabaseError, ProjectionBusy
-from projections.postgres.connect import Targets, connect, connect_for_cypher
+from projections.postgres.connect import Targets, connect_for_cypher
 from projections.runner import RebuildProgress, rebuild, tail
 from projections.settings import Settings
-from projections.sinks._leaving import wait_for_drop
 from projections.sinks.vectors import VectorSink
+from tests.drops import wait_for_drops
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows
 
@@ -56,13 +56,6 @@ class Reader(threading.Thread):
                     self.first.set()
                 assert row is not None
                 self.answers.append(str(row[0]))
-
-
-def wait_for_drops(targets: Targets) -> None:
-    """Until the server has dropped what a rebuild replaced: its sessions hold these locks."""
-    with connect(targets.graph_url) as connection:
-        wait_for_drop(connection, "graph")
-        wait_for_drop(connection, "vectors")
 
 
 def single_answer(connection: psycopg.Connection, query: str) -> str:

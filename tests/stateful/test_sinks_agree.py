@@ -34,6 +34,7 @@ from projections.runner._fold import LiveFold
 from projections.settings import Settings
 from projections.sinks.loader import LoaderName
 from projections.sinks.memory import MemorySink
+from tests.drops import wait_for_drops
 from tests.envelopes import envelope
 from tests.logs import append_raw, bridge, walk, write_log
 from tests.rows import ORDER, graph_rows, vector_rows
@@ -80,6 +81,7 @@ class SinksAgree(RuleBasedStateMachine):
             self._empty(self.targets[name])
 
     def _empty(self, targets: Targets) -> None:
+        wait_for_drops(targets)
         for url in {targets.graph_url, targets.vector_url}:
             with connect(url, autocommit=True) as connection:
                 connection.execute("SET client_min_messages = warning")
