@@ -5,8 +5,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
-from projections.errors import DatabaseUnavailable
+from projections.errors import DatabaseError, DatabaseUnavailable, EmbeddedServerError
 
+AWAY: Final = (DatabaseUnavailable, EmbeddedServerError)
+"""What another attempt may mend: a server killed once more while it starts does not start."""
 FIRST_PAUSE_S: Final = 0.1
 LONGEST_PAUSE_S: Final = 5.0
 
@@ -32,7 +34,7 @@ class Backoff:
                 " the log and comes with the next start"
             )
 
-    def failed(self, error: DatabaseUnavailable) -> None:
+    def failed(self, error: DatabaseError) -> None:
         """An attempt failed: tell of it and wait longer next time. Raises it out of patience."""
         self.waited_s += self.pause_s
         if self.patience_s is not None and self.waited_s > self.patience_s:

@@ -26,7 +26,7 @@ from projections.sink import Checkpoint, Sink, SinkName
 from projections.sinks import _checkpoint
 from projections.sinks._checkpoint import DeadLetter
 
-from ._backoff import Backoff, OnTrouble
+from ._backoff import AWAY, Backoff, OnTrouble
 from ._stores import Store
 
 Found: TypeAlias = dict[SinkName, Checkpoint | None]
@@ -119,7 +119,7 @@ class Writer:
                 self.revive()
                 self.store.reconnect()
                 return self._look()
-            except DatabaseUnavailable as error:
+            except AWAY as error:
                 backoff.failed(error)
 
     def _look(self) -> Found:

@@ -12,12 +12,11 @@ from pathlib import Path
 from typing import Final
 
 from eventsrc.log import LogReader
-from projections.errors import DatabaseUnavailable
 from projections.postgres.connect import Targets, place
 from projections.settings import Settings
 from projections.sinks.loader import LoaderName
 
-from ._backoff import Backoff, OnTrouble
+from ._backoff import AWAY, Backoff, OnTrouble
 from ._stores import Only, open_stores
 from ._tail_pass import Note, OnBatch, TailPass, TailPlan
 from ._writing import LostCommits
@@ -98,7 +97,7 @@ def _pass(
             run.begin(reader)
             begun = True
             run.follow(reader)
-    except DatabaseUnavailable as error:
+    except AWAY as error:
         if begun or outage is None:
             raise
         outage.failed(error)

@@ -84,6 +84,31 @@ def test_postgres_itself_is_killed_again_and_again(
     assert all_rows(targets) == tailed
 
 
+def test_a_server_that_does_not_start_at_once_is_tried_again(
+    tmp_path: Path, own_server: EmbeddedServer
+) -> None:
+    log = write_log(tmp_path / "log", walk(40))
+    targets = Targets(own_server.url, own_server.url, own_server)
+    spoilt = own_server.data / "postgresql.auto.conf"
+    troubles: list[str] = []
+
+    def spoil(report: TailReport) -> None:
+        if report.next_offset == 20 and not troubles:
+            kill_postgres(own_server)
+            spoilt.write_text("no_such_setting = 1\n")
+
+    def mend(trouble: str) -> None:
+        troubles.append(trouble)
+        if "no_such_setting" in trouble:
+            spoilt.write_text("")
+
+    report = tail(
+        log, targets, SETTINGS, once=True, batch_events=10, on_batch=spoil, on_trouble=mend
+    )
+    assert report.next_offset == 40
+    assert "no_such_setting" in troubles[-1]
+
+
 def cut_connections(url: str) -> None:
     """End every other session of the database and wait until they are gone."""
     with connect(url, autocommit=True) as admin:
