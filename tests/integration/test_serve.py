@@ -387,7 +387,8 @@ def test_people_hear_of_a_cut_connection_in_our_words_only(targets: Targets) -> 
     finally:
         program.terminate()
         program.wait(DEADLINE_S)
-    lines = program.stderr.read().splitlines()  # not communicate(): readline() has read ahead
+    with program.stderr:
+        lines = program.stderr.read().splitlines()  # not communicate(): readline() has read ahead
     assert lines[0] == "Ctrl-C ends it"
     assert lines[1].startswith("mapfold: database ")
     assert lines[2:] == ["mapfold: the database answers again", "service ended"]
