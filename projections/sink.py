@@ -7,11 +7,11 @@ its own, so a write that failed can be repeated with it, and writing it again do
 A rebuild goes another way to the same rows: `begin` a shadow; while the fold runs `take_final` the
 rows that can never change again and `load` them; then `take_rest` and `load` the rest, `index`,
 `check` and `swap` the shadow in, all in one transaction; then `tidy` away what it replaced. Until
-then nobody sees anything of it. What needs the view and what needs the connection are two methods,
-so that a thread can write while the fold goes on.
+then nobody sees anything of it. What needs the view and what needs the connection are apart, so
+that a thread can send while the fold goes on.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol, TypeAlias, TypeVar
 
@@ -78,8 +78,8 @@ class Sink(Protocol[Changes]):
     def take_rest(self, view: MapView) -> Changes:
         """All rows that `take_final` has not given out yet; the fold is over."""
 
-    def load(self, connection: Connection, changes: Changes) -> None:
-        """Write what was taken to the shadow."""
+    def load(self, changes: Changes) -> Callable[[Connection], None]:
+        """What writes what was taken to the shadow, and has only to send it."""
 
     def index(self, connection: Connection) -> None:
         """Index the shadow, which is complete now, and gather its statistics."""

@@ -105,7 +105,7 @@ def rebuild(
                 folded = time.monotonic()
                 tell(RebuildProgress("writing", total, total))
                 for loading, sink, connection in loadings:
-                    loading.put(partial(sink.load, connection, sink.take_rest(fold.view)))
+                    loading.put(partial(sink.load(sink.take_rest(fold.view)), connection))
                     loading.put(partial(sink.index, connection))
                 digest = map_digest(fold.view)
                 for loading, _, _ in loadings:
@@ -188,7 +188,7 @@ def _fold_into(
         for loading, sink, connection in loadings:
             rows = sink.take_final(fold.view)
             if rows is not None:
-                loading.put(partial(sink.load, connection, rows))
+                loading.put(partial(sink.load(rows), connection))
     return last
 
 

@@ -1,7 +1,7 @@
 """The sink that writes the map as an Apache AGE graph."""
 
 from collections.abc import Mapping, Sequence
-from typing import Final
+from typing import Any, Final
 
 from psycopg import sql
 
@@ -24,7 +24,7 @@ from .labels import (
     VERTEX_LABELS,
     Label,
 )
-from .loader import InsertLoader, Loader, LoaderName, insert_columns, loader_of
+from .loader import InsertLoader, Load, Loader, LoaderName, loader_of, unnest_columns
 
 STREAM_ROWS: Final = 2_000
 """Keyframes and observations that wait before a rebuild writes them: enough to make COPY's round
@@ -71,10 +71,10 @@ class GraphSink:
         """Insert, upsert and delete what was taken."""
         loader = InsertLoader() if self.few(changes) else self._loader
         for label, rows in changes.inserted.items():
-            self._insert(loader, connection, GRAPH, label, rows)
+            _new_rows(loader, GRAPH, label, rows)(connection)
         for label, rows in changes.upserted.items():
             kind = "upsert_vertex" if label in VERTEX_LABELS else "upsert_edge"
-            insert_columns(connection, kind, GRAPH, label, rows)
+            unnest_columns(kind, GRAPH, label, rows)(connection)
         for label, ids in changes.deleted.items():
             query = statements("graph")["delete"].format(
                 graph=sql.Identifier(GRAPH), label=sql.Identifier(label)
@@ -107,10 +107,18 @@ class GraphSink:
         """All rows that are still missing."""
         return self._whole.take_rest(view)
 
-    def load(self, connection: Connection, changes: GraphChanges) -> None:
-        """Write rows to the shadow, where none of them is yet."""
-        for label, rows in changes.inserted.items():
-            self._insert(self._loader, connection, NEXT_GRAPH, label, rows)
+    def load(self, changes: GraphChanges) -> Load:
+        """What writes rows to the shadow, where none of them is yet."""
+        loads = [
+            _new_rows(self._loader, NEXT_GRAPH, label, rows)
+            for label, rows in changes.inserted.items()
+        ]
+
+        def load(connection: Connection) -> None:
+            for each in loads:
+                each(connection)
+
+        return load
 
     def index(self, connection: Connection) -> None:
         """Index the shadow and gather its statistics."""
@@ -149,10 +157,8 @@ class GraphSink:
         ):
             _graph_ddl.leave_dropping(connection, OLD_GRAPH)
 
-    def _insert(
-        self, loader: Loader, connection: Connection, graph: str, label: Label, rows: list[object]
-    ) -> None:
-        if label in EDGE_LABELS:
-            loader.edges(connection, graph, label, rows)  # type: ignore[arg-type]
-        else:
-            loader.vertices(connection, graph, label, rows)  # type: ignore[arg-type]
+
+def _new_rows(loader: Loader, graph: str, label: Label, rows: list[Any]) -> Load:
+    if label in EDGE_LABELS:
+        return loader.edges(graph, label, rows)
+    return loader.vertices(graph, label, rows)  # type: ignore[arg-type]

@@ -4,9 +4,13 @@
 SELECT unnest`` per call, for servers and proxies that do not let COPY through, and for batches so
 small that COPY's own round trips would cost more. Both write the same rows: one contract test
 class runs on both.
+
+A loader makes a `Load` of the rows: all that takes time in this process is done then, and what is
+left is sending. A rebuild sends in a thread; were the thread to make bytes of rows too, it and the
+fold would take the interpreter from each other tens of thousands of times, a fifth of both.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final, Literal, Protocol, TypeAlias
 
 from psycopg import sql
@@ -20,6 +24,8 @@ from .labels import EdgeLabel, VertexLabel
 from .vector_rows import VectorRow
 
 LoaderName: TypeAlias = Literal["copy", "insert"]
+Load: TypeAlias = Callable[[Connection], None]
+"""Sends rows that are not there yet; the connection is inside a transaction."""
 INSERT_CHUNK: Final = 5_000
 """Rows of one INSERT: a statement's parameters are held in memory whole, on both sides."""
 VECTOR_CHUNK: Final = 500
@@ -29,115 +35,114 @@ memory is asked of the system anew each time."""
 
 
 class Loader(Protocol):
-    """Writes rows that are not there yet. ``connection`` is inside a transaction."""
+    """Makes what writes rows that are not there yet."""
 
-    def vertices(
-        self, connection: Connection, graph: str, label: VertexLabel, rows: Sequence[VertexRow]
-    ) -> None:
+    def vertices(self, graph: str, label: VertexLabel, rows: Sequence[VertexRow]) -> Load:
         """Add vertices of one label."""
 
-    def edges(
-        self, connection: Connection, graph: str, label: EdgeLabel, rows: Sequence[EdgeRow]
-    ) -> None:
+    def edges(self, graph: str, label: EdgeLabel, rows: Sequence[EdgeRow]) -> Load:
         """Add edges of one label."""
 
-    def vectors(
-        self, connection: Connection, schema: str, vector: sql.Composable, rows: Sequence[VectorRow]
-    ) -> None:
+    def vectors(self, schema: str, vector: sql.Composable, rows: Sequence[VectorRow]) -> Load:
         """Add rows of ``detection_embeddings``; ``vector`` names pgvector's type."""
 
 
 class CopyLoader:
     """COPY: text for the graph (agtype has no binary form), binary for the vectors."""
 
-    def vertices(
-        self, connection: Connection, graph: str, label: VertexLabel, rows: Sequence[VertexRow]
-    ) -> None:
+    def vertices(self, graph: str, label: VertexLabel, rows: Sequence[VertexRow]) -> Load:
         """Add vertices of one label."""
         lines = [f"{i}\t{properties}\n" for i, properties in rows]
-        self._copy(connection, "copy_vertex", graph, label, lines)
+        return _copy(_about("copy_vertex", graph, label), [_text_document(lines)])
 
-    def edges(
-        self, connection: Connection, graph: str, label: EdgeLabel, rows: Sequence[EdgeRow]
-    ) -> None:
+    def edges(self, graph: str, label: EdgeLabel, rows: Sequence[EdgeRow]) -> Load:
         """Add edges of one label."""
         lines = [f"{i}\t{start}\t{end}\t{properties}\n" for i, start, end, properties in rows]
-        self._copy(connection, "copy_edge", graph, label, lines)
+        return _copy(_about("copy_edge", graph, label), [_text_document(lines)])
 
     def vectors(
         self,
-        connection: Connection,
         schema: str,
         vector: sql.Composable,  # noqa: ARG002 - COPY takes the type from the table
         rows: Sequence[VectorRow],
-    ) -> None:
+    ) -> Load:
         """Add rows of ``detection_embeddings``."""
         statement = sql.SQL("COPY {}.detection_embeddings ({}) FROM STDIN (FORMAT binary)").format(
             sql.Identifier(schema), sql.SQL(", ").join(map(sql.Identifier, COPIED))
         )
-        with connection.cursor() as cursor, cursor.copy(statement) as copy:
-            for start in range(0, len(rows), COPY_CHUNK):
-                last = start + COPY_CHUNK >= len(rows)
-                copy.write(copy_document(rows[start : start + COPY_CHUNK], start == 0, last))
-
-    def _copy(
-        self, connection: Connection, statement: str, graph: str, label: str, lines: list[str]
-    ) -> None:
-        # agtype text holds no raw tab or line end (they are escaped in strings), so the backslash
-        # is the only character that COPY's own format still has to escape.
-        data = "".join(lines).replace("\\", "\\\\")
-        query = statements("graph")[statement].format(
-            graph=sql.Identifier(graph), label=sql.Identifier(label)
+        starts = range(0, len(rows), COPY_CHUNK)
+        return _copy(
+            statement,
+            [
+                copy_document(rows[i : i + COPY_CHUNK], i == 0, i + COPY_CHUNK >= len(rows))
+                for i in starts
+            ],
         )
-        with connection.cursor() as cursor, cursor.copy(query) as copy:
-            copy.write(data)
 
 
 class InsertLoader:
     """``INSERT … SELECT unnest(…)`` with the columns as bound arrays."""
 
-    def vertices(
-        self, connection: Connection, graph: str, label: VertexLabel, rows: Sequence[VertexRow]
-    ) -> None:
+    def vertices(self, graph: str, label: VertexLabel, rows: Sequence[VertexRow]) -> Load:
         """Add vertices of one label."""
-        insert_columns(connection, "insert_vertex", graph, label, rows)
+        return unnest_columns("insert_vertex", graph, label, rows)
 
-    def edges(
-        self, connection: Connection, graph: str, label: EdgeLabel, rows: Sequence[EdgeRow]
-    ) -> None:
+    def edges(self, graph: str, label: EdgeLabel, rows: Sequence[EdgeRow]) -> Load:
         """Add edges of one label."""
-        insert_columns(connection, "insert_edge", graph, label, rows)
+        return unnest_columns("insert_edge", graph, label, rows)
 
-    def vectors(
-        self, connection: Connection, schema: str, vector: sql.Composable, rows: Sequence[VectorRow]
-    ) -> None:
+    def vectors(self, schema: str, vector: sql.Composable, rows: Sequence[VectorRow]) -> Load:
         """Add rows of ``detection_embeddings``."""
         query = statements("vectors")["insert"].format(schema=sql.Identifier(schema), vector=vector)
-        for start in range(0, len(rows), VECTOR_CHUNK):
-            chunk = rows[start : start + VECTOR_CHUNK]
-            columns = zip(*(_vector_fields(row) for row in chunk), strict=True)
-            connection.execute(query, [list(column) for column in columns])
+        return _unnest(query, [_vector_fields(row) for row in rows], VECTOR_CHUNK)
 
 
-def insert_columns(
-    connection: Connection,
-    statement: str,
-    graph: str,
-    label: str,
-    rows: Sequence[VertexRow] | Sequence[EdgeRow],
-) -> None:
-    """Run one of the unnest statements of ``sql/graph.sql`` with the columns of ``rows``."""
-    query = statements("graph")[statement].format(
-        graph=sql.Identifier(graph), label=sql.Identifier(label)
-    )
-    for start in range(0, len(rows), INSERT_CHUNK):
-        columns = zip(*rows[start : start + INSERT_CHUNK], strict=True)
-        connection.execute(query, [[str(value) for value in column] for column in columns])
+def unnest_columns(
+    statement: str, graph: str, label: str, rows: Sequence[VertexRow] | Sequence[EdgeRow]
+) -> Load:
+    """One of the unnest statements of ``sql/graph.sql``, with the columns of ``rows``."""
+    as_text = [tuple(map(str, row)) for row in rows]
+    return _unnest(_about(statement, graph, label), as_text, INSERT_CHUNK)
 
 
 def loader_of(name: LoaderName) -> Loader:
     """The loader called ``name``."""
     return CopyLoader() if name == "copy" else InsertLoader()
+
+
+def _about(statement: str, graph: str, label: str) -> sql.Composed:
+    return statements("graph")[statement].format(
+        graph=sql.Identifier(graph), label=sql.Identifier(label)
+    )
+
+
+def _text_document(lines: list[str]) -> bytes:
+    # agtype text holds no raw tab or line end (they are escaped in strings), so the backslash is
+    # the only character that COPY's own format still has to escape.
+    return "".join(lines).replace("\\", "\\\\").encode()
+
+
+def _copy(statement: sql.Composed, documents: list[bytes]) -> Load:
+    def load(connection: Connection) -> None:
+        with connection.cursor() as cursor, cursor.copy(statement) as copy:
+            for document in documents:
+                copy.write(document)
+
+    return load
+
+
+def _unnest(statement: sql.Composed, rows: Sequence[tuple[object, ...]], size: int) -> Load:
+    """``size`` rows with one statement."""
+    chunks = [
+        [list(column) for column in zip(*rows[start : start + size], strict=True)]
+        for start in range(0, len(rows), size)
+    ]
+
+    def load(connection: Connection) -> None:
+        for columns in chunks:
+            connection.execute(statement, columns)
+
+    return load
 
 
 def _vector_fields(row: VectorRow) -> tuple[object, ...]:

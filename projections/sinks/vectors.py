@@ -15,7 +15,7 @@ from projections.view import MapView
 from . import _leaving, _readers
 from ._sql import statements
 from .labels import TABLE
-from .loader import InsertLoader, Loader, LoaderName, loader_of
+from .loader import InsertLoader, Load, Loader, LoaderName, loader_of
 from .vector_rows import VectorRow, VectorRows
 
 DEFAULT_DIMENSION: Final = 512
@@ -72,7 +72,7 @@ class VectorSink:
             self._redimension(connection, _PUBLIC, dimension)
             self._dimension = dimension
         loader = InsertLoader() if self.few(changes) else self._loader
-        loader.vectors(connection, _PUBLIC, self._type, changes)
+        loader.vectors(_PUBLIC, self._type, changes)(connection)
 
     def clear(self, connection: Connection) -> None:
         """Drop a replaced table that was left; refuse early if the name in use is not ours."""
@@ -94,15 +94,20 @@ class VectorSink:
         """The rows that still wait."""
         return self._rows.take(view)
 
-    def load(self, connection: Connection, changes: Sequence[VectorRow]) -> None:
-        """Write rows to the shadow."""
+    def load(self, changes: Sequence[VectorRow]) -> Load:
+        """What writes rows to the shadow."""
         if not changes:
-            return
+            return lambda _: None
         dimension = len(changes[0].unit)
-        if dimension != self._shadow_dimension:
-            self._redimension(connection, _SHADOW, dimension)
-            self._shadow_dimension = dimension
-        self._loader.vectors(connection, _SHADOW, self._type, changes)
+        add = self._loader.vectors(_SHADOW, self._type, changes)
+
+        def load(connection: Connection) -> None:
+            if dimension != self._shadow_dimension:
+                self._redimension(connection, _SHADOW, dimension)
+                self._shadow_dimension = dimension
+            add(connection)
+
+        return load
 
     def index(self, connection: Connection) -> None:
         """Only statistics: the keys' indexes are there, HNSW comes after the swap."""

@@ -20,7 +20,7 @@ from projections.postgres.connect import Targets, connect, ensure_extension
 from projections.postgres.embedded import EmbeddedServer
 from projections.runner import RebuildProgress, rebuild
 from projections.settings import Settings
-from projections.sinks.loader import CopyLoader
+from projections.sinks.loader import CopyLoader, Load
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows
 
@@ -121,21 +121,17 @@ def test_rows_the_server_refuses_in_the_middle_of_the_stream(
     calls: list[int] = []
 
     def twice_the_second_time(
-        self: CopyLoader,
-        connection: psycopg.Connection,
-        schema: str,
-        vector: sql.Composable,
-        rows: Sequence[Any],
-    ) -> None:
+        self: CopyLoader, schema: str, vector: sql.Composable, rows: Sequence[Any]
+    ) -> Load:
         calls.append(len(rows))
-        vectors(self, connection, schema, vector, [*rows, *rows] if len(calls) == 2 else rows)
+        return vectors(self, schema, vector, [*rows, *rows] if len(calls) == 2 else rows)
 
     vectors = CopyLoader.vectors
     with monkeypatch.context() as patched:
         patched.setattr(CopyLoader, "vectors", twice_the_second_time)
         with pytest.raises(DatabaseError, match="duplicate key"):
             rebuild(log, one_database, SETTINGS)
-    assert len(calls) == 2
+    assert len(calls) >= 2  # made ready ahead of what was refused
     assert all_rows(one_database) == old
     rebuild(log, one_database, SETTINGS)
     assert all_rows(one_database) != old

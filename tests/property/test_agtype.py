@@ -34,7 +34,7 @@ def trip(connection: psycopg.Connection, loader: Loader, texts: list[str]) -> li
     with connection.transaction(force_rollback=True):
         base = 3 << 48
         rows = [(base + i, text) for i, text in enumerate(texts, 1)]
-        loader.vertices(connection, "agtype_trip", "Thing", rows)  # type: ignore[arg-type]
+        loader.vertices("agtype_trip", "Thing", rows)(connection)  # type: ignore[arg-type]
         found = connection.execute(
             'SELECT properties FROM agtype_trip."Thing" ORDER BY id'
         ).fetchall()
