@@ -8,7 +8,7 @@ the (halved) path of survivors, so a merge costs little however many keyframes m
 
 import zlib
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, ClassVar
 
 from .deltas import (
     Delta,
@@ -50,30 +50,16 @@ class MapView:
         self.places: dict[int, PlaceRecord] = {}
         self.adjacency: dict[tuple[int, int], int] = {}
         self.skipped: dict[str, int] = {"duplicate": 0, "conflict": 0, "det_id_reused": 0}
-        self._appliers: dict[type, Callable[[Any], None]] = {
-            RunSeen: self._run_seen,
-            KeyframeAdded: self._keyframe_added,
-            ObservationAdded: self._observation_added,
-            EventSkipped: self._event_skipped,
-            PlaceFormed: self._place_formed,
-            PlacesMerged: self._places_merged,
-            KeyframePlaced: self._keyframe_placed,
-            PlaceChanged: self._place_changed,
-            ObjectFound: self._object_found,
-            ObjectSeen: self._object_seen,
-            ObjectMoved: self._object_moved,
-            PlacesLinked: self._places_linked,
-        }
 
     def apply(self, delta: Delta) -> None:
         """Take in one delta."""
-        self._appliers[type(delta)](delta)
+        self._APPLIERS[type(delta)](self, delta)
 
     def apply_event(self, offset: int, deltas: Iterable[Delta]) -> None:
         """Take in all deltas of the event at ``offset`` and advance past it."""
-        appliers = self._appliers
+        appliers = self._APPLIERS
         for delta in deltas:
-            appliers[type(delta)](delta)
+            appliers[type(delta)](self, delta)
         self.next_offset = offset + 1
 
     def advance(self, next_offset: int) -> None:
@@ -195,6 +181,23 @@ class MapView:
             self.adjacency[delta.a, delta.b] = delta.shared_transitions
         else:
             self.adjacency.pop((delta.a, delta.b), None)
+
+    # Of the class, not bound to the view: a view that refers to itself would, when nobody wants it
+    # any more, keep a whole map in memory until Python looks for cycles.
+    _APPLIERS: ClassVar[dict[type, Callable[["MapView", Any], None]]] = {
+        RunSeen: _run_seen,
+        KeyframeAdded: _keyframe_added,
+        ObservationAdded: _observation_added,
+        EventSkipped: _event_skipped,
+        PlaceFormed: _place_formed,
+        PlacesMerged: _places_merged,
+        KeyframePlaced: _keyframe_placed,
+        PlaceChanged: _place_changed,
+        ObjectFound: _object_found,
+        ObjectSeen: _object_seen,
+        ObjectMoved: _object_moved,
+        PlacesLinked: _places_linked,
+    }
 
     def counts(self) -> dict[str, int]:
         """How many of everything; the last seven are the graph's edges by label."""

@@ -13,7 +13,7 @@ for that, only the view.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 from projections.deltas import (
     Delta,
@@ -123,26 +123,13 @@ class GraphRows:
     def __init__(self) -> None:
         self._forget_fixed()
         self._forget_changing()
-        self._noters: dict[type, Callable[[Any, MapView], None]] = {
-            RunSeen: lambda d, _: self._runs.add(d.run),
-            KeyframeAdded: lambda d, _: self._keyframes.append(d.keyframe),
-            ObservationAdded: lambda d, _: self._observations.append(d.observation),
-            ObjectFound: lambda d, _: self._objects.add(d.object),
-            ObjectSeen: lambda d, _: self._objects.add(d.object),
-            ObjectMoved: lambda d, _: self._located.add(d.object),
-            PlaceFormed: lambda d, _: self._places.add(d.place),
-            PlaceChanged: lambda d, _: self._places.add(d.place),
-            KeyframePlaced: lambda d, _: self._placed.add(d.keyframe),
-            PlacesMerged: self._places_merged,
-            PlacesLinked: lambda d, _: self._links.add((d.a, d.b)),
-        }
 
     def note(self, deltas: Iterable[Delta], view: MapView) -> None:
         """Remember what an event's deltas will change; ``view`` has not applied them yet."""
         for delta in deltas:
-            noter = self._noters.get(type(delta))
+            noter = self._NOTERS.get(type(delta))
             if noter is not None:
-                noter(delta, view)
+                noter(self, delta, view)
 
     def take(self, view: MapView) -> GraphChanges:
         """All rows that changed since the last take, as ``view`` has them now."""
@@ -192,3 +179,18 @@ class GraphRows:
         for place in delta.absorbed:
             self._absorbed.add(place)
             self._placed.update(view.all_places[place].unordered_members)
+
+    # Of the class, not bound to what collects; `MapView` says why.
+    _NOTERS: ClassVar[dict[type, Callable[["GraphRows", Any, MapView], None]]] = {
+        RunSeen: lambda self, d, _: self._runs.add(d.run),
+        KeyframeAdded: lambda self, d, _: self._keyframes.append(d.keyframe),
+        ObservationAdded: lambda self, d, _: self._observations.append(d.observation),
+        ObjectFound: lambda self, d, _: self._objects.add(d.object),
+        ObjectSeen: lambda self, d, _: self._objects.add(d.object),
+        ObjectMoved: lambda self, d, _: self._located.add(d.object),
+        PlaceFormed: lambda self, d, _: self._places.add(d.place),
+        PlaceChanged: lambda self, d, _: self._places.add(d.place),
+        KeyframePlaced: lambda self, d, _: self._placed.add(d.keyframe),
+        PlacesMerged: _places_merged,
+        PlacesLinked: lambda self, d, _: self._links.add((d.a, d.b)),
+    }

@@ -12,7 +12,7 @@ from array import array
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from projections.deltas import (
     Delta,
@@ -68,16 +68,6 @@ class History:
         self.place_numbers: dict[str, int] = {}
         self.object_numbers: dict[str, int] = {}
         self._neighbours: tuple[int, Neighbours] | None = None
-        self._apply: dict[type, Callable[[Any, Cause], None]] = {
-            RunSeen: self._run_seen,
-            KeyframeAdded: self._keyframe_added,
-            EventSkipped: self._event_skipped,
-            PlaceFormed: self._place_formed,
-            KeyframePlaced: self._keyframe_placed,
-            PlaceChanged: self._place_changed,
-            ObjectFound: self._object_found,
-            ObjectSeen: self._object_seen,
-        }
 
     def apply(self, offset: int, deltas: Sequence[Delta]) -> None:
         """Remember what the event at ``offset`` did."""
@@ -89,8 +79,8 @@ class History:
         moves: list[_Move] = []
         links: list[EdgeChange] = []
         for delta in deltas:
-            if (handle := self._apply.get(type(delta))) is not None:
-                handle(delta, cause)
+            if (handle := self._APPLIERS.get(type(delta))) is not None:
+                handle(self, delta, cause)
             elif isinstance(delta, PlacesMerged):
                 merges.append(delta)
             elif isinstance(delta, ObjectMoved):
@@ -171,6 +161,18 @@ class History:
 
     def _object_seen(self, delta: ObjectSeen, _: Cause) -> None:
         self.objects[delta.object].seen.append(delta)
+
+    # Of the class, not bound to the history; `MapView` says why.
+    _APPLIERS: ClassVar[dict[type, Callable[["History", Any, Cause], None]]] = {
+        RunSeen: _run_seen,
+        KeyframeAdded: _keyframe_added,
+        EventSkipped: _event_skipped,
+        PlaceFormed: _place_formed,
+        KeyframePlaced: _keyframe_placed,
+        PlaceChanged: _place_changed,
+        ObjectFound: _object_found,
+        ObjectSeen: _object_seen,
+    }
 
     def _object_moved(self, delta: ObjectMoved) -> _Move:
         life = self.objects[delta.object]

@@ -1,0 +1,60 @@
+"""A map nobody wants any more is gone at once, not when Python next looks for cycles.
+
+A rebuild leaves hundreds of megabytes behind, and whoever folds in one process again and again (a
+tail that starts anew, ``whatif``, ``serve``) would hold several of them.
+"""
+
+import gc
+import weakref
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from eventsrc.log import LogReader
+from projections.folding import fold_log
+from projections.runner._fold import LiveFold
+from projections.settings import Settings
+from projections.sinks.graph import GraphSink
+from projections.sinks.vectors import VectorSink
+from projections.timetravel.history import History
+
+SAMPLE = Path(__file__).parents[2] / "logs" / "sample"
+
+
+@pytest.fixture
+def no_search_for_cycles() -> Iterator[None]:
+    gc.disable()
+    yield
+    gc.enable()
+
+
+def folded() -> object:
+    with LogReader(SAMPLE) as reader:
+        return fold_log(reader, Settings())[1]
+
+
+def folding() -> object:
+    with LogReader(SAMPLE) as reader:
+        return fold_log(reader, Settings())[0]
+
+
+@pytest.mark.usefixtures("no_search_for_cycles")
+@pytest.mark.parametrize(
+    "make",
+    [
+        folded,
+        folding,
+        lambda: LiveFold(Settings()).view,
+        GraphSink,
+        lambda: GraphSink()._rows,
+        VectorSink,
+        lambda: History(Settings()),
+    ],
+    ids=["view", "map", "live view", "graph sink", "graph rows", "vector sink", "history"],
+)
+def test_nobody_holds_on_to_it(make: Callable[[], object]) -> None:
+    thing = make()
+    gone = weakref.ref(thing)
+    del thing
+    assert gone() is None
