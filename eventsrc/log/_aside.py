@@ -66,6 +66,7 @@ class SealingProcess:
                 "log_id": plan.log_id,
                 "base": plan.base,
                 "previous_sha256": plan.previous_sha256,
+                "following": plan.following,
             }
         )
         if "errno" in answer:

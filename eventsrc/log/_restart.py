@@ -47,8 +47,9 @@ class Restart:
     recovered_events: int = 0
     torn_bytes: int = 0
     torn_events: int = 0
-    unsealed: list[int] = field(default_factory=list)
-    """Bases of the left-over segments that are finished and still to be sealed, in order."""
+    unsealed: list[tuple[int, int]] = field(default_factory=list)
+    """Base and next offset of the left-over segments that are finished and still to be sealed, in
+    order."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +84,7 @@ def restart(log: Path) -> Restart:
     if all(left.finishable and left.segment.base > last_sealed for left in found):
         for left in found:
             _finish(left)
-            state.unsealed.append(left.segment.base)
+            state.unsealed.append((left.segment.base, left.scan.next_offset))
     else:
         for left in found:
             _seal_now(log, left)
@@ -171,7 +172,7 @@ def _seal_now(log: Path, left: _Leftover) -> None:
     before = [s for s in list_segments(log) if s.base < left.segment.base]
     previous = file_sha256(before[-1].path) if before else NO_PREVIOUS
     file = ActiveFile(left.segment.path, left.segment.base)
-    plan = SegmentPlan(log, file.log_id, left.segment.base, previous)
+    plan = SegmentPlan(log, file.log_id, left.segment.base, previous, left.scan.next_offset)
     seal(plan, (file.read_chunk(chunk) for chunk in left.scan.chunks))
     left.segment.path.unlink()
     sync_directory(log)

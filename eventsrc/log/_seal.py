@@ -49,12 +49,17 @@ REPLACES = "replaces_sha256"
 
 @dataclass(frozen=True, slots=True)
 class SegmentPlan:
-    """What a sealed segment says of itself: its log, its base and the hash of the one before."""
+    """What a sealed segment says of itself: its log, its base and the hash of the one before.
+
+    ``following`` is the offset behind its last event. Bodies that end elsewhere are not sealed:
+    something has rotted, and the file they came from is all there is of the rest.
+    """
 
     log: Path
     log_id: str
     base: int
     previous_sha256: str
+    following: int
     notes: dict[str, str] = field(default_factory=dict)
 
 
@@ -75,6 +80,7 @@ def write_sealed(plan: SegmentPlan, bodies: Iterable[bytes], temporary: Path) ->
         builder = _Builder(fd, plan)
         for part in parts_of(bodies):
             builder.add_chunk(part)
+        builder.expect_end(plan)
         builder.finish()
         sync_file(fd)
     except BadRecord as error:
@@ -157,6 +163,14 @@ class _Builder:
                 uncompressed_size=len(body),
             )
         )
+
+    def expect_end(self, plan: SegmentPlan) -> None:
+        """Raise BadRecord unless everything up to the end of the plan was added."""
+        reached = plan.base + self._edges[-1]
+        if reached != plan.following:
+            raise BadRecord(
+                f"offsets {reached} to {plan.following - 1} were recorded and cannot be read"
+            )
 
     def finish(self) -> None:
         """Seal, end of data, summary, footer."""

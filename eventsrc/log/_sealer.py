@@ -14,13 +14,13 @@ import shutil
 import threading
 from collections import deque
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
-from eventsrc.errors import LogError, MapfoldError
+from eventsrc.errors import LogDamaged, LogError, MapfoldError
 
 from ._active_file import ActiveFile
 from ._aside import ProcessGone, SealingProcess
-from ._naming import ACTIVE, segment_path
+from ._naming import ACTIVE, SEALED, segment_path
 from ._seal import SegmentPlan, seal
 from .fsync import sync_directory
 
@@ -31,8 +31,15 @@ _FREE_DISK_SHARE: Final = 4
 _LOOK_AGAIN_S: Final = 0.25
 
 
+class Finished(NamedTuple):
+    """A segment that was written to its end: its offsets are ``base`` to before ``following``."""
+
+    base: int
+    following: int
+
+
 class Sealer:
-    """``submit`` bases in offset order; ``finish`` waits for all of them."""
+    """``submit`` segments in offset order; ``finish`` waits for all of them."""
 
     def __init__(
         self, log: Path, log_id: str, previous_sha256: str, *, aside: bool = False
@@ -42,7 +49,7 @@ class Sealer:
         self._process: SealingProcess | None = None
         self._log_id = log_id
         self._previous_sha256 = self._sealed_sha256 = previous_sha256
-        self._submitted: queue.Queue[int | None] = queue.Queue()
+        self._submitted: queue.Queue[Finished | None] = queue.Queue()
         self._finishing = False
         self._at_leisure = threading.Event()
         self._at_leisure.set()
@@ -57,14 +64,15 @@ class Sealer:
         """Segments submitted and not sealed."""
         return self._count - self._sealed
 
-    def submit(self, base: int, *, last: bool = False) -> None:
-        """Seal the finished active segment at ``base`` when its turn comes."""
+    def submit(self, base: int, following: int, *, last: bool = False) -> None:
+        """Seal the finished active segment of offsets ``base`` to before ``following`` when its
+        turn comes."""
         self._finishing = last  # too late for a process that is not there yet
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name="mapfold-sealer", daemon=True)
             self._thread.start()
         self._count += 1
-        self._submitted.put(base)
+        self._submitted.put(Finished(base, following))
 
     def hurry(self, on: bool) -> None:
         """Put sealing off, or no longer."""
@@ -82,19 +90,19 @@ class Sealer:
             self._thread = None
 
     def _run(self) -> None:
-        waiting: deque[int] = deque()
-        while (base := self._submitted.get()) is not None:
-            waiting.append(base)
+        waiting: deque[Finished] = deque()
+        while (finished := self._submitted.get()) is not None:
+            waiting.append(finished)
             self._work_off(waiting)
         self._work_off(waiting)
         if self._process is not None:
             self._process.close()
 
-    def _work_off(self, waiting: deque[int]) -> None:
+    def _work_off(self, waiting: deque[Finished]) -> None:
         """Seal in order, for a segment carries the hash of the one before it. A disk that refused
         is tried again when the next segment comes; damage stays."""
         while waiting and not self._damaged:
-            path = segment_path(self._log, waiting[0], ACTIVE)
+            path = segment_path(self._log, waiting[0].base, ACTIVE)
             self._wait_for_leisure(path)
             try:
                 self._seal(waiting[0])
@@ -121,12 +129,16 @@ class Sealer:
             if size * self.waiting * _FREE_DISK_SHARE > free:
                 return
 
-    def _seal(self, base: int) -> None:
+    def _seal(self, segment: Finished) -> None:
+        base, following = segment
         active = segment_path(self._log, base, ACTIVE)
         if active.exists():  # else only the folder's sync failed, the time before
-            plan = SegmentPlan(self._log, self._log_id, base, self._previous_sha256)
+            plan = SegmentPlan(self._log, self._log_id, base, self._previous_sha256, following)
             self._sealed_sha256 = self._seal_aside(plan) or self._seal_here(plan)
             active.unlink()
+        elif not segment_path(self._log, base, SEALED).exists():
+            lost = f"offsets {base} to {following - 1} are lost"
+            raise LogDamaged(f"{active} was deleted before it was sealed: {lost}")
         sync_directory(self._log)
         self._previous_sha256 = self._sealed_sha256
 

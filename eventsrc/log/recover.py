@@ -124,6 +124,7 @@ class _Recovery:
                 self._log_id,
                 scan.base,
                 file_sha256(self._previous.path) if self._previous else NO_PREVIOUS,
+                scan.next_offset,
                 _replaces(following),
             )
             nearby = moment_between(self._previous, following)

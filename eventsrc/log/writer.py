@@ -87,8 +87,8 @@ class LogWriter:
             )
             self._active = self._ending = self._next_segment(self.restart.next_offset)
             self._active.create()
-            for base in self.restart.unsealed:
-                self._sealer.submit(base)
+            for base, following in self.restart.unsealed:
+                self._sealer.submit(base, following)
         except BaseException:
             self._lock.release()
             raise
@@ -180,7 +180,10 @@ class LogWriter:
     def _rotate(self) -> None:
         ending, following = self._active, self._next_segment(self._active.next_offset)
         self._ending, self._active = ending, following  # first: if this fails, both refuse
-        self._commits.rotate(ending, following, lambda: self._sealer.submit(ending.base))
+        self._commits.rotate(ending, following, lambda: self._submit(ending))
+
+    def _submit(self, finished: ActiveSegment, *, last: bool = False) -> None:
+        self._sealer.submit(finished.base, finished.committed, last=last)
 
     def close(self) -> None:
         """Commit, seal, let the next writer in. Raises LogError when the last events or the seal
@@ -205,7 +208,7 @@ class LogWriter:
     def _finish_active(self) -> None:
         """An empty segment stays only where it is all there is: it carries the log's id."""
         if self._active.committed > self._active.base:
-            self._sealer.submit(self._active.base, last=True)
+            self._submit(self._active, last=True)
         elif self._active.base > 0:
             unlink_quietly(self._active.path)
 

@@ -34,7 +34,7 @@ def growing(path: Path, events: int = 5) -> SegmentPlan:
         check=False,
         timeout=TIMEOUT_S,
     )
-    return SegmentPlan(path, done.stdout.strip(), 0, NO_PREVIOUS)
+    return SegmentPlan(path, done.stdout.strip(), 0, NO_PREVIOUS, events)
 
 
 def test_it_writes_what_sealing_here_writes(tmp_path: Path) -> None:
@@ -174,7 +174,8 @@ def test_a_dead_writer_leaves_nothing_that_stands_in_the_next_ones_way(log_path:
     plan = growing(log_path)
     process = SealingProcess()
     process._to.write(
-        b'{"log": "%s", "log_id": "%s", "base": 0, "previous_sha256": ""}\n'
+        b'{"log": "%s", "log_id": "%s", "base": 0, "previous_sha256": "", '
+        b'"following": 5}\n'
         % (str(log_path).encode(), plan.log_id.encode())
     )
     process._from.close()

@@ -10,11 +10,19 @@ from pathlib import Path
 import pytest
 
 from eventsrc.errors import LogError
-from eventsrc.log import ALWAYS, LogReader, LogWriter, _mcap, _sealer, verify_log
+from eventsrc.log import (
+    ALWAYS,
+    LogReader,
+    LogWriter,
+    _mcap,
+    _sealer,
+    recover_log,
+    verify_log,
+)
 from eventsrc.log._head import file_head, head_metadata
 from eventsrc.log._naming import ACTIVE, SEALED, segment_path
 from eventsrc.log._sealer import Sealer
-from tests.fixtures_log import KEY, read_log
+from tests.fixtures_log import KEY, flip, read_log
 
 TIMEOUT_S = 30
 
@@ -49,8 +57,8 @@ def test_a_disk_that_was_full_for_a_while_is_tried_again(
 ) -> None:
     sealer = segments(log_path, 3)
     disk = Disk(monkeypatch)
-    sealer.submit(0)
-    sealer.submit(1)
+    sealer.submit(0, 1)
+    sealer.submit(1, 2)
     sealer.finish()
     assert sealer.waiting == 2
     assert sealer.error is not None
@@ -60,7 +68,7 @@ def test_a_disk_that_was_full_for_a_while_is_tried_again(
     disk.full = False
     sealer = Sealer(log_path, LogReader(log_path).log_id, "")
     for base in range(3):
-        sealer.submit(base)
+        sealer.submit(base, base + 1)
     sealer.finish()
     assert (sealer.waiting, sealer.error) == (0, None)
     assert not list(log_path.glob("*.active"))
@@ -94,8 +102,8 @@ def test_a_folder_that_cannot_be_synced_is_tried_again(
         real(path)
 
     monkeypatch.setattr(_sealer, "sync_directory", sync_directory)
-    sealer.submit(0)
-    sealer.submit(1)
+    sealer.submit(0, 1)
+    sealer.submit(1, 2)
     sealer.finish()
     assert (sealer.waiting, sealer.error) == (0, None)
     assert {f.kind for f in verify_log(log_path).findings} == {"schema"}
@@ -108,8 +116,8 @@ def test_a_segment_that_contradicts_itself_is_told_and_kept(log_path: Path, asid
     sealer = Sealer(log_path, LogReader(log_path).log_id, "", aside=aside)
     active = segment_path(log_path, 0, ACTIVE)
     active.write_bytes(with_a_cut_message(active.read_bytes()))
-    sealer.submit(0)
-    sealer.submit(1)
+    sealer.submit(0, 1)
+    sealer.submit(1, 2)
     sealer.finish()
     assert sealer.waiting == 2
     with pytest.raises(LogError, match=r"does not fit its chunk; run `mapfold log recover"):
@@ -118,6 +126,39 @@ def test_a_segment_that_contradicts_itself_is_told_and_kept(log_path: Path, asid
         segment_path(log_path, base, ACTIVE).name for base in (0, 1)
     }
     assert not segment_path(log_path, 0, SEALED).exists()
+
+
+@pytest.mark.parametrize("at", [3, -10], ids=["chunk head", "commit mark"])
+@pytest.mark.parametrize("aside", [False, True])
+def test_what_hides_behind_a_rotten_frame_is_not_sealed_away(
+    log_path: Path, at: int, aside: bool
+) -> None:
+    """Readers see nothing behind it, so a sealed segment of what they see would be all there is."""
+    writer = LogWriter(log_path, fsync=ALWAYS)
+    writer._sealer.submit = lambda *_, **__: None  # type: ignore[method-assign]
+    active = segment_path(log_path, 0, ACTIVE)
+    ends = []
+    for number in range(4):
+        writer.append(KEY, b"%d" % number)
+        ends.append(active.stat().st_size)
+    writer.close()
+    flip(active, ends[0] + at if at > 0 else ends[1] + at)
+    sealer = Sealer(log_path, writer.log_id, "", aside=aside)
+    sealer.submit(0, 4)
+    sealer.finish()
+    with pytest.raises(LogError, match=r"offsets 1 to 3 were recorded .* log recover"):
+        raise sealer.error or AssertionError("nothing said")
+    recover_log(log_path)
+    kept = [e.payload for e in read_log(log_path) if e.key == KEY]
+    assert kept == ([b"0", b"2", b"3"] if at > 0 else [b"0", b"1", b"2", b"3"])
+
+
+def test_a_segment_that_was_deleted_before_it_was_sealed_is_told(log_path: Path) -> None:
+    writer = LogWriter(log_path, fsync=ALWAYS)
+    writer.append(KEY, b"0")
+    segment_path(log_path, 0, ACTIVE).unlink()
+    with pytest.raises(LogError, match=r"was deleted before it was sealed: offsets 0 to 0 are"):
+        writer.close()
 
 
 def with_a_cut_message(data: bytes) -> bytes:
