@@ -9,7 +9,8 @@ recovery, which has no writer to race with, takes every chunk whose CRC holds, m
 last mark of a segment is synced before the next segment begins: without it a reader would find the
 next one's events and not those before them.
 
-A commit that fails leaves the file at the last good byte, and the segment refuses further work.
+A commit that fails leaves the file at the last good byte, and the segment refuses further work. So
+it does when somebody has deleted the file: nothing may be called recorded that has no name.
 """
 
 import os
@@ -103,8 +104,11 @@ class ActiveSegment:
             if self._syncs:
                 sync_file(self._fd)
             write_all(self._fd, mark)
+            gone = os.fstat(self._fd).st_nlink == 0
         except OSError as error:
             raise self._fail(error) from error
+        if gone:
+            raise self._deleted()
         self.size += len(head) + len(body) + len(mark)
         self.committed = group.following
 
@@ -134,6 +138,14 @@ class ActiveSegment:
         except OSError as cut_error:
             message += f" (the torn end stays: {cut_error.strerror}; recovery ignores it)"
         return self.refuse(message)
+
+    def _deleted(self) -> LogError:
+        """A file without a name takes everything and keeps nothing."""
+        return self.refuse(
+            f"{self.path} was deleted while it was being written: offsets {self.base} to "
+            f"{self.next_offset - 1} are lost. Keep others away from {self.path.parent} and start "
+            "again"
+        )
 
     def refuse(self, message: str) -> LogError:
         """From now on every append and commit raises this."""

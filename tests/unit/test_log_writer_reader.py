@@ -1,14 +1,17 @@
 """What goes into a log comes out of it: bytes, times, keys and offsets."""
 
+import fcntl
 import json
 import os
 import socket
+import time
 from pathlib import Path
 
 import pytest
 
 from eventsrc.errors import LogBusy, LogNotFound, NotALog
 from eventsrc.log import LogReader, LogWriter, log_info
+from eventsrc.log._lock import is_held
 from tests.fixtures_log import BY_HAND, KEY, envelope, read_log, write_log
 
 ODD_PAYLOADS = [b"", b"\x00", b"\xff\xfe not utf-8", "ε🙂".encode(), b"x" * 100_000]
@@ -79,6 +82,31 @@ def test_a_second_writer_is_told_who_holds_the_log(log_path: Path) -> None:
     assert socket.gethostname() in message
     assert "1970-01-01T00:00:00+00:00" in message
     LogWriter(log_path).close()
+
+
+def test_a_deleted_lock_file_lets_nobody_in(log_path: Path) -> None:
+    with LogWriter(log_path) as writer:
+        writer.append(KEY, b"0")
+        writer.sync()
+        (log_path / "lock").unlink()
+        assert is_held(log_path)
+        with pytest.raises(LogBusy, match="is being written by another process"):
+            LogWriter(log_path)
+        assert is_held(log_path)
+    assert not is_held(log_path)
+    LogWriter(log_path).close()
+
+
+def test_who_only_looks_keeps_no_writer_out(
+    log_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`log verify` asks whether a log is held, and holds it while it does."""
+    LogWriter(log_path).close()
+    looking = os.open(log_path / "lock", os.O_RDONLY)
+    fcntl.flock(looking, fcntl.LOCK_SH)
+    monkeypatch.setattr(time, "sleep", lambda _: fcntl.flock(looking, fcntl.LOCK_UN))
+    LogWriter(log_path).close()
+    os.close(looking)
 
 
 def test_no_log_and_not_a_log_are_named(tmp_path: Path) -> None:
