@@ -38,19 +38,23 @@ class Verification:
 
 def verify_log(log: Path) -> Verification:
     """Look at everything. Raises only when there is no log, or one that may not be read."""
+    before: list[SegmentPath] = []
     while True:
+        segments = segments_of(log)
         try:
-            return _Verifier(log).run()
-        except FileNotFoundError:
-            continue  # a segment was sealed while we looked: look again
+            return _Verifier(log, segments).run()
         except OSError as error:
-            raise LogError(f"{log}: {error.strerror or error}; check its rights") from error
+            sealed_meanwhile = isinstance(error, FileNotFoundError) and segments != before
+            if not sealed_meanwhile:
+                place, reason = error.filename or log, error.strerror or error
+                raise LogError(f"{place}: {reason}; check its rights and its disk") from error
+            before = segments
 
 
 class _Verifier:
-    def __init__(self, log: Path) -> None:
+    def __init__(self, log: Path, segments: list[SegmentPath]) -> None:
         self._log = log
-        self._segments = segments_of(log)
+        self._segments = segments
         self._live = is_held(log)
         self._found: list[Finding] = []
         self._events = EventFindings()

@@ -96,3 +96,12 @@ def test_two_writers(run: Commands) -> None:
             said = run(*command, stdin=PAYLOADS[0], code=1)
             assert "being written by process" in said.err
     run("log", "recover", "L")
+
+
+def test_a_segment_whose_disk_is_away_does_not_hang_verify(run: Commands) -> None:
+    away = run.folder / "unmounted" / segment(run).name
+    segment(run).unlink()
+    segment(run).symlink_to(away)
+    said = run("log", "verify", "L", code=1)
+    assert said.err.count("\n") == 1
+    assert f"{away.name}: No such file or directory; check" in said.err
