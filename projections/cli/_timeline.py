@@ -17,11 +17,12 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from eventsrc.cli._shell import people, say
-from eventsrc.log.whence import resolve
+from eventsrc.cli._shell import people
 from projections.cli._options import settings_from
 from projections.settings import Settings
 from projections.timetravel import Timeline
+
+from ._point import W
 
 LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="The log's folder.")]
 AtOption = Annotated[
@@ -29,7 +30,7 @@ AtOption = Annotated[
     typer.Option(
         "--at",
         metavar="W",
-        help="Look from here: number of events, ISO time, RUN:KEYFRAME (inclusive) or end.",
+        help=f"Look from here: {W}.",
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")]
@@ -81,8 +82,3 @@ class FoldBar:
         self._bar.update(self._task, completed=done, total=total)
         if done >= total:
             self._bar.stop()
-
-
-def point(opened: Timeline, text: str) -> int:
-    """The number of events that W means in this log."""
-    return resolve(opened.reader, text, note=say)

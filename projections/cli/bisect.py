@@ -14,7 +14,8 @@ from projections.timetravel.expression import functions_help
 from projections.timetravel.text import search_text
 
 from ._options import SetOption, SettingsOption
-from ._timeline import MOST_LINES, AllOption, JsonOption, LogArgument, point, timeline
+from ._point import W, point
+from ._timeline import MOST_LINES, AllOption, JsonOption, LogArgument, timeline
 
 _HELP = f"""The first event that made a condition over the map true.
 
@@ -31,10 +32,10 @@ def bisect(
     log: LogArgument,
     expression: Annotated[str, typer.Argument(metavar="EXPR", help="The condition.")],
     start: Annotated[
-        str, typer.Option("--from", metavar="W", help="Look at events from here on.")
+        str, typer.Option("--from", metavar="W", help=f"Begin with the map as of here: {W}.")
     ] = "0",
     end: Annotated[
-        str, typer.Option("--to", metavar="W", help="Look at events up to here.")
+        str, typer.Option("--to", metavar="W", help="End with the map as of here.")
     ] = "end",
     scan: Annotated[
         bool,
@@ -47,7 +48,7 @@ def bisect(
 ) -> None:
     with _pointing(), timeline(log, settings_file, set_) as opened:
         asked = Expression(expression)
-        span = point(opened, start), point(opened, end)
+        span = point(opened.reader, start), point(opened.reader, end)
         found = opened.bisect(asked, *span, scan=scan)
     if json_:
         emit(found.document())

@@ -9,15 +9,14 @@ from eventsrc.cli._shell import emit
 from projections.timetravel.text import difference_text
 
 from ._options import SetOption, SettingsOption
-from ._timeline import MOST_LINES, AllOption, JsonOption, LogArgument, point, timeline
-
-_W = "Number of events, ISO time, RUN:KEYFRAME (inclusive) or end."
+from ._point import W, point
+from ._timeline import MOST_LINES, AllOption, JsonOption, LogArgument, timeline
 
 
 def diff(
     log: LogArgument,
-    first: Annotated[str, typer.Argument(metavar="W1", help=f"From here. {_W}")],
-    second: Annotated[str, typer.Argument(metavar="W2", help="To here.")] = "end",
+    first: Annotated[str, typer.Argument(metavar="W1", help=f"From here: {W}.")],
+    second: Annotated[str, typer.Argument(metavar="W2", help="To here: the same.")] = "end",
     json_: JsonOption = False,
     all_: AllOption = False,
     set_: SetOption = None,
@@ -25,7 +24,7 @@ def diff(
 ) -> None:
     """Places, objects and adjacency that changed from one moment of the map to another."""
     with timeline(log, settings_file, set_) as opened:
-        found = opened.diff(point(opened, first), point(opened, second))
+        found = opened.diff(point(opened.reader, first), point(opened.reader, second))
     if json_:
         emit(found.document())
     else:

@@ -7,9 +7,9 @@ import typer
 
 from eventsrc.cli._shell import say
 from eventsrc.log import LogReader
-from eventsrc.log.whence import resolve
 from eventsrc.words import counted
 from projections.cli._options import SetOption, SettingsOption, settings_from
+from projections.cli._point import W, point
 from projections.folding import fold_events
 from projections.reducers.semantic_map import SemanticMap
 from projections.view import MapView
@@ -19,11 +19,7 @@ def draw(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="The log's folder.")],
     at: Annotated[
         str,
-        typer.Option(
-            "--at",
-            metavar="W",
-            help="Fold to here: number of events, ISO time, RUN:KEYFRAME (inclusive) or end.",
-        ),
+        typer.Option("--at", metavar="W", help=f"Fold to here: {W}."),
     ] = "end",
     out: Annotated[
         Path, typer.Option(metavar="FILE", help="The picture; its suffix says how: png, svg, pdf.")
@@ -53,7 +49,7 @@ def draw(
     settings = settings_from(settings_file, set_)
     view = MapView(settings, keep_embeddings=False)
     with LogReader(log) as reader:
-        events = reader.read(0, resolve(reader, at, note=say))
+        events = reader.read(0, point(reader, at))
         merged = fold_with_merges(fold_events(events, SemanticMap(settings)), view)
     draw_map(
         view,

@@ -8,6 +8,7 @@ import typer
 
 from eventsrc.cli._shell import emit, say
 from projections.cli._options import SetOption, SettingsOption, settings_from
+from projections.cli._point import W
 from projections.cli._question import HfovOption, ImageOption, camera_from
 from projections.cli.relocalize import method_from
 from projections.evaluate import evaluate as score
@@ -28,7 +29,7 @@ def evaluate(
         typer.Option("--truth", metavar="FILE", help="Truth of map and query runs; several."),
     ] = None,
     until: Annotated[
-        str, typer.Option("--at", metavar="W", help="Fold the map's log only to here.")
+        str, typer.Option("--at", metavar="W", help=f"Fold the map's log only to here: {W}.")
     ] = "end",
     method: Annotated[str, typer.Option("--method", help="joint or plain.")] = "joint",
     seed: Annotated[int, typer.Option("--seed", help="Draws the crops asked with.")] = DEFAULT_SEED,

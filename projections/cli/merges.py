@@ -14,7 +14,8 @@ from projections.timetravel.merge_story import merge_document
 from projections.timetravel.text import merge_text, merges_text
 
 from ._options import SetOption, SettingsOption
-from ._timeline import AtOption, JsonOption, LogArgument, point, timeline
+from ._point import point
+from ._timeline import AtOption, JsonOption, LogArgument, timeline
 
 
 def merges(
@@ -39,7 +40,7 @@ def merges(
 ) -> None:
     """Every merge of places: when, by which keyframe, who survived, who was absorbed."""
     with timeline(log, settings_file, set_) as opened:
-        end = point(opened, at)
+        end = point(opened.reader, at)
         found = opened.merges(end)
         if draw is not None:
             _draw(opened, numbered(found, draw), out)

@@ -11,7 +11,6 @@ import typer
 from eventsrc.cli._shell import emit
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
-from eventsrc.log.whence import resolve
 from projections.cli._options import (
     DbOption,
     SetOption,
@@ -20,6 +19,7 @@ from projections.cli._options import (
     databases,
 )
 from projections.cli._past import past_settings, say_defaults
+from projections.cli._point import W, point
 from projections.cli._question import QuestionArgument, question_from
 from projections.folding import fold_log
 from projections.postgres.connect import connect
@@ -38,7 +38,7 @@ from projections.settings import Settings
 
 AtOption = Annotated[
     str | None,
-    typer.Option("--at", metavar="W", help="Ask the map as of this point of --log instead."),
+    typer.Option("--at", metavar="W", help=f"Ask the map as it was: {W} of --log."),
 ]
 LogOption = Annotated[
     Path | None,
@@ -126,7 +126,7 @@ def _asker(db: str | None, log: Path | None, at: str | None, settings: Settings)
     """The live graph, or the log folded to a point with ``settings``."""
     if log is not None:
         with LogReader(log) as reader:
-            _, view = fold_log(reader, settings, resolve(reader, at or "end"))
+            _, view = fold_log(reader, settings, point(reader, at or "end"))
         say_defaults(settings)
         yield ViewAsker(view)
         return

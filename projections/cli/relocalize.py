@@ -16,6 +16,7 @@ from projections.cli._options import (
     databases,
 )
 from projections.cli._past import past_settings, say_defaults
+from projections.cli._point import W
 from projections.cli._question import (
     HfovOption,
     ImageOption,
@@ -34,11 +35,7 @@ def relocalize(
     top: Annotated[int, typer.Option("--top", min=1, max=100, help="Places to list.")] = 3,
     as_of: Annotated[
         str | None,
-        typer.Option(
-            "--as-of",
-            metavar="W",
-            help="Ask the map as it was: number of events, ISO time, RUN:KEYFRAME or end of --log.",
-        ),
+        typer.Option("--as-of", metavar="W", help=f"Ask the map as it was: {W} of --log."),
     ] = None,
     log: Annotated[
         Path | None,
@@ -64,7 +61,9 @@ def relocalize(
         answer = _live(crops, top, how, camera, db, vector_db)
     else:
         then = as_of or "end"
-        answer = relocalize_as_of(log, then, settings, crops, top=top, method=how, camera=camera)
+        answer = relocalize_as_of(
+            log, then, settings, crops, top=top, method=how, camera=camera, note=say
+        )
         say_defaults(settings)
     _tell(answer, json_)
 

@@ -9,7 +9,6 @@ import typer
 
 from eventsrc.cli._shell import emit, say
 from eventsrc.log import LogReader
-from eventsrc.log.whence import resolve
 from eventsrc.words import counted
 from projections.runner import RebuildReport, rebuild
 from projections.settings import Settings
@@ -26,6 +25,7 @@ from ._options import (
     databases,
     settings_from,
 )
+from ._point import W, point
 
 
 class Sinks(StrEnum):
@@ -70,9 +70,7 @@ def loader_of(loader: Loaders) -> LoaderName:
 
 def replay(
     log: LogArgument,
-    until: Annotated[
-        str, typer.Option("--until", metavar="W", help="Offset, ISO time, run:keyframe, or end.")
-    ] = "end",
+    until: Annotated[str, typer.Option("--until", metavar="W", help=f"Fold to here: {W}.")] = "end",
     only: OnlyOption = None,
     db: DbOption = None,
     vector_db: VectorDbOption = None,
@@ -87,7 +85,7 @@ def replay(
     """Rebuild the databases from LOG. Readers see the old map until the new one is whole."""
     settings = settings_from(settings_file, assignments)
     with LogReader(log) as reader:
-        end = resolve(reader, until)
+        end = point(reader, until)
     with databases(db, vector_db) as targets, Bar() as bar:
         report = rebuild(
             log,

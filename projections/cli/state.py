@@ -9,8 +9,8 @@ import typer
 from eventsrc.cli._shell import emit, say
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
-from eventsrc.log.whence import resolve
 from projections.cli._options import SetOption, SettingsOption, settings_from
+from projections.cli._point import W, point
 from projections.digest import map_digest
 from projections.folding import fold_log_cached
 from projections.state_json import state_document
@@ -21,11 +21,7 @@ def state(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="The log's folder.")],
     at: Annotated[
         str,
-        typer.Option(
-            "--at",
-            metavar="W",
-            help="Fold to here: number of events, ISO time, RUN:KEYFRAME (inclusive) or end.",
-        ),
+        typer.Option("--at", metavar="W", help=f"Fold to here: {W}."),
     ] = "end",
     json_: Annotated[bool, typer.Option("--json", help="The whole map as JSON on stdout.")] = False,
     digest: Annotated[bool, typer.Option("--digest", help="Print only the digest.")] = False,
@@ -37,7 +33,7 @@ def state(
         raise MisuseError("--json and --digest together: --json holds the digest already")
     settings = settings_from(settings_file, set_)
     with LogReader(log) as reader:
-        _, view = fold_log_cached(reader, settings, resolve(reader, at, note=say), note=say)
+        _, view = fold_log_cached(reader, settings, point(reader, at), note=say)
     hexdigits = map_digest(view)
     if json_:
         emit(state_document(view, hexdigits))

@@ -9,7 +9,6 @@ import typer
 from eventsrc.cli._shell import emit, say
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
-from eventsrc.log.whence import resolve
 from eventsrc.words import counted
 from projections.evaluate.truth import read_truth
 from projections.timetravel import Timeline
@@ -18,6 +17,7 @@ from projections.timetravel.text import whatif_text
 from projections.timetravel.whatif import WhatIf, what_if
 
 from ._options import SettingsOption, settings_from
+from ._point import point
 from ._timeline import MOST_LINES, AllOption, AtOption, FoldBar, JsonOption, LogArgument
 
 
@@ -87,7 +87,7 @@ def whatif(
         raise MisuseError("nothing to try; give --set eps_m=1.0, --try or --grid eps_m=0.5,1.0")
     scored = read_truth(truth) if truth else None
     with LogReader(log) as reader:
-        end = resolve(reader, at, note=say)
+        end = point(reader, at)
     with FoldBar() as bar:
         found = what_if(log, common, others, end, truth=scored, processes=processes, progress=bar)
     if picture is not None:

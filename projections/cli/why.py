@@ -11,7 +11,8 @@ from projections.timetravel import Story, Timeline
 from projections.timetravel.text import story_text
 
 from ._options import SetOption, SettingsOption
-from ._timeline import AtOption, JsonOption, LogArgument, point, timeline
+from ._point import point
+from ._timeline import AtOption, JsonOption, LogArgument, timeline
 
 
 def why(
@@ -39,7 +40,7 @@ def why(
     if (thing is None) == (same is None):
         raise MisuseError("give one of PLACE_ID, OBJECT_ID and --same RUN:KEYFRAME RUN:KEYFRAME")
     with timeline(log, settings_file, set_) as opened:
-        story = _story(opened, thing, same, point(opened, at))
+        story = _story(opened, thing, same, point(opened.reader, at))
     if json_:
         emit(story.document())
     else:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from eventsrc.log import LogReader
+from eventsrc.words import counted
 from projections.digest import map_digest
 from projections.errors import WhenceError
 from projections.folding import (
@@ -172,6 +173,8 @@ class Timeline:
         """
         asked = Expression(expression) if isinstance(expression, str) else expression
         facts = self.facts(end)
+        if self._end(start) > facts.end:
+            raise WhenceError(f"from {start} to {facts.end} nothing happens; swap them")
         self._check_names(asked, facts)
         return Searcher(asked, facts, self.history.cause_at).search(start, facts.end, scan=scan)
 
@@ -180,8 +183,8 @@ class Timeline:
             return self.end
         if not 0 <= end <= self.end:
             raise WhenceError(
-                f"{end} is no point in {self.reader.path}, which holds {self.end} events; "
-                f"give 0 to {self.end}"
+                f"{end} is no point in {self.reader.path}, which holds "
+                f"{counted(self.end, 'event')}; give 0 to {self.end}"
             )
         return end
 
