@@ -26,6 +26,9 @@ from .vector_rows import VectorRow
 LoaderName: TypeAlias = Literal["copy", "insert"]
 Load: TypeAlias = Callable[[Connection], None]
 """Sends rows that are not there yet; the connection is inside a transaction."""
+TypeName: TypeAlias = Callable[[], sql.Composable]
+"""Names pgvector's type. Asked when rows are sent: when they are made, a rebuild's other thread may
+not have learnt yet in which schema the server has it."""
 INSERT_CHUNK: Final = 5_000
 """Rows of one INSERT: a statement's parameters are held in memory whole, on both sides."""
 VECTOR_CHUNK: Final = 500
@@ -43,8 +46,8 @@ class Loader(Protocol):
     def edges(self, graph: str, label: EdgeLabel, rows: Sequence[EdgeRow]) -> Load:
         """Add edges of one label."""
 
-    def vectors(self, schema: str, vector: sql.Composable, rows: Sequence[VectorRow]) -> Load:
-        """Add rows of ``detection_embeddings``; ``vector`` names pgvector's type."""
+    def vectors(self, schema: str, vector: TypeName, rows: Sequence[VectorRow]) -> Load:
+        """Add rows of ``detection_embeddings``."""
 
 
 class CopyLoader:
@@ -63,7 +66,7 @@ class CopyLoader:
     def vectors(
         self,
         schema: str,
-        vector: sql.Composable,  # noqa: ARG002 - COPY takes the type from the table
+        vector: TypeName,  # noqa: ARG002 - COPY takes the type from the table
         rows: Sequence[VectorRow],
     ) -> Load:
         """Add rows of ``detection_embeddings``."""
@@ -91,10 +94,11 @@ class InsertLoader:
         """Add edges of one label."""
         return unnest_columns("insert_edge", graph, label, rows)
 
-    def vectors(self, schema: str, vector: sql.Composable, rows: Sequence[VectorRow]) -> Load:
+    def vectors(self, schema: str, vector: TypeName, rows: Sequence[VectorRow]) -> Load:
         """Add rows of ``detection_embeddings``."""
-        query = statements("vectors")["insert"].format(schema=sql.Identifier(schema), vector=vector)
-        return _unnest(query, [_vector_fields(row) for row in rows], VECTOR_CHUNK)
+        insert, where = statements("vectors")["insert"], sql.Identifier(schema)
+        fields = [_vector_fields(row) for row in rows]
+        return _unnest(lambda: insert.format(schema=where, vector=vector()), fields, VECTOR_CHUNK)
 
 
 def unnest_columns(
@@ -102,7 +106,8 @@ def unnest_columns(
 ) -> Load:
     """One of the unnest statements of ``sql/graph.sql``, with the columns of ``rows``."""
     as_text = [tuple(map(str, row)) for row in rows]
-    return _unnest(_about(statement, graph, label), as_text, INSERT_CHUNK)
+    query = _about(statement, graph, label)
+    return _unnest(lambda: query, as_text, INSERT_CHUNK)
 
 
 def loader_of(name: LoaderName) -> Loader:
@@ -131,7 +136,9 @@ def _copy(statement: sql.Composed, documents: list[bytes]) -> Load:
     return load
 
 
-def _unnest(statement: sql.Composed, rows: Sequence[tuple[object, ...]], size: int) -> Load:
+def _unnest(
+    statement: Callable[[], sql.Composed], rows: Sequence[tuple[object, ...]], size: int
+) -> Load:
     """``size`` rows with one statement."""
     chunks = [
         [list(column) for column in zip(*rows[start : start + size], strict=True)]
@@ -139,8 +146,9 @@ def _unnest(statement: sql.Composed, rows: Sequence[tuple[object, ...]], size: i
     ]
 
     def load(connection: Connection) -> None:
+        query = statement()
         for columns in chunks:
-            connection.execute(statement, columns)
+            connection.execute(query, columns)
 
     return load
 

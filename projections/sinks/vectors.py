@@ -69,10 +69,11 @@ class VectorSink:
             return
         dimension = len(changes[0].unit)
         if dimension != self._dimension:
+            self._refuse_if_not_owner(connection, dimension)
             self._redimension(connection, _PUBLIC, dimension)
             self._dimension = dimension
         loader = InsertLoader() if self.few(changes) else self._loader
-        loader.vectors(_PUBLIC, self._type, changes)(connection)
+        loader.vectors(_PUBLIC, lambda: self._type, changes)(connection)
 
     def clear(self, connection: Connection) -> None:
         """Drop a replaced table that was left; refuse early if the name in use is not ours."""
@@ -99,7 +100,7 @@ class VectorSink:
         if not changes:
             return lambda _: None
         dimension = len(changes[0].unit)
-        add = self._loader.vectors(_SHADOW, self._type, changes)
+        add = self._loader.vectors(_SHADOW, lambda: self._type, changes)
 
         def load(connection: Connection) -> None:
             if dimension != self._shadow_dimension:
@@ -195,6 +196,16 @@ class VectorSink:
         redimension = statements("vectors")["redimension"]
         connection.execute(redimension.format(**self._names(schema, dimension)))
         self._set_storage(connection, schema, dimension)
+
+    def _refuse_if_not_owner(self, connection: Connection, dimension: int) -> None:
+        """Asked beforehand: in a pipeline the server's own refusal comes too late to explain."""
+        row = connection.execute(statements("vectors")["is_owner"]).fetchone()
+        if row is not None and not row[0]:
+            raise DatabaseError(
+                f"{place_of(connection)}: the map's embeddings have {dimension} dimensions,"
+                f" {TABLE} is for {self._dimension}, and only its owner may change that; have the"
+                " owner run mapfold replay, then start again"
+            )
 
     def _set_storage(self, connection: Connection, schema: str, dimension: int) -> None:
         kind = "plain" if dimension <= PLAIN_DIMENSION else "external"

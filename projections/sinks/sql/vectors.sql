@@ -68,6 +68,10 @@ SELECT coalesce(obj_description(c.oid, 'pg_class'), ''), a.atttypmod
 FROM pg_class c LEFT JOIN pg_attribute a ON a.attrelid = c.oid AND a.attname = 'embedding'
 WHERE c.oid = to_regclass(%(table)s)
 
+-- name: is_owner
+SELECT pg_has_role(relowner, 'USAGE') FROM pg_class
+WHERE oid = to_regclass('public.detection_embeddings')
+
 -- name: count
 SELECT count(*) FROM {schema}.detection_embeddings
 
