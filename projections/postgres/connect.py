@@ -31,6 +31,13 @@ Connection = psycopg.Connection[TupleRow]
 logging.getLogger("psycopg").addHandler(logging.NullHandler())
 
 CONNECT_SECONDS: Final = 10
+_TIMEOUTS: Final = (
+    "statement_timeout",
+    "lock_timeout",
+    "idle_in_transaction_session_timeout",
+    "transaction_timeout",  # from PostgreSQL 17 on
+    "idle_session_timeout",
+)
 _PACKAGES: Final[Mapping[str, str]] = {"age": "Apache AGE", "vector": "pgvector"}
 
 
@@ -97,6 +104,18 @@ def connect(url: str, *, application: str = "mapfold", autocommit: bool = False)
     except psycopg.OperationalError as error:
         told = f"{_first_line(error)}; {_advice(error, url)}"
         raise DatabaseUnavailable(f"{place(url)}: {told}") from None
+
+
+def lift_timeouts(connection: Connection) -> None:
+    """Let the session take its time, whatever the server's owner has set for others.
+
+    A rebuild folds for minutes between two statements, an index of many vectors takes longer, and a
+    tail may have nothing to say all night.
+    """
+    connection.execute(
+        "SELECT set_config(name, '0', false) FROM pg_catalog.pg_settings WHERE name = ANY(%s)",
+        [list(_TIMEOUTS)],
+    )
 
 
 def connect_for_cypher(url: str, *, application: str = "mapfold query") -> Connection:

@@ -40,11 +40,13 @@ class Loading:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
     ) -> None:
-        if error is not None and self._failed is None:
-            self._failed = error
-            self._cancel()
-        self._jobs.put(None)
-        self._thread.join()
+        try:
+            if error is not None and self._failed is None:
+                self._failed = error
+                self._cancel()
+        finally:
+            self._jobs.put(None)
+            self._thread.join()
 
     def put(self, job: Job) -> None:
         """Have ``job`` done. Raises what an earlier one raised."""

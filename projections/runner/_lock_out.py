@@ -8,10 +8,13 @@ PostgreSQL resolves the name again when it gets the lock.
 
 While we wait with some of the locks in hand, a reader may wait for us: a deadlock. So we wait only
 briefly, let go of all of them, and try again; below the server's deadlock_timeout (1 s) it is
-always us who give way.
+always us who give way. That goes for the locks of two databases together: no server sees a deadlock
+between them, and the readers of one are not to wait until those of the other have ended.
 """
 
+import contextlib
 import time
+from collections.abc import Sequence
 from typing import Final
 
 import psycopg
@@ -25,23 +28,30 @@ PAUSE_S: Final = 0.02
 PATIENCE_S: Final = 120.0
 
 
-def lock_readers_out(store: Store) -> None:
-    """Lock what the store's sinks will swap. Raises DatabaseError when readers never let go."""
-    connection = store.connection
+def lock_readers_out(stores: Sequence[Store]) -> None:
+    """Lock what the stores' sinks will swap. Raises DatabaseError when readers never let go."""
     deadline = time.monotonic() + PATIENCE_S
-    while True:
-        try:
-            with connection.transaction():  # a savepoint: going back lets go of the locks
-                connection.execute(ATTEMPT)
-                for sink in store.sinks:
-                    sink.lock(connection)
-        except psycopg.errors.LockNotAvailable:
-            if time.monotonic() > deadline:
-                raise DatabaseError(
-                    f"{store.place}: readers kept the map locked for {PATIENCE_S:.0f} s; end their"
-                    " transactions, then run the rebuild again"
-                ) from None
-            time.sleep(PAUSE_S)
-        else:
-            connection.execute("SET LOCAL lock_timeout = DEFAULT")
-            return
+    while (read := _still_read(stores)) is not None:
+        if time.monotonic() > deadline:
+            raise DatabaseError(
+                f"{read.place}: readers kept the map locked for {PATIENCE_S:.0f} s; end their"
+                " transactions, then run the rebuild again"
+            )
+        time.sleep(PAUSE_S)
+    for store in stores:
+        store.connection.execute("SET LOCAL lock_timeout = 0")
+
+
+def _still_read(stores: Sequence[Store]) -> Store | None:
+    """Try once: None when all is locked, else whose readers are in the way; then nothing is."""
+    at = None
+    try:
+        with contextlib.ExitStack() as savepoints:  # going back to them lets go of the locks
+            for at in stores:
+                savepoints.enter_context(at.connection.transaction())
+                at.connection.execute(ATTEMPT)
+                for sink in at.sinks:
+                    sink.lock(at.connection)
+    except psycopg.errors.LockNotAvailable:
+        return at
+    return None

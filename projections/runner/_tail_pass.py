@@ -30,6 +30,7 @@ from projections.snapshot import SnapshotCache
 from ._backoff import OnTrouble
 from ._dead_letters import dead_letter
 from ._fold import LiveFold, batches
+from ._origin import refuse_misfit
 from ._stores import Store
 from ._writing import SinkBatch, Writer
 from .progress import TailProgress, TailReport
@@ -127,7 +128,7 @@ class TailPass:
                     _checkpoint.begin(store.connection, sink.name, reader.log_id, plan.settings)
                     found = _checkpoint.load(store.connection, sink.name)
                     assert found is not None  # noqa: S101 - begun in this transaction
-                    self._check(found, sink, store, reader)
+                    refuse_misfit(found, sink.name, store.place, plan.log, reader, plan.settings)
                     # At once: from here on the lock says that a tail is at work.
                     _checkpoint.beat(store.connection, sink.name)
                     self.checkpoints[sink.name] = found
@@ -136,22 +137,6 @@ class TailPass:
         self.parked = parked
         self.report.next_offset = min(c.next_offset for c in self.checkpoints.values())
         self.plan.progress.update(self.report)
-
-    def _check(self, found: Checkpoint, sink: Sink[Any], store: Store, reader: LogReader) -> None:
-        _checkpoint.refuse_other_origin(
-            found, sink.name, store.place, reader.log_id, self.plan.settings, self._advice()
-        )
-        if found.next_offset > reader.next_offset:
-            raise ProjectionMismatch(
-                f"{store.place}: {found.next_offset:,} events are in the {sink.name} there, but"
-                f" {self.plan.log} has only {reader.next_offset:,}; {self._advice()}"
-            )
-        for event in reader.read(max(0, found.next_offset - 1), found.next_offset):
-            if event_hash(event) != found.last_event:
-                raise ProjectionMismatch(
-                    f"{self.plan.log}: the event at offset {event.offset:,} is not the one that is"
-                    f" in the {sink.name}; {self._advice()}"
-                )
 
     def _advice(self) -> str:
         return remake(self.plan.log, self.plan.settings)

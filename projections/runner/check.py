@@ -18,17 +18,25 @@ from psycopg import IsolationLevel, sql
 
 from eventsrc.log import Event, LogReader
 from projections.errors import ProjectionMissing
-from projections.postgres.connect import Connection, Targets, connect, database_errors, place
+from projections.postgres.connect import (
+    Connection,
+    Targets,
+    connect,
+    database_errors,
+    lift_timeouts,
+    place,
+)
 from projections.settings import Settings
 from projections.sink import Checkpoint, Sink, SinkName
 from projections.sinks import _checkpoint
-from projections.sinks._advice import command, remake
+from projections.sinks._advice import command
 from projections.sinks.graph_render import Row, expected_rows
 from projections.sinks.labels import GRAPH, LABELS, TABLE, VERTEX_LABELS
 from projections.sinks.vector_rows import VectorRow
 from projections.sinks.vectors import VectorSink
 
 from ._fold import LiveFold, batches
+from ._origin import refuse_misfit
 
 Kind: TypeAlias = Literal["missing", "extra", "different"]
 Keyed: TypeAlias = tuple[int, Any]
@@ -37,6 +45,7 @@ NAMED: Final = 100
 """This many differences are named; all are counted."""
 STREAM_ROWS: Final = 2_000
 BATCH_EVENTS: Final = 256
+_NONE: Final[dict[SinkName, str]] = {"graph": "no graph has", "vectors": "no vectors have"}
 
 _VECTORS: Final = """
 SELECT det_pk, run_id, det_id, keyframe_id, class_name, confidence, bbox, map_x, map_y, map_yaw,
@@ -85,16 +94,14 @@ def _check(log: Path, sink: SinkName, url: str, settings: Settings) -> CheckRepo
         connection.isolation_level = IsolationLevel.REPEATABLE_READ
         connection.read_only = True
         with database_errors(url):
+            lift_timeouts(connection)
             checkpoint = _checkpoint.load(connection, sink)
             if checkpoint is None:
                 raise ProjectionMissing(
-                    f"{place(url)}: no {sink} have been projected there;"
+                    f"{place(url)}: {_NONE[sink]} been projected there;"
                     f" run: {command('replay', log, settings)}"
                 )
-            advice = remake(log, settings)
-            _checkpoint.refuse_other_origin(
-                checkpoint, sink, place(url), reader.log_id, settings, advice
-            )
+            refuse_misfit(checkpoint, sink, place(url), log, reader, settings)
             compare = _compare_graph if sink == "graph" else _compare_vectors
             compare(connection, reader, checkpoint, settings, tally)
     return CheckReport(

@@ -14,6 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeAlias
 
+import psycopg
+
 from eventsrc.log import Event, LogReader
 from projections.digest import map_digest
 from projections.errors import FoldError
@@ -22,6 +24,7 @@ from projections.postgres.connect import Connection, Targets, database_errors
 from projections.settings import Settings
 from projections.sink import Checkpoint, Sink
 from projections.sinks import _checkpoint
+from projections.sinks._advice import command
 from projections.sinks.hnsw import HnswReport, build_hnsw
 from projections.sinks.loader import LoaderName
 
@@ -101,7 +104,8 @@ def rebuild(
         fold = LiveFold(settings)
         with _transactions(stores):
             with short_turns(), _loadings(stores) as loadings:
-                last = _fold_into(fold, reader.read(0, total), loadings, total, tell)
+                events, advice = reader.read(0, total), partial(_advice, log, settings)
+                last = _fold_into(fold, events, loadings, total, tell, advice)
                 folded = time.monotonic()
                 tell(RebuildProgress("writing", total, total))
                 for loading, sink, connection in loadings:
@@ -120,8 +124,8 @@ def rebuild(
             )
             rows = _check(stores, fold, checkpoint)
             tell(RebuildProgress("swapping", total, total))
+            lock_readers_out(stores)
             for store in stores:
-                lock_readers_out(store)
                 for sink in store.sinks:
                     sink.swap(store.connection)
         tell(RebuildProgress("tidying", total, total))
@@ -155,10 +159,15 @@ def _loadings(stores: list[Store]) -> Iterator[list[SinkLoading]]:
     with contextlib.ExitStack() as threads:
         loadings = []
         for store in stores:
-            loading = threads.enter_context(Loading(store.connection.cancel_safe))
+            loading = threads.enter_context(Loading(partial(_break_off, store.connection)))
             loading.put(partial(_begin, store))
             loadings += [SinkLoading(loading, sink, store.connection) for sink in store.sinks]
         yield loadings
+
+
+def _break_off(connection: Connection) -> None:
+    with contextlib.suppress(psycopg.Error):  # the server is gone, and what it was at with it
+        connection.cancel_safe()
 
 
 def _begin(store: Store) -> None:
@@ -175,14 +184,14 @@ def _fold_into(
     loadings: list[SinkLoading],
     total: int,
     tell: OnProgress,
+    advice: Callable[[int], str],
 ) -> Event | None:
     told_of = [sink for _, sink, _ in loadings if not sink.rebuilds_from_view]
     last: Event | None = None
     for batch in batches(events, TICK_EVENTS):
         for failed in fold.feed(batch, lambda _: told_of):
             if failed is not None:
-                told = f"{failed.reason}; the databases stay as they were"
-                raise FoldError(failed.offset, told)
+                raise FoldError(failed.offset, f"{failed.reason}; {advice(failed.offset)}")
         last = batch[-1]
         tell(RebuildProgress("folding", last.offset + 1, total))
         for loading, sink, connection in loadings:
@@ -190,6 +199,15 @@ def _fold_into(
             if rows is not None:
                 loading.put(partial(sink.load(rows), connection))
     return last
+
+
+def _advice(log: Path, settings: Settings, offset: int) -> str:
+    """What to do about an event that cannot be folded."""
+    before = command("replay", log, settings, "--until", str(offset))
+    return (
+        "the databases stay as they were; to leave it out run:"
+        f" {before} && {command('tail', log, settings)}"
+    )
 
 
 def _check(stores: list[Store], fold: LiveFold, checkpoint: Checkpoint) -> dict[str, int]:

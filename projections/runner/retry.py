@@ -12,12 +12,13 @@ from pathlib import Path
 from eventsrc.ingest import Rejected
 from eventsrc.log import LogReader
 from eventsrc.upcast import read_envelope
-from projections.postgres.connect import Targets, connect, database_errors
+from projections.postgres.connect import Targets, connect, database_errors, place
 from projections.settings import Settings
 from projections.sink import SinkName
 from projections.sinks import _checkpoint
 from projections.sinks._checkpoint import DeadLetter
 
+from ._origin import refuse_misfit
 from .rebuild import rebuild
 
 
@@ -32,7 +33,7 @@ class RetryReport:
 
 
 def retry(log: Path, targets: Targets, settings: Settings) -> list[RetryReport]:
-    """Try the dead letters of both sinks."""
+    """Try the dead letters of both sinks. Raises ProjectionMismatch for another log or settings."""
     sinks: tuple[tuple[SinkName, str], ...] = (
         ("graph", targets.graph_url),
         ("vectors", targets.vector_url),
@@ -43,22 +44,24 @@ def retry(log: Path, targets: Targets, settings: Settings) -> list[RetryReport]:
 def _retry(
     log: Path, targets: Targets, settings: Settings, sink: SinkName, url: str
 ) -> RetryReport:
-    with connect(url, application="mapfold retry") as connection, database_errors(url):
+    opened = connect(url, application="mapfold retry")
+    with LogReader(log) as reader, opened as connection, database_errors(url):
         letters = _checkpoint.parked(connection, sink)
         checkpoint = _checkpoint.load(connection, sink)
-    still = tuple(_still_failing(log, letters))
-    rebuilt = bool(letters) and not still and checkpoint is not None
-    if rebuilt and checkpoint is not None:
+        if checkpoint is None or not letters:
+            return RetryReport(sink, 0, (), rebuilt=False)
+        refuse_misfit(checkpoint, sink, place(url), log, reader, settings)
+        still = tuple(_still_failing(reader, letters))
+    if not still:
         rebuild(log, targets, settings, until=checkpoint.next_offset, only=sink)
-    return RetryReport(sink, len(letters), still, rebuilt)
+    return RetryReport(sink, len(letters), still, rebuilt=not still)
 
 
-def _still_failing(log: Path, letters: list[DeadLetter]) -> list[DeadLetter]:
+def _still_failing(reader: LogReader, letters: list[DeadLetter]) -> list[DeadLetter]:
     failing = []
-    with LogReader(log) as reader:
-        for letter in letters:
-            (event,) = reader.read(letter.offset, letter.offset + 1)
-            judged = read_envelope(event, max_bytes=sys.maxsize)
-            if isinstance(judged, Rejected):
-                failing.append(DeadLetter(letter.offset, letter.key, letter.run_id, judged.reason))
+    for letter in letters:
+        (event,) = reader.read(letter.offset, letter.offset + 1)
+        judged = read_envelope(event, max_bytes=sys.maxsize)
+        if isinstance(judged, Rejected):
+            failing.append(DeadLetter(letter.offset, letter.key, letter.run_id, judged.reason))
     return failing

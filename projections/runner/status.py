@@ -99,11 +99,13 @@ def _look(
     where = place(connection.info.dsn)
     versions = _versions(connection)
     found = _checkpoint.load(connection, sink)
+    writer = _checkpoint.writer_of(connection, sink)
+    if found is None and writer is not None:
+        return SinkStatus(sink, where, _at_work(writer), writer=writer, versions=versions)
     if found is None:
         advice = f"nothing has been projected there; run: {command('replay', log, settings)}"
         return SinkStatus(sink, where, "missing", note=advice, versions=versions)
     moved, beaten = _checkpoint.ages(connection, sink)
-    writer = _checkpoint.writer_of(connection, sink)
     condition, note = _condition(found, sink, where, log, log_id, end, settings, writer, beaten)
     return SinkStatus(
         sink,
@@ -142,10 +144,14 @@ def _condition(
     if writer == "mapfold tail" and (beaten is None or beaten > STALLED_S):
         return "stalled", "a tail holds it but has not been heard of; look at that process"
     if writer is not None:
-        return "following" if writer == "mapfold tail" else "rebuilding", None
+        return _at_work(writer), None
     if found.next_offset == end:
         return "idle", None
     return "behind", f"nobody writes it; run: {command('tail', log, settings)}"
+
+
+def _at_work(writer: str) -> Literal["following", "rebuilding"]:
+    return "following" if writer == "mapfold tail" else "rebuilding"
 
 
 def _versions(connection: Connection) -> dict[str, str]:

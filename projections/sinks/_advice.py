@@ -13,11 +13,12 @@ from projections.settings import Settings
 _BY_PROGRAMS_ONLY = "neighbourhood"
 
 
-def command(name: str, log: Path, settings: Settings) -> str:
-    """``mapfold NAME LOG`` with the ``--set`` for all that is not as by default."""
+def command(name: str, log: Path, settings: Settings, *options: str) -> str:
+    """``mapfold NAME LOG`` with ``options`` and the ``--set`` for all that is not as by default."""
     default = Settings().model_dump()
     changed = [key for key, value in settings.model_dump().items() if value != default[key]]
-    return " ".join(["mapfold", name, shlex.quote(str(log)), *_options(settings, changed)])
+    words = ["mapfold", name, shlex.quote(str(log)), *options, *_options(settings, changed)]
+    return " ".join(words)
 
 
 def remake(log: Path, settings: Settings) -> str:

@@ -7,20 +7,22 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import psycopg
 import pytest
-from psycopg import sql
 
 from projections.errors import DatabaseError, DatabaseUnavailable
 from projections.postgres.connect import Targets, connect, ensure_extension
 from projections.postgres.embedded import EmbeddedServer
 from projections.runner import RebuildProgress, rebuild
 from projections.settings import Settings
-from projections.sinks.loader import CopyLoader, Load
+from projections.sinks.loader import CopyLoader, Load, TypeName
+from projections.sinks.vectors import VectorSink
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows
 
@@ -121,7 +123,7 @@ def test_rows_the_server_refuses_in_the_middle_of_the_stream(
     calls: list[int] = []
 
     def twice_the_second_time(
-        self: CopyLoader, schema: str, vector: sql.Composable, rows: Sequence[Any]
+        self: CopyLoader, schema: str, vector: TypeName, rows: Sequence[Any]
     ) -> Load:
         calls.append(len(rows))
         return vectors(self, schema, vector, [*rows, *rows] if len(calls) == 2 else rows)
@@ -137,6 +139,13 @@ def test_rows_the_server_refuses_in_the_middle_of_the_stream(
     assert all_rows(one_database) != old
 
 
+def kill(server: EmbeddedServer) -> None:
+    with psycopg.connect(server.url, autocommit=True) as witness:
+        os.kill(int((server.data / "postmaster.pid").read_text().split()[0]), signal.SIGKILL)
+        with pytest.raises(psycopg.OperationalError):
+            list(witness.notifies(timeout=WAIT_S))
+
+
 def test_postgres_itself_is_killed_in_the_middle(
     log: Path, own_server: EmbeddedServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -147,17 +156,34 @@ def test_postgres_itself_is_killed_in_the_middle(
         admin.execute("CHECKPOINT")  # what is asked here is not what a crash may take back
     old = all_rows(targets)
 
-    def kill() -> None:
-        with psycopg.connect(own_server.url, autocommit=True) as witness:
-            os.kill(
-                int((own_server.data / "postmaster.pid").read_text().split()[0]), signal.SIGKILL
-            )
-            with pytest.raises(psycopg.OperationalError):
-                list(witness.notifies(timeout=WAIT_S))
-
     with pytest.raises(DatabaseUnavailable):
-        rebuild(log, targets, SETTINGS, progress=at_stage("folding", kill))
+        rebuild(log, targets, SETTINGS, progress=at_stage("folding", partial(kill, own_server)))
     own_server.start()
     assert all_rows(targets) == old
     rebuild(log, targets, SETTINGS)
     assert all_rows(targets) != old
+
+
+def test_who_interrupts_a_rebuild_whose_server_has_gone_is_told_of_the_interruption(
+    tmp_path: Path, own_server: EmbeddedServer
+) -> None:
+    """There is nothing left to break off, which is no news to anybody."""
+    targets = Targets(own_server.url, own_server.url, own_server)
+    log = write_log(tmp_path / "short", walk(20))
+    begun = threading.Event()
+
+    def interrupt(_: RebuildProgress) -> None:
+        assert begun.wait(WAIT_S)
+        kill(own_server)
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patched:
+        last = VectorSink.begin
+
+        def and_say_so(self: VectorSink, connection: psycopg.Connection) -> None:
+            last(self, connection)
+            begun.set()
+
+        patched.setattr(VectorSink, "begin", and_say_so)
+        with pytest.raises(KeyboardInterrupt):
+            rebuild(log, targets, SETTINGS, progress=interrupt)

@@ -85,6 +85,22 @@ def test_parked_events_are_findings(mapfold: Commands, log: Path) -> None:
     assert "still cannot be folded" in mapfold("db", "retry", log, code=3).out
 
 
+def test_what_a_replay_advises_for_an_event_that_cannot_be_folded_works(
+    mapfold: Commands, log: Path
+) -> None:
+    append_raw(log, b"not an envelope")
+    write_log(log, walk(5, run_id="after"))
+    said = mapfold("replay", log, "--set", "eps_m=1.0", code=1).err
+    assert "offset 40 cannot be folded" in said
+    assert "the databases stay as they were" in said
+    first, then = said.strip().rpartition("run: ")[2].split(" && ")
+    mapfold(*shlex.split(first)[1:])
+    mapfold(*shlex.split(then)[1:], "--once", code=3)
+    status = mapfold("status", log, "--set", "eps_m=1.0", code=3)
+    assert status.out.count("at offset 46, 0 behind") == 2
+    assert status.out.count("parked: offset 40: ") == 2
+
+
 def test_other_settings_are_refused_with_the_command_to_run(mapfold: Commands, log: Path) -> None:
     mapfold("replay", log)
     said = mapfold("tail", log, "--once", "--set", "eps_m=2", code=1)

@@ -70,6 +70,14 @@ DAMAGE = {
         "UPDATE detection_embeddings SET embedding = '[1,0,0,0,0,0,0,0]' WHERE det_pk = 1",
         [("detection_embeddings", "different")],
     ),
+    "one bit of a vector changed": (
+        (
+            "UPDATE detection_embeddings SET embedding = (SELECT array_agg(CASE n WHEN 3 THEN v +"
+            " sign(v) * 1e-7 ELSE v END ORDER BY n)::vector FROM unnest(embedding::real[]) WITH"
+            " ORDINALITY AS e(v, n)) WHERE det_pk = 1"
+        ),
+        [("detection_embeddings", "different")],
+    ),
     "a name changed": (
         "UPDATE detection_embeddings SET class_name = class_name || ' ' WHERE det_pk = 1",
         [("detection_embeddings", "different")],
@@ -93,6 +101,20 @@ def test_damage_is_named_and_repaired(
     assert [r.differing for r in check(log, one_database, SETTINGS)] == [0, 0]
 
 
+def test_a_count_on_an_edge(tmp_path: Path, one_database: Targets, pg: psycopg.Connection) -> None:
+    log = write_log(tmp_path / "log", walk(120))
+    rebuild(log, one_database, SETTINGS)
+    changed = pg.execute(
+        'UPDATE semantic_map."ADJACENT_TO" SET properties = \'{"shared_transitions": 999}\''
+        ' WHERE id = (SELECT max(id::text)::graphid FROM semantic_map."ADJACENT_TO")'
+    )
+    assert changed.rowcount == 1
+    (graph,) = check(log, one_database, SETTINGS, only="graph")
+    (difference,) = graph.differences
+    assert (difference.table, difference.kind) == ("ADJACENT_TO", "different")
+    assert "999" in str(difference.found)
+
+
 def test_all_differences_are_counted_though_not_all_are_named(
     log: Path, one_database: Targets, pg: psycopg.Connection
 ) -> None:
@@ -111,3 +133,11 @@ def test_what_cannot_be_compared_is_refused(
     rebuild(log, one_database, SETTINGS)
     with pytest.raises(ProjectionMismatch, match="min_samples=3 there, 2 here"):
         check(log, one_database, SETTINGS.with_assignments(["min_samples=2"]))
+    with psycopg.connect(one_database.graph_url) as connection:
+        connection.execute("UPDATE mapfold.checkpoint SET next_offset = 130")
+    with pytest.raises(ProjectionMismatch, match=r"130 events are in the graph .* only 120"):
+        check(log, one_database, SETTINGS)
+    with psycopg.connect(one_database.graph_url) as connection:
+        connection.execute("UPDATE mapfold.checkpoint SET next_offset = 119")
+    with pytest.raises(ProjectionMismatch, match="offset 118 is not the one"):
+        check(log, one_database, SETTINGS)

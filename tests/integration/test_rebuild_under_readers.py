@@ -259,3 +259,36 @@ def test_a_transaction_that_reads_both_is_never_the_victim_of_a_deadlock(
         assert not rebuilding.is_alive()
         assert answers == [expected[0], *[expected[1]] * 50]
         assert single_answer(reader, first) != expected[0]
+
+
+def test_readers_of_one_database_do_not_wait_for_those_of_the_other(
+    tmp_path: Path, two_databases: Targets
+) -> None:
+    log = write_log(tmp_path / "log", walk(60))
+    rebuild(log, two_databases, SETTINGS, until=30)
+    swapping = threading.Event()
+
+    def tell(at: RebuildProgress) -> None:
+        if at.stage == "swapping":
+            swapping.set()
+
+    rebuilding = threading.Thread(
+        target=rebuild, args=(log, two_databases, SETTINGS), kwargs={"progress": tell}
+    )
+    with (
+        connect_for_cypher(two_databases.graph_url) as graph,
+        psycopg.connect(two_databases.vector_url) as sits,
+    ):
+        expected = single_answer(graph, COUNT_PATHS)
+        single_answer(sits, COUNT_VECTORS)
+        rebuilding.start()
+        assert swapping.wait(WAIT_S)
+        graph.execute("SET lock_timeout = '900ms'")
+        for _ in range(50):
+            assert single_answer(graph, COUNT_PATHS) == expected
+            graph.execute("SELECT pg_sleep(0.02)")
+        assert rebuilding.is_alive()
+        sits.rollback()
+        rebuilding.join(WAIT_S)
+    assert not rebuilding.is_alive()
+    assert tail(log, two_databases, SETTINGS, once=True).events == 0

@@ -11,9 +11,9 @@ import pytest
 from eventsrc.append import append_payload
 from eventsrc.log import ALWAYS, Event, LogWriter
 from eventsrc.upcast import read_envelope
-from projections.errors import ProjectionBusy
+from projections.errors import ProjectionBusy, ProjectionMismatch
 from projections.postgres.connect import Targets
-from projections.runner import TailProgress, TailReport, rebuild, tail
+from projections.runner import RebuildProgress, TailProgress, TailReport, rebuild, tail
 from projections.runner.metrics import serving_tail_metrics
 from projections.runner.retry import retry
 from projections.runner.status import projection_status
@@ -121,6 +121,20 @@ def test_a_replay_at_work_is_no_tail(tmp_path: Path, one_database: Targets) -> N
     assert seen[0] == {"rebuilding"}
 
 
+def test_a_first_replay_is_not_missing(tmp_path: Path, one_database: Targets) -> None:
+    log = write_log(tmp_path / "log", walk(20))
+    seen = []
+
+    def look(at: RebuildProgress) -> None:
+        if at.stage == "writing":
+            status = projection_status(log, one_database, SETTINGS)
+            seen.append({(s.condition, s.writer, s.note) for s in status.sinks})
+            assert status.healthy
+
+    rebuild(log, one_database, SETTINGS, progress=look)
+    assert seen == [{("rebuilding", "mapfold replay", None)}]
+
+
 def test_who_is_told_to_wait_learns_what_the_number_is(
     tmp_path: Path, one_database: Targets
 ) -> None:
@@ -178,3 +192,17 @@ def test_parked_events_are_tried_again(
     assert projection_status(log, one_database, SETTINGS).healthy
     rows = all_rows(one_database)
     assert len(rows[0]["Keyframe"]) == len(before[0]["Keyframe"]) + 1
+
+
+def test_parked_events_of_another_log_or_with_other_settings_are_not_tried(
+    tmp_path: Path, one_database: Targets
+) -> None:
+    """Nobody asked for a map with other settings, which is what a rebuild would make."""
+    log = write_log(tmp_path / "log", walk(10))
+    append_raw(log, b"not an envelope")
+    tail(log, one_database, SETTINGS, once=True)
+    with pytest.raises(ProjectionMismatch, match=r"eps_m=1.5 there, 1.0 here"):
+        retry(log, one_database, SETTINGS.with_assignments(["eps_m=1.0"]))
+    other = write_log(tmp_path / "other", walk(3))
+    with pytest.raises(ProjectionMismatch, match="made from log"):
+        retry(other, one_database, SETTINGS)

@@ -84,6 +84,17 @@ def test_leaving_by_an_error_breaks_off_what_runs_and_drops_the_rest() -> None:
     assert done == [1]
 
 
+def test_the_thread_ends_also_when_nothing_can_be_broken_off() -> None:
+    def leave() -> None:
+        with Loading(_fail):
+            raise KeyboardInterrupt
+
+    before = threading.active_count()
+    with pytest.raises(LookupError):
+        leave()
+    assert threading.active_count() == before
+
+
 def test_turns_are_short_only_inside() -> None:
     before = sys.getswitchinterval()
     with short_turns():

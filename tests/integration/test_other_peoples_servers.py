@@ -1,0 +1,133 @@
+"""Servers that somebody else has set up: other schemas, short timeouts, no superuser for us."""
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import psycopg
+import pytest
+from psycopg import sql
+
+from projections.errors import DatabaseError
+from projections.postgres.connect import Targets, connect
+from projections.postgres.embedded import EmbeddedServer
+from projections.runner import rebuild, tail
+from projections.runner.check import check
+from projections.runner.status import projection_status
+from projections.settings import Settings
+from projections.sinks.loader import LoaderName
+from projections.sinks.roles import roles_sql
+from tests.drops import wait_for_drops
+from tests.logs import walk, write_log
+from tests.rows import all_rows
+
+SETTINGS = Settings()
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "projections.md"
+TIMEOUTS = (
+    "SELECT name FROM pg_settings WHERE name ~"
+    " '^(statement|lock|transaction|idle_session|idle_in_transaction_session)_timeout$'"
+)
+OWNER, WRITER = "an_owner", "a_tail"
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    return write_log(tmp_path / "log", walk(40))
+
+
+@pytest.fixture
+def bare(bare_pg_url: str) -> Iterator[psycopg.Connection]:
+    """A superuser's autocommit connection to a database without our extensions."""
+    with psycopg.connect(bare_pg_url, autocommit=True) as connection:
+        yield connection
+
+
+def as_user(url: str, user: str) -> Targets:
+    """The same database for another user."""
+    theirs = url.replace(f"//{urlsplit(url).username}", f"//{user}", 1)
+    return Targets(theirs, theirs)
+
+
+@pytest.mark.parametrize("loader", ["copy", "insert"])
+def test_pgvector_in_a_schema_of_its_own(
+    log: Path, bare: psycopg.Connection, bare_pg_url: str, loader: LoaderName
+) -> None:
+    """The fold makes rows before the thread that sends them has found the type."""
+    bare.execute("CREATE SCHEMA elsewhere")
+    bare.execute("CREATE EXTENSION vector WITH SCHEMA elsewhere")
+    targets = Targets(bare_pg_url, bare_pg_url)
+    rebuild(log, targets, SETTINGS, until=30, loader=loader)
+    assert tail(log, targets, SETTINGS, once=True, loader=loader).events == 10
+    assert [r.differing for r in check(log, targets, SETTINGS)] == [0, 0]
+
+
+def test_timeouts_meant_for_others(tmp_path: Path, pg_url: str, pg: psycopg.Connection) -> None:
+    """They are shorter than a replay's transaction, and much longer than its first statement."""
+    log = write_log(tmp_path / "log", walk(400))
+    database = sql.Identifier(pg.info.dbname)
+    for (name,) in pg.execute(TIMEOUTS).fetchall():
+        alter = sql.SQL("ALTER DATABASE {} SET {} = '150ms'")
+        pg.execute(alter.format(database, sql.Identifier(name)))
+    targets = Targets(pg_url, pg_url)
+    assert rebuild(log, targets, SETTINGS, until=390).total_s > 0.15
+    assert tail(log, targets, SETTINGS, once=True).events == 10
+    assert [r.differing for r in check(log, targets, SETTINGS)] == [0, 0]
+
+
+@pytest.fixture
+def owned(pg_server: EmbeddedServer) -> Iterator[str]:
+    """URL of a database that goes before the roles that own things in it."""
+    name = sql.Identifier(f"owned_{os.getpid()}")
+    with connect(pg_server.url, autocommit=True) as admin:
+        admin.execute(sql.SQL("CREATE DATABASE {} TEMPLATE template0").format(name))
+        yield pg_server.url_of(name.as_string(None).strip('"'))
+        admin.execute(sql.SQL("DROP DATABASE {} WITH (FORCE)").format(name))
+        for role in (OWNER, WRITER, "mapfold_writer", "mapfold_reader"):
+            admin.execute(sql.SQL("DROP ROLE IF EXISTS {}").format(sql.Identifier(role)))
+
+
+@pytest.fixture
+def superuser(owned: str) -> Iterator[psycopg.Connection]:
+    """Has done what docs/projections.md has a superuser do for an owner who is none."""
+    text = PAGE.read_text("utf-8")
+    found = re.search(r"^    CREATE EXTENSION IF NOT EXISTS age;\n(    .*\n)+", text, re.MULTILINE)
+    assert found is not None
+    with psycopg.connect(owned, autocommit=True) as connection:
+        connection.execute(f"CREATE ROLE {OWNER} LOGIN")  # type: ignore[arg-type]
+        told = found[0].replace("DATABASE postgres", f"DATABASE {connection.info.dbname}")
+        connection.execute(re.sub(r"\bme\b", OWNER, told))  # type: ignore[arg-type]
+        yield connection
+
+
+@pytest.mark.usefixtures("superuser")
+def test_an_owner_who_is_no_superuser(log: Path, owned: str) -> None:
+    owner = as_user(owned, OWNER)
+    for until in (20, 30):
+        rebuild(log, owner, SETTINGS, until=until)
+        wait_for_drops(owner)
+    assert tail(log, owner, SETTINGS, once=True).events == 10
+    assert [r.differing for r in check(log, owner, SETTINGS)] == [0, 0]
+    assert projection_status(log, owner, SETTINGS).healthy
+    with connect(owner.graph_url) as connection:
+        names = connection.execute("SELECT name::text FROM ag_catalog.ag_graph").fetchall()
+    assert names == [("semantic_map",)]
+
+
+def test_a_writer_cannot_change_the_dimension_and_says_who_can(
+    tmp_path: Path, superuser: psycopg.Connection, owned: str
+) -> None:
+    owner, writer = as_user(owned, OWNER), as_user(owned, WRITER)
+    log = write_log(tmp_path / "log", [])
+    rebuild(log, owner, SETTINGS)
+    superuser.execute(roles_sql())  # type: ignore[arg-type]
+    superuser.execute(f"CREATE ROLE {WRITER} LOGIN IN ROLE mapfold_writer")  # type: ignore[arg-type]
+    write_log(log, walk(10))
+    with pytest.raises(DatabaseError, match=r"8 dimensions, .* for 512, .* mapfold replay"):
+        tail(log, writer, SETTINGS, once=True)
+    rebuild(log, owner, SETTINGS)
+    rows = all_rows(owner)
+    write_log(log, walk(5, first=10))
+    assert tail(log, writer, SETTINGS, once=True).events == 5
+    assert len(all_rows(owner)[0]["Keyframe"]) == len(rows[0]["Keyframe"]) + 5
