@@ -8,7 +8,6 @@ Exit codes: 0 done · 1 failed · 2 misuse · 3 done, with loss or findings · 1
 """
 
 import contextlib
-import os
 import sys
 from collections.abc import Callable, Iterator
 from typing import Any, Final, NoReturn
@@ -19,6 +18,7 @@ from typer.core import TyperGroup
 from eventsrc.errors import MapfoldError
 
 from ._shell import EXIT_FAILED, people
+from ._streams import OutputLost, give_up_stdout, secure_streams
 
 EXIT_INTERRUPTED: Final = 130
 EXIT_READER_GONE: Final = 141
@@ -62,16 +62,22 @@ class Program(TyperGroup):
 
 def run_app(app: Callable[..., Any]) -> NoReturn:
     """Run a typer app made of `Program`, and exit: our errors are one line for people."""
+    secure_streams()
     code = _exit_code(app)
     try:
         sys.stdout.flush()
-    except OSError as error:
-        # Point stdout elsewhere so that the interpreter's own flush at exit does not fail again.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        if not isinstance(error, BrokenPipeError):
-            people.print(f"mapfold: stdout: {error.strerror}; nobody has got all of the output")
-            code = EXIT_FAILED
+    except BrokenPipeError:
+        give_up_stdout()
+    except OutputLost as lost:
+        give_up_stdout()
+        if code != EXIT_FAILED:
+            code = _say_lost(lost)
     sys.exit(code)
+
+
+def _say_lost(lost: OutputLost) -> int:
+    people.print(f"mapfold: stdout: {lost}; nobody has got all of the output")
+    return EXIT_FAILED
 
 
 def _exit_code(app: Callable[..., Any]) -> int:
@@ -82,6 +88,8 @@ def _exit_code(app: Callable[..., Any]) -> int:
     except MapfoldError as error:
         people.print(f"mapfold: {error}")
         return error.exit_code
+    except OutputLost as lost:
+        return _say_lost(lost)
     except _ReaderGone:
         return EXIT_READER_GONE
     except (_Interrupted, KeyboardInterrupt):

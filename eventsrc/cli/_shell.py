@@ -1,7 +1,6 @@
 """What every command shares: data on stdout, people on stderr, findings as an exit code."""
 
 import json
-import os
 import sys
 from collections.abc import Iterable
 from typing import Any
@@ -13,16 +12,7 @@ EXIT_FAILED = 1
 EXIT_FINDINGS = 3
 
 
-class _People(Console):
-    """Where people read. They may stop reading; the command has its work to do all the same."""
-
-    def on_broken_pipe(self) -> None:
-        """Be silent from now on; rich would end the program, and with exit 1."""
-        self.quiet = True
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
-
-
-people = _People(stderr=True, highlight=False, soft_wrap=True, markup=False)
+people = Console(stderr=True, highlight=False, soft_wrap=True, markup=False)
 """Plain text: ids and reasons may hold anything, so markup is off."""
 
 

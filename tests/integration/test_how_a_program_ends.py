@@ -1,5 +1,6 @@
 """Ctrl-C, readers that leave, --version: how the program itself ends, whatever the command."""
 
+import json
 import os
 import subprocess
 import sys
@@ -119,19 +120,77 @@ def test_the_work_is_done_also_when_nobody_reads_the_news(mapfold: Commands) -> 
     assert '"rejected": 1' in out
 
 
-def test_output_that_finds_no_room_is_a_failure(mapfold: Commands) -> None:
+@pytest.mark.parametrize("unbuffered", [{}, {"PYTHONUNBUFFERED": "1"}], ids=["", "unbuffered"])
+@pytest.mark.parametrize(
+    "args",
+    [
+        ("state", "log"),  # little: found out at the end
+        ("log", "cat", "log", "--json"),  # much: found out on the way
+        ("log", "info", "log", "--json"),
+        ("--help",),
+        ("--version",),
+    ],
+    ids=lambda args: args[0],
+)
+def test_output_that_finds_no_room_is_a_failure(
+    mapfold: Commands, args: tuple[str, ...], unbuffered: dict[str, str]
+) -> None:
     env = {k: v for k, v in mapfold.env.items() if k != "PYTHONUNBUFFERED"}
     with Path("/dev/full").open("wb") as full:
         done = subprocess.run(
-            [str(PROGRAM), "state", "log"],
+            [str(PROGRAM), *args],
             cwd=mapfold.folder,
-            env=env,
+            env=env | unbuffered,
             stdout=full,
             stderr=subprocess.PIPE,
             check=False,
         )
     assert done.returncode == 1
-    assert done.stderr.startswith(b"mapfold: stdout: No space left on device")
+    assert done.stderr == (
+        b"mapfold: stdout: No space left on device; nobody has got all of the output\n"
+    )
+
+
+def test_news_that_find_no_room_change_nothing(mapfold: Commands) -> None:
+    with Path("/dev/full").open("wb") as full:
+        done = subprocess.run(
+            [str(PROGRAM), "log", "verify", "log", "--json"],
+            cwd=mapfold.folder,
+            env=mapfold.env,
+            stdout=subprocess.PIPE,
+            stderr=full,
+            check=False,
+        )
+    assert done.returncode == 0
+    assert b'"findings": []' in done.stdout
+
+
+def test_a_program_without_streams_gives_their_numbers_to_no_file(mapfold: Commands) -> None:
+    program = (
+        "import os; from pathlib import Path; from eventsrc.cli._program import run_app\n"
+        "def app():\n"
+        "    fds = [os.readlink(f'/proc/self/fd/{number}') for number in range(3)]\n"
+        "    Path('fds').write_text(str([*fds, os.open('first', os.O_CREAT) > 2]))\n"
+        "    print('said')\n"
+        "run_app(app)"
+    )
+    done = subprocess.run(
+        ["bash", "-c", '"$@" 0<&- 1>&- 2>&-', "bash", sys.executable, "-c", program],
+        cwd=mapfold.folder,
+        env={**mapfold.env, "PYTHONPATH": str(ROOT)},
+        check=False,
+    )
+    assert done.returncode == 0
+    said = (mapfold.folder / "fds").read_text()
+    assert said == "['/dev/null', '/dev/null', '/dev/null', True]"
+
+
+def test_characters_that_the_encoding_lacks_are_written_all_the_same(mapfold: Commands) -> None:
+    encoded = Commands(mapfold.folder, {**mapfold.env, "PYTHONIOENCODING": "ascii"})
+    assert r"saw \u2615 \U0001f916" in encoded("log", "cat", "log").out
+    odd = os.fsdecode(b"l\xff")
+    (mapfold.folder / "log").rename(mapfold.folder / odd)
+    assert json.loads(mapfold("log", "info", odd, "--json").out)["path"] == odd
 
 
 def test_the_version(mapfold: Commands) -> None:

@@ -6,6 +6,7 @@ import random
 import resource
 import signal
 import socket
+import subprocess
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +19,7 @@ from eventsrc.acks import Ack, ack_key
 from eventsrc.append import append_payload
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.router import Router
+from tests.commands import PROGRAM
 from tests.envelopes import envelope, payload
 from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK, PUBLISHER, Program
 
@@ -311,3 +313,15 @@ def test_rot_in_an_old_segment_does_not_keep_a_robot_from_recording(
     assert recorder.end(signal.SIGINT) == 0
     assert "1 recorded" in recorder.lines[-1]
     assert not (log / NAME).exists()
+
+
+def test_news_that_find_no_room_end_no_recording(
+    publish: Start, endpoint: str, tmp_path: Path
+) -> None:
+    """What it says goes to a file on a full disk; the log is on another one."""
+    log = tmp_path / "log"
+    args = [str(PROGRAM), "record", str(log), "--connect", endpoint, "--max-events", "2"]
+    with Path("/dev/full").open("wb") as full, subprocess.Popen(args, stderr=full) as recorder:
+        assert publish(KEY, "no envelope", payload(envelope(1)).decode()).wait() == 0
+        assert recorder.wait(DEADLINE_S) == 3  # one was rejected
+    assert len(_stored(log)) == 2
