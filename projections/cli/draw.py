@@ -9,6 +9,7 @@ from eventsrc.cli._shell import say
 from eventsrc.log import LogReader
 from eventsrc.words import counted
 from projections.cli._options import SetOption, SettingsOption, settings_from
+from projections.cli._picture import check_picture
 from projections.cli._point import W, point
 from projections.folding import fold_events
 from projections.reducers.semantic_map import SemanticMap
@@ -46,6 +47,7 @@ def draw(
     from projections.drawing import draw_map, floor_of
     from projections.drawing.merges import bridges_of, fold_with_merges
 
+    check_picture(out)
     settings = settings_from(settings_file, set_)
     view = MapView(settings, keep_embeddings=False)
     with LogReader(log) as reader:

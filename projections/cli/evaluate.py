@@ -8,6 +8,7 @@ import typer
 
 from eventsrc.cli._shell import emit, say
 from projections.cli._options import SetOption, SettingsOption, settings_from
+from projections.cli._picture import check_picture
 from projections.cli._point import W
 from projections.cli._question import HfovOption, ImageOption, camera_from
 from projections.cli.relocalize import method_from
@@ -44,6 +45,7 @@ def evaluate(
     json_: Annotated[bool, typer.Option("--json", help="The scores as JSON on stdout.")] = False,
 ) -> None:
     """Scores of places, objects and re-localisation with one, two and three crops."""
+    check_picture(picture)
     result = score(
         map_log,
         query_logs or [],

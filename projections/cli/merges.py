@@ -14,6 +14,7 @@ from projections.timetravel.merge_story import merge_document
 from projections.timetravel.text import merge_text, merges_text
 
 from ._options import SetOption, SettingsOption
+from ._picture import check_picture
 from ._point import point
 from ._timeline import AtOption, JsonOption, LogArgument, timeline
 
@@ -32,18 +33,27 @@ def merges(
         typer.Option("--draw", metavar="N", help="Draw merge number N, before and after."),
     ] = None,
     out: Annotated[
-        Path, typer.Option(metavar="FILE", help="The picture of --draw: .png, .svg or .pdf.")
-    ] = Path("merge.png"),
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="The picture of --draw: .png, .svg or .pdf [default: merge.png].",
+        ),
+    ] = None,
     json_: JsonOption = False,
     set_: SetOption = None,
     settings_file: SettingsOption = None,
 ) -> None:
     """Every merge of places: when, by which keyframe, who survived, who was absorbed."""
+    if draw is None and out is not None:
+        raise MisuseError(f"--out {out} is for the picture of --draw N; give --draw too")
+    picture = out or Path("merge.png")
+    if draw is not None:
+        check_picture(picture)
     with timeline(log, settings_file, set_) as opened:
         end = point(opened.reader, at)
         found = opened.merges(end)
         if draw is not None:
-            _draw(opened, numbered(found, draw), out)
+            _draw(opened, numbered(found, draw), picture)
         if show is not None:
             found = [numbered(found, show)]
         if json_:

@@ -11,12 +11,12 @@ from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 from eventsrc.words import counted
 from projections.evaluate.truth import read_truth
-from projections.timetravel import Timeline
 from projections.timetravel.alternatives import alternatives, assigned
 from projections.timetravel.text import whatif_text
-from projections.timetravel.whatif import WhatIf, what_if
+from projections.timetravel.whatif import Alternative, WhatIf, what_if
 
 from ._options import SettingsOption, settings_from
+from ._picture import check_picture
 from ._point import point
 from ._timeline import MOST_LINES, AllOption, AtOption, FoldBar, JsonOption, LogArgument
 
@@ -83,33 +83,37 @@ def whatif(
     """
     common = assigned(settings_from(settings_file, None), base, "--base")
     others = alternatives(common, set_ or (), try_ or (), grid or ())
+    check_picture(picture)
     if not others:
         raise MisuseError("nothing to try; give --set eps_m=1.0, --try or --grid eps_m=0.5,1.0")
     scored = read_truth(truth) if truth else None
     with LogReader(log) as reader:
         end = point(reader, at)
     with FoldBar() as bar:
-        found = what_if(log, common, others, end, truth=scored, processes=processes, progress=bar)
+        found = what_if(
+            log, common, others, end,
+            truth=scored, processes=processes, progress=bar, keep_views=picture is not None,
+        )  # fmt: skip
     if picture is not None:
-        _draw(log, found, picture)
+        _draw(found, picture)
     if json_:
         emit(found.document())
     else:
         sys.stdout.write(whatif_text(found, most=None if all_ else MOST_LINES))
 
 
-def _draw(log: Path, found: WhatIf, out: Path) -> None:
+def _draw(found: WhatIf, out: Path) -> None:
     # Here and not above: matplotlib takes longer to import than most commands take to run.
     from projections.timetravel.picture import draw_maps
 
-    maps = []
-    for each in found.all:
-        with Timeline(log, each.outcome.settings) as opened:
-            counts = each.outcome.counts
-            title = f"{each.name}: {counted(counts['places'], 'place')}, {counts['noise']} noise"
-            maps.append((title, opened.at(found.end)))
-    draw_maps(maps, out)
+    maps = [(_title(each), each.outcome.view) for each in found.all]
+    draw_maps([(title, view) for title, view in maps if view is not None], out)
     say(f"wrote {out}: {counted(len(maps), 'map')}")
+
+
+def _title(each: Alternative) -> str:
+    counts = each.outcome.counts
+    return f"{each.name}: {counted(counts['places'], 'place')}, {counts['noise']} noise"
 
 
 def register(app: typer.Typer) -> None:

@@ -62,6 +62,12 @@ class Canvas:
             ) from None
 
 
+def check_name(out: Path) -> None:
+    """Raises MisuseError when ``out`` is no picture's name."""
+    if out.suffix.lower() not in SUFFIXES:
+        raise MisuseError(f"{out}: a picture is .png, .svg or .pdf; give such a name")
+
+
 def new_canvas(view: MapView, floor: Floor) -> Canvas:
     """An empty sheet that fits every pose of ``view`` and every wall of ``floor``."""
     x0, y0, x1, y1 = bounds = _bounds(view, floor)

@@ -7,12 +7,11 @@ labels are moved aside to stay legible, a hairline leads back.
 from collections.abc import Sequence
 from pathlib import Path
 
-from eventsrc.errors import MisuseError
 from eventsrc.words import counted
 from projections.view import MapView
 
 from . import palette
-from .canvas import SUFFIXES, Canvas, new_canvas
+from .canvas import Canvas, check_name, new_canvas
 from .ground import draw_drives, draw_floor, draw_regions, draw_walls
 from .marks import (
     draw_adjacency,
@@ -45,8 +44,7 @@ def draw_map(
     Objects seen fewer than ``min_observations`` times are left out. Raises MisuseError when ``out``
     cannot be written or has another suffix.
     """
-    if out.suffix.lower() not in SUFFIXES:
-        raise MisuseError(f"{out}: a picture is .png, .svg or .pdf; give --out such a name")
+    check_name(out)
     compose(view, title, floor or Floor(), lost, bridges, min_observations).save(out)
 
 

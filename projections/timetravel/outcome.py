@@ -46,6 +46,8 @@ class Outcome:
     scores: dict[str, dict[str, Any]] | None
     """``places`` and ``objects`` against the truth (`projections.evaluate.map_scores`)."""
     seconds: float
+    view: MapView | None = None
+    """The map itself, where it was asked for: to be read only."""
 
 
 def outcome_of(view: MapView, history: History, truth: Truth | None, seconds: float) -> Outcome:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import islice
 from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
@@ -49,16 +50,18 @@ def fold_all(
     truth: Truth | None = None,
     processes: int | None = None,
     progress: Progress | None = None,
+    keep_views: bool = False,
 ) -> list[Outcome]:
     """The outcome of the first ``end`` events under each of ``settings``, in their order.
 
-    Raises FoldError at an event that cannot be folded.
+    With ``keep_views`` each has its map too, without embeddings. Raises FoldError at an event that
+    cannot be folded.
     """
     workers = min(processes or _processors(), len(settings))
     if workers <= 1 or (processes is None and end * len(settings) < WORTH_A_PROCESS):
-        return fold_several(log, settings, end, truth, progress)
+        return fold_several(log, settings, end, truth, progress, keep_views=keep_views)
     shares = [list(settings[index::workers]) for index in range(workers)]
-    outcomes = _in_processes(log, shares, end, truth, progress)
+    outcomes = _in_processes(log, shares, end, truth, progress, keep_views=keep_views)
     return [outcomes[index % workers][index // workers] for index in range(len(settings))]
 
 
@@ -68,6 +71,8 @@ def fold_several(
     end: int,
     truth: Truth | None = None,
     progress: Progress | None = None,
+    *,
+    keep_views: bool = False,
 ) -> list[Outcome]:
     """The same in this process: one pass over the log for all of ``settings``."""
     folds = [_Fold(each) for each in settings]
@@ -78,7 +83,7 @@ def fold_several(
                 _fold_chunk(chunk, folds)
                 if progress is not None:
                     progress(chunk[-1].offset + 1, end)
-            return [fold.outcome(truth) for fold in folds]
+            return [fold.outcome(truth, keep_view=keep_views) for fold in folds]
 
 
 class _Fold:
@@ -96,8 +101,9 @@ class _Fold:
         self.view.apply_event(offset, deltas)
         self.history.apply(offset, [delta for delta in deltas if type(delta) in _OF_PLACES])
 
-    def outcome(self, truth: Truth | None) -> Outcome:
-        return outcome_of(self.view, self.history, truth, self.seconds)
+    def outcome(self, truth: Truth | None, *, keep_view: bool) -> Outcome:
+        outcome = outcome_of(self.view, self.history, truth, self.seconds)
+        return replace(outcome, view=self.view) if keep_view else outcome
 
 
 def _fold_chunk(chunk: Sequence[Event], folds: Sequence[_Fold]) -> None:
@@ -116,6 +122,8 @@ def _in_processes(
     end: int,
     truth: Truth | None,
     progress: Progress | None,
+    *,
+    keep_views: bool,
 ) -> list[list[Outcome]]:
     # Spawned, not forked: the caller may have threads (a writer, a Zenoh session) whose locks a
     # fork would copy in whatever state they are.
@@ -125,7 +133,7 @@ def _in_processes(
         len(shares), mp_context=context, initializer=_start_worker, initargs=(done,)
     ) as pool:
         with _no_ctrl_c():
-            futures = [pool.submit(_work, log, share, end, truth) for share in shares]
+            futures = [pool.submit(_work, log, each, end, truth, keep_views) for each in shares]
         _watch(futures, done, end * len(shares), progress)
         try:
             return [future.result() for future in futures]
@@ -154,7 +162,9 @@ def _start_worker(done: "Synchronized[int]") -> None:
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
-def _work(log: Path, settings: list[Settings], end: int, truth: Truth | None) -> list[Outcome]:
+def _work(
+    log: Path, settings: list[Settings], end: int, truth: Truth | None, keep_views: bool
+) -> list[Outcome]:
     counted = 0
 
     def report(folded: int, _: int) -> None:
@@ -164,7 +174,7 @@ def _work(log: Path, settings: list[Settings], end: int, truth: Truth | None) ->
                 _done.value += folded - counted
         counted = folded
 
-    return fold_several(log, settings, end, truth, report)
+    return fold_several(log, settings, end, truth, report, keep_views=keep_views)
 
 
 def _watch(

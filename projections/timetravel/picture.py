@@ -11,9 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from eventsrc.errors import MisuseError
 from projections.drawing import palette
-from projections.drawing.canvas import HALO, SUFFIXES, Bounds, Canvas
+from projections.drawing.canvas import HALO, Bounds, Canvas, check_name
 from projections.drawing.ground import draw_drives, draw_regions
 from projections.drawing.marks import draw_place_names
 from projections.view import MapView
@@ -145,6 +144,5 @@ def _whole(views: Sequence[MapView]) -> Bounds:
 
 
 def _save(figure: Figure, out: Path) -> None:
-    if out.suffix.lower() not in SUFFIXES:
-        raise MisuseError(f"{out}: a picture is .png, .svg or .pdf; give such a name")
+    check_name(out)
     Canvas(figure, figure.axes[0], (0, 0, 1, 1), 1.0).save(out)

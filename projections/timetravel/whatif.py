@@ -68,13 +68,18 @@ def what_if(
     truth: Truth | None = None,
     processes: int | None = None,
     progress: Progress | None = None,
+    keep_views: bool = False,
 ) -> WhatIf:
     """Fold the first ``end`` events of a log under ``base`` and ``others``, and compare.
 
-    A setting that stands several times is folded once.
+    A setting that stands several times is folded once. With ``keep_views`` each outcome has its
+    map too.
     """
     wanted = list(dict.fromkeys((base, *others)))
-    folded = fold_all(log, wanted, end, truth=truth, processes=processes, progress=progress)
+    folded = fold_all(
+        log, wanted, end,
+        truth=truth, processes=processes, progress=progress, keep_views=keep_views,
+    )  # fmt: skip
     outcomes = dict(zip(wanted, folded, strict=True))
     first = outcomes[base]
     changed = base != Settings()

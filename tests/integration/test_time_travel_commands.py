@@ -1,11 +1,14 @@
 """merges, why, diff, bisect and whatif as a person runs them: streams, exit codes, JSON."""
 
 import json
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from projections.cli import main
+from projections.reducers.semantic_map import SemanticMap
 from tests.commands import Commands, Said
 from tests.envelopes import detection, envelope
 from tests.fixtures_timetravel import write_damaged_log, write_log
@@ -18,20 +21,22 @@ XS = (0.0, 1.0, 2.0, 6.0, 5.0, 4.0, 9.0, 3.0)
 class Here:
     """Runs commands in this process: as `Commands` does, but without starting Python anew."""
 
-    def __init__(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def __init__(self, folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
         self.folder = folder
-        self._capsys = capsys
+        self._capfd = capfd
 
     def __call__(self, *args: str | Path, code: int = 0) -> Said:
         with pytest.MonkeyPatch.context() as patch:
             patch.chdir(self.folder)
             patch.setattr("sys.argv", ["mapfold", *map(str, args)])
+            for stream in ("stdout", "stderr"):  # a program makes its own of them; give them back
+                patch.setattr(sys, stream, getattr(sys, stream))
             try:
                 main()
                 left: object = 0
             except SystemExit as error:
                 left = error.code or 0
-        out, err = self._capsys.readouterr()
+        out, err = self._capfd.readouterr()
         assert left == code, f"exit {left}: {err or out}"
         return Said(code, out, err)
 
@@ -43,10 +48,10 @@ def make_log(folder: Path) -> None:
 
 
 @pytest.fixture
-def mapfold(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Here:
+def mapfold(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> Here:
     """Commands beside a log whose keyframe 8, at offset 7, makes two places one."""
     make_log(tmp_path)
-    return Here(tmp_path, capsys)
+    return Here(tmp_path, capfd)
 
 
 def test_the_program_itself(tmp_path: Path) -> None:
@@ -176,9 +181,49 @@ def test_whatif_with_truth_and_picture(mapfold: Here) -> None:
     assert said.err.endswith("wrote maps.png: 2 maps\n")
 
 
+@pytest.mark.parametrize("processes", ["1", "2"])
+def test_whatif_draws_what_it_has_folded(
+    mapfold: Here, monkeypatch: pytest.MonkeyPatch, processes: str
+) -> None:
+    folded = 0
+    fold = SemanticMap.fold
+
+    def counting(self: SemanticMap, *args: Any) -> Any:
+        nonlocal folded
+        folded += 1
+        return fold(self, *args)
+
+    monkeypatch.setattr(SemanticMap, "fold", counting)
+    asked = ("whatif", "log", "--base", "eps_m=1", "--try", "min_samples=2")
+    mapfold(*asked, "--picture", f"{processes}.svg", "--processes", processes)
+    assert folded == (2 * len(XS) if processes == "1" else 0)  # the others fold elsewhere
+    drawn = (mapfold.folder / f"{processes}.svg").read_text("utf-8")
+    assert drawn.count(">p0<") == 2
+    assert "min_samples=2: 1 place, 1 noise" in drawn
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        ("draw", "log", "--out", "m.gif"),
+        ("merges", "log", "--draw", "1", "--out", "m.gif"),
+        ("whatif", "log", "--try", "eps_m=1", "--picture", "m.gif"),
+        ("evaluate", "--map", "log", "--picture", "m.gif"),
+    ],
+    ids=lambda args: args[0],
+)
+def test_a_name_that_no_picture_has_is_told_before_a_long_fold(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], args: tuple[str, ...]
+) -> None:
+    write_damaged_log(tmp_path / "log", [envelope(1)])  # who folds it first meets that instead
+    said = Here(tmp_path, capfd)(*args, code=2)
+    assert said.err == "mapfold: m.gif: a picture is .png, .svg or .pdf; give such a name\n"
+
+
 @pytest.mark.parametrize(
     ("args", "says"),
     [
+        (("merges", "log", "--out", "m.png"), "--out m.png is for the picture of --draw N"),
         (("merges", "nolog"), "no log at nolog"),
         (("merges", "log", "--at", "99"), "99 is beyond the end"),
         (("merges", "log", "--at", "3", "--show", "1"), "no merge number 1; there are none"),
@@ -212,9 +257,9 @@ def test_misuse_is_told_in_one_line(mapfold: Here, args: tuple[str, ...], says: 
     ],
 )
 def test_an_event_that_cannot_be_folded_is_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], args: tuple[str, ...]
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], args: tuple[str, ...]
 ) -> None:
     write_damaged_log(tmp_path / "log", [envelope(1), envelope(2)])
-    said = Here(tmp_path, capsys)(args[0], "log", *args[1:], code=1)
+    said = Here(tmp_path, capfd)(args[0], "log", *args[1:], code=1)
     assert said.err.startswith("mapfold: event at offset 2 cannot be folded: not JSON")
     assert len(said.err.splitlines()) == 1

@@ -13,6 +13,7 @@ from projections.folding import fold_log
 from projections.settings import Settings
 from projections.timetravel.whatif import what_if
 from projections.view import MapView
+from tests.envelopes import envelope
 from tests.fixtures_timetravel import walks, write_log
 
 BASE = Settings(eps_m=0.7, min_samples=3, fusion_radius_m=2.0)
@@ -81,3 +82,19 @@ def test_todays_settings_change_nothing(documents: list[dict[str, Any]]) -> None
     assert same.parted_objects is None
     assert same.outcome.digest == found.base.outcome.digest
     assert same.name == "no change"
+
+
+def test_a_long_chain_of_merges_comes_back_from_a_process(tmp_path: Path) -> None:
+    """Each place is absorbed by the one founded before it, the last one first: a pickle that went
+    from survivor to survivor would go too deep."""
+    far, count = Settings(eps_m=1.0, min_samples=2), 3_000
+    first = [envelope(n, 1.5 * n) for n in range(count)]
+    second = [envelope(count + n, 1.5 * n + 0.1) for n in reversed(range(count))]
+    between = [envelope(2 * count + n, 1.5 * n + 0.8) for n in range(count - 1)]
+    documents = [*first, *second, *between]
+    log = write_log(tmp_path / "log", documents)
+    found = what_if(log, far, [BASE], len(documents), processes=2, keep_views=True)
+    assert found.base.outcome.merges == count - 1
+    for each in found.all:
+        assert each.outcome.view is not None
+        assert map_digest(each.outcome.view) == each.outcome.digest
