@@ -30,6 +30,7 @@ from ._naming import ACTIVE, SegmentPath, leftovers, list_segments, segment_path
 from ._scan import Scan, scan_active
 from ._seal import NO_PREVIOUS, SegmentPlan, file_sha256, seal
 from ._sealed_file import SealedFile
+from ._whose import log_id_of
 from .fsync import sync_directory, sync_file, unlink_quietly, write_all
 
 
@@ -71,10 +72,15 @@ class _Leftover:
 
 
 def restart(log: Path) -> Restart:
-    """Put in order what is left over. The caller holds the writer lock."""
+    """Put in order what is left over. The caller holds the writer lock.
+
+    Raises LogDamaged for rot, and when the first and the last segment and those that are left over
+    are not of one log.
+    """
     for path in leftovers(log):
         unlink_quietly(path)
     segments = list_segments(log)
+    log_id_of([*segments[:1], *(s for s in segments[1:-1] if not s.sealed), *segments[-1:]])
     for segment in segments:
         if segment.sealed:
             unlink_quietly(segment_path(log, segment.base, ACTIVE))

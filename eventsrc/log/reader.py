@@ -17,6 +17,7 @@ from eventsrc.errors import LogDamaged, LogNotFound, NotALog
 from ._active_file import ActiveFile
 from ._naming import ACTIVE, SEALED, SegmentPath, list_growing, segment_path
 from ._sealed_file import SealedFile
+from ._whose import mixed_up
 from .event import Event
 from .segment import Unreadable, chunk_events
 
@@ -35,6 +36,7 @@ class LogReader:
         self._segments = segments_of(path)
         self._last = _open_segment(path, self._segments[-1])
         self.log_id = self._last.log_id
+        """As its last segment says; no other is read if it says otherwise."""
 
     @property
     def next_offset(self) -> int:
@@ -53,18 +55,32 @@ class LogReader:
                 self._last.refresh()
             following = self._following()
             if following is not None:
+                last = self._open_own(following)
                 self._segments.append(following)
                 self._remember(self._last)
-                self._last = _open_segment(self.path, following)
+                self._last = last
             elif isinstance(self._last, ActiveFile) and self._last.was_replaced():
                 self._reopen_last()
             else:
                 return self.next_offset
 
+    def check_end(self) -> None:
+        """See whether there is really nothing behind `next_offset`. Raises LogDamaged where events
+        were recorded there that cannot be read, and LogNotFound when the log is gone."""
+        if not self.path.exists():
+            raise LogNotFound(f"the log at {self.path} is gone; check the path")
+        stop = _stop_at_gap(self.path)
+        self._look_for_rot(0, stop)
+        segments = list_growing(self.path)
+        known = self.refresh()  # after the look at the folder: a writer may be at work
+        for newest in segments[-1:]:
+            if newest.base > known:
+                stop(Unreadable(known, newest.base - 1, f"missing before {newest.path.name}"))
+
     def _reopen_last(self) -> None:
         """A restarted writer has sealed the segment, perhaps with events that had no commit mark
         yet, or has begun an empty one anew."""
-        self._last = _open_segment(self.path, self._segments[-1])
+        self._last = self._open_own(self._segments[-1])
 
     def _following(self) -> SegmentPath | None:
         """The segment that starts where the last one ends, once its writer has begun it."""
@@ -152,8 +168,14 @@ class LogReader:
         """One of `segments`, open. The last one is always the object that `refresh` keeps up."""
         if entry.base == self._last.base:
             return self._last
-        segment = self._open.get(entry.base) or _open_segment(self.path, entry)
+        segment = self._open.get(entry.base) or self._open_own(entry)
         self._remember(segment)
+        return segment
+
+    def _open_own(self, entry: SegmentPath) -> OpenSegment:
+        segment = _open_segment(self.path, entry)
+        if segment.log_id != self.log_id:
+            raise LogDamaged(mixed_up(entry.path, segment.log_id, self._last.path, self.log_id))
         return segment
 
     def _remember(self, segment: OpenSegment) -> None:

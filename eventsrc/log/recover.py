@@ -26,6 +26,7 @@ from ._rebuild import rebuild
 from ._scan import Scan, scan_active
 from ._scan_sealed import scan_sealed
 from ._seal import NO_PREVIOUS, REPLACES, SegmentPlan, file_sha256
+from ._whose import log_id_of
 from .fsync import GROUP_COMMIT, sync_directory, unlink_quietly
 from .reader import segments_of
 
@@ -60,7 +61,8 @@ class RecoveryReport:
 
 
 def recover_log(log: Path, *, clock: Clock = system_clock) -> RecoveryReport:
-    """Recover a log. Raises LogNotFound, NotALog, LogBusy, or LogError when the disk refuses."""
+    """Recover a log. Raises LogNotFound, NotALog, LogBusy, LogDamaged when its segments are of two
+    logs, or LogError when the disk refuses."""
     segments_of(log)
     try:
         with WriterLock(log, clock):
@@ -83,7 +85,7 @@ class _Recovery:
         for path in leftovers(self._log):
             unlink_quietly(path)
         segments = list_segments(self._log)
-        self._log_id = _find_log_id(segments)
+        self._log_id = log_id_of(segments) or uuid.uuid4().hex
         for index, segment in enumerate(segments):
             following = segments[index + 1] if index + 1 < len(segments) else None
             if segment.base > self._next:
@@ -165,15 +167,6 @@ class _Recovery:
             else:
                 sync_directory(self._log)
                 return copy.name
-
-
-def _find_log_id(segments: list[SegmentPath]) -> str:
-    for segment in segments:
-        try:
-            return head_of(segment.path, segment.base)["log_id"]
-        except (LogDamaged, NotALog):
-            continue
-    return uuid.uuid4().hex
 
 
 def _replaces(following: SegmentPath | None) -> dict[str, str]:

@@ -1,6 +1,7 @@
 """A tail sees every event once and in order, across rotations, from another process too."""
 
 import queue
+import shutil
 import subprocess
 import sys
 import threading
@@ -11,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import LogDamaged, LogError
+from eventsrc.errors import LogDamaged, LogError, LogNotFound
 from eventsrc.log import Event, LogReader, LogWriter, follow
 from eventsrc.log._mcap import MARK_BYTES
 from tests.chaos.log_writer import payload_at
-from tests.fixtures_log import BY_HAND, KEY
+from tests.fixtures_log import BY_HAND, KEY, flip, write_log
 
 ROOT = Path(__file__).parents[2]
 TIMEOUT_S = 60
@@ -117,6 +118,42 @@ def test_a_tail_stops_at_what_it_cannot_read(log_path: Path) -> None:
         next(events)
     with pytest.raises(LogError, match="log recover"):
         writer.close()
+
+
+@pytest.mark.parametrize("at", [3, -10], ids=["chunk head", "commit mark"])
+@pytest.mark.parametrize("behind", ["same segment", "next segment"])
+def test_a_tail_does_not_wait_for_ever_for_what_has_rotted(
+    log_path: Path, at: int, behind: str
+) -> None:
+    stop = threading.Event()
+    rotate_events = 2 if behind == "next segment" else 100
+    writer = LogWriter(log_path, fsync=BY_HAND, rotate_events=rotate_events)
+    writer._sealer.submit = lambda *_, **__: None  # type: ignore[method-assign]
+    active = next(log_path.glob("*.active"))
+    ends = []
+    for number in range(3):
+        writer.append(KEY, b"%d" % number)
+        writer.sync()
+        ends.append(active.stat().st_size)
+        writer.commit_if_due()
+    flip(active, ends[0] + at if at > 0 else ends[1] + at)
+    events = follow(log_path, 0, stop=stop, poll_s=0.0)
+    first = next(events)
+    assert first is not None
+    assert first.payload == b"0"
+    with pytest.raises(LogDamaged, match="offsets 1 to"):
+        list(events)
+    writer._active.close()
+    writer._lock.release()
+
+
+def test_a_tail_of_a_log_that_is_gone_ends(log_path: Path) -> None:
+    write_log(log_path, [b"0"])
+    events = follow(log_path, 0, stop=threading.Event(), poll_s=0.0)
+    assert next(events) is not None
+    shutil.rmtree(log_path)
+    with pytest.raises(LogNotFound, match="is gone"):
+        list(events)
 
 
 def test_a_tail_gets_what_recovery_found_behind_the_last_mark(log_path: Path) -> None:

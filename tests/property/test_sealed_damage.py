@@ -8,10 +8,27 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import LogError
-from eventsrc.log import Event, LogReader, LogWriter, _parts, log_info, recover_log, verify_log
+from eventsrc.errors import LogDamaged, LogError
+from eventsrc.log import (
+    ALWAYS,
+    Event,
+    LogReader,
+    LogWriter,
+    _parts,
+    log_info,
+    recover_log,
+    verify_log,
+)
 from eventsrc.system_events import LOSS_KEY, REJECTED_KEY, Loss
-from tests.fixtures_log import BY_HAND, KEY, envelope, flip, read_log, read_with_gaps
+from tests.fixtures_log import (
+    BY_HAND,
+    KEY,
+    envelope,
+    flip,
+    read_log,
+    read_with_gaps,
+    write_log,
+)
 
 MEMORY_DISK = Path("/dev/shm")
 EVENTS = 6
@@ -225,6 +242,30 @@ def test_the_chain_notices_a_segment_put_in_anothers_place(quick_path: Path) -> 
     shutil.copy(quick_path / "b" / middle, quick_path / "a" / middle)
     kinds = [f.kind for f in verify_log(quick_path / "a").findings]
     assert kinds == ["log_id", "chain", "chain"]
+
+
+@pytest.mark.parametrize("which", [0, 2, 4])
+def test_a_segment_of_another_log_is_not_read_as_one_of_this(quick_path: Path, which: int) -> None:
+    for name in "ab":
+        payloads = [f"{name}{number}".encode() for number in range(6)]
+        write_log(quick_path / name, payloads, fsync=ALWAYS, rotate_events=2)
+    log, foreign = quick_path / "a", f"{which:020d}.mcap"
+    before = {p.name for p in log.iterdir()}
+    shutil.copy(quick_path / "b" / foreign, log / foreign)
+    events, named = read_with_gaps(log)
+    wrong = {which, which + 1}
+    if which == 4:  # the last one says whose log it is
+        assert named == set(range(4))
+    else:
+        assert named == wrong
+        assert {e.payload[:1] for e in events} == {b"a"}
+    for use in (read_log, recover_log, *([] if which == 2 else [LogWriter])):
+        with pytest.raises(LogDamaged, match=r"belongs to log .* put the right file in place"):
+            use(log)
+    assert {p.name for p in log.iterdir()} == before
+    (log / foreign).unlink()
+    assert recover_log(log).events == (4 if which == 4 else 6)
+    assert {e.payload[:1] for e in read_log(log) if e.key != LOSS_KEY} == {b"a"}
 
 
 def test_verify_tells_what_no_checksum_knows(quick_path: Path) -> None:
