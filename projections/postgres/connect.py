@@ -8,6 +8,7 @@ Messages name host, port and database, never a password.
 """
 
 import contextlib
+import json
 import logging
 import os
 from collections.abc import Iterator, Mapping
@@ -16,7 +17,7 @@ from typing import Final, LiteralString
 
 import psycopg
 from psycopg import sql
-from psycopg.conninfo import conninfo_to_dict
+from psycopg.conninfo import conninfo_to_dict, make_conninfo
 from psycopg.rows import TupleRow
 
 from eventsrc.errors import MisuseError
@@ -31,13 +32,25 @@ Connection = psycopg.Connection[TupleRow]
 logging.getLogger("psycopg").addHandler(logging.NullHandler())
 
 CONNECT_SECONDS: Final = 10
-_TIMEOUTS: Final = (
-    "statement_timeout",
-    "lock_timeout",
-    "idle_in_transaction_session_timeout",
-    "transaction_timeout",  # from PostgreSQL 17 on
-    "idle_session_timeout",
-)
+_LINK: Final[Mapping[str, int]] = {
+    "keepalives_idle": 20,
+    "keepalives_interval": 10,
+    "keepalives_count": 3,
+    "tcp_user_timeout": 50_000,
+}
+"""A server that went without a word (its power, the network) is missed within a minute; by default
+that takes hours. What the URL says of it wins."""
+_SESSION: Final[Mapping[str, str]] = {
+    "statement_timeout": "0",
+    "lock_timeout": "0",
+    "idle_in_transaction_session_timeout": "0",
+    "transaction_timeout": "0",  # from PostgreSQL 17 on
+    "idle_session_timeout": "0",
+    # The same from the server's side: a writer that went without a word gives its lock back.
+    "tcp_keepalives_idle": "20",
+    "tcp_keepalives_interval": "10",
+    "tcp_keepalives_count": "3",
+}
 _PACKAGES: Final[Mapping[str, str]] = {"age": "Apache AGE", "vector": "pgvector"}
 
 
@@ -94,9 +107,11 @@ def check_url(url: str) -> None:
 def connect(url: str, *, application: str = "mapfold", autocommit: bool = False) -> Connection:
     """A connection. Raises DatabaseUnavailable in one line that says what to do next."""
     check_url(url)
+    said = conninfo_to_dict(url)
+    missing = {name: value for name, value in _LINK.items() if name not in said}
     try:
         return psycopg.connect(
-            url,
+            make_conninfo(url, **missing),
             autocommit=autocommit,
             application_name=application,
             connect_timeout=CONNECT_SECONDS,
@@ -106,15 +121,16 @@ def connect(url: str, *, application: str = "mapfold", autocommit: bool = False)
         raise DatabaseUnavailable(f"{place(url)}: {told}") from None
 
 
-def lift_timeouts(connection: Connection) -> None:
+def settle(connection: Connection) -> None:
     """Let the session take its time, whatever the server's owner has set for others.
 
     A rebuild folds for minutes between two statements, an index of many vectors takes longer, and a
-    tail may have nothing to say all night.
+    tail may have nothing to say all night. But it ends when its client is no longer there.
     """
     connection.execute(
-        "SELECT set_config(name, '0', false) FROM pg_catalog.pg_settings WHERE name = ANY(%s)",
-        [list(_TIMEOUTS)],
+        "SELECT set_config(name, wanted ->> name, false)"
+        " FROM pg_catalog.pg_settings, (SELECT %s::jsonb) AS w(wanted) WHERE wanted ? name",
+        [json.dumps(_SESSION)],
     )
 
 

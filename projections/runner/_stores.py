@@ -12,8 +12,8 @@ from projections.postgres.connect import (
     Targets,
     connect,
     database_errors,
-    lift_timeouts,
     place,
+    settle,
 )
 from projections.settings import Settings
 from projections.sink import Sink, SinkName
@@ -54,7 +54,7 @@ class Store:
         opened = connect(self.url, application=self.application, autocommit=True)
         with opened as connection, database_errors(self.url):
             connection.execute("SET client_min_messages = warning")
-            lift_timeouts(connection)
+            settle(connection)
             yield connection
 
     def close(self) -> None:
@@ -102,7 +102,7 @@ def _open(url: str, application: str, sinks: tuple[Sink[Any], ...]) -> Connectio
         with database_errors(url):
             # AGE and the schema commands talk; only what goes wrong is of interest.
             connection.execute("SET client_min_messages = warning")
-            lift_timeouts(connection)
+            settle(connection)
             for sink in sinks:
                 _checkpoint.lock_writer(connection, sink.name)
             _ensure_store(connection)

@@ -23,8 +23,8 @@ from projections.postgres.connect import (
     Targets,
     connect,
     database_errors,
-    lift_timeouts,
     place,
+    settle,
 )
 from projections.settings import Settings
 from projections.sink import Checkpoint, Sink, SinkName
@@ -94,7 +94,7 @@ def _check(log: Path, sink: SinkName, url: str, settings: Settings) -> CheckRepo
         connection.isolation_level = IsolationLevel.REPEATABLE_READ
         connection.read_only = True
         with database_errors(url):
-            lift_timeouts(connection)
+            settle(connection)
             checkpoint = _checkpoint.load(connection, sink)
             if checkpoint is None:
                 raise ProjectionMissing(

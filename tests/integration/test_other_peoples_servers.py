@@ -11,9 +11,10 @@ import pytest
 from psycopg import sql
 
 from projections.errors import DatabaseError
-from projections.postgres.connect import Targets, connect
+from projections.postgres import _cluster
+from projections.postgres.connect import Targets, connect, settle
 from projections.postgres.embedded import EmbeddedServer
-from projections.runner import rebuild, tail
+from projections.runner import RebuildProgress, rebuild, tail
 from projections.runner.check import check
 from projections.runner.status import projection_status
 from projections.settings import Settings
@@ -22,6 +23,7 @@ from projections.sinks.roles import roles_sql
 from tests.drops import wait_for_drops
 from tests.logs import walk, write_log
 from tests.rows import all_rows
+from tests.servers import server_to_kill
 
 SETTINGS = Settings()
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "projections.md"
@@ -29,6 +31,8 @@ TIMEOUTS = (
     "SELECT name FROM pg_settings WHERE name ~"
     " '^(statement|lock|transaction|idle_session|idle_in_transaction_session)_timeout$'"
 )
+KEEPALIVES = {"keepalives_idle": "20", "keepalives_interval": "10", "keepalives_count": "3"}
+HOST = "127.0.0.77"  # nobody else's port 5432
 OWNER, WRITER = "an_owner", "a_tail"
 
 
@@ -63,17 +67,38 @@ def test_pgvector_in_a_schema_of_its_own(
     assert [r.differing for r in check(log, targets, SETTINGS)] == [0, 0]
 
 
-def test_timeouts_meant_for_others(tmp_path: Path, pg_url: str, pg: psycopg.Connection) -> None:
-    """They are shorter than a replay's transaction, and much longer than its first statement."""
-    log = write_log(tmp_path / "log", walk(400))
+def test_timeouts_meant_for_others(
+    log: Path, one_database: Targets, pg: psycopg.Connection
+) -> None:
+    """A rebuild's session idles in its transaction for as long as the fold takes."""
     database = sql.Identifier(pg.info.dbname)
     for (name,) in pg.execute(TIMEOUTS).fetchall():
-        alter = sql.SQL("ALTER DATABASE {} SET {} = '150ms'")
+        alter = sql.SQL("ALTER DATABASE {} SET {} = '250ms'")
         pg.execute(alter.format(database, sql.Identifier(name)))
-    targets = Targets(pg_url, pg_url)
-    assert rebuild(log, targets, SETTINGS, until=390).total_s > 0.15
-    assert tail(log, targets, SETTINGS, once=True).events == 10
-    assert [r.differing for r in check(log, targets, SETTINGS)] == [0, 0]
+
+    def idle(at: RebuildProgress) -> None:
+        if at.stage == "swapping":
+            pg.execute("SELECT pg_sleep(0.4)")  # a session from before
+
+    rebuild(log, one_database, SETTINGS, until=30, progress=idle)
+    assert tail(log, one_database, SETTINGS, once=True).events == 10
+    assert [r.differing for r in check(log, one_database, SETTINGS)] == [0, 0]
+
+
+def test_a_peer_that_went_without_a_word_is_missed_within_a_minute(
+    pg_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By both sides; only so does a writer's lock come back when its machine has lost power."""
+    settings = {**_cluster.SETTINGS, "listen_addresses": HOST}  # a unix socket knows no such thing
+    monkeypatch.setattr(_cluster, "SETTINGS", settings)
+    with server_to_kill(), connect(f"postgresql://postgres@{HOST}/postgres") as connection:
+        settle(connection)
+        for name, wanted in KEEPALIVES.items():
+            assert connection.execute(f"SHOW tcp_{name}").fetchone() == (wanted,)  # type: ignore[arg-type]
+            assert connection.info.get_parameters()[name] == wanted
+        assert connection.info.get_parameters()["tcp_user_timeout"] == "50000"
+    with connect(f"{pg_url}{'&' if '?' in pg_url else '?'}keepalives_idle=7") as connection:
+        assert connection.info.get_parameters()["keepalives_idle"] == "7"
 
 
 @pytest.fixture
