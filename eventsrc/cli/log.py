@@ -19,6 +19,7 @@ from eventsrc.log import (
     recover_log,
     verify_log,
 )
+from eventsrc.log.reader import OnGap
 from eventsrc.log.whence import resolve, resolve_start
 from eventsrc.words import counted
 
@@ -106,12 +107,14 @@ def cat(
     with LogReader(log) as reader:
         on_gap = note if skip_damage else None
         start = resolve_start(reader, from_, on_gap=on_gap)
-        end = reader.next_offset if to == "end" else resolve(reader, to, on_gap=on_gap)
-        if start > end:
-            raise MisuseError(f"--from {from_} is offset {start}, behind --to {to}, which is {end}")
-        until = None if to == "end" else end
+        end = _end(reader, to, start, on_gap)
+        last = reader.next_offset if end is None else end
+        if start > last:
+            raise MisuseError(
+                f"--from {from_} is offset {start}, behind --to {to}, which is {last}"
+            )
         watch = Watch(from_, to, key or ())
-        events = watch.over(reader.read(start, until, keys=key or None, on_gap=on_gap))
+        events = watch.over(reader.read(start, end, keys=key or None, on_gap=on_gap))
         if json_:
             emit_lines(map(event_document, events))
         else:
@@ -119,6 +122,25 @@ def cat(
     for line in watch.told(log):
         say(line)
     finish(findings=bool(gaps))
+
+
+def _end(reader: LogReader, to: str, start: int, on_gap: OnGap | None) -> int | None:
+    """Where a range from offset ``start`` on ends. None: at the end of the log, or at the damage on
+    the way to ``to``, where reading will stop; what is before that is shown first."""
+    if to == "end":
+        return None
+    if on_gap is not None:
+        return resolve(reader, to, on_gap=on_gap)
+    met: list[Unreadable] = []
+    try:
+        end = resolve(reader, to, on_gap=met.append)
+    except MisuseError:
+        if not met:
+            raise
+        end = 0  # it may be among what cannot be read
+    if met and met[0].last < start:
+        return resolve(reader, to)  # which says so
+    return None if met else end
 
 
 @log_app.command()

@@ -1,9 +1,12 @@
 """`mapfold log cat` of a log with rot in the middle: stop there, or go on and name it, but a range
 that the rot is not in is read as if it were not there."""
 
+from pathlib import Path
+
 import pytest
 
 from eventsrc.cli._event_text import iso_time
+from eventsrc.errors import LogError
 from eventsrc.log import LogReader, LogWriter
 from tests.commands import Commands
 from tests.fixtures_log import BY_HAND, KEY, envelope, flip
@@ -76,6 +79,39 @@ def test_a_range_around_the_damage(run: Commands) -> None:
     said = run("log", "cat", "L", *ends, code=1)
     assert shown(said.out) == [98, 99]
     assert "offsets 100 to 199 cannot be read" in said.err
+
+
+@pytest.mark.parametrize("to", ["r1:250", "r1:150", "r1:1000"])
+def test_what_is_before_the_damage_is_shown_on_the_way_to_a_keyframe(
+    run: Commands, to: str
+) -> None:
+    said = run("log", "cat", "L", "--from", "98", "--to", to, code=1)
+    assert shown(said.out) == [98, 99]
+    assert said.err.count("\n") == 1
+    assert "offsets 100 to 199 cannot be read" in said.err
+
+
+@pytest.mark.parametrize("to", ["r1:25", at(25), "end", "r1:99"])
+def test_what_is_before_rot_at_the_end_of_a_growing_segment_is_shown(
+    tmp_path: Path, to: str
+) -> None:
+    log = tmp_path / "L"
+    writer = LogWriter(log, fsync=BY_HAND)
+    (active,) = log.glob("*.active")
+    ends = []
+    for k in range(30):
+        writer.append(KEY, envelope(k, "r1"), stamp_ns=k * SECOND)
+        if k % 10 == 9:
+            writer.sync()
+            ends.append(active.stat().st_size)
+    flip(active, ends[1] - 10)
+    with pytest.raises(LogError, match="log recover"):
+        writer.close()
+    said = Commands.in_folder(tmp_path)("log", "cat", "L", "--to", to, code=1)
+    assert shown(said.out) == list(range(10))
+    assert said.err.count("\n") == 1
+    assert "offsets 10 to 29 cannot be read" in said.err
+    assert "run `mapfold log" in said.err
 
 
 def test_a_range_that_ends_somewhere_in_the_damage(run: Commands) -> None:
