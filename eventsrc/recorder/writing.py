@@ -3,6 +3,8 @@
 * One thread owns the LogWriter. It takes batches from the inbox, appends, and lets the log commit.
 * Nothing follows from an event before it is synced: only then does it enter the gap ledger, count
   as recorded, and is its robot told: acknowledged, or refused.
+* An ack speaks of nothing but what this recorder itself has synced. What an earlier one has may
+  have rotted since, whatever a saved ledger says; a robot that still has it sends it again.
 * When the log cannot be written any more, what was received and is not known to be synced is
   counted: being written, taken, or still in the queue.
 * Losses are written about once a second, not one by one: a queue that overflows is busy enough.
@@ -60,6 +62,8 @@ class Writing:
         self._inbox = inbox
         self._writer = writer
         self._ledger = GapLedger() if ledger is None else ledger
+        self._synced = GapLedger()
+        """What acks speak of."""
         self._saves = ledger is not None  # one that does not know the whole log is not its ledger
         self._answer = answer
         self._room = max_events
@@ -129,6 +133,7 @@ class Writing:
         now_ns = time.monotonic_ns()
         if now_ns >= self._losses_due_ns:
             self._losses_due_ns = now_ns + _LOSSES_EVERY_NS
+            self._synced.flush()  # its gaps are nobody's; the ledger of the whole log tells them
             self._write_losses(self._ledger.due(now_ns))
         if now_ns >= self._save_due_ns:
             self._save_due_ns = now_ns + _SAVE_EVERY_NS
@@ -159,8 +164,9 @@ class Writing:
             self._rejected += event.refusal is not None
             if event.run_id is not None:
                 self._ledger.record(event.run_id, event.keyframe_id, now_ns)
+                self._synced.record(event.run_id, event.keyframe_id, now_ns)
             answers.note(event)
-        for key, payload in answers.messages(self._writer.log_id, self._ledger):
+        for key, payload in answers.messages(self._writer.log_id, self._synced):
             self._answer(key, payload)
 
     def _sync(self) -> int:

@@ -13,9 +13,10 @@ import zenoh
 
 from eventsrc._zenoh import Received, Session, ZenohOptions, open_session
 from eventsrc.acks import Ack, ack_key
+from eventsrc.append import append_payload
 from eventsrc.clock import system_clock
-from eventsrc.errors import LogError, MisuseError
-from eventsrc.ledger import ledger_of
+from eventsrc.errors import LogDamaged, LogError, MisuseError
+from eventsrc.ledger import ledger_of, save_ledger
 from eventsrc.log import Event, FsyncPolicy, LogReader, LogWriter
 from eventsrc.losses import Gap
 from eventsrc.recorder import Recorder, RecorderReport
@@ -23,6 +24,7 @@ from eventsrc.refusals import Refusal, Refusals, refusal_key
 from eventsrc.router import Router
 from eventsrc.system_events import LOSS_KEY, REJECTED_KEY, Loss, RejectedPayload
 from tests.envelopes import detection, envelope, payload
+from tests.fixtures_log import flip
 from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK, Program
 
 Sessions = Callable[[], Session]
@@ -187,6 +189,39 @@ def test_an_ack_covers_what_is_synced_and_nothing_else(connected: Sessions, tmp_
     assert {ack.run_id for ack in acks} == {run_id}
     claimed = {k for ack in acks for first, last in ack.stretches for k in range(first, last + 1)}
     assert claimed == {1, 2, 3, 9}
+
+
+def test_an_ack_does_not_rest_on_what_an_earlier_recorder_synced(
+    connected: Sessions, tmp_path: Path
+) -> None:
+    """Keyframe 1 rots in a sealed segment; the saved ledger still has it, and so has a robot."""
+    log = tmp_path / "log"
+    with LogWriter(log) as writer:
+        for message in _keyframes(1, 2, note="x" * 1000):
+            append_payload(writer, KEY, message)
+    with LogReader(log) as reader:
+        save_ledger(log, reader.log_id, reader.next_offset, ledger_of(reader))
+    (segment,) = log.glob("*.mcap")
+    flip(segment, segment.read_bytes().index(b"zstd") + 100)
+    with pytest.raises(LogDamaged):
+        _events(log)
+    acks: list[Ack] = []
+    acked = threading.Event()
+
+    def hear(message: Received) -> None:
+        acks.append(Ack.decode(message.payload))
+        acked.set()
+
+    watcher = connected()
+    watcher.subscribe(ack_key("run-a"), hear)
+    watcher.confirm()
+    with recording(connected(), log) as running:
+        publisher = connected().publisher(KEY)
+        assert publisher.wait_for_subscriber(DEADLINE_S)
+        publisher.put(*_keyframes(3))
+        assert acked.wait(DEADLINE_S)
+        running.finish()
+    assert [ack.stretches for ack in acks] == [((3, 3),)]
 
 
 def test_a_refusal_follows_when_the_rejected_bytes_are_synced(
