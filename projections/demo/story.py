@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 
+from eventsrc.words import counted
 from projections.relocalize import UNKNOWN_BELOW
 from projections.runner import RebuildReport
 from projections.settings import Settings
@@ -19,20 +20,21 @@ def tell_recording(
     """How run A got into the log, and from there into the databases."""
     kept = "byte for byte" if recorded.intact else "NOT byte for byte"
     yield (
-        f"   {recorded.run_id} drove {recorded.drive_seconds:.0f} s through {rooms} rooms, played "
+        f"   {recorded.run_id} drove {recorded.drive_seconds:.0f} s through "
+        f"{counted(rooms, 'room')}, played "
         f"{speed:g} times as fast, over a Zenoh router to"
     )
     yield (
         f"   `mapfold record` in another process: {recorded.recorded} of {recorded.published} "
-        f"keyframes with {detections} detections are in the log,"
+        f"keyframes with {counted(detections, 'detection')} are in the log,"
     )
     yield (
         f"   {kept}; {recorded.rejected} rejected, {recorded.lost} lost, "
         f"{recorded.log_bytes / 1e6:.1f} MB"
     )
     yield (
-        f"   a tail wrote them to Apache AGE and pgvector as they came, in {followed.batches} "
-        f"transactions:"
+        f"   a tail wrote them to Apache AGE and pgvector as they came, in "
+        f"{counted(followed.batches, 'transaction')}:"
     )
     yield (
         f"   {1000 * followed.median_delay_s:.0f} ms (median) after it was recorded an event could "
@@ -46,8 +48,9 @@ def tell_replay(replayed: RebuildReport, folded: Folded, same_rows: bool) -> Ite
     edges = sum(replayed.rows[label] for label in EDGE_LABELS)
     rows = "the same rows as" if same_rows else "OTHER rows than"
     yield (
-        f"   all made anew from the log in {replayed.total_s:.2f} s: {nodes} nodes, {edges} edges, "
-        f"{replayed.rows[TABLE]} vectors;"
+        f"   all made anew from the log in {replayed.total_s:.2f} s: "
+        f"{counted(nodes, 'node')}, {counted(edges, 'edge')}, "
+        f"{counted(replayed.rows[TABLE], 'vector')};"
     )
     digest = "the same digest as" if replayed.digest == folded.digest else "ANOTHER digest than"
     yield f"   {rows} the tail wrote, {digest} a fold without databases: {folded.digest[:16]}…"
@@ -58,17 +61,18 @@ def tell_map(folded: Folded, other_settings: Settings, other_places: int) -> Ite
     counts, settings = folded.view.counts(), folded.view.settings
     transitions = sum(count for _, _, count in folded.view.edges())
     yield (
-        f"   {_count(counts['places'], 'place')} from {counts['keyframes']} keyframes "
-        f"({counts['noise']} in none), {counts['objects']} objects from {counts['observations']} "
-        f"observations,"
+        f"   {counted(counts['places'], 'place')} from {counted(counts['keyframes'], 'keyframe')} "
+        f"({counts['noise']} in none), {counted(counts['objects'], 'object')} from "
+        f"{counted(counts['observations'], 'observation')},"
     )
+    pairs = counted(counts["adjacency"], "pair")
     yield (
-        f"   {transitions} transitions between {counts['adjacency']} pairs of neighbouring places; "
+        f"   {counted(transitions, 'transition')} between {pairs} of neighbouring places; "
         f"settings ε {settings.eps_m:g} m, min_samples {settings.min_samples}"
     )
     yield (
         f"   (the default, {other_settings.eps_m:g} m and {other_settings.min_samples}, chains "
-        f"this drive into {_count(other_places, 'place')})"
+        f"this drive into {counted(other_places, 'place')})"
     )
 
 
@@ -87,7 +91,7 @@ def tell_merges(merges: tuple[MergeMoment, ...]) -> Iterator[str]:
         f"{merge.offset} of the log, and are {_short(merge.survivor.place_id)} since,"
     )
     yield (
-        f"   because it was founded first ({_count(merge.places_before, 'place')} before, "
+        f"   because it was founded first ({counted(merge.places_before, 'place')} before, "
         f"{after} after{more})"
     )
 
@@ -99,13 +103,13 @@ def tell_lost(lost: Lost, rooms: dict[str, str]) -> Iterator[str]:
         f"{lost.room}, in truth)"
     )
     for asked in lost.questions:
-        yield f"   {_count(len(asked.classes), 'crop')} ({', '.join(asked.classes)})"
+        yield f"   {counted(len(asked.classes), 'crop')} ({', '.join(asked.classes)})"
         yield f"     → {_places(asked, rooms)}"
         yield f"       {_pose(asked)}"
     every = lost.everywhere
     yield (
-        f"   asked once from each of its {every.asked} keyframes that show something: "
-        f"{every.near} answers within {NEAR_M:g} m,"
+        f"   asked once from each of its {counted(every.asked, 'keyframe')} that show something: "
+        f"{counted(every.near, 'answer')} within {NEAR_M:g} m,"
     )
     yield (
         f'   {every.unknown} "unknown", {every.asked - every.unknown - every.near} wrong; '
@@ -132,12 +136,8 @@ def _pose(asked: Asked) -> str:
 
 
 def _part(part: Part) -> str:
-    return f"{_short(part.place_id)} ({_count(part.keyframes, 'keyframe')}, {part.room})"
+    return f"{_short(part.place_id)} ({counted(part.keyframes, 'keyframe')}, {part.room})"
 
 
 def _short(place_id: str) -> str:
     return place_id.rpartition("_")[2]
-
-
-def _count(number: int, thing: str) -> str:
-    return f"{number} {thing}" if number == 1 else f"{number} {thing}s"

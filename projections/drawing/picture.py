@@ -83,7 +83,7 @@ def _numbers(view: MapView, min_observations: int) -> str:
         f"{counted(counts['keyframes'], 'keyframe')} ({counts['noise']} in no place)  ·  "
         f"{counted(counts['places'], 'place')}  ·  "
         f"{counted(counts['objects'], 'object')}, {shown} of them shown: seen "
-        f"{min_observations} times or more  ·  ε {settings.eps_m:g} m, "
+        f"{counted(min_observations, 'time')} or more  ·  ε {settings.eps_m:g} m, "
         f"min_samples {settings.min_samples}"
     )
 
@@ -95,5 +95,5 @@ def _legend(lost: LostRobot | None, bridges: Sequence[Bridge], left_out: int) ->
     if lost is not None:
         parts.append("✖ lost robot, true spot    ● (red) where the map puts it")
     if left_out:
-        parts.append(f"{left_out} object labels had no room")
+        parts.append(f"{counted(left_out, 'object label')} had no room")
     return [LEGEND, "    ".join(parts)]

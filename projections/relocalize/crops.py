@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from eventsrc.envelope import MAX_DIMENSION, Text, fault
+from eventsrc.words import counted
 from projections.errors import QuestionError
 from projections.exact import quantise, to_float32
 
@@ -67,6 +68,13 @@ def parse_question(payload: bytes | str) -> tuple[Crop, ...]:
     """Read a question. Raises QuestionError that names what is wrong and what to send instead."""
     try:
         document = json.loads(payload)
+    except json.JSONDecodeError as error:
+        if error.msg == "Extra data":
+            raise QuestionError(
+                f"more comes behind the question, in line {error.lineno}; send one JSON document,"
+                " such as one line of a file of envelopes"
+            ) from None
+        raise QuestionError(f"the question is not JSON: {error}") from None
     except (ValueError, RecursionError) as error:
         raise QuestionError(f"the question is not JSON: {error}") from None
     return read_crops(document)
@@ -76,10 +84,11 @@ def read_crops(document: Any) -> tuple[Crop, ...]:
     """The crops of a parsed question that have an embedding; at least one, of one dimension."""
     models = _validated(_crop_list(document))
     crops = [_crop(index, m) for index, m in enumerate(models) if m.embedding is not None]
+    if not models:
+        raise QuestionError("the question has no crops; send at least one, with its embedding")
     if not crops:
-        raise QuestionError(
-            f"none of the {len(models)} crops in the question has an embedding; send at least one"
-        )
+        count = counted(len(models), "crop")
+        raise QuestionError(f"the question has {count} and no embedding; send at least one")
     _same_space(crops)
     return tuple(crops)
 
@@ -115,7 +124,7 @@ def _crop(index: int, model: _CropModel) -> Crop:
     raw = _floats(index, model)
     if model.embedding_dim is not None and len(raw) != model.embedding_dim:
         raise QuestionError(
-            f"crops.{index}.embedding: holds {len(raw)} numbers, embedding_dim says"
+            f"crops.{index}.embedding: holds {counted(len(raw), 'number')}, embedding_dim says"
             f" {model.embedding_dim}"
         )
     if not np.isfinite(raw).all() or not raw.any():
@@ -139,7 +148,7 @@ def _floats(index: int, model: _CropModel) -> Vector:
             raise QuestionError(f"crops.{index}.embedding: not base64: {error}") from None
         if not raw or len(raw) % 4:
             raise QuestionError(
-                f"crops.{index}.embedding: {len(raw)} bytes are no row of 4-byte floats"
+                f"crops.{index}.embedding: {counted(len(raw), 'byte')}, so no row of 4-byte floats"
             )
         return np.frombuffer(raw, dtype="<f4")
     if not given:

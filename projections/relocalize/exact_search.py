@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from eventsrc.words import counted
 from projections.errors import QuestionError
 from projections.exact import Q40, quantise
 from projections.view import MapView
@@ -69,8 +70,8 @@ def check_space(crop: Crop, dimension: int, model: str | None) -> None:
     """Raise QuestionError when the crop is not of the map's embedding space."""
     if len(crop.vector) != dimension:
         raise QuestionError(
-            f"the question's embeddings have {len(crop.vector)} dimensions, the map's"
-            f" {dimension}; ask with the model that made the map ({model})"
+            f"the question's embeddings have {counted(len(crop.vector), 'dimension')}, the"
+            f" map's {dimension}; ask with the model that made the map ({model})"
         )
     if crop.model is not None and model is not None and crop.model != model:
         raise QuestionError(

@@ -132,8 +132,9 @@ def _objects(history: History, place: int, end: int) -> str:
     if not classes:
         return "no objects"
     most = sorted(classes.items(), key=lambda item: (-item[1], item[0]))
-    named = ", ".join(f"{count} {name}" for name, count in most[:8])
-    more = f" and {len(most) - 8} more classes" if len(most) > 8 else ""
+    named = ", ".join(name if count == 1 else f"{name} ×{count}" for name, count in most[:8])
+    others = len(most) - 8
+    more = f" and {others} more {'class' if others == 1 else 'classes'}" if others > 0 else ""
     return f"{counted(classes.total(), 'object')}: {named}{more}"
 
 

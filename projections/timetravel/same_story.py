@@ -5,6 +5,8 @@ one at the event after which both chains lead to the same place, and the merges 
 to that event are why.
 """
 
+from eventsrc.words import counted
+
 from .history import NEVER, History
 from .links import reason
 from .lives import Merge
@@ -59,7 +61,8 @@ def _chain(history: History, keyframes: tuple[int, int], end: int) -> list[Merge
 def _placing(history: History, keyframe: int) -> Entry:
     place = place_name(history, history.placed_in[keyframe])
     offset, own = history.placed_offsets[keyframe], history.keyframe_offsets[keyframe]
-    late = "" if offset == own else f", {offset - own:,} events after it came: it was noise before"
+    wait = counted(offset - own, "event")
+    late = "" if offset == own else f", {wait} after it came: it was noise before"
     name = keyframe_name(history, keyframe)
     return Entry(
         history.cause_at(offset),

@@ -1,5 +1,6 @@
 """One place is no "1 places": in what commands say, and on pictures."""
 
+import json
 import re
 from pathlib import Path
 
@@ -10,18 +11,29 @@ from tests.envelopes import detection, envelope
 from tests.fixtures_timetravel import write_log
 
 _LONE = ("--set", "min_samples=1", "--set", "eps_m=0.5")
-_ONES = re.compile(r"(?<![\d.,])1 (place|keyframe|object|event|map)s\b")
+_ONES = re.compile(
+    r"(?<![\d.,])1 ((shared |more )?"
+    r"(place|keyframe|object|event|map|merge|time|transition|crop|dimension|label)s|more classes)\b"
+)
 
 
 @pytest.fixture
 def mapfold(tmp_path: Path) -> Commands:
-    """Beside a log of three keyframes; the third makes two places of one keyframe one."""
-    cup = detection("cup", [1.0, 0.0])
-    xs = {1: 0.0, 2: 1.0, 3: 0.5}
+    """Beside a log of three keyframes; the third makes two places of one keyframe one.
+
+    A cup is seen twice, then another cup and a thing of each of eight classes.
+    """
+    cup, *more = [detection("cup", [1.0, 0.0]), detection("cup", [0.0, 1.0])]
+    more += [detection(f"thing {n}", [1.0, 0.0]) for n in range(8)]
     write_log(
         tmp_path / "log",
-        [envelope(n, x, detections=[cup] if n == 1 else []) for n, x in xs.items()],
+        [
+            envelope(1, 0.0, detections=[cup]),
+            envelope(2, 1.0, detections=[cup]),
+            envelope(3, 0.5, detections=more),
+        ],
     )
+    (tmp_path / "flat.json").write_text(json.dumps([{"embedding": [1.0]}]))
     return Commands.in_folder(tmp_path)
 
 
@@ -31,6 +43,11 @@ def mapfold(tmp_path: Path) -> Commands:
         (("diff", "log", "0", "1", *_LONE), "1 keyframe around"),
         (("diff", "log", "2", "3", *_LONE), "(1 keyframe) into"),
         (("diff", "log", "3", "0", *_LONE), None),
+        (("diff", "log", "2", "1", *_LONE), "seen 2 → 1 time,"),
+        (("why", "log", "run-a_p0", *_LONE), "10 objects: cup ×2, thing 0, thing 1, "),
+        (("why", "log", "run-a_p0", *_LONE), "thing 6 and 1 more class; next to"),
+        (("why", "log", "--same", "run-a:1", "run-a:2", "--set", "min_samples=2"), "1 event after"),
+        (("draw", "log", "--out", "all.svg", "--min-observations", "1"), "seen 1 time or more"),
         (("merges", "log", "--show", "1", *_LONE), "absorbed  run-a_p1, 1 keyframe"),
         (("state", "log", "--at", "1", *_LONE), "1 place"),
         (("draw", "log", "--at", "1", "--out", "one.svg", *_LONE), "1 place, 1 object"),
@@ -43,3 +60,8 @@ def test_one_is_singular(mapfold: Commands, args: tuple[str, ...], says: str | N
         told += picture.read_text("utf-8")
     assert says is None or says in told
     assert not _ONES.search(told), told
+
+
+def test_a_question_of_one_dimension(mapfold: Commands) -> None:
+    said = mapfold("relocalize", "flat.json", "--log", "log", code=2).err
+    assert "have 1 dimension, the map's 2" in said

@@ -102,3 +102,11 @@ def test_lines_fit_a_terminal() -> None:
         *story.tell_merges(merges),
     ]
     assert max(map(len, lines)) <= 100
+
+
+def test_one_is_singular() -> None:
+    at_once = replace(FOLLOWED, batches=1)
+    told = "\n".join(story.tell_recording(RECORDED, at_once, 1, 1, 30.0))
+    assert "through 1 room, " in told
+    assert "with 1 detection are in the log" in told
+    assert "in 1 transaction:" in told

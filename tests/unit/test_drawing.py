@@ -12,7 +12,7 @@ from projections import deltas as d
 from projections.drawing import Bridge, Floor, LostRobot, Spot, draw_map, floor_of
 from projections.drawing.canvas import Canvas
 from projections.drawing.palette import place_colour
-from projections.drawing.picture import compose
+from projections.drawing.picture import _legend, compose
 from projections.settings import Settings
 from projections.view import MapView
 
@@ -118,6 +118,10 @@ def test_labels_that_find_no_room_are_counted_on_the_picture() -> None:
     drawn = sum(text.startswith("a rather long") for text in texts)
     assert 0 < drawn < 297
     assert any(f"{297 - drawn} object labels had no room" in text for text in texts)
+
+
+def test_one_label_without_room_is_no_labels() -> None:
+    assert _legend(None, (), 1)[1] == "1 object label had no room"
 
 
 def test_a_lost_robot_without_an_estimate_is_drawn_too(tmp_path: Path) -> None:

@@ -105,7 +105,8 @@ class _ObjectChange:
         if self.relocated:
             parts.append(f"{self.before.place_id or 'no place'} → {after.place_id or 'no place'}")
         if self.seen:
-            parts.append(f"seen {len(self.before.det_ids):,} → {len(after.det_ids):,} times")
+            now = counted(len(after.det_ids), "time")
+            parts.append(f"seen {len(self.before.det_ids):,} → {now}")
         if shift >= _MOVED_M:
             parts.append(f"moved {shift:.2f} m")
         return parts[0] + " " + ", ".join(parts[1:])

@@ -46,4 +46,4 @@ def _place(history: History, place: int, size: int) -> str:
 
 def _edge_text(history: History, edge: EdgeChange) -> str:
     a, b = place_name(history, edge.a), place_name(history, edge.b)
-    return f"edge      {a} – {b}: {edge.before:,} → {edge.after:,} shared transitions"
+    return f"edge      {a} – {b}: {edge.before:,} → {counted(edge.after, 'shared transition')}"
