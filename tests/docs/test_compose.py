@@ -50,6 +50,19 @@ def test_what_is_waited_for_is_there_and_says_that_it_is_well(compose: dict[str,
         assert "healthcheck" in services[dependency], f"{name} waits for {dependency}"
 
 
+def test_whatever_runs_for_long_says_whether_it_is_well(compose: dict[str, Any]) -> None:
+    """But for the two images that are not ours to ask."""
+    without = {n for n, s in compose["services"].items() if "healthcheck" not in s}
+    assert without == {"demo-world", "tools", "zenoh-bridge", "detector"}
+
+
+def test_a_tail_is_asked_where_it_serves(compose: dict[str, Any]) -> None:
+    for name in ("embedding-ingest", "graph-builder"):
+        service = compose["services"][name]
+        port = service["command"][-1].rpartition(":")[2]
+        assert f"http://127.0.0.1:{port}/metrics" in service["healthcheck"]["test"][-1]
+
+
 def test_volumes_are_declared(compose: dict[str, Any]) -> None:
     used = {v.partition(":")[0] for s in compose["services"].values() for v in s.get("volumes", ())}
     assert used == set(compose["volumes"]) == {"logs", "age", "vector"}
@@ -74,5 +87,8 @@ def test_the_image_holds_what_the_package_needs() -> None:
     for name in ("pyproject.toml", "README.md", "LICENSE", "eventsrc", "projections"):
         assert name in text
         assert (ROOT / name).exists()
+    ignored = (ROOT / "docker/Dockerfile.dockerignore").read_text().split()
+    for name in re.findall(r"^COPY (.*) \S+$", text, re.MULTILINE):
+        assert {f"!{each}" for each in name.split()} <= set(ignored)
     assert 'ENTRYPOINT ["mapfold"]' in text
     assert "USER mapfold" in text
