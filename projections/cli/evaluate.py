@@ -11,6 +11,7 @@ from projections.cli._options import SetOption, SettingsOption, settings_from
 from projections.cli._picture import check_picture
 from projections.cli._point import W
 from projections.cli._question import HfovOption, ImageOption, camera_from
+from projections.cli._truth import warn_of_no_truth
 from projections.cli.relocalize import method_from
 from projections.evaluate import evaluate as score
 from projections.evaluate import read_truth
@@ -57,6 +58,7 @@ def evaluate(
         seed=seed,
         note=say,
     )
+    warn_of_no_truth(map_log, result.scores)
     if json_:
         emit(result.scores)
     else:

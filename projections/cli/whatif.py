@@ -19,6 +19,7 @@ from ._options import SettingsOption, settings_from
 from ._picture import check_picture
 from ._point import point
 from ._timeline import MOST_LINES, AllOption, AtOption, FoldBar, JsonOption, LogArgument
+from ._truth import warn_of_no_truth
 
 
 def whatif(
@@ -94,6 +95,7 @@ def whatif(
             log, common, others, end,
             truth=scored, processes=processes, progress=bar, keep_views=picture is not None,
         )  # fmt: skip
+    warn_of_no_truth(log, found.base.outcome.scores)
     if picture is not None:
         _draw(found, picture)
     if json_:

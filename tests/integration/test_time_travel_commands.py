@@ -181,6 +181,21 @@ def test_whatif_with_truth_and_picture(mapfold: Here) -> None:
     assert said.err.endswith("wrote maps.png: 2 maps\n")
 
 
+@pytest.mark.parametrize(
+    "args", [("whatif", "log", "--try", "eps_m=1"), ("evaluate", "--map", "log")]
+)
+def test_truth_of_something_else_scores_nothing(mapfold: Here, args: tuple[str, ...]) -> None:
+    truth = mapfold.folder / "other.jsonl"
+    line = {"run_id": "run-z", "keyframe_id": 1, "room": "a", "instances": ["cup-1"]}
+    truth.write_text(json.dumps(line))
+    said = mapfold(*args, "--truth", truth)
+    assert said.err.startswith("no truth for any keyframe of log: its places and objects are not")
+    if args[0] == "whatif":
+        assert [row.split()[-2:] for row in said.out.splitlines()[1:3]] == [["-", "-"]] * 2
+    truth.write_text(json.dumps({**line, "run_id": "run-a"}))
+    assert mapfold(*args, "--truth", truth).err == ""
+
+
 @pytest.mark.parametrize("processes", ["1", "2"])
 def test_whatif_draws_what_it_has_folded(
     mapfold: Here, monkeypatch: pytest.MonkeyPatch, processes: str

@@ -37,7 +37,10 @@ def _row(each: Alternative, *, truth: bool) -> tuple[str, ...]:
 
 def _scores(each: Alternative) -> tuple[str, ...]:
     scores = each.outcome.scores or {}
-    return tuple(f"{scores[table]['v_measure']:.3f}" for table in ("places", "objects"))
+    return tuple(
+        f"{scores[table]['v_measure']:.3f}" if scores[table][scored] else "-"
+        for table, scored in (("places", "keyframes"), ("objects", "observations"))
+    )
 
 
 def _differences(each: Alternative, most: int | None) -> Iterator[str]:
