@@ -16,13 +16,13 @@ from tests.fixtures_timetravel import write_damaged_log, write_log
 from tests.logs import walk
 
 _CTRL_C_AT_IMPORT = """
-import importlib.abc, signal, sys
+import _signal, sys  # nothing that loads what the program loads
 module = sys.argv.pop(1)
 
-class CtrlC(importlib.abc.MetaPathFinder):
+class CtrlC:
     def find_spec(self, name, path, target=None):
         if name == module:
-            signal.raise_signal(signal.SIGINT)
+            _signal.raise_signal(_signal.SIGINT)
 
 sys.meta_path.insert(0, CtrlC())
 from projections.cli import main
@@ -44,6 +44,8 @@ def mapfold(tmp_path: Path) -> Commands:
 @pytest.mark.parametrize(
     ("module", "args"),
     [
+        ("contextlib", ("log", "info", "log")),  # the first thing that is imported
+        ("projections.cli._start", ("log", "info", "log")),
         ("typer", ("state", "log")),
         ("projections.cli.state", ("state", "log")),
         ("numpy", ("state", "log")),
