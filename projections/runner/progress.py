@@ -34,10 +34,11 @@ class TailProgress:
     def update(self, report: TailReport) -> None:
         """Take in where the tail is, at its start and after each commit; wakes who waits."""
         with self._moved:
+            if report.batches > self.batches:
+                self.committed_at = time.monotonic()
             self.next_offset = report.next_offset
             self.events, self.batches = report.events, report.batches
             self.restarts, self.parked = report.restarts, len(report.parked)
-            self.committed_at = time.monotonic()
             self._moved.notify_all()
 
     def trouble(self, _what: str) -> None:

@@ -18,7 +18,7 @@ import psycopg
 
 from eventsrc.log import Event, LogReader
 from projections.digest import map_digest
-from projections.errors import FoldError
+from projections.errors import DatabaseError, FoldError
 from projections.folding import no_cycle_search
 from projections.postgres.connect import Connection, Targets, database_errors
 from projections.settings import Settings
@@ -129,7 +129,8 @@ def rebuild(
                 for sink in store.sinks:
                     sink.swap(store.connection)
         tell(RebuildProgress("tidying", total, total))
-        index = _after(stores, tell, total, hnsw=hnsw)
+        with _swapped():
+            index = _after(stores, tell, total, hnsw=hnsw)
         ended = time.monotonic()
         return RebuildReport(
             total,
@@ -218,6 +219,15 @@ def _check(stores: list[Store], fold: LiveFold, checkpoint: Checkpoint) -> dict[
             rows.update(sink.check(store.connection, fold.view))
             _checkpoint.replace(store.connection, sink.name, checkpoint)
     return rows
+
+
+@contextlib.contextmanager
+def _swapped() -> Iterator[None]:
+    """What fails now leaves nobody with the old map, and should not sound as if it did."""
+    try:
+        yield
+    except DatabaseError as error:
+        raise type(error)(f"{error}; the new map is in place all the same") from error
 
 
 def _after(stores: list[Store], tell: OnProgress, total: int, *, hnsw: bool) -> HnswReport | None:

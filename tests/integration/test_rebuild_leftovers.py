@@ -1,5 +1,7 @@
 """What a swap replaced is dropped by the server on its own, if need be by the next rebuild."""
 
+import sys
+from functools import partial
 from pathlib import Path
 
 import psycopg
@@ -9,8 +11,10 @@ from psycopg import sql
 from projections.errors import DatabaseError
 from projections.postgres.connect import Connection, Targets, connect
 from projections.runner import RebuildProgress, rebuild
+from projections.runner.check import check
 from projections.settings import Settings
 from projections.sinks._leaving import may_drop
+from projections.sinks.hnsw import build_hnsw
 from tests.drops import wait_for_drops
 from tests.logs import walk, write_log
 from tests.rows import all_rows
@@ -88,3 +92,19 @@ def test_a_schema_of_somebody_else_stays(
     with pytest.raises(DatabaseError, match="schema mapfold_old that mapfold did not make"):
         rebuild(log, one_database, SETTINGS)
     assert left_over(pg) == {"mapfold_old"}
+
+
+def test_what_fails_after_the_swap_does_not_sound_as_if_the_old_map_were_served(
+    log: Path, one_database: Targets, pg: psycopg.Connection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pg.execute("CREATE TABLE public.taken (n int)")
+    pg.execute("CREATE INDEX detection_embeddings_hnsw ON public.taken (n)")
+    for_any_table = partial(build_hnsw, threshold=1)
+    monkeypatch.setattr(sys.modules["projections.runner.rebuild"], "build_hnsw", for_any_table)
+    with pytest.raises(DatabaseError, match="already exists; the new map is in place"):
+        rebuild(log, one_database, SETTINGS)
+    assert [r.differing for r in check(log, one_database, SETTINGS)] == [0, 0]
+    pg.execute("DROP TABLE public.taken")
+    report = rebuild(log, one_database, SETTINGS)
+    assert report.hnsw is not None
+    assert report.hnsw.built

@@ -1,5 +1,6 @@
 """A tail that follows: from append to visible, drained by its stop, watched by others."""
 
+import re
 import threading
 import urllib.request
 from dataclasses import replace
@@ -147,17 +148,38 @@ def test_who_is_told_to_wait_learns_what_the_number_is(
             rebuild(log, one_database, SETTINGS)
 
 
+def scraped(running: Tail, log: Path) -> str:
+    with serving_tail_metrics(("127.0.0.1", 0), running.progress, log) as port:
+        address = f"http://127.0.0.1:{port}/metrics"
+        body: bytes = urllib.request.urlopen(address, timeout=10).read()
+    return body.decode()
+
+
 def test_metrics_of_a_tail(tmp_path: Path, one_database: Targets) -> None:
     log = write_log(tmp_path / "log", walk(12))
     rebuild(log, one_database, SETTINGS, until=7)
     with Tail(log, one_database) as running:
         assert running.progress.wait(12, WAIT_S)
-        with serving_tail_metrics(("127.0.0.1", 0), running.progress, log) as port:
-            address = f"http://127.0.0.1:{port}/metrics"
-            text = urllib.request.urlopen(address, timeout=10).read().decode()
+        text = scraped(running, log)
     assert "mapfold_tail_events_total 5.0" in text
     assert "mapfold_tail_next_offset 12.0" in text
     assert "mapfold_tail_lag 0.0" in text
+    assert "mapfold_tail_commit_age_seconds " in text
+    page = (Path(__file__).resolve().parents[2] / "docs/projections.md").read_text("utf-8")
+    names = set(re.findall(r"^(mapfold_tail_\w+)", text, re.MULTILINE))
+    assert names == set(re.findall(r"mapfold_tail_\w+", page))
+
+
+def test_a_tail_that_has_committed_nothing_tells_no_time_of_it(
+    tmp_path: Path, one_database: Targets
+) -> None:
+    log = write_log(tmp_path / "log", walk(12))
+    rebuild(log, one_database, SETTINGS)
+    with Tail(log, one_database) as running:
+        assert running.progress.wait(12, WAIT_S)
+        text = scraped(running, log)
+    assert "mapfold_tail_next_offset 12.0" in text
+    assert "commit_age" not in text
 
 
 def test_waiting_too_long_is_told() -> None:
