@@ -22,7 +22,10 @@ def diff(
     set_: SetOption = None,
     settings_file: SettingsOption = None,
 ) -> None:
-    """Places, objects and adjacency that changed from one moment of the map to another."""
+    """What changed from one moment of the map to another.
+
+    Keyframes, places, objects and adjacency.
+    """
     with timeline(log, settings_file, set_) as opened:
         found = opened.diff(point(opened.reader, first), point(opened.reader, second))
     if json_:

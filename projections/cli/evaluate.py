@@ -45,7 +45,10 @@ def evaluate(
     settings_file: SettingsOption = None,
     json_: Annotated[bool, typer.Option("--json", help="The scores as JSON on stdout.")] = False,
 ) -> None:
-    """Scores of places, objects and re-localisation with one, two and three crops."""
+    """How good places, objects and re-localisation are.
+
+    Scores against the truth, of re-localisation with one, two and three crops a question.
+    """
     check_picture(picture)
     result = score(
         map_log,

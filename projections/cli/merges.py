@@ -43,7 +43,10 @@ def merges(
     set_: SetOption = None,
     settings_file: SettingsOption = None,
 ) -> None:
-    """Every merge of places: when, by which keyframe, who survived, who was absorbed."""
+    """Every merge of places, and which keyframe made it.
+
+    When, by which keyframe, who survived, who was absorbed, and what changed hands.
+    """
     if draw is None and out is not None:
         raise MisuseError(f"--out {out} is for the picture of --draw N; give --draw too")
     picture = out or Path("merge.png")

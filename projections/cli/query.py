@@ -101,7 +101,10 @@ def holding(
     db: DbOption = None,
     json_: JsonOption = False,
 ) -> None:
-    """Places within some steps of a place that hold an object of a class."""
+    """Places near a place that hold an object of a class.
+
+    Near is at most --hops steps away, each from a place to one next to it.
+    """
     with _asker(db, log, at, past_settings(log, settings_file, set_)) as asker:
         _tell(places_holding(asker, class_name, start, hops), json_)
 

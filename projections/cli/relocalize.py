@@ -52,7 +52,10 @@ def relocalize(
     settings_file: SettingsOption = None,
     json_: Annotated[bool, typer.Option("--json", help="The answer as JSON on stdout.")] = False,
 ) -> None:
-    """Ranked Places with evidence, a pose hypothesis and a confidence, from object crops."""
+    """Where a robot is, from a few object crops.
+
+    Ranked Places with evidence, a pose hypothesis and a confidence.
+    """
     how, camera, crops = method_from(method), camera_from(hfov, image), question_from(query)
     if as_of is not None and log is None:
         raise MisuseError("--as-of asks a past map, which only the log knows; give --log LOG too")

@@ -40,9 +40,10 @@ def serve(
     db: DbOption = None,
     vector_db: VectorDbOption = None,
 ) -> None:
-    """Answer questions from the live databases until Ctrl-C: mapfold/relocalize, mapfold/state/**.
+    """Answer questions from the live databases until Ctrl-C.
 
-    Errors come back as replies. On SIGINT or SIGTERM open questions are answered first.
+    Over Zenoh at mapfold/relocalize and mapfold/state/**, over HTTP as /docs there tells. Errors
+    come back as replies. On SIGINT or SIGTERM open questions are answered first.
     """
     if http is None and not zenoh:
         raise MisuseError("neither --zenoh nor --http: there is nothing to serve on")

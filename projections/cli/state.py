@@ -28,7 +28,10 @@ def state(
     set_: SetOption = None,
     settings_file: SettingsOption = None,
 ) -> None:
-    """The map folded to a point in the log: places, objects, adjacency, counts, digest."""
+    """The map folded to a point in the log.
+
+    Counts, settings, digest, and each place with its size and its neighbours; --json has it all.
+    """
     if json_ and digest:
         raise MisuseError("--json and --digest together: --json holds the digest already")
     settings = settings_from(settings_file, set_)

@@ -75,12 +75,12 @@ def whatif(
     ] = None,
     settings_file: SettingsOption = None,
 ) -> None:
-    """What the map would be under other settings: places, noise, merges, objects, differences.
+    """What the map would be under other settings.
 
-    ARI is the adjusted Rand index against the base: 1 is the same partition of keyframes into
-    places or observations into objects, 0 no better than chance, and so is any difference from a
-    base of one single place. With --truth, V is the V-measure against rooms and instances: 1 is
-    perfect.
+    Places, noise, merges and objects under each, and how the maps differ. ARI is the adjusted Rand
+    index against the base: 1 is the same partition of keyframes into places or observations into
+    objects, 0 no better than chance, and so is any difference from a base of one single place. With
+    --truth, V is the V-measure against rooms and instances: 1 is perfect.
     """
     common = assigned(settings_from(settings_file, None), base, "--base")
     others = alternatives(common, set_ or (), try_ or (), grid or ())

@@ -16,6 +16,18 @@ def test_every_command_and_parameter_has_help(name: str) -> None:
     assert [p.name for p in command.params if not getattr(p, "help", None)] == []
 
 
+LISTED = ["state", "relocalize", "evaluate", "serve", "draw", "merges", "why", "diff", "bisect"]
+LISTED += ["whatif", "query where", "query contents", "query holding", "query path"]
+
+
+@pytest.mark.parametrize("path", LISTED)
+def test_what_a_list_of_commands_says_of_it_is_whole(path: str) -> None:
+    """On a terminal of 80 columns the lists of --help have this much for each."""
+    said = COMMANDS[f"mapfold {path}"].get_short_help_str(62)
+    assert said.endswith(".")
+    assert not said.endswith("...")
+
+
 def test_the_page_is_what_the_commands_say() -> None:
     assert PAGE.read_text(encoding="utf-8") == page(), "run scripts/update_docs"
 
