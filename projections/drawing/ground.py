@@ -1,25 +1,19 @@
 """The lower layers: floor, place regions, drives, walls.
 
-A place's region is all that lies within ``_REACH_M`` of one of its keyframes and nearer to it than
+A place's region is all that lies within ``REACH_M`` of one of its keyframes and nearer to it than
 to any other place's.
 """
 
 import numpy as np
 from matplotlib.patches import Rectangle
-from numpy.typing import NDArray
 
 from projections.view import MapView
 
 from . import palette
 from .canvas import Canvas
 from .labels import Extent
+from .raster import FAR_M, REACH_M, Raster
 from .scene import Box, Floor, drives, place_spots
-
-_REACH_M = 0.55
-_STEP_M = 0.05
-_MAX_STEPS = 400
-
-Grid = NDArray[np.float64]
 
 
 def draw_floor(canvas: Canvas, floor: Floor) -> None:
@@ -43,23 +37,20 @@ def draw_walls(canvas: Canvas, floor: Floor) -> None:
 
 def draw_regions(canvas: Canvas, view: MapView) -> None:
     """What each place covers, in its colour."""
-    x0, y0, x1, y1 = canvas.bounds
-    step = max(_STEP_M, (x1 - x0) / _MAX_STEPS, (y1 - y0) / _MAX_STEPS)
-    xs, ys = np.arange(x0, x1, step), np.arange(y0, y1, step)
-    spots = {place: s for place, s in place_spots(view).items() if s}
-    nearest = np.full((len(ys), len(xs)), np.inf)
-    for own in spots.values():
-        nearest = np.minimum(nearest, _distances(own, xs, ys))
-    for place, own in spots.items():
-        field = _distances(own, xs, ys)
-        field = np.where(field <= nearest, field, 2 * _REACH_M)
-        colour = palette.place_colour(place)
-        canvas.axes.contourf(
-            xs, ys, field, levels=[-1.0, _REACH_M], colors=[colour], alpha=0.28, zorder=2
-        )
-        canvas.axes.contour(
-            xs, ys, field, levels=[_REACH_M], colors=[colour], linewidths=1.1, zorder=3
-        )
+    raster = Raster(canvas.bounds)
+    patches = {p: raster.distances(spots) for p, spots in place_spots(view).items()}
+    nearest = np.full((len(raster.ys), len(raster.xs)), np.inf)
+    for patch in patches.values():
+        own = nearest[patch.rows, patch.columns]
+        np.minimum(own, patch.field, out=own)
+    for place, patch in patches.items():
+        if min(patch.field.shape) < 2:
+            continue
+        field = np.where(patch.field <= nearest[patch.rows, patch.columns], patch.field, FAR_M)
+        sheet = raster.xs[patch.columns], raster.ys[patch.rows], field
+        colours = [palette.place_colour(place)]
+        canvas.axes.contourf(*sheet, levels=[-1.0, REACH_M], colors=colours, alpha=0.28, zorder=2)
+        canvas.axes.contour(*sheet, levels=[REACH_M], colors=colours, linewidths=1.1, zorder=3)
 
 
 def draw_drives(canvas: Canvas, view: MapView) -> None:
@@ -80,11 +71,3 @@ def _rectangle(canvas: Canvas, box: Box, fill: str, edge: str, zorder: int) -> N
     patch = Rectangle((x0, y0), x1 - x0, y1 - y0, facecolor=fill, edgecolor=edge, lw=0.6)
     patch.set_zorder(zorder)
     canvas.axes.add_patch(patch)
-
-
-def _distances(spots: list[tuple[float, float]], xs: Grid, ys: Grid) -> Grid:
-    """Distance of every grid point to the nearest of ``spots``; shape (len(ys), len(xs))."""
-    nearest: Grid = np.full((len(ys), len(xs)), np.inf)
-    for x, y in spots:
-        nearest = np.minimum(nearest, np.hypot(xs[None, :] - x, ys[:, None] - y))
-    return nearest
