@@ -20,6 +20,7 @@ from typing import Final
 import psycopg
 
 from projections.errors import DatabaseError
+from projections.postgres.connect import database_errors
 
 from ._stores import Store
 
@@ -42,16 +43,30 @@ def lock_readers_out(stores: Sequence[Store]) -> None:
         store.connection.execute("SET LOCAL lock_timeout = 0")
 
 
+class _StillRead(Exception):
+    """A reader has one of the tables."""
+
+    def __init__(self, store: Store) -> None:
+        self.store = store
+
+
 def _still_read(stores: Sequence[Store]) -> Store | None:
     """Try once: None when all is locked, else whose readers are in the way; then nothing is."""
-    at = None
     try:
         with contextlib.ExitStack() as savepoints:  # going back to them lets go of the locks
-            for at in stores:
-                savepoints.enter_context(at.connection.transaction())
-                at.connection.execute(ATTEMPT)
-                for sink in at.sinks:
-                    sink.lock(at.connection)
-    except psycopg.errors.LockNotAvailable:
-        return at
+            for store in stores:
+                with database_errors(store.url):
+                    savepoints.enter_context(store.connection.transaction())
+                    _lock(store)
+    except _StillRead as reader:
+        return reader.store
     return None
+
+
+def _lock(store: Store) -> None:
+    try:
+        store.connection.execute(ATTEMPT)
+        for sink in store.sinks:
+            sink.lock(store.connection)
+    except psycopg.errors.LockNotAvailable:
+        raise _StillRead(store) from None

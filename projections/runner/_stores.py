@@ -1,7 +1,7 @@
 """The databases of a run, and which sinks live in which: what shares one, commits together."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -56,6 +56,11 @@ class Store:
             connection.execute("SET client_min_messages = warning")
             settle(connection)
             yield connection
+
+    def do(self, job: Callable[[Connection], None]) -> None:
+        """Do ``job`` with the connection; of two stores, an error names the right one."""
+        with database_errors(self.url):
+            job(self.connection)
 
     def close(self) -> None:
         """Close the connection, which gives the locks back."""

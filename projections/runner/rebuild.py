@@ -48,11 +48,15 @@ class RebuildProgress:
 
 
 class SinkLoading(NamedTuple):
-    """A sink, the connection it writes through, and the thread that does it."""
+    """A sink, where it lives, and the thread that writes there."""
 
     loading: Loading
     sink: Sink[Any]
-    connection: Connection
+    store: Store
+
+    def put(self, job: Callable[[Connection], None]) -> None:
+        """Have ``job`` done with the store's connection, its errors told as the store's."""
+        self.loading.put(partial(self.store.do, job))
 
 
 OnProgress: TypeAlias = Callable[[RebuildProgress], None]
@@ -108,12 +112,12 @@ def rebuild(
                 last = _fold_into(fold, events, loadings, total, tell, advice)
                 folded = time.monotonic()
                 tell(RebuildProgress("writing", total, total))
-                for loading, sink, connection in loadings:
-                    loading.put(partial(sink.load(sink.take_rest(fold.view)), connection))
-                    loading.put(partial(sink.index, connection))
+                for loading in loadings:
+                    loading.put(loading.sink.load(loading.sink.take_rest(fold.view)))
+                    loading.put(loading.sink.index)
                 digest = map_digest(fold.view)
-                for loading, _, _ in loadings:
-                    loading.flush()
+                for loading in loadings:
+                    loading.loading.flush()
             checkpoint = Checkpoint(
                 reader.log_id,
                 settings.fingerprint(),
@@ -127,7 +131,7 @@ def rebuild(
             lock_readers_out(stores)
             for store in stores:
                 for sink in store.sinks:
-                    sink.swap(store.connection)
+                    store.do(sink.swap)
         tell(RebuildProgress("tidying", total, total))
         with _swapped():
             index = _after(stores, tell, total, hnsw=hnsw)
@@ -162,7 +166,7 @@ def _loadings(stores: list[Store]) -> Iterator[list[SinkLoading]]:
         for store in stores:
             loading = threads.enter_context(Loading(partial(_break_off, store.connection)))
             loading.put(partial(_begin, store))
-            loadings += [SinkLoading(loading, sink, store.connection) for sink in store.sinks]
+            loadings += [SinkLoading(loading, sink, store) for sink in store.sinks]
         yield loadings
 
 
@@ -176,7 +180,7 @@ def _begin(store: Store) -> None:
         for sink in store.sinks:
             sink.clear(connection)
     for sink in store.sinks:
-        sink.begin(store.connection)
+        store.do(sink.begin)
 
 
 def _fold_into(
@@ -187,7 +191,7 @@ def _fold_into(
     tell: OnProgress,
     advice: Callable[[int], str],
 ) -> Event | None:
-    told_of = [sink for _, sink, _ in loadings if not sink.rebuilds_from_view]
+    told_of = [each.sink for each in loadings if not each.sink.rebuilds_from_view]
     last: Event | None = None
     for batch in batches(events, TICK_EVENTS):
         for failed in fold.feed(batch, lambda _: told_of):
@@ -195,10 +199,10 @@ def _fold_into(
                 raise FoldError(failed.offset, f"{failed.reason}; {advice(failed.offset)}")
         last = batch[-1]
         tell(RebuildProgress("folding", last.offset + 1, total))
-        for loading, sink, connection in loadings:
-            rows = sink.take_final(fold.view)
+        for loading in loadings:
+            rows = loading.sink.take_final(fold.view)
             if rows is not None:
-                loading.put(partial(sink.load(rows), connection))
+                loading.put(loading.sink.load(rows))
     return last
 
 
@@ -216,8 +220,9 @@ def _check(stores: list[Store], fold: LiveFold, checkpoint: Checkpoint) -> dict[
     rows: dict[str, int] = {}
     for store in stores:
         for sink in store.sinks:
-            rows.update(sink.check(store.connection, fold.view))
-            _checkpoint.replace(store.connection, sink.name, checkpoint)
+            with database_errors(store.url):
+                rows.update(sink.check(store.connection, fold.view))
+                _checkpoint.replace(store.connection, sink.name, checkpoint)
     return rows
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -17,7 +18,7 @@ import psycopg
 import pytest
 
 from projections.errors import DatabaseError, DatabaseUnavailable
-from projections.postgres.connect import Targets, connect, ensure_extension
+from projections.postgres.connect import Targets, connect, ensure_extension, place
 from projections.postgres.embedded import EmbeddedServer
 from projections.runner import RebuildProgress, rebuild
 from projections.settings import Settings
@@ -112,6 +113,25 @@ def test_a_session_that_is_ended_ends_the_rebuild_in_words(
     assert all_rows(one_database) == old
     rebuild(log, one_database, SETTINGS)
     assert all_rows(one_database) != old
+
+
+@pytest.mark.parametrize("stage", ["folding", "writing", "swapping"])
+@pytest.mark.parametrize("of", ["graph_url", "vector_url"])
+def test_of_two_databases_the_one_that_went_is_named(
+    log: Path, two_databases: Targets, monkeypatch: pytest.MonkeyPatch, stage: str, of: str
+) -> None:
+    in_small_streams(monkeypatch)
+    url: str = getattr(two_databases, of)
+
+    def end_sessions() -> None:
+        with connect(url, autocommit=True) as admin:
+            admin.execute(
+                "SELECT pg_terminate_backend(pid, 10000) FROM pg_stat_activity"
+                " WHERE datname = current_database() AND application_name = 'mapfold replay'"
+            )
+
+    with pytest.raises(DatabaseUnavailable, match=f"^{re.escape(place(url))}: "):
+        rebuild(log, two_databases, SETTINGS, progress=at_stage(stage, end_sessions))
 
 
 def test_rows_the_server_refuses_in_the_middle_of_the_stream(
