@@ -2,10 +2,14 @@
 
 A file named ``MARKER`` says that the demo made a folder. Its log, questions and picture are removed
 before the next demo; the database server's files in it are kept, because making them takes longest
-and a replay replaces what is in them.
+and a replay replaces what is in them. A demo at work holds a lock on ``MARKER``: a second one in the
+same folder would take the log from under it.
 """
 
+import contextlib
+import fcntl
 import shutil
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -46,21 +50,44 @@ class DemoFolder:
         return self.path / f"{child}.txt"
 
 
-def fresh_folder(path: Path) -> DemoFolder:
-    """An empty demo folder at ``path``. Raises MisuseError when something else is there."""
+@contextlib.contextmanager
+def fresh_folder(path: Path) -> Iterator[DemoFolder]:
+    """An empty demo folder at ``path``, this demo's alone until the end.
+
+    Raises MisuseError when something else is there, or another demo is at work in it.
+    """
+    with contextlib.ExitStack() as held:
+        try:
+            _claim(path, held)
+            folder = DemoFolder(path)
+            _empty(folder)
+        except OSError as error:
+            raise MisuseError(f"{path}: {error.strerror}; choose another --out") from None
+        yield folder
+
+
+def _claim(path: Path, held: contextlib.ExitStack) -> None:
+    """Mark the folder, and lock the mark for as long as ``held`` is; see `fresh_folder`."""
+    if path.exists() and not (path / MARKER).exists() and any(path.iterdir()):
+        raise MisuseError(
+            f"{path}: not empty and not made by the demo; choose another --out or remove it"
+        )
+    path.mkdir(parents=True, exist_ok=True)
+    mark = held.enter_context((path / MARKER).open("a"))
     try:
-        if path.exists() and not (path / MARKER).exists() and any(path.iterdir()):
-            raise MisuseError(
-                f"{path}: not empty and not made by the demo; choose another --out or remove it"
-            )
-        path.mkdir(parents=True, exist_ok=True)
-        (path / MARKER).write_text("made by mapfold demo; the next one removes it\n")
-        folder = DemoFolder(path)
-        if folder.log.exists():
-            shutil.rmtree(folder.log)
-        for pattern in _MADE:
-            for old in path.glob(pattern):
-                old.unlink()
-    except OSError as error:
-        raise MisuseError(f"{path}: {error.strerror}; choose another --out") from None
-    return folder
+        fcntl.flock(mark, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise MisuseError(
+            f"{path}: another demo is at work there; wait for it or choose another --out"
+        ) from None
+    mark.truncate(0)
+    mark.write("made by mapfold demo; the next one removes it\n")
+    mark.flush()
+
+
+def _empty(folder: DemoFolder) -> None:
+    if folder.log.exists():
+        shutil.rmtree(folder.log)
+    for pattern in _MADE:
+        for old in folder.path.glob(pattern):
+            old.unlink()

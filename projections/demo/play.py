@@ -48,8 +48,12 @@ Tell = Callable[[str], None]
 
 def run_demo(options: DemoOptions, tell: Tell) -> dict[str, Any]:
     """Play the demo, telling it line by line; returns its numbers as a JSON document."""
+    with fresh_folder(options.out) as folder:
+        return _play(options, folder, tell)
+
+
+def _play(options: DemoOptions, folder: DemoFolder, tell: Tell) -> dict[str, Any]:
     explorer, lost_run = simulate_run(options.seed, "a"), simulate_run(options.seed, "b")
-    folder = fresh_folder(options.out)
     folder.settings.write_text(SETTINGS.model_dump_json(indent=2) + "\n", "utf-8")
     clock = _Stages(tell)
     house = explorer.house

@@ -1,0 +1,25 @@
+"""The demo's folder: one demo at a time, and nothing of anybody else's."""
+
+from pathlib import Path
+
+import pytest
+
+from eventsrc.errors import MisuseError
+from projections.demo.folder import fresh_folder
+
+
+def test_a_second_demo_does_not_take_the_log_of_one_at_work(tmp_path: Path) -> None:
+    with fresh_folder(tmp_path / "demo") as folder:
+        folder.log.mkdir()
+        with pytest.raises(MisuseError, match="another demo is at work there; wait"):
+            fresh_folder(tmp_path / "demo").__enter__()
+        assert folder.log.is_dir()
+    with fresh_folder(tmp_path / "demo") as again:
+        assert not again.log.exists()
+
+
+def test_a_folder_of_somebody_elses_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "log").mkdir()
+    with pytest.raises(MisuseError, match="not made by the demo"), fresh_folder(tmp_path):
+        raise AssertionError
+    assert [path.name for path in tmp_path.iterdir()] == ["log"]
