@@ -2,8 +2,8 @@
 
 A file named ``MARKER`` says that the demo made a folder. Its log, questions and picture are removed
 before the next demo; the database server's files in it are kept, because making them takes longest
-and a replay replaces what is in them. A demo at work holds a lock on ``MARKER``: a second one in the
-same folder would take the log from under it.
+and a replay replaces what is in them. A demo at work holds a lock on ``MARKER``: a second one in
+the same folder would take the log from under it.
 """
 
 import contextlib
