@@ -20,7 +20,7 @@ def why(
     thing: Annotated[
         str | None,
         typer.Argument(
-            metavar="[PLACE_ID|OBJECT_ID]", help="A place, also an absorbed one; an object."
+            metavar="PLACE_ID|OBJECT_ID", help="A place, also an absorbed one; an object."
         ),
     ] = None,
     same: Annotated[

@@ -54,8 +54,8 @@ def _section(name: str, command: Any) -> str:
     usage = " ".join([name, *map(_usage, arguments), *(["[OPTIONS]"] if options else [])])
     said = inspect.cleandoc(command.help).replace("\b\n", "")  # a mark to click: do not wrap
     lines = [f"## {name}", "", said, "", f"    {usage}", ""]
-    rows = [f"| `{_name(p)}` | {_cell(p.help)} |" for p in arguments]
-    rows += [f"| `{_flags(p)}` | {_cell(p.help)} |" for p in options]
+    rows = [f"| `{_cell(_name(p))}` | {_cell(p.help)} |" for p in arguments]
+    rows += [f"| `{_cell(_flags(p))}` | {_cell(p.help)} |" for p in options]
     if rows:
         lines += ["| | |", "|---|---|", *rows, ""]
     return "\n".join(lines)
