@@ -57,8 +57,8 @@ class Sink(Protocol[Changes]):
     def take(self, view: MapView) -> Changes:
         """What changed since the last take, as ``view`` has it now."""
 
-    def ensure(self, connection: Connection) -> None:
-        """Create what `write` needs where it is missing; refuse what is not ours."""
+    def ensure(self, connection: Connection) -> bool:
+        """Create what `write` needs, if it is missing: True then. Refuses what is not ours."""
 
     def few(self, changes: Changes) -> bool:
         """True when `write` will send plain statements only, so that they may be pipelined."""

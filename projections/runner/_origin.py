@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from eventsrc.log import LogReader
-from projections.errors import ProjectionMismatch
+from projections.errors import ProjectionMismatch, ProjectionMissing
 from projections.settings import Settings
 from projections.sink import Checkpoint, SinkName
 from projections.sinks._advice import remake
@@ -30,3 +30,13 @@ def refuse_misfit(
                 f"{log}: the event at offset {event.offset:,} is not the one that is in the"
                 f" {sink}; {advice}"
             )
+
+
+def gone(
+    found: Checkpoint, sink: SinkName, where: str, log: Path, settings: Settings
+) -> ProjectionMissing:
+    """The error for a checkpoint whose rows somebody has dropped."""
+    return ProjectionMissing(
+        f"{where}: {found.next_offset:,} events are in the {sink} by its checkpoint, but somebody"
+        f" has dropped what they were in; {remake(log, settings)}"
+    )

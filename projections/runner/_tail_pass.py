@@ -30,7 +30,7 @@ from projections.snapshot import SnapshotCache
 from ._backoff import OnTrouble
 from ._dead_letters import dead_letter
 from ._fold import LiveFold, batches
-from ._origin import refuse_misfit
+from ._origin import gone, refuse_misfit
 from ._stores import Store
 from ._writing import SinkBatch, Writer
 from .progress import TailProgress, TailReport
@@ -124,11 +124,13 @@ class TailPass:
         for store in self.stores:
             with database_errors(store.url), store.connection.transaction():
                 for sink in store.sinks:
-                    sink.ensure(store.connection)
+                    made = sink.ensure(store.connection)
                     _checkpoint.begin(store.connection, sink.name, reader.log_id, plan.settings)
                     found = _checkpoint.load(store.connection, sink.name)
                     assert found is not None  # noqa: S101 - begun in this transaction
                     refuse_misfit(found, sink.name, store.place, plan.log, reader, plan.settings)
+                    if made and found.next_offset:
+                        raise gone(found, sink.name, store.place, plan.log, plan.settings)
                     # At once: from here on the lock says that a tail is at work.
                     _checkpoint.beat(store.connection, sink.name)
                     self.checkpoints[sink.name] = found

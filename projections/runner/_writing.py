@@ -127,7 +127,8 @@ class Writer:
         with database_errors(self.store.url), connection.transaction():
             for sink in self.store.sinks:
                 # What a rolled back transaction had made is not there, whatever the sink thinks.
-                sink.ensure(connection)
+                if sink.ensure(connection):
+                    raise LostCommits  # all the rows are gone; the next pass finds out why
                 found[sink.name] = _checkpoint.load(connection, sink.name)
         return found
 

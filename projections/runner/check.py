@@ -14,6 +14,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias
 
+import psycopg
 from psycopg import IsolationLevel, sql
 
 from eventsrc.log import Event, LogReader
@@ -36,7 +37,7 @@ from projections.sinks.vector_rows import VectorRow
 from projections.sinks.vectors import VectorSink
 
 from ._fold import LiveFold, batches
-from ._origin import refuse_misfit
+from ._origin import gone, refuse_misfit
 
 Kind: TypeAlias = Literal["missing", "extra", "different"]
 Keyed: TypeAlias = tuple[int, Any]
@@ -47,6 +48,10 @@ STREAM_ROWS: Final = 2_000
 BATCH_EVENTS: Final = 256
 _NONE: Final[dict[SinkName, str]] = {"graph": "no graph has", "vectors": "no vectors have"}
 
+_TABLES: Final[dict[SinkName, list[sql.Identifier]]] = {
+    "graph": [sql.Identifier(GRAPH, label) for label in LABELS],
+    "vectors": [sql.Identifier("public", TABLE)],
+}
 _VECTORS: Final = """
 SELECT det_pk, run_id, det_id, keyframe_id, class_name, confidence, bbox, map_x, map_y, map_yaw,
        embedding_model, embedding::real[],
@@ -95,18 +100,36 @@ def _check(log: Path, sink: SinkName, url: str, settings: Settings) -> CheckRepo
         connection.read_only = True
         with database_errors(url):
             settle(connection)
+            connection.commit()
+            held = _hold(connection, sink)
             checkpoint = _checkpoint.load(connection, sink)
             if checkpoint is None:
                 raise ProjectionMissing(
                     f"{place(url)}: {_NONE[sink]} been projected there;"
                     f" run: {command('replay', log, settings)}"
                 )
+            if not held:
+                raise gone(checkpoint, sink, place(url), log, settings)
             refuse_misfit(checkpoint, sink, place(url), log, reader, settings)
             compare = _compare_graph if sink == "graph" else _compare_vectors
             compare(connection, reader, checkpoint, settings, tally)
     return CheckReport(
         sink, checkpoint.next_offset, tally.rows, tally.differing, tuple(tally.differences)
     )
+
+
+def _hold(connection: Connection, sink: SinkName) -> bool:
+    """Keep rebuilds from swapping until the transaction ends; False when there is nothing to swap.
+
+    Before its first look at anything: to a snapshot from before a swap the new tables are empty.
+    """
+    tables = sql.SQL(", ").join(_TABLES[sink])
+    try:
+        connection.execute(sql.SQL("LOCK TABLE {} IN ACCESS SHARE MODE").format(tables))
+    except (psycopg.errors.UndefinedTable, psycopg.errors.InvalidSchemaName):
+        connection.rollback()
+        return False
+    return True
 
 
 class _Tally:

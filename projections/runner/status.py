@@ -105,6 +105,10 @@ def _look(
     if found is None:
         advice = f"nothing has been projected there; run: {command('replay', log, settings)}"
         return SinkStatus(sink, where, "missing", note=advice, versions=versions)
+    if not _checkpoint.is_there(connection, sink):
+        told = f"somebody has dropped what its {found.next_offset:,} events were in"
+        advice = f"{told}; {remake(log, settings)}"
+        return SinkStatus(sink, where, "missing", note=advice, versions=versions)
     moved, beaten = _checkpoint.ages(connection, sink)
     condition, note = _condition(found, sink, where, log, log_id, end, settings, writer, beaten)
     return SinkStatus(

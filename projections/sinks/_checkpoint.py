@@ -19,8 +19,13 @@ from projections.sink import Checkpoint, SinkName
 
 from ._advice import differences, fitting
 from ._sql import statements
+from .labels import GRAPH, LABELS, TABLE
 
 _LOCK_NUMBERS: Final[dict[SinkName, int]] = {"graph": 1, "vectors": 2}
+_ONE_OF: Final[dict[SinkName, str]] = {
+    "graph": f'{GRAPH}."{LABELS[0]}"',
+    "vectors": f"public.{TABLE}",
+}
 _MARK: Final = "mapfold"
 _WAS: Final[dict[SinkName, str]] = {"graph": "was", "vectors": "were"}
 LOCK_GRACE_S: Final = 1.0
@@ -98,6 +103,14 @@ def load(connection: Connection, sink: SinkName) -> Checkpoint | None:
         return None
     row = connection.execute(statements("checkpoint")["load"], {"sink": sink}).fetchone()
     return None if row is None else Checkpoint(*row)
+
+
+def is_there(connection: Connection, sink: SinkName) -> bool:
+    """Whether the sink's rows have somewhere to be: somebody may have dropped it."""
+    row = connection.execute(
+        statements("checkpoint")["is_there"], {"table": _ONE_OF[sink]}
+    ).fetchone()
+    return row is not None and bool(row[0])
 
 
 def begin(connection: Connection, sink: SinkName, log_id: str, settings: Settings) -> None:

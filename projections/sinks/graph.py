@@ -56,12 +56,14 @@ class GraphSink:
         """What changed since the last take."""
         return self._rows.take(view)
 
-    def ensure(self, connection: Connection) -> None:
+    def ensure(self, connection: Connection) -> bool:
         """Create an empty graph if there is none."""
         ensure_extension(connection, "age")
-        if not _graph_ddl.exists(connection, GRAPH):
-            _graph_ddl.create(connection, GRAPH)
-            _graph_ddl.index(connection, GRAPH)
+        if _graph_ddl.exists(connection, GRAPH):
+            return False
+        _graph_ddl.create(connection, GRAPH)
+        _graph_ddl.index(connection, GRAPH)
+        return True
 
     def few(self, changes: GraphChanges) -> bool:
         """True when the new rows are so few that they are not worth a COPY."""

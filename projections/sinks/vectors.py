@@ -50,14 +50,15 @@ class VectorSink:
         """The rows added since the last take."""
         return self._rows.take(view)
 
-    def ensure(self, connection: Connection) -> None:
+    def ensure(self, connection: Connection) -> bool:
         """Create the table if there is none; learn the dimension it has."""
         self._find_type(connection)
         dimension = self._existing(connection)
         if dimension is None:
             self._create(connection, _PUBLIC, self._dimension)
-        else:
-            self._dimension = dimension
+            return True
+        self._dimension = dimension
+        return False
 
     def few(self, changes: Sequence[VectorRow]) -> bool:
         """True when the rows are so few that they are not worth a COPY."""

@@ -5,11 +5,14 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from projections.errors import ProjectionMismatch, ProjectionMissing
-from projections.postgres.connect import Targets
+from projections.errors import DatabaseError, ProjectionMismatch, ProjectionMissing
+from projections.postgres.connect import Connection, Targets
 from projections.runner import rebuild, tail
 from projections.runner.check import NAMED, check
+from projections.runner.status import projection_status
 from projections.settings import Settings
+from projections.sink import Checkpoint, SinkName
+from projections.sinks import _checkpoint
 from tests.logs import append_raw, bridge, walk, write_log
 
 SETTINGS = Settings()
@@ -141,3 +144,50 @@ def test_what_cannot_be_compared_is_refused(
         connection.execute("UPDATE mapfold.checkpoint SET next_offset = 119")
     with pytest.raises(ProjectionMismatch, match="offset 118 is not the one"):
         check(log, one_database, SETTINGS)
+
+
+DROPS = {
+    "graph": "SELECT drop_graph('semantic_map', true)",
+    "vectors": "DROP TABLE detection_embeddings",
+}
+
+
+@pytest.mark.parametrize("sink", DROPS)
+def test_what_somebody_has_dropped_is_missed_and_not_gone_on_with(
+    log: Path, one_database: Targets, pg: psycopg.Connection, sink: str
+) -> None:
+    rebuild(log, one_database, SETTINGS)
+    pg.execute(DROPS[sink])  # type: ignore[arg-type]
+    found = {s.sink: s for s in projection_status(log, one_database, SETTINGS).sinks}
+    assert found[sink].condition == "missing"
+    assert "mapfold replay" in str(found[sink].note)
+    write_log(log, walk(5, first=100))
+    told = f"120 events are in the {sink} by its checkpoint, .* mapfold replay"
+    for act in (
+        lambda: check(log, one_database, SETTINGS),
+        lambda: tail(log, one_database, SETTINGS, once=True),
+    ):
+        with pytest.raises(ProjectionMissing, match=told):
+            act()
+    rebuild(log, one_database, SETTINGS)
+    assert [r.differing for r in check(log, one_database, SETTINGS)] == [0, 0]
+
+
+@pytest.mark.parametrize("sink", DROPS)
+def test_a_rebuild_that_swaps_beside_a_check_is_no_difference(
+    log: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch, sink: SinkName
+) -> None:
+    """To the check's snapshot the tables of such a rebuild would be empty."""
+    monkeypatch.setattr("projections.runner._lock_out.PATIENCE_S", 0.3)
+    rebuild(log, one_database, SETTINGS)
+    load = _checkpoint.load
+
+    def rebuild_meanwhile(connection: Connection, sink: SinkName) -> Checkpoint | None:
+        found = load(connection, sink)
+        monkeypatch.setattr(_checkpoint, "load", load)
+        with pytest.raises(DatabaseError, match="readers kept the map locked"):
+            rebuild(log, one_database, SETTINGS)
+        return found
+
+    monkeypatch.setattr(_checkpoint, "load", rebuild_meanwhile)
+    assert [r.differing for r in check(log, one_database, SETTINGS, only=sink)] == [0]

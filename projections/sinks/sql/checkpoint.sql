@@ -33,6 +33,9 @@ CREATE TABLE mapfold.dead_letter (
 SELECT log_id, fingerprint, settings, next_offset, last_event, digest
 FROM mapfold.checkpoint WHERE sink = %(sink)s
 
+-- name: is_there
+SELECT to_regclass(%(table)s) IS NOT NULL
+
 -- name: begin
 -- A first checkpoint; two tails that both find none must not both get one.
 INSERT INTO mapfold.checkpoint (sink, log_id, fingerprint, settings, next_offset, last_event)
