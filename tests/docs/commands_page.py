@@ -22,8 +22,9 @@ Exit codes: 0 done · 1 failed · 2 misuse · 3 done, with loss or findings · 1
 · 141 the reader of stdout left before everything was printed (`… | head`) · 143 terminated
 (SIGTERM). What works until it is told to stop, such as `record`, exits with 0 or 3 when told so.
 
-`W` is a point in a log: an offset, an ISO time, `run:keyframe`, or `end`. `--at N` means after the
-first N events; a time or a keyframe means including it.
+`W` is a point in a log: a number of events, an ISO time, `RUN:KEYFRAME`, or `end`. `--at N` means
+after the first N events; a time or a keyframe means including it. Where stamps run backwards in a
+log, a line says how many events of later times a time takes in.
 
 This page is made from the commands themselves by `scripts/update_docs`.
 """
