@@ -135,10 +135,16 @@ class _Import:
 
 
 def check_sources(names: Sequence[str]) -> None:
-    """MisuseError for the first that is not there, before a log is made for nothing."""
+    """MisuseError for the first that is out of reach, before a log is made for nothing."""
     for name in names:
-        if name != STDIN and not Path(name).exists():
-            raise MisuseError(f"{name}: no such file; check the path")
+        if name == STDIN:
+            continue
+        try:
+            Path(name).stat()
+        except FileNotFoundError:
+            raise MisuseError(f"{name}: no such file; check the path") from None
+        except OSError as error:
+            raise MisuseError(f"{name}: {error.strerror or error}; check the path") from None
 
 
 def open_source(name: str, files: ExitStack) -> Source:

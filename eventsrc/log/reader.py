@@ -12,7 +12,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Collection, Generator, Iterator
 from pathlib import Path
 
-from eventsrc.errors import LogDamaged, LogNotFound, NotALog
+from eventsrc.errors import LogDamaged, LogError, LogNotFound, NotALog
 
 from ._active_file import ActiveFile
 from ._naming import ACTIVE, SEALED, SegmentPath, list_growing, segment_path
@@ -196,7 +196,16 @@ class LogReader:
 
 
 def segments_of(path: Path) -> list[SegmentPath]:
-    """The segments of a log; LogNotFound or NotALog when there are none."""
+    """The segments of a log; LogNotFound or NotALog when there are none, LogError when the folder
+    may not be read."""
+    try:
+        return _segments_of(path)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise LogError(f"{path}: {reason}; check the folder's rights and its disk") from error
+
+
+def _segments_of(path: Path) -> list[SegmentPath]:
     if not path.exists():
         raise LogNotFound(f"no log at {path}; record or import one, or check the path")
     if not path.is_dir():

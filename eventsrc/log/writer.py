@@ -74,7 +74,8 @@ class LogWriter:
         try:
             self._open()
         except OSError as error:
-            raise LogError(f"{path}: {error.strerror or error}; {_way_out(error)}") from error
+            place, reason = error.filename or path, error.strerror or error
+            raise LogError(f"{place}: {reason}; {_way_out(error)}") from error
 
     def _open(self) -> None:
         _make_log_directory(self.path)
@@ -231,7 +232,7 @@ class LogWriter:
 def _way_out(error: OSError) -> str:
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return "free space on its disk and start again"
-    return "check the folder's rights and its disk"
+    return "check its rights, those of its folder, and its disk"
 
 
 def _make_log_directory(path: Path) -> None:

@@ -73,6 +73,13 @@ def test_nothing_is_made_when_a_file_is_missing(run: Commands) -> None:
     assert not (run.folder / "a").exists()
 
 
+def test_a_file_that_cannot_be_looked_at_is_one_line(run: Commands) -> None:
+    said = run("import", "L2", "x" * 300, code=2)
+    assert said.err.endswith("File name too long; check the path\n")
+    assert said.err.count("\n") == 1
+    assert not (run.folder / "L2").exists()
+
+
 def test_info_and_cat(run: Commands) -> None:
     run("import", "a", "-", "--key", "k", stdin=b"\n".join(PAYLOADS))
     info = run("log", "info", "a", "--json").json

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import LogBusy, LogNotFound, NotALog
-from eventsrc.log import LogReader, LogWriter, log_info
+from eventsrc.errors import LogBusy, LogError, LogNotFound, NotALog
+from eventsrc.log import LogReader, LogWriter, log_info, verify_log
 from eventsrc.log._lock import is_held
 from tests.fixtures_log import BY_HAND, KEY, envelope, read_log, write_log
 
@@ -121,6 +121,20 @@ def test_no_log_and_not_a_log_are_named(tmp_path: Path) -> None:
         LogReader(tmp_path)
     with pytest.raises(NotALog, match="holds file"):
         LogWriter(tmp_path)
+
+
+def test_a_place_that_cannot_be_looked_at_is_one_line(tmp_path: Path) -> None:
+    for use in (LogReader, LogWriter, verify_log):
+        with pytest.raises(LogError, match=r"File name too long; check (its|the folder's) rights"):
+            use(tmp_path / ("x" * 300))
+
+
+def test_a_lock_that_may_not_be_written_is_named(log_path: Path) -> None:
+    LogWriter(log_path).close()
+    (log_path / "lock").unlink()
+    (log_path / "lock").mkdir()
+    with pytest.raises(LogError, match=r"log/lock: Is a directory; check its rights"):
+        LogWriter(log_path)
 
 
 def test_info_counts_sealed_and_growing_segments(log_path: Path) -> None:
