@@ -56,7 +56,7 @@ def draw(
     draw_map(
         view,
         out,
-        title=f"{log.name} after {counted(view.next_offset, 'event')}",
+        title=f"{log.resolve().name} after {counted(view.next_offset, 'event')}",
         floor=None if house is None else floor_of(build_house(house)),
         bridges=bridges_of(view, merged) if merges else (),
         min_observations=min_observations,

@@ -44,6 +44,15 @@ def test_a_picture_of_any_point_with_other_settings(log: Path, tmp_path: Path) -
     assert "ε 0.75 m, min_samples 8" in part.read_text("utf-8")
 
 
+def test_the_title_of_the_log_one_is_in(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``.`` has no name of its own."""
+    monkeypatch.chdir(log)
+    assert _draw(".", "--at", "1", "--out", str(tmp_path / "here.svg")).returncode == 0
+    assert "drive after 1 event" in (tmp_path / "here.svg").read_text("utf-8")
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
