@@ -1,5 +1,6 @@
 """The sheet a map is drawn on: axes in metres, and the boxes that text already takes."""
 
+import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -7,6 +8,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
+from matplotlib.text import Text
 
 from eventsrc.errors import MisuseError
 from projections.view import MapView
@@ -50,11 +52,17 @@ class Canvas:
 
     def save(self, out: Path) -> None:
         """Write the picture; the same picture gives the same bytes."""
+        for text in self.figure.findobj(Text):
+            text.set_parse_math(False)  # a class may be called "$5 bill$", which is no formula
         # What would differ from time to time: PDF's and SVG's date, SVG's ids salted by chance.
         undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
         try:
             out.parent.mkdir(parents=True, exist_ok=True)
-            with rc_context({"svg.hashsalt": "mapfold", "svg.fonttype": "none"}):
+            with (
+                rc_context({"svg.hashsalt": "mapfold", "svg.fonttype": "none"}),
+                warnings.catch_warnings(),
+            ):
+                warnings.filterwarnings("ignore", message="Glyph .* missing from font")  # a box
                 self.figure.savefig(out, dpi=_DPI, metadata=undated.get(out.suffix.lower()))
         except OSError as error:
             raise MisuseError(

@@ -131,6 +131,26 @@ def test_a_lost_robot_without_an_estimate_is_drawn_too(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["png", "svg", "pdf"])
+def test_a_class_may_be_called_anything(tmp_path: Path, suffix: str) -> None:
+    """``$…$`` is no formula, and letters that the font lacks are no warning to the reader."""
+    view, out = _two_places(), tmp_path / f"map.{suffix}"
+    for number, name in enumerate(
+        ("$\\frac$", "a $x$ $b", "\u2615 \U0001f916", "\u65e5\u672c"), start=3
+    ):
+        box = (0.0, 0.0, 1.0, 1.0)
+        view.apply(
+            d.ObservationAdded(
+                number, number, 0, "run", 0, f"d{number}", name, 0.9, box, None, None, False
+            )
+        )
+        view.apply(d.ObjectFound(2, number, f"obj-{number}", name, number))
+        view.apply(d.ObjectSeen(2, number, number, 0, 2, 4_000_000, 1_000_000, 0.0, 0.0))
+    draw_map(view, out, title="lo$g$")
+    assert out.stat().st_size > 10_000
+    assert suffix != "svg" or ">lo$g$</text>" in out.read_text("utf-8")
+
+
+@pytest.mark.parametrize("suffix", ["png", "svg", "pdf"])
 def test_the_same_map_gives_the_same_bytes(tmp_path: Path, suffix: str) -> None:
     one, two = tmp_path / f"one.{suffix}", tmp_path / "sub" / f"two.{suffix}"
     draw_map(_two_places(), one, title="t")
