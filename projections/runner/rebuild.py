@@ -12,25 +12,24 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, NamedTuple, TypeAlias
-
-import psycopg
+from typing import Final, TypeAlias
 
 from eventsrc.log import Event, LogReader
 from projections.digest import map_digest
 from projections.errors import DatabaseError, FoldError
 from projections.folding import no_cycle_search
-from projections.postgres.connect import Connection, Targets, database_errors
+from projections.postgres.connect import Targets, database_errors
 from projections.settings import Settings
-from projections.sink import Checkpoint, Sink
+from projections.sink import Checkpoint
 from projections.sinks import _checkpoint
 from projections.sinks._advice import command
 from projections.sinks.hnsw import HnswReport, build_hnsw
 from projections.sinks.loader import LoaderName
 
+from ._filling import SinkLoading, loadings_of
 from ._fold import LiveFold, batches
 from ._foreign import ForeignEmbedding, first_foreign
-from ._loading import Loading, short_turns
+from ._loading import short_turns
 from ._lock_out import lock_readers_out
 from ._stores import Only, Store, open_stores
 
@@ -45,18 +44,6 @@ class RebuildProgress:
     stage: str
     done: int
     total: int
-
-
-class SinkLoading(NamedTuple):
-    """A sink, where it lives, and the thread that writes there."""
-
-    loading: Loading
-    sink: Sink[Any]
-    store: Store
-
-    def put(self, job: Callable[[Connection], None]) -> None:
-        """Have ``job`` done with the store's connection, its errors told as the store's."""
-        self.loading.put(partial(self.store.do, job))
 
 
 OnProgress: TypeAlias = Callable[[RebuildProgress], None]
@@ -107,7 +94,7 @@ def rebuild(
         total = reader.next_offset if until is None else min(until, reader.next_offset)
         fold = LiveFold(settings)
         with _transactions(stores):
-            with short_turns(), _loadings(stores) as loadings:
+            with short_turns(), loadings_of(stores) as loadings:
                 events, advice = reader.read(0, total), partial(_advice, log, settings)
                 last = _fold_into(fold, events, loadings, total, tell, advice)
                 folded = time.monotonic()
@@ -156,31 +143,6 @@ def _transactions(stores: list[Store]) -> Iterator[None]:
             transactions.enter_context(database_errors(store.url))
             transactions.enter_context(store.connection.transaction())
         yield
-
-
-@contextlib.contextmanager
-def _loadings(stores: list[Store]) -> Iterator[list[SinkLoading]]:
-    """A thread for each store, which begins its shadows, and which sink writes through which."""
-    with contextlib.ExitStack() as threads:
-        loadings = []
-        for store in stores:
-            loading = threads.enter_context(Loading(partial(_break_off, store.connection)))
-            loading.put(partial(_begin, store))
-            loadings += [SinkLoading(loading, sink, store) for sink in store.sinks]
-        yield loadings
-
-
-def _break_off(connection: Connection) -> None:
-    with contextlib.suppress(psycopg.Error):  # the server is gone, and what it was at with it
-        connection.cancel_safe()
-
-
-def _begin(store: Store) -> None:
-    with store.aside() as connection:
-        for sink in store.sinks:
-            sink.clear(connection)
-    for sink in store.sinks:
-        store.do(sink.begin)
 
 
 def _fold_into(
