@@ -21,6 +21,7 @@ from ._set_aside import Refused
 from ._zenoh import ZenohOptions, check_options
 from .errors import InvalidEnvelope, MisuseError
 from .ingest import Rejected, ingest
+from .keys import check_key
 from .sending import RESEND_AFTER_S, WINDOW, Sender
 from .spool import DEFAULT_SPOOL_BYTES, Spool
 from .system_events import RESERVED_PREFIX, is_system_key
@@ -30,9 +31,9 @@ class EnvelopePublisher:
     """Publishes one robot's envelopes under ``key``; a context manager, usable from any thread.
 
     The constructor opens the spool and begins to send what an earlier process left in it. It raises
-    SpoolError if the spool cannot be used, and MisuseError if the key is one of mapfold's own, an
-    endpoint malformed or the configuration file none; but nothing when nobody answers there: the
-    sending thread tries until somebody does.
+    SpoolError if the spool cannot be used, and MisuseError if the key is one of mapfold's own or
+    malformed, an endpoint malformed or the configuration file none; but nothing when nobody answers
+    there: the sending thread tries until somebody does.
     """
 
     def __init__(
@@ -50,6 +51,7 @@ class EnvelopePublisher:
                 f"key {key!r}: every recorder refuses envelopes under {RESERVED_PREFIX}; "
                 "choose another"
             )
+        check_key(key, "key")
         check_options(options)
         self._spool = Spool(spool, max_spool_bytes)
         self._sender = Sender(

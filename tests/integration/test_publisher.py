@@ -312,6 +312,13 @@ def test_a_key_of_our_own_is_refused_at_once(tmp_path: Path) -> None:
         EnvelopePublisher(ZenohOptions(), tmp_path / "spool", "mapfold/detections")
 
 
+@pytest.mark.parametrize("key", ["", "tb//detections", "/tb", "tb/*"])
+def test_a_key_that_nothing_can_be_sent_under_is_refused_at_once(tmp_path: Path, key: str) -> None:
+    """Else it would be tried for ever, and only the spool would grow."""
+    with pytest.raises(MisuseError, match="nothing can be published under it"):
+        EnvelopePublisher(ZenohOptions(), tmp_path / "spool", key)
+
+
 def test_a_full_spool_is_the_callers_to_decide(endpoint: str, tmp_path: Path) -> None:
     message = payload(envelope(1))
     options = ZenohOptions(connect=(endpoint,))
