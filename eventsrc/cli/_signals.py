@@ -1,23 +1,28 @@
-"""Ending a long-running command: the first SIGINT or SIGTERM asks, the second one insists; or
-Ctrl-C ends it, but between two steps."""
+"""Ending a long-running command: the first SIGINT, SIGTERM or SIGHUP asks, the second one insists;
+or Ctrl-C ends it, but between two steps."""
 
 import contextlib
 import signal
 import threading
 from collections.abc import Iterator
 from types import FrameType, TracebackType
-from typing import Self
+from typing import Final, Self
+
+_STOPPING: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @contextlib.contextmanager
 def stop_on_signals() -> Iterator[threading.Event]:
-    """An event that SIGINT and SIGTERM set, so that the command can finish its work.
+    """An event that SIGINT, SIGTERM and SIGHUP set, so that the command can finish its work. SIGHUP
+    comes when the terminal goes; where it is ignored (``nohup``) it stays so.
 
-    After the first signal both have their usual effect again: a second Ctrl-C ends a command that
+    After the first signal all have their usual effect again: a second Ctrl-C ends a command that
     does not end. For the main thread only, as Python's signals are.
     """
     stop = threading.Event()
-    usual = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    usual = {number: signal.getsignal(number) for number in _STOPPING}
+    if usual[signal.SIGHUP] == signal.SIG_IGN:
+        del usual[signal.SIGHUP]
 
     def restore() -> None:
         for number, handler in usual.items():

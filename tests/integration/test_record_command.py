@@ -33,7 +33,7 @@ def _stored(log: Path) -> list[bytes]:
         return [event.payload for event in reader.read()]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_drains_the_queue_and_exits_0(
     start: Start, publish: Start, endpoint: str, tmp_path: Path, number: int
 ) -> None:
