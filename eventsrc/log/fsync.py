@@ -7,8 +7,10 @@
 """
 
 import contextlib
+import errno
 import os
 import re
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -81,6 +83,28 @@ def replace_durably(temporary: Path, final: Path) -> None:
     """Rename a synced file to its name and sync the name."""
     temporary.replace(final)
     sync_directory(final.parent)
+
+
+def keep_copy(path: Path, copy: Path) -> None:
+    """Give a file a second name, or where its file system knows none (exFAT), copy and sync it.
+    Raises FileExistsError when the name is taken."""
+    try:
+        copy.hardlink_to(path)
+    except OSError as error:
+        if error.errno not in (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK):
+            raise
+        _copy_durably(path, copy)
+
+
+def _copy_durably(path: Path, copy: Path) -> None:
+    with path.open("rb") as source, copy.open("xb") as target:
+        try:
+            shutil.copyfileobj(source, target)
+            target.flush()
+            sync_file(target.fileno())
+        except OSError:
+            copy.unlink()
+            raise
 
 
 def unlink_quietly(path: Path) -> None:

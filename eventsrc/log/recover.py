@@ -27,7 +27,7 @@ from ._scan import Scan, scan_active
 from ._scan_sealed import scan_sealed
 from ._seal import NO_PREVIOUS, REPLACES, SegmentPlan, file_sha256
 from ._whose import log_id_of
-from .fsync import GROUP_COMMIT, sync_directory, unlink_quietly
+from .fsync import GROUP_COMMIT, keep_copy, sync_directory, unlink_quietly
 from .reader import segments_of
 
 
@@ -161,7 +161,7 @@ class _Recovery:
             suffix = DAMAGED if number == 1 else f"{DAMAGED}-{number}"
             copy = segment.path.with_name(segment.path.name + suffix)
             try:
-                copy.hardlink_to(segment.path)
+                keep_copy(segment.path, copy)
             except FileExistsError:
                 number += 1
             else:

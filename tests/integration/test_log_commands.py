@@ -1,9 +1,14 @@
 """`mapfold log verify` and `recover` as a person runs them."""
 
+import errno
+import os
+import shutil
 from pathlib import Path
 
 import pytest
 
+from eventsrc.errors import LogError
+from eventsrc.log import recover_log
 from tests.commands import Commands
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import flip
@@ -57,6 +62,31 @@ def test_a_flip_that_touches_no_event_loses_none(run: Commands) -> None:
     run("log", "recover", "L", code=0)
     run("log", "verify", "L")
     assert len(run("log", "cat", "L").out.splitlines()) == 5
+
+
+def test_the_original_is_kept_where_no_file_can_have_two_names(
+    run: Commands, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On exFAT, for example."""
+
+    def refuse(*_: object) -> None:
+        raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
+
+    monkeypatch.setattr(Path, "hardlink_to", refuse)
+    log = run.folder / "L"
+    flip(segment(run), segment(run).stat().st_size // 3)
+    rotten = segment(run).read_bytes()
+    kept = [f"{segment(run).name}.damaged", f"{segment(run).name}.damaged-2"]
+    for name in kept:
+        (recovered,) = recover_log(log).segments
+        assert recovered.kept_copy == name
+        assert (log / name).read_bytes() == rotten
+        segment(run).write_bytes(rotten)
+    monkeypatch.setattr(shutil, "copyfileobj", lambda *_: refuse())
+    with pytest.raises(LogError, match="nothing was replaced"):
+        recover_log(log)
+    assert sorted(p.name for p in log.glob("*.damaged*")) == kept
+    assert segment(run).read_bytes() == rotten
 
 
 def test_a_writer_refuses_a_rotten_growing_segment_and_says_what_to_do(run: Commands) -> None:
