@@ -46,7 +46,11 @@ _SESSION: Final[Mapping[str, str]] = {
     "idle_in_transaction_session_timeout": "0",
     "transaction_timeout": "0",  # from PostgreSQL 17 on
     "idle_session_timeout": "0",
-    # The same from the server's side: a writer that went without a word gives its lock back.
+    # How values are written, which a server's owner may have set for people to read.
+    "DateStyle": "ISO",
+    "extra_float_digits": "1",
+    "array_nulls": "on",
+    # From the server's side: a writer that went without a word gives its lock back.
     "tcp_keepalives_idle": "20",
     "tcp_keepalives_interval": "10",
     "tcp_keepalives_count": "3",
@@ -111,7 +115,8 @@ def connect(url: str, *, application: str = "mapfold", autocommit: bool = False)
     missing = {name: value for name, value in _LINK.items() if name not in said}
     try:
         return psycopg.connect(
-            make_conninfo(url, **missing),
+            # COPY data is made here, in UTF-8, whatever the server's owner prefers to read.
+            make_conninfo(url, **missing, client_encoding="UTF8"),
             autocommit=autocommit,
             application_name=application,
             connect_timeout=CONNECT_SECONDS,
@@ -122,7 +127,7 @@ def connect(url: str, *, application: str = "mapfold", autocommit: bool = False)
 
 
 def settle(connection: Connection) -> None:
-    """Let the session take its time, whatever the server's owner has set for others.
+    """Let the session take its time and mean what it says, whatever is set for others there.
 
     A rebuild folds for minutes between two statements, an index of many vectors takes longer, and a
     tail may have nothing to say all night. But it ends when its client is no longer there.

@@ -7,6 +7,7 @@ from typing import Any, TypeAlias
 
 import psycopg
 
+from projections.errors import DatabaseError
 from projections.postgres.connect import (
     Connection,
     Targets,
@@ -104,6 +105,7 @@ def _layout(
 def _open(url: str, application: str, sinks: tuple[Sink[Any], ...]) -> Connection:
     connection = connect(url, application=application, autocommit=True)
     try:
+        _refuse_encoding(connection, url)
         with database_errors(url):
             # AGE and the schema commands talk; only what goes wrong is of interest.
             connection.execute("SET client_min_messages = warning")
@@ -115,6 +117,15 @@ def _open(url: str, application: str, sinks: tuple[Sink[Any], ...]) -> Connectio
         connection.close()
         raise
     return connection
+
+
+def _refuse_encoding(connection: Connection, url: str) -> None:
+    encoding = connection.info.parameter_status("server_encoding")
+    if encoding not in ("UTF8", "SQL_ASCII"):
+        raise DatabaseError(
+            f"{place(url)}: its encoding is {encoding}, which cannot hold every name in a log; make"
+            " a database with createdb --encoding UTF8 --template template0"
+        )
 
 
 def _ensure_store(connection: Connection) -> None:

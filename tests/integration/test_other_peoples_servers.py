@@ -85,6 +85,54 @@ def test_timeouts_meant_for_others(
     assert [r.differing for r in check(log, one_database, SETTINGS)] == [0, 0]
 
 
+@pytest.mark.parametrize("loader", ["copy", "insert"])
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "client_encoding = 'LATIN1'",
+        "extra_float_digits = 0",
+        "datestyle = 'German'",
+        "array_nulls = off",
+        "search_path = ''",
+        "timezone = 'Asia/Kathmandu'",
+        "standard_conforming_strings = off",
+        "default_transaction_isolation = 'serializable'",
+    ],
+)
+def test_values_are_what_they_are_however_they_are_written_there(
+    log: Path, one_database: Targets, pg: psycopg.Connection, setting: str, loader: LoaderName
+) -> None:
+    rebuild(log, one_database, SETTINGS)
+    rows = all_rows(one_database)
+    database = sql.Identifier(pg.info.dbname)
+    pg.execute(sql.SQL("ALTER DATABASE {} SET ").format(database) + sql.SQL(setting))  # type: ignore[arg-type]
+    rebuild(log, one_database, SETTINGS, until=5, loader=loader)
+    assert tail(log, one_database, SETTINGS, once=True, loader=loader, batch_events=30).events == 35
+    assert [r.differing for r in check(log, one_database, SETTINGS)] == [0, 0]
+    assert projection_status(log, one_database, SETTINGS).healthy
+    pg.execute(sql.SQL("ALTER DATABASE {} RESET ALL").format(database))
+    assert all_rows(one_database) == rows
+
+
+def test_a_database_that_cannot_hold_every_name(log: Path, pg_server: EmbeddedServer) -> None:
+    name = f"latin_{os.getpid()}"
+    with connect(pg_server.url, autocommit=True) as admin:
+        admin.execute(
+            sql.SQL(
+                "CREATE DATABASE {} TEMPLATE template0 ENCODING 'LATIN1'"
+                " LOCALE_PROVIDER libc LC_COLLATE 'C' LC_CTYPE 'C'"
+            ).format(sql.Identifier(name))
+        )
+        targets = Targets(pg_server.url_of(name), pg_server.url_of(name))
+        try:
+            with pytest.raises(
+                DatabaseError, match=r"encoding is LATIN1.* createdb --encoding UTF8"
+            ):
+                rebuild(log, targets, SETTINGS)
+        finally:
+            admin.execute(sql.SQL("DROP DATABASE {}").format(sql.Identifier(name)))
+
+
 def test_a_peer_that_went_without_a_word_is_missed_within_a_minute(
     pg_url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
