@@ -157,6 +157,8 @@ def decode_chunk_head(data: bytes) -> ChunkHead:
     if opcode != Opcode.CHUNK or name_size not in (0, 4) or length > MAX_RECORD_BYTES:
         raise BadRecord("no chunk where one should start")
     data_at = PLAIN_CHUNK_HEAD + name_size
+    if len(data) < data_at:
+        raise BadRecord("cut short inside a chunk's head")
     if name_size and data[_CHUNK.size : _CHUNK.size + 4] != b"zstd":
         raise BadRecord("chunk with an unknown compression")
     (data_size,) = _U64.unpack_from(data, _CHUNK.size + name_size)

@@ -175,8 +175,7 @@ def test_a_dead_writer_leaves_nothing_that_stands_in_the_next_ones_way(log_path:
     process = SealingProcess()
     process._to.write(
         b'{"log": "%s", "log_id": "%s", "base": 0, "previous_sha256": "", '
-        b'"following": 5}\n'
-        % (str(log_path).encode(), plan.log_id.encode())
+        b'"following": 5}\n' % (str(log_path).encode(), plan.log_id.encode())
     )
     process._from.close()
     process._to.close()  # the writer is killed here

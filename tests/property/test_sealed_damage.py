@@ -14,6 +14,7 @@ from eventsrc.log import (
     Event,
     LogReader,
     LogWriter,
+    _mcap,
     _parts,
     log_info,
     recover_log,
@@ -101,6 +102,25 @@ def test_recovery_keeps_every_whole_chunk_at_its_offsets(sealed: tuple[Path, lis
         assert log_info(log).lost == len(lost)
         assert recover_log(log).segments == ()
         (log / segment.kept_copy).unlink()
+
+
+def test_a_sealed_segment_that_is_cut_at_any_byte_is_told_and_recovered(
+    sealed: tuple[Path, list[Event]],
+) -> None:
+    segment, written = sealed
+    log, whole = segment.parent, segment.read_bytes()
+    for length in range(len(whole)):
+        segment.write_bytes(whole[:length])
+        assert {f.kind for f in verify_log(log).findings} & {"crc", "gap"}, length
+        with contextlib.suppress(LogError):
+            events, _ = read_with_gaps(log)
+            assert events == written[: len(events)]
+    for length in (0, *range(len(whole) - 1, len(_mcap.MAGIC), -len(whole) // 40)):
+        segment.write_bytes(whole[:length])
+        recover_log(log)
+        assert read_log(log) == written[: len(read_log(log))]
+        for left in log.glob("*.mcap*"):
+            left.unlink()
 
 
 def test_a_missing_segment_becomes_losses(quick_path: Path) -> None:
