@@ -292,3 +292,41 @@ def test_readers_of_one_database_do_not_wait_for_those_of_the_other(
         rebuilding.join(WAIT_S)
     assert not rebuilding.is_alive()
     assert tail(log, two_databases, SETTINGS, once=True).events == 0
+
+
+def test_readers_that_go_one_by_one_make_no_victim_of_one_that_waits(
+    tmp_path: Path, one_database: Targets
+) -> None:
+    """The swap waits for each a little, and for all of them longer than deadlock_timeout, 1 s."""
+    log = write_log(tmp_path / "log", walk(60))
+    rebuild(log, one_database, SETTINGS, until=30)
+    swapping, url = threading.Event(), one_database.graph_url
+    read, held = 'SELECT count(*) FROM semantic_map."{}"', threading.Semaphore(0)
+
+    def sit(number: int, label: str) -> None:
+        with psycopg.connect(url) as connection:
+            single_answer(connection, read.format(label))
+            held.release()
+            assert swapping.wait(WAIT_S)
+            connection.execute("SELECT pg_sleep(%s)", [0.15 * number])
+
+    labels = ["Keyframe", "Pose", "Observation", "Object", "Place", "HAS_KEYFRAME"]
+    sitting = [threading.Thread(target=sit, args=pair) for pair in enumerate(labels, 1)]
+    rebuilding = threading.Thread(
+        target=rebuild,
+        args=(log, one_database, SETTINGS),
+        kwargs={"progress": lambda at: swapping.set() if at.stage == "swapping" else None},
+    )
+    for thread in sitting:
+        thread.start()
+        assert held.acquire(timeout=WAIT_S)
+    with psycopg.connect(url) as waiting:
+        single_answer(waiting, read.format("ADJACENT_TO"))
+        rebuilding.start()
+        assert swapping.wait(WAIT_S)
+        waiting.execute("SELECT pg_sleep(0.03)")
+        single_answer(waiting, read.format("Run"))
+    for thread in (*sitting, rebuilding):
+        thread.join(WAIT_S)
+        assert not thread.is_alive()
+    assert tail(log, one_database, SETTINGS, once=True).events == 0
