@@ -67,7 +67,8 @@ class EnvelopePublisher:
         """Take one envelope: a dictionary, or its JSON as bytes, which are sent as they are.
 
         Raises InvalidEnvelope with the reason a recorder would give, SpoolFull when the spool has
-        no room, SpoolError when the spool is closed or its disk fails.
+        no room, SpoolError when the spool is closed or its disk fails, TransportError when the
+        sending thread has died.
         """
         payload = envelope if isinstance(envelope, bytes) else _encode(envelope)
         outcome = ingest(payload)

@@ -61,7 +61,7 @@ class Sender:
         self._answers: deque[Ack | Refusals] = deque()
         self._sent = 0  # the last seq that was ever sent
         self._news = self._stopping = False
-        self._failure: SpoolError | None = None
+        self._failure: TransportError | None = None
 
     def wake(self) -> None:
         """Something was spooled."""
@@ -89,15 +89,26 @@ class Sender:
 
     def run(self) -> None:
         """Connect, send, and connect again, until stopped or the spool fails."""
-        while not self._stopping:
-            try:
-                with open_session(self._options, mode=self._options.mode) as session:
-                    self._serve(session)
-            except SpoolError as failure:
-                self._failure = failure
+        try:
+            while not self._stopping:
+                self._connect_and_serve()
+        finally:
+            if not self._stopping:  # so that nobody spools for a thread that is gone
+                self._failure = TransportError(
+                    f"key {self._key!r}: the sending thread has died, stderr says of what; what is "
+                    "spooled stays. Close this publisher and open another"
+                )
                 self.stop()
-            except (TransportError, MisuseError):  # nobody there, or the configuration file is not
-                self._rest(_RECONNECT_S)  # any more; the spool keeps everything meanwhile
+
+    def _connect_and_serve(self) -> None:
+        try:
+            with open_session(self._options, mode=self._options.mode) as session:
+                self._serve(session)
+        except SpoolError as failure:
+            self._failure = failure
+            self.stop()
+        except (TransportError, MisuseError):  # nobody there, or the configuration file is not
+            self._rest(_RECONNECT_S)  # any more; the spool keeps everything meanwhile
 
     def _serve(self, session: Session) -> None:
         publisher = session.publisher(self._key, advanced=True, cache=2 * self._window)

@@ -13,6 +13,7 @@ A commit that fails leaves the file at the last good byte, and the segment refus
 it does when somebody has deleted the file: nothing may be called recorded that has no name.
 """
 
+import errno
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -107,6 +108,9 @@ class ActiveSegment:
             gone = os.fstat(self._fd).st_nlink == 0
         except OSError as error:
             raise self._fail(error) from error
+        except BaseException:  # Ctrl-C: what is half written must have nothing behind it
+            self._fail(InterruptedError(errno.EINTR, "interrupted"))
+            raise
         if gone:
             raise self._deleted()
         self.size += len(head) + len(body) + len(mark)

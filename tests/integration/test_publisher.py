@@ -10,11 +10,12 @@ import pytest
 
 from eventsrc._zenoh import Received, Session, ZenohOptions
 from eventsrc.acks import Ack, ack_key
-from eventsrc.errors import InvalidEnvelope, MisuseError, SpoolFull
+from eventsrc.errors import InvalidEnvelope, MisuseError, SpoolFull, TransportError
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.publisher import EnvelopePublisher
 from eventsrc.refusals import Refusal, Refusals, refusal_key
 from eventsrc.router import Router
+from eventsrc.sending import Sender
 from eventsrc.system_events import REJECTED_KEY
 from tests.envelopes import envelope, payload
 from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK, Program
@@ -310,6 +311,22 @@ def test_an_ack_that_comes_when_the_recorder_has_left_is_taken(
 def test_a_key_of_our_own_is_refused_at_once(tmp_path: Path) -> None:
     with pytest.raises(MisuseError, match="every recorder refuses envelopes under mapfold/"):
         EnvelopePublisher(ZenohOptions(), tmp_path / "spool", "mapfold/detections")
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_sending_thread_that_dies_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def die(_: Sender) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(Sender, "_connect_and_serve", die)
+    with EnvelopePublisher(ZenohOptions(), tmp_path / "spool") as robot:
+        robot._thread.join(DEADLINE_S)
+        with pytest.raises(TransportError, match="the sending thread has died"):
+            robot.publish(payload(envelope(1)))
+        with pytest.raises(TransportError, match="the sending thread has died"):
+            robot.flush(DEADLINE_S)
 
 
 @pytest.mark.parametrize("key", ["", "tb//detections", "/tb", "tb/*"])

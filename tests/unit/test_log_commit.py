@@ -16,6 +16,7 @@ from eventsrc.log import (
     NEVER,
     LogReader,
     LogWriter,
+    _active,
     _sealer,
     log_info,
     parse_fsync,
@@ -198,6 +199,32 @@ def test_a_disk_that_fails_to_sync_ends_the_writer(
         writer.close()
     with LogWriter(log_path) as again:
         assert again.next_offset == 1
+
+
+def test_nothing_is_written_behind_what_an_interrupt_cut_short(
+    log_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever caught Ctrl-C and went on would write where no reader comes to."""
+    writer = LogWriter(log_path, fsync=BY_HAND)
+    writer.append(KEY, b"0")
+    writer.sync()
+
+    def interrupted(fd: int, data: bytes) -> None:
+        os.write(fd, data[:20])
+        raise KeyboardInterrupt
+
+    writer.append(KEY, b"1")
+    with monkeypatch.context() as patch:
+        patch.setattr(_active, "write_all", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            writer.sync()
+    with pytest.raises(LogError, match="interrupted: 1 events from offset 1 on could not be"):
+        writer.append(KEY, b"2")
+    with pytest.raises(LogError, match="interrupted"):
+        writer.close()
+    assert [e.payload for e in read_log(log_path)] == [b"0"]
+    with LogWriter(log_path) as again:
+        assert (again.restart.torn_bytes, again.append(KEY, b"1")) == (0, 1)
 
 
 @pytest.mark.parametrize("overlap", [False, True])
