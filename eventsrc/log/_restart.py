@@ -74,13 +74,15 @@ class _Leftover:
 def restart(log: Path) -> Restart:
     """Put in order what is left over. The caller holds the writer lock.
 
-    Raises LogDamaged for rot, and when the first and the last segment and those that are left over
-    are not of one log.
+    Raises LogDamaged for rot in what a writer goes by, and when the first and the last segment and
+    those that are left over are not of one log.
     """
     for path in leftovers(log):
         unlink_quietly(path)
     segments = list_segments(log)
     log_id_of([*segments[:1], *(s for s in segments[1:-1] if not s.sealed), *segments[-1:]])
+    for segment in [s for s in segments if s.sealed][-1:]:
+        SealedFile(segment.path, segment.base).close()  # before anything is changed
     for segment in segments:
         if segment.sealed:
             unlink_quietly(segment_path(log, segment.base, ACTIVE))

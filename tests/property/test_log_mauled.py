@@ -1,0 +1,94 @@
+"""A log of several segments, one of them growing, damaged in several places and ways at once.
+
+Reading never makes anything up and repeats nothing, starting a writer and recovering take nothing
+away that could be read, and a recovered log is whole.
+"""
+
+import contextlib
+import random
+import shutil
+from pathlib import Path
+
+import pytest
+
+from eventsrc.errors import LogError
+from eventsrc.log import ALWAYS, LogWriter, recover_log, verify_log
+from eventsrc.log._naming import list_segments
+from eventsrc.system_events import LOSS_KEY
+from tests.fixtures_log import BY_HAND, KEY, envelope, read_log, read_with_gaps
+
+EVENTS = 25
+PAYLOADS = [envelope(i, note="x" * random.Random(i).randrange(400)) for i in range(EVENTS)]
+LATER = envelope(EVENTS)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four sealed segments of six events and a growing one of one, as a killed writer leaves it."""
+    log = tmp_path_factory.mktemp("whole") / "log"
+    writer = LogWriter(log, fsync=BY_HAND, rotate_events=6)
+    for number, payload in enumerate(PAYLOADS):
+        writer.append(KEY, payload)
+        if number % 3 == 2:
+            writer.sync()
+            writer.commit_if_due()
+    writer.sync()
+    writer._sealer.finish()
+    writer._active.close()
+    writer._lock.release()
+    return log
+
+
+def maul(log: Path, chance: random.Random) -> None:
+    """Damage one to three segments."""
+    for _ in range(chance.choice([1, 1, 2, 3])):
+        path = chance.choice(list_segments(log)).path
+        data = bytearray(path.read_bytes())
+        at = chance.randrange(len(data) or 1)
+        match chance.choice(["flip", "zeros", "cut", "again", "more"]):
+            case "flip" if data:
+                data[at] ^= 1 << chance.randrange(8)
+            case "zeros":
+                data[at : at + 64] = bytes(len(data[at : at + 64]))
+            case "cut":
+                del data[at:]
+            case "again":
+                data[at:at] = data[max(0, at - 100) : at]
+            case "more":
+                data += chance.randbytes(50)
+        path.write_bytes(data)
+
+
+def readable(log: Path) -> dict[int, bytes]:
+    """Every event of a robot that is read, checked against what was written."""
+    try:
+        events, named = read_with_gaps(log)
+    except LogError:
+        return {}
+    offsets = [event.offset for event in events]
+    assert offsets == sorted(set(offsets))
+    assert not named & set(offsets)
+    found = {event.offset: event.payload for event in events if event.key == KEY}
+    assert all(found[o] in (LATER, PAYLOADS[o] if o < EVENTS else LATER) for o in found)
+    return found
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_nothing_is_made_up_and_nothing_that_can_be_read_is_lost(
+    whole: Path, quick_path: Path, seed: int
+) -> None:
+    log = quick_path / "log"
+    shutil.copytree(whole, log)
+    maul(log, random.Random(seed))
+    before = readable(log).items()
+    verify_log(log)
+    with contextlib.suppress(LogError), LogWriter(log, fsync=ALWAYS) as writer:
+        writer.append(KEY, LATER)
+    assert before <= readable(log).items()
+    recover_log(log)
+    assert before <= readable(log).items()
+    events = read_log(log)
+    assert [event.offset for event in events] == list(range(len(events)))
+    assert {event.key for event in events} <= {KEY, LOSS_KEY}
+    assert {f.kind for f in verify_log(log).findings} <= {"loss", "time", "duplicate"}
+    assert recover_log(log).segments == ()
