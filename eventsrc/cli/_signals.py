@@ -11,6 +11,22 @@ from typing import Final, Self
 _STOPPING: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
+_LOOK_S: Final = 0.25
+
+
+class _Stop(threading.Event):
+    """Waits in pieces. Python runs a signal's handler in the main thread, between two steps of it;
+    a signal that another thread gets, or that comes just before the wait, does not end the wait.
+    """
+
+    def wait(self, timeout: float | None = None) -> bool:
+        if timeout is not None:
+            return super().wait(timeout)
+        while not super().wait(_LOOK_S):
+            pass
+        return True
+
+
 @contextlib.contextmanager
 def stop_on_signals() -> Iterator[threading.Event]:
     """An event that SIGINT, SIGTERM and SIGHUP set, so that the command can finish its work. SIGHUP
@@ -19,7 +35,7 @@ def stop_on_signals() -> Iterator[threading.Event]:
     After the first signal all have their usual effect again: a second Ctrl-C ends a command that
     does not end. For the main thread only, as Python's signals are.
     """
-    stop = threading.Event()
+    stop = _Stop()
     usual = {number: signal.getsignal(number) for number in _STOPPING}
     if usual[signal.SIGHUP] == signal.SIG_IGN:
         del usual[signal.SIGHUP]

@@ -1,12 +1,15 @@
 """`mapfold router` in a process of its own."""
 
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 
 import pytest
 
 from eventsrc._zenoh import ZenohOptions, open_session
-from tests.fixtures_zenoh import Program
+from tests.docs.console import ROOT
+from tests.fixtures_zenoh import DEADLINE_S, Program
 
 Start = Callable[..., Program]
 
@@ -19,6 +22,28 @@ def test_it_says_where_it_listens_and_ends_cleanly(start: Start, number: int) ->
         assert session.linked
     assert program.end(number) == 0
     assert program.lines[-1] == "router ended"
+
+
+_SIGNAL_IN_ANOTHER_THREAD = """
+import signal, threading
+from eventsrc.cli._signals import stop_on_signals
+
+def hit(stop):
+    while not stop._cond._waiters:
+        pass
+    signal.pthread_kill(threading.get_ident(), signal.SIGTERM)
+    threading.Event().wait()
+
+with stop_on_signals() as stop:
+    threading.Thread(target=hit, args=(stop,), daemon=True).start()
+    stop.wait()
+"""
+
+
+def test_a_signal_that_another_thread_gets_is_not_waited_past() -> None:
+    """Zenoh has threads of its own, and a signal may come just before the wait for it."""
+    command = [sys.executable, "-c", _SIGNAL_IN_ANOTHER_THREAD]
+    assert subprocess.run(command, timeout=DEADLINE_S, cwd=ROOT, check=False).returncode == 0
 
 
 def test_a_busy_port_is_one_line_and_exit_1(start: Start, endpoint: str) -> None:
