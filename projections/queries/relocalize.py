@@ -80,7 +80,8 @@ def prepare_vectors(connection: Connection) -> None:
         register_vector(connection)
     except psycopg.ProgrammingError:
         raise ExtensionMissing(
-            f"{place_of(connection)}: the extension vector is not created there; run mapfold replay"
+            f"{place_of(connection)}: nothing has been projected there yet, not even the extension"
+            " vector is created; run mapfold replay"
         ) from None
     connection.execute("SELECT '[1]'::vector")  # loads the library, whose settings come next
     connection.execute(sql.SQL("SET hnsw.ef_search = {}").format(sql.Literal(_EF_SEARCH)))

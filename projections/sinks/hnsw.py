@@ -14,6 +14,7 @@ from typing import Final
 
 from psycopg import sql
 
+from eventsrc.words import counted
 from projections.postgres.connect import Connection, extension_version
 
 from ._sql import statements
@@ -41,16 +42,17 @@ def build_hnsw(connection: Connection, *, threshold: int = EXACT_ROWS) -> HnswRe
     row = connection.execute(statements("vectors")["shape"]).fetchone()
     rows, dimension = (0, 0) if row is None else (int(row[0]), int(row[1]))
     if rows < threshold:
-        return HnswReport(False, f"{rows} rows are searched exactly (index from {threshold})")
+        searched = f"{counted(rows, 'row')} {'is' if rows == 1 else 'are'} searched exactly"
+        return HnswReport(False, f"{searched} (index from {threshold:,})")
     if dimension > INDEX_DIMENSION:
-        return HnswReport(False, f"{dimension} dimensions are beyond HNSW's {INDEX_DIMENSION}")
+        return HnswReport(False, f"{dimension:,} dimensions are beyond HNSW's {INDEX_DIMENSION}")
     started = time.monotonic()
     schema = connection.execute(statements("vectors")["extension_schema"]).fetchone()
     opclass = sql.Identifier(str(schema[0]) if schema else "public", "vector_cosine_ops")
     with connection.transaction():
         _prepare(connection, rows, dimension)
         connection.execute(statements("vectors")["hnsw"].format(opclass=opclass))
-    return HnswReport(True, f"HNSW index over {rows} rows", time.monotonic() - started)
+    return HnswReport(True, f"HNSW index over {counted(rows, 'row')}", time.monotonic() - started)
 
 
 def _prepare(connection: Connection, rows: int, dimension: int) -> None:

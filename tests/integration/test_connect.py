@@ -12,6 +12,7 @@ import pytest
 from eventsrc.errors import MisuseError
 from projections.errors import DatabaseUnavailable, ExtensionMissing
 from projections.postgres.connect import (
+    Targets,
     connect,
     connect_for_cypher,
     ensure_extension,
@@ -19,6 +20,7 @@ from projections.postgres.connect import (
     place,
 )
 from projections.postgres.embedded import EmbeddedServer
+from projections.queries.relocalize import Reader
 
 
 @pytest.fixture(autouse=True)
@@ -174,6 +176,11 @@ def test_cypher_without_being_superuser(pg: psycopg.Connection, ordinary_url: st
 def test_cypher_without_the_extension(bare_pg_url: str) -> None:
     with pytest.raises(ExtensionMissing, match="age is not created there"):
         connect_for_cypher(bare_pg_url)
+
+
+def test_a_question_to_a_database_that_nothing_was_ever_projected_into(bare_pg_url: str) -> None:
+    with pytest.raises(ExtensionMissing, match="nothing has been projected .*; run mapfold replay"):
+        Reader(Targets(bare_pg_url, bare_pg_url))
 
 
 def test_place_names_no_password() -> None:

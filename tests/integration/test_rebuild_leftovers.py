@@ -108,3 +108,4 @@ def test_what_fails_after_the_swap_does_not_sound_as_if_the_old_map_were_served(
     report = rebuild(log, one_database, SETTINGS)
     assert report.hnsw is not None
     assert report.hnsw.built
+    assert report.hnsw.reason == f"HNSW index over {report.rows['detection_embeddings']} rows"
