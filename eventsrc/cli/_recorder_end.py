@@ -60,8 +60,9 @@ def lost_in_queue(report: RecorderReport) -> str:
 def summary(log: Path, report: RecorderReport) -> str:
     """The last line for people."""
     return (
-        f"{log}: {report.recorded} recorded, {report.rejected} rejected, {report.lost} lost, "
-        f"{report.missing} keyframes missing; {report.next_offset} events in the log"
+        f"{log}: {report.recorded:,} recorded, {report.rejected:,} rejected, {report.lost:,} lost, "
+        f"{counted(report.missing, 'keyframe')} missing; "
+        f"{counted(report.next_offset, 'event')} in the log"
     )
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from eventsrc.errors import LogDamaged, LogError, NotALog
+from eventsrc.words import counted
 
 from ._check import check_sealed
 from ._head import head_of
@@ -127,7 +128,7 @@ class _Verifier:
 
     def _check_end(self, name: str, scan: Scan) -> None:
         if scan.lost_bytes and not scan.gaps and not self._live:
-            text = f"{scan.lost_bytes} bytes at its end were being written when the writer died"
+            text = f"{counted(scan.lost_bytes, 'byte')} at its end: the writer died while writing"
             self._add("torn", text, name, count=scan.torn_events)
 
     def _look_at_events(self, segment: SegmentPath, scan: Scan) -> None:

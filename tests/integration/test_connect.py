@@ -179,7 +179,7 @@ def test_cypher_without_the_extension(bare_pg_url: str) -> None:
 
 
 def test_a_question_to_a_database_that_nothing_was_ever_projected_into(bare_pg_url: str) -> None:
-    with pytest.raises(ExtensionMissing, match="nothing has been projected .*; run mapfold replay"):
+    with pytest.raises(ExtensionMissing, match=r"nothing has been projected .*; run mapfold"):
         Reader(Targets(bare_pg_url, bare_pg_url))
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 from pathlib import Path
 
+from eventsrc.cli._recorder_end import summary
 from eventsrc.cli._recorder_line import RecorderLine
 from eventsrc.recorder import RecorderReport
 
@@ -68,3 +69,10 @@ def test_clean_means_that_this_recorder_lost_nothing() -> None:
     assert dataclasses.replace(NOTHING, missing=4, missing_before=4).clean
     for name in ("rejected", "queue_full", "transport_missed", "unwritten", "missing"):
         assert not dataclasses.replace(NOTHING, **{name: 1}).clean, name
+
+
+def test_the_last_line_counts_as_people_do() -> None:
+    report = dataclasses.replace(NOTHING, recorded=1_234, missing=1, next_offset=1)
+    assert summary(Path("L"), report) == (
+        "L: 1,234 recorded, 0 rejected, 0 lost, 1 keyframe missing; 1 event in the log"
+    )
