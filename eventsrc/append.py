@@ -7,7 +7,7 @@ in silence.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import TypeAlias
 
 from eventsrc.envelope import ENVELOPE_VERSION, Envelope
 from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES, Rejected
@@ -15,12 +15,8 @@ from eventsrc.log import LogWriter, NewEvent
 from eventsrc.system_events import REJECTED_KEY, RejectedPayload, is_system_key
 from eventsrc.upcast import Arrival, check_envelopes, guess_version
 
-
-class Judged(NamedTuple):
-    """What gets into the log for one payload, and what the door said to it."""
-
-    event: NewEvent
-    verdict: Envelope | Rejected
+Judged: TypeAlias = tuple[NewEvent, Envelope | Rejected]
+"""What gets into the log for one payload, and what the door said to it."""
 
 
 def append_payload(
@@ -35,9 +31,10 @@ def append_payload(
 
     ``logged_ns`` is when it was received, if that was earlier and elsewhere; otherwise now.
     """
-    (judged,) = judge_payloads(writer, [(key, payload)], logged_ns=logged_ns, max_bytes=max_bytes)
-    writer.append_all([judged.event])
-    return judged.verdict
+    messages = [(key, payload)]
+    ((event, verdict),) = judge_payloads(writer, messages, logged_ns=logged_ns, max_bytes=max_bytes)
+    writer.append_all([event])
+    return verdict
 
 
 def judge_payloads(
@@ -58,7 +55,7 @@ def judge_payloads(
         for offset, (key, payload) in enumerate(messages, writer.next_offset)
     ]
     verdicts = _judge(arrivals, max_bytes)
-    return [Judged(_event(*both), both[1]) for both in zip(arrivals, verdicts, strict=True)]
+    return list(zip(map(_event, arrivals, verdicts), verdicts, strict=True))
 
 
 def _event(arrival: Arrival, verdict: Envelope | Rejected) -> NewEvent:

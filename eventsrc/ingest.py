@@ -7,14 +7,14 @@ the ``mapfold/rejected`` channel.
 
 import binascii
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 from typing import cast
 
 import numpy as np
 import pybase64
 from numpy.typing import NDArray
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from .envelope import Detection, Envelope, fault
 from .frozen import frozen
@@ -24,6 +24,8 @@ DEFAULT_MAX_PAYLOAD_BYTES = 16 * 1024 * 1024
 
 Vector = NDArray[np.float32]
 _FLOAT32 = np.dtype("<f4")
+_validate_json: Callable[[bytes], Envelope] = TypeAdapter(Envelope).validator.validate_json
+"""``Envelope.model_validate_json`` without the layer of Python around it, a twentieth of it."""
 
 
 @frozen
@@ -87,7 +89,7 @@ def _read(payload: bytes, max_bytes: int) -> Envelope | Rejected:
     if len(payload) > max_bytes:
         return Rejected(f"payload of {len(payload)} bytes is over the limit of {max_bytes}")
     try:
-        return Envelope.model_validate_json(payload)
+        return _validate_json(payload)
     except ValidationError as error:
         return Rejected(_first_error(error))
     except RecursionError:  # nesting deeper than the parser follows
@@ -124,12 +126,15 @@ def _first_error(error: ValidationError) -> str:
 
 
 def _check_det_ids(said: Envelope | Rejected) -> Envelope | Rejected:
-    if isinstance(said, Rejected) or not any(d.det_id is not None for d in said.detections):
-        return said  # the ids that mapfold gives differ from one another
-    try:
-        _det_ids(said)
-    except _RefusalError as refusal:
-        return Rejected(str(refusal))
+    if isinstance(said, Rejected):
+        return said
+    for detection in said.detections:
+        if detection.det_id is not None:  # the ids that mapfold gives differ from one another
+            try:
+                _det_ids(said)
+            except _RefusalError as refusal:
+                return Rejected(str(refusal))
+            break
     return said
 
 

@@ -82,7 +82,7 @@ class Inbox:
                 self._taking = False
             count = min(limit, len(self._messages))
             taken = [self._messages.popleft() for _ in range(count)]
-            self._bytes -= sum(len(message.payload) for message in taken)
+            self._bytes -= sum([len(message.payload) for message in taken])  # quicker as a list
             self._patient = self._patient or 2 * len(self._messages) <= self.size
             if self._putting:
                 self._emptied.notify_all()

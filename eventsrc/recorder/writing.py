@@ -157,15 +157,18 @@ class Writing:
         if not waiting or waiting[0].offset >= durable:
             return
         now_ns = time.monotonic_ns()
-        answers = Answers()
+        answers, ledger, synced = Answers(), self._ledger, self._synced
+        rejected, before = 0, len(waiting)
         while waiting and waiting[0].offset < durable:
             event = waiting.popleft()
-            self._recorded += event.refusal is None
-            self._rejected += event.refusal is not None
-            if event.run_id is not None:
-                self._ledger.record(event.run_id, event.keyframe_id, now_ns)
-                self._synced.record(event.run_id, event.keyframe_id, now_ns)
+            rejected += event.refusal is not None
+            run_id, keyframe_id = event.run_id, event.keyframe_id
+            if run_id is not None:
+                ledger.record(run_id, keyframe_id, now_ns)
+                synced.record(run_id, keyframe_id, now_ns)
             answers.note(event)
+        self._rejected += rejected
+        self._recorded += before - len(waiting) - rejected
         for key, payload in answers.messages(self._writer.log_id, self._synced):
             self._answer(key, payload)
 
