@@ -3,11 +3,9 @@
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -18,7 +16,7 @@ import psycopg
 import pytest
 
 from projections.errors import DatabaseError, DatabaseUnavailable
-from projections.postgres.connect import Targets, connect, ensure_extension, place
+from projections.postgres.connect import Targets, connect, place
 from projections.postgres.embedded import EmbeddedServer
 from projections.runner import RebuildProgress, rebuild
 from projections.settings import Settings
@@ -26,6 +24,7 @@ from projections.sinks.loader import CopyLoader, Load, TypeName
 from projections.sinks.vectors import VectorSink
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows
+from tests.servers import server_to_kill
 
 SETTINGS = Settings()
 WAIT_S = 240.0
@@ -34,18 +33,8 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture
 def own_server() -> Iterator[EmbeddedServer]:
-    """A server that a test may kill."""
-    home = Path(tempfile.mkdtemp(prefix="mapfold-test-kill-"))
-    server = EmbeddedServer(home)
-    try:
-        with server, connect(server.url, autocommit=True) as connection:
-            ensure_extension(connection, "age")
-            ensure_extension(connection, "vector")
-            connection.close()
-            yield server
-    finally:
-        server.stop()
-        shutil.rmtree(home, ignore_errors=True)
+    with server_to_kill() as server:
+        yield server
 
 
 @pytest.fixture

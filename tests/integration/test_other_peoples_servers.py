@@ -142,7 +142,8 @@ def test_a_peer_that_went_without_a_word_is_missed_within_a_minute(
     with server_to_kill(), connect(f"postgresql://postgres@{HOST}/postgres") as connection:
         settle(connection)
         for name, wanted in KEEPALIVES.items():
-            assert connection.execute(f"SHOW tcp_{name}").fetchone() == (wanted,)  # type: ignore[arg-type]
+            row = connection.execute("SELECT current_setting(%s)", [f"tcp_{name}"]).fetchone()
+            assert row == (wanted,)
             assert connection.info.get_parameters()[name] == wanted
         assert connection.info.get_parameters()["tcp_user_timeout"] == "50000"
     with connect(f"{pg_url}{'&' if '?' in pg_url else '?'}keepalives_idle=7") as connection:
@@ -168,7 +169,7 @@ def superuser(owned: str) -> Iterator[psycopg.Connection]:
     found = re.search(r"^    GRANT CREATE ON DATABASE postgres .*\n(    .*\n)+", text, re.MULTILINE)
     assert found is not None
     with psycopg.connect(owned, autocommit=True) as connection:
-        connection.execute(f"CREATE ROLE {OWNER} LOGIN")  # type: ignore[arg-type]
+        connection.execute(sql.SQL("CREATE ROLE {} LOGIN").format(sql.Identifier(OWNER)))
         told = found[0].replace("DATABASE postgres", f"DATABASE {connection.info.dbname}")
         connection.execute(re.sub(r"\bme\b", OWNER, told))  # type: ignore[arg-type]
         yield connection
@@ -195,7 +196,8 @@ def test_a_writer_cannot_change_the_dimension_and_says_who_can(
     log = write_log(tmp_path / "log", [])
     rebuild(log, owner, SETTINGS)
     superuser.execute(roles_sql())  # type: ignore[arg-type]
-    superuser.execute(f"CREATE ROLE {WRITER} LOGIN IN ROLE mapfold_writer")  # type: ignore[arg-type]
+    create = sql.SQL("CREATE ROLE {} LOGIN IN ROLE mapfold_writer")
+    superuser.execute(create.format(sql.Identifier(WRITER)))
     write_log(log, walk(10))
     with pytest.raises(DatabaseError, match=r"8 dimensions, .* for 512, .* mapfold replay"):
         tail(log, writer, SETTINGS, once=True)
