@@ -67,7 +67,7 @@ def _event(arrival: Arrival, verdict: Envelope | Rejected) -> NewEvent:
 
 
 def _rejected(key: str, payload: bytes, reason: str, logged_ns: int) -> NewEvent:
-    record = RejectedPayload.of(key, reason, payload).model_dump_json().encode()
+    record = RejectedPayload.encode(key, reason, payload)
     return NewEvent(REJECTED_KEY, record, logged_ns, logged_ns)
 
 

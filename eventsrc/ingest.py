@@ -8,19 +8,28 @@ the ``mapfold/rejected`` channel.
 import binascii
 import math
 from collections.abc import Callable, Iterator, Sequence
-from itertools import islice
-from typing import cast
+from itertools import chain, islice
+from typing import Any, Final, cast
 
 import numpy as np
 import pybase64
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
+from pydantic_core import from_json
 
-from .envelope import Detection, Envelope, fault
+from .envelope import Detection, Envelope, NotFinite, fault, holds_not_finite
 from .frozen import frozen
 from .ids import DetId, default_det_id
+from .terminal import visible
 
 DEFAULT_MAX_PAYLOAD_BYTES = 16 * 1024 * 1024
+MAX_MARKS = 500_000
+"""Bound of the commas and opening brackets in one payload, as many as it has values: reading JSON
+costs some hundred bytes and a microsecond a value, however short the value."""
+_FEW_MARKS_BYTES: Final = 64 * 1024
+"""Payloads up to here are not counted: they cannot cost much."""
+_QUOTED: Final = 80
+"""How many characters of a value a reason shows."""
 
 Vector = NDArray[np.float32]
 _FLOAT32 = np.dtype("<f4")
@@ -85,13 +94,29 @@ def _detections(read: Sequence[Envelope | Rejected]) -> list[Detection]:
     return [d for said in read if isinstance(said, Envelope) for d in said.detections]
 
 
-def _read(payload: bytes, max_bytes: int) -> Envelope | Rejected:
+def excess(payload: bytes, max_bytes: int) -> Rejected | None:
+    """The refusal of a payload that would cost too much to read, told before it is read."""
     if len(payload) > max_bytes:
         return Rejected(f"payload of {len(payload)} bytes is over the limit of {max_bytes}")
+    if len(payload) > _FEW_MARKS_BYTES:
+        marks = sum(map(payload.count, (b",", b"[", b"{")))
+        if marks > MAX_MARKS:
+            return Rejected(
+                f"payload of {marks:,} commas and opening brackets, more than {MAX_MARKS:,}"
+            )
+    return None
+
+
+def _read(payload: bytes, max_bytes: int) -> Envelope | Rejected:
+    refused = excess(payload, max_bytes)
+    if refused is not None:
+        return refused
     try:
         return _validate_json(payload)
     except ValidationError as error:
-        return Rejected(_first_error(error))
+        return Rejected(_first_error(error, payload))
+    except NotFinite:
+        return Rejected(_not_finite(from_json(payload)))
     except RecursionError:  # nesting deeper than the parser follows
         return Rejected("not JSON that can be read: nested too deeply")
 
@@ -107,22 +132,74 @@ def _admit(said: Envelope | Rejected, vectors: Iterator[Vector] | None) -> Accep
         return Rejected(str(refusal))
 
 
-def _first_error(error: ValidationError) -> str:
-    """One line for the first thing that is wrong, and how many more there are."""
-    details = error.errors(include_url=False, include_context=False)
+def _first_error(error: ValidationError, payload: bytes) -> str:
+    """One line for the first thing that is wrong, and how many more pydantic met before it stopped.
+
+    Pydantic would give the wrong value with each error, the whole envelope for every field that is
+    missing in it; so the one that is shown is looked up instead.
+    """
+    details = error.errors(include_url=False, include_context=False, include_input=False)
     first = details[0]
     if first["type"] == "json_invalid":
         return f"not JSON: {first['msg'].removeprefix('Invalid JSON: ')}"
     if first["type"] == "model_type" and not first["loc"]:
-        return f"not a JSON object but {type(first['input']).__name__}"
-    place = ".".join(str(part) for part in first["loc"]) or "envelope"
-    message = fault(first)
+        return f"not a JSON object but {type(from_json(payload)).__name__}"
     more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
+    place = _place(*first["loc"])
     if first["type"] == "missing":
         return f"{place}: required field is missing{more}"
-    value = repr(first["input"])
-    value = value if len(value) <= 80 else value[:77] + "..."
-    return f"{place}: {message} (got {value}){more}" if first["loc"] else f"{message}{more}"
+    if not first["loc"]:
+        return f"{fault(first)}{more}"
+    value = from_json(payload)
+    for part in first["loc"]:
+        value = value[part]
+    first["input"] = value
+    return f"{place}: {fault(first)} (got {_quoted(value)}){more}"
+
+
+def _not_finite(document: Any) -> str:
+    """The reason for an object with NaN or infinity in a field that an envelope does not know.
+    There may be more that is wrong with it."""
+    of_envelope = (((name,), value) for name, value in document.items() if name != "detections")
+    detections = document.get("detections")
+    of_detections = (
+        (("detections", index, name), value)
+        for index, detection in enumerate(detections if isinstance(detections, list) else ())
+        if isinstance(detection, dict)
+        for name, value in detection.items()
+    )
+    fields: Iterator[tuple[tuple[str | int, ...], Any]] = chain(of_envelope, of_detections)
+    place, value = next(field for field in fields if holds_not_finite(field[1]))
+    return f"{_place(*place)}: holds NaN or infinity (got {_quoted(value)})"
+
+
+def _place(*parts: str | int) -> str:
+    """``detections.3.bbox``, however long or odd a field's name is."""
+    return visible(".".join(str(part)[:_QUOTED] for part in parts))
+
+
+def _quoted(value: Any) -> str:
+    """The beginning of a JSON value as Python writes it, at the cost of no more than that."""
+    text = _beginning(value, _QUOTED)
+    return text if len(text) <= _QUOTED else text[: _QUOTED - 3] + "..."
+
+
+def _beginning(value: Any, room: int) -> str:
+    """``repr(value)``, of which only the first ``room`` characters count."""
+    if isinstance(value, str):
+        return repr(value[: room + 1])
+    if not isinstance(value, list | dict):
+        return repr(value)
+    text = ""
+    for item in value.items() if isinstance(value, dict) else value:
+        if len(text) > room:
+            break
+        text += ", " if text else ""
+        if isinstance(item, tuple):  # a member of an object
+            text += f"{_beginning(item[0], room)}: {_beginning(item[1], room - len(text))}"
+        else:
+            text += _beginning(item, room - len(text))
+    return f"{{{text}}}" if isinstance(value, dict) else f"[{text}]"
 
 
 def _check_det_ids(said: Envelope | Rejected) -> Envelope | Rejected:

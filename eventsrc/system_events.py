@@ -5,9 +5,10 @@
 ``mapfold/command``   what an operator said (kept for later; nothing writes it yet)
 """
 
-import base64
+import json
 from typing import Annotated, Literal
 
+import pybase64
 from pydantic import BaseModel, ConfigDict, Field
 
 RESERVED_PREFIX = "mapfold/"
@@ -32,15 +33,18 @@ class RejectedPayload(_Model):
     reason: str
     payload: str
 
-    @classmethod
-    def of(cls, key: str, reason: str, raw: bytes) -> "RejectedPayload":
-        """Keep ``raw``, which came under ``key`` and was refused for ``reason``."""
-        return cls(key=key, reason=reason, payload=base64.b64encode(raw).decode("ascii"))
+    @staticmethod
+    def encode(key: str, reason: str, raw: bytes) -> bytes:
+        """The JSON that keeps ``raw``, which came under ``key`` and was refused for ``reason``.
+
+        Written from bytes: ``raw`` may be large, and each step over text would be a copy of it."""
+        head = json.dumps({"key": key, "reason": reason}, ensure_ascii=False, separators=(",", ":"))
+        return b"".join((head[:-1].encode(), b',"payload":"', pybase64.b64encode(raw), b'"}'))
 
     @property
     def raw(self) -> bytes:
         """The refused bytes."""
-        return base64.b64decode(self.payload)
+        return pybase64.b64decode(self.payload)
 
 
 class Loss(_Model):

@@ -20,17 +20,25 @@ from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
-from .envelope import ENVELOPE_VERSION, Envelope
+from .envelope import (
+    ENVELOPE_VERSION,
+    MAX_DETECTIONS,
+    Detection,
+    Envelope,
+    holds_not_finite,
+)
 from .ingest import (
     DEFAULT_MAX_PAYLOAD_BYTES,
     Accepted,
     Rejected,
     check_all,
+    excess,
     ingest,
     ingest_all,
 )
 
 BARE_LIST_VERSION = 1
+_DETECTION_FIELDS = tuple(field.alias or name for name, field in Detection.model_fields.items())
 
 
 class Recorded(Protocol):
@@ -70,10 +78,11 @@ def read_envelope(
         return ingest(event.payload, max_bytes=max_bytes)
     if event.version not in LADDER:
         return Rejected(f"envelope version {event.version} is unknown here; upgrade mapfold")
-    if len(event.payload) > max_bytes:
-        return Rejected(f"payload of {len(event.payload)} bytes is over the limit of {max_bytes}")
+    refused = excess(event.payload, max_bytes)
+    if refused is not None:
+        return refused
     try:
-        document = json.loads(event.payload)
+        document = _finite(json.loads(event.payload))
         for version in range(event.version, ENVELOPE_VERSION):
             document = LADDER[version](document, event)
         payload = json.dumps(document).encode()
@@ -109,9 +118,18 @@ def guess_version(payload: bytes) -> int:
     return BARE_LIST_VERSION if b"".join(start).startswith(b"[{") else ENVELOPE_VERSION
 
 
+def _finite(document: Any) -> Any:
+    """The same, where unknown fields that a step leaves out hold no NaN or infinity either."""
+    if holds_not_finite(document):
+        raise ValueError("holds NaN or infinity")
+    return document
+
+
 def _envelope_around_bare_list(document: Any, event: Recorded) -> dict[str, Any]:
     if not isinstance(document, list) or not all(isinstance(d, dict) for d in document):
         raise ValueError("not a list of detections")
+    if len(document) > MAX_DETECTIONS:
+        raise ValueError(f"{len(document)} detections, more than {MAX_DETECTIONS}")
     return {
         "run_id": f"unnamed:{event.key}",
         "keyframe_id": event.offset,
@@ -121,10 +139,12 @@ def _envelope_around_bare_list(document: Any, event: Recorded) -> dict[str, Any]
 
 
 def _class_for_class_name(detection: dict[str, Any]) -> dict[str, Any]:
-    if "class" in detection or "class_name" not in detection:
-        return detection
-    rest = {name: value for name, value in detection.items() if name != "class_name"}
-    return {**rest, "class": detection["class_name"]}
+    """The fields that an envelope knows; the others stay in the log. ``class`` is the only one that
+    was called otherwise."""
+    known = {name: detection[name] for name in _DETECTION_FIELDS if name in detection}
+    if "class" not in detection and "class_name" in detection:
+        known["class"] = detection["class_name"]
+    return known
 
 
 LADDER: Mapping[int, Step] = MappingProxyType({1: _envelope_around_bare_list})

@@ -7,6 +7,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from eventsrc.ingest import Accepted, Rejected, ingest, ingest_all
+from eventsrc.terminal import visible
 from tests.envelopes import detection, envelope, payload
 
 TEXT = st.text(st.characters(exclude_categories=["Cc", "Cs"]), min_size=1, max_size=256)
@@ -29,6 +30,24 @@ def test_any_bytes_are_answered(raw: bytes) -> None:
 def test_any_field_may_hold_any_json(fields: dict[str, Any]) -> None:
     result = ingest(payload({**envelope(), **fields}))
     assert isinstance(result, Accepted) or result.reason
+
+
+NAMES = st.sampled_from(["det_id", "class", "class_name", "confidence", "bbox", "embedding", "x"])
+
+
+@settings(suppress_health_check=[HealthCheck.too_slow])
+@given(
+    st.lists(st.dictionaries(NAMES, JSON, max_size=4) | JSON, max_size=3),
+    st.sets(FIELDS, max_size=2),
+    st.dictionaries(st.text(max_size=3), JSON, max_size=2),
+)
+def test_any_broken_envelope_is_refused_with_a_short_reason(
+    detections: list[Any], missing: set[str], unknown: dict[str, Any]
+) -> None:
+    whole = {**unknown, **envelope(), "detections": [detection(), *detections]}
+    result = ingest(payload({name: v for name, v in whole.items() if name not in missing}))
+    assert isinstance(result, Accepted) or 0 < len(result.reason) < 400
+    assert isinstance(result, Accepted) or result.reason == visible(result.reason)
 
 
 @given(
