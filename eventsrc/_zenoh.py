@@ -12,7 +12,6 @@ What holds behind this door:
   ``RUST_LOG`` asks for it.
 """
 
-import contextlib
 import itertools
 import json
 from collections.abc import Callable, Sequence
@@ -25,20 +24,24 @@ import zenoh
 from ._zenoh_config import Mode, ZenohOptions, configure
 from ._zenoh_ends import (
     Asked,
+    Bound,
     Missed,
     Publisher,
     Received,
     Subscription,
+    check_key_length,
     clear_errors,
+    quietly,
     received,
     subscribe_advanced,
 )
-from ._zenoh_errors import cannot_open, plain
+from ._zenoh_errors import cannot_open, is_panic, plain
 from .endpoints import check_endpoints
 from .errors import MisuseError
 
 __all__ = [
     "Asked",
+    "Bound",
     "Missed",
     "Mode",
     "Publisher",
@@ -69,17 +72,23 @@ class Session:
         key_expr: str,
         handler: Callable[[Received], None],
         on_miss: Callable[[Missed], None] | None = None,
+        at_most: Bound | None = None,
     ) -> Subscription:
         """Call ``handler`` for every message under ``key_expr``, from a thread of Zenoh's.
 
         The handler must only hand over: while it works nothing else is received, and after five
         seconds of that Zenoh gives up links and loses messages without a word. With ``on_miss``
-        gaps in what advanced publishers send are fetched again, and told of if that fails.
+        gaps in what advanced publishers send are fetched again, and told of if that fails. What is
+        larger than ``at_most`` is not copied out of Zenoh.
         """
 
         def receive(sample: zenoh.Sample) -> None:
-            handler(received(sample))
+            if at_most is not None and len(sample.payload) > at_most.size_bytes:
+                at_most.refuse(str(sample.key_expr))
+            else:
+                handler(received(sample))
 
+        check_key_length(key_expr)
         with clear_errors(f"key expression {key_expr!r} cannot be subscribed to"):
             if on_miss is None:
                 return Subscription(self.raw.declare_subscriber(key_expr, receive))
@@ -87,6 +96,7 @@ class Session:
 
     def send(self, key: str, payload: bytes) -> None:
         """Send one message that may be dropped if the network is full; never blocks on it."""
+        check_key_length(key)
         with clear_errors(f"key {key!r}: not sent"):
             self.raw.put(key, payload, congestion_control=zenoh.CongestionControl.DROP)
 
@@ -116,6 +126,7 @@ class Session:
         self, selector: str, payload: bytes | None = None, *, timeout_s: float
     ) -> list[tuple[bool, bytes]]:
         """Like `get`, with the refusals: (True, answer) and (False, error) as they came."""
+        check_key_length(selector)
         with clear_errors(f"selector {selector!r} cannot be asked"):
             return [
                 (True, reply.ok.payload.to_bytes())
@@ -138,7 +149,7 @@ class Session:
 
     def close(self) -> None:
         """Undeclare everything and close. May be called twice."""
-        with contextlib.suppress(zenoh.ZError):
+        with quietly():
             self.raw.close()  # type: ignore[no-untyped-call]
 
     def __enter__(self) -> Self:
@@ -184,8 +195,10 @@ def open_session(options: ZenohOptions, *, mode: Mode) -> Session:
     connect, listen = config.get_json("connect/endpoints"), config.get_json("listen/endpoints")
     try:
         return Session(zenoh.open(config))
-    except zenoh.ZError as error:
-        raise cannot_open(error, json.loads(connect), json.loads(listen)) from None
+    except BaseException as error:
+        if isinstance(error, zenoh.ZError) or is_panic(error):
+            raise cannot_open(error, json.loads(connect), json.loads(listen)) from None
+        raise
 
 
 def _config_from_file(path: Path | None) -> zenoh.Config:

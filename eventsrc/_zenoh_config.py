@@ -14,6 +14,10 @@ from .endpoints import DEFAULT_ENDPOINT, check_endpoints
 Mode = Literal["client", "peer", "router"]
 
 _OPEN_TIMEOUT_MS: Final = 5_000
+_LARGEST_MESSAGE: Final = "transport/link/rx/max_message_size"
+_LARGEST_MESSAGE_BYTES: Final = 512 * 1024 * 1024
+"""What a session puts together of one message; Zenoh drops a larger one. Its own bound is twice."""
+_ZENOH_LARGEST_BYTES: Final = 1024 * 1024 * 1024
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +56,8 @@ def configure(config: Config, options: ZenohOptions, mode: Mode) -> None:
         _set(config, "connect/endpoints", connect)
     if listen or options.config_file is None:
         _set(config, "listen/endpoints", listen)
+    if int(config.get_json(_LARGEST_MESSAGE)) >= _ZENOH_LARGEST_BYTES:  # the file says nothing else
+        _set(config, _LARGEST_MESSAGE, _LARGEST_MESSAGE_BYTES)
     _configure_scouting(config)
     if mode == "peer":  # a router starts before the routers it is linked to; a peer's error counts
         _set(config, "connect/exit_on_failure", True)

@@ -9,10 +9,12 @@ from typing import Any, Final, NamedTuple
 
 import zenoh
 
-from ._zenoh_errors import plain
+from ._zenoh_errors import is_panic, plain
 from .errors import TransportError
 
 _HEARTBEAT_S: Final = 0.5
+_MOST_KEY_BYTES: Final = 16 * 1024
+"""Zenoh panics when a key does not fit one batch of 64 KiB beside what else stands in it."""
 
 
 class Received(NamedTuple):
@@ -21,6 +23,13 @@ class Received(NamedTuple):
 
     key: str
     payload: bytes
+
+
+class Bound(NamedTuple):
+    """Messages over ``size_bytes`` are not taken; ``refuse`` is called with the key of each."""
+
+    size_bytes: int
+    refuse: Callable[[str], None]
 
 
 class Missed(NamedTuple):
@@ -52,7 +61,7 @@ class Asked:
         self._end(lambda: self._query.reply_err(payload))
 
     def _end(self, send: Callable[[], None]) -> None:
-        with contextlib.suppress(zenoh.ZError):  # who asked may be gone: nobody is left to tell
+        with quietly():  # who asked may be gone: nobody is left to tell
             send()
         self._query.drop()  # type: ignore[no-untyped-call]
         self.ended = True
@@ -66,6 +75,7 @@ class Publisher:
     """
 
     def __init__(self, session: zenoh.Session, key: str, *, advanced: bool, cache: int) -> None:
+        check_key_length(key)
         self.key = key
         declare = _declare_advanced if advanced else _declare_plain
         with clear_errors(f"key {key!r} cannot be published to"):
@@ -99,7 +109,7 @@ class Publisher:
 
     def close(self) -> None:
         """Stop publishing under this key."""
-        with contextlib.suppress(zenoh.ZError):
+        with quietly():
             self._sender.undeclare()
             if self._watch is not self._sender:
                 self._watch.undeclare()
@@ -113,7 +123,7 @@ class Subscription:
 
     def close(self) -> None:
         """Stop receiving."""
-        with contextlib.suppress(zenoh.ZError):
+        with quietly():
             for entity in self._declared:
                 entity.undeclare()
 
@@ -172,8 +182,29 @@ def received(sample: zenoh.Sample) -> Received:
 
 @contextlib.contextmanager
 def clear_errors(place: str) -> Iterator[None]:
-    """Whatever Zenoh raises as a TransportError that says ``place``."""
+    """Whatever Zenoh raises as a TransportError that says ``place``. A panic, after which the
+    session may be of no more use, says so."""
     try:
         yield
     except zenoh.ZError as error:
         raise TransportError(f"{place}: {plain(error)}") from None
+    except BaseException as error:
+        if not is_panic(error):
+            raise
+        raise TransportError(f"{place}: Zenoh failed inside: {plain(error)}") from None
+
+
+@contextlib.contextmanager
+def quietly() -> Iterator[None]:
+    """Ending something whatever Zenoh raises: what is told nobody can act on."""
+    with contextlib.suppress(TransportError), clear_errors("ending"):
+        yield
+
+
+def check_key_length(key: str) -> None:
+    """TransportError for a key that Zenoh would fail inside on, and the session with it."""
+    size = len(key.encode())
+    if size > _MOST_KEY_BYTES:
+        raise TransportError(
+            f"key {key[:80]!r}…: {size:,} bytes are more than {_MOST_KEY_BYTES:,}; choose a shorter"
+        )

@@ -10,9 +10,10 @@ from collections.abc import Sequence
 from typing import TypeAlias
 
 from eventsrc.envelope import ENVELOPE_VERSION, Envelope
-from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES, Rejected
+from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES, Rejected, quoted
+from eventsrc.keys import fault_in_log
 from eventsrc.log import LogWriter, NewEvent
-from eventsrc.system_events import REJECTED_KEY, RejectedPayload, is_system_key
+from eventsrc.system_events import REJECTED_KEY, RejectedPayload
 from eventsrc.upcast import Arrival, check_envelopes, guess_version
 
 Judged: TypeAlias = tuple[NewEvent, Envelope | Rejected]
@@ -67,15 +68,16 @@ def _event(arrival: Arrival, verdict: Envelope | Rejected) -> NewEvent:
 
 
 def _rejected(key: str, payload: bytes, reason: str, logged_ns: int) -> NewEvent:
-    record = RejectedPayload.encode(key, reason, payload)
+    named = key.encode(errors="backslashreplace").decode()  # half a surrogate pair is no UTF-8
+    record = RejectedPayload.encode(named, reason, payload)
     return NewEvent(REJECTED_KEY, record, logged_ns, logged_ns)
 
 
 def _judge(arrivals: Sequence[Arrival], max_bytes: int) -> list[Envelope | Rejected]:
-    """What the door says, but for keys that nobody may send under."""
+    """What the door says, but for keys that a log does not keep envelopes under."""
     verdicts = check_envelopes(arrivals, max_bytes=max_bytes)
     for index, arrival in enumerate(arrivals):
-        if is_system_key(arrival.key):
-            reason = f"key {arrival.key!r} is reserved for mapfold's own events"
-            verdicts[index] = Rejected(reason)
+        fault = fault_in_log(arrival.key)
+        if fault is not None:
+            verdicts[index] = Rejected(f"key {quoted(arrival.key)} {fault}")
     return verdicts

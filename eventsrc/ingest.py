@@ -154,7 +154,7 @@ def _first_error(error: ValidationError, payload: bytes) -> str:
     for part in first["loc"]:
         value = value[part]
     first["input"] = value
-    return f"{place}: {fault(first)} (got {_quoted(value)}){more}"
+    return f"{place}: {fault(first)} (got {quoted(value)}){more}"
 
 
 def _not_finite(document: Any) -> str:
@@ -170,7 +170,7 @@ def _not_finite(document: Any) -> str:
     )
     fields: Iterator[tuple[tuple[str | int, ...], Any]] = chain(of_envelope, of_detections)
     place, value = next(field for field in fields if holds_not_finite(field[1]))
-    return f"{_place(*place)}: holds NaN or infinity (got {_quoted(value)})"
+    return f"{_place(*place)}: holds NaN or infinity (got {quoted(value)})"
 
 
 def _place(*parts: str | int) -> str:
@@ -178,7 +178,7 @@ def _place(*parts: str | int) -> str:
     return visible(".".join(str(part)[:_QUOTED] for part in parts))
 
 
-def _quoted(value: Any) -> str:
+def quoted(value: Any) -> str:
     """The beginning of a JSON value as Python writes it, at the cost of no more than that."""
     text = _beginning(value, _QUOTED)
     return text if len(text) <= _QUOTED else text[: _QUOTED - 3] + "..."

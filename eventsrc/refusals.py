@@ -14,12 +14,17 @@ from urllib.parse import quote
 from pydantic import BaseModel, ConfigDict, Field
 
 from .acks import ACK_PREFIX
+from .keys import MAX_KEY_BYTES
 
 _PREFIX: Final = f"{ACK_PREFIX}refused/"
 
 
 def refusal_key(key: str) -> str:
-    """The key of the refusals of what came under ``key``."""
+    """The key of the refusals of what came under ``key``. One that is too long for an envelope is
+    named by its digest behind a ``=``, which `quote` leaves in nothing; else it would be longer."""
+    raw = key.encode()
+    if len(raw) > MAX_KEY_BYTES:
+        return f"{_PREFIX}={hashlib.sha256(raw).hexdigest()}"
     return _PREFIX + quote(key, safe="")
 
 

@@ -38,7 +38,7 @@ class RejectedPayload(_Model):
         """The JSON that keeps ``raw``, which came under ``key`` and was refused for ``reason``.
 
         Written from bytes: ``raw`` may be large, and each step over text would be a copy of it."""
-        head = json.dumps({"key": key, "reason": reason}, ensure_ascii=False, separators=(",", ":"))
+        head = json.dumps({"key": key, "reason": reason}, separators=(",", ":"))
         return b"".join((head[:-1].encode(), b',"payload":"', pybase64.b64encode(raw), b'"}'))
 
     @property
@@ -51,7 +51,7 @@ class Loss(_Model):
     """The content of a ``mapfold/loss`` event.
 
     ``publisher`` names who it was lost from: a run id (cause ``keyframe_gap``), a Zenoh source id
-    (``transport_miss``), the key expression (``queue_full``), or ``log`` where a recovered log
+    (``transport_miss``), the key (``queue_full``, ``too_large``), or ``log`` where a recovered log
     lacks the event of this very offset (``rot``). ``first`` and ``last`` are the first and last
     missing number in that publisher's own counting, None where nothing was counted.
     """
@@ -60,4 +60,4 @@ class Loss(_Model):
     first: int | None = None
     last: int | None = None
     count: Annotated[int, Field(ge=1)]
-    cause: Literal["keyframe_gap", "queue_full", "transport_miss", "rot"]
+    cause: Literal["keyframe_gap", "queue_full", "too_large", "transport_miss", "rot"]

@@ -72,6 +72,7 @@ def as_json(report: RecorderReport) -> dict[str, int | str | None]:
         "recorded": report.recorded,
         "rejected": report.rejected,
         "queue_full": report.queue_full,
+        "too_large": report.too_large,
         "transport_missed": report.transport_missed,
         "unwritten": report.unwritten,
         "missing": report.missing,

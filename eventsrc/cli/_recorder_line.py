@@ -43,11 +43,12 @@ class RecorderLine:
     def complaints(self, report: RecorderReport) -> list[str]:
         """A line for whatever has grown since the call before."""
         lines = []
-        lost = report.queue_full + report.transport_missed
+        lost = report.queue_full + report.too_large + report.transport_missed
         if lost > self._lost:
             lines.append(
                 f"LOST {lost - self._lost} messages ({report.queue_full} in a full queue, "
-                f"{report.transport_missed} on the way, in all); see mapfold/loss in {self._log}"
+                f"{report.too_large} too large, {report.transport_missed} on the way, in all); "
+                f"see mapfold/loss in {self._log}"
             )
         if report.rejected > self._rejected:
             lines.append(

@@ -70,6 +70,11 @@ class ActiveSegment:
         """Events taken and not committed."""
         return self.next_offset - self.committed
 
+    @property
+    def channels(self) -> int:
+        """How many keys, each of one version, it has so far."""
+        return self._group.channels
+
     def take(self, events: Sequence[NewEvent], start: int) -> int:
         """Take events from index ``start`` on until a commit is needed; how many were taken."""
         self._check()

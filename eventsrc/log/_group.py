@@ -71,6 +71,11 @@ class GroupBuilder:
         """Events taken and not cut."""
         return self.next_offset - self._first
 
+    @property
+    def channels(self) -> int:
+        """Keys, each of one version, that were taken so far."""
+        return len(self._channels)
+
     def take(self, events: Sequence[NewEvent], start: int) -> int:
         """Take events from index ``start`` on until the group is full; how many were taken."""
         if not self._parts:

@@ -30,6 +30,9 @@ from .fsync import GROUP_COMMIT, FsyncPolicy, make_directory_durably, unlink_qui
 ROTATE_BYTES = 64 * 1024 * 1024
 ROTATE_EVENTS = 1_000_000
 ROTATE_SECONDS = 3600.0
+ROTATE_CHANNELS = 4_096
+"""A segment keeps the names of its channels in memory and writes them once more when it is sealed,
+and MCAP counts no more than 65,535 of them. Whoever invents keys gets more segments."""
 _MAX_NS = 2**63
 
 
@@ -174,6 +177,7 @@ class LogWriter:
         events = active.committed - active.base
         return events > 0 and (
             active.size >= self._rotate_bytes
+            or active.channels >= ROTATE_CHANNELS
             or events >= self._rotate_events
             or time.monotonic_ns() - self._begun >= self._rotate_ns
         )

@@ -13,11 +13,18 @@ from collections import deque
 from typing import Final
 
 from eventsrc._zenoh import Missed, Received
+from eventsrc.keys import MAX_KEY_BYTES
 
 DEFAULT_QUEUE_SIZE: Final = 16_384
 """Messages. At 9 kB each about 150 MB, and two seconds of 8,000 a second."""
-DEFAULT_QUEUE_BYTES: Final = 512 * 1024 * 1024
+DEFAULT_QUEUE_BYTES: Final = 160 * 1024 * 1024
 """Payload bytes, so that a queue of large messages does not take all memory."""
+TAKE_BYTES: Final = 16 * 1024 * 1024
+"""Payload bytes after which `Inbox.take` takes no further message: what is taken makes room."""
+MOST_KEYS: Final = 1_000
+"""How many keys losses are counted for, each by itself, before the writer fetches the counts."""
+OTHER_KEYS: Final = "**"
+"""What the losses of all further keys, and of very long ones, are counted under."""
 PATIENCE_S: Final = 1.0
 """How long a message may wait for room. Longer than a sync takes, far shorter than five seconds."""
 
@@ -43,11 +50,14 @@ class Inbox:
         self._bytes = 0
         self._messages: deque[Received] = deque()
         self._overflow: dict[str, int] = {}
+        self._too_large: dict[str, int] = {}
         self._missed: dict[str, int] = {}
         self.overflowed = 0
         """Messages that did not fit, since the beginning."""
         self.missed = 0
         """Messages that Zenoh says never came, since the beginning."""
+        self.too_large = 0
+        """Messages that were too large to be taken from Zenoh, since the beginning."""
         self._lock = threading.Lock()
         self._filled = threading.Condition(self._lock)
         self._emptied = threading.Condition(self._lock)
@@ -63,7 +73,7 @@ class Inbox:
                 self._bytes += len(message.payload)
             else:
                 self.overflowed += 1
-                self._overflow[message.key] = self._overflow.get(message.key, 0) + 1
+                _count(self._overflow, message.key)
             if self._taking:
                 self._filled.notify()
 
@@ -73,16 +83,27 @@ class Inbox:
             self.missed += missed.missed
             self._missed[missed.source] = self._missed.get(missed.source, 0) + missed.missed
 
+    def refuse(self, key: str) -> None:
+        """Count a message that is too large to be taken from Zenoh."""
+        with self._lock:
+            self.too_large += 1
+            _count(self._too_large, key)
+
     def take(self, limit: int, timeout_s: float) -> list[Received]:
-        """Up to ``limit`` messages in order; empty when none came in time or it is closed."""
+        """Up to ``limit`` messages in order, fewer if they are large; empty when none came in time
+        or it is closed."""
         with self._lock:
             if not self._messages and not self._closed and timeout_s > 0:
                 self._taking = True
                 self._filled.wait(timeout_s)
                 self._taking = False
-            count = min(limit, len(self._messages))
-            taken = [self._messages.popleft() for _ in range(count)]
-            self._bytes -= sum([len(message.payload) for message in taken])  # quicker as a list
+            taken: list[Received] = []
+            size = 0
+            while self._messages and len(taken) < limit and size < TAKE_BYTES:
+                message = self._messages.popleft()
+                taken.append(message)
+                size += len(message.payload)
+            self._bytes -= size
             self._patient = self._patient or 2 * len(self._messages) <= self.size
             if self._putting:
                 self._emptied.notify_all()
@@ -93,6 +114,12 @@ class Inbox:
         with self._lock:
             overflow, self._overflow = self._overflow, {}
             return overflow
+
+    def take_too_large(self) -> dict[str, int]:
+        """How many messages were too large since the last call, by key."""
+        with self._lock:
+            too_large, self._too_large = self._too_large, {}
+            return too_large
 
     def take_missed(self) -> dict[str, int]:
         """How many messages Zenoh missed since the last call, by publisher."""
@@ -133,3 +160,9 @@ class Inbox:
         if not fits:
             self._patient = False
         return fits
+
+
+def _count(counts: dict[str, int], key: str) -> None:
+    if key not in counts and (len(counts) >= MOST_KEYS or len(key) > MAX_KEY_BYTES):
+        key = OTHER_KEYS
+    counts[key] = counts.get(key, 0) + 1

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Final
 
-from eventsrc._zenoh import Received, Session, check_keys
+from eventsrc._zenoh import Bound, Received, Session, check_keys
 from eventsrc.acks import ACK_PREFIX
 from eventsrc.errors import TransportError
 from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES
@@ -17,6 +17,9 @@ from .report import RecorderReport
 from .writing import Writing
 
 DEFAULT_KEYS: Final = ("tb/detections",)
+_TAKEN_WHOLE: Final = 2
+"""A message of up to so many times the size limit is rejected and kept. A larger one is lost, and
+said to be: it would be in memory several times over before it is on the disk."""
 
 
 class Recorder:
@@ -52,8 +55,10 @@ class Recorder:
             report_gaps=report_gaps,
             max_payload_bytes=max_payload_bytes,
         )
+        at_most = Bound(_TAKEN_WHOLE * max_payload_bytes, self._refuse)
         self._subscriptions = [
-            session.subscribe(key, self._receive, on_miss=self._inbox.miss) for key in keys
+            session.subscribe(key, self._receive, on_miss=self._inbox.miss, at_most=at_most)
+            for key in keys
         ]
         session.confirm()
 
@@ -103,6 +108,10 @@ class Recorder:
         # Under `**` a recorder hears acks and refusals, its own too. They are answers, not data.
         if not message.key.startswith(ACK_PREFIX):
             self._inbox.put(message)
+
+    def _refuse(self, key: str) -> None:
+        if not key.startswith(ACK_PREFIX):
+            self._inbox.refuse(key)
 
     def _answer(self, key: str, payload: bytes) -> None:
         try:

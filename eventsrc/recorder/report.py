@@ -8,14 +8,14 @@ class RecorderReport:
     """Counted since this recorder began, but for what the log lacks, its end and the queue.
 
     ``recorded`` are envelopes that are synced, ``rejected`` payloads that are kept under
-    ``mapfold/rejected``. ``queue_full`` and ``transport_missed`` are messages that were sent and
-    are not in the log. ``missing`` are the keyframes that the log's runs lack now, whatever the
-    cause and whichever recorder lost them, and ``missing_before`` were lacking when this one
-    began; a message lost in the queue is usually missing as well. ``unwritten`` are messages that
-    were received and not written, because the log could not be written any more: if the next start
-    finds some of them on the disk all the same, the better. ``unsealed`` segments are finished and
-    wait to be sealed, ``sealing_error`` says why if that fails; it costs room on the disk and loses
-    nothing.
+    ``mapfold/rejected``. ``queue_full``, ``too_large`` and ``transport_missed`` are messages that
+    were sent and are not in the log. ``missing`` are the keyframes that the log's runs lack now,
+    whatever the cause and whichever recorder lost them, and ``missing_before`` were lacking when
+    this one began; a message lost in the queue is usually missing as well. ``unwritten`` are
+    messages that were received and not written, because the log could not be written any more: if
+    the next start finds some of them on the disk all the same, the better. ``unsealed`` segments
+    are finished and wait to be sealed, ``sealing_error`` says why if that fails; it costs room on
+    the disk and loses nothing.
     """
 
     recorded: int
@@ -27,6 +27,7 @@ class RecorderReport:
     queue_depth: int
     queue_size: int
     next_offset: int
+    too_large: int = 0
     unwritten: int = 0
     unsealed: int = 0
     sealing_error: str | None = None
@@ -34,7 +35,7 @@ class RecorderReport:
     @property
     def lost(self) -> int:
         """Messages that were sent and are not in the log."""
-        return self.queue_full + self.transport_missed + self.unwritten
+        return self.queue_full + self.too_large + self.transport_missed + self.unwritten
 
     @property
     def clean(self) -> bool:

@@ -15,7 +15,7 @@
 import itertools
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final, Literal
 
 from eventsrc._zenoh import Received
@@ -32,11 +32,13 @@ from .report import RecorderReport
 
 Answer = Callable[[str, bytes], None]
 """Sends a payload under a key."""
-Cause = Literal["queue_full", "transport_miss"]
+Cause = Literal["queue_full", "too_large", "transport_miss"]
 
 _BATCH: Final = 256
 _TOGETHER: Final = 16
 """How many are checked at a time: enough to save time, few enough to stay in the cache."""
+_TOGETHER_BYTES: Final = 1024 * 1024
+"""After how many bytes fewer are checked at a time: what is read of them is held together."""
 _IDLE_S: Final = 0.25
 _UNSYNCED_S: Final = 0.005
 """How long to wait for more while a group commit is due: a tenth of the default group."""
@@ -102,6 +104,7 @@ class Writing:
             recorded=self._recorded,
             rejected=self._rejected,
             queue_full=self._inbox.overflowed,
+            too_large=self._inbox.too_large,
             transport_missed=self._inbox.missed,
             missing=self._missing,
             missing_before=self._missing_before,
@@ -126,8 +129,8 @@ class Writing:
         self._writer.hurry(2 * self._inbox.depth() >= self._inbox.size)
         batch = self._inbox.take(limit, _UNSYNCED_S if waiting else _IDLE_S)
         self._in_hand = len(batch)
-        for start in range(0, len(batch), _TOGETHER):
-            self._record(batch[start : start + _TOGETHER])
+        for messages in _portions(batch):
+            self._record(messages)
         self._writer.commit_if_due()
         self._follow_up()
         now_ns = time.monotonic_ns()
@@ -195,6 +198,7 @@ class Writing:
                 )
             )
         self._write_counts("queue_full", self._inbox.take_overflow())
+        self._write_counts("too_large", self._inbox.take_too_large())
         self._write_counts("transport_miss", self._inbox.take_missed())
         self._missing = self._ledger.missing if self._report_gaps else 0
 
@@ -204,3 +208,17 @@ class Writing:
 
     def _append_loss(self, loss: Loss) -> None:
         self._writer.append(LOSS_KEY, loss.model_dump_json().encode())
+
+
+def _portions(messages: Sequence[Received]) -> Iterator[list[Received]]:
+    """``messages`` in portions to be checked together."""
+    portion: list[Received] = []
+    size = 0
+    for message in messages:
+        portion.append(message)
+        size += len(message.payload)
+        if len(portion) == _TOGETHER or size >= _TOGETHER_BYTES:
+            yield portion
+            portion, size = [], 0
+    if portion:
+        yield portion

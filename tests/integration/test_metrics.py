@@ -11,7 +11,9 @@ from eventsrc.recorder import RecorderReport
 from tests.envelopes import envelope, payload
 from tests.fixtures_zenoh import Program, scrape
 
-REPORT = RecorderReport(12, 3, 4, 5, 6, 0, 7, 100, 15, unsealed=8, sealing_error="disk is on fire")
+REPORT = RecorderReport(
+    12, 3, 4, 5, 6, 0, 7, 100, 15, too_large=9, unsealed=8, sealing_error="disk is on fire"
+)
 
 
 def test_every_number_is_scraped_as_it_is_at_that_moment(tmp_path: Path) -> None:
@@ -22,6 +24,7 @@ def test_every_number_is_scraped_as_it_is_at_that_moment(tmp_path: Path) -> None
         "mapfold_recorder_recorded_total": 12,
         "mapfold_recorder_rejected_total": 3,
         "mapfold_recorder_queue_full_total": 4,
+        "mapfold_recorder_too_large_total": 9,
         "mapfold_recorder_transport_missed_total": 5,
         "mapfold_recorder_missing": 6,
         "mapfold_recorder_queue_depth": 7,

@@ -5,7 +5,8 @@ import threading
 import pytest
 
 from eventsrc._zenoh import Missed, Received
-from eventsrc.recorder.inbox import Inbox
+from eventsrc.recorder import inbox as inbox_module
+from eventsrc.recorder.inbox import MOST_KEYS, OTHER_KEYS, Inbox
 from tests.fixtures_zenoh import DEADLINE_S
 
 
@@ -145,3 +146,37 @@ def test_what_waits_at_the_end_is_still_taken() -> None:
 def test_a_queue_for_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match="at least 1"):
         Inbox(0)
+
+
+def test_large_messages_are_taken_a_few_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is taken makes room in the queue, so it must be bounded by itself."""
+    monkeypatch.setattr(inbox_module, "TAKE_BYTES", 5)
+    inbox = Inbox(10)
+    for text in ("abc", "de", "f", "larger than that", "g"):
+        inbox.put(_message(text))
+    assert _texts(inbox.take(10, 0)) == ["abc", "de"]
+    assert _texts(inbox.take(10, 0)) == ["f", "larger than that"]
+    assert _texts(inbox.take(10, 0)) == ["g"]
+
+
+def test_messages_that_are_too_large_are_counted_by_key() -> None:
+    inbox = Inbox(1)
+    for key in ("a", "b", "a"):
+        inbox.refuse(key)
+    assert inbox.too_large == 3
+    assert inbox.take_too_large() == {"a": 2, "b": 1}
+    assert inbox.take_too_large() == {}
+
+
+def test_the_keys_that_losses_are_counted_for_are_bounded() -> None:
+    inbox = Inbox(1, patience_s=0)
+    inbox.put(_message("fits"))
+    for number in range(MOST_KEYS + 5):
+        inbox.put(_message("x", key=f"k/{number}"))
+    inbox.put(_message("x", key="k/0"))
+    counts = inbox.take_overflow()
+    assert len(counts) == MOST_KEYS + 1
+    assert counts[OTHER_KEYS] == 5
+    assert counts["k/0"] == 2
+    inbox.put(_message("x", key="k" * 20_000))
+    assert inbox.take_overflow() == {OTHER_KEYS: 1}

@@ -6,7 +6,9 @@ from eventsrc.errors import MisuseError
 from eventsrc.keys import check_key
 
 
-@pytest.mark.parametrize("key", ["k", "tb/detections", "robot-7/küche/é", "@a/b", "a:b/c.d"])
+@pytest.mark.parametrize(
+    "key", ["k", "k" * 1024, "tb/detections", "robot-7/küche/é", "@a/b", "a:b/c.d"]
+)
 def test_a_key(key: str) -> None:
     assert check_key(key, "--key") == key
 
@@ -25,6 +27,8 @@ def test_a_key(key: str) -> None:
         ("/tb", "a part of it is empty"),
         ("tb//x", "a part of it is empty"),
         ("mapfold/loss", "mapfold's own"),
+        ("k" * 1025, "1025 bytes long, more than 1024"),
+        ("é" * 513, "1026 bytes long, more than 1024"),
     ],
 )
 def test_no_key(key: str, says: str) -> None:

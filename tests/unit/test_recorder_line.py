@@ -38,9 +38,12 @@ def test_a_loss_is_told_when_it_happens_and_once() -> None:
     assert status.complaints(NOTHING) == []
     lost = dataclasses.replace(NOTHING, queue_full=5, transport_missed=2)
     (line,) = status.complaints(lost)
-    assert line.startswith("LOST 7 messages (5 in a full queue, 2 on the way, in all)")
+    assert line.startswith("LOST 7 messages (5 in a full queue, 0 too large, 2 on the way, in all)")
     assert "logs/run-7" in line
     assert status.complaints(lost) == []
+    (line,) = status.complaints(dataclasses.replace(lost, too_large=3))
+    assert line.startswith("LOST 3 messages (5 in a full queue, 3 too large, 2 on")
+    status.complaints(lost)
     (line,) = status.complaints(dataclasses.replace(lost, queue_full=6))
     assert line.startswith("LOST 1 messages (6 in a full queue")
 
@@ -67,7 +70,7 @@ def test_sealing_is_spoken_of_only_when_it_is_behind_or_fails() -> None:
 def test_clean_means_that_this_recorder_lost_nothing() -> None:
     assert NOTHING.clean
     assert dataclasses.replace(NOTHING, missing=4, missing_before=4).clean
-    for name in ("rejected", "queue_full", "transport_missed", "unwritten", "missing"):
+    for name in ("rejected", "queue_full", "too_large", "transport_missed", "unwritten", "missing"):
         assert not dataclasses.replace(NOTHING, **{name: 1}).clean, name
 
 

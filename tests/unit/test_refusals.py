@@ -35,3 +35,16 @@ def test_no_run_is_called_like_the_refusals_of_a_key(name: str) -> None:
     assert behind.count("/") == 1, "so a recorder of an older version passes it over"
     assert "/" not in ack_key(name).removeprefix(ACK_PREFIX)
     assert not {"*", "?", "#", "$"} & set(refusal_key(name))
+
+
+@pytest.mark.parametrize("name", ["k" * 1024, "🤖" * 256, "🤖" * 257, "é/" * 10_000, "k" * 60_000])
+def test_the_key_of_an_answer_is_never_long(name: str) -> None:
+    assert len(refusal_key(name)) < 4_000
+    assert len(ack_key(name[:256])) < 4_000, "a run id has at most 256 characters"
+
+
+def test_long_keys_have_refusals_of_their_own() -> None:
+    one, other = refusal_key("a" * 2_000), refusal_key("a" * 1_999 + "b")
+    assert one != other
+    assert one == refusal_key("a" * 2_000)
+    assert one.removeprefix(ACK_PREFIX).startswith("refused/=")

@@ -1,0 +1,145 @@
+"""What a stranger can send to a recorder: it goes on, and nothing is dropped in silence."""
+
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from eventsrc._zenoh import Received, Session
+from eventsrc.append import append_payload
+from eventsrc.errors import TransportError
+from eventsrc.log import LogReader, LogWriter, log_info, verify_log
+from eventsrc.recorder import Recorder
+from eventsrc.refusals import Refusals, refusal_key
+from eventsrc.system_events import LOSS_KEY, REJECTED_KEY, Loss, RejectedPayload
+from tests.envelopes import envelope, payload
+from tests.fixtures_zenoh import DEADLINE_S
+
+Sessions = Callable[[], Session]
+LONG_KEYS = ("t/" + "é" * 11_000, "t/" + "k" * 22_000, "t/" + "k" * 60_000)
+
+PANIC = """
+import sys
+from eventsrc._zenoh import ZenohOptions, open_session
+from eventsrc._zenoh_ends import clear_errors
+from eventsrc.errors import TransportError
+
+session = open_session(ZenohOptions(connect=(sys.argv[1],)), mode="client")
+for _ in range(2):  # from the second on a lock of Zenoh's is poisoned
+    try:
+        with clear_errors("here"):
+            session.raw.put("t/" + "k" * 70_000, b"")
+    except TransportError as error:
+        print(error)
+session.close()
+try:
+    with clear_errors("here"):
+        raise KeyboardInterrupt
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+
+
+def test_keys_of_any_length_stop_no_recorder(connected: Sessions, tmp_path: Path) -> None:
+    good = payload(envelope(1))
+    heard: dict[str, Refusals] = {}
+    all_heard = threading.Event()
+
+    def hear(message: Received) -> None:
+        heard[message.key] = Refusals.decode(message.payload)
+        if len(heard) == len(LONG_KEYS):
+            all_heard.set()
+
+    robot = connected()
+    for key in LONG_KEYS:
+        robot.subscribe(refusal_key(key), hear)
+    robot.confirm()
+    with LogWriter(tmp_path / "log") as writer:
+        recorder = Recorder(connected(), writer, ["**"], max_events=len(LONG_KEYS) + 1)
+        for key in LONG_KEYS:
+            robot.raw.put(key, good)
+        robot.raw.put("t/short", good)
+        report = recorder.run(threading.Event())
+        assert all_heard.wait(DEADLINE_S)
+    assert (report.recorded, report.rejected, report.lost) == (1, len(LONG_KEYS), 0)
+    with LogReader(tmp_path / "log") as reader:
+        rejected = [
+            RejectedPayload.model_validate_json(event.payload)
+            for event in reader.read(keys={REJECTED_KEY})
+        ]
+    assert {r.key for r in rejected} == set(LONG_KEYS)
+    assert {r.raw for r in rejected} == {good}
+    assert all(r.reason.endswith("bytes long, more than 1024") for r in rejected)
+    assert all(len(r.reason) < 200 for r in rejected)
+    assert verify_log(tmp_path / "log").findings == ()
+
+
+def test_a_message_far_over_the_limit_is_lost_and_said_to_be(
+    connected: Sessions, tmp_path: Path
+) -> None:
+    robot = connected()
+    with LogWriter(tmp_path / "log") as writer:
+        recorder = Recorder(
+            connected(), writer, ["t/**"], max_events=2, max_payload_bytes=1_000, report_gaps=False
+        )
+        for size in (2_001, 300_000, 2_000):
+            robot.raw.put("t/a", b"x" * size)
+        robot.raw.put("t/a", payload(envelope(1)))
+        report = recorder.run(threading.Event())
+    assert (report.recorded, report.rejected, report.too_large, report.lost) == (1, 1, 2, 2)
+    assert not report.clean
+    with LogReader(tmp_path / "log") as reader:
+        (loss,) = (
+            Loss.model_validate_json(event.payload) for event in reader.read(keys={LOSS_KEY})
+        )
+    assert loss == Loss(publisher="t/a", count=2, cause="too_large")
+    assert log_info(tmp_path / "log").lost == 2
+
+
+def test_what_zenoh_would_fail_inside_on_is_not_sent(connected: Sessions) -> None:
+    session = connected()
+    for send in (lambda key: session.send(key, b""), session.publisher):
+        with pytest.raises(TransportError, match=r"key 'kkk.*20,000 bytes are more than 16,384"):
+            send("k" * 20_000)  # type: ignore[operator]
+
+
+def test_a_panic_of_zenoh_is_an_error_of_ours(endpoint: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", PANIC, endpoint],
+        capture_output=True,
+        text=True,
+        timeout=DEADLINE_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    *panics, last = done.stdout.splitlines()
+    assert len(panics) == 2
+    assert all(line.startswith("here: Zenoh failed inside: ") for line in panics)
+    assert last == "interrupted"
+
+
+def test_half_a_surrogate_pair_in_a_key_is_kept(tmp_path: Path) -> None:
+    """From a file: Zenoh's own keys are UTF-8."""
+    with LogWriter(tmp_path / "log") as writer:
+        append_payload(writer, "t/\ud800", payload(envelope(1)))
+    with LogReader(tmp_path / "log") as reader:
+        (event,) = reader.read()
+    record = RejectedPayload.model_validate_json(event.payload)
+    assert record.key == r"t/\ud800"
+    assert record.reason == r"key 't/\ud800' is no UTF-8"
+
+
+def test_thousands_of_keys_go_into_several_segments(tmp_path: Path) -> None:
+    """MCAP counts channels in 16 bits, and a segment repeats all their names at its end."""
+    most, keys = 4_096, [f"robot/{number}" for number in range(10_000)]
+    with LogWriter(tmp_path / "log") as writer:
+        for key in keys:
+            writer.append(key, b"{}")
+    with LogReader(tmp_path / "log") as reader:
+        assert [event.key for event in reader.read()] == keys
+        counts = [len(reader.open_segment(entry).channels) for entry in reader.segments]  # type: ignore[union-attr]
+    assert len(counts) == 3
+    assert max(counts) < most + 256
