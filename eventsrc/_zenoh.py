@@ -4,6 +4,8 @@ What holds behind this door:
 
 * Multicast scouting is off unless a configuration file turns it on: a recorder never joins a
   network it was not pointed at.
+* A session listens nowhere, and a router on loopback only, unless told otherwise: by an endpoint or
+  by a configuration file.
 * Shared memory is off, always. Payloads over 3 kB would travel through it and can vanish with the
   process that owns the segment.
 * Publishers are reliable and block. Zenoh's default drops when a queue is full, and says nothing.
@@ -191,7 +193,7 @@ def open_session(options: ZenohOptions, *, mode: Mode) -> Session:
     """
     zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]
     config = _config_from_file(options.config_file)
-    configure(config, options, mode)
+    configure(config, zenoh.Config(), options, mode)
     connect, listen = config.get_json("connect/endpoints"), config.get_json("listen/endpoints")
     try:
         return Session(zenoh.open(config))

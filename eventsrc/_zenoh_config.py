@@ -14,10 +14,10 @@ from .endpoints import DEFAULT_ENDPOINT, check_endpoints
 Mode = Literal["client", "peer", "router"]
 
 _OPEN_TIMEOUT_MS: Final = 5_000
+_LISTEN: Final = "listen/endpoints"
 _LARGEST_MESSAGE: Final = "transport/link/rx/max_message_size"
 _LARGEST_MESSAGE_BYTES: Final = 512 * 1024 * 1024
 """What a session puts together of one message; Zenoh drops a larger one. Its own bound is twice."""
-_ZENOH_LARGEST_BYTES: Final = 1024 * 1024 * 1024
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,8 +45,9 @@ class Config(Protocol):
     def insert_json5(self, key: str, value: Any) -> None: ...
 
 
-def configure(config: Config, options: ZenohOptions, mode: Mode) -> None:
-    """Apply ``options`` and the rules to ``config``; raises MisuseError for a bad endpoint."""
+def configure(config: Config, zenoh: Config, options: ZenohOptions, mode: Mode) -> None:
+    """Apply ``options`` and the rules to ``config``, which is the file's or else like ``zenoh``,
+    what Zenoh itself says where nobody does. Raises MisuseError for a bad endpoint."""
     connect, listen = check_endpoints(options.connect), check_endpoints(options.listen)
     if not connect and mode == "client" and _is_unset(config, "connect/endpoints"):
         connect = (DEFAULT_ENDPOINT,)
@@ -54,9 +55,11 @@ def configure(config: Config, options: ZenohOptions, mode: Mode) -> None:
     _set(config, "transport/shared_memory/enabled", False)
     if connect:
         _set(config, "connect/endpoints", connect)
-    if listen or options.config_file is None:
-        _set(config, "listen/endpoints", listen)
-    if int(config.get_json(_LARGEST_MESSAGE)) >= _ZENOH_LARGEST_BYTES:  # the file says nothing else
+    if listen or not _says_where_to_listen(config, zenoh, mode):
+        # Zenoh's own routers would listen on every address of the machine, to anybody.
+        nowhere_else = (DEFAULT_ENDPOINT,) if mode == "router" else ()
+        _set(config, _LISTEN, listen or nowhere_else)
+    if config.get_json(_LARGEST_MESSAGE) == zenoh.get_json(_LARGEST_MESSAGE):
         _set(config, _LARGEST_MESSAGE, _LARGEST_MESSAGE_BYTES)
     _configure_scouting(config)
     if mode == "peer":  # a router starts before the routers it is linked to; a peer's error counts
@@ -73,6 +76,15 @@ def _configure_scouting(config: Config) -> None:
     scouts = json.loads(config.get_json("scouting/multicast/enabled"))
     if not scouts and _is_unset(config, "scouting/delay"):
         _set(config, "scouting/delay", 0)
+
+
+def _says_where_to_listen(config: Config, zenoh: Config, mode: Mode) -> bool:
+    """Whether the file does, for this mode. One that says what Zenoh says anyway, as a copy of its
+    example does, counts as one that says nothing."""
+    if config.get_json(_LISTEN) == zenoh.get_json(_LISTEN):
+        return False
+    endpoints = json.loads(config.get_json(_LISTEN))
+    return not isinstance(endpoints, dict) or mode in endpoints
 
 
 def _set(config: Config, key: str, value: object) -> None:

@@ -1,10 +1,7 @@
 """`mapfold router`: a Zenoh router, until a signal ends it."""
 
-import dataclasses
-
 import typer
 
-from eventsrc.endpoints import DEFAULT_ENDPOINT
 from eventsrc.router import Router
 
 from ._shell import say
@@ -21,8 +18,6 @@ def router(
     --connect links it to other routers.
     """
     options = zenoh_options(connect, listen, zenoh_config)
-    if not options.listen and options.config_file is None:
-        options = dataclasses.replace(options, listen=(DEFAULT_ENDPOINT,))
     with stop_on_signals() as stop, Router(options) as running:
         say(f"router listening on {', '.join(running.endpoints)}; Ctrl-C ends it")
         stop.wait()

@@ -1,0 +1,82 @@
+"""What a session is told to listen on, whatever a configuration file says or leaves out."""
+
+import json
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from eventsrc._zenoh_config import Mode, ZenohOptions, configure
+from eventsrc.endpoints import DEFAULT_ENDPOINT
+
+ELSEWHERE = "tcp/127.0.0.2:0"
+ZENOHS_OWN = "{listen: {endpoints: {router: ['tcp/[::]:7447'], peer: ['tcp/[::]:0']}}}"
+"""Stands in the example that comes with Zenoh."""
+
+
+def _configured(
+    folder: Path, text: str | None, mode: Mode, listen: tuple[str, ...] = ()
+) -> zenoh.Config:
+    if text is None:
+        config, options = zenoh.Config(), ZenohOptions(listen=listen)
+    else:
+        file = folder / "zenoh.json5"
+        file.write_text(text)
+        config = zenoh.Config.from_file(file)
+        options = ZenohOptions(listen=listen, config_file=file)
+    configure(config, zenoh.Config(), options, mode)
+    return config
+
+
+@pytest.mark.parametrize("mode", ["client", "peer", "router"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        None,
+        "{}",
+        "{listen: {}}",
+        "{mode: 'router', scouting: {multicast: {enabled: false}}}",
+        "{transport: {link: {tls: {enable_mtls: true}}}}",
+        ZENOHS_OWN,
+    ],
+)
+def test_a_session_listens_on_loopback_or_nowhere_unless_told(
+    tmp_path: Path, text: str | None, mode: Mode
+) -> None:
+    listens = json.loads(_configured(tmp_path, text, mode).get_json("listen/endpoints"))
+    assert listens == ([DEFAULT_ENDPOINT] if mode == "router" else [])
+    assert DEFAULT_ENDPOINT.startswith("tcp/127.0.0.1:")
+
+
+@pytest.mark.parametrize("mode", ["client", "peer", "router"])
+@pytest.mark.parametrize("text", [None, "{}", f"{{listen: {{endpoints: ['{ELSEWHERE}']}}}}"])
+def test_the_command_line_says_where_first(tmp_path: Path, text: str | None, mode: Mode) -> None:
+    config = _configured(tmp_path, text, mode, ("tcp/127.0.0.3:0",))
+    assert json.loads(config.get_json("listen/endpoints")) == ["tcp/127.0.0.3:0"]
+
+
+@pytest.mark.parametrize(
+    ("endpoints", "listens"),
+    [
+        (f"['{ELSEWHERE}']", [ELSEWHERE]),
+        ("['tcp/[::]:7447']", ["tcp/[::]:7447"]),
+        (f"{{router: ['{ELSEWHERE}']}}", {"router": [ELSEWHERE]}),
+        (f"{{peer: ['{ELSEWHERE}']}}", [DEFAULT_ENDPOINT]),
+        ("[]", []),
+    ],
+)
+def test_a_file_that_says_where_is_heeded(
+    tmp_path: Path, endpoints: str, listens: list[str]
+) -> None:
+    config = _configured(tmp_path, f"{{listen: {{endpoints: {endpoints}}}}}", "router")
+    assert json.loads(config.get_json("listen/endpoints")) == listens
+
+
+@pytest.mark.parametrize(
+    ("text", "size"), [("{}", 2**29), ("{transport: {link: {rx: {max_message_size: 77}}}}", 77)]
+)
+def test_the_largest_message_is_bounded_unless_a_file_says_how(
+    tmp_path: Path, text: str, size: int
+) -> None:
+    config = _configured(tmp_path, text, "client")
+    assert json.loads(config.get_json("transport/link/rx/max_message_size")) == size
