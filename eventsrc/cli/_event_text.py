@@ -6,6 +6,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from eventsrc.log import Event
+from eventsrc.terminal import visible
 
 _SHORT = 100
 
@@ -52,7 +53,8 @@ def _refuse(name: str) -> None:
 
 def event_line(event: Event) -> str:
     """Offset, time, key and the gist."""
-    return f"{event.offset:>8}  {iso_time(event.stamp_ns)}  {event.key}  {_gist(event)}"
+    text = f"{event.offset:>8}  {iso_time(event.stamp_ns)}  {event.key}  {_gist(event)}"
+    return visible(text)
 
 
 def _gist(event: Event) -> str:

@@ -17,7 +17,7 @@ from typer.core import TyperGroup
 
 from eventsrc.errors import MapfoldError
 
-from ._shell import EXIT_FAILED, people
+from ._shell import EXIT_FAILED, say
 from ._streams import OutputLost, give_up_stdout, secure_streams
 
 EXIT_INTERRUPTED: Final = 130
@@ -76,7 +76,7 @@ def run_app(app: Callable[..., Any]) -> NoReturn:
 
 
 def _say_lost(lost: OutputLost) -> int:
-    people.print(f"mapfold: stdout: {lost}; nobody has got all of the output")
+    say(f"mapfold: stdout: {lost}; nobody has got all of the output")
     return EXIT_FAILED
 
 
@@ -86,13 +86,13 @@ def _exit_code(app: Callable[..., Any]) -> int:
     except SystemExit as ended:  # how typer ends, also when all is well
         return ended.code if isinstance(ended.code, int) else 0
     except MapfoldError as error:
-        people.print(f"mapfold: {error}")
+        say(f"mapfold: {error}")
         return error.exit_code
     except OutputLost as lost:
         return _say_lost(lost)
     except _ReaderGone:
         return EXIT_READER_GONE
     except (_Interrupted, KeyboardInterrupt):
-        people.print("mapfold: interrupted")
+        say("mapfold: interrupted")
         return EXIT_INTERRUPTED
     return 0

@@ -1,4 +1,8 @@
-"""What every command shares: data on stdout, people on stderr, findings as an exit code."""
+"""What every command shares: data on stdout, people on stderr, findings as an exit code.
+
+Whatever is printed goes through here, and so through `eventsrc.terminal`: keys, names and reasons
+come from the network.
+"""
 
 import json
 import sys
@@ -7,6 +11,8 @@ from typing import Any
 
 import typer
 from rich.console import Console
+
+from eventsrc.terminal import visible_json, visible_lines
 
 EXIT_FAILED = 1
 EXIT_FINDINGS = 3
@@ -17,20 +23,30 @@ people = Console(stderr=True, highlight=False, soft_wrap=True, markup=False)
 
 
 def say(message: str) -> None:
-    """One line for people."""
-    people.print(message)
+    """One line for people, or lines that were laid out."""
+    people.print(visible_lines(message))
+
+
+def display(text: str) -> None:
+    """Lines on stdout for people; an end is added to the last one if it has none."""
+    sys.stdout.write(visible_lines(text))
+    if text and not text.endswith("\n"):
+        sys.stdout.write("\n")
 
 
 def emit(document: Any) -> None:
     """One JSON document on stdout."""
-    json.dump(document, sys.stdout, ensure_ascii=False, allow_nan=False, indent=2)
+    encoder = json.JSONEncoder(ensure_ascii=False, allow_nan=False, indent=2)
+    for part in encoder.iterencode(document):
+        sys.stdout.write(visible_json(part))
     sys.stdout.write("\n")
 
 
 def emit_lines(documents: Iterable[Any]) -> None:
     """JSON lines on stdout, each as soon as it is there."""
     for document in documents:
-        sys.stdout.write(json.dumps(document, ensure_ascii=False, allow_nan=False) + "\n")
+        text = json.dumps(document, ensure_ascii=False, allow_nan=False)
+        sys.stdout.write(visible_json(text) + "\n")
 
 
 def finish(*, findings: bool) -> None:

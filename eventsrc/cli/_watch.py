@@ -13,6 +13,7 @@ from eventsrc.errors import LogError
 from eventsrc.log import Event, log_info
 from eventsrc.log.whence import time_of
 from eventsrc.system_events import is_system_key
+from eventsrc.terminal import visible
 from eventsrc.words import counted
 
 
@@ -63,5 +64,5 @@ class Watch:
             there = log_info(log).keys
             for key in self._missing:
                 if key not in there:
-                    names = ", ".join(there) or "none, as the log is empty"
+                    names = ", ".join(map(visible, there)) or "none, as the log is empty"
                     yield f"{log}: no event has the key {key!r}; there are {names}"

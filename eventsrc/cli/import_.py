@@ -27,6 +27,7 @@ from eventsrc.importers import (
 from eventsrc.importers.record import Source
 from eventsrc.keys import check_key
 from eventsrc.log import LogWriter
+from eventsrc.terminal import visible
 from eventsrc.words import counted
 
 from ._restart_line import restart_as_json, say_restart
@@ -85,7 +86,7 @@ class _Rejects:
     def say(self, place: str, reason: str) -> None:
         self._count += 1
         if self._count <= _MOST_REJECTS:
-            say(f"{place}: rejected: {reason}")
+            say(visible(f"{place}: rejected: {reason}"))
 
     def say_rest(self) -> None:
         if self._count > _MOST_REJECTS:
@@ -123,7 +124,7 @@ def _progress() -> Iterator["_Show | None"]:
         yield None
         return
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         TaskProgressColumn(),
         TransferSpeedColumn(),
@@ -143,7 +144,7 @@ class _Show:
     def __call__(self, source: Source) -> None:
         task = self._tasks.get(id(source))
         if task is None:
-            task = self._progress.add_task(source.name, total=source.size_bytes)
+            task = self._progress.add_task(visible(source.name), total=source.size_bytes)
             self._tasks[id(source)] = task
         self._progress.update(task, completed=source.position())  # type: ignore[arg-type]
 

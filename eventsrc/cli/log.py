@@ -1,6 +1,5 @@
 """`mapfold log …`: look at a log."""
 
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,10 +20,11 @@ from eventsrc.log import (
 )
 from eventsrc.log.reader import OnGap
 from eventsrc.log.whence import resolve, resolve_start
+from eventsrc.terminal import visible
 from eventsrc.words import counted
 
 from ._event_text import event_document, event_line, iso_time
-from ._shell import emit, emit_lines, finish, say
+from ._shell import display, emit, emit_lines, finish, say
 from ._watch import Watch
 
 LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="The log's folder.")]
@@ -40,7 +40,7 @@ def info(log: LogArgument, json_: JsonOption = False) -> None:
     if json_:
         emit(_info_document(report))
     else:
-        sys.stdout.write(_info_text(report))
+        display(_info_text(report))
 
 
 def _info_document(report: LogInfo) -> dict[str, Any]:
@@ -62,7 +62,7 @@ def _info_text(report: LogInfo) -> str:
         rows.append(("logged", _span(report.first_logged_ns, report.last_logged_ns)))
     if report.first_stamp_ns is not None and report.last_stamp_ns is not None:
         rows.append(("stamped", _span(report.first_stamp_ns, report.last_stamp_ns)))
-    rows += [("key", f"{key}: {count}") for key, count in report.keys.items()]
+    rows += [("key", f"{visible(key)}: {count}") for key, count in report.keys.items()]
     rows += [("segment", _segment_text(segment)) for segment in report.segments]
     return "".join(f"{name:<9} {value}\n" for name, value in rows)
 
@@ -118,7 +118,8 @@ def cat(
         if json_:
             emit_lines(map(event_document, events))
         else:
-            sys.stdout.writelines(f"{event_line(event)}\n" for event in events)
+            for event in events:
+                display(event_line(event))
     for line in watch.told(log):
         say(line)
     finish(findings=bool(gaps))
@@ -155,7 +156,7 @@ def verify(log: LogArgument, json_: JsonOption = False) -> None:
         emit({**asdict(result), "path": str(log)})
     else:
         for finding in result.findings:
-            sys.stdout.write(f"{_finding_text(finding)}\n")
+            display(_finding_text(finding))
     size = f"{counted(result.events, 'event')} in {counted(result.segments, 'segment')}"
     found = counted(len(result.findings), "finding") if result.findings else "all good"
     say(f"{log}: {size}, {result.size_bytes:,} bytes: {found}")
@@ -166,7 +167,7 @@ def _finding_text(finding: Finding) -> str:
     where = [finding.segment] if finding.segment else []
     if finding.first_offset is not None:
         where.append(f"offsets {finding.first_offset} to {finding.last_offset}")
-    return f"{finding.kind:<9} {': '.join([*where, finding.message])}"
+    return visible(f"{finding.kind:<9} {': '.join([*where, finding.message])}")
 
 
 @log_app.command()

@@ -1,14 +1,13 @@
 """`mapfold bisect`: the event that made a condition over the map true."""
 
 import contextlib
-import sys
 from collections.abc import Iterator
 from textwrap import indent
 from typing import Annotated
 
 import typer
 
-from eventsrc.cli._shell import emit, say
+from eventsrc.cli._shell import display, emit, say
 from projections.timetravel import Expression, ExpressionError
 from projections.timetravel.expression import functions_help
 from projections.timetravel.text import search_text
@@ -53,7 +52,7 @@ def bisect(
     if json_:
         emit(found.document())
     else:
-        sys.stdout.write(search_text(found, most=None if all_ else MOST_LINES))
+        display(search_text(found, most=None if all_ else MOST_LINES))
 
 
 @contextlib.contextmanager

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from eventsrc.cli._shell import emit, finish, say
+from eventsrc.cli._shell import display, emit, finish, say
 from eventsrc.words import counted
 from projections.postgres.embedded import EmbeddedServer
 from projections.runner import rebuild
@@ -43,7 +43,7 @@ def url(as_json: JsonOption = False) -> None:
     if as_json:
         emit({"url": server.url, "data": str(server.data), "running": running, "kept": server.kept})
         return
-    typer.echo(server.url)
+    display(server.url)
     if not running:
         say("the server is not running; start it with: mapfold db start")
 
@@ -57,7 +57,7 @@ def start(as_json: JsonOption = False) -> None:
     if as_json:
         emit({"url": address, "data": str(server.data), "running": True, "kept": True})
         return
-    typer.echo(address)
+    display(address)
     say(f"running, with its data in {server.data}; stop it with: mapfold db stop")
 
 
@@ -107,7 +107,7 @@ def check(
 @group.command()
 def roles(only: OnlyOption = None) -> None:
     """Print SQL for two least-privilege roles: mapfold_reader and mapfold_writer."""
-    typer.echo(roles_sql(("graph", "vectors") if only is None else (only.value,)), nl=False)
+    display(roles_sql(("graph", "vectors") if only is None else (only.value,)))
 
 
 @group.command(name="retry")
@@ -127,22 +127,22 @@ def retry_command(
         emit({"sinks": [asdict(r) for r in reports]})
     for report in () if as_json else reports:
         done = "rebuilt" if report.rebuilt else f"{len(report.still)} still cannot be folded"
-        typer.echo(f"{report.sink}: {report.parked} parked, {done}")
+        display(f"{report.sink}: {report.parked} parked, {done}")
         for letter in report.still:
-            typer.echo(f"  offset {letter.offset:,}: {letter.reason}")
+            display(f"  offset {letter.offset:,}: {letter.reason}")
     finish(findings=any(report.still for report in reports))
 
 
 def _tell(reports: list[CheckReport]) -> None:
     for report in reports:
-        typer.echo(
+        display(
             f"{report.sink}: {counted(report.rows, 'row')} at offset {report.next_offset:,},"
             f" {report.differing:,} differ"
         )
         for difference in report.differences:
-            typer.echo(
+            display(
                 f"  {difference.kind} {difference.table} {difference.id}:"
                 f" expected {difference.expected}, found {difference.found}"
             )
         if report.differing > len(report.differences):
-            typer.echo(f"  and {report.differing - len(report.differences):,} more")
+            display(f"  and {report.differing - len(report.differences):,} more")

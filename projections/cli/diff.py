@@ -1,11 +1,10 @@
 """`mapfold diff`: what lies between two moments of a map."""
 
-import sys
 from typing import Annotated
 
 import typer
 
-from eventsrc.cli._shell import emit
+from eventsrc.cli._shell import display, emit
 from projections.timetravel.text import difference_text
 
 from ._options import SetOption, SettingsOption
@@ -31,7 +30,7 @@ def diff(
     if json_:
         emit(found.document())
     else:
-        sys.stdout.write(difference_text(found, most=None if all_ else MOST_LINES))
+        display(difference_text(found, most=None if all_ else MOST_LINES))
 
 
 def register(app: typer.Typer) -> None:

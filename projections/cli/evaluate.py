@@ -1,12 +1,11 @@
 """`mapfold evaluate`: how good are the places, the objects and the re-localisation."""
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from eventsrc.cli._shell import emit, say
+from eventsrc.cli._shell import display, emit, say
 from projections.cli._options import SetOption, SettingsOption, settings_from
 from projections.cli._picture import check_picture
 from projections.cli._point import W
@@ -65,7 +64,7 @@ def evaluate(
     if json_:
         emit(result.scores)
     else:
-        sys.stdout.write(scores_text(result.scores))
+        display(scores_text(result.scores))
     if picture is not None:
         draw_failures(result.view, result.trials[3], picture)
 

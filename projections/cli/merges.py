@@ -1,12 +1,11 @@
 """`mapfold merges`: every merge of places, what made it and what changed hands."""
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from eventsrc.cli._shell import emit, say
+from eventsrc.cli._shell import display, emit, say
 from eventsrc.errors import MisuseError
 from projections.timetravel import Timeline
 from projections.timetravel.lives import Merge
@@ -62,9 +61,9 @@ def merges(
         if json_:
             emit([merge_document(opened.history, merge) for merge in found])
         elif show is not None:
-            sys.stdout.write(merge_text(opened.history, found[0]))
+            display(merge_text(opened.history, found[0]))
         else:
-            sys.stdout.write(merges_text(opened.history, found, end))
+            display(merges_text(opened.history, found, end))
 
 
 def _draw(opened: Timeline, merge: Merge, out: Path) -> None:

@@ -1,14 +1,13 @@
 """`mapfold query …`: what stands where, what is near, how to get there."""
 
 import contextlib
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from eventsrc.cli._shell import emit
+from eventsrc.cli._shell import display, emit
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 from projections.cli._options import (
@@ -148,7 +147,7 @@ def _tell(found: Any, as_json: bool) -> None:
         emit(found)
         return
     rows = found if isinstance(found, list) else [found]
-    sys.stdout.write("".join(f"{_line(row)}\n" for row in rows) or "nothing\n")
+    display("".join(f"{_line(row)}\n" for row in rows) or "nothing")
 
 
 def _line(row: dict[str, Any]) -> str:

@@ -1,12 +1,11 @@
 """`mapfold relocalize`: which Place is this, from a few object crops."""
 
-import sys
 from pathlib import Path
 from typing import Annotated, cast, get_args
 
 import typer
 
-from eventsrc.cli._shell import emit, say
+from eventsrc.cli._shell import display, emit, say
 from eventsrc.errors import MisuseError
 from projections.cli._options import (
     DbOption,
@@ -92,7 +91,7 @@ def method_from(text: str) -> Method:
 
 def _tell(answer: Answer, as_json: bool) -> None:
     if not as_json:
-        sys.stdout.write(answer_text(answer))
+        display(answer_text(answer))
         return
     emit(answer.document())
     if answer.unknown:

@@ -1,12 +1,11 @@
 """`mapfold state`: the map folded to a point in the log."""
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from eventsrc.cli._shell import emit, say
+from eventsrc.cli._shell import display, emit, say
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 from projections.cli._options import SetOption, SettingsOption, settings_from
@@ -41,9 +40,9 @@ def state(
     if json_:
         emit(state_document(view, hexdigits))
     elif digest:
-        sys.stdout.write(f"{hexdigits}\n")
+        display(f"{hexdigits}\n")
     else:
-        sys.stdout.write(state_text(view, hexdigits))
+        display(state_text(view, hexdigits))
 
 
 def register(app: typer.Typer) -> None:

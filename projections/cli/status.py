@@ -4,7 +4,7 @@ from dataclasses import asdict
 
 import typer
 
-from eventsrc.cli._shell import emit, finish, say
+from eventsrc.cli._shell import display, emit, finish, say
 from eventsrc.log import LogInfo, log_info
 from eventsrc.words import counted
 from projections.runner.status import SinkStatus, Status, projection_status
@@ -56,17 +56,17 @@ def status(
 
 
 def _tell(info: LogInfo, found: Status) -> None:
-    typer.echo(
+    display(
         f"log      {info.log_id}: {counted(info.events, 'event')}, {info.rejected:,} rejected,"
         f" {info.lost:,} lost"
     )
     for sink in found.sinks:
-        typer.echo(f"{sink.sink:<8} {_line(sink)}")
+        display(f"{sink.sink:<8} {_line(sink)}")
         if sink.note:
             say(f"         {sink.note}")
         for letter in sink.dead_letters:
             run = f" (run {letter.run_id})" if letter.run_id else ""
-            typer.echo(f"         parked: offset {letter.offset:,}{run}: {letter.reason}")
+            display(f"         parked: offset {letter.offset:,}{run}: {letter.reason}")
 
 
 def _line(sink: SinkStatus) -> str:

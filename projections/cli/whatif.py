@@ -1,12 +1,11 @@
 """`mapfold whatif`: the same log under other settings, side by side."""
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from eventsrc.cli._shell import emit, say
+from eventsrc.cli._shell import display, emit, say
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 from eventsrc.words import counted
@@ -101,7 +100,7 @@ def whatif(
     if json_:
         emit(found.document())
     else:
-        sys.stdout.write(whatif_text(found, most=None if all_ else MOST_LINES))
+        display(whatif_text(found, most=None if all_ else MOST_LINES))
 
 
 def _draw(found: WhatIf, out: Path) -> None:

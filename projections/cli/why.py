@@ -1,11 +1,10 @@
 """`mapfold why`: the life of a place or an object, or why two keyframes are in one place."""
 
-import sys
 from typing import Annotated
 
 import typer
 
-from eventsrc.cli._shell import emit
+from eventsrc.cli._shell import display, emit
 from eventsrc.errors import MisuseError
 from projections.timetravel import Story, Timeline
 from projections.timetravel.text import story_text
@@ -44,7 +43,7 @@ def why(
     if json_:
         emit(story.document())
     else:
-        sys.stdout.write(story_text(story))
+        display(story_text(story))
 
 
 def _story(opened: Timeline, thing: str | None, same: tuple[str, str] | None, end: int) -> Story:
