@@ -16,8 +16,6 @@ Mode = Literal["client", "peer", "router"]
 _OPEN_TIMEOUT_MS: Final = 5_000
 _LISTEN: Final = "listen/endpoints"
 _LARGEST_MESSAGE: Final = "transport/link/rx/max_message_size"
-_LARGEST_MESSAGE_BYTES: Final = 512 * 1024 * 1024
-"""What a session puts together of one message; Zenoh drops a larger one. Its own bound is twice."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,12 +23,15 @@ class ZenohOptions:
     """Where to connect, where to listen, and a Zenoh configuration file (JSON5) for the rest.
 
     ``connect`` and ``listen`` go before what the file says. TLS, access control and scouting are
-    the file's business.
+    the file's business. ``largest_message_bytes`` is for a session that receives from strangers:
+    Zenoh drops a message that is larger, unless the file says how large one may be; its own bound
+    is 1 GiB, of each of several that may be under way.
     """
 
     connect: tuple[str, ...] = ()
     listen: tuple[str, ...] = ()
     config_file: Path | None = None
+    largest_message_bytes: int | None = None
 
     @property
     def mode(self) -> Literal["client", "peer"]:
@@ -59,8 +60,9 @@ def configure(config: Config, zenoh: Config, options: ZenohOptions, mode: Mode) 
         # Zenoh's own routers would listen on every address of the machine, to anybody.
         nowhere_else = (DEFAULT_ENDPOINT,) if mode == "router" else ()
         _set(config, _LISTEN, listen or nowhere_else)
-    if config.get_json(_LARGEST_MESSAGE) == zenoh.get_json(_LARGEST_MESSAGE):
-        _set(config, _LARGEST_MESSAGE, _LARGEST_MESSAGE_BYTES)
+    largest = options.largest_message_bytes
+    if largest and config.get_json(_LARGEST_MESSAGE) == zenoh.get_json(_LARGEST_MESSAGE):
+        _set(config, _LARGEST_MESSAGE, largest)
     _configure_scouting(config)
     if mode == "peer":  # a router starts before the routers it is linked to; a peer's error counts
         _set(config, "connect/exit_on_failure", True)

@@ -1,5 +1,6 @@
 """`mapfold record`: Zenoh to log, until a signal ends it."""
 
+import dataclasses
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,6 +26,9 @@ from ._zenoh_options import ConfigOption, ConnectOption, ListenOption, zenoh_opt
 
 _MANY: Final = 100_000
 """Events that take seconds to read; below it nobody notices."""
+_LARGEST_BYTES: Final = 128 * 1024 * 1024
+"""What Zenoh puts together of one message, however small ``--max-payload``: it tells nobody of what
+it drops, so most of what is too large should come this far and be counted."""
 
 
 def record(
@@ -72,7 +76,10 @@ def record(
     Exit 3 when anything was rejected, lost or is missing.
     """
     policy = parse_fsync(fsync)
-    options = zenoh_options(connect, listen, zenoh_config)
+    options = dataclasses.replace(
+        zenoh_options(connect, listen, zenoh_config),
+        largest_message_bytes=max(_LARGEST_BYTES, 4 * max_payload),
+    )
     keys = tuple(key or DEFAULT_KEYS)
     check_keys(keys)
     address = None if metrics is None else parse_address(metrics, "--metrics")

@@ -15,6 +15,8 @@ from collections.abc import Iterator
 from decimal import Decimal, InvalidOperation
 from json.decoder import JSONDecodeError
 
+from eventsrc.ingest import excess
+
 from .record import Imported
 
 _DECODER = json.JSONDecoder()
@@ -25,6 +27,8 @@ _PAYLOAD_FIELDS = ("payload", "detections")
 def read_line(line: bytes) -> Imported:
     """The message in one line: a logger's record, or else the line itself."""
     if b'"ts"' not in line or not any(b'"%s"' % f.encode() in line for f in _PAYLOAD_FIELDS):
+        return Imported(line)
+    if excess(line, len(line)) is not None:  # too much to take apart; it will be refused as it is
         return Imported(line)
     try:
         fields = {name: (value, text) for name, value, text in _members(line.decode())}

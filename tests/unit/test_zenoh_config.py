@@ -15,7 +15,11 @@ ZENOHS_OWN = "{listen: {endpoints: {router: ['tcp/[::]:7447'], peer: ['tcp/[::]:
 
 
 def _configured(
-    folder: Path, text: str | None, mode: Mode, listen: tuple[str, ...] = ()
+    folder: Path,
+    text: str | None,
+    mode: Mode,
+    listen: tuple[str, ...] = (),
+    largest: int | None = None,
 ) -> zenoh.Config:
     if text is None:
         config, options = zenoh.Config(), ZenohOptions(listen=listen)
@@ -23,7 +27,7 @@ def _configured(
         file = folder / "zenoh.json5"
         file.write_text(text)
         config = zenoh.Config.from_file(file)
-        options = ZenohOptions(listen=listen, config_file=file)
+        options = ZenohOptions(listen=listen, config_file=file, largest_message_bytes=largest)
     configure(config, zenoh.Config(), options, mode)
     return config
 
@@ -73,10 +77,15 @@ def test_a_file_that_says_where_is_heeded(
 
 
 @pytest.mark.parametrize(
-    ("text", "size"), [("{}", 2**29), ("{transport: {link: {rx: {max_message_size: 77}}}}", 77)]
+    ("text", "largest", "size"),
+    [
+        ("{}", None, 2**30),
+        ("{}", 2**27, 2**27),
+        ("{transport: {link: {rx: {max_message_size: 77}}}}", 2**27, 77),
+    ],
 )
-def test_the_largest_message_is_bounded_unless_a_file_says_how(
-    tmp_path: Path, text: str, size: int
+def test_a_file_says_how_large_a_message_may_be(
+    tmp_path: Path, text: str, largest: int | None, size: int
 ) -> None:
-    config = _configured(tmp_path, text, "client")
+    config = _configured(tmp_path, text, "client", largest=largest)
     assert json.loads(config.get_json("transport/link/rx/max_message_size")) == size
