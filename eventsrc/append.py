@@ -76,8 +76,9 @@ def _rejected(key: str, payload: bytes, reason: str, logged_ns: int) -> NewEvent
 def _judge(arrivals: Sequence[Arrival], max_bytes: int) -> list[Envelope | Rejected]:
     """What the door says, but for keys that a log does not keep envelopes under."""
     verdicts = check_envelopes(arrivals, max_bytes=max_bytes)
-    for index, arrival in enumerate(arrivals):
-        fault = fault_in_log(arrival.key)
-        if fault is not None:
-            verdicts[index] = Rejected(f"key {quoted(arrival.key)} {fault}")
+    keys = {arrival.key for arrival in arrivals}  # one, as a rule
+    faults = {key: fault for key in keys if (fault := fault_in_log(key)) is not None}
+    for index, arrival in enumerate(arrivals if faults else ()):
+        if arrival.key in faults:
+            verdicts[index] = Rejected(f"key {quoted(arrival.key)} {faults[arrival.key]}")
     return verdicts
