@@ -8,6 +8,8 @@ A part of `eventsrc.spool`, whose lock and transactions it relies on.
 import sqlite3
 from typing import Final, NamedTuple
 
+from ._spool_upgrade import add_digests
+
 _SCHEMA: Final = """
 create table if not exists refused (
     seq integer primary key,
@@ -15,11 +17,12 @@ create table if not exists refused (
     keyframe_id integer not null,
     payload blob,
     log_id text not null,
-    reason text not null
+    reason text not null,
+    sha256 text
 );
-create index if not exists refused_keyframe on refused (run_id, keyframe_id);
 create index if not exists refused_payload on refused (seq) where payload is not null;
 """
+_INDEX: Final = "create index if not exists refused_sha256 on refused (sha256)"
 
 
 class Refused(NamedTuple):
@@ -37,14 +40,16 @@ class SetAside:
     def __init__(self, db: sqlite3.Connection) -> None:
         self._db = db
         db.executescript(_SCHEMA)
+        add_digests(db)
+        db.execute(_INDEX)
         row = db.execute("select count(*), coalesce(sum(length(payload)), 0) from refused")
         self.count, self.size = map(int, row.fetchone())
 
     def take(self, seq: int, log_id: str, reason: str, size: int) -> None:
         """Keep the spooled envelope ``seq``, of ``size`` bytes."""
         self._db.execute(
-            "insert into refused select seq, run_id, keyframe_id, payload, ?, ? from spooled "
-            "where seq = ?",
+            "insert into refused select seq, run_id, keyframe_id, payload, ?, ?, sha256 "
+            "from spooled where seq = ?",
             (log_id, reason, seq),
         )
         self.count += 1
@@ -74,28 +79,27 @@ class SetAside:
     def put_back(self) -> tuple[int, int]:
         """Spool everything whose bytes are still here anew; how many, and how many bytes."""
         put = self._db.execute(
-            "insert into spooled (run_id, keyframe_id, payload) select run_id, keyframe_id, "
-            "payload from refused where payload is not null order by seq"
+            "insert into spooled (run_id, keyframe_id, payload, sha256) select run_id, "
+            "keyframe_id, payload, sha256 from refused where payload is not null order by seq"
         ).rowcount
         self._db.execute("delete from refused where payload is not null")
         size, self.size = self.size, 0
         self.count -= put
         return put, size
 
-    def forget(self, run_id: str, first: int, last: int) -> None:
-        """Drop a stretch of keyframes: some log has them."""
+    def forget(self, sha256: str) -> None:
+        """Drop the payload that ``sha256`` names: some log has it."""
         if self.count:
             self._drop(
-                "delete from refused where run_id = ? and keyframe_id between ? and ? "
-                "returning coalesce(length(payload), 0)",
-                (run_id, first, last),
+                "delete from refused where sha256 = ? returning coalesce(length(payload), 0)",
+                (sha256,),
             )
 
     def clear(self) -> int:
         """Drop everything; how many that were."""
         return self._drop("delete from refused returning coalesce(length(payload), 0)", ())
 
-    def _drop(self, query: str, values: tuple[str | int, ...]) -> int:
+    def _drop(self, query: str, values: tuple[str, ...]) -> int:
         sizes = [size for (size,) in self._db.execute(query, values)]
         self.count -= len(sizes)
         self.size -= sum(sizes)

@@ -9,6 +9,7 @@ What holds behind this door:
 * Shared memory is off, always. Payloads over 3 kB would travel through it and can vanish with the
   process that owns the segment.
 * Publishers are reliable and block. Zenoh's default drops when a queue is full, and says nothing.
+* Subscribers are plain. Advanced ones drop what bears an earlier timestamp than a message before.
 * A session is a context manager and is always closed. Every failure to open, declare or send is a
   TransportError of one line that says where and what to do; Zenoh's own log is silent unless
   ``RUST_LOG`` asks for it.
@@ -27,15 +28,17 @@ from ._zenoh_config import Mode, ZenohOptions, configure
 from ._zenoh_ends import (
     Asked,
     Bound,
-    Missed,
+    Number,
     Publisher,
     Received,
     Subscription,
     check_key_length,
     clear_errors,
+    heartbeat,
+    heartbeats_under,
+    number_of,
     quietly,
     received,
-    subscribe_advanced,
 )
 from ._zenoh_errors import cannot_open, is_panic, plain
 from .endpoints import check_endpoints
@@ -44,8 +47,8 @@ from .errors import MisuseError
 __all__ = [
     "Asked",
     "Bound",
-    "Missed",
     "Mode",
+    "Number",
     "Publisher",
     "Received",
     "Session",
@@ -65,36 +68,44 @@ class Session:
         self.raw = raw
         """Zenoh's own object; for the door and nobody else."""
 
-    def publisher(self, key: str, *, advanced: bool = False, cache: int = 1_000) -> Publisher:
+    def publisher(self, key: str) -> Publisher:
         """Declare a publisher on ``key``."""
-        return Publisher(self.raw, key, advanced=advanced, cache=cache)
+        return Publisher(self.raw, key)
 
     def subscribe(
-        self,
-        key_expr: str,
-        handler: Callable[[Received], None],
-        on_miss: Callable[[Missed], None] | None = None,
-        at_most: Bound | None = None,
+        self, key_expr: str, handler: Callable[[Received], None], at_most: Bound | None = None
     ) -> Subscription:
         """Call ``handler`` for every message under ``key_expr``, from a thread of Zenoh's.
 
         The handler must only hand over: while it works nothing else is received, and after five
-        seconds of that Zenoh gives up links and loses messages without a word. With ``on_miss``
-        gaps in what advanced publishers send are fetched again, and told of if that fails. What is
-        larger than ``at_most`` is not copied out of Zenoh.
+        seconds of that Zenoh gives up links and loses messages without a word. The subscription is
+        a plain one, because an advanced one drops what bears an earlier timestamp than a message
+        before it. What is larger than ``at_most`` is not copied out of Zenoh.
         """
 
         def receive(sample: zenoh.Sample) -> None:
             if at_most is not None and len(sample.payload) > at_most.size_bytes:
-                at_most.refuse(str(sample.key_expr))
+                at_most.refuse(str(sample.key_expr), number_of(sample))
             else:
                 handler(received(sample))
 
         check_key_length(key_expr)
         with clear_errors(f"key expression {key_expr!r} cannot be subscribed to"):
-            if on_miss is None:
-                return Subscription(self.raw.declare_subscriber(key_expr, receive))
-            return subscribe_advanced(self.raw, key_expr, receive, on_miss)
+            return Subscription(self.raw.declare_subscriber(key_expr, receive))
+
+    def heartbeats(self, key_expr: str, handler: Callable[[Number], None]) -> Subscription:
+        """Call ``handler`` with the last number of every advanced publisher under ``key_expr``, as
+        often as it tells; like `subscribe` from a thread of Zenoh's."""
+
+        def receive(sample: zenoh.Sample) -> None:
+            number = heartbeat(sample)
+            if number is not None:
+                handler(number)
+
+        expression = heartbeats_under(key_expr)
+        check_key_length(expression)
+        with clear_errors(f"key expression {expression!r} cannot be subscribed to"):
+            return Subscription(self.raw.declare_subscriber(expression, receive))
 
     def send(self, key: str, payload: bytes) -> None:
         """Send one message that may be dropped if the network is full; never blocks on it."""

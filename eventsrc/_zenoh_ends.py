@@ -12,31 +12,38 @@ import zenoh
 from ._zenoh_errors import is_panic, plain
 from .errors import TransportError
 
-_HEARTBEAT_S: Final = 0.5
 _MOST_KEY_BYTES: Final = 16 * 1024
 """Zenoh panics when a key does not fit one batch of 64 KiB beside what else stands in it."""
+_HEARTBEATS: Final = "@adv/pub/"
+"""What stands between a key and the session and entity id of an advanced publisher under it."""
+_NUMBER_BYTES: Final = 4
+
+
+class Number(NamedTuple):
+    """The number ``value`` (32 bits, then 0 again) that ``source`` has given to a message.
+
+    Zenoh's advanced publishers number their messages; ``source`` is ``<session id>:<entity id>``.
+    """
+
+    source: str
+    value: int
 
 
 class Received(NamedTuple):
-    """One message. Zenoh's own timestamp is left out: it may be missing, nothing goes by it, and
-    thousands a second would have to be read."""
+    """One message, with its publisher's number if it has one. Zenoh's timestamp is not read: it
+    may be missing, equal to another or earlier than the one before, and nothing depends on it."""
 
     key: str
     payload: bytes
+    number: Number | None = None
 
 
 class Bound(NamedTuple):
-    """Messages over ``size_bytes`` are not taken; ``refuse`` is called with the key of each."""
+    """Messages over ``size_bytes`` are not taken; ``refuse`` is called with the key of each and its
+    publisher's number, if it has one."""
 
     size_bytes: int
-    refuse: Callable[[str], None]
-
-
-class Missed(NamedTuple):
-    """``missed`` messages of the advanced publisher ``source`` never came nor can be fetched."""
-
-    source: str
-    missed: int
+    refuse: Callable[[str, Number | None], None]
 
 
 class Asked:
@@ -68,20 +75,17 @@ class Asked:
 
 
 class Publisher:
-    """Sends bytes under one key: reliable, in order, blocking while the network is full.
+    """Sends bytes under one key: reliable, in order, blocking while the network is full."""
 
-    An ``advanced`` one also numbers its messages and keeps the last ``cache`` of them, so that a
-    subscriber notices what it missed and can fetch it.
-    """
-
-    def __init__(self, session: zenoh.Session, key: str, *, advanced: bool, cache: int) -> None:
+    def __init__(self, session: zenoh.Session, key: str) -> None:
         check_key_length(key)
         self.key = key
-        declare = _declare_advanced if advanced else _declare_plain
         with clear_errors(f"key {key!r} cannot be published to"):
-            self._sender = declare(session, key, cache)
-            # An advanced publisher cannot say whether anybody listens; a plain one beside it can.
-            self._watch = session.declare_publisher(key) if advanced else self._sender
+            self._sender: Any = session.declare_publisher(
+                key,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                reliability=zenoh.Reliability.RELIABLE,
+            )
 
     def put(self, payload: bytes) -> None:
         """Send. Returns when Zenoh has taken it, which is not yet when anybody has received it."""
@@ -92,14 +96,14 @@ class Publisher:
     def has_subscriber(self) -> bool:
         """Whether somebody subscribes to this key now, as far as this session knows."""
         with clear_errors(f"key {self.key!r}: the session is gone"):
-            status: Any = self._watch.matching_status  # typed bool in zenoh's stubs, but it is none
+            status: Any = self._sender.matching_status  # its stubs say bool, which it is not
             return bool(status.matching)
 
     def wait_for_subscriber(self, timeout_s: float) -> bool:
         """Wait until somebody subscribes to this key; False when nobody did in time."""
         matched = threading.Event()
         with clear_errors(f"key {self.key!r}: the session is gone"):
-            listener = self._watch.declare_matching_listener(
+            listener = self._sender.declare_matching_listener(
                 lambda status: matched.set() if status.matching else None
             )
         try:
@@ -111,8 +115,6 @@ class Publisher:
         """Stop publishing under this key."""
         with quietly():
             self._sender.undeclare()
-            if self._watch is not self._sender:
-                self._watch.undeclare()
 
 
 class Subscription:
@@ -128,47 +130,6 @@ class Subscription:
                 entity.undeclare()
 
 
-def _declare_plain(session: zenoh.Session, key: str, _: int) -> Any:
-    return session.declare_publisher(
-        key,
-        congestion_control=zenoh.CongestionControl.BLOCK,
-        reliability=zenoh.Reliability.RELIABLE,
-    )
-
-
-def _declare_advanced(session: zenoh.Session, key: str, cache: int) -> Any:
-    return zenoh.ext.declare_advanced_publisher(
-        session,
-        key,
-        congestion_control=zenoh.CongestionControl.BLOCK,
-        reliability=zenoh.Reliability.RELIABLE,
-        cache=zenoh.ext.CacheConfig(cache),
-        sample_miss_detection=zenoh.ext.MissDetectionConfig(
-            heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S
-        ),
-        publisher_detection=True,
-    )
-
-
-def subscribe_advanced(
-    session: zenoh.Session,
-    key_expr: str,
-    receive: Callable[[zenoh.Sample], None],
-    on_miss: Callable[[Missed], None],
-) -> Subscription:
-    """A subscription that fetches again what it missed, and tells of it where that fails."""
-    subscriber = zenoh.ext.declare_advanced_subscriber(
-        session,
-        key_expr,
-        receive,
-        recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
-    )
-    listener = subscriber.sample_miss_listener(
-        lambda miss: on_miss(Missed(f"{miss.source.zid}:{miss.source.eid}", miss.nb))
-    )
-    return Subscription(listener, subscriber)
-
-
 def _parameters(text: str) -> dict[str, str]:
     """Zenoh writes them ``name=value;name=value``."""
     pairs = (part.partition("=") for part in text.split(";") if part)
@@ -177,7 +138,28 @@ def _parameters(text: str) -> dict[str, str]:
 
 def received(sample: zenoh.Sample) -> Received:
     """What we take of a message."""
-    return Received(str(sample.key_expr), sample.payload.to_bytes())
+    return Received(str(sample.key_expr), sample.payload.to_bytes(), number_of(sample))
+
+
+def number_of(sample: zenoh.Sample) -> Number | None:
+    """The number that an advanced publisher gave to ``sample``."""
+    info = sample.source_info
+    if info is None:
+        return None
+    return Number(f"{info.source_id.zid}:{info.source_id.eid}", info.source_sn)
+
+
+def heartbeats_under(key_expr: str) -> str:
+    """The key expression of the heartbeats of all advanced publishers under ``key_expr``."""
+    return f"{key_expr}/{_HEARTBEATS}**"
+
+
+def heartbeat(sample: zenoh.Sample) -> Number | None:
+    """The last number its publisher has given, if ``sample`` is a heartbeat as we know them."""
+    source = str(sample.key_expr).rpartition(_HEARTBEATS)[2].split("/")
+    if len(source) < 2 or len(sample.payload) != _NUMBER_BYTES:
+        return None
+    return Number(":".join(source[:2]), int.from_bytes(sample.payload.to_bytes(), "little"))
 
 
 @contextlib.contextmanager

@@ -1,17 +1,20 @@
-"""What a recorder tells robots: these keyframes of yours are on disk.
+"""What a recorder tells robots: these envelopes of yours are on disk.
 
-An ack goes out on ``mapfold/ack/<run_id>`` after a sync and names the stretches of the run around
-every keyframe received since the ack before; so whatever a robot sends, or sends again, is covered
-by the next ack it gets. It is no event: it is not in the log, and a lost one is made good by the
-next.
+An ack goes out on ``mapfold/ack/<run_id>`` after a sync and names the SHA-256 of every payload of
+that run which this sync has put on the disk, and the key they came under. So it can be wrong about
+nobody's envelopes, whatever run, keyframe or sender a message claims: who has the same bytes under
+the same key has them in the log. It is no event: it is not in the log, and a robot that has not
+heard it sends again and hears the next.
 """
 
 from typing import Annotated, Final
 from urllib.parse import quote
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, FailFast, Field
 
 ACK_PREFIX: Final = "mapfold/ack/"
+MOST_PER_ACK: Final = 512
+"""Payloads one ack names: 34 kB, which Zenoh sends in one piece."""
 
 
 def ack_key(run_id: str) -> str:
@@ -20,13 +23,14 @@ def ack_key(run_id: str) -> str:
 
 
 class Ack(BaseModel):
-    """Every keyframe of ``stretches`` (first and last, both included) is synced in ``log_id``."""
+    """Every payload of ``sha256`` came under ``key`` and is synced in ``log_id``."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
     run_id: str
+    key: str
     log_id: str
-    stretches: Annotated[tuple[tuple[int, int], ...], Field(min_length=1)]
+    sha256: Annotated[tuple[str, ...], Field(min_length=1), FailFast()]
 
     def encode(self) -> bytes:
         """The bytes that go over the wire."""
@@ -36,7 +40,3 @@ class Ack(BaseModel):
     def decode(cls, payload: bytes) -> "Ack":
         """Back from bytes; raises ValidationError for anything that is no ack."""
         return cls.model_validate_json(payload)
-
-    def covers(self, keyframe_id: int) -> bool:
-        """Whether this keyframe is among them."""
-        return any(first <= keyframe_id <= last for first, last in self.stretches)

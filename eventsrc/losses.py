@@ -12,6 +12,10 @@ The rules:
 * A log never forgets: the ``mapfold/loss`` event of a gap stays when a late keyframe closes it.
   So what is lost *now* is never the sum of the loss events, but the holes of the whole log.
 * One keyframe twice is no loss. It is counted as a duplicate.
+* A publisher may say how far it has got. When it said so the settle time ago, and the run's highest
+  recorded keyframe is still a lower one, what lies behind that is a hole too. At a recorder's end
+  a younger statement is disregarded: what it speaks of may still be on its way. So is one of a run
+  of which nothing is recorded, because nobody knows where it begins.
 
 A ledger is folded over a log from its start (or from a saved one) when a recorder opens it, so a
 hole between two recorders' lives is found like any other.
@@ -19,6 +23,7 @@ hole between two recorders' lives is found like any other.
 
 import heapq
 from bisect import bisect_right
+from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
@@ -100,6 +105,8 @@ class GapLedger:
         # Holes to report, oldest first: (since_ns, a number that makes it unique, hole).
         self._young: list[tuple[int, int, _Hole]] = []
         self._opened = 0
+        # What publishers said, oldest first: (when, run, its last keyframe).
+        self._said: deque[tuple[int, str, int]] = deque()
         self.missing = 0
         """How many keyframes are missing now."""
         self.duplicates = 0
@@ -122,29 +129,67 @@ class GapLedger:
         else:
             self._fill(run, keyframe_id)
 
+    def expect(self, run_id: str, last: int, now_ns: int) -> None:
+        """The publisher of ``run_id`` says at ``now_ns`` that it has sent keyframe ``last``."""
+        self._said.append((now_ns, run_id, last))
+
     def mark_reported(self, gap: Gap) -> None:
         """The log says that ``gap`` was reported: what is left of it will not be reported again."""
         run = self._runs.get(gap.run_id)
-        index = run.holes_before(gap.first - 1) if run is not None else 0
-        while run is not None and index < len(run.holes) and run.holes[index].last <= gap.last:
-            run.holes[index].reported = True
+        if run is None:
+            return
+        index = max(0, run.holes_before(gap.first) - 1)
+        while index < len(run.holes) and run.holes[index].first <= gap.last:
+            hole = run.holes[index]
+            first, last = max(hole.first, gap.first), min(hole.last, gap.last)
+            if first <= last and not hole.reported:
+                self._cut(run, index, first, last)
+                index = run.holes_before(first) - 1
+                run.holes[index].reported = True
             index += 1
 
     def assume(self, gap: Gap, now_ns: int) -> None:
-        """Take a loss event's word for it: the keyframes on both sides were recorded, this was not,
-        and it will not be reported again."""
-        for keyframe_id in (gap.first - 1, gap.last + 1):
-            if self.stretch(gap.run_id, keyframe_id) is None:
-                self.record(gap.run_id, keyframe_id, now_ns)
+        """Take a loss event's word for it: the keyframe before ``gap`` was recorded or reported
+        missing, ``gap`` is missing, and it will not be reported again."""
+        before = gap.first - 1
+        run = self._runs.get(gap.run_id)
+        if run is None or not run.first <= before <= run.last:
+            self.record(gap.run_id, before, now_ns)
+        self._extend(gap.run_id, gap.last, now_ns)
         self.mark_reported(gap)
 
     def due(self, now_ns: int) -> list[Gap]:
         """The gaps to report now: open for the settle time. Each is returned once."""
-        return self._report(now_ns - self._settle_ns)
+        settled_ns = now_ns - self._settle_ns
+        while self._said and self._said[0][0] <= settled_ns:
+            said_ns, run_id, last = self._said.popleft()
+            self._extend(run_id, last, said_ns)
+        return self._report(settled_ns)
 
     def flush(self) -> list[Gap]:
         """Every gap not yet reported, however young: the recorder ends."""
+        self._said.clear()
         return self._report(None)
+
+    def highest(self, run_id: str) -> int | None:
+        """The highest keyframe that is known of this run, recorded or missing."""
+        run = self._runs.get(run_id)
+        return None if run is None else run.last
+
+    def close(self, gap: Gap) -> None:
+        """Take what is missing of ``gap`` for recorded."""
+        run = self._runs.get(gap.run_id)
+        index = run.holes_before(gap.first - 1) if run is not None else 0
+        while run is not None and index < len(run.holes) and run.holes[index].last <= gap.last:
+            self._remove(run, index)
+
+    def forget(self, run_id: str) -> list[Gap]:
+        """Know nothing of this run any more; what is missing of it and was not yet reported."""
+        run = self._runs.pop(run_id)
+        gaps = [Gap(run_id, hole.first, hole.last) for hole in run.holes if not hole.reported]
+        while run.holes:
+            self._remove(run, 0)
+        return gaps
 
     def gaps(self) -> Iterator[Gap]:
         """Everything that is missing now, reported or not, in the order the runs began."""
@@ -162,18 +207,6 @@ class GapLedger:
     def missing_reported(self) -> int:
         """How many of the missing keyframes have been reported."""
         return sum(gap.count for gap in self.reported_gaps())
-
-    def stretch(self, run_id: str, keyframe_id: int) -> tuple[int, int] | None:
-        """The longest stretch of recorded keyframes around this one; None if it is missing."""
-        run = self._runs.get(run_id)
-        if run is None or not run.first <= keyframe_id <= run.last:
-            return None
-        index = run.holes_before(keyframe_id)
-        before = run.holes[index - 1].last if index else run.first - 1
-        if keyframe_id <= before:
-            return None
-        after = run.holes[index].first if index < len(run.holes) else run.last + 1
-        return before + 1, after - 1
 
     def state(self) -> tuple[RunState, ...]:
         """Everything `restore` needs to go on from here, but for how long holes have been open."""
@@ -209,12 +242,30 @@ class GapLedger:
         if index < 0 or keyframe_id > run.holes[index].last:
             self.duplicates += 1
             return
+        self._cut(run, index, keyframe_id, keyframe_id)
+        self._remove(run, run.holes_before(keyframe_id) - 1)
+
+    def _extend(self, run_id: str, last: int, now_ns: int) -> None:
+        """All up to ``last`` were sent; a hole is what is not recorded of them."""
+        run = self._runs.get(run_id)
+        if run is not None and last > run.last:
+            self._open(run, len(run.holes), run.last + 1, last, now_ns)
+            run.last = last
+
+    def _cut(self, run: _Run, index: int, first: int, last: int) -> None:
+        """Make the part from ``first`` to ``last`` of a hole a hole of its own."""
+        hole = run.holes[index]
+        if (hole.first, hole.last) == (first, last):
+            return
+        self._remove(run, index)
+        for start, end in ((last + 1, hole.last), (first, last), (hole.first, first - 1)):
+            if start <= end:
+                self._add(run, index, _Hole(run.run_id, start, end, hole.since_ns, hole.reported))
+
+    def _remove(self, run: _Run, index: int) -> None:
         hole = run.holes.pop(index)
         hole.closed = True
         self.missing -= hole.count
-        for first, last in ((keyframe_id + 1, hole.last), (hole.first, keyframe_id - 1)):
-            if first <= last:
-                self._add(run, index, _Hole(run.run_id, first, last, hole.since_ns, hole.reported))
 
     def _report(self, open_since_ns: int | None) -> list[Gap]:
         """In the order of run ids and keyframes, so that equal ledgers report equally."""

@@ -2,9 +2,9 @@
 
 * `EnvelopePublisher.publish` writes the envelope into the spool and returns; it never waits for
   the network. One thread does all the sending (`eventsrc.sending`), in the order of publishing.
-* An envelope leaves the spool when a recorder's ack covers it, and an ack covers what is synced in
-  a log. Until then it is sent again. So it may arrive more than once, which the fold absorbs: the
-  first one counts.
+* An envelope leaves the spool when a recorder's ack names its bytes, and an ack names what is
+  synced in a log. Until then it is sent again. So it may arrive more than once, which the fold
+  absorbs: the first one counts.
 * What no recorder would accept is refused here, by the same door (`eventsrc.ingest`). A recorder
   may have narrower rules (`--max-payload`) or older ones; what it refuses, with the bytes and the
   reason in its log, is set aside and no longer sent: see `EnvelopePublisher.refused`.

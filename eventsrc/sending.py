@@ -7,14 +7,15 @@
 * When acks stay away longer than the resend time, the oldest envelope is sent again, alone, as a
   question whether anybody is still there; each question in vain doubles the pause. Once there is an
   answer and it does not cover the rest, sending goes back to the oldest.
-* What a recorder that stood still has missed meanwhile is still in the publisher's cache, and Zenoh
-  fetches it from there by itself. That is why the questions are few and the cache is not small.
+* Beside the envelopes it tells how far it has got with each run (`eventsrc.sent`): at most twice a
+  second, and when it ends. So a recorder misses the last ones of a run, too.
 * What a recorder says it has refused is set aside: it would be refused for ever, and hold up all
   that comes after it.
 * Answers come in on Zenoh's thread, which only hands them over. They are taken whether or not
   anybody subscribes: a recorder's last acks arrive when it has just unsubscribed.
 """
 
+import contextlib
 import threading
 import time
 from collections import deque
@@ -27,6 +28,7 @@ from ._zenoh import Publisher, Received, Session, ZenohOptions, open_session
 from .acks import Ack, ack_key
 from .errors import MisuseError, SpoolError, TransportError
 from .refusals import Refusals, refusal_key
+from .sent import Sent, sent_key
 from .spool import Spool, Spooled
 
 WINDOW: Final = 1_024
@@ -36,6 +38,9 @@ _LONGEST_PAUSE_S: Final = 30.0
 _REST_S: Final = 0.5
 """After the answer to a question: how long the acks of the rest may take. They come in groups."""
 _RECONNECT_S: Final = 1.0
+_TELL_EVERY_S: Final = 0.5
+_MAX_ANSWER_BYTES: Final = 4 * 1024 * 1024
+"""What is larger was not sent by a recorder."""
 _LOOK_S: Final = 0.25
 """How often to look whether a recorder is still there, and how long stopping may take."""
 
@@ -60,6 +65,8 @@ class Sender:
         self._changed = threading.Condition()
         self._answers: deque[Ack | Refusals] = deque()
         self._sent = 0  # the last seq that was ever sent
+        self._untold: dict[str, int] = {}  # by run: the highest keyframe sent since it was told of
+        self._tell_due_s = 0.0
         self._news = self._stopping = False
         self._failure: TransportError | None = None
 
@@ -111,24 +118,30 @@ class Sender:
             self._rest(_RECONNECT_S)  # any more; the spool keeps everything meanwhile
 
     def _serve(self, session: Session) -> None:
-        publisher = session.publisher(self._key, advanced=True, cache=2 * self._window)
+        publisher, teller = session.publisher(self._key), session.publisher(sent_key(self._key))
         session.subscribe(refusal_key(self._key), lambda said: self._hear(said, Refusals))
         heard: set[str] = set()
         try:
             while not self._stopping:
                 self._take_answers()
                 if publisher.wait_for_subscriber(_LOOK_S):
-                    self._converse(session, publisher, heard)
+                    self._converse(session, publisher, teller, heard)
         finally:
+            with contextlib.suppress(TransportError):  # nobody is there to be told any more
+                self._tell(teller)
             self._take_answers()
 
-    def _converse(self, session: Session, publisher: Publisher, heard: set[str]) -> None:
+    def _converse(
+        self, session: Session, publisher: Publisher, teller: Publisher, heard: set[str]
+    ) -> None:
         """Send and hear acks while somebody subscribes; ``heard`` are the runs listened for."""
         cursor = 0
         patience = Patience(self._resend_after_s)
         while not self._stopping and publisher.has_subscriber:
             if self._take_answers():
                 patience.answered()
+            if self._untold and time.monotonic() >= self._tell_due_s:
+                self._tell(teller)
             under_way = self._spool.waiting_up_to(cursor)
             batch = self._spool.after(cursor, self._window - under_way)
             if batch:
@@ -160,9 +173,20 @@ class Sender:
         for spooled in batch:
             publisher.put(spooled.payload)
             self._sent = max(self._sent, spooled.seq)
+            known = self._untold.get(spooled.run_id, spooled.keyframe_id)
+            self._untold[spooled.run_id] = max(known, spooled.keyframe_id)
         return batch[-1].seq if batch else 0
 
+    def _tell(self, teller: Publisher) -> None:
+        """Say how far each run was sent."""
+        for run_id, last in self._untold.items():
+            teller.put(Sent(run_id=run_id, last=last).encode())
+        self._untold.clear()
+        self._tell_due_s = time.monotonic() + _TELL_EVERY_S
+
     def _hear(self, message: Received, kind: type[Ack] | type[Refusals]) -> None:
+        if len(message.payload) > _MAX_ANSWER_BYTES:
+            return
         try:
             answer = kind.decode(message.payload)
         except ValidationError:
@@ -184,7 +208,8 @@ class Sender:
 
     def _take(self, answer: Ack | Refusals) -> int:
         if isinstance(answer, Ack):
-            return self._spool.acknowledge(answer)
+            # Of the same bytes under another key, the log has the other robot's.
+            return self._spool.acknowledge(answer) if answer.key == self._key else 0
         return self._spool.refuse(answer, up_to=self._sent)
 
     def _wait(self, timeout_s: float) -> None:

@@ -3,6 +3,8 @@
 * One SQLite file, one owner. A published envelope is in the file before anything is sent, so it
   outlives the robot's process; write-ahead logging without a sync per envelope means that a power
   cut may take the last moments, and never more. The order is the order of publishing.
+* An envelope is named by the SHA-256 of its bytes: an ack of those very bytes frees it, and nothing
+  else. Twice the same bytes are one envelope that was published twice; an ack frees both.
 * What a recorder has refused waits no more. It is set aside in the same file, within the same
   bound, and gives way to new envelopes (`eventsrc._set_aside`). An ack frees it too: then another
   recorder has it.
@@ -28,10 +30,11 @@ create table if not exists spooled (
     seq integer primary key autoincrement,
     run_id text not null,
     keyframe_id integer not null,
-    payload blob not null
+    payload blob not null,
+    sha256 text
 );
-create index if not exists spooled_keyframe on spooled (run_id, keyframe_id);
 """
+_INDEX: Final = "create index if not exists spooled_sha256 on spooled (sha256)"
 
 
 class Spooled(NamedTuple):
@@ -39,6 +42,7 @@ class Spooled(NamedTuple):
 
     seq: int
     run_id: str
+    keyframe_id: int
     payload: bytes
 
 
@@ -66,7 +70,8 @@ class Spool:
         self._db.execute("pragma journal_mode = wal")
         self._db.execute("pragma synchronous = normal")
         self._db.executescript(_SCHEMA)
-        self._aside = SetAside(self._db)
+        self._aside = SetAside(self._db)  # which upgrades both tables
+        self._db.execute(_INDEX)
         row = self._db.execute("select count(*), coalesce(sum(length(payload)), 0) from spooled")
         self._count, self._bytes = row.fetchone()
 
@@ -80,8 +85,8 @@ class Spool:
                     "bring the link or the recorder back, or allow a larger spool"
                 )
             self._db.execute(
-                "insert into spooled (run_id, keyframe_id, payload) values (?, ?, ?)",
-                (run_id, keyframe_id, payload),
+                "insert into spooled (run_id, keyframe_id, payload, sha256) values (?, ?, ?, ?)",
+                (run_id, keyframe_id, payload, fingerprint(payload)),
             )
             self._count += 1
             self._bytes += len(payload)
@@ -97,7 +102,8 @@ class Spool:
         """The oldest envelopes after ``seq``, in order, at most ``limit``."""
         with self._clear_errors(), self._lock:
             rows = self._db.execute(
-                "select seq, run_id, payload from spooled where seq > ? order by seq limit ?",
+                "select seq, run_id, keyframe_id, payload from spooled where seq > ? "
+                "order by seq limit ?",
                 (seq, limit),
             )
             return [Spooled(*row) for row in rows]
@@ -110,41 +116,33 @@ class Spool:
             return int(count)
 
     def acknowledge(self, ack: Ack) -> int:
-        """Let go of what ``ack`` covers; how many envelopes wait no more."""
+        """Let go of what ``ack`` names; how many envelopes wait no more."""
         removed = 0
-        with self._clear_errors(), self._lock:
-            for first, last in ack.stretches:
+        with self._clear_errors(), self._lock, self._transaction():
+            for sha256 in ack.sha256:
                 rows = self._db.execute(
-                    "delete from spooled where run_id = ? and keyframe_id between ? and ? "
-                    "returning length(payload)",
-                    (ack.run_id, first, last),
+                    "delete from spooled where sha256 = ? returning length(payload)", (sha256,)
                 ).fetchall()
                 removed += len(rows)
                 self._bytes -= sum(size for (size,) in rows)
-                self._aside.forget(ack.run_id, first, last)
+                self._aside.forget(sha256)
             self._count -= removed
         return removed
 
     def refuse(self, refusals: Refusals, up_to: int) -> int:
         """Set aside what ``refusals`` name among the envelopes up to the seq ``up_to``; how many
         envelopes wait no more."""
-        reasons = {(said.size, said.sha256): said.reason for said in refusals.refused}
-        sizes = {size for size, _ in reasons}
         moved = 0
         with self._clear_errors(), self._lock, self._transaction():
-            rows = self._db.execute(
-                "select seq, length(payload) from spooled where seq <= ?", (up_to,)
-            ).fetchall()
-            for seq, size in rows:
-                reason = reasons.get((size, self._fingerprint(seq))) if size in sizes else None
-                if reason is not None:
-                    self._set_aside(seq, size, refusals.log_id, reason)
+            for said in refusals.refused:
+                rows = self._db.execute(
+                    "select seq, length(payload) from spooled where sha256 = ? and seq <= ?",
+                    (said.sha256, up_to),
+                ).fetchall()
+                for seq, size in rows:
+                    self._set_aside(seq, size, refusals.log_id, said.reason)
                     moved += 1
         return moved
-
-    def _fingerprint(self, seq: int) -> str:
-        ((payload,),) = self._db.execute("select payload from spooled where seq = ?", (seq,))
-        return fingerprint(payload)
 
     def _set_aside(self, seq: int, size: int, log_id: str, reason: str) -> None:
         self._aside.take(seq, log_id, reason, size)

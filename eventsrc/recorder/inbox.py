@@ -6,14 +6,22 @@ loses nothing. But the wait is bounded, and shorter than the five seconds after 
 link up and loses messages without a word: a writer that makes no room for that long is stuck. From
 then on what does not fit is turned away at once and counted, per key, until the writer fetches the
 count and writes it into the log; and when half the queue is free again, so is the patience.
+
+A message that was turned away has come all the same: what is missing in its publisher's numbering
+(`eventsrc.recorder.numbering`) are only those that never came.
 """
 
 import threading
+import time
 from collections import deque
 from typing import Final
 
-from eventsrc._zenoh import Missed, Received
+from eventsrc._zenoh import Number, Received
 from eventsrc.keys import MAX_KEY_BYTES
+from eventsrc.losses import Gap
+from eventsrc.sent import SENT_SUFFIX
+
+from .numbering import Numbering
 
 DEFAULT_QUEUE_SIZE: Final = 16_384
 """Messages. At 9 kB each about 150 MB, and two seconds of 8,000 a second."""
@@ -51,11 +59,11 @@ class Inbox:
         self._messages: deque[Received] = deque()
         self._overflow: dict[str, int] = {}
         self._too_large: dict[str, int] = {}
-        self._missed: dict[str, int] = {}
+        self._numbering = Numbering()
         self.overflowed = 0
         """Messages that did not fit, since the beginning."""
         self.missed = 0
-        """Messages that Zenoh says never came, since the beginning."""
+        """Messages that by their publishers' numbers never came, since the beginning."""
         self.too_large = 0
         """Messages that were too large to be taken from Zenoh, since the beginning."""
         self._lock = threading.Lock()
@@ -68,24 +76,27 @@ class Inbox:
     def put(self, message: Received) -> None:
         """Hand over one message, or count it as lost when there is no room for it in time."""
         with self._lock:
+            if message.number is not None:
+                self._numbering.arrived(message.number, time.monotonic_ns())
             if self._fits(message) or self._wait_for_room(message):
                 self._messages.append(message)
                 self._bytes += len(message.payload)
-            else:
+            elif not message.key.endswith(SENT_SUFFIX):  # which says how far a robot has got
                 self.overflowed += 1
                 _count(self._overflow, message.key)
             if self._taking:
                 self._filled.notify()
 
-    def miss(self, missed: Missed) -> None:
-        """Count messages that Zenoh says never came."""
+    def told(self, number: Number) -> None:
+        """Take in how far a publisher says it has got."""
         with self._lock:
-            self.missed += missed.missed
-            self._missed[missed.source] = self._missed.get(missed.source, 0) + missed.missed
+            self._numbering.told(number, time.monotonic_ns())
 
-    def refuse(self, key: str) -> None:
+    def refuse(self, key: str, number: Number | None) -> None:
         """Count a message that is too large to be taken from Zenoh."""
         with self._lock:
+            if number is not None:
+                self._numbering.arrived(number, time.monotonic_ns())
             self.too_large += 1
             _count(self._too_large, key)
 
@@ -121,11 +132,14 @@ class Inbox:
             too_large, self._too_large = self._too_large, {}
             return too_large
 
-    def take_missed(self) -> dict[str, int]:
-        """How many messages Zenoh missed since the last call, by publisher."""
+    def take_missed(self, now_ns: int | None) -> list[Gap]:
+        """The numbers that never came, each once: those long enough missing at ``now_ns``, or all
+        that are missing."""
         with self._lock:
-            missed, self._missed = self._missed, {}
-            return missed
+            numbering = self._numbering
+            gaps = numbering.flush() if now_ns is None else numbering.due(now_ns)
+            self.missed += sum(gap.count for gap in gaps)
+            return gaps
 
     def close(self) -> None:
         """Wake everybody: nothing more will come, and nobody waits for room."""

@@ -5,12 +5,13 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Final
 
-from eventsrc._zenoh import Bound, Received, Session, check_keys
+from eventsrc._zenoh import Bound, Number, Received, Session, check_keys
 from eventsrc.acks import ACK_PREFIX
 from eventsrc.errors import TransportError
 from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES
 from eventsrc.log import LogWriter
 from eventsrc.losses import GapLedger
+from eventsrc.sent import MAX_SENT_BYTES, sent_key
 
 from .inbox import DEFAULT_QUEUE_SIZE, Inbox
 from .report import RecorderReport
@@ -56,9 +57,15 @@ class Recorder:
             max_payload_bytes=max_payload_bytes,
         )
         at_most = Bound(_TAKEN_WHOLE * max_payload_bytes, self._refuse)
+        sent_at_most = Bound(MAX_SENT_BYTES, self._refuse)
         self._subscriptions = [
-            session.subscribe(key, self._receive, on_miss=self._inbox.miss, at_most=at_most)
+            subscription
             for key in keys
+            for subscription in (
+                session.subscribe(key, self._receive, at_most=at_most),
+                session.subscribe(sent_key(key), self._receive_sent, at_most=sent_at_most),
+                session.heartbeats(key, self._inbox.told),
+            )
         ]
         session.confirm()
 
@@ -109,9 +116,12 @@ class Recorder:
         if not message.key.startswith(ACK_PREFIX):
             self._inbox.put(message)
 
-    def _refuse(self, key: str) -> None:
+    def _refuse(self, key: str, number: Number | None) -> None:
         if not key.startswith(ACK_PREFIX):
-            self._inbox.refuse(key)
+            self._inbox.refuse(key, number)
+
+    def _receive_sent(self, message: Received) -> None:
+        self._inbox.put(message)
 
     def _answer(self, key: str, payload: bytes) -> None:
         try:

@@ -3,8 +3,10 @@
 * One thread owns the LogWriter. It takes batches from the inbox, appends, and lets the log commit.
 * Nothing follows from an event before it is synced: only then does it enter the gap ledger, count
   as recorded, and is its robot told: acknowledged, or refused.
-* An ack speaks of nothing but what this recorder itself has synced. What an earlier one has may
+* An ack names the payloads of one sync and nothing else. What an earlier recorder has synced may
   have rotted since, whatever a saved ledger says; a robot that still has it sends it again.
+* How far a robot says it has got comes through the same queue, behind what it sent before, and
+  enters the gap ledger when that is synced. It is nothing to record.
 * When the log cannot be written any more, what was received and is not known to be synced is
   counted: being written, taken, or still in the queue.
 * Losses are written about once a second, not one by one: a queue that overflows is busy enough.
@@ -16,7 +18,9 @@ import itertools
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
+
+from pydantic import ValidationError
 
 from eventsrc._zenoh import Received
 from eventsrc.append import judge_payloads
@@ -24,6 +28,7 @@ from eventsrc.errors import LogError
 from eventsrc.ledger import save_ledger
 from eventsrc.log import LogWriter
 from eventsrc.losses import Gap, GapLedger
+from eventsrc.sent import SENT_SUFFIX, Sent
 from eventsrc.system_events import LOSS_KEY, Loss
 
 from .answers import Answers, Unsynced, unsynced
@@ -32,7 +37,6 @@ from .report import RecorderReport
 
 Answer = Callable[[str, bytes], None]
 """Sends a payload under a key."""
-Cause = Literal["queue_full", "too_large", "transport_miss"]
 
 _BATCH: Final = 256
 _TOGETHER: Final = 16
@@ -45,6 +49,13 @@ _UNSYNCED_S: Final = 0.005
 _LOSSES_EVERY_NS: Final = 1_000_000_000
 _SAVE_EVERY_NS: Final = 60_000_000_000
 """So a recorder that was killed leaves a minute of its log to be read again, not the whole."""
+
+
+class _Told(NamedTuple):
+    """What a robot said when the log's next offset was ``offset``."""
+
+    offset: int
+    sent: Sent
 
 
 class Writing:
@@ -64,8 +75,6 @@ class Writing:
         self._inbox = inbox
         self._writer = writer
         self._ledger = GapLedger() if ledger is None else ledger
-        self._synced = GapLedger()
-        """What acks speak of."""
         self._saves = ledger is not None  # one that does not know the whole log is not its ledger
         self._answer = answer
         self._room = max_events
@@ -74,6 +83,7 @@ class Writing:
         self._losses_due_ns = time.monotonic_ns() + _LOSSES_EVERY_NS
         self._save_due_ns = time.monotonic_ns() + _SAVE_EVERY_NS
         self._unsynced: deque[Unsynced] = deque()
+        self._told: deque[_Told] = deque()
         self._in_hand = 0  # taken from the inbox and not yet given to the log
         self._failed = False
         self._recorded = self._rejected = 0
@@ -88,7 +98,7 @@ class Writing:
             while self._step():
                 pass
             self._sync()
-            self._write_losses(self._ledger.flush())
+            self._write_losses(self._ledger.flush(), self._inbox.take_missed(None))
             self._save()
         except LogError:
             self._failed = True
@@ -127,40 +137,56 @@ class Writing:
         closed = self._inbox.closed  # before taking: what came before the closing is still taken
         waiting = self._writer.durable_offset < self._writer.next_offset
         self._writer.hurry(2 * self._inbox.depth() >= self._inbox.size)
-        batch = self._inbox.take(limit, _UNSYNCED_S if waiting else _IDLE_S)
+        taken = self._inbox.take(limit, _UNSYNCED_S if waiting else _IDLE_S)
+        batch = [message for message in taken if not message.key.endswith(SENT_SUFFIX)]
         self._in_hand = len(batch)
         for messages in _portions(batch):
             self._record(messages)
+        if len(batch) < len(taken):
+            self._take_told(taken)
         self._writer.commit_if_due()
         self._follow_up()
         now_ns = time.monotonic_ns()
         if now_ns >= self._losses_due_ns:
             self._losses_due_ns = now_ns + _LOSSES_EVERY_NS
-            self._synced.flush()  # its gaps are nobody's; the ledger of the whole log tells them
-            self._write_losses(self._ledger.due(now_ns))
+            self._write_losses(self._ledger.due(now_ns), self._inbox.take_missed(now_ns))
         if now_ns >= self._save_due_ns:
             self._save_due_ns = now_ns + _SAVE_EVERY_NS
             self._save()
         if self._room is not None:
             self._room -= len(batch)
-        return bool(batch or not closed) and self._room != 0
+        return bool(taken or not closed) and self._room != 0
 
     def _record(self, messages: list[Received]) -> None:
-        judged = judge_payloads(self._writer, messages, max_bytes=self._max_payload_bytes)
+        payloads = [(message.key, message.payload) for message in messages]
+        judged = judge_payloads(self._writer, payloads, max_bytes=self._max_payload_bytes)
         # Noted first: should appending fail in the middle, what was synced by then still counts.
         offsets = itertools.count(self._writer.next_offset)
         self._unsynced.extend(map(unsynced, offsets, messages, judged))
         self._in_hand -= len(messages)
         self._writer.append_all([event for event, _ in judged])
 
+    def _take_told(self, taken: list[Received]) -> None:
+        for message in taken:
+            if message.key.endswith(SENT_SUFFIX):
+                try:
+                    sent = Sent.decode(message.payload)
+                except ValidationError:
+                    continue  # not from a robot we understand, so it has said nothing
+                self._told.append(_Told(self._writer.next_offset, sent))
+
     def _follow_up(self) -> None:
         """Everything synced since the last call: recorded, counted, answered."""
         durable = self._writer.durable_offset
-        waiting = self._unsynced
-        if not waiting or waiting[0].offset >= durable:
-            return
         now_ns = time.monotonic_ns()
-        answers, ledger, synced = Answers(), self._ledger, self._synced
+        if self._unsynced and self._unsynced[0].offset < durable:
+            self._follow_events(durable, now_ns)
+        while self._told and self._told[0].offset <= durable:
+            sent = self._told.popleft().sent
+            self._ledger.expect(sent.run_id, sent.last, now_ns)
+
+    def _follow_events(self, durable: int, now_ns: int) -> None:
+        waiting, answers, ledger = self._unsynced, Answers(), self._ledger
         rejected, before = 0, len(waiting)
         while waiting and waiting[0].offset < durable:
             event = waiting.popleft()
@@ -168,11 +194,10 @@ class Writing:
             run_id, keyframe_id = event.run_id, event.keyframe_id
             if run_id is not None:
                 ledger.record(run_id, keyframe_id, now_ns)
-                synced.record(run_id, keyframe_id, now_ns)
             answers.note(event)
         self._rejected += rejected
         self._recorded += before - len(waiting) - rejected
-        for key, payload in answers.messages(self._writer.log_id, self._synced):
+        for key, payload in answers.messages(self._writer.log_id):
             self._answer(key, payload)
 
     def _sync(self) -> int:
@@ -186,25 +211,17 @@ class Writing:
         if self._saves:
             save_ledger(self._writer.path, self._writer.log_id, next_offset, self._ledger)
 
-    def _write_losses(self, gaps: list[Gap]) -> None:
-        for gap in gaps if self._report_gaps else ():
-            self._append_loss(
-                Loss(
-                    publisher=gap.run_id,
-                    first=gap.first,
-                    last=gap.last,
-                    count=gap.count,
-                    cause="keyframe_gap",
-                )
-            )
-        self._write_counts("queue_full", self._inbox.take_overflow())
-        self._write_counts("too_large", self._inbox.take_too_large())
-        self._write_counts("transport_miss", self._inbox.take_missed())
+    def _write_losses(self, missing: list[Gap], missed: list[Gap]) -> None:
+        """``missing`` are keyframes, ``missed`` publishers' own numbers."""
+        for gap in missing if self._report_gaps else ():
+            self._append_loss(_loss("keyframe_gap", gap))
+        for key, count in self._inbox.take_overflow().items():
+            self._append_loss(Loss(publisher=key, count=count, cause="queue_full"))
+        for key, count in self._inbox.take_too_large().items():
+            self._append_loss(Loss(publisher=key, count=count, cause="too_large"))
+        for gap in missed:
+            self._append_loss(_loss("transport_miss", gap))
         self._missing = self._ledger.missing if self._report_gaps else 0
-
-    def _write_counts(self, cause: Cause, counts: dict[str, int]) -> None:
-        for publisher, count in counts.items():
-            self._append_loss(Loss(publisher=publisher, count=count, cause=cause))
 
     def _append_loss(self, loss: Loss) -> None:
         self._writer.append(LOSS_KEY, loss.model_dump_json().encode())
@@ -222,3 +239,7 @@ def _portions(messages: Sequence[Received]) -> Iterator[list[Received]]:
             portion, size = [], 0
     if portion:
         yield portion
+
+
+def _loss(cause: Literal["keyframe_gap", "transport_miss"], gap: Gap) -> Loss:
+    return Loss(publisher=gap.run_id, first=gap.first, last=gap.last, count=gap.count, cause=cause)

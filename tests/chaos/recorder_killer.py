@@ -27,10 +27,11 @@ from eventsrc._zenoh import Received, ZenohOptions, open_session
 from eventsrc.acks import Ack, ack_key
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.publisher import EnvelopePublisher
+from eventsrc.refusals import fingerprint
 from eventsrc.router import Router
 from projections.folding import fold_log
 from projections.settings import Settings
-from tests.envelopes import envelope
+from tests.envelopes import envelope, payload
 from tests.fixtures_zenoh import LOOPBACK, MAPFOLD, Program
 
 LONGEST_LIFE_S = 0.6
@@ -46,6 +47,7 @@ class Robot:
         self.publisher = EnvelopePublisher(options, spool, resend_after_s=0.5)
         self.published = 0
         self._acked: set[int] = set()
+        self._keyframes: dict[str, int] = {}
         self._lock = threading.Lock()
         self._pause_s = 1 / per_second
         self._stop = threading.Event()
@@ -56,13 +58,16 @@ class Robot:
 
     def _publish(self) -> None:
         while not self._stop.wait(self._pause_s):
-            self.publisher.publish(envelope(self.published, run_id=RUN, note="x" * 4_000))
+            message = payload(envelope(self.published, run_id=RUN, note="x" * 4_000))
+            with self._lock:
+                self._keyframes[fingerprint(message)] = self.published
+            self.publisher.publish(message)
             self.published += 1
 
     def _hear(self, message: Received) -> None:
         with self._lock:
-            for first, last in Ack.decode(message.payload).stretches:
-                self._acked.update(range(first, last + 1))
+            acked = Ack.decode(message.payload).sha256
+            self._acked.update(self._keyframes[digest] for digest in acked)
 
     def acknowledged(self) -> set[int]:
         """What was acknowledged by now."""

@@ -1,6 +1,7 @@
 """The robot's publisher against real routers and recorders, with both of them going away."""
 
 import json
+import queue
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -13,9 +14,10 @@ from eventsrc.acks import Ack, ack_key
 from eventsrc.errors import InvalidEnvelope, MisuseError, SpoolFull, TransportError
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.publisher import EnvelopePublisher
-from eventsrc.refusals import Refusal, Refusals, refusal_key
+from eventsrc.refusals import Refusal, Refusals, fingerprint, refusal_key
 from eventsrc.router import Router
 from eventsrc.sending import Sender
+from eventsrc.sent import Sent, sent_key
 from eventsrc.system_events import REJECTED_KEY
 from tests.envelopes import envelope, payload
 from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK, Program
@@ -23,6 +25,11 @@ from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK, Program
 Sessions = Callable[[], Session]
 Start = Callable[..., Program]
 KEY = "tb/detections"
+
+
+def _ack(*payloads: bytes, key: str = KEY) -> bytes:
+    digests = tuple(map(fingerprint, payloads))
+    return Ack(run_id="run-a", key=key, log_id="log", sha256=digests).encode()
 
 
 def _stored(log: Path) -> list[bytes]:
@@ -136,8 +143,7 @@ def test_only_a_window_is_under_way(endpoint: str, connected: Sessions, tmp_path
             robot.publish(envelope(k))
         assert again.wait(DEADLINE_S)
         assert seen[:11] == [*range(10), 0]
-        stretch = Ack(run_id="run-a", log_id="log", stretches=((0, 4),))
-        viewer.send(ack_key("run-a"), stretch.encode())
+        viewer.send(ack_key("run-a"), _ack(*(payload(envelope(k)) for k in range(5))))
         assert more.wait(DEADLINE_S)
         assert max(seen) <= 14
 
@@ -157,6 +163,34 @@ def test_two_robots_hear_their_own_acks(
         assert one.flush(DEADLINE_S)
         assert other.flush(DEADLINE_S)
     assert _keyframes(tmp_path / "log") == {*range(20), *range(1_000, 1_020)}
+
+
+def test_a_run_id_used_by_two_robots_acknowledges_to_each_its_own(
+    endpoint: str, connected: Sessions, start: Start, tmp_path: Path
+) -> None:
+    """One publishes under a key that nobody records; the other's acks are heard by both."""
+    program = start("record", str(tmp_path / "log"), "--connect", endpoint)
+    program.wait_for("recording")
+    arrived = threading.Semaphore(0)
+    viewer = connected()
+    viewer.subscribe("tb/elsewhere", lambda _: arrived.release())
+    viewer.confirm()
+    options = ZenohOptions(connect=(endpoint,))
+    with (
+        EnvelopePublisher(options, tmp_path / "a") as one,
+        EnvelopePublisher(options, tmp_path / "b", "tb/elsewhere", resend_after_s=0.1) as other,
+    ):
+        for k in range(20):
+            other.publish(envelope(k, note="the other's"))
+        other.publish(envelope(99))
+        for _ in range(21):
+            assert arrived.acquire(timeout=DEADLINE_S)
+        for k in range(100):
+            one.publish(envelope(k))
+        assert one.flush(DEADLINE_S)
+        assert arrived.acquire(timeout=DEADLINE_S), "sent again after that"
+        assert other.unacknowledged == 21
+    assert _keyframes(tmp_path / "log") == set(range(100))
 
 
 def test_a_router_that_comes_and_goes_loses_nothing(start: Start, tmp_path: Path) -> None:
@@ -194,10 +228,14 @@ def test_nonsense_on_the_ack_key_acknowledges_nothing(
     assert arrived.acquire(timeout=DEADLINE_S)
     viewer.send(ack_key("run-a"), b"{}")
     assert arrived.acquire(timeout=DEADLINE_S), "it is sent again"
-    viewer.send(ack_key("run-a"), Ack(run_id="run-a", log_id="l", stretches=((2, 9),)).encode())
+    mine, others = payload(envelope(1)), payload(envelope(1, note="another robot's"))
+    older = b'{"run_id":"run-a","log_id":"log","stretches":[[0,9]]}'
+    for wrong in (_ack(others), _ack(mine, key="tb/other"), older):
+        viewer.send(ack_key("run-a"), wrong)
+        assert arrived.acquire(timeout=DEADLINE_S), "it is sent again"
     assert arrived.acquire(timeout=DEADLINE_S)
     assert robot.unacknowledged == 1
-    viewer.send(ack_key("run-a"), Ack(run_id="run-a", log_id="l", stretches=((0, 1),)).encode())
+    viewer.send(ack_key("run-a"), _ack(others, mine))
     assert robot.flush(DEADLINE_S)
 
 
@@ -303,9 +341,30 @@ def test_an_ack_that_comes_when_the_recorder_has_left_is_taken(
     watch = viewer.publisher(KEY)
     while watch.has_subscriber:
         viewer.confirm()
-    ack = Ack(run_id="run-a", log_id="log", stretches=((0, 9),))
-    recorder.send(ack_key("run-a"), ack.encode())
+    recorder.send(ack_key("run-a"), _ack(*(payload(envelope(k)) for k in range(10))))
     assert robot.flush(DEADLINE_S)
+
+
+def test_a_robot_tells_how_far_it_has_got_and_tells_it_once_more_when_it_ends(
+    endpoint: str, connected: Sessions, tmp_path: Path
+) -> None:
+    arrived = threading.Semaphore(0)
+    told: queue.SimpleQueue[Sent] = queue.SimpleQueue()
+    viewer = connected()
+    viewer.subscribe(KEY, lambda _: arrived.release())
+    viewer.subscribe(sent_key(KEY), lambda said: told.put(Sent.decode(said.payload)))
+    viewer.confirm()
+    with EnvelopePublisher(ZenohOptions(connect=(endpoint,)), tmp_path / "spool") as robot:
+        robot.publish(envelope(5))
+        while told.get(timeout=DEADLINE_S) != Sent(run_id="run-a", last=5):
+            pass
+        for k, run_id in ((7, "run-a"), (6, "run-a"), (1, "run-b")):
+            robot.publish(envelope(k, run_id=run_id))
+        for _ in range(4):
+            assert arrived.acquire(timeout=DEADLINE_S)
+    awaited = {Sent(run_id="run-a", last=7), Sent(run_id="run-b", last=1)}
+    while awaited:
+        awaited.discard(told.get(timeout=DEADLINE_S))
 
 
 def test_a_key_of_our_own_is_refused_at_once(tmp_path: Path) -> None:
@@ -367,13 +426,14 @@ def test_kill_9_loses_nothing_that_was_acknowledged_and_resending_fills_the_rest
     tmp_path: Path,
 ) -> None:
     """Three recorders are killed under load; each time the log must hold what was acked by then."""
+    sent = [payload(envelope(k, note="x" * 1_000)) for k in range(6_000)]
+    keyframes = {fingerprint(message): k for k, message in enumerate(sent)}
     acked: set[int] = set()
     progress = threading.Condition()
 
     def hear(message: Received) -> None:
         with progress:
-            for first, last in Ack.decode(message.payload).stretches:
-                acked.update(range(first, last + 1))
+            acked.update(keyframes[digest] for digest in Ack.decode(message.payload).sha256)
             progress.notify_all()
 
     watcher = connected()
@@ -382,8 +442,8 @@ def test_kill_9_loses_nothing_that_was_acknowledged_and_resending_fills_the_rest
     published = threading.Event()
 
     def publish() -> None:
-        for k in range(6_000):
-            robot.publish(envelope(k, note="x" * 1_000))
+        for message in sent:
+            robot.publish(message)
         published.set()
 
     thread = threading.Thread(target=publish)

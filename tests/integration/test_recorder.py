@@ -12,7 +12,7 @@ import pytest
 import zenoh
 
 from eventsrc._zenoh import Received, Session, ZenohOptions, open_session
-from eventsrc.acks import Ack, ack_key
+from eventsrc.acks import MOST_PER_ACK, Ack, ack_key
 from eventsrc.append import append_payload
 from eventsrc.clock import system_clock
 from eventsrc.errors import LogDamaged, LogError, MisuseError
@@ -20,8 +20,9 @@ from eventsrc.ledger import ledger_of, save_ledger
 from eventsrc.log import Event, FsyncPolicy, LogReader, LogWriter
 from eventsrc.losses import Gap
 from eventsrc.recorder import Recorder, RecorderReport
-from eventsrc.refusals import Refusal, Refusals, refusal_key
+from eventsrc.refusals import Refusal, Refusals, fingerprint, refusal_key
 from eventsrc.router import Router
+from eventsrc.sent import MAX_SENT_BYTES, Sent, sent_key
 from eventsrc.system_events import LOSS_KEY, REJECTED_KEY, Loss, RejectedPayload
 from tests.envelopes import detection, envelope, payload
 from tests.fixtures_log import flip
@@ -166,14 +167,17 @@ def test_a_recorder_of_everything_does_not_record_its_own_acks(
         assert running.finish().rejected == 0
 
 
-def test_an_ack_covers_what_is_synced_and_nothing_else(connected: Sessions, tmp_path: Path) -> None:
+def test_an_ack_names_what_is_synced_and_nothing_else(connected: Sessions, tmp_path: Path) -> None:
+    """More payloads than one ack names, and of each robot its own though they share a run."""
     run_id = "robot/*?#$ 🤖"
     acks: list[Ack] = []
     covered = threading.Event()
+    sent = [*_keyframes(*range(600), run_id=run_id), *_keyframes(1, 2, run_id=run_id, note="b")]
+    wanted = set(map(fingerprint, sent))
 
     def hear(message: Received) -> None:
         acks.append(Ack.decode(message.payload))
-        if acks[-1].covers(9):
+        if {digest for ack in acks for digest in ack.sha256} >= wanted:
             covered.set()
 
     watcher = connected()
@@ -182,13 +186,15 @@ def test_an_ack_covers_what_is_synced_and_nothing_else(connected: Sessions, tmp_
     with recording(connected(), tmp_path / "log") as running:
         publisher = connected().publisher(KEY)
         assert publisher.wait_for_subscriber(DEADLINE_S)
-        for message in (*_keyframes(1, 2, 3, 9, run_id=run_id), b"no envelope"):
+        for message in (b"no envelope", *sent):
             publisher.put(message)
         assert covered.wait(DEADLINE_S)
         running.finish()
-    assert {ack.run_id for ack in acks} == {run_id}
-    claimed = {k for ack in acks for first, last in ack.stretches for k in range(first, last + 1)}
-    assert claimed == {1, 2, 3, 9}
+    assert {(ack.run_id, ack.key) for ack in acks} == {(run_id, KEY)}
+    assert {digest for ack in acks for digest in ack.sha256} == wanted
+    assert max(len(ack.sha256) for ack in acks) <= MOST_PER_ACK
+    with LogReader(tmp_path / "log") as reader:
+        assert {ack.log_id for ack in acks} == {reader.log_id}
 
 
 def test_an_ack_does_not_rest_on_what_an_earlier_recorder_synced(
@@ -215,13 +221,14 @@ def test_an_ack_does_not_rest_on_what_an_earlier_recorder_synced(
     watcher = connected()
     watcher.subscribe(ack_key("run-a"), hear)
     watcher.confirm()
+    (message,) = _keyframes(3)
     with recording(connected(), log) as running:
         publisher = connected().publisher(KEY)
         assert publisher.wait_for_subscriber(DEADLINE_S)
-        publisher.put(*_keyframes(3))
+        publisher.put(message)
         assert acked.wait(DEADLINE_S)
         running.finish()
-    assert [ack.stretches for ack in acks] == [((3, 3),)]
+    assert [ack.sha256 for ack in acks] == [(fingerprint(message),)]
 
 
 def test_a_refusal_follows_when_the_rejected_bytes_are_synced(
@@ -294,10 +301,15 @@ def test_a_queue_that_stays_full_loses_loudly(connected: Sessions, tmp_path: Pat
     assert Loss(publisher="run-a", first=5, last=11, count=7, cause="keyframe_gap") in losses
 
 
+def _losses(log: Path) -> list[Loss]:
+    return [Loss.model_validate_json(e.payload) for e in _events(log) if e.key == LOSS_KEY]
+
+
 def test_what_an_advanced_publisher_sent_and_never_came_is_a_loss(
     connected: Sessions, tmp_path: Path
 ) -> None:
-    """The numbers of an advanced publisher are put on by hand, so that some can be left out."""
+    """The numbers of an advanced publisher are put on by hand, so that some can be left out; and
+    so is its heartbeat, which tells that there were two more."""
     with recording(connected(), tmp_path / "log") as running:
         robot = connected()
         publisher = robot.raw.declare_publisher(KEY)
@@ -308,18 +320,42 @@ def test_what_an_advanced_publisher_sent_and_never_came_is_a_loss(
                 congestion_control=zenoh.CongestionControl.BLOCK,
                 source_info=zenoh.SourceInfo(publisher.id, number),
             )
+        source = f"{publisher.id.zid}/{publisher.id.eid}"
+        robot.publisher(f"{KEY}/@adv/pub/{source}/_").put((11).to_bytes(4, "little"))
         running.wait_until(lambda report: report.recorded == 5)
-        running.wait_until(lambda report: report.transport_missed == 5)
+        running.wait_until(lambda report: report.transport_missed == 7)
         assert not running.finish().clean
-    losses = [
-        Loss.model_validate_json(event.payload)
-        for event in _events(tmp_path / "log")
-        if event.key == LOSS_KEY
-    ]
+    losses = _losses(tmp_path / "log")
     missed = [loss for loss in losses if loss.cause == "transport_miss"]
-    assert sum(loss.count for loss in missed) == 5
-    assert {loss.publisher.split(":")[0] for loss in missed} == {str(robot.raw.zid())}
+    assert [(x.first, x.last, x.count) for x in missed] == [(2, 3, 2), (6, 8, 3), (10, 11, 2)]
+    assert {loss.publisher for loss in missed} == {source.replace("/", ":")}
     assert [(x.first, x.last) for x in losses if x.cause == "keyframe_gap"] == [(2, 3), (6, 8)]
+
+
+def test_the_last_keyframes_of_a_run_are_missed_when_their_robot_says_that_it_sent_them(
+    connected: Sessions, tmp_path: Path
+) -> None:
+    """The words of a publisher of ours, without the messages. What it says is nothing to record."""
+    log = tmp_path / "log"
+    with recording(connected(), log, ["tb/*"]) as running:
+        robot = connected()
+        publisher, teller = robot.publisher(KEY), robot.publisher(sent_key(KEY))
+        assert publisher.wait_for_subscriber(DEADLINE_S)
+        for message in _keyframes(1, 2):
+            publisher.put(message)
+        for said in (b"nonsense", b"{" * MAX_SENT_BYTES, b" " * (MAX_SENT_BYTES + 1)):
+            teller.put(said)
+        teller.put(Sent(run_id="run-a", last=5).encode())
+        running.wait_until(lambda report: report.missing == 3)
+        report = running.finish()
+    assert (report.recorded, report.rejected, report.lost, report.clean) == (2, 0, 0, False)
+    gap = Loss(publisher="run-a", first=3, last=5, count=3, cause="keyframe_gap")
+    assert _losses(log) == [gap]
+    with recording(connected(), log) as running:
+        robot.publisher(KEY).put(*_keyframes(4))
+        running.wait_until(lambda report: report.recorded == 1)
+        assert running.finish().missing == 2
+    assert _losses(log) == [gap], "one gap is reported once"
 
 
 def test_an_older_form_is_recorded_and_counts_no_keyframes(

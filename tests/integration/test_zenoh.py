@@ -6,8 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import zenoh
 
-from eventsrc._zenoh import Asked, Received, Session, ZenohOptions, open_session
+from eventsrc._zenoh import Asked, Number, Received, Session, ZenohOptions, open_session
 from eventsrc.errors import MapfoldError, MisuseError, TransportError
 from eventsrc.router import Router
 from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK
@@ -22,15 +23,11 @@ def _one_line(error: MapfoldError) -> str:
     return text
 
 
-@pytest.mark.parametrize("advanced", [False, True])
-@pytest.mark.parametrize("watched", [False, True])
-def test_bytes_arrive_as_sent_and_in_order(
-    connected: Sessions, *, advanced: bool, watched: bool
-) -> None:
+def test_bytes_arrive_as_sent_and_in_order(connected: Sessions) -> None:
     arrived: queue.SimpleQueue[Received] = queue.SimpleQueue()
     subscriber = connected()
-    subscriber.subscribe("tb/**", arrived.put, (lambda _: None) if watched else None)
-    publisher = connected().publisher("tb/detections", advanced=advanced)
+    subscriber.subscribe("tb/**", arrived.put)
+    publisher = connected().publisher("tb/detections")
     assert publisher.wait_for_subscriber(DEADLINE_S)
     sent = [bytes([n]) * size for n, size in enumerate((0, 1, 3_000, 9_000, 2_000_000))]
     for payload in sent:
@@ -38,6 +35,38 @@ def test_bytes_arrive_as_sent_and_in_order(
     got = [arrived.get(timeout=DEADLINE_S) for _ in sent]
     assert [m.payload for m in got] == sent
     assert {m.key for m in got} == {"tb/detections"}
+    assert {m.number for m in got} == {None}
+
+
+def test_an_advanced_publishers_numbers_arrive_and_the_last_one_again(connected: Sessions) -> None:
+    arrived: queue.SimpleQueue[Received] = queue.SimpleQueue()
+    told: queue.SimpleQueue[Number] = queue.SimpleQueue()
+    subscriber = connected()
+    subscriber.subscribe("tb/**", arrived.put)
+    subscriber.heartbeats("tb/**", told.put)
+    subscriber.confirm()
+    publisher = zenoh.ext.declare_advanced_publisher(
+        connected().raw,
+        "tb/detections",
+        sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.1),
+    )
+    for _ in range(3):
+        publisher.put(b"x")
+    numbers = [arrived.get(timeout=DEADLINE_S).number for _ in range(3)]
+    source = f"{publisher.id.zid}:{publisher.id.eid}"
+    assert numbers == [Number(source, value) for value in range(3)]
+    while told.get(timeout=DEADLINE_S) != Number(source, 2):
+        pass
+
+
+def test_what_is_no_heartbeat_tells_nothing(connected: Sessions) -> None:
+    told: queue.SimpleQueue[Number] = queue.SimpleQueue()
+    subscriber, sender = connected(), connected()
+    subscriber.heartbeats("tb/x", told.put)
+    subscriber.confirm()
+    for key, payload in [("a/1/_", b"short"), ("a", b"1234"), ("a/1/_", b""), ("b/2", b"\1\0\0\0")]:
+        sender.publisher(f"tb/x/@adv/pub/{key}").put(payload)
+    assert told.get(timeout=DEADLINE_S) == Number("b:2", 1)
 
 
 def test_a_publisher_knows_whether_anybody_listens(connected: Sessions) -> None:

@@ -59,17 +59,40 @@ def test_every_missing_keyframe_is_reported_once_when_it_has_settled(
     assert set(since_ns) <= set(told)
 
 
-@given(st.sets(st.integers(-3, 30), min_size=1), st.integers(-5, 35))
-def test_a_stretch_is_the_longest_around_a_keyframe(recorded: set[int], probe: int) -> None:
-    ledger = GapLedger(SETTLE_NS)
-    for keyframe_id in sorted(recorded, key=lambda k: (k * 7) % 11):
-        ledger.record("run-a", keyframe_id, 0)
-    first = last = probe
-    while first - 1 in recorded:
-        first -= 1
-    while last + 1 in recorded:
-        last += 1
-    assert ledger.stretch("run-a", probe) == ((first, last) if probe in recorded else None)
+@given(
+    st.lists(st.one_of(st.integers(0, 20), st.tuples(st.integers(0, 30)))),
+    st.integers(0, 20),
+)
+def test_what_a_publisher_said_is_missing_until_it_comes(
+    steps: list[int | tuple[int]], late: int
+) -> None:
+    """A bare number is recorded, one in a tuple is said to be the last that was sent."""
+    ledger = GapLedger(0)
+    recorded: set[int] = set()
+    highest = -1
+    for step in steps:
+        if isinstance(step, tuple):
+            ledger.expect("run-a", step[0], 0)
+            ledger.due(0)
+            highest = max(highest, step[0]) if recorded else highest
+        else:
+            ledger.record("run-a", step, 0)
+            recorded.add(step)
+            highest = max(highest, step)
+    if recorded:
+        ledger.record("run-a", late, 0)
+        recorded.add(late)
+    wanted = set(range(min(recorded), max(highest, late) + 1)) - recorded if recorded else set()
+    missing = {k for gap in ledger.gaps() for k in range(gap.first, gap.last + 1)}
+    assert missing == wanted
+    assert ledger.missing == len(wanted)
+    again = GapLedger(0)
+    for k in sorted(recorded):
+        again.record("run-a", k, 0)
+    for gap in ledger.gaps():  # as loss events of the log tell them
+        again.assume(gap, 0)
+    assert {k for g in again.reported_gaps() for k in range(g.first, g.last + 1)} == wanted
+    assert again.missing == len(wanted)
 
 
 @given(steps, st.integers(0, 20))
@@ -98,7 +121,6 @@ def test_restored_it_goes_on_as_if_nothing_had_been(
 def test_what_was_reported_stays_so_until_a_keyframe_closes_it(
     before: list[int], told: list[tuple[int, int]], late: list[int]
 ) -> None:
-    """Whole holes of the ledger are reported, as an earlier recorder would have done."""
     ledger = GapLedger(SETTLE_NS)
     for keyframe_id in before:
         ledger.record("run-a", keyframe_id, 0)
@@ -107,8 +129,7 @@ def test_what_was_reported_stays_so_until_a_keyframe_closes_it(
     for first, length in told:
         ledger.mark_reported(Gap("run-a", first, first + length))
         for hole in holes:
-            if first <= hole.first and hole.last <= first + length:
-                reported |= set(range(hole.first, hole.last + 1))
+            reported |= set(range(max(first, hole.first), min(first + length, hole.last) + 1))
     for keyframe_id in late:
         ledger.record("run-a", keyframe_id, 0)
     missing = _missing(set(before + late))

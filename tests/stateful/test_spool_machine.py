@@ -11,7 +11,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 from eventsrc._set_aside import Refused
 from eventsrc.acks import Ack
 from eventsrc.errors import SpoolFull
-from eventsrc.refusals import Refusal, Refusals
+from eventsrc.refusals import Refusal, Refusals, fingerprint
 from eventsrc.spool import Spool, Spooled
 
 MAX_BYTES = 60
@@ -25,7 +25,8 @@ class SpoolMachine(RuleBasedStateMachine):
         self.folder = Path(tempfile.mkdtemp())
         self.spool = self._open()
         self.waiting: list[tuple[int, str, int, bytes]] = []
-        self.aside: list[tuple[int, str, int, bytes | None]] = []
+        # The last is the digest, which stays when the payload has given way.
+        self.aside: list[tuple[int, str, int, bytes | None, str]] = []
         self.last_seq = 0
 
     def _open(self) -> Spool:
@@ -46,10 +47,10 @@ class SpoolMachine(RuleBasedStateMachine):
 
     def _make_room(self, room: int) -> None:
         """The oldest payloads set aside go until what is left fits ``room`` bytes."""
-        for index, (seq, run_id, keyframe_id, _) in enumerate(self.aside):
+        for index, (seq, run_id, keyframe_id, _, digest) in enumerate(self.aside):
             if sum(len(entry[3] or b"") for entry in self.aside) <= room:
                 break
-            self.aside[index] = (seq, run_id, keyframe_id, None)
+            self.aside[index] = (seq, run_id, keyframe_id, None, digest)
 
     @rule(data=st.data(), up_to=st.integers(0, 30))
     def refuse(self, data: st.DataObject, up_to: int) -> None:
@@ -59,11 +60,12 @@ class SpoolMachine(RuleBasedStateMachine):
         moved = [e for e in self.waiting if e[3] in refused and e[0] <= up_to]
         assert self.spool.refuse(Refusals(log_id="log", refused=said), up_to) == len(moved)
         self.waiting = [e for e in self.waiting if e not in moved]
-        self.aside = sorted([*self.aside, *moved], key=lambda entry: entry[0])
+        shelved = [(*entry, fingerprint(entry[3])) for entry in moved]
+        self.aside = sorted([*self.aside, *shelved], key=lambda entry: entry[0])
 
     @rule()
     def retry(self) -> None:
-        kept = [(r, k, payload) for _, r, k, payload in self.aside if payload is not None]
+        kept = [(r, k, payload) for _, r, k, payload, _ in self.aside if payload is not None]
         assert self.spool.retry_refused() == len(kept)
         self.aside = [entry for entry in self.aside if entry[3] is None]
         for run_id, keyframe_id, payload in kept:
@@ -75,17 +77,23 @@ class SpoolMachine(RuleBasedStateMachine):
         assert self.spool.discard_refused() == len(self.aside)
         self.aside = []
 
-    @rule(run_id=runs, ends=st.lists(st.tuples(keyframes, keyframes), min_size=1, max_size=3))
-    def acknowledge(self, run_id: str, ends: list[tuple[int, int]]) -> None:
-        ack = Ack(run_id=run_id, log_id="log", stretches=tuple(ends))
-        kept = [e for e in self.waiting if not (e[1] == run_id and ack.covers(e[2]))]
+    @rule(data=st.data())
+    def acknowledge(self, data: st.DataObject) -> None:
+        """Of payloads that wait, are set aside, or are nobody's here."""
+        known = [entry[3] for entry in [*self.waiting, *self.aside] if entry[3] is not None]
+        payloads = data.draw(
+            st.lists(st.one_of(st.sampled_from([b"x", *known]), st.binary(max_size=3)), min_size=1)
+        )
+        digests = tuple(map(fingerprint, payloads))
+        ack = Ack(run_id="run-a", key="tb/detections", log_id="log", sha256=digests)
+        kept = [entry for entry in self.waiting if entry[3] not in payloads]
         assert self.spool.acknowledge(ack) == len(self.waiting) - len(kept)
         self.waiting = kept
-        self.aside = [e for e in self.aside if not (e[1] == run_id and ack.covers(e[2]))]
+        self.aside = [entry for entry in self.aside if entry[4] not in digests]
 
     @rule(seq=st.integers(0, 30), limit=st.integers(0, 5))
     def look(self, seq: int, limit: int) -> None:
-        after = [Spooled(s, run_id, p) for s, run_id, _, p in self.waiting if s > seq]
+        after = [Spooled(*entry) for entry in self.waiting if entry[0] > seq]
         assert self.spool.after(seq, limit) == after[:limit]
         assert self.spool.waiting_up_to(seq) == len(self.waiting) - len(after)
 
@@ -100,7 +108,7 @@ class SpoolMachine(RuleBasedStateMachine):
         assert self.spool.refused_count == len(self.aside)
         assert self.spool.refused(100) == [
             Refused(run_id, keyframe_id, "log", "too blue")
-            for _, run_id, keyframe_id, _ in self.aside
+            for _, run_id, keyframe_id, *_ in self.aside
         ]
 
     def teardown(self) -> None:

@@ -4,9 +4,11 @@ import threading
 
 import pytest
 
-from eventsrc._zenoh import Missed, Received
+from eventsrc._zenoh import Number, Received
+from eventsrc.losses import Gap
 from eventsrc.recorder import inbox as inbox_module
 from eventsrc.recorder.inbox import MOST_KEYS, OTHER_KEYS, Inbox
+from eventsrc.sent import sent_key
 from tests.fixtures_zenoh import DEADLINE_S
 
 
@@ -53,13 +55,22 @@ def test_bytes_are_bounded_too_but_one_message_always_fits() -> None:
     assert _texts(inbox.take(10, 0)) == ["ok"], "taking makes room again"
 
 
-def test_misses_are_added_up_by_publisher() -> None:
-    inbox = Inbox(1)
-    for source, count in (("a", 2), ("b", 1), ("a", 3)):
-        inbox.miss(Missed(source, count))
-    assert inbox.missed == 6
-    assert inbox.take_missed() == {"a": 5, "b": 1}
-    assert inbox.take_missed() == {}
+def test_what_was_turned_away_has_come_all_the_same() -> None:
+    """A message is lost in the queue or on the way, never both."""
+    inbox = Inbox(1, patience_s=0)
+    for value in (0, 1, 4):
+        inbox.put(Received("tb/detections", b"x", Number("zid:1", value)))
+    assert inbox.take_missed(None) == [Gap("zid:1", 2, 3)]
+    assert inbox.take_missed(None) == []
+    assert (inbox.overflowed, inbox.missed) == (2, 2)
+
+
+def test_how_far_a_robot_has_got_is_no_message_that_is_lost() -> None:
+    inbox = Inbox(1, patience_s=0)
+    for text in "ab":
+        inbox.put(_message(text, key=sent_key("tb/detections")))
+    assert inbox.overflowed == 0
+    assert _texts(inbox.take(9, 0)) == ["a"]
 
 
 def test_a_waiting_taker_is_woken_by_a_message() -> None:
@@ -162,7 +173,7 @@ def test_large_messages_are_taken_a_few_at_a_time(monkeypatch: pytest.MonkeyPatc
 def test_messages_that_are_too_large_are_counted_by_key() -> None:
     inbox = Inbox(1)
     for key in ("a", "b", "a"):
-        inbox.refuse(key)
+        inbox.refuse(key, None)
     assert inbox.too_large == 3
     assert inbox.take_too_large() == {"a": 2, "b": 1}
     assert inbox.take_too_large() == {}

@@ -17,7 +17,7 @@ def _ledger(*keyframe_ids: int, at_ns: int = 0) -> GapLedger:
 def test_a_run_in_order_lacks_nothing() -> None:
     ledger = _ledger(40, 41, 42)
     assert list(ledger.gaps()) == []
-    assert ledger.stretch("run-a", 41) == (40, 42)
+    assert (ledger.highest("run-a"), ledger.highest("run-b")) == (42, None)
 
 
 def test_what_lies_between_is_missing() -> None:
@@ -92,25 +92,52 @@ def test_what_an_earlier_recorder_reported_is_not_reported_again() -> None:
     assert ledger.flush() == [Gap("run-a", 6, 6)]
 
 
-@pytest.mark.parametrize(
-    ("keyframe_id", "stretch"),
-    [
-        (0, None),
-        (1, (1, 2)),
-        (2, (1, 2)),
-        (3, None),
-        (4, None),
-        (5, (5, 7)),
-        (7, (5, 7)),
-        (8, None),
-    ],
-)
-def test_a_stretch_ends_at_the_holes(keyframe_id: int, stretch: tuple[int, int] | None) -> None:
-    assert _ledger(1, 2, 5, 6, 7).stretch("run-a", keyframe_id) == stretch
+def test_what_a_publisher_has_sent_and_is_not_recorded_is_missing_once_that_has_settled() -> None:
+    ledger = _ledger(1, 2, at_ns=100)
+    ledger.expect("run-a", 5, 101)
+    ledger.record("run-a", 4, 105)
+    assert ledger.due(110) == []
+    assert ledger.missing == 1, "before, nobody knows whether it is still on its way"
+    assert ledger.due(111) == [Gap("run-a", 5, 5)]
+    assert ledger.due(115) == [Gap("run-a", 3, 3)]
+    assert (ledger.missing, ledger.highest("run-a")) == (2, 5)
+    ledger.record("run-a", 6, 200)
+    ledger.record("run-a", 5, 200)
+    assert list(ledger.gaps()) == [Gap("run-a", 3, 3)], "it may come late like any other"
 
 
-def test_nothing_is_recorded_of_an_unknown_run() -> None:
-    assert _ledger(1).stretch("run-b", 1) is None
+def test_what_was_said_at_the_last_moment_or_of_an_unknown_run_is_no_gap() -> None:
+    ledger = _ledger(1, at_ns=100)
+    ledger.expect("run-b", 7, 100)
+    assert ledger.due(110) == []
+    ledger.expect("run-a", 7, 111)
+    assert ledger.flush() == []
+    assert ledger.due(1_000) == []
+    assert (ledger.missing, ledger.highest("run-b")) == (0, None)
+
+
+def test_each_statement_adds_what_is_new_in_it() -> None:
+    ledger = _ledger(1)
+    for last in (3, 2, 6):
+        ledger.expect("run-a", last, 0)
+    assert ledger.due(SETTLE_NS) == [Gap("run-a", 2, 3), Gap("run-a", 4, 6)]
+
+
+def test_a_gap_that_is_closed_or_a_run_that_is_forgotten_is_not_missing() -> None:
+    ledger = _ledger(1, 5, 7)
+    ledger.close(Gap("run-a", 2, 4))
+    ledger.close(Gap("run-b", 2, 4))
+    assert ledger.missing == 1
+    assert ledger.forget("run-a") == [Gap("run-a", 6, 6)]
+    assert (ledger.missing, ledger.flush(), ledger.highest("run-a")) == (0, [], None)
+
+
+def test_a_part_of_a_hole_can_have_been_reported() -> None:
+    """A recorder that said 2 to 4 were missing, when nobody knew of 5 to 8 yet."""
+    ledger = _ledger(1, 9)
+    ledger.mark_reported(Gap("run-a", 2, 4))
+    assert ledger.missing_reported() == 3
+    assert ledger.flush() == [Gap("run-a", 5, 8)]
 
 
 def test_a_gap_holds_at_least_one_keyframe() -> None:
@@ -132,3 +159,10 @@ def test_a_loss_events_word_can_be_taken_for_a_gap() -> None:
     ledger.record("run-a", 9, 0)
     ledger.record("run-b", 9, 0)
     assert ledger.missing_reported() == 2 + 2**62 - 8
+
+
+def test_loss_events_that_follow_one_another_tell_of_the_end_of_a_run() -> None:
+    ledger = _ledger(1)
+    for gap in (Gap("run-a", 2, 3), Gap("run-a", 4, 6)):
+        ledger.assume(gap, now_ns=0)
+    assert (ledger.missing, ledger.missing_reported(), ledger.flush()) == (5, 5, [])

@@ -7,13 +7,32 @@ from pydantic import ValidationError
 
 from eventsrc.acks import ACK_PREFIX, Ack, ack_key
 from eventsrc.refusals import Refusal, Refusals, refusal_key
+from eventsrc.sent import Sent, sent_key
 
 
-def test_an_ack_reads_as_it_always_did() -> None:
-    ack = Ack(run_id="run-a", log_id="log", stretches=((0, 4), (7, 7)))
-    assert ack.encode() == b'{"run_id":"run-a","log_id":"log","stretches":[[0,4],[7,7]]}'
-    newer = b'{"run_id":"run-a","log_id":"log","stretches":[[0,4],[7,7]],"mood":"good"}'
-    assert Ack.decode(newer) == ack
+def test_an_ack_names_the_bytes() -> None:
+    ack = Ack(run_id="run-a", key="tb/x", log_id="log", sha256=("00", "ff"))
+    written = b'{"run_id":"run-a","key":"tb/x","log_id":"log","sha256":["00","ff"]}'
+    assert ack.encode() == written
+    assert Ack.decode(written[:-1] + b',"mood":"good"}') == ack
+    older = b'{"run_id":"run-a","log_id":"log","stretches":[[0,4]]}'
+    for wrong in (older, written.replace(b'"00","ff"', b""), written.replace(b'"00"', b"0")):
+        with pytest.raises(ValidationError):
+            Ack.decode(wrong)
+
+
+def test_how_far_a_robot_has_got_reads_as_written() -> None:
+    said = Sent(run_id="run-a", last=-(2**63))
+    assert said.encode() == b'{"run_id":"run-a","last":-9223372036854775808}'
+    assert Sent.decode(said.encode()) == said
+    assert sent_key("tb/**") == "tb/**/@mapfold/sent"
+    for wrong in (
+        b"{}",
+        b'{"run_id":"a","last":1.5}',
+        b'{"run_id":"a","last":%d}' % 2**63,
+    ):
+        with pytest.raises(ValidationError):
+            Sent.decode(wrong)
 
 
 def test_a_refusal_names_the_bytes() -> None:

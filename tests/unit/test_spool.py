@@ -1,5 +1,6 @@
 """The robot's spool: bounded, in order, and still there after the process."""
 
+import sqlite3
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -11,12 +12,13 @@ import pytest
 from eventsrc._set_aside import Refused
 from eventsrc.acks import Ack
 from eventsrc.errors import SpoolError, SpoolFull
-from eventsrc.refusals import Refusal, Refusals
+from eventsrc.refusals import Refusal, Refusals, fingerprint
 from eventsrc.spool import Spool, Spooled
 
 
-def _ack(*stretches: tuple[int, int], run_id: str = "run-a") -> Ack:
-    return Ack(run_id=run_id, log_id="log", stretches=stretches)
+def _ack(*payloads: bytes) -> Ack:
+    digests = tuple(map(fingerprint, payloads))
+    return Ack(run_id="run-a", key="tb/detections", log_id="log", sha256=digests)
 
 
 def _refusals(*payloads: bytes) -> Refusals:
@@ -37,24 +39,24 @@ def spool(tmp_path: Path) -> Iterator[Spool]:
 def test_it_keeps_the_order_and_counts_on(spool: Spool) -> None:
     for k in (3, 1, 2):
         spool.add("run-a", k, b"%d" % k)
-    assert spool.after(0, 2) == [Spooled(1, "run-a", b"3"), Spooled(2, "run-a", b"1")]
-    assert spool.after(2, 2) == [Spooled(3, "run-a", b"2")]
+    assert spool.after(0, 2) == [
+        Spooled(1, "run-a", 3, b"3"),
+        Spooled(2, "run-a", 1, b"1"),
+    ]
+    assert spool.after(2, 2) == [Spooled(3, "run-a", 2, b"2")]
     assert spool.waiting_up_to(2) == 2
     assert len(spool) == 3
 
 
-def test_an_ack_frees_what_it_covers_and_nothing_else(spool: Spool) -> None:
-    for run_id in ("run-a", "run-b"):
-        for k in range(6):
-            spool.add(run_id, k, f"{run_id}{k}".encode())
-    assert spool.acknowledge(_ack((0, 1), (4, 4), (9, 9))) == 3
-    assert len(spool) == 9
-    assert [p for p in _payloads(spool) if p.startswith(b"run-a")] == [
-        b"run-a2",
-        b"run-a3",
-        b"run-a5",
-    ]
-    assert spool.acknowledge(_ack((0, 1))) == 0
+def test_an_ack_frees_the_bytes_it_names_and_nothing_else(spool: Spool) -> None:
+    """Not even the same keyframe of the same run, with other bytes."""
+    for message in (b"a", b"b", b"A", b"a"):
+        spool.add("run-a", 1, message)
+    assert spool.acknowledge(_ack(b"a", b"x")) == 2
+    assert _payloads(spool) == [b"b", b"A"]
+    assert spool.acknowledge(_ack(b"a")) == 0
+    assert spool.acknowledge(_ack(b"b", b"A")) == 2
+    assert len(spool) == 0
 
 
 def test_it_is_bounded_and_an_ack_makes_room(spool: Spool) -> None:
@@ -62,7 +64,7 @@ def test_it_is_bounded_and_an_ack_makes_room(spool: Spool) -> None:
     with pytest.raises(SpoolFull, match="1 envelopes \\(60 bytes\\)"):
         spool.add("run-a", 2, b"x" * 41)
     spool.add("run-a", 2, b"x" * 40)
-    spool.acknowledge(_ack((1, 1)))
+    spool.acknowledge(_ack(b"x" * 60))
     spool.add("run-a", 3, b"x" * 60)
     assert len(spool) == 2
 
@@ -91,7 +93,7 @@ def test_an_ack_frees_what_was_refused_too(spool: Spool) -> None:
     for k in range(3):
         spool.add("run-a", k, b"%d" % k)
     spool.refuse(_refusals(b"0", b"1"), up_to=3)
-    assert spool.acknowledge(_ack((1, 2))) == 1, "one of them was waiting"
+    assert spool.acknowledge(_ack(b"1", b"2")) == 1, "one of them was waiting"
     assert [one.keyframe_id for one in spool.refused(10)] == [0]
 
 
@@ -131,11 +133,11 @@ def test_numbers_are_never_used_twice(tmp_path: Path) -> None:
     """A cursor over the spool may outlive the row it points at."""
     spool = Spool(tmp_path / "spool")
     spool.add("run-a", 1, b"1")
-    spool.acknowledge(_ack((1, 1)))
+    spool.acknowledge(_ack(b"1"))
     spool.close()
     with closing(Spool(tmp_path / "spool")) as again:
         again.add("run-a", 2, b"2")
-        assert again.after(1, 10) == [Spooled(2, "run-a", b"2")]
+        assert again.after(1, 10) == [Spooled(2, "run-a", 2, b"2")]
 
 
 def test_one_owner(tmp_path: Path, spool: Spool) -> None:
@@ -171,4 +173,38 @@ def test_a_closed_spool_says_so(spool: Spool) -> None:
 @pytest.mark.parametrize("keyframe_id", [-(2**63), 2**63 - 1])
 def test_every_keyframe_id_fits(spool: Spool, keyframe_id: int) -> None:
     spool.add("run-a", keyframe_id, b"x")
-    assert spool.acknowledge(_ack((-(2**63), 2**63 - 1))) == 1
+    assert [one.keyframe_id for one in spool.after(0, 9)] == [keyframe_id]
+
+
+_OLD_SCHEMA = """
+create table spooled (
+    seq integer primary key autoincrement, run_id text not null,
+    keyframe_id integer not null, payload blob not null
+);
+create index spooled_keyframe on spooled (run_id, keyframe_id);
+create table refused (
+    seq integer primary key, run_id text not null, keyframe_id integer not null,
+    payload blob, log_id text not null, reason text not null
+);
+create index refused_keyframe on refused (run_id, keyframe_id);
+insert into spooled values (4, 'run-a', 4, x'34'), (5, 'run-a', 5, x'35');
+insert into refused values (1, 'run-a', 1, null, 'log', 'too blue'),
+                           (2, 'run-a', 2, x'32', 'log', 'too blue');
+"""
+
+
+def test_a_spool_of_an_earlier_version_is_gone_on_from(tmp_path: Path) -> None:
+    """It did not name payloads; acks name nothing else."""
+    with closing(sqlite3.connect(tmp_path / "spool")) as db:
+        db.executescript(_OLD_SCHEMA)
+    for _ in range(2):
+        with closing(Spool(tmp_path / "spool")) as spool:
+            assert (_payloads(spool), spool.refused_count) == ([b"4", b"5"], 2)
+    with closing(Spool(tmp_path / "spool")) as spool:
+        assert spool.acknowledge(_ack(b"2", b"4")) == 1
+        spool.add("run-a", 6, b"6")
+        assert spool.after(0, 9) == [
+            Spooled(5, "run-a", 5, b"5"),
+            Spooled(6, "run-a", 6, b"6"),
+        ]
+        assert [one.keyframe_id for one in spool.refused(9)] == [1]
