@@ -80,12 +80,18 @@ class Publisher:
     def __init__(self, session: zenoh.Session, key: str) -> None:
         check_key_length(key)
         self.key = key
+        self.departures = 0
+        """How often the last subscriber has left."""
         with clear_errors(f"key {key!r} cannot be published to"):
             self._sender: Any = session.declare_publisher(
                 key,
                 congestion_control=zenoh.CongestionControl.BLOCK,
                 reliability=zenoh.Reliability.RELIABLE,
             )
+            self._listener: Any = self._sender.declare_matching_listener(self._note)
+
+    def _note(self, status: Any) -> None:
+        self.departures += not status.matching
 
     def put(self, payload: bytes) -> None:
         """Send. Returns when Zenoh has taken it, which is not yet when anybody has received it."""
@@ -114,6 +120,7 @@ class Publisher:
     def close(self) -> None:
         """Stop publishing under this key."""
         with quietly():
+            self._listener.undeclare()
             self._sender.undeclare()
 
 

@@ -7,6 +7,10 @@
 * When acks stay away longer than the resend time, the oldest envelope is sent again, alone, as a
   question whether anybody is still there; each question in vain doubles the pause. Once there is an
   answer and it does not cover the rest, sending goes back to the oldest.
+* Acks come in the order of sending. When the oldest envelope waits for the resend time while
+  younger ones are acknowledged, it was lost on the way, and sending goes back to it; else what was
+  lost would fill the window for good. It also goes back when the last subscriber has left and
+  another is there, however soon.
 * Beside the envelopes it tells how far it has got with each run (`eventsrc.sent`): at most twice a
   second, and when it ends. So a recorder misses the last ones of a run, too.
 * What a recorder says it has refused is set aside: it would be refused for ever, and hold up all
@@ -135,11 +139,15 @@ class Sender:
         self, session: Session, publisher: Publisher, teller: Publisher, heard: set[str]
     ) -> None:
         """Send and hear acks while somebody subscribes; ``heard`` are the runs listened for."""
-        cursor = 0
+        cursor, oldest = 0, self._spool.oldest()
+        departures = publisher.departures
         patience = Patience(self._resend_after_s)
         while not self._stopping and publisher.has_subscriber:
+            if publisher.departures != departures:
+                return
             if self._take_answers():
-                patience.answered()
+                before, oldest = oldest, self._spool.oldest()
+                patience.answered() if oldest != before else patience.passed_over()
             if self._untold and time.monotonic() >= self._tell_due_s:
                 self._tell(teller)
             under_way = self._spool.waiting_up_to(cursor)
@@ -245,11 +253,16 @@ class Patience:
         self._over_s = self._clock() + self._pause_s
 
     def answered(self) -> None:
-        """An ack freed something."""
+        """An ack freed the oldest."""
         self.somebody_answered = self._asked
         wait_s = min(_REST_S, self._resend_after_s) if self._asked else self._resend_after_s
         self._pause_s = self._resend_after_s
         self._over_s = self._clock() + wait_s
+
+    def passed_over(self) -> None:
+        """An ack freed others than the oldest."""
+        self.somebody_answered = True
+        self._over_s = min(self._over_s, self._clock() + self._resend_after_s)
 
     def is_over(self) -> bool:
         """Whether acks have stayed away too long."""

@@ -108,6 +108,12 @@ class Spool:
             )
             return [Spooled(*row) for row in rows]
 
+    def oldest(self) -> int | None:
+        """The seq of the oldest envelope that waits."""
+        with self._clear_errors(), self._lock:
+            ((seq,),) = self._db.execute("select min(seq) from spooled")
+            return None if seq is None else int(seq)
+
     def waiting_up_to(self, seq: int) -> int:
         """How many envelopes up to ``seq`` still wait."""
         with self._clear_errors(), self._lock:

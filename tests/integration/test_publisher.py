@@ -148,6 +148,34 @@ def test_only_a_window_is_under_way(endpoint: str, connected: Sessions, tmp_path
         assert max(seen) <= 14
 
 
+def test_what_was_lost_does_not_fill_the_window(
+    endpoint: str, connected: Sessions, tmp_path: Path
+) -> None:
+    """The first nine of a window of ten get no ack: they come again while the rest goes on."""
+    viewer = connected()
+    seen: list[int] = []
+    again = threading.Event()
+
+    def acknowledge(message: Received) -> None:
+        seen.append(json.loads(message.payload)["keyframe_id"])
+        if seen[-1] >= 9 or seen.count(8) > 1:
+            viewer.send(ack_key("run-a"), _ack(message.payload))
+        if seen.count(8) > 1:
+            again.set()
+
+    viewer.subscribe(KEY, acknowledge)
+    viewer.confirm()
+    options = ZenohOptions(connect=(endpoint,))
+    with EnvelopePublisher(options, tmp_path / "spool", window=10, resend_after_s=0.5) as robot:
+        k = 0
+        while not again.is_set():  # so that there is always an ack of a younger one
+            robot.publish(envelope(k))
+            k += 1
+            again.wait(0.01)
+            assert k < 100 * DEADLINE_S
+        assert seen.index(0, 1) > 10, "others were acknowledged before"
+
+
 def test_two_robots_hear_their_own_acks(
     endpoint: str, recorder: Callable[[], Program], tmp_path: Path
 ) -> None:
@@ -215,6 +243,31 @@ def test_a_router_that_comes_and_goes_loses_nothing(start: Start, tmp_path: Path
         assert robot.flush(DEADLINE_S)
         assert recorder.end(signal.SIGINT) in (0, 3)
     assert _keyframes(log) == set(range(1_500))
+
+
+@pytest.mark.slow
+def test_a_recorder_that_stands_still_until_its_router_gives_it_up_loses_nothing(
+    robot: EnvelopePublisher,
+    connected: Sessions,
+    recorder: Callable[[], Program],
+    tmp_path: Path,
+) -> None:
+    """Some ten seconds; what is sent meanwhile is dropped by the router and comes again."""
+    program = recorder()
+    watch = connected().publisher(KEY)
+    robot.publish(envelope(0))
+    assert robot.flush(DEADLINE_S)
+    program.process.send_signal(signal.SIGSTOP)
+    for k in range(1, 3_000):
+        robot.publish(envelope(k, note="x" * 10_000))
+    viewer = connected()
+    while watch.has_subscriber:
+        viewer.confirm()
+    program.process.send_signal(signal.SIGCONT)
+    assert robot.flush(2 * DEADLINE_S)
+    assert program.end(signal.SIGINT) in (0, 3)
+    assert _keyframes(tmp_path / "log") == set(range(3_000))
+    assert "0 keyframes missing" in program.lines[-1]
 
 
 def test_nonsense_on_the_ack_key_acknowledges_nothing(

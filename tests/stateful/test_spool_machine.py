@@ -105,6 +105,7 @@ class SpoolMachine(RuleBasedStateMachine):
     @invariant()
     def counts_what_waits(self) -> None:
         assert len(self.spool) == len(self.waiting)
+        assert self.spool.oldest() == min((entry[0] for entry in self.waiting), default=None)
         assert self.spool.refused_count == len(self.aside)
         assert self.spool.refused(100) == [
             Refused(run_id, keyframe_id, "log", "too blue")

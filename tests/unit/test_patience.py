@@ -43,6 +43,20 @@ def test_acks_that_come_by_themselves_are_no_answer() -> None:
     assert not patience.somebody_answered
 
 
+def test_acks_of_younger_ones_do_not_put_off_the_oldest() -> None:
+    clock = Clock()
+    patience = Patience(RESEND_AFTER_S, clock)
+    began_s = clock.now_s
+    while not patience.is_over():
+        patience.passed_over()
+        clock.now_s += 0.25
+    assert (clock.now_s - began_s, patience.somebody_answered) == (2.0, True)
+    for _ in range(4):
+        patience.ask()
+    patience.passed_over()
+    assert _waits(patience, clock) == 2.0, "not the half minute"
+
+
 def test_after_an_answer_the_rest_is_soon_sent_again() -> None:
     clock = Clock()
     patience = Patience(RESEND_AFTER_S, clock)
