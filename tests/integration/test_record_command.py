@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import zenoh
 
 from eventsrc._ledger_cache import NAME
 from eventsrc._zenoh import Received, Session
@@ -168,6 +169,45 @@ def test_misuse_is_one_line_and_exit_2(
     (line,) = recorder.lines
     assert complaint in line
     assert not (tmp_path / "log").exists()
+
+
+@pytest.mark.slow
+def test_what_zenoh_drops_while_the_recorder_stands_still_is_counted(
+    start: Start, endpoint: str, connected: Sessions, tmp_path: Path
+) -> None:
+    """Some ten seconds: the router gives the recorder up, and then drops what comes for it."""
+    log = tmp_path / "log"
+    recorder = start("record", str(log), "--connect", endpoint, "--json")
+    recorder.wait_for("recording")
+    session = connected()
+    publisher = zenoh.ext.declare_advanced_publisher(
+        session.raw,
+        KEY,
+        congestion_control=zenoh.CongestionControl.BLOCK,
+        sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=1.0, sporadic_heartbeat=None),
+    )
+    watch = session.publisher(KEY)
+    assert watch.wait_for_subscriber(DEADLINE_S)
+    acked = threading.Event()
+    session.subscribe(ack_key("run-a"), lambda _: acked.set())
+    session.confirm()
+    publisher.put(payload(envelope(0)))
+    assert acked.wait(DEADLINE_S)
+    recorder.process.send_signal(signal.SIGSTOP)
+    sent = 1
+    while watch.has_subscriber:
+        publisher.put(payload(envelope(sent, note="x" * 10_000)))
+        sent += 1
+    recorder.process.send_signal(signal.SIGCONT)
+    assert watch.wait_for_subscriber(DEADLINE_S)
+    recorder.wait_for("LOST")
+    acked.clear()
+    publisher.put(payload(envelope(sent)))
+    assert acked.wait(DEADLINE_S)
+    assert recorder.end(signal.SIGINT) == 3
+    numbers = json.loads(recorder.output())
+    assert numbers["recorded"] + numbers["transport_missed"] == sent + 1
+    assert numbers["missing"] == numbers["transport_missed"] > 0
 
 
 _ON_A_SMALL_DISK = """
