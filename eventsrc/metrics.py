@@ -22,7 +22,7 @@ _COUNTERS: Final = (
     ("recorded", "Envelopes synced to the log."),
     ("rejected", "Payloads refused and kept under mapfold/rejected."),
     ("queue_full", "Messages lost because the queue was full."),
-    ("too_large", "Messages lost because they were over twice the size limit."),
+    ("too_large", "Messages lost because they were too large to be kept as rejected."),
     ("transport_missed", "Messages that advanced publishers sent and that never came."),
 )
 _GAUGES: Final = (

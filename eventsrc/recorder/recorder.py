@@ -18,9 +18,10 @@ from .report import RecorderReport
 from .writing import Writing
 
 DEFAULT_KEYS: Final = ("tb/detections",)
-_TAKEN_WHOLE: Final = 2
-"""A message of up to so many times the size limit is rejected and kept. A larger one is lost, and
-said to be: it would be in memory several times over before it is on the disk."""
+_REJECTED_WHOLE: Final = 2
+"""A message of up to so many times the size limit, or the default limit if that is larger, is
+rejected and kept, and its robot is told, so that it stops sending it. A larger one is a loss: it
+would be in memory several times over before it is on the disk."""
 
 
 class Recorder:
@@ -56,14 +57,17 @@ class Recorder:
             report_gaps=report_gaps,
             max_payload_bytes=max_payload_bytes,
         )
-        at_most = Bound(_TAKEN_WHOLE * max_payload_bytes, self._refuse)
-        sent_at_most = Bound(MAX_SENT_BYTES, self._refuse)
+        at_most = Bound(
+            _REJECTED_WHOLE * max(max_payload_bytes, DEFAULT_MAX_PAYLOAD_BYTES), self._refuse
+        )
+        # A longer one says nothing, like any that cannot be read: no event is lost with it.
+        sent_at_most = Bound(MAX_SENT_BYTES, lambda _key, _number: None)
         self._subscriptions = [
             subscription
             for key in keys
             for subscription in (
                 session.subscribe(key, self._receive, at_most=at_most),
-                session.subscribe(sent_key(key), self._receive_sent, at_most=sent_at_most),
+                session.subscribe(sent_key(key), self._inbox.put, at_most=sent_at_most),
                 session.heartbeats(key, self._inbox.told),
             )
         ]
@@ -119,9 +123,6 @@ class Recorder:
     def _refuse(self, key: str, number: Number | None) -> None:
         if not key.startswith(ACK_PREFIX):
             self._inbox.refuse(key, number)
-
-    def _receive_sent(self, message: Received) -> None:
-        self._inbox.put(message)
 
     def _answer(self, key: str, payload: bytes) -> None:
         try:

@@ -11,6 +11,7 @@ import pytest
 from eventsrc._zenoh import Received, Session
 from eventsrc.append import append_payload
 from eventsrc.errors import TransportError
+from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES
 from eventsrc.log import LogReader, LogWriter, log_info, verify_log
 from eventsrc.recorder import Recorder
 from eventsrc.refusals import Refusals, refusal_key
@@ -85,8 +86,9 @@ def test_a_message_far_over_the_limit_is_lost_and_said_to_be(
         recorder = Recorder(
             connected(), writer, ["t/**"], max_events=2, max_payload_bytes=1_000, report_gaps=False
         )
-        for size in (2_001, 300_000, 2_000):
-            robot.raw.put("t/a", b"x" * size)
+        most = 2 * DEFAULT_MAX_PAYLOAD_BYTES
+        for size in (most + 1, 2 * most, 2_000):
+            robot.raw.put("t/a", bytes(size))
         robot.raw.put("t/a", payload(envelope(1)))
         report = recorder.run(threading.Event())
     assert (report.recorded, report.rejected, report.too_large, report.lost) == (1, 1, 2, 2)
