@@ -5,6 +5,7 @@ whole door. Envelopes of older versions do not count their keyframes and are pas
 saves its ledger beside the log, so only the first reading ever is of the whole log.
 """
 
+import contextlib
 import time
 from collections.abc import Iterable
 from pathlib import Path
@@ -57,6 +58,12 @@ def save_ledger(path: Path, log_id: str, next_offset: int, ledger: GapLedger) ->
     They must be durable, with everything the ledger reported among them.
     """
     _ledger_cache.save(path, log_id, next_offset, ledger)
+
+
+def forget_ledger(path: Path) -> None:
+    """Delete the saved ledger of the log at ``path``: the log has lost events that it knows."""
+    with contextlib.suppress(OSError):  # it is not believed either while a segment is missing
+        _ledger_cache.forget(path)
 
 
 def fold_ledger(events: Iterable[Event], ledger: GapLedger, now_ns: int) -> GapLedger:

@@ -24,6 +24,7 @@ _COUNTERS: Final = (
     ("queue_full", "Messages lost because the queue was full."),
     ("too_large", "Messages lost because they were too large to be kept as rejected."),
     ("transport_missed", "Messages that advanced publishers sent and that never came."),
+    ("lost_from_log", "Recorded events lost with a segment file that was taken away or cut short."),
 )
 _GAUGES: Final = (
     ("missing", "Keyframes the log's runs lack now."),

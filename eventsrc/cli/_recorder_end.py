@@ -75,6 +75,7 @@ def as_json(report: RecorderReport) -> dict[str, int | str | None]:
         "too_large": report.too_large,
         "transport_missed": report.transport_missed,
         "unwritten": report.unwritten,
+        "lost_from_log": report.lost_from_log,
         "missing": report.missing,
         "next_offset": report.next_offset,
         "unsealed": report.unsealed,

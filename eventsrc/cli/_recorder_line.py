@@ -27,6 +27,7 @@ class RecorderLine:
         self._at_s = clock()
         self._recorded = self._lost = self._rejected = 0
         self._sealing_error: str | None = None
+        self._faults = 0
 
     def line(self, report: RecorderReport, free_bytes: int) -> str:
         """The status line; the rate is that since the call before."""
@@ -55,9 +56,14 @@ class RecorderLine:
                 f"rejected {report.rejected - self._rejected} payloads; "
                 f"see mapfold/rejected in {self._log}"
             )
+        lines += [
+            f"SEGMENT GIVEN UP: {fault}; recording goes on in a new segment"
+            for fault in report.faults[self._faults :]
+        ]
         if report.sealing_error not in (None, self._sealing_error):
             lines.append(f"sealing fails: {report.sealing_error}")
         self._lost, self._rejected = lost, report.rejected
+        self._faults = len(report.faults)
         self._sealing_error = report.sealing_error
         return lines
 

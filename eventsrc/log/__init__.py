@@ -1,5 +1,6 @@
 """The log: an append-only directory of MCAP segments, the only truth (docs/log-format.md)."""
 
+from ._file_fault import FileFault
 from ._lineage import lineage, still_holds
 from .event import Event, NewEvent
 from .findings import Finding
@@ -17,6 +18,7 @@ __all__ = [
     "GROUP_COMMIT",
     "NEVER",
     "Event",
+    "FileFault",
     "Finding",
     "FsyncPolicy",
     "LogInfo",

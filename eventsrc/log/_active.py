@@ -9,17 +9,31 @@ recovery, which has no writer to race with, takes every chunk whose CRC holds, m
 last mark of a segment is synced before the next segment begins: without it a reader would find the
 next one's events and not those before them.
 
-A commit that fails leaves the file at the last good byte, and the segment refuses further work. So
-it does when somebody has deleted the file: nothing may be called recorded that has no name.
+A commit that fails leaves the file at the last good byte, and the segment refuses further work.
+
+Nothing may be called recorded that is in a file which somebody has deleted, renamed, replaced or
+cut short. So each commit checks, before it writes and once more after its sync, that the file under
+the segment's name is the one that is open and as long as what was written to it. If it is not, a
+new file is begun at the offset of the group at hand, which is written there, and so are the events
+behind it; no offset is given twice. What was recorded in the old file is told as a `FileFault`.
 """
 
 import errno
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from eventsrc.errors import LogError
 
+from ._file_fault import (
+    FileFault,
+    Found,
+    Identity,
+    fault_of,
+    identity_of,
+    is_readable_segment,
+    set_aside,
+)
 from ._group import Group, GroupBuilder
 from ._head import file_head, head_metadata
 from ._naming import ACTIVE, NEW, segment_path
@@ -32,33 +46,51 @@ class ActiveSegment:
 
     Or, with another thread to do it: once that thread's `write` of what `cut` gave has returned.
     Groups must be written in the order they were cut in, one at a time.
+
+    ``on_fault`` is called by `write` when a file was given up and the next one stands.
     """
 
     def __init__(
-        self, log: Path, log_id: str, base: int, policy: FsyncPolicy, slack: int = 1
+        self,
+        log: Path,
+        log_id: str,
+        base: int,
+        policy: FsyncPolicy,
+        slack: int = 1,
+        on_fault: Callable[[FileFault], None] = lambda _: None,
     ) -> None:
-        self.path = segment_path(log, base, ACTIVE)
         self.base = base
+        """The first offset, which stays when `file_base` moves on to that of a new file."""
         self.committed = base
         self.size = 0
-        self._temporary = segment_path(log, base, NEW)
-        self._head = file_head(head_metadata(log_id, base))
+        self._log = log
+        self._log_id = log_id
+        self._folder: Identity | None = None
+        self._on_fault = on_fault
+        self._name_file(base)
         self._syncs = policy.syncs
         self._group = GroupBuilder(base, policy, slack)
         self._failure: str | None = None
         self._fd = -1
 
+    def _name_file(self, base: int) -> None:
+        self.file_base = base
+        self.path = segment_path(self._log, base, ACTIVE)
+
     def create(self) -> None:
         """Make the file, before the first `write`; events may be taken earlier. Raises OSError."""
-        fd = os.open(self._temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+        temporary = segment_path(self._log, self.file_base, NEW)
+        head = file_head(head_metadata(self._log_id, self.file_base))
+        fd = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
         try:
-            write_all(fd, self._head)
+            write_all(fd, head)
             sync_file(fd)
         finally:
             os.close(fd)
-        replace_durably(self._temporary, self.path)
-        self._fd = os.open(self.path, os.O_WRONLY | os.O_APPEND)
-        self.size = len(self._head)
+        replace_durably(temporary, self.path)
+        self._fd = os.open(self.path, os.O_RDWR | os.O_APPEND)
+        self._folder = identity_of(self._log)
+        self._head_size = self.size = len(head)
 
     @property
     def next_offset(self) -> int:
@@ -103,23 +135,77 @@ class ActiveSegment:
     def write(self, group: Group) -> None:
         """Bring one group to the disk, then say so. Raises LogError."""
         self._check()
-        head, body, mark = group.pieces()
         try:
-            write_all(self._fd, head)
-            write_all(self._fd, body)
-            if self._syncs:
-                sync_file(self._fd)
-            write_all(self._fd, mark)
-            gone = os.fstat(self._fd).st_nlink == 0
+            found = self._write(group)
+            if found is not None:
+                self._begin_anew(group.first, found)
+                found = self._write(group)
         except OSError as error:
             raise self._fail(error) from error
+        except LogError:
+            raise
         except BaseException:  # Ctrl-C: what is half written must have nothing behind it
             self._fail(InterruptedError(errno.EINTR, "interrupted"))
             raise
-        if gone:
-            raise self._deleted()
-        self.size += len(head) + len(body) + len(mark)
+        if found is not None:
+            raise self.refuse(
+                f"{self.path} {found.text}, and the file before it had to be given up as well: "
+                f"offsets from {group.first} on are not recorded. Keep other programs away from "
+                f"{self._log} and start again"
+            )
+
+    def _write(self, group: Group) -> Found | None:
+        """None when the group is on the disk, else what was found wrong with the file."""
+        found = fault_of(self._fd, self.path, self.size)
+        if found is not None:
+            return found
+        head, body, mark = group.pieces(self.file_base)
+        write_all(self._fd, head)
+        write_all(self._fd, body)
+        if self._syncs:
+            sync_file(self._fd)
+        end = self.size + len(head) + len(body)
+        found = fault_of(self._fd, self.path, end)
+        if found is not None:
+            self._take_back(head, end)
+            return found
+        write_all(self._fd, mark)
+        self.size = end + len(mark)
         self.committed = group.following
+        return None
+
+    def _take_back(self, head: bytes, end: int) -> None:
+        """Cut the group off that was appended to a file which is given up: it will stand in the
+        next one. If the file was cut short before, the group stands at its end all the same."""
+        size = os.fstat(self._fd).st_size
+        start = size - (end - self.size)
+        if start >= 0 and os.pread(self._fd, len(head), start) == head:
+            os.ftruncate(self._fd, start)
+        elif size > self.size:
+            os.ftruncate(self._fd, self.size)
+
+    def _begin_anew(self, first: int, found: Found) -> None:
+        """Go on in a new file, whose first offset is ``first``. Raises LogError if that cannot be
+        made."""
+        fault = FileFault(self.path, self.file_base, first, found.text, not found.whole)
+        try:
+            if self._folder != identity_of(self._log):
+                raise self.refuse(
+                    f"{fault}; {self._log} is another folder than it was. Put the right one back "
+                    "and start again"
+                )
+            self.close()
+            if first == self.file_base or not is_readable_segment(self.path, self._head_size):
+                set_aside(self.path)
+            self._name_file(first)
+            self.create()
+        except OSError as error:
+            raise self.refuse(
+                f"{fault}; no new segment at offset {first}: {error.strerror or error}. Offsets "
+                f"from there on are not recorded. Check that {self._log} is there and its disk has "
+                "room, then start again"
+            ) from error
+        self._on_fault(fault)
 
     def end(self, rest: Group) -> None:
         """Write the last group, and make the mark of the last commit survive a power cut. Raises
@@ -143,18 +229,11 @@ class ActiveSegment:
             "Free space or fix the disk, then start again"
         )
         try:
-            os.ftruncate(self._fd, self.size)
+            if self._fd >= 0 and os.fstat(self._fd).st_size > self.size:
+                os.ftruncate(self._fd, self.size)
         except OSError as cut_error:
             message += f" (the torn end stays: {cut_error.strerror}; recovery ignores it)"
         return self.refuse(message)
-
-    def _deleted(self) -> LogError:
-        """A file without a name takes everything and keeps nothing."""
-        return self.refuse(
-            f"{self.path} was deleted while it was being written: offsets {self.base} to "
-            f"{self.next_offset - 1} are lost. Keep others away from {self.path.parent} and start "
-            "again"
-        )
 
     def refuse(self, message: str) -> LogError:
         """From now on every append and commit raises this."""

@@ -20,8 +20,10 @@ from .fsync import FsyncPolicy
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Offsets ``first`` to before ``following``, and the records that hold them."""
+    """Offsets ``first`` to before ``following``, and the records that hold them. ``parts`` are the
+    head and the payload of each message by turns; the heads count from offset ``base``."""
 
+    base: int
     first: int
     following: int
     first_ns: int
@@ -29,10 +31,15 @@ class Group:
     definitions: list[bytes]
     parts: list[bytes]
 
-    def pieces(self) -> tuple[bytes, bytes, bytes]:
-        """What to write, in this order: the chunk's head, its messages, its commit mark. The first
-        two are not joined, for the messages are megabytes."""
-        lead, body = b"".join(self.definitions), b"".join(self.parts)
+    def pieces(self, base: int) -> tuple[bytes, bytes, bytes]:
+        """What to write into a file that begins at offset ``base``, in this order: the chunk's
+        head, its messages, its commit mark. The first two are not joined, for the messages are
+        megabytes."""
+        parts = self.parts
+        if base != self.base:
+            parts = list(parts)
+            parts[::2] = [_mcap.renumbered(head, self.base - base) for head in parts[::2]]
+        lead, body = b"".join(self.definitions), b"".join(parts)
         size = len(lead) + len(body)
         crc = zlib.crc32(body, zlib.crc32(lead))
         head = _mcap.encode_plain_chunk_head(size, crc, self.first_ns, self.last_ns)
@@ -141,6 +148,7 @@ class GroupBuilder:
     def cut(self) -> Group:
         """What was taken since the last cut, as one group."""
         group = Group(
+            self._base,
             self._first,
             self.next_offset,
             self._first_ns,

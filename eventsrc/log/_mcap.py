@@ -122,6 +122,12 @@ def encode_message_head(channel: int, sequence: int, log: int, publish: int, siz
     return MESSAGE.pack(Opcode.MESSAGE, 22 + size, channel, sequence, log, publish)
 
 
+def renumbered(head: bytes, by: int) -> bytes:
+    """A message's head with its sequence number changed by ``by``."""
+    opcode, length, channel, sequence, log, publish = MESSAGE.unpack(head)
+    return MESSAGE.pack(opcode, length, channel, sequence + by, log, publish)
+
+
 def compressor() -> zstandard.ZstdCompressor:
     """What `encode_chunk` compresses with; for one thread, and quicker when used again."""
     return zstandard.ZstdCompressor(level=_ZSTD_LEVEL)

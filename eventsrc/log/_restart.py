@@ -116,6 +116,9 @@ def _look_at_leftovers(log: Path, segments: list[SegmentPath], state: Restart) -
             state.recovered_events += left.scan.next_offset - segment.base
             found.append(left)
         else:
+            if left.scan.log_id is not None:
+                # The writer had come to this offset, even if files before it are gone by now.
+                state.next_offset = max(state.next_offset, segment.base)
             segment.path.unlink()
             sync_directory(log)
     return found
@@ -192,7 +195,7 @@ def _read_end(log: Path, state: Restart, found: list[_Leftover]) -> None:
     if sealed:
         last = SealedFile(sealed[-1].path, sealed[-1].base)
         state.log_id = last.log_id
-        state.next_offset = last.next_offset
+        state.next_offset = max(state.next_offset, last.next_offset)
         state.previous_sha256 = file_sha256(sealed[-1].path)
     if state.unsealed:
-        state.next_offset = found[-1].scan.next_offset
+        state.next_offset = max(state.next_offset, found[-1].scan.next_offset)

@@ -177,7 +177,7 @@ def _replaces(following: SegmentPath | None) -> dict[str, str]:
         claim = head_of(following.path, following.base).get("previous_sha256")
     except (LogDamaged, NotALog):
         return {}
-    return {REPLACES: claim} if claim else {}
+    return {} if claim is None else {REPLACES: claim}
 
 
 def _told(segment: SegmentPath | None, scan: Scan, copy: str | None) -> SegmentRecovery:

@@ -124,7 +124,7 @@ class _Verifier:
         previous = head.get("previous_sha256", NO_PREVIOUS)
         if head and self._known_as and previous not in self._known_as:
             self._add("chain", "was not written after the segment before it", name)
-        self._known_as = {check.sha256, head.get(REPLACES) or check.sha256}
+        self._known_as = {check.sha256, head.get(REPLACES, check.sha256)}
 
     def _check_end(self, name: str, scan: Scan) -> None:
         if scan.lost_bytes and not scan.gaps and not self._live:

@@ -20,6 +20,7 @@ from eventsrc.errors import LogError, MapfoldError, NotALog
 
 from ._active import ActiveSegment
 from ._commits import Commits, OverlappedCommits
+from ._file_fault import FileFault
 from ._lock import WriterLock
 from ._naming import LOCK, leftovers, list_segments
 from ._restart import Restart, restart
@@ -48,6 +49,10 @@ class LogWriter:
     """A context manager; creates the log if there is none, takes its lock, recovers what a
     predecessor left. Raises LogBusy, NotALog, LogDamaged or LogError.
 
+    A segment file that somebody deletes, moves or cuts short under the writer is given up, and
+    writing goes on in a new one behind the last recorded offset; `faults` tells at once, and
+    `close` raises LogError.
+
     ``overlap`` is for much at once. A thread beside the caller's then writes and syncs one group
     while the next is taken, so `durable_offset` moves by itself and an error shows with one of the
     next calls (but not under ``always``, which syncs before `append` returns); and segments are
@@ -72,6 +77,7 @@ class LogWriter:
         self._rotate_events = rotate_events
         self._rotate_ns = int(rotate_seconds * 1e9)
         self._closed = False
+        self._faults: list[FileFault] = []
         self._overlap = overlap
         self._commits = OverlappedCommits() if overlap and fsync.max_events > 1 else Commits()
         try:
@@ -99,7 +105,13 @@ class LogWriter:
 
     def _next_segment(self, base: int) -> ActiveSegment:
         self._begun = time.monotonic_ns()
-        return ActiveSegment(self.path, self.log_id, base, self._fsync, self._commits.slack)
+        slack = self._commits.slack
+        return ActiveSegment(self.path, self.log_id, base, self._fsync, slack, self._take_fault)
+
+    def _take_fault(self, fault: FileFault) -> None:
+        if not fault.lost and fault.following > fault.base:
+            self._sealer.submit(fault.base, fault.following)
+        self._faults.append(fault)
 
     @property
     def next_offset(self) -> int:
@@ -111,6 +123,12 @@ class LogWriter:
         """Every event below it is synced, and visible to readers."""
         ending = self._ending.committed  # all of it is, when it has come to the next one's base
         return ending if ending < self._active.base else self._active.committed
+
+    @property
+    def faults(self) -> Sequence[FileFault]:
+        """The files that had to be given up so far. A file is among them before `durable_offset`
+        passes the first event written behind it."""
+        return self._faults
 
     @property
     def sealing(self) -> Sealing:
@@ -174,7 +192,7 @@ class LogWriter:
 
     def _full(self) -> bool:
         active = self._active
-        events = active.committed - active.base
+        events = active.committed - active.file_base
         return events > 0 and (
             active.size >= self._rotate_bytes
             or active.channels >= ROTATE_CHANNELS
@@ -188,11 +206,11 @@ class LogWriter:
         self._commits.rotate(ending, following, lambda: self._submit(ending))
 
     def _submit(self, finished: ActiveSegment, *, last: bool = False) -> None:
-        self._sealer.submit(finished.base, finished.committed, last=last)
+        self._sealer.submit(finished.file_base, finished.committed, last=last)
 
     def close(self) -> None:
         """Commit, seal, let the next writer in. Raises LogError when the last events or the seal
-        could not be written; the log is released either way."""
+        could not be written, or a file had to be given up; the log is released either way."""
         if self._closed:
             return
         self._closed = True
@@ -207,14 +225,25 @@ class LogWriter:
             self._active.close()
             self._sealer.finish()
             self._lock.release()
+        if self._faults:
+            raise LogError(self._told_of_faults())
         if self._sealer.error is not None:
             raise self._sealer.error
 
+    def _told_of_faults(self) -> str:
+        more = f" (and {len(self._faults) - 1} more such files)" if len(self._faults) > 1 else ""
+        return (
+            f"{self._faults[0]}{more}; what was written from offset {self._faults[-1].following} "
+            f"on is recorded. Keep other programs away from {self.path}; `mapfold log verify "
+            f"{self.path}` names what cannot be read, `mapfold log recover {self.path}` marks it "
+            "as lost"
+        )
+
     def _finish_active(self) -> None:
         """An empty segment stays only where it is all there is: it carries the log's id."""
-        if self._active.committed > self._active.base:
+        if self._active.committed > self._active.file_base:
             self._submit(self._active, last=True)
-        elif self._active.base > 0:
+        elif self._active.file_base > 0:
             unlink_quietly(self._active.path)
 
     def __enter__(self) -> "LogWriter":

@@ -15,7 +15,8 @@ class RecorderReport:
     messages that were received and not written, because the log could not be written any more: if
     the next start finds some of them on the disk all the same, the better. ``unsealed`` segments
     are finished and wait to be sealed, ``sealing_error`` says why if that fails; it costs room on
-    the disk and loses nothing.
+    the disk and loses nothing. ``faults`` are what became of segment files that somebody took
+    away, cut short or wrote to, and ``lost_from_log`` how many recorded events were in them.
     """
 
     recorded: int
@@ -31,11 +32,14 @@ class RecorderReport:
     unwritten: int = 0
     unsealed: int = 0
     sealing_error: str | None = None
+    lost_from_log: int = 0
+    faults: tuple[str, ...] = ()
 
     @property
     def lost(self) -> int:
-        """Messages that were sent and are not in the log."""
-        return self.queue_full + self.too_large + self.transport_missed + self.unwritten
+        """Messages that were sent and are not in the log, or are no longer."""
+        on_the_way = self.queue_full + self.too_large + self.transport_missed
+        return on_the_way + self.unwritten + self.lost_from_log
 
     @property
     def clean(self) -> bool:

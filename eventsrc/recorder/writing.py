@@ -7,6 +7,9 @@
   have rotted since, whatever a saved ledger says; a robot that still has it sends it again.
 * How far a robot says it has got comes through the same queue, behind what it sent before, and
   enters the gap ledger when that is synced. It is nothing to record.
+* When a segment file is taken away, cut short or replaced, the log goes on in a new one. What had
+  been synced in the old one and is not answered yet never is, and no ledger is saved any more, for
+  it would know events that the log has lost.
 * When the log cannot be written any more, what was received and is not known to be synced is
   counted: being written, taken, or still in the queue.
 * Losses are written about once a second, not one by one: a queue that overflows is busy enough.
@@ -25,7 +28,7 @@ from pydantic import ValidationError
 from eventsrc._zenoh import Received
 from eventsrc.append import judge_payloads
 from eventsrc.errors import LogError
-from eventsrc.ledger import save_ledger
+from eventsrc.ledger import forget_ledger, save_ledger
 from eventsrc.log import LogWriter
 from eventsrc.losses import Gap, GapLedger
 from eventsrc.sent import SENT_SUFFIX, Sent
@@ -86,6 +89,7 @@ class Writing:
         self._told: deque[_Told] = deque()
         self._in_hand = 0  # taken from the inbox and not yet given to the log
         self._failed = False
+        self._faults = 0
         self._recorded = self._rejected = 0
         self._missing = self._missing_before = self._ledger.missing if report_gaps else 0
 
@@ -124,6 +128,8 @@ class Writing:
             unwritten=self._unwritten(),
             unsealed=sealing.waiting,
             sealing_error=None if sealing.error is None else str(sealing.error),
+            lost_from_log=sum(fault.lost_events for fault in writer.faults),
+            faults=tuple(map(str, writer.faults)),
         )
 
     def _unwritten(self) -> int:
@@ -178,6 +184,7 @@ class Writing:
     def _follow_up(self) -> None:
         """Everything synced since the last call: recorded, counted, answered."""
         durable = self._writer.durable_offset
+        self._forget_lost()  # after `durable` was read: no fault before it is overlooked
         now_ns = time.monotonic_ns()
         if self._unsynced and self._unsynced[0].offset < durable:
             self._follow_events(durable, now_ns)
@@ -199,6 +206,21 @@ class Writing:
         self._recorded += before - len(waiting) - rejected
         for key, payload in answers.messages(self._writer.log_id):
             self._answer(key, payload)
+
+    def _forget_lost(self) -> None:
+        """Answer nothing that was synced in a file which has been given up since."""
+        faults = self._writer.faults
+        if len(faults) == self._faults:
+            return
+        self._faults = len(faults)
+        lost = [(fault.base, fault.following) for fault in faults if fault.lost_events]
+        if not lost:
+            return
+        kept = [e for e in self._unsynced if not any(a <= e.offset < b for a, b in lost)]
+        self._unsynced = deque(kept)
+        if self._saves:
+            self._saves = False
+            forget_ledger(self._writer.path)
 
     def _sync(self) -> int:
         """Make everything durable, so that the ledger is that of the whole log; its end."""

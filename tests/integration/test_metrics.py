@@ -12,7 +12,11 @@ from tests.envelopes import envelope, payload
 from tests.fixtures_zenoh import Program, scrape
 
 REPORT = RecorderReport(
-    12, 3, 4, 5, 6, 0, 7, 100, 15, too_large=9, unsealed=8, sealing_error="disk is on fire"
+    *(12, 3, 4, 5, 6, 0, 7, 100, 15),
+    too_large=9,
+    unsealed=8,
+    sealing_error="disk is on fire",
+    lost_from_log=10,
 )
 
 
@@ -26,6 +30,7 @@ def test_every_number_is_scraped_as_it_is_at_that_moment(tmp_path: Path) -> None
         "mapfold_recorder_queue_full_total": 4,
         "mapfold_recorder_too_large_total": 9,
         "mapfold_recorder_transport_missed_total": 5,
+        "mapfold_recorder_lost_from_log_total": 10,
         "mapfold_recorder_missing": 6,
         "mapfold_recorder_queue_depth": 7,
         "mapfold_recorder_queue_size": 100,

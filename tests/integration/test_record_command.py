@@ -15,10 +15,11 @@ import pytest
 import zenoh
 
 from eventsrc._ledger_cache import NAME
-from eventsrc._zenoh import Received, Session
+from eventsrc._zenoh import Received, Session, ZenohOptions
 from eventsrc.acks import Ack, ack_key
 from eventsrc.append import append_payload
 from eventsrc.log import LogReader, LogWriter
+from eventsrc.publisher import EnvelopePublisher
 from eventsrc.refusals import fingerprint
 from eventsrc.router import Router
 from tests.commands import PROGRAM
@@ -56,6 +57,7 @@ def test_a_signal_drains_the_queue_and_exits_0(
         "too_large": 0,
         "transport_missed": 0,
         "unwritten": 0,
+        "lost_from_log": 0,
         "missing": 0,
         "next_offset": 30,
         "unsealed": 0,
@@ -286,6 +288,33 @@ def test_a_segment_that_cannot_be_sealed_is_told_with_the_numbers(
     assert "could not be sealed: File too large" in numbers["sealing_error"]
     assert recorder.lines[-1] == f"mapfold: {numbers['sealing_error']}"
     assert len(_stored(log)) == 1
+
+
+def test_a_segment_that_is_cut_short_ends_no_recording_and_is_told(
+    start: Start, endpoint: str, tmp_path: Path
+) -> None:
+    log = tmp_path / "log"
+    recorder = start("record", str(log), "--connect", endpoint, "--fsync", "always", "--json")
+    recorder.wait_for("recording")
+    with EnvelopePublisher(ZenohOptions(connect=(endpoint,)), tmp_path / "spool") as robot:
+        for k in range(5):
+            robot.publish(envelope(k))
+        assert robot.flush(DEADLINE_S)
+        (active,) = log.glob("*.active")
+        os.truncate(active, 0)
+        for k in range(5, 9):
+            robot.publish(envelope(k))
+        assert robot.flush(DEADLINE_S)
+    said = recorder.wait_for("SEGMENT GIVEN UP")
+    assert f"{active} was cut short to 0 of" in said
+    assert "offsets 0 to 4, which had been recorded in it, are lost" in said
+    assert recorder.end(signal.SIGINT) == 1
+    numbers = json.loads(recorder.output())
+    assert (numbers["recorded"], numbers["lost_from_log"], numbers["next_offset"]) == (9, 5, 9)
+    assert "mapfold log recover" in recorder.lines[-1]
+    with LogReader(log) as reader:
+        assert [e.payload for e in reader.read(5)] == [payload(envelope(k)) for k in range(5, 9)]
+    assert not (log / NAME).exists(), "it would know keyframes that the log has lost"
 
 
 def _leave_torn(log: Path) -> None:

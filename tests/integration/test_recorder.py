@@ -20,6 +20,8 @@ from eventsrc.ledger import ledger_of, save_ledger
 from eventsrc.log import Event, FsyncPolicy, LogReader, LogWriter
 from eventsrc.losses import Gap
 from eventsrc.recorder import Recorder, RecorderReport
+from eventsrc.recorder.inbox import Inbox
+from eventsrc.recorder.writing import Writing
 from eventsrc.refusals import Refusal, Refusals, fingerprint, refusal_key
 from eventsrc.router import Router
 from eventsrc.sent import MAX_SENT_BYTES, Sent, sent_key
@@ -503,6 +505,33 @@ def test_what_was_received_and_could_not_be_written_is_counted(
             running._done.result(DEADLINE_S)
     report = running._recorder.report()
     assert (report.recorded, report.unwritten, report.lost, report.clean) == (0, 11, 11, False)
+
+
+def test_what_is_lost_before_it_was_answered_is_not_answered(tmp_path: Path) -> None:
+    """The recorder comes to tell of the first group when the second has found the file deleted."""
+    answered: list[tuple[str, bytes]] = []
+    writer = LogWriter(tmp_path / "log")
+    writing = Writing(
+        Inbox(),
+        writer,
+        None,
+        lambda key, said: answered.append((key, said)),
+        max_events=None,
+        report_gaps=True,
+        max_payload_bytes=2**20,
+    )
+    for run_id, count in (("lost", 3), ("kept", 2)):
+        writing._record([Received(KEY, p) for p in _keyframes(*range(count), run_id=run_id)])
+        writer.sync()
+        if run_id == "lost":
+            next((tmp_path / "log").glob("*.active")).unlink()
+    writing._follow_up()
+    report = writing.report()
+    assert (report.recorded, report.lost_from_log, report.clean) == (2, 3, False)
+    assert {b"lost" in said for _, said in answered} == {False}
+    assert len(answered) == 1
+    with pytest.raises(LogError, match="was deleted"):
+        writer.close()
 
 
 @pytest.mark.parametrize("keys", [["tb/*", "tb/detections"], ["**", "a"], ["a", "a"]])

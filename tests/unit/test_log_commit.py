@@ -227,23 +227,6 @@ def test_nothing_is_written_behind_what_an_interrupt_cut_short(
         assert (again.restart.torn_bytes, again.append(KEY, b"1")) == (0, 1)
 
 
-@pytest.mark.parametrize("overlap", [False, True])
-def test_a_file_that_is_deleted_under_the_writer_ends_it(log_path: Path, overlap: bool) -> None:
-    """What has no name is gone when its writer is, so it is not recorded."""
-    writer = LogWriter(log_path, fsync=BY_HAND, overlap=overlap)
-    writer.append(KEY, b"0")
-    writer.sync()
-    next(log_path.glob("*.active")).unlink()
-    writer.append(KEY, b"1")
-    with pytest.raises(LogError, match="was deleted while it was being written: offsets 0 to 1"):
-        writer.sync()
-    assert writer.durable_offset == 1
-    with pytest.raises(LogError, match="was deleted"):
-        writer.append(KEY, b"2")
-    with pytest.raises(LogError, match="was deleted"):
-        writer.close()
-
-
 def test_times_out_of_bounds_are_refused(log_path: Path) -> None:
     with LogWriter(log_path) as writer:
         for times in ({"stamp_ns": -1}, {"logged_ns": 2**63}):
