@@ -1,63 +1,153 @@
 """A saved gap ledger beside its log: ``.ledger.json``, a cache, safe to delete.
 
-It is believed only if it is of this log, of no more events than the log has, and if the segments
-it was folded from are still there: a ledger that knows events which the log has lost would have a
-recorder acknowledge them, and the robot throw away the last copy. Recovery, which takes events
-away, deletes it first.
+It is believed only if it is what was saved, to the byte, if a ledger can be like that at all, if it
+is of this log, of no more events than the log has, and if the segments it was folded from are still
+there: a ledger that knows events which the log has lost would have a recorder acknowledge them, and
+the robot throw away the last copy. Recovery, which takes events away, deletes it first. Where there
+is any doubt the log is counted again, and the reason told.
+
+The file is one JSON object, ``{"sha256": …, "ledger": {…}}``; the hash is that of the bytes of the
+inner object.
 """
 
 import contextlib
+import hashlib
+import os
+import re
+import stat
+from collections.abc import Callable
 from pathlib import Path
-from typing import Final, Literal
+from typing import Annotated, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError
 
+from .envelope import Int64
 from .log._lineage import lineage, still_holds
-from .log.fsync import sync_directory, unlink_quietly
+from .log.fsync import sync_directory, unlink_quietly, write_all
 from .log.reader import LogReader
-from .losses import GapLedger, RunState
+from .losses import GapLedger, RunState, sound
 
 NAME: Final = ".ledger.json"
+MAX_BYTES: Final = 8 * 1024 * 1024
+"""Half a million gaps. A larger ledger is not saved: reading it would cost more memory than the log
+it is of."""
+_FORM: Final = re.compile(rb'\{"sha256":"([0-9a-f]{64})","ledger":(\{.*\})\}', re.DOTALL)
+
+Note = Callable[[str], None]
+"""Takes one line for people."""
+
+
+Run = tuple[str, Int64, Int64, Annotated[tuple[tuple[Int64, Int64, bool], ...], FailFast()]]
+"""A `RunState` as it is saved."""
 
 
 class SavedLedger(BaseModel):
     """The ledger of the first ``next_offset`` events of the log ``log_id``."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
-    format: Literal[2] = 2
+    format: Literal[3] = 3
     log_id: str
-    next_offset: int
-    segments: tuple[str, ...]
-    runs: tuple[RunState, ...]
+    next_offset: Annotated[int, Field(ge=0, lt=2**63)]
+    segments: Annotated[tuple[str, ...], FailFast()]
+    runs: Annotated[tuple[Run, ...], FailFast()]
+
+    def states(self) -> list[RunState]:
+        """What `GapLedger.restore` takes."""
+        return [RunState(*run) for run in self.runs]
 
 
-def load(reader: LogReader) -> SavedLedger | None:
-    """The saved ledger of a log; None if there is none that can be believed."""
+class _Doubt(Exception):
+    """Why a saved ledger is not believed."""
+
+
+def load(reader: LogReader, note: Note | None = None) -> SavedLedger | None:
+    """The saved ledger of a log; None if there is none, or none that can be believed, which
+    ``note`` is told."""
+    path = reader.path / NAME
     try:
-        saved = SavedLedger.model_validate_json((reader.path / NAME).read_bytes())
-        believable = (
-            saved.log_id == reader.log_id
-            and saved.next_offset <= reader.next_offset
-            and still_holds(saved.segments, lineage(reader.path, saved.next_offset))
-        )
-    except (OSError, ValidationError):
+        saved = _decode(_read(path))
+        _check(saved, reader)
+    except FileNotFoundError:
         return None
-    return saved if believable else None
+    except (OSError, _Doubt) as error:
+        if note is not None:
+            reason = error.strerror if isinstance(error, OSError) else error
+            note(f"{path} is not used: {reason}; what it says is counted again from the log")
+        return None
+    return saved
+
+
+def _read(path: Path) -> bytes:
+    """Raises OSError, also for a symbolic link, and _Doubt for what is no file or a huge one."""
+    fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    try:
+        status = os.fstat(fd)
+        if not stat.S_ISREG(status.st_mode):
+            raise _Doubt("it is not a regular file")
+        if status.st_size > MAX_BYTES:
+            raise _Doubt(f"it is {status.st_size:,} bytes large, more than {MAX_BYTES:,}")
+        return os.read(fd, MAX_BYTES)
+    finally:
+        os.close(fd)
+
+
+def _decode(data: bytes) -> SavedLedger:
+    found = _FORM.fullmatch(data)
+    if found is None:
+        raise _Doubt("it is not a ledger as this version of mapfold saves it")
+    if hashlib.sha256(found[2]).hexdigest().encode() != found[1]:
+        raise _Doubt("its checksum does not match its content")
+    try:
+        return SavedLedger.model_validate_json(found[2])
+    except ValidationError as error:
+        fault = error.errors(include_url=False, include_context=False, include_input=False)[0]
+        place = ".".join(map(str, fault["loc"]))
+        raise _Doubt(f"it holds what no ledger does: {place}: {fault['msg']}") from None
+
+
+def _check(saved: SavedLedger, reader: LogReader) -> None:
+    if not sound(saved.states(), saved.next_offset):
+        raise _Doubt("it holds keyframes or gaps that contradict each other")
+    if saved.log_id != reader.log_id:
+        raise _Doubt("it is of another log")
+    if saved.next_offset > reader.next_offset:
+        raise _Doubt(f"it knows {saved.next_offset} events and the log has {reader.next_offset}")
+    if not still_holds(saved.segments, lineage(reader.path, saved.next_offset)):
+        raise _Doubt("segments that it was made from have changed or are gone")
 
 
 def save(path: Path, log_id: str, next_offset: int, ledger: GapLedger) -> None:
-    """Replace the saved ledger. That it cannot be written is no error: it is a cache."""
-    temporary = path / f"{NAME}.new"
-    with contextlib.suppress(OSError):
+    """Replace the saved ledger. That it cannot be written is no error: it is a cache. Nor is it one
+    if the log names keyframes that no envelope can have."""
+    with contextlib.suppress(OSError, ValidationError):
         saved = SavedLedger(
             log_id=log_id,
             next_offset=next_offset,
             segments=lineage(path, next_offset),
             runs=ledger.state(),
         )
-        temporary.write_text(saved.model_dump_json())
-        temporary.replace(path / NAME)
+        _write(path, encode(saved.model_dump_json().encode()))
+
+
+def encode(ledger: bytes) -> bytes:
+    """The content of the file around the JSON of a `SavedLedger`."""
+    digest = hashlib.sha256(ledger).hexdigest().encode()
+    return b'{"sha256":"%s","ledger":%s}' % (digest, ledger)
+
+
+def _write(path: Path, data: bytes) -> None:
+    if len(data) > MAX_BYTES:
+        unlink_quietly(path / NAME)
+        return
+    temporary = path / f"{NAME}.new"
+    unlink_quietly(temporary)
+    fd = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o644)
+    try:
+        write_all(fd, data)
+    finally:
+        os.close(fd)
+    temporary.replace(path / NAME)
 
 
 def forget(path: Path) -> None:

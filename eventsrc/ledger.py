@@ -9,15 +9,22 @@ import contextlib
 import time
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Final
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from . import _ledger_cache
-from .envelope import ENVELOPE_VERSION
+from ._ledger_cache import Note
+from .envelope import ENVELOPE_VERSION, Int64
 from .log.event import Event
 from .log.reader import LogReader
 from .losses import DEFAULT_SETTLE_NS, GapLedger, gap_of
 from .system_events import LOSS_KEY, Loss, is_system_key
+
+SAVE_EVERY: Final = 50_000
+"""Events; they take a second or two to read."""
+_MANY: Final = 100_000
+"""Events that take seconds to read; below it nobody notices."""
 
 
 class _Identity(BaseModel):
@@ -26,24 +33,54 @@ class _Identity(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True, extra="ignore")
 
     run_id: str
-    keyframe_id: int
+    keyframe_id: Int64
 
 
 def ledger_of(
-    reader: LogReader, *, settle_ns: int = DEFAULT_SETTLE_NS, now_ns: int | None = None
+    reader: LogReader,
+    *,
+    settle_ns: int = DEFAULT_SETTLE_NS,
+    now_ns: int | None = None,
+    note: Note | None = None,
 ) -> GapLedger:
     """The ledger of a whole log, beginning where a saved one ends.
 
     Holes the log never reported count as open since ``now_ns`` (by default: now, monotonic clock).
+    ``note`` is told why a saved ledger is not used.
     """
     now_ns = time.monotonic_ns() if now_ns is None else now_ns
-    ledger = GapLedger(settle_ns)
-    start = 0
-    saved = _ledger_cache.load(reader)
-    if saved is not None:
-        start = saved.next_offset
-        ledger.restore(saved.runs, now_ns)
+    start, ledger = _resume(reader, settle_ns, now_ns, note)
     return fold_ledger(reader.read(start), ledger, now_ns)
+
+
+def keep_ledger(reader: LogReader, *, note: Note | None = None) -> GapLedger:
+    """`ledger_of` for the log's writer, which saves it: on the way through a long log as well, so
+    that one that is killed meanwhile reads no event twice but the last `SAVE_EVERY`."""
+    now_ns = time.monotonic_ns()
+    at, ledger = _resume(reader, DEFAULT_SETTLE_NS, now_ns, note)
+    end = reader.next_offset
+    if note is not None and end - at >= _MANY:
+        note(f"reading {reader.path} once, to know which keyframes it lacks …")
+    while at < end:
+        upto = min(at + SAVE_EVERY, end)
+        # Only a reading without an end looks for damage behind the last event.
+        events = reader.read(at) if upto == end else reader.read(at, upto)
+        fold_ledger(events, ledger, now_ns)
+        save_ledger(reader.path, reader.log_id, upto, ledger)
+        at = upto
+    return ledger
+
+
+def _resume(
+    reader: LogReader, settle_ns: int, now_ns: int, note: Note | None
+) -> tuple[int, GapLedger]:
+    """The saved ledger and the offset behind what it knows; an empty one and 0 if there is none."""
+    ledger = GapLedger(settle_ns)
+    saved = _ledger_cache.load(reader, note)
+    if saved is None:
+        return 0, ledger
+    ledger.restore(saved.states(), now_ns)
+    return saved.next_offset, ledger
 
 
 def unread_events(reader: LogReader) -> int:

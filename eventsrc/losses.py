@@ -96,6 +96,25 @@ class RunState(NamedTuple):
     holes: tuple[tuple[int, int, bool], ...]
 
 
+def sound(runs: Iterable[RunState], events: int) -> bool:
+    """Whether a ledger of that many events can be in this state. Between two holes there is a
+    recorded keyframe, and each event is one keyframe, or a loss with one recorded on each side."""
+    seen: set[str] = set()
+    recorded = 0
+    for run_id, first, last, holes in runs:
+        if run_id in seen or last < first:
+            return False
+        seen.add(run_id)
+        recorded += last - first + 1
+        before = first - 1
+        for start, end, _ in holes:
+            if not before + 1 < start <= end < last:
+                return False
+            recorded -= end - start + 1
+            before = end
+    return recorded <= 2 * events
+
+
 class GapLedger:
     """What is recorded and what is missing, run by run. Memory: a few words per run and hole."""
 

@@ -36,7 +36,7 @@ log_app = typer.Typer(help="Look at a log: info, cat, verify, recover.", no_args
 @log_app.command()
 def info(log: LogArgument, json_: JsonOption = False) -> None:
     """What a log holds: id, segments, offsets, counts by key, rejected, losses, times."""
-    report = log_info(log)
+    report = log_info(log, note=say)
     if json_:
         emit(_info_document(report))
     else:

@@ -12,7 +12,7 @@ from eventsrc._zenoh import check_keys, open_session
 from eventsrc.endpoints import parse_address
 from eventsrc.errors import LogDamaged
 from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES
-from eventsrc.ledger import ledger_of, unread_events
+from eventsrc.ledger import keep_ledger
 from eventsrc.log import LogReader, LogWriter, parse_fsync
 from eventsrc.losses import GapLedger
 from eventsrc.recorder import DEFAULT_KEYS, DEFAULT_QUEUE_SIZE, Recorder
@@ -24,8 +24,6 @@ from ._shell import say
 from ._signals import stop_on_signals
 from ._zenoh_options import ConfigOption, ConnectOption, ListenOption, zenoh_options
 
-_MANY: Final = 100_000
-"""Events that take seconds to read; below it nobody notices."""
 _LARGEST_BYTES: Final = 128 * 1024 * 1024
 """What Zenoh puts together of one message, however small ``--max-payload``: it tells nobody of what
 it drops, so most of what is too large should come this far and be counted."""
@@ -112,9 +110,7 @@ def _ledger(log: Path) -> GapLedger | None:
     """What the log lacks so far. Damage in an old segment is no reason not to record."""
     try:
         with LogReader(log) as reader:
-            if unread_events(reader) >= _MANY:
-                say(f"reading {log} once, to know which keyframes it lacks …")
-            return ledger_of(reader)
+            return keep_ledger(reader, note=say)
     except LogDamaged as error:
         say(f"recording all the same, without knowing what the log lacks so far: {error}")
         return None

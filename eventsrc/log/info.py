@@ -1,6 +1,7 @@
 """What `mapfold log info` tells: counted from the indexes, hardly reading any events."""
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -54,8 +55,9 @@ class _Tally:
     stamps: RobotStamps
 
 
-def log_info(path: Path) -> LogInfo:
-    """Count a log. Raises LogNotFound, NotALog or LogDamaged."""
+def log_info(path: Path, *, note: Callable[[str], None] | None = None) -> LogInfo:
+    """Count a log. Raises LogNotFound, NotALog or LogDamaged. ``note`` takes a line for people: why
+    a ledger saved beside the log is not used."""
     tally = _Tally(Counter(), [], RobotStamps())
     with LogReader(path) as reader:
         segments = tuple(_count(reader, entry, tally) for entry in reader.segments)
@@ -68,7 +70,7 @@ def log_info(path: Path) -> LogInfo:
             segments=segments,
             keys={key: tally.keys[key] for key in sorted(tally.keys)},
             rejected=tally.keys[REJECTED_KEY],
-            lost=count_lost(reader) if tally.keys[LOSS_KEY] else 0,
+            lost=count_lost(reader, note) if tally.keys[LOSS_KEY] else 0,
             first_logged_ns=min(tally.logged, default=None),
             last_logged_ns=max(tally.logged, default=None),
             first_stamp_ns=tally.stamps.first,

@@ -50,8 +50,11 @@ _IDLE_S: Final = 0.25
 _UNSYNCED_S: Final = 0.005
 """How long to wait for more while a group commit is due: a tenth of the default group."""
 _LOSSES_EVERY_NS: Final = 1_000_000_000
+_FIRST_SAVE_NS: Final = 1_000_000_000
 _SAVE_EVERY_NS: Final = 60_000_000_000
-"""So a recorder that was killed leaves a minute of its log to be read again, not the whole."""
+"""The ledger is saved after one second, and then after twice as long as the time before, up to a
+minute: a recorder that was killed leaves at most half of what it recorded to be read again, or a
+minute of it."""
 
 
 class _Told(NamedTuple):
@@ -84,7 +87,8 @@ class Writing:
         self._report_gaps = report_gaps
         self._max_payload_bytes = max_payload_bytes
         self._losses_due_ns = time.monotonic_ns() + _LOSSES_EVERY_NS
-        self._save_due_ns = time.monotonic_ns() + _SAVE_EVERY_NS
+        self._save_after_ns = _FIRST_SAVE_NS
+        self._save_due_ns = time.monotonic_ns() + self._save_after_ns
         self._unsynced: deque[Unsynced] = deque()
         self._told: deque[_Told] = deque()
         self._in_hand = 0  # taken from the inbox and not yet given to the log
@@ -157,7 +161,8 @@ class Writing:
             self._losses_due_ns = now_ns + _LOSSES_EVERY_NS
             self._write_losses(self._ledger.due(now_ns), self._inbox.take_missed(now_ns))
         if now_ns >= self._save_due_ns:
-            self._save_due_ns = now_ns + _SAVE_EVERY_NS
+            self._save_after_ns = min(2 * self._save_after_ns, _SAVE_EVERY_NS)
+            self._save_due_ns = now_ns + self._save_after_ns
             self._save()
         if self._room is not None:
             self._room -= len(batch)

@@ -1,15 +1,18 @@
 """The ledger of a log: what a log lacks, from its events or from a saved ledger and the rest."""
 
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from eventsrc import ledger as ledger_module
 from eventsrc._ledger_cache import NAME
 from eventsrc.append import append_payload
 from eventsrc.errors import LogDamaged
-from eventsrc.ledger import fold_ledger, ledger_of, save_ledger, unread_events
-from eventsrc.log import NEVER, LogReader, LogWriter, _parts, log_info, recover, recover_log
+from eventsrc.ledger import fold_ledger, keep_ledger, ledger_of, save_ledger, unread_events
+from eventsrc.log import NEVER, Event, LogReader, LogWriter, _parts, log_info, recover, recover_log
 from eventsrc.losses import Gap, GapLedger
 from eventsrc.system_events import LOSS_KEY, Loss
 from tests.envelopes import detection, envelope, payload
@@ -253,6 +256,51 @@ def test_saving_and_going_on_equals_reading_everything(log: Path) -> None:
     again = _ledger(log)
     assert again.state() == whole.state()
     assert again.flush() == whole.flush()
+
+
+class Counted:
+    """Counts the events that are read of a log; reading stops, as if killed, at ``kill_at``."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.read = 0
+        self.kill_at: int | None = None
+        real = LogReader.read
+
+        def read(reader: LogReader, *args: Any, **options: Any) -> Iterator[Event]:
+            for event in real(reader, *args, **options):
+                if event.offset == self.kill_at:
+                    raise KeyboardInterrupt
+                self.read += 1
+                yield event
+
+        monkeypatch.setattr(LogReader, "read", read)
+
+    def keep(self, log: Path) -> tuple[int, GapLedger | None]:
+        """How many events are read for the ledger, and the ledger unless killed before."""
+        self.read = 0
+        with LogReader(log) as reader:
+            try:
+                ledger = keep_ledger(reader)
+            except KeyboardInterrupt:
+                return self.read, None
+        return self.read, ledger
+
+
+def test_a_start_that_is_killed_while_it_reads_the_log_is_gone_on_from(
+    long_log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = _ledger(long_log).state()
+    monkeypatch.setattr(ledger_module, "SAVE_EVERY", 5)
+    counted = Counted(monkeypatch)
+    counted.kill_at = 7
+    assert counted.keep(long_log) == (7, None)
+    assert counted.keep(long_log) == (2, None), "from offset 5 on"
+    counted.kill_at = None
+    read, found = counted.keep(long_log)
+    assert read == LONG - 5
+    assert found is not None
+    assert found.state() == whole
+    assert counted.keep(long_log)[0] == 0
 
 
 def test_that_the_cache_cannot_be_written_is_no_error(tmp_path: Path) -> None:

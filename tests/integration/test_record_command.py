@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from eventsrc._ledger_cache import NAME
 from eventsrc._zenoh import Received, Session, ZenohOptions
 from eventsrc.acks import Ack, ack_key
 from eventsrc.append import append_payload
+from eventsrc.ledger import unread_events
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.publisher import EnvelopePublisher
 from eventsrc.refusals import fingerprint
@@ -288,6 +290,39 @@ def test_a_segment_that_cannot_be_sealed_is_told_with_the_numbers(
     assert "could not be sealed: File too large" in numbers["sealing_error"]
     assert recorder.lines[-1] == f"mapfold: {numbers['sealing_error']}"
     assert len(_stored(log)) == 1
+
+
+def test_a_recorder_that_is_killed_soon_leaves_little_to_be_read_again(
+    start: Start, publish: Start, endpoint: str, tmp_path: Path
+) -> None:
+    log = tmp_path / "log"
+    with LogWriter(log) as writer:
+        for k in range(20):
+            append_payload(writer, KEY, payload(envelope(k)))
+    first = start("record", str(log), "--connect", endpoint)
+    first.wait_for("recording")
+    first.end(signal.SIGKILL)
+    assert _unread(log) == 0
+    second = start("record", str(log), "--connect", endpoint)
+    second.wait_for("recording")
+    publish(KEY, *(payload(envelope(k)).decode() for k in range(20, 25)))
+    deadline, pause = time.monotonic() + DEADLINE_S, threading.Event()
+    while _known(log) < 25:
+        assert time.monotonic() < deadline, "nothing saved although the recorder is at work"
+        pause.wait(0.05)
+    second.end(signal.SIGKILL)
+    assert _unread(log) == 0
+
+
+def _unread(log: Path) -> int:
+    with LogReader(log) as reader:
+        return unread_events(reader)
+
+
+def _known(log: Path) -> int:
+    """How many events the saved ledger knows."""
+    with LogReader(log) as reader:
+        return reader.next_offset - unread_events(reader)
 
 
 def test_a_segment_that_is_cut_short_ends_no_recording_and_is_told(
