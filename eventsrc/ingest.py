@@ -23,6 +23,8 @@ from .ids import DetId, default_det_id
 from .terminal import visible
 
 DEFAULT_MAX_PAYLOAD_BYTES = 16 * 1024 * 1024
+MAX_PAYLOAD_BYTES = 2 * DEFAULT_MAX_PAYLOAD_BYTES
+"""Of what may be asked for: a log keeps events of up to 96 MiB, and what is rejected as base64."""
 MAX_MARKS = 500_000
 """Bound of the commas and opening brackets in one payload, as many as it has values: reading JSON
 costs some hundred bytes and a microsecond a value, however short the value."""

@@ -11,7 +11,7 @@ import typer
 from eventsrc._zenoh import check_keys, open_session
 from eventsrc.endpoints import parse_address
 from eventsrc.errors import LogDamaged
-from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES
+from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES, MAX_PAYLOAD_BYTES
 from eventsrc.ledger import keep_ledger
 from eventsrc.log import LogReader, LogWriter, parse_fsync
 from eventsrc.losses import GapLedger
@@ -51,7 +51,10 @@ def record(
         int, typer.Option(min=1, help="How many messages may wait for the disk.")
     ] = DEFAULT_QUEUE_SIZE,
     max_payload: Annotated[
-        int, typer.Option(min=1, metavar="BYTES", help="Larger messages are rejected.")
+        int,
+        typer.Option(
+            min=1, max=MAX_PAYLOAD_BYTES, metavar="BYTES", help="Larger messages are rejected."
+        ),
     ] = DEFAULT_MAX_PAYLOAD_BYTES,
     max_events: Annotated[
         int | None, typer.Option(min=1, help="Stop after so many messages.")

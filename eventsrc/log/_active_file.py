@@ -5,6 +5,7 @@ import os
 from pathlib import Path
 
 from . import _mcap
+from ._bytes import FileBytes
 from ._mcap import BadRecord, Channel
 from ._naming import SEALED, segment_path
 from .segment import ChunkRef, SegmentFile, Unreadable
@@ -60,8 +61,8 @@ class ActiveFile(SegmentFile):
         """What once was durable behind the last readable commit. A crash tears only the end, and
         no commit mark can follow what was never synced; so where one does, bytes have rotted."""
         while self.position < self.size():
-            rest = os.pread(self._fd, self.size() - self.position, self.position)
-            promised = max(_mcap.marks_in(rest), default=0)
+            with FileBytes(self._fd, self.position) as rest:
+                promised = max(_mcap.marks_in(rest), default=0)
             before = self.next_offset
             if self.refresh() == before:  # else a writer was at work between the two looks
                 if promised <= before:

@@ -1,25 +1,134 @@
-"""Reading a file from a disk that may be failing."""
+"""The bytes of a file that may be huge, full of holes, or on a disk that is failing.
 
+Read in blocks, and as much of them as is asked for, so that memory does not grow with the file. The
+holes of a sparse file are passed over when it is searched. Not mapped: a bad sector under a mapping
+kills the process.
+"""
+
+import errno
 import os
 from pathlib import Path
+from types import TracebackType
 
-_BLOCK = 64 * 1024
-
-
-def read_whatever_can_be(path: Path) -> bytes:
-    """The whole file; zeros where the disk gives an error, which no checksum takes for data.
-
-    Segments are rotated at 64 MiB, so this is what it takes in memory. Not mapped: a bad sector
-    under a mapping kills the process.
-    """
-    with path.open("rb", buffering=0) as file:
-        fd = file.fileno()
-        size = os.fstat(fd).st_size
-        return b"".join(_block(fd, at, min(_BLOCK, size - at)) for at in range(0, size, _BLOCK))
+_BLOCK = 1024 * 1024
+_SECTOR = 64 * 1024
+_OVERLAP = 64
+"""Bytes that a block holds of the next one, so that a pattern on the border is found."""
 
 
-def _block(fd: int, at: int, length: int) -> bytes:
-    try:
-        return os.pread(fd, length, at)
-    except OSError:
-        return bytes(length)
+class FileBytes:
+    """What stands in an open file from byte ``start`` on, as of now; used like `bytes`. Zeros where
+    the disk gives an error, which no checksum takes for data."""
+
+    def __init__(self, fd: int, start: int = 0) -> None:
+        self._fd = os.dup(fd)
+        self._start = start
+        self._size = max(0, os.fstat(self._fd).st_size - start)
+        self._block_at = -1
+        self._block = b""
+
+    @classmethod
+    def of(cls, path: Path) -> "FileBytes":
+        """Those of the whole file at ``path``. Raises OSError."""
+        fd = os.open(path, os.O_RDONLY)
+        try:
+            return cls(fd)
+        finally:
+            os.close(fd)
+
+    def __len__(self) -> int:
+        return self._size
+
+    def __getitem__(self, part: slice) -> bytes:
+        at, stop, step = part.indices(self._size)
+        if step != 1:
+            raise ValueError("only whole stretches of a file can be read")
+        return self._read(at, max(0, stop - at))
+
+    def startswith(self, prefix: bytes, at: int = 0) -> bool:
+        """Whether ``prefix`` stands at byte ``at``."""
+        return self[at : at + len(prefix)] == prefix
+
+    def find(self, pattern: bytes, start: int = 0, end: int | None = None) -> int:
+        """As `bytes.find`. ``pattern`` is short, and does not begin with a zero byte: it is not
+        looked for in holes."""
+        end = self._size if end is None else min(end, self._size)
+        at = max(start, 0)
+        while at + len(pattern) <= end:
+            if not self._in_block(at):
+                at = self._data_from(at)
+                self._load(at)
+            block = self._block_at
+            stop = min(block + _BLOCK + len(pattern) - 1, end)
+            found = self._block.find(pattern, at - block, stop - block)
+            if found >= 0:
+                return block + found
+            at = block + _BLOCK
+        return -1
+
+    def rfind(self, pattern: bytes, start: int = 0, end: int | None = None) -> int:
+        """As `bytes.rfind`, with the same exception."""
+        stop = self._size if end is None else min(end, self._size)
+        while stop - len(pattern) >= start:
+            at = max(start, stop - _BLOCK - len(pattern))
+            if self._data_from(at) < stop:
+                found = self[at:stop].rfind(pattern)
+                if found >= 0:
+                    return at + found
+            if at == start:
+                break
+            stop = at + len(pattern) - 1
+        return -1
+
+    def _in_block(self, at: int) -> bool:
+        return self._block_at >= 0 and 0 <= at - self._block_at < _BLOCK
+
+    def _load(self, at: int) -> None:
+        self._block_at = at - at % _BLOCK
+        length = min(_BLOCK + _OVERLAP, self._size - self._block_at)
+        self._block = self._pread(self._block_at, length)
+
+    def _data_from(self, at: int) -> int:
+        """The first byte from ``at`` on that is not in a hole; the end if there is none."""
+        try:
+            return min(os.lseek(self._fd, self._start + at, os.SEEK_DATA) - self._start, self._size)
+        except OSError as error:
+            return self._size if error.errno == errno.ENXIO else at  # others: it knows no holes
+
+    def _read(self, at: int, length: int) -> bytes:
+        if length > _BLOCK:
+            return self._pread(at, length)
+        if not self._in_block(at):
+            self._load(at)
+        start = at - self._block_at
+        data = self._block[start : start + length]
+        rest = length - len(data)
+        return data + self._pread(at + len(data), rest) if rest else data
+
+    def _pread(self, at: int, length: int) -> bytes:
+        try:
+            return os.pread(self._fd, length, self._start + at)
+        except OSError:
+            sectors = range(at, at + length, _SECTOR)
+            return b"".join(self._sector(s, min(_SECTOR, at + length - s)) for s in sectors)
+
+    def _sector(self, at: int, length: int) -> bytes:
+        try:
+            return os.pread(self._fd, length, self._start + at)
+        except OSError:
+            return bytes(length)
+
+    def close(self) -> None:
+        """Let go of the file."""
+        os.close(self._fd)
+
+    def __enter__(self) -> "FileBytes":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
+        self.close()

@@ -38,6 +38,8 @@ def _check(path: Path) -> FileCheck:
         size = os.fstat(file.fileno()).st_size
         tail = os.pread(file.fileno(), _mcap.TAIL_BYTES, max(0, size - _mcap.TAIL_BYTES))
         summary_start, fault = _summary_start(tail, size)
+        if fault is not None:
+            return FileCheck("", fault)  # it is not what was sealed, whatever its hash
         data_end_at = summary_start - _DATA_END_BYTES
         sha256 = hashlib.sha256()
         crc = 0
@@ -46,8 +48,7 @@ def _check(path: Path) -> FileCheck:
             sha256.update(block)
             crc = zlib.crc32(block[: max(0, data_end_at - at)], crc)
             at += len(block)
-        if fault is None:
-            fault = _data_end_fault(file.fileno(), data_end_at, crc)
+        fault = _data_end_fault(file.fileno(), data_end_at, crc)
         if fault is None:
             fault = _summary_fault(file.fileno(), summary_start, size, tail)
     return FileCheck(sha256.hexdigest(), fault)
@@ -59,6 +60,8 @@ def _summary_start(tail: bytes, size: int) -> tuple[int, str | None]:
     start = int.from_bytes(tail[9:17], "little")
     if not _DATA_END_BYTES < start < size:
         return _DATA_END_BYTES, "the footer points nowhere"
+    if size - start > _mcap.MAX_SUMMARY_BYTES + _mcap.TAIL_BYTES:
+        return _DATA_END_BYTES, f"the footer claims a summary of {size - start:,} bytes"
     return start, None
 
 
@@ -69,8 +72,10 @@ def _data_end_fault(fd: int, at: int, crc: int) -> str | None:
 
 
 def _summary_fault(fd: int, start: int, size: int, tail: bytes) -> str | None:
-    summary = os.pread(fd, size - _mcap.TAIL_BYTES - start, start)
+    crc = 0
+    for at in range(start, size - _mcap.TAIL_BYTES, _BLOCK):
+        crc = zlib.crc32(os.pread(fd, min(_BLOCK, size - _mcap.TAIL_BYTES - at), at), crc)
     footer = tail[: _mcap.FOOTER_BYTES]
-    if zlib.crc32(footer[:-4], zlib.crc32(summary)) != int.from_bytes(footer[-4:], "little"):
+    if zlib.crc32(footer[:-4], crc) != int.from_bytes(footer[-4:], "little"):
         return "the summary does not match its CRC"
     return None

@@ -58,8 +58,8 @@ class GroupBuilder:
         self.next_offset = base
         self._first = base
         self._policy = policy
-        self._most_events = policy.max_events * slack
-        self._most_bytes = policy.max_bytes * slack
+        self._most_events = min(policy.max_events * slack, _mcap.MAX_MESSAGES)
+        self._most_bytes = min(policy.max_bytes * slack, _mcap.MAX_GROUP_BYTES)
         self._channels: dict[tuple[str, int], Channel] = {}
         self._schemas: dict[str, int] = {}
         self._begin()
@@ -136,7 +136,8 @@ class GroupBuilder:
         """True when the policy wants a commit now."""
         policy = self._policy
         return self.waiting > 0 and (
-            self.waiting >= policy.max_events
+            self.full()
+            or self.waiting >= policy.max_events
             or self._bytes >= policy.max_bytes
             or time.monotonic_ns() - self._since_ns >= policy.interval_ns
         )

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from . import _mcap
-from ._mcap import FRAME, MESSAGE, BadRecord, Opcode
+from ._mcap import FRAME, MAX_MESSAGES, MESSAGE, BadRecord, Opcode
 
 CHUNK_BYTES = 1024 * 1024
 
@@ -96,6 +96,8 @@ def _layout(body: bytes) -> tuple[list[tuple[int, ...]], list[int], list[tuple[i
             if body[at] == message:
                 row = unpack(body, at)
                 rows.append(row)
+                if len(rows) > MAX_MESSAGES:
+                    raise BadRecord(f"a chunk of more than {MAX_MESSAGES:,} messages")
                 starts.append(at)
                 at += FRAME.size + row[1]
             else:

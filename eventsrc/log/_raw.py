@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterator
+from functools import partial
 
 from . import _mcap
 from ._scan import Scan
@@ -12,7 +13,7 @@ from .segment import ChunkRef
 
 def read_body(fd: int, chunk: ChunkRef) -> bytes:
     """The body of a chunk that has been checked already."""
-    return _mcap.decode_chunk(os.pread(fd, chunk.length, chunk.position))
+    return _mcap.read_chunk(partial(os.pread, fd), chunk.length, chunk.position)
 
 
 def raw_events(fd: int, scan: Scan, chunk: ChunkRef) -> Iterator[Event]:

@@ -16,12 +16,13 @@ from pathlib import Path
 from eventsrc.errors import LogDamaged, NotALog
 
 from . import _mcap
-from ._bytes import read_whatever_can_be
+from ._bytes import FileBytes
 from ._head import HEAD_BYTES, read_head
 from ._mcap import BadRecord, Channel
 from .segment import ChunkRef
 
 _NEAR = 4096
+_IN_A_CHUNK = (_mcap.Opcode.SCHEMA, _mcap.Opcode.CHANNEL, _mcap.Opcode.MESSAGE)
 
 
 @dataclass(slots=True)
@@ -33,6 +34,8 @@ class Scan:
     chunks: list[ChunkRef] = field(default_factory=list)
     gaps: list[tuple[int, int]] = field(default_factory=list)
     """First and last offset of events that were recorded once and are gone."""
+    index_fault: str | None = None
+    """Why the index of a sealed segment cannot be used, if so."""
     lost_bytes: int = 0
     torn_events: int = 0
     """Events that had begun to be written in the torn end; none of them was synced."""
@@ -53,31 +56,35 @@ class Scan:
             self.next_offset = offset
 
 
-def chunk_extent(data: bytes, at: int, scan: Scan) -> tuple[int, int, int]:
+def chunk_extent(data: FileBytes, at: int, scan: Scan) -> tuple[int, int, int]:
     """Length, first and next offset of the chunk at ``at``; BadRecord unless all of it is good."""
     head = _mcap.decode_chunk_head(data[at : at + _mcap.ZSTD_CHUNK_HEAD])
     if at + head.length > len(data):
         raise BadRecord("cut short inside a chunk")
-    body = _mcap.decode_chunk(data[at : at + head.length])
+    body = _mcap.read_chunk(lambda length, place: data[place : place + length], head.length, at)
     channels = {*scan.channels, *(channel.id for channel in _mcap.definitions(body)[1])}
-    sequences = []
+    first = following = -1
     for channel, sequence, _, _, _, _ in _mcap.walk(body):
         if channel not in channels:
             raise BadRecord(f"a chunk uses channel {channel}, which nothing defines")
-        sequences.append(sequence)
-    if not sequences or sequences != list(range(sequences[0], sequences[0] + len(sequences))):
-        raise BadRecord("a chunk's sequence numbers have holes")
-    first = scan.base + sequences[0]
-    return head.length, first, first + len(sequences)
+        if first < 0:
+            first = following = sequence
+        if sequence != following or following - first >= _mcap.MAX_MESSAGES:
+            raise BadRecord("a chunk's sequence numbers have holes, or are too many")
+        following += 1
+    if first < 0:
+        raise BadRecord("a chunk without any message")
+    return head.length, scan.base + first, scan.base + following
 
 
 def scan_active(path: Path, base: int) -> Scan:
     """Look at every byte of an active segment."""
-    return _Scanner(path, base, read_whatever_can_be(path)).run()
+    with FileBytes.of(path) as data:
+        return _Scanner(path, base, data).run()
 
 
 class _Scanner:
-    def __init__(self, path: Path, base: int, data: bytes) -> None:
+    def __init__(self, path: Path, base: int, data: FileBytes) -> None:
         self._path = path
         self._data = data
         self._at = 0
@@ -126,7 +133,7 @@ class _Scanner:
         self._at = self._near_chunk(start) or self._after_mark(start) or len(self._data)
         self.result.lost_bytes += self._at - start
         if self._at == len(self._data):
-            self.result.torn_events += _count_begun(self._data[start:])
+            self.result.torn_events += _count_begun(self._data, start)
 
     def _near_chunk(self, start: int) -> int | None:
         at = start
@@ -150,11 +157,14 @@ class _Scanner:
         return None
 
 
-def _count_begun(torn: bytes) -> int:
-    """How many events a torn chunk had begun; nothing of them can be trusted, their number may."""
-    at, count = _mcap.PLAIN_CHUNK_HEAD, 0
-    while at + _mcap.FRAME.size <= len(torn):
-        opcode, length = _mcap.FRAME.unpack_from(torn, at)
+def _count_begun(data: FileBytes, torn: int) -> int:
+    """How many events a chunk that is torn had begun; nothing of them can be trusted, their number
+    may."""
+    at, count = torn + _mcap.PLAIN_CHUNK_HEAD, 0
+    while at + _mcap.FRAME.size <= len(data):
+        opcode, length = _mcap.FRAME.unpack(data[at : at + _mcap.FRAME.size])
+        if opcode not in _IN_A_CHUNK:
+            break
         count += opcode == _mcap.Opcode.MESSAGE
         at += _mcap.FRAME.size + length
     return count

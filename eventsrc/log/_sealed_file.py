@@ -3,6 +3,7 @@ and its channels, so nothing before the wanted event is read."""
 
 import os
 import zlib
+from itertools import pairwise
 from pathlib import Path
 
 from eventsrc.errors import LogDamaged
@@ -21,6 +22,8 @@ from ._mcap import (
 from .segment import ChunkRef, SegmentFile
 
 SEAL_METADATA = "mapfold.seal"
+_MAX_CHUNKS = 1 << 16
+"""In one segment: a chunk is a mebibyte or a single event, and a segment is full at 64 MiB."""
 
 
 class SealedFile(SegmentFile):
@@ -31,7 +34,7 @@ class SealedFile(SegmentFile):
         self.channels: dict[int, Channel] = {}
         try:
             self._read_summary()
-        except BadRecord as error:
+        except (ValueError, KeyError) as error:
             self.close()
             raise LogDamaged(
                 f"{path}: the index at its end cannot be read, which leaves offsets from {base} "
@@ -54,44 +57,68 @@ class SealedFile(SegmentFile):
         if not 0 < footer.summary_start <= size - _mcap.TAIL_BYTES:
             raise BadRecord("the footer points nowhere")
         length = size - _mcap.TAIL_BYTES - footer.summary_start
+        if length > _mcap.MAX_SUMMARY_BYTES:
+            raise BadRecord(f"a summary of {length:,} bytes, more than {_mcap.MAX_SUMMARY_BYTES:,}")
         summary = os.pread(self._fd, length, footer.summary_start)
         if zlib.crc32(tail[: _mcap.FOOTER_BYTES - 4], zlib.crc32(summary)) != footer.summary_crc:
             raise BadRecord("the summary does not match its CRC")
-        self._take(summary)
+        self._take(summary, size)
 
-    def _take(self, summary: bytes) -> None:
-        indexes: list[ChunkIndex] = []
+    def _take(self, summary: bytes, size: int) -> None:
+        indexes: list[tuple[int, int, frozenset[int]]] = []
+        statistics, seal = None, None
+        definitions = 0
         for opcode, content in _mcap.records(summary):
             if opcode == Opcode.CHUNK_INDEX:
-                indexes.append(_mcap.decode_as(ChunkIndex, content))
+                indexes.append(_place(_mcap.decode_as(ChunkIndex, content), size))
+                if len(indexes) > _MAX_CHUNKS:
+                    raise BadRecord(f"an index of more than {_MAX_CHUNKS:,} chunks")
             elif opcode == Opcode.CHANNEL:
+                definitions += len(content)
+                _mcap.check_definitions(definitions)
                 channel = _mcap.decode_as(Channel, content)
                 self.channels[channel.id] = channel
             elif opcode == Opcode.STATISTICS:
-                self.statistics = _mcap.decode_as(Statistics, content)
+                statistics = _mcap.decode_as(Statistics, content)
             elif opcode == Opcode.METADATA_INDEX:
                 index = _mcap.decode_as(MetadataIndex, content)
                 if index.name == SEAL_METADATA:
-                    self.seal = self._metadata(index)
+                    seal = self._metadata(index, size)
+        if statistics is None or seal is None:
+            raise BadRecord("no statistics or no seal")
+        if not self.channels.keys() >= statistics.channel_message_counts.keys():
+            raise BadRecord("statistics of channels that nothing defines")
+        self.statistics, self.seal = statistics, seal
+        self.first_stamp_ns = int(seal["first_stamp_ns"])
+        self.last_stamp_ns = int(seal["last_stamp_ns"])
         self._take_chunks(indexes)
 
-    def _metadata(self, index: MetadataIndex) -> dict[str, str]:
+    def _metadata(self, index: MetadataIndex, size: int) -> dict[str, str]:
+        if index.length > _mcap.MAX_DEFINITIONS_BYTES or index.offset + index.length > size:
+            raise BadRecord("the seal is out of bounds")
         record = os.pread(self._fd, index.length, index.offset)
         content = record[_mcap.FRAME.size :]
         return _mcap.checked_metadata(_mcap.decode_as(Metadata, content))
 
-    def _take_chunks(self, indexes: list[ChunkIndex]) -> None:
+    def _take_chunks(self, indexes: list[tuple[int, int, frozenset[int]]]) -> None:
         edges = [self.base + int(n) for n in self.seal["chunk_edges"].split(",")]
-        if len(edges) != len(indexes) + 1:
+        ascending = all(one < other for one, other in pairwise(edges))
+        if len(edges) != len(indexes) + 1 or edges[0] != self.base or not ascending:
             raise BadRecord("the seal does not fit the index")
         self.next_offset = edges[-1]
         self.chunks = [
-            ChunkRef(
-                index.chunk_start_offset,
-                index.chunk_length,
-                first,
-                following,
-                frozenset(index.message_index_offsets),
+            ChunkRef(position, length, first, following, channels)
+            for (position, length, channels), (first, following) in zip(
+                indexes, pairwise(edges), strict=True
             )
-            for index, first, following in zip(indexes, edges, edges[1:], strict=False)
         ]
+
+
+def _place(index: ChunkIndex, size: int) -> tuple[int, int, frozenset[int]]:
+    """Where a chunk stands and how long it is, and its channels."""
+    position, length = index.chunk_start_offset, index.chunk_length
+    if position + length > size:
+        raise BadRecord(
+            f"a chunk of {length:,} bytes at byte {position:,} of a file of {size:,} bytes"
+        )
+    return position, length, frozenset(index.message_index_offsets)

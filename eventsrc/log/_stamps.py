@@ -35,8 +35,7 @@ class RobotStamps:
 
     def take_sealed(self, entry: SegmentPath, segment: SealedFile) -> None:
         """The bounds that a sealed segment names."""
-        first = int(segment.seal["first_stamp_ns"])
-        last = int(segment.seal["last_stamp_ns"])
+        first, last = segment.first_stamp_ns, segment.last_stamp_ns
         if _holds_ours(segment):
             self._doubtful.append((first, last, entry))
         else:

@@ -104,7 +104,8 @@ class _Recovery:
         if segment.sealed:
             unlink_quietly(segment_path(self._log, segment.base, ACTIVE))
             scan = scan_sealed(segment.path, segment.base, reach)
-            if not scan.gaps and check_sealed(segment.path).fault is None:
+            sound = not scan.gaps and scan.index_fault is None
+            if sound and check_sealed(segment.path).fault is None:
                 self._next = scan.next_offset
                 self._previous = segment
                 return

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from eventsrc.errors import LogDamaged
@@ -54,8 +55,7 @@ class SegmentFile:
     def read_chunk(self, chunk: ChunkRef) -> bytes:
         """The chunk's body, CRC checked; LogDamaged otherwise."""
         try:
-            record = os.pread(self._fd, chunk.length, chunk.position)
-            return _mcap.decode_chunk(record)
+            return _mcap.read_chunk(partial(os.pread, self._fd), chunk.length, chunk.position)
         except BadRecord as error:
             raise LogDamaged(f"{self.path.name} at byte {chunk.position}: {error}") from None
         except OSError as error:  # a bad sector

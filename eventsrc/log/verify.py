@@ -121,6 +121,8 @@ class _Verifier:
         if check.fault is not None:
             known = "" if scan.gaps else "; no event is affected"
             self._add("crc", f"{check.fault}{known}", name)
+        elif scan.index_fault is not None:
+            self._add("crc", scan.index_fault, name)
         previous = head.get("previous_sha256", NO_PREVIOUS)
         if head and self._known_as and previous not in self._known_as:
             self._add("chain", "was not written after the segment before it", name)

@@ -22,6 +22,7 @@ from ._active import ActiveSegment
 from ._commits import Commits, OverlappedCommits
 from ._file_fault import FileFault
 from ._lock import WriterLock
+from ._mcap import MAX_EVENT_BYTES
 from ._naming import LOCK, leftovers, list_segments
 from ._restart import Restart, restart
 from ._sealer import Sealer
@@ -164,8 +165,13 @@ class LogWriter:
 
     def append_all(self, events: Sequence[NewEvent]) -> int:
         """Take several events in order; the offset of the first. Commits in between as the policy
-        says, as `append` of each would. Either all their times are in bounds or none is taken."""
+        says, as `append` of each would. None is taken unless all times and sizes are in bounds."""
         for event in events:
+            if len(event.payload) > MAX_EVENT_BYTES:
+                raise LogError(
+                    f"{self.path}: {len(event.payload):,} bytes under {event.key[:80]!r} are more "
+                    f"than the {MAX_EVENT_BYTES:,} that one event may have"
+                )
             if not (0 <= event.logged_ns < _MAX_NS and 0 <= event.stamp_ns < _MAX_NS):
                 raise LogError(
                     f"times {event.logged_ns} and {event.stamp_ns} are not nanoseconds "
