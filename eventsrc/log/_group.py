@@ -21,7 +21,9 @@ from .fsync import FsyncPolicy
 @dataclass(frozen=True, slots=True)
 class Group:
     """Offsets ``first`` to before ``following``, and the records that hold them. ``parts`` are the
-    head and the payload of each message by turns; the heads count from offset ``base``."""
+    head and the payload of each message by turns; the heads count from offset ``base``.
+    ``definitions`` hold the schemas that are new in it; ``schemas`` are all so far, for a file that
+    does not have those before."""
 
     base: int
     first: int
@@ -30,16 +32,20 @@ class Group:
     last_ns: int
     definitions: list[bytes]
     parts: list[bytes]
+    schemas: list[bytes]
 
     def pieces(self, base: int) -> tuple[bytes, bytes, bytes]:
         """What to write into a file that begins at offset ``base``, in this order: the chunk's
         head, its messages, its commit mark. The first two are not joined, for the messages are
         megabytes."""
-        parts = self.parts
+        parts, definitions = self.parts, self.definitions
         if base != self.base:
+            if base == self.first:
+                old = [schema for schema in self.schemas if schema not in definitions]
+                definitions = old + definitions
             parts = list(parts)
             parts[::2] = [_mcap.renumbered(head, self.base - base) for head in parts[::2]]
-        lead, body = b"".join(self.definitions), b"".join(parts)
+        lead, body = b"".join(definitions), b"".join(parts)
         size = len(lead) + len(body)
         crc = zlib.crc32(body, zlib.crc32(lead))
         head = _mcap.encode_plain_chunk_head(size, crc, self.first_ns, self.last_ns)
@@ -62,6 +68,7 @@ class GroupBuilder:
         self._most_bytes = min(policy.max_bytes * slack, _mcap.MAX_GROUP_BYTES)
         self._channels: dict[tuple[str, int], Channel] = {}
         self._schemas: dict[str, int] = {}
+        self._schema_records: list[bytes] = []
         self._begin()
 
     def _begin(self) -> None:
@@ -129,7 +136,8 @@ class GroupBuilder:
         if schema is None:
             schema = self._schemas[name] = len(self._schemas) + 1
             record = Schema(id=schema, name=name, encoding="jsonschema", data=text)
-            self._definitions.append(_mcap.encode(record))
+            self._schema_records.append(_mcap.encode(record))
+            self._definitions.append(self._schema_records[-1])
         return key_channel(len(self._channels) + 1, schema, key, version)
 
     def due(self) -> bool:
@@ -156,6 +164,7 @@ class GroupBuilder:
             self._last_ns,
             self._definitions,
             self._parts,
+            list(self._schema_records),
         )
         self._first = self.next_offset
         self._begin()

@@ -6,10 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from mcap.reader import SeekingReader
 
 from eventsrc.errors import LogDamaged, LogError
 from eventsrc.log import LogReader, LogWriter, _active, recover_log, verify_log
 from eventsrc.log._naming import ACTIVE, SEALED, segment_path
+from eventsrc.log._schemas import schema_of
 from eventsrc.system_events import LOSS_KEY
 from tests.fixtures_log import BY_HAND, KEY, read_log, read_with_gaps
 
@@ -221,6 +223,24 @@ def test_events_taken_before_the_file_was_given_up_keep_their_offsets(log_path: 
         writer.close()
     events = read_log(log_path, BEFORE)
     assert [(e.offset, e.payload) for e in events] == [(n, b"%d" % n) for n in range(BEFORE, 12)]
+
+
+def test_the_new_file_is_one_that_other_programs_read(log_path: Path) -> None:
+    """It holds the schemas that the old file had, too."""
+    writer = LogWriter(log_path, fsync=BY_HAND)
+    write(writer, range(BEFORE))
+    delete(growing(log_path))
+    write(writer, range(BEFORE, 5))
+    writer.append("mapfold/loss", b"{}")
+    with pytest.raises(LogError):
+        writer.close()
+    (path,) = log_path.glob("*.mcap")
+    with path.open("rb") as file:
+        found = list(SeekingReader(file, validate_crcs=True).iter_messages())
+    assert [message.data for _, _, message in found] == [b"3", b"4", b"{}"]
+    assert [schema is not None and schema.name for schema, _, _ in found] == [
+        schema_of(key)[0] for key in (KEY, KEY, "mapfold/loss")
+    ]
 
 
 def test_rotation_goes_on_behind_a_file_that_was_given_up(log_path: Path) -> None:
