@@ -8,7 +8,7 @@ from .answer import Answer, Evidence, PoseHypothesis, RankedPlace
 from .camera import Camera
 from .candidates import NEIGHBOURS, Candidates, Match, Spot
 from .confidence import UNKNOWN_BELOW
-from .crops import Crop, parse_question, read_crops
+from .crops import Crop, parse_json, parse_question, read_crops, shown
 from .exact_search import ExactIndex
 from .rank import DEFAULT_CAMERA, Method, rank
 
@@ -27,7 +27,9 @@ __all__ = [
     "PoseHypothesis",
     "RankedPlace",
     "Spot",
+    "parse_json",
     "parse_question",
     "rank",
     "read_crops",
+    "shown",
 ]

@@ -19,6 +19,8 @@ Flags = NDArray[np.bool_]
 _MIN_HEIGHT_PX = 4.0
 _EDGE_PX = 1.0
 _UNKNOWN_HEIGHT_PX = 100.0
+_FARTHEST_PX = 1e6
+"""Coordinates beyond it are taken as it, so that the geometry's squares stay finite."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +65,7 @@ def views(camera: Camera, boxes: Sequence[tuple[float, float, float, float] | No
     rows = np.array(
         [(0.0, 0.0, 0.0, 0.0) if box is None else box for box in boxes], dtype=np.float64
     ).reshape(-1, 4)
+    rows = np.clip(rows, -_FARTHEST_PX, _FARTHEST_PX)
     x0, y0, x1, y1 = rows.T
     known = (x1 > x0) & (y1 > y0)
     slope = (camera.width_px / 2.0 - (x0 + x1) / 2.0) / camera.focal_px

@@ -13,7 +13,7 @@ import binascii
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +24,12 @@ from eventsrc.words import counted
 from projections.errors import QuestionError
 from projections.exact import quantise, to_float32
 
-MAX_CROPS = 32
+MAX_CROPS: Final = 32
 """More crops than this are refused: each one costs a search."""
+MAX_MARKS: Final = 20_000
+"""More of ``[``, ``{`` and ``:`` than this are refused before the JSON is parsed. Empty lists and
+objects cost most per byte; a question of 32 crops holds about 300 of these characters."""
+_MAX_SHOWN: Final = 80
 
 Vector = NDArray[np.float32]
 Box = tuple[float, float, float, float]
@@ -50,24 +54,42 @@ class Crop:
         return self.vector.tobytes(), self.bbox or (0.0, 0.0, 0.0, 0.0), self.det_id or ""
 
 
+# A list ends at its first wrong item: pydantic would collect an error of 2 kB for each of them.
+_Numbers = Annotated[list[float], Field(max_length=MAX_DIMENSION, fail_fast=True)]
+_Pixels = Annotated[list[float], Field(min_length=4, max_length=4, fail_fast=True)]
+
+
 class _CropModel(BaseModel):
     model_config = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False)
 
-    embedding: str | list[float] | None = None
+    embedding: str | _Numbers | None = None
     embedding_dim: Annotated[int, Field(ge=1, le=MAX_DIMENSION)] | None = None
     embedding_model: Text | None = None
     class_name: Text | None = Field(default=None, alias="class")
-    bbox: Annotated[list[float], Field(min_length=4, max_length=4)] | None = None
+    bbox: _Pixels | None = None
     det_id: Text | None = None
 
 
-_CROPS: TypeAdapter[list[_CropModel]] = TypeAdapter(list[_CropModel])
+_CROPS: TypeAdapter[list[_CropModel]] = TypeAdapter(
+    Annotated[list[_CropModel], Field(fail_fast=True)]
+)
 
 
-def parse_question(payload: bytes | str) -> tuple[Crop, ...]:
+def parse_question(payload: bytes) -> tuple[Crop, ...]:
     """Read a question. Raises QuestionError that names what is wrong and what to send instead."""
+    return read_crops(parse_json(payload))
+
+
+def parse_json(payload: bytes) -> Any:
+    """The JSON document of a question. Raises QuestionError when it is none or too complex."""
+    marks = sum(map(payload.count, (b"[", b"{", b":")))
+    if marks > MAX_MARKS:
+        raise QuestionError(
+            f"the question is not a list of crops: it has {marks} brackets and colons, more than"
+            f" {MAX_MARKS}; send at most {MAX_CROPS} crops"
+        )
     try:
-        document = json.loads(payload)
+        return json.loads(payload)
     except json.JSONDecodeError as error:
         if error.msg == "Extra data":
             raise QuestionError(
@@ -77,7 +99,14 @@ def parse_question(payload: bytes | str) -> tuple[Crop, ...]:
         raise QuestionError(f"the question is not JSON: {error}") from None
     except (ValueError, RecursionError) as error:
         raise QuestionError(f"the question is not JSON: {error}") from None
-    return read_crops(document)
+
+
+def shown(value: Any) -> str:
+    """A value of a question as a message may show it: escaped, and not long."""
+    if isinstance(value, list | dict):
+        return f"a {'list' if isinstance(value, list) else 'JSON object'}"
+    text = repr(value[:_MAX_SHOWN] if isinstance(value, str) else value)
+    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}…"
 
 
 def read_crops(document: Any) -> tuple[Crop, ...]:
@@ -115,13 +144,20 @@ def _validated(items: list[Any]) -> list[_CropModel]:
     try:
         return _CROPS.validate_python(items)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        place = ".".join(str(part) for part in first["loc"] if not str(part).endswith("]"))
-        raise QuestionError(f"crops.{place}: {fault(first).lower()}") from None
+        errors = error.errors(include_url=False)
+        # Of the two forms of an embedding the list is named last, and says more.
+        first = next((e for e in errors if e["loc"][-1] != "str"), errors[0])
+        place = ".".join(str(p) for p in first["loc"] if not str(p).startswith("list["))
+        what = "should be a JSON object" if first["type"] == "model_type" else fault(first).lower()
+        raise QuestionError(f"crops.{place}: {what}") from None
 
 
 def _crop(index: int, model: _CropModel) -> Crop:
     raw = _floats(index, model)
+    if len(raw) > MAX_DIMENSION:
+        raise QuestionError(
+            f"crops.{index}.embedding: holds {len(raw)} numbers, more than {MAX_DIMENSION}"
+        )
     if model.embedding_dim is not None and len(raw) != model.embedding_dim:
         raise QuestionError(
             f"crops.{index}.embedding: holds {counted(len(raw), 'number')}, embedding_dim says"
