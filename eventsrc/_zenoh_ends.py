@@ -49,15 +49,26 @@ class Bound(NamedTuple):
 class Asked:
     """A question under a queryable. Answer or refuse it once, from any thread; that ends it.
 
-    ``key`` is what was asked, which may hold wildcards; ``parameters`` stand behind its ``?``.
+    ``key`` is what was asked, which may hold wildcards. ``size`` and ``selector_size`` are the
+    bytes of the payload and of the key with its parameters, known before any of them is read.
     """
 
     def __init__(self, query: zenoh.Query) -> None:
         self._query = query
         self.key = str(query.key_expr)
-        self.parameters = _parameters(str(query.parameters))
-        self.payload = query.payload.to_bytes() if query.payload is not None else b""
+        self.size = len(query.payload) if query.payload is not None else 0
+        self.selector_size = len(str(query.selector))
         self.ended = False
+
+    @property
+    def parameters(self) -> dict[str, str]:
+        """What stands behind the ``?`` of the selector."""
+        return _parameters(str(self._query.parameters))
+
+    @property
+    def payload(self) -> bytes:
+        """A copy of what came with the question."""
+        return self._query.payload.to_bytes() if self._query.payload is not None else b""
 
     def answer(self, key: str, payload: bytes) -> None:
         """Send the answer, under ``key``."""

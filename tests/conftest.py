@@ -3,5 +3,6 @@
 pytest_plugins = [
     "tests.fixtures_postgres",
     "tests.fixtures_log",
+    "tests.fixtures_tls",
     "tests.fixtures_zenoh",
 ]

@@ -1,6 +1,7 @@
 """`mapfold serve`: answer lost robots over Zenoh and HTTP until a signal ends it."""
 
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -10,10 +11,11 @@ from eventsrc.cli._shell import say
 from eventsrc.cli._signals import stop_on_signals
 from eventsrc.cli._zenoh_options import ConfigOption, ConnectOption, ListenOption, zenoh_options
 from eventsrc.errors import MisuseError
+from projections.cli._http import HttpDoor, HttpOptions
 from projections.cli._options import DbOption, VectorDbOption
 from projections.cli._question import HfovOption, ImageOption, camera_from
 from projections.postgres.connect import open_targets
-from projections.serve import Answerer, Pools, ZenohService
+from projections.serve import Answerer, Pools, Room, ZenohService
 from projections.serve.answering import DEFAULT_MAX_BYTES
 
 
@@ -21,6 +23,31 @@ def serve(
     http: Annotated[
         str | None,
         typer.Option("--http", metavar="HOST:PORT", help="Serve HTTP there too (extra [serve])."),
+    ] = None,
+    token_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--token-file",
+            metavar="FILE",
+            help="Token that HTTP requests must send [env MAPFOLD_TOKEN]; must be there unless"
+            " --http is on loopback.",
+        ),
+    ] = None,
+    tls_cert: Annotated[
+        Path | None,
+        typer.Option("--tls-cert", metavar="FILE", help="PEM certificate: serve HTTPS."),
+    ] = None,
+    tls_key: Annotated[
+        Path | None, typer.Option("--tls-key", metavar="FILE", help="PEM key of --tls-cert.")
+    ] = None,
+    allow_host: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--allow-host",
+            metavar="NAME",
+            help="Name by which HTTP clients call this service, beside its addresses; may be"
+            " repeated.",
+        ),
     ] = None,
     zenoh: Annotated[bool, typer.Option(help="Serve mapfold/relocalize over Zenoh.")] = True,
     connect: ConnectOption = None,
@@ -48,35 +75,27 @@ def serve(
     if http is None and not zenoh:
         raise MisuseError("neither --zenoh nor --http: there is nothing to serve on")
     camera, options = camera_from(hfov, image), zenoh_options(connect, listen, zenoh_config)
+    given = HttpOptions(token_file, tls_cert, tls_key, tuple(allow_host or ()))
     with ExitStack() as stack:
+        door = None if http is None else stack.enter_context(HttpDoor.opened(http, given))
+        if http is None:
+            given.refuse_without_http()
         stop = stack.enter_context(stop_on_signals())
         targets = stack.enter_context(open_targets(db, vector_db))
         pools = stack.enter_context(Pools(targets, workers, lambda what: say(f"mapfold: {what}")))
-        answerer = Answerer(pools, per_second=rate, max_bytes=max_bytes, camera=camera)
+        answerer = Answerer(pools, per_second=rate, max_bytes=max_bytes, camera=camera, tell=say)
+        room = stack.enter_context(Room(workers))
         if zenoh:
             session = stack.enter_context(open_session(options, mode=options.mode))
-            stack.enter_context(ZenohService(session, answerer, workers))
+            stack.enter_context(ZenohService(session, answerer, room))
             say("answering mapfold/relocalize and mapfold/state/** over Zenoh")
-        if http is not None:
-            say(f"answering http://{_serve_http(stack, http, answerer)}, described at /docs")
+        if door is not None:
+            say(
+                f"answering {stack.enter_context(door.serving(answerer, room))}, described at /docs"
+            )
         say("Ctrl-C ends it")
         stop.wait()
     say("service ended")
-
-
-def _serve_http(stack: ExitStack, http: str, answerer: Answerer) -> str:
-    host, colon, port = http.rpartition(":")
-    if not colon or not port.isdecimal() or int(port) > 65_535:
-        raise MisuseError(f"--http {http}: write it as HOST:PORT, such as 127.0.0.1:8080")
-    try:
-        from projections.serve.http import create_app, serving
-    except ModuleNotFoundError as error:
-        raise MisuseError(
-            f"--http needs {error.name}, which is not installed; pip install 'mapfold[serve]'"
-        ) from None
-    host = host.strip("[]") or "127.0.0.1"
-    bound = stack.enter_context(serving(create_app(answerer), host, int(port)))
-    return f"{host}:{bound}"
 
 
 def register(app: typer.Typer) -> None:

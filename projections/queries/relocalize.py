@@ -226,6 +226,6 @@ def _clear_errors(connection: Connection) -> Iterator[None]:
             ) from None
         except psycopg.errors.DataException as error:
             raise QuestionError(
-                f"the question does not fit the map in {place_of(connection)}:"
-                f" {error.diag.message_primary}; ask with the model that made the map"
+                f"the question does not fit the map: {error.diag.message_primary}; ask with the"
+                " model that made the map"
             ) from None

@@ -2,6 +2,7 @@
 
 from .answering import Answerer
 from .pools import Pools
+from .room import Room
 from .zenoh_side import ZenohService
 
-__all__ = ["Answerer", "Pools", "ZenohService"]
+__all__ = ["Answerer", "Pools", "Room", "ZenohService"]

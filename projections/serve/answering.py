@@ -4,31 +4,61 @@ A question is what ``mapfold relocalize`` takes; an object with crops may also s
 ``method``. Every refusal is ``{"error": {"kind", "message"}}`` with one of the kinds below.
 """
 
+import contextlib
 import json
 import math
-from collections.abc import Mapping
+import threading
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final, cast, get_args
 
 from eventsrc.errors import MapfoldError
-from projections.errors import DatabaseError, QuestionError
+from projections.errors import (
+    DatabaseError,
+    DatabaseUnavailable,
+    ProjectionMismatch,
+    ProjectionMissing,
+    QuestionError,
+)
 from projections.queries.near import objects_near, places_near
-from projections.relocalize import DEFAULT_CAMERA, Camera, Method, rank, read_crops
+from projections.relocalize import (
+    DEFAULT_CAMERA,
+    Camera,
+    Crop,
+    Method,
+    parse_json,
+    rank,
+    read_crops,
+    shown,
+)
 
-from .limits import Bucket, TooMuchError
+from .limits import Bucket, BusyError, TooMuchError
+from .notices import Notices
 from .pools import Pools
 
 MAX_TOP: Final = 100
 DEFAULT_RADIUS_M: Final = 3.0
+MAX_METRES: Final = 1e8
+"""Ten times as far as a pose may be from the origin."""
 DEFAULT_MAX_BYTES: Final = 1_000_000
-_KINDS: Final[tuple[tuple[type[MapfoldError], str, int], ...]] = (
-    (TooMuchError, "too_much", 429),
-    (QuestionError, "bad_question", 400),
-    (DatabaseError, "database", 503),
+_KINDS: Final[tuple[tuple[type[MapfoldError], str, int, str | None], ...]] = (
+    (BusyError, "too_much", 503, None),
+    (TooMuchError, "too_much", 429, None),
+    (QuestionError, "bad_question", 400, None),
+    (ProjectionMissing, "database", 503, "there is no map yet; ask again later"),
+    (ProjectionMismatch, "database", 503, "graph and vectors are not of one map"),
+    (DatabaseUnavailable, "database", 503, "the database does not answer; ask again later"),
+    (DatabaseError, "database", 503, "the database cannot be asked; the service tells why"),
+    (MapfoldError, "failed", 500, "failed; the service tells why"),
 )
+"""Kinds of errors and what others may read. What names databases and paths, the service's own
+stderr says (`Answerer`)."""
 
 
 class Answerer:
-    """Answers questions from the live databases; safe to use from many threads."""
+    """Answers questions from the live databases; safe to use from many threads.
+
+    ``tell`` gets a line for people when a question fails for a reason that is not the asker's.
+    """
 
     def __init__(
         self,
@@ -37,55 +67,60 @@ class Answerer:
         per_second: float,
         max_bytes: int = DEFAULT_MAX_BYTES,
         camera: Camera = DEFAULT_CAMERA,
+        tell: Callable[[str], None] = lambda _: None,
     ) -> None:
         self._pools, self._bucket, self._camera = pools, Bucket(per_second), camera
+        self._notices = Notices(tell)
+        # One at a time: the JSON parser keeps the interpreter to itself for up to 30 ms, and the
+        # thread that reads from the network must get its turn.
+        self._parsing = threading.Lock()
         self.max_bytes = max_bytes
 
     def relocalize(self, payload: bytes, options: Mapping[str, str]) -> dict[str, Any]:
         """The answer to a question, as ``relocalize --json`` gives it."""
-        self._bucket.take()
         if len(payload) > self.max_bytes:
             raise QuestionError(
                 f"the question has {len(payload)} bytes, more than {self.max_bytes}"
             )
-        try:
-            document = json.loads(payload)
-        except (ValueError, RecursionError) as error:
-            raise QuestionError(f"the question is not JSON: {error}") from None
-        said = {**document, **options} if isinstance(document, dict) else dict(options)
-        crops = read_crops(document)
-        answer = rank(
-            crops,
-            self._pools.candidates(crops),
-            top=_top(said.get("top", 3)),
-            method=_method(said.get("method", "joint")),
-            camera=self._camera,
-        )
-        return answer.document()
+        with self._parsing:
+            crops, top, method = _read(payload, options)
+        with self._telling():
+            self._bucket.take()
+            candidates = self._pools.candidates(crops)
+        return rank(crops, candidates, top=top, method=method, camera=self._camera).document()
 
     def state(self, what: str, options: Mapping[str, str]) -> dict[str, Any]:
         """``places`` or ``objects`` near a pose: x, y and radius in metres."""
-        self._bucket.take()
+        near = {"places": places_near, "objects": objects_near}.get(what)
+        if near is None:
+            raise QuestionError(f"no state called {shown(what)}; there are places and objects")
         x, y = _number(options, "x"), _number(options, "y")
         radius = _number(options, "radius", DEFAULT_RADIUS_M)
-        if what == "places":
-            return {"places": self._pools.on_graph(lambda c: places_near(c, x, y, radius))}
-        if what == "objects":
-            return {"objects": self._pools.on_graph(lambda c: objects_near(c, x, y, radius))}
-        raise QuestionError(f"no state called {what!r}; there are places and objects")
+        with self._telling():
+            self._bucket.take()
+            return {what: self._pools.on_graph(lambda c: near(c, x, y, radius))}
 
     def health(self) -> dict[str, str]:
         """``{"status": "ok"}``. Raises DatabaseError when questions cannot be answered now."""
-        self._pools.check()
+        with self._telling():
+            self._pools.check()
         return {"status": "ok"}
+
+    @contextlib.contextmanager
+    def _telling(self) -> Iterator[None]:
+        try:
+            yield
+        except DatabaseError as error:
+            self._notices(f"mapfold: {error}")
+            raise
 
 
 def refusal(error: MapfoldError) -> tuple[int, dict[str, Any]]:
     """An HTTP status and the error as JSON."""
-    for kind, name, status in _KINDS:
+    for kind, name, status, text in _KINDS:
         if isinstance(error, kind):
-            return status, {"error": {"kind": name, "message": str(error)}}
-    return 500, {"error": {"kind": "failed", "message": str(error)}}
+            return status, {"error": {"kind": name, "message": text or str(error)}}
+    raise AssertionError(error)  # the last kind is the base class
 
 
 def encode(document: Mapping[str, Any]) -> bytes:
@@ -93,20 +128,26 @@ def encode(document: Mapping[str, Any]) -> bytes:
     return json.dumps(document, ensure_ascii=False, allow_nan=False).encode()
 
 
+def _read(payload: bytes, options: Mapping[str, str]) -> tuple[tuple[Crop, ...], int, Method]:
+    document = parse_json(payload)
+    said = document if isinstance(document, dict) else {}
+    top = _top(options.get("top", said.get("top", 3)))
+    method = _method(options.get("method", said.get("method", "joint")))
+    return read_crops(document), top, method
+
+
 def _top(value: Any) -> int:
-    try:
-        top = int(value)
-    except (TypeError, ValueError):
-        top = 0
-    if not 1 <= top <= MAX_TOP:
-        raise QuestionError(f"top is {value!r}; give a number from 1 to {MAX_TOP}")
-    return top
+    if isinstance(value, str) and value.isascii() and value.isdecimal() and len(value) <= 9:
+        value = int(value)
+    if type(value) is not int or not 1 <= value <= MAX_TOP:
+        raise QuestionError(f"top is {shown(value)}; give a number from 1 to {MAX_TOP}")
+    return value
 
 
 def _method(value: Any) -> Method:
-    if value in get_args(Method):
+    if isinstance(value, str) and value in get_args(Method):
         return cast("Method", value)
-    raise QuestionError(f"method is {value!r}; there are joint and plain")
+    raise QuestionError(f"method is {shown(value)}; there are joint and plain")
 
 
 def _number(options: Mapping[str, str], name: str, default: float | None = None) -> float:
@@ -114,6 +155,6 @@ def _number(options: Mapping[str, str], name: str, default: float | None = None)
         value = float(options[name]) if name in options or default is None else default
     except (KeyError, ValueError):
         value = math.nan
-    if not math.isfinite(value):
-        raise QuestionError(f"{name} is {options.get(name)!r}; give a number of metres")
+    if not abs(value) <= MAX_METRES:  # nor NaN
+        raise QuestionError(f"{name} is {shown(options.get(name))}; give a number of metres")
     return value

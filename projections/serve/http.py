@@ -1,25 +1,27 @@
 """The service over HTTP: an ASGI app that describes itself at ``/openapi.json`` and ``/docs``.
 
-Needs the extra ``mapfold[serve]`` (fastapi, uvicorn). Handlers run in a thread each, because the
-databases are asked synchronously.
+Needs the extra ``mapfold[serve]`` (fastapi, uvicorn). The event loop only takes in requests; the
+waiting room works on them, because the databases are asked synchronously.
 """
 
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+import asyncio
+from collections.abc import Callable
 from typing import Any
 
-import uvicorn
 from fastapi import FastAPI, Query, Request
-from fastapi.concurrency import run_in_threadpool
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse
+from fastapi.responses import JSONResponse, Response
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
-from eventsrc.errors import MapfoldError, TransportError
+from eventsrc.errors import MapfoldError
 from projections.errors import QuestionError
+from projections.relocalize import shown
 
-from .answering import DEFAULT_RADIUS_M, MAX_TOP, Answerer, refusal
+from .answering import DEFAULT_RADIUS_M, MAX_TOP, Answerer, encode, refusal
+from .connections import peer_of
+from .limits import TooMuchError
+from .room import Room
 
 _EXAMPLE = {"crops": [{"class": "cup", "bbox": [120, 80, 250, 310], "embedding": "<base64>"}]}
 _QUESTION = {
@@ -39,21 +41,28 @@ _REFUSED: dict[int | str, dict[str, Any]] = {
         },
     }
     for status, text, kind in (
-        ("4XX", "A question that cannot be answered, or too many of them", "bad_question"),
-        ("5XX", "The database cannot be asked just now", "database"),
+        ("4XX", "A question that cannot be answered, or may not be asked", "bad_question"),
+        ("5XX", "No answer just now: the database is away, or too many ask", "database"),
     )
 }
 _DRAINED = 8
+_RETRY_AFTER = {"Retry-After": "1"}
 
 
-def create_app(answerer: Answerer) -> FastAPI:
-    """The ASGI application; it owns nothing, so closing the pools is its maker's business."""
+def create_app(answerer: Answerer, room: Room) -> FastAPI:
+    """The ASGI application; it owns nothing, so closing pools and room is its maker's business."""
     app = FastAPI(
         title="mapfold",
         summary="Where is the robot, and what stands near a pose?",
         responses=_REFUSED,
+        redirect_slashes=False,
     )
     _refuse_in_our_words(app)
+
+    async def answered(request: Request, work: Callable[[], dict[str, Any]]) -> Response:
+        peer = "" if request.client is None else peer_of(request.client.host)
+        future = room.submit(peer, lambda: encode(work()))
+        return Response(await asyncio.wrap_future(future), media_type="application/json")
 
     @app.post(
         "/relocalize", summary="Ranked Places, a pose and a confidence", openapi_extra=_QUESTION
@@ -62,19 +71,22 @@ def create_app(answerer: Answerer) -> FastAPI:
         request: Request,
         top: int | None = Query(None, ge=1, le=MAX_TOP),
         method: str | None = None,
-    ) -> dict[str, Any]:
+    ) -> Response:
         payload = await _limited(request, answerer.max_bytes)
         given = {"top": top, "method": method}
         options = {name: str(value) for name, value in given.items() if value is not None}
-        return await run_in_threadpool(answerer.relocalize, payload, options)
+        return await answered(request, lambda: answerer.relocalize(payload, options))
 
     @app.get("/state/{what}", summary="places or objects near a pose, nearest first")
-    def state(what: str, x: float, y: float, radius: float = DEFAULT_RADIUS_M) -> dict[str, Any]:
-        return answerer.state(what, {"x": str(x), "y": str(y), "radius": str(radius)})
+    async def state(
+        request: Request, what: str, x: float, y: float, radius: float = DEFAULT_RADIUS_M
+    ) -> Response:
+        options = {"x": str(x), "y": str(y), "radius": str(radius)}
+        return await answered(request, lambda: answerer.state(what, options))
 
     @app.get("/health", summary="200 while questions can be answered, else 503")
-    def health() -> dict[str, str]:
-        return answerer.health()
+    async def health(request: Request) -> Response:
+        return await answered(request, answerer.health)
 
     return app
 
@@ -83,23 +95,34 @@ def _refuse_in_our_words(app: FastAPI) -> None:
     """Every refusal has the same form, whoever finds the question wrong."""
 
     @app.exception_handler(MapfoldError)
-    def refuse(_: Request, error: MapfoldError) -> JSONResponse:
+    async def refuse(_: Request, error: MapfoldError) -> JSONResponse:
         status, document = refusal(error)
-        return JSONResponse(document, status)
+        headers = _RETRY_AFTER if isinstance(error, TooMuchError) else None
+        return JSONResponse(document, status, headers)
 
     @app.exception_handler(RequestValidationError)
-    def refuse_parameter(_: Request, error: RequestValidationError) -> JSONResponse:
+    async def refuse_parameter(_: Request, error: RequestValidationError) -> JSONResponse:
         first = error.errors()[0]
-        found = "missing" if first["type"] == "missing" else repr(first["input"])
+        found = "missing" if first["type"] == "missing" else shown(first["input"])
         said = f"{first['loc'][-1]} is {found}; {first['msg'].lower()}"
         status, document = refusal(QuestionError(said))
         return JSONResponse(document, status)
 
     @app.exception_handler(HTTPException)
-    def refuse_path(request: Request, error: HTTPException) -> JSONResponse:
-        said = f"{request.method} {request.url.path}: {error.detail}; /docs tells what there is"
+    async def refuse_path(request: Request, error: HTTPException) -> JSONResponse:
+        asked = f"{request.method} {shown(request.scope['path'])}"
+        said = f"{asked}: {error.detail}; /docs tells what there is"
         _, document = refusal(QuestionError(said))
         return JSONResponse(document, error.status_code, headers=error.headers)
+
+    @app.exception_handler(ClientDisconnect)
+    async def nobody_to_answer(_: Request, __: ClientDisconnect) -> Response:
+        return Response(status_code=400)
+
+    @app.exception_handler(Exception)
+    async def failed(_: Request, __: Exception) -> JSONResponse:  # uvicorn logs what it was
+        status, document = refusal(MapfoldError())
+        return JSONResponse(document, status)
 
 
 async def _limited(request: Request, most: int) -> bytes:
@@ -117,36 +140,3 @@ async def _limited(request: Request, most: int) -> bytes:
     if length > most:
         raise QuestionError(f"the question has more than {most} bytes; send fewer crops")
     return bytes(body)
-
-
-@contextmanager
-def serving(app: FastAPI, host: str, port: int) -> Iterator[int]:
-    """Serve in a thread; yields the port. Ends gracefully: requests under way are answered."""
-    config = uvicorn.Config(app, host=host, port=port, log_level="warning", lifespan="off")
-    server = uvicorn.Server(config)
-    listener = _bind(config)
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, name="http")
-    thread.start()
-    try:
-        yield int(listener.getsockname()[1])
-    finally:
-        server.should_exit = True
-        thread.join()
-        listener.close()
-
-
-def _bind(config: uvicorn.Config) -> Any:
-    import socket
-
-    family = socket.AF_INET6 if ":" in config.host else socket.AF_INET
-    listener = socket.socket(family)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listener.bind((config.host, config.port))
-        listener.listen(128)  # from now on clients wait instead of being refused
-    except OSError as error:
-        listener.close()
-        raise TransportError(
-            f"http {config.host}:{config.port}: {error.strerror or error}; give --http another"
-        ) from None
-    return listener

@@ -1,4 +1,4 @@
-"""How much a service takes on: a bucket of tokens that fills at the rate questions may come."""
+"""How much a service takes on: questions a second, and questions that wait."""
 
 import threading
 import time
@@ -9,6 +9,10 @@ from eventsrc.errors import MapfoldError
 
 class TooMuchError(MapfoldError):
     """The service has more questions than it may answer; ask again later."""
+
+
+class BusyError(TooMuchError):
+    """Too many questions wait already, or this one has waited for too long."""
 
 
 class Bucket:

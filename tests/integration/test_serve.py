@@ -9,6 +9,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,11 @@ from projections.postgres.embedded import EmbeddedServer
 from projections.queries.relocalize import relocalize
 from projections.relocalize import parse_question
 from projections.runner import rebuild
-from projections.serve import Answerer, Pools, ZenohService
-from projections.serve.http import create_app, serving
+from projections.serve import Answerer, Pools, Room, ZenohService
+from projections.serve.guard import Guard
+from projections.serve.http import create_app
 from projections.serve.limits import Bucket, TooMuchError
+from projections.serve.listening import bind, serving
 from projections.settings import Settings
 from tests.envelopes import detection
 from tests.logs import walk, write_log
@@ -51,6 +54,19 @@ def answerer(pools: Pools) -> Answerer:
     return Answerer(pools, per_second=10_000.0)
 
 
+@pytest.fixture
+def room() -> Iterator[Room]:
+    with Room(4, patience_s=DEADLINE_S) as room:
+        yield room
+
+
+@contextmanager
+def http_at(answerer: Answerer, room: Room, port: int = 0) -> Iterator[int]:
+    app = Guard(create_app(answerer, room))
+    with serving(app, bind("127.0.0.1", port)) as bound:
+        yield bound
+
+
 def question(number: int = 0) -> bytes:
     documents = [d for d in walk(30, seed=9, run_id="run-b") if d["detections"]]
     return json.dumps(documents[number % len(documents)]).encode()
@@ -66,9 +82,9 @@ class TestZenoh:
 
     @pytest.fixture
     def service(
-        self, connected: Callable[[], Session], answerer: Answerer
+        self, connected: Callable[[], Session], answerer: Answerer, room: Room
     ) -> Iterator[ZenohService]:
-        with ZenohService(connected(), answerer, workers=4) as service:
+        with ZenohService(connected(), answerer, room) as service:
             yield service
 
     @pytest.mark.usefixtures("service")
@@ -155,7 +171,8 @@ class TestZenoh:
         self, connected: Callable[[], Session], answerer: Answerer
     ) -> None:
         session, answers = connected(), []
-        service = ZenohService(connected(), answerer, workers=1)
+        room = Room(1, patience_s=DEADLINE_S)
+        service = ZenohService(connected(), answerer, room)
         threads = [
             threading.Thread(
                 target=lambda: answers.extend(
@@ -168,6 +185,7 @@ class TestZenoh:
             thread.start()
         service.close()
         service.close()
+        room.close()
         for thread in threads:
             thread.join()
         assert all(json.loads(answer) for _, answer in answers)
@@ -208,8 +226,8 @@ class TestHttp:
     """The ASGI app behind a real server on a free port."""
 
     @pytest.fixture
-    def http(self, answerer: Answerer) -> Iterator[str]:
-        with serving(create_app(answerer), "127.0.0.1", 0) as port:
+    def http(self, answerer: Answerer, room: Room) -> Iterator[str]:
+        with http_at(answerer, room) as port:
             yield f"http://127.0.0.1:{port}"
 
     def test_the_answer_is_the_librarys(self, http: str, targets: Targets) -> None:
@@ -256,20 +274,20 @@ class TestHttp:
         status, found = fetch(f"{http}/state/places?x=0&y=0&radius=1000")
         assert (status, bool(found["places"])) == (200, True)
 
-    def test_too_much_is_429(self, pools: Pools) -> None:
-        slow = create_app(Answerer(pools, per_second=0.01))
-        with serving(slow, "127.0.0.1", 0) as port:
+    def test_too_much_is_429(self, pools: Pools, room: Room) -> None:
+        with http_at(Answerer(pools, per_second=0.01), room) as port:
             url = f"http://127.0.0.1:{port}/relocalize"
             assert fetch(url, question())[0] == 200
             assert fetch(url, question())[0] == 429
 
-    def test_it_ends_with_its_block_and_frees_the_port(self, answerer: Answerer) -> None:
-        app = create_app(answerer)
-        with serving(app, "127.0.0.1", 0) as port:
+    def test_it_ends_with_its_block_and_frees_the_port(
+        self, answerer: Answerer, room: Room
+    ) -> None:
+        with http_at(answerer, room) as port:
             assert fetch(f"http://127.0.0.1:{port}/health")[0] == 200
-            with pytest.raises(TransportError, match="in use"), serving(app, "127.0.0.1", port):
+            with pytest.raises(TransportError, match="in use"), http_at(answerer, room, port):
                 pytest.fail("two servers on one port")
-        with serving(app, "127.0.0.1", port) as again:
+        with http_at(answerer, room, port) as again:
             assert again == port
 
 
@@ -322,7 +340,7 @@ class TestKilledServer:
         assert [line.endswith("trying again") for line in told[:4]] == [True, False, True, False]
 
     def test_another_is_waited_for_a_little_and_missed_at_once_after_that(
-        self, server: EmbeddedServer, monkeypatch: pytest.MonkeyPatch
+        self, server: EmbeddedServer, room: Room, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr("projections.serve.outage.PATIENCE_S", 0.5)
         told: list[str] = []
@@ -330,7 +348,7 @@ class TestKilledServer:
             answerer = Answerer(pools, per_second=10_000.0)
             answerer.relocalize(question(), {})
             kill_postgres(server)
-            with serving(create_app(answerer), "127.0.0.1", 0) as port:
+            with http_at(answerer, room) as port:
                 for path, data in (("relocalize", question()), ("health", None)):
                     status, document = fetch(f"http://127.0.0.1:{port}/{path}", data)
                     assert (status, document["error"]["kind"]) == (503, "database")

@@ -1,0 +1,160 @@
+"""The HTTP server: a bound address, TLS, and uvicorn behind an accept loop of our own.
+
+asyncio accepts whatever comes, and has TLS handshakes in progress that nobody counts. Here each
+connection is counted from the moment it is accepted (`connections`), and one is accepted in each
+turn of the event loop, so that those which are there already are heard in between.
+"""
+
+import asyncio
+import contextlib
+import ipaddress
+import socket
+import ssl
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import uvicorn
+from starlette.types import ASGIApp
+
+from eventsrc.errors import MisuseError, TransportError
+
+from .connections import MAX_CONNECTIONS, REQUEST_S, Connection, Connections
+from .notices import Notices
+
+_BACKLOG: Final = 1024
+_KEEP_ALIVE_S: Final = 5
+_PAUSE_S: Final = 0.1
+
+
+def bind(host: str, port: int) -> socket.socket:
+    """A socket bound to the address; nobody can connect yet. Raises TransportError."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listener = socket.socket(family)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((host, port))
+    except OSError as error:
+        listener.close()
+        raise TransportError(
+            f"http {host}:{port}: {error.strerror or error}; give --http another"
+        ) from None
+    return listener
+
+
+def is_loopback(listener: socket.socket) -> bool:
+    """Whether only this machine can connect."""
+    return ipaddress.ip_address(listener.getsockname()[0].partition("%")[0]).is_loopback
+
+
+def tls_context(certificate: Path, key: Path) -> ssl.SSLContext:
+    """TLS as a server with this certificate. Raises MisuseError that names what cannot be used."""
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    for option, file in (("--tls-cert", certificate), ("--tls-key", key)):
+        try:
+            file.open("rb").close()
+        except OSError as error:
+            raise MisuseError(f"{option} {file}: {error.strerror or error}") from None
+    try:
+        context.load_cert_chain(certificate, key, password=lambda: b"")  # not asked on a terminal
+    except (ssl.SSLError, ValueError) as error:
+        why = getattr(error, "reason", None) or error
+        raise MisuseError(
+            f"--tls-cert {certificate} with --tls-key {key}: {why}; give a certificate and its key"
+            " in PEM, the key without a password"
+        ) from None
+    return context
+
+
+class _Server(uvicorn.Server):
+    def __init__(
+        self, config: uvicorn.Config, connections: Connections, tls: ssl.SSLContext | None
+    ) -> None:
+        super().__init__(config)
+        self._connections = connections
+        self._opening: set[asyncio.Task[None]] = set()
+        # Without TLS asyncio does not take these options.
+        self._tls: dict[str, Any] = (
+            {}
+            if tls is None
+            else {"ssl": tls, "ssl_handshake_timeout": REQUEST_S, "ssl_shutdown_timeout": 1.0}
+        )
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        self.servers = []
+        self._accepting = [
+            asyncio.create_task(self._accept(listener)) for listener in sockets or ()
+        ]
+        self.started = True
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        for task in self._accepting:
+            task.cancel()
+        await asyncio.wait(self._accepting)
+        self._connections.close_unmade()
+        await super().shutdown(sockets)
+
+    async def _accept(self, listener: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            try:
+                accepted, _ = await loop.sock_accept(listener)
+            except OSError as error:  # such as no free file descriptor
+                self._connections.note(error.strerror or str(error))
+                await asyncio.sleep(_PAUSE_S)
+                continue
+            self._begin(accepted)
+            await asyncio.sleep(0)
+
+    def _begin(self, accepted: socket.socket) -> None:
+        try:
+            connection = Connection(self.config, self.server_state, self._connections, accepted)
+        except OSError:  # the peer is gone already
+            accepted.close()
+            return
+        if not self._connections.admit(connection):
+            accepted.close()
+            return
+        task = asyncio.create_task(self._open(connection, accepted))
+        self._opening.add(task)
+        task.add_done_callback(self._opening.discard)
+
+    async def _open(self, connection: Connection, accepted: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        try:
+            await loop.connect_accepted_socket(lambda: connection, accepted, **self._tls)
+        except OSError:  # no TLS, or the handshake took too long
+            self._connections.forget(connection)
+
+
+@contextlib.contextmanager
+def serving(
+    app: ASGIApp,
+    listener: socket.socket,
+    tls: ssl.SSLContext | None = None,
+    tell: Callable[[str], None] = lambda _: None,
+) -> Iterator[int]:
+    """Serve in a thread; yields the port. Ends gracefully: requests under way are answered."""
+    config = uvicorn.Config(
+        app,
+        http=Connection,
+        ws="none",
+        lifespan="off",
+        log_level="error",
+        access_log=False,
+        proxy_headers=False,
+        server_header=False,
+        timeout_keep_alive=_KEEP_ALIVE_S,
+    )
+    server = _Server(config, Connections(Notices(tell), MAX_CONNECTIONS), tls)
+    listener.setblocking(False)
+    listener.listen(_BACKLOG)  # from now on clients wait instead of being refused
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, name="http")
+    thread.start()
+    try:
+        yield int(listener.getsockname()[1])
+    finally:
+        server.should_exit = True
+        thread.join()
+        listener.close()

@@ -1,0 +1,210 @@
+"""HTTP connections that never end and requests that are none: real sockets, a small application."""
+
+import json
+import ssl
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
+from typing import Any
+
+import pytest
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import Response
+from starlette.types import Receive, Scope, Send
+
+from projections.serve import connections
+from projections.serve.listening import bind, serving, tls_context
+from tests.fixtures_tls import Certificate
+from tests.http_attacks import DEADLINE_S, answer, ask, connect, request, status
+
+LONG = 16 * 1024 * 1024
+SECONDS = 0.5
+START = Callable[..., int]
+
+
+async def application(scope: Scope, receive: Receive, send: Send) -> None:
+    """Answers with the length of the body; at /long with more than a socket's buffers take."""
+    asked = Request(scope, receive)
+    try:
+        body = await asked.body()
+    except ClientDisconnect:
+        return
+    long = scope["path"] == "/long"
+    await Response(b"x" * LONG if long else b"%d" % len(body))(scope, receive, send)
+
+
+@pytest.fixture
+def told() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def start(monkeypatch: pytest.MonkeyPatch, told: list[str]) -> Iterator[START]:
+    """Starts servers with limits that a test can reach; they end with the test."""
+    with ExitStack() as servers:
+
+        def start(most: int = 8, seconds: float = SECONDS, **options: Any) -> int:
+            monkeypatch.setattr(connections, "REQUEST_S", seconds)
+            monkeypatch.setattr(connections, "ANSWER_S", seconds)
+            monkeypatch.setattr("projections.serve.listening.REQUEST_S", seconds)
+            monkeypatch.setattr("projections.serve.listening.MAX_CONNECTIONS", most)
+            listener = bind("127.0.0.1", 0)
+            return servers.enter_context(
+                serving(application, listener, tell=told.append, **options)
+            )
+
+        yield start
+
+
+def refused(response: bytes) -> tuple[int, str]:
+    """The status and kind of a refusal in the documented form."""
+    head, _, body = response.partition(b"\r\n\r\n")
+    error = json.loads(body)["error"]
+    assert set(error) == {"kind", "message"}
+    assert b"\r\nconnection: close" in head.lower()
+    return status(response), error["kind"]
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [b"", b"P", b"POST / HTTP/1.1\r\nHost: x\r\n", request("POST", "/", b"12345")[:-1]],
+    ids=["nothing", "a byte", "half a head", "a body without its end"],
+)
+def test_a_request_that_does_not_end_is_ended(start: START, told: list[str], sent: bytes) -> None:
+    assert refused(ask(start(), sent)) == (408, "bad_question")
+    assert told == ["http: closed a connection: no complete request within 0.5 s"]
+
+
+def test_bytes_that_drip_in_extend_nothing(start: START, told: list[str]) -> None:
+    with connect(start()) as dripping:
+        dripping.sendall(request("POST", "/", b"x" * 10**6)[: -(10**6)])
+        dripping.settimeout(0.02)
+        sent = 0
+        while not told:
+            dripping.send(b"x")
+            sent += 1
+            with suppress(TimeoutError):
+                dripping.recv(65_536)
+        assert sent < 10**6
+    assert told == ["http: closed a connection: no complete request within 0.5 s"]
+
+
+def test_a_connection_may_be_used_again_and_then_has_time_anew(start: START) -> None:
+    with connect(start(seconds=DEADLINE_S)) as one, one.makefile("rb") as answers:
+        for _ in range(3):
+            one.sendall(request("POST", "/", b"12345", {"Connection": "keep-alive"}))
+            assert [line for line in iter(answers.readline, b"\r\n") if b"200 OK" in line]
+            assert answers.read(1) == b"5"
+
+
+def test_an_answer_that_nobody_reads_is_given_up(start: START, told: list[str]) -> None:
+    port = start()
+    with connect(port) as deaf:
+        deaf.sendall(request("GET", "/long"))
+        while not told:
+            assert status(ask(port, request("GET", "/"))) == 200
+    assert told == ["http: closed a connection: no answer was read within 0.5 s"]
+
+
+def test_unread_answers_are_limited_together(
+    start: START, told: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connections, "MAX_UNREAD", LONG // 8)
+    port = start(seconds=DEADLINE_S)
+    with ExitStack() as held:
+        for _ in range(4):
+            deaf = held.enter_context(connect(port))
+            deaf.sendall(request("GET", "/long"))
+        while not told:
+            ask(port, request("GET", "/"))
+    assert told[0] == "http: closed a connection: its answer is long and was not read"
+
+
+class TestFull:
+    """More connections than may be open."""
+
+    def test_the_peer_with_the_most_loses_the_one_that_waited_longest(self, start: START) -> None:
+        port = start(most=6, seconds=DEADLINE_S)
+        with ExitStack() as held:
+            mine = held.enter_context(connect(port, "127.0.0.2"))
+            mine.sendall(b"P")
+            others = [held.enter_context(connect(port, "127.0.0.3")) for _ in range(20)]
+            for other in others[:15]:
+                assert answer(other) == b""
+            mine.sendall(request("POST", "/", b"12345")[1:])
+            assert answer(mine).endswith(b"\r\n\r\n5")
+            others[-1].sendall(request("POST", "/", b"123"))
+            assert answer(others[-1]).endswith(b"\r\n\r\n3")
+
+    def test_handshakes_that_do_not_end_count_too(
+        self, start: START, certificate: Certificate
+    ) -> None:
+        port = start(most=6, seconds=DEADLINE_S, tls=tls_context(certificate.cert, certificate.key))
+        client = ssl.create_default_context(cafile=str(certificate.cert))
+        with ExitStack() as held:
+            silent = [held.enter_context(connect(port)) for _ in range(20)]
+            for one in silent[:14]:
+                assert answer(one) == b""
+            with client.wrap_socket(connect(port), server_hostname="127.0.0.1") as honest:
+                honest.sendall(request("POST", "/", b"12345"))
+                assert answer(honest).endswith(b"5")
+
+    def test_a_handshake_has_its_time_too(self, start: START, certificate: Certificate) -> None:
+        port = start(tls=tls_context(certificate.cert, certificate.key))
+        assert ask(port, b"") == b""
+        assert ask(port, b"GET / HTTP/1.1\r\n\r\n") == b""
+
+
+@pytest.mark.parametrize(
+    ("sent", "expected"),
+    [
+        (b"\x16\x03\x01 nonsense\r\n\r\n", 400),
+        (b"GET / HTTP/1.1\r\n\r\n", 400),
+        (b"GET / HTTP/1.1\r\nHost: a\r\nHost: b\r\n\r\n", 400),
+        (b"GET / HTTP/1.1\r\nHost: a\r\nX: " + b"x" * 20_000, 431),
+        (request("POST", "/", b"", {"Content-Length": "-1"}), 400),
+        (request("POST", "/", b"", {"Content-Length": "1, 2"}), 400),
+        (b"POST / HTTP/1.1\r\nHost: a\r\nTransfer-Encoding: chunked\r\n\r\n" + b"1\r\na\r\n", 411),
+        (b"POST / HTTP/1.1\r\nHost: a\r\nTransfer-Encoding: gzip\r\n\r\n", 501),
+        (b"GET / HTTP/1.1 x\r\n\r\n", 400),
+    ],
+    ids=lambda value: str(value)[:50],
+)
+def test_what_is_no_request_is_refused_in_the_form_of_all_others(
+    start: START, sent: bytes, expected: int
+) -> None:
+    code, kind = refused(ask(start(), sent))
+    assert kind == "bad_question"
+    assert code == expected
+
+
+def test_an_upgrade_is_answered_as_what_it_is(start: START) -> None:
+    upgrade = {"Connection": "Upgrade, close", "Upgrade": "websocket"}
+    assert status(ask(start(), request("GET", "/", headers=upgrade))) == 200
+
+
+def test_requests_sent_ahead_are_answered_one_after_the_other(start: START) -> None:
+    ahead = request("POST", "/", b"123", {"Connection": "keep-alive"}) * 50
+    got = ask(start(seconds=DEADLINE_S), ahead + request("POST", "/", b"1"))
+    assert got.count(b"HTTP/1.1 200 OK") == 51
+
+
+def test_an_end_waits_for_no_half_request(start: START) -> None:
+    listener = bind("127.0.0.1", 0)
+    with ExitStack() as held, serving(application, listener) as port:
+        for sent in (b"", b"P", request("POST", "/", b"12345")[:-1]):
+            held.enter_context(connect(port)).sendall(sent)
+        assert status(ask(port, request("GET", "/"))) == 200
+
+
+@pytest.mark.parametrize(
+    ("address", "peer"),
+    [
+        ("192.0.2.7", "192.0.2.7"),
+        ("2001:db8::1", "2001:db8::/64"),
+        ("2001:db8::ffff:1", "2001:db8::/64"),
+        ("fe80::1%eth0", "fe80::/64"),
+        ("::ffff:192.0.2.7", "192.0.2.7"),
+    ],
+)
+def test_who_is_behind_an_address(address: str, peer: str) -> None:
+    assert connections.peer_of(address) == peer
