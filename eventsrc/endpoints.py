@@ -4,6 +4,7 @@ Zenoh itself reports a malformed endpoint as "unable to connect", which sends pe
 router that runs very well. So endpoints are checked here, before a session is opened. No I/O.
 """
 
+import ipaddress
 from collections.abc import Iterable
 from typing import Final
 
@@ -43,6 +44,14 @@ def parse_address(text: str, option: str) -> tuple[str, int]:
     if not _is_port(port) or (colon and not host):
         raise MisuseError(f"{option} {text!r} is neither PORT nor HOST:PORT; try {option} 9464")
     return host or "127.0.0.1", int(port)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can connect to what listens on ``host``, as far as one can tell."""
+    try:
+        return ipaddress.ip_address(host.strip("[]").partition("%")[0]).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 def _is_port(text: str) -> bool:

@@ -6,15 +6,16 @@ recording nothing.
 
 import shutil
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from prometheus_client import CollectorRegistry, start_http_server
+from prometheus_client import CollectorRegistry, make_wsgi_app
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from ._metrics_server import serving_wsgi
 from .errors import TransportError
 from .recorder import RecorderReport
 
@@ -101,16 +102,12 @@ def _serving(address: tuple[str, int], collector: Collector) -> Iterator[int]:
     registry = CollectorRegistry()
     registry.register(collector)
     host, port = address
-    try:
-        server, thread = start_http_server(port, host, registry)
-    except OSError as error:
-        raise TransportError(
-            f"cannot serve metrics on {host}:{port}: {error.strerror or error}; "
-            "choose another with --metrics"
-        ) from None
-    try:
-        yield server.server_port
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
+    with ExitStack() as stack:
+        try:
+            bound = stack.enter_context(serving_wsgi(host, port, make_wsgi_app(registry)))
+        except OSError as error:
+            raise TransportError(
+                f"cannot serve metrics on {host}:{port}: {error.strerror or error}; "
+                "choose another with --metrics"
+            ) from None
+        yield bound

@@ -12,6 +12,7 @@ from typing import Any
 import typer
 from rich.console import Console
 
+from eventsrc.endpoints import is_loopback
 from eventsrc.terminal import visible_json, visible_lines
 
 EXIT_FAILED = 1
@@ -32,6 +33,16 @@ def display(text: str) -> None:
     sys.stdout.write(visible_lines(text))
     if text and not text.endswith("\n"):
         sys.stdout.write("\n")
+
+
+def say_metrics(address: tuple[str, int], port: int) -> None:
+    """Where the numbers of ``--metrics`` are, and who can read them."""
+    say(f"metrics on http://{address[0]}:{port}/metrics")
+    if not is_loopback(address[0]):
+        say(
+            f"warning: --metrics {address[0]}:{address[1]}: everybody who can reach it reads these"
+            " numbers; keep it in a network of your own"
+        )
 
 
 def emit(document: Any) -> None:

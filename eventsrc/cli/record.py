@@ -20,7 +20,7 @@ from eventsrc.recorder import DEFAULT_KEYS, DEFAULT_QUEUE_SIZE, Recorder
 from ._recorder_end import RecorderEnd
 from ._recorder_line import EVERY_S, watching
 from ._restart_line import say_restart
-from ._shell import say
+from ._shell import say, say_metrics
 from ._signals import stop_on_signals
 from ._zenoh_options import ConfigOption, ConnectOption, ListenOption, zenoh_options
 
@@ -127,7 +127,7 @@ def _measured(address: tuple[str, int] | None, recorder: Recorder, log: Path) ->
     from eventsrc.metrics import serving_metrics  # costs nothing unless asked for
 
     with serving_metrics(address, recorder.report, log) as port:
-        say(f"metrics on http://{address[0]}:{port}/metrics")
+        say_metrics(address, port)
         yield
 
 

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from eventsrc.cli._shell import emit, finish, say
+from eventsrc.cli._shell import emit, finish, say, say_metrics
 from eventsrc.endpoints import parse_address
 from eventsrc.log import LogReader
 from eventsrc.words import counted
@@ -97,7 +97,7 @@ def _metrics(address: tuple[str, int] | None, progress: TailProgress, log: Path)
     from projections.runner.metrics import serving_tail_metrics  # costs nothing unless asked for
 
     with serving_tail_metrics(address, progress, log) as port:
-        say(f"metrics on http://{address[0]}:{port}/metrics")
+        say_metrics(address, port)
         yield
 
 

@@ -1,15 +1,18 @@
 """Prometheus scrapes a recorder."""
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
+from eventsrc._metrics_server import MAX_CONNECTIONS
 from eventsrc.errors import TransportError
 from eventsrc.metrics import serving_metrics
 from eventsrc.recorder import RecorderReport
 from tests.envelopes import envelope, payload
 from tests.fixtures_zenoh import Program, scrape
+from tests.http_attacks import answer, ask, connect
 
 REPORT = RecorderReport(
     *(12, 3, 4, 5, 6, 0, 7, 100, 15),
@@ -47,6 +50,30 @@ def test_a_busy_port_is_one_clear_line(tmp_path: Path) -> None:
         serving_metrics(("127.0.0.1", port), lambda: REPORT, tmp_path),
     ):
         pytest.fail("two servers on one port")
+
+
+def test_connections_held_open_keep_no_scrape_out_and_give_way(tmp_path: Path) -> None:
+    with ExitStack() as held, serving_metrics(("127.0.0.1", 0), lambda: REPORT, tmp_path) as port:
+        silent = [held.enter_context(connect(port)) for _ in range(5 * MAX_CONNECTIONS)]
+        for connection in silent:
+            connection.send(b"GET /metrics HTTP/1.1\r\n")
+        assert scrape(port)["mapfold_recorder_recorded_total"] == 12
+        for connection in silent[:MAX_CONNECTIONS]:
+            assert answer(connection) == b""
+
+
+def test_a_silent_connection_is_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("eventsrc._metrics_server._Handler.timeout", 0.2)
+    with serving_metrics(("127.0.0.1", 0), lambda: REPORT, tmp_path) as port:
+        assert ask(port, b"GET /metrics HTTP/1.1\r\n") == b""
+
+
+def test_numbers_that_others_can_read_are_warned_of(
+    start: Callable[..., Program], endpoint: str, tmp_path: Path
+) -> None:
+    args = ("record", str(tmp_path / "log"), "--connect", endpoint, "--metrics")
+    recorder = start(*args, "0.0.0.0:0")
+    assert "everybody who can reach it reads" in recorder.wait_for("warning: --metrics 0.0.0.0:0")
 
 
 def test_the_record_command_serves_them(

@@ -2,7 +2,7 @@
 
 import pytest
 
-from eventsrc.endpoints import check_endpoint, check_endpoints, parse_address
+from eventsrc.endpoints import check_endpoint, check_endpoints, is_loopback, parse_address
 from eventsrc.errors import MisuseError
 
 
@@ -59,3 +59,13 @@ def test_an_address_is_a_port_or_host_and_port(text: str, address: tuple[str, in
 def test_what_is_no_address_names_the_option(text: str) -> None:
     with pytest.raises(MisuseError, match=f"--metrics {text!r}"):
         parse_address(text, "--metrics")
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.9.9.9", "::1", "[::1]", "localhost"])
+def test_what_only_this_machine_reaches(host: str) -> None:
+    assert is_loopback(host)
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "[::]", "192.0.2.1", "example", "localhost.x"])
+def test_what_others_may_reach(host: str) -> None:
+    assert not is_loopback(host)
