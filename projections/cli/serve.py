@@ -84,15 +84,16 @@ def serve(
         targets = stack.enter_context(open_targets(db, vector_db))
         pools = stack.enter_context(Pools(targets, workers, lambda what: say(f"mapfold: {what}")))
         answerer = Answerer(pools, per_second=rate, max_bytes=max_bytes, camera=camera, tell=say)
-        room = stack.enter_context(Room(workers))
+        session = None
         if zenoh:
             session = stack.enter_context(open_session(options, mode=options.mode))
+        room = stack.enter_context(Room(workers))  # its last answers go over the session
+        if session is not None:
             stack.enter_context(ZenohService(session, answerer, room))
             say("answering mapfold/relocalize and mapfold/state/** over Zenoh")
         if door is not None:
-            say(
-                f"answering {stack.enter_context(door.serving(answerer, room))}, described at /docs"
-            )
+            url = stack.enter_context(door.serving(answerer, room))
+            say(f"answering {url}, described at /docs")
         say("Ctrl-C ends it")
         stop.wait()
     say("service ended")

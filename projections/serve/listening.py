@@ -138,6 +138,7 @@ def serving(
     """Serve in a thread; yields the port. Ends gracefully: requests under way are answered."""
     config = uvicorn.Config(
         app,
+        loop="asyncio",
         http=Connection,
         ws="none",
         lifespan="off",
