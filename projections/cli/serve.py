@@ -1,8 +1,9 @@
 """`mapfold serve`: answer lost robots over Zenoh and HTTP until a signal ends it."""
 
+import dataclasses
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
@@ -17,6 +18,10 @@ from projections.cli._question import HfovOption, ImageOption, camera_from
 from projections.postgres.connect import open_targets
 from projections.serve import Answerer, Pools, Room, ZenohService
 from projections.serve.answering import DEFAULT_MAX_BYTES
+
+_LARGEST_BYTES: Final = 16 * 1024 * 1024
+"""What Zenoh puts together of one question. A longer one gets no answer; a shorter one that is over
+``--max-bytes`` is told so."""
 
 
 def serve(
@@ -74,7 +79,11 @@ def serve(
     """
     if http is None and not zenoh:
         raise MisuseError("neither --zenoh nor --http: there is nothing to serve on")
-    camera, options = camera_from(hfov, image), zenoh_options(connect, listen, zenoh_config)
+    camera = camera_from(hfov, image)
+    options = dataclasses.replace(
+        zenoh_options(connect, listen, zenoh_config),
+        largest_message_bytes=max(_LARGEST_BYTES, 4 * max_bytes),
+    )
     given = HttpOptions(token_file, tls_cert, tls_key, tuple(allow_host or ()))
     with ExitStack() as stack:
         door = None if http is None else stack.enter_context(HttpDoor.opened(http, given))

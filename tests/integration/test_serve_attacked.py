@@ -168,6 +168,19 @@ class TestOverZenoh:
         assert "has 10000000 bytes" in json.loads(got)["error"]["message"]
 
 
+def test_zenoh_puts_together_no_question_that_is_far_too_long(
+    targets: Targets, endpoint: str, connected: Callable[[], Session]
+) -> None:
+    args = ("--connect", endpoint, "--http", "127.0.0.1:0", "--db", targets.graph_url)
+    with served(*args) as service:
+        asking, before = connected(), service.peak_bytes
+        asking.ask("mapfold/relocalize", bytes(300 * MEBIBYTE), timeout_s=5.0)
+        assert status(ask(service.port, question())) == 200
+        ((good, _),) = asking.ask("mapfold/relocalize", b"nonsense", timeout_s=DEADLINE_S)
+        assert not good
+        assert service.peak_bytes - before < 150 * MEBIBYTE
+
+
 NUMBERS = st.one_of(
     st.floats(width=32),
     st.integers(-(10**40), 10**40),
