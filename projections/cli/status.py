@@ -64,9 +64,20 @@ def _tell(info: LogInfo, found: Status) -> None:
         display(f"{sink.sink:<8} {_line(sink)}")
         if sink.note:
             say(f"         {sink.note}")
+        if sink.unwanted_writers:
+            typer.echo(f"         {_open_to(sink.unwanted_writers)}")
         for letter in sink.dead_letters:
             run = f" (run {letter.run_id})" if letter.run_id else ""
             display(f"         parked: offset {letter.offset:,}{run}: {letter.reason}")
+
+
+def _open_to(roles: tuple[str, ...]) -> str:
+    them = ", ".join(roles)
+    return (
+        f"not read-only: {them} may only read the graph, but Apache AGE lets them change it through"
+        " cypher(); run mapfold replay with AGE 1.7 or later, or what mapfold db roles prints and"
+        f" REVOKE USAGE ON SCHEMA ag_catalog FROM {them}"
+    )
 
 
 def _line(sink: SinkStatus) -> str:

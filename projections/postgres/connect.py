@@ -23,6 +23,7 @@ from psycopg.rows import TupleRow
 from eventsrc.errors import MisuseError
 from projections.errors import DatabaseError, DatabaseUnavailable, ExtensionMissing
 
+from .age import enforces_row_security
 from .embedded import EmbeddedServer, embedded_log
 
 Connection = psycopg.Connection[TupleRow]
@@ -164,10 +165,7 @@ def load_age(connection: Connection) -> None:
             " or have a superuser run CREATE EXTENSION age"
         ) from None
     except psycopg.errors.InsufficientPrivilege:
-        raise ExtensionMissing(
-            f"{place_of(connection)}: user {connection.info.user} may not use Apache AGE; have a"
-            f" superuser run GRANT USAGE ON SCHEMA ag_catalog TO {connection.info.user}"
-        ) from None
+        raise ExtensionMissing(_may_not_use_age(connection)) from None
     connection.execute('SET search_path = ag_catalog, "$user", public')
 
 
@@ -236,6 +234,18 @@ def database_errors(url: str) -> Iterator[None]:
         ) from error
     except psycopg.Error as error:
         raise DatabaseError(f"{place(url)}: {_first_line(error)}") from error
+
+
+def _may_not_use_age(connection: Connection) -> str:
+    connection.rollback()
+    user, version = connection.info.user, extension_version(connection, "age") or ""
+    told = f"{place_of(connection)}: user {user} may not use Apache AGE"
+    if enforces_row_security(version):
+        return f"{told}; have a superuser run GRANT USAGE ON SCHEMA ag_catalog TO {user}"
+    return (
+        f"{told} {version}, which would let it change the graph whatever its privileges; ask as"
+        " the owner or as a member of mapfold_writer, or use AGE 1.7 or later"
+    )
 
 
 def _missing(name: str, where: str) -> str:

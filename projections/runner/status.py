@@ -25,6 +25,7 @@ from projections.sink import Checkpoint, SinkName
 from projections.sinks import _checkpoint
 from projections.sinks._advice import command, remake
 from projections.sinks._checkpoint import DeadLetter
+from projections.sinks._cypher_guard import unwanted_writers
 
 STALLED_S: Final = 20.0
 """A living tail says so every 5 s."""
@@ -39,6 +40,7 @@ class SinkStatus:
     """One sink. Ages are seconds; ``note`` explains ``other`` and ``unreachable``.
 
     ``lag`` is None when it was made from another log, or a longer one: there is nothing to count.
+    ``unwanted_writers`` are roles without the privilege that Apache AGE lets write all the same.
     """
 
     sink: SinkName
@@ -53,6 +55,7 @@ class SinkStatus:
     digest: str | None = None
     dead_letters: tuple[DeadLetter, ...] = ()
     versions: dict[str, str] | None = None
+    unwanted_writers: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,9 +68,12 @@ class Status:
 
     @property
     def healthy(self) -> bool:
-        """True when nothing is missing, stalled, of another origin, or parked."""
+        """True when nothing is missing, stalled, of another origin, parked, or open to readers."""
         good = ("idle", "following", "rebuilding")
-        return all(s.condition in good and not s.dead_letters for s in self.sinks)
+        return all(
+            s.condition in good and not s.dead_letters and not s.unwanted_writers
+            for s in self.sinks
+        )
 
 
 def projection_status(log: Path, targets: Targets, settings: Settings) -> Status:
@@ -124,6 +130,7 @@ def _look(
         found.digest,
         tuple(_checkpoint.parked(connection, sink)),
         versions,
+        tuple(unwanted_writers(connection)) if sink == "graph" else (),
     )
 
 

@@ -16,6 +16,7 @@ from projections.errors import DatabaseError
 from projections.postgres.connect import Connection, place_of
 
 from . import _leaving
+from ._cypher_guard import PARENTS, guard
 from ._sql import statements
 from .labels import (
     CHANGING_EDGES,
@@ -59,6 +60,7 @@ def create(connection: Connection, graph: str) -> None:
     for name in LABELS:
         table = sql.Identifier(graph, name)
         connection.execute(run["no_statistics"].format(table=table))
+    guard(connection, graph)
     found: dict[str, int] = dict(connection.execute(run["label_ids"], {"graph": graph}).fetchall())
     if any(found.get(label) != number for label, number in LABEL_IDS.items()):
         raise DatabaseError(
@@ -108,8 +110,7 @@ def counts(connection: Connection, graph: str) -> dict[str, int]:
 def lock(connection: Connection, graph: str) -> None:
     """Lock all tables of a graph exclusively, if it is there."""
     if exists(connection, graph):
-        names = ["_ag_label_vertex", "_ag_label_edge", *LABELS]
-        tables = sql.SQL(", ").join(sql.Identifier(graph, name) for name in names)
+        tables = sql.SQL(", ").join(sql.Identifier(graph, name) for name in (*PARENTS, *LABELS))
         connection.execute(statements("graph")["lock"].format(tables=tables))
 
 

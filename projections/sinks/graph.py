@@ -11,7 +11,7 @@ from projections.postgres.connect import Connection, ensure_extension, place_of
 from projections.sink import SinkName
 from projections.view import MapView
 
-from . import _graph_ddl, _leaving, _readers, _swap_guard
+from . import _cypher_guard, _graph_ddl, _leaving, _readers, _swap_guard
 from ._sql import statements
 from .graph_rows import GraphChanges, GraphRows, WholeGraph
 from .labels import (
@@ -71,7 +71,8 @@ class GraphSink:
 
     def write(self, connection: Connection, changes: GraphChanges) -> None:
         """Insert, upsert and delete what was taken."""
-        loader = InsertLoader() if self.few(changes) else self._loader
+        copies = not self.few(changes) and not _cypher_guard.subject(connection)
+        loader = self._loader if copies else InsertLoader()
         for label, rows in changes.inserted.items():
             _new_rows(loader, GRAPH, label, rows)(connection)
         for label, rows in changes.upserted.items():
