@@ -93,15 +93,21 @@ def check(
     with databases(db, vector_db) as targets:
         reports = check_projections(log, targets, settings, only=only_of(only))
         wrong = [report for report in reports if report.differing]
-        for report in wrong if repair else ():
+        # A rebuild would drop what somebody else has put into the graph.
+        mended = [report for report in wrong if repair and not report.foreign]
+        for report in mended:
             rebuild(log, targets, settings, until=report.next_offset, only=report.sink)
     if as_json:
-        emit({"sinks": [asdict(r) for r in reports], "repaired": repair and bool(wrong)})
+        emit({"sinks": [asdict(r) for r in reports], "repaired": bool(mended)})
     else:
         _tell(reports)
-        if wrong:
-            say("rebuilt" if repair else f"to mend it run: mapfold db check --repair {log}")
-    finish(findings=bool(wrong))
+        for report in mended:
+            say(f"{report.sink}: rebuilt")
+        if wrong and not repair:
+            say(f"to mend it run: mapfold db check --repair {log}")
+        elif len(mended) < len(wrong):
+            say("graph: not rebuilt, as that would drop what is not ours; remove it first")
+    finish(findings=not all(report.sound for report in reports))
 
 
 @group.command()
@@ -146,3 +152,9 @@ def _tell(reports: list[CheckReport]) -> None:
             )
         if report.differing > len(report.differences):
             display(f"  and {report.differing - len(report.differences):,} more")
+        for table in report.foreign:
+            rows = "rows" if table.rows is None else counted(table.rows, "row")
+            display(
+                f"  not ours: {table.what} {table.table!r} with {rows}; a rebuild drops it."
+                f" Keep a copy: {table.keep}; remove it: {table.remove};"
+            )

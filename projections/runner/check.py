@@ -31,6 +31,7 @@ from projections.settings import Settings
 from projections.sink import Checkpoint, Sink, SinkName
 from projections.sinks import _checkpoint
 from projections.sinks._advice import command
+from projections.sinks._foreign_tables import ForeignTable, foreign_tables
 from projections.sinks.graph_render import Row, expected_rows
 from projections.sinks.labels import GRAPH, LABELS, TABLE, VERTEX_LABELS
 from projections.sinks.vector_rows import VectorRow
@@ -73,13 +74,22 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class CheckReport:
-    """One sink at its checkpoint. ``differences`` names the first of ``differing``."""
+    """One sink at its checkpoint. ``differences`` names the first of ``differing``.
+
+    ``foreign`` is what somebody else keeps in the graph's schema; a rebuild would drop it.
+    """
 
     sink: SinkName
     next_offset: int
     rows: int
     differing: int
     differences: tuple[Difference, ...]
+    foreign: tuple[ForeignTable, ...] = ()
+
+    @property
+    def sound(self) -> bool:
+        """True when the sink holds what the log says and nothing else."""
+        return not self.differing and not self.foreign
 
 
 def check(
@@ -113,8 +123,9 @@ def _check(log: Path, sink: SinkName, url: str, settings: Settings) -> CheckRepo
             refuse_misfit(checkpoint, sink, place(url), log, reader, settings)
             compare = _compare_graph if sink == "graph" else _compare_vectors
             compare(connection, reader, checkpoint, settings, tally)
+            foreign = foreign_tables(connection) if sink == "graph" else ()
     return CheckReport(
-        sink, checkpoint.next_offset, tally.rows, tally.differing, tuple(tally.differences)
+        sink, checkpoint.next_offset, tally.rows, tally.differing, tuple(tally.differences), foreign
     )
 
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import psycopg
 import pytest
+from psycopg import sql
 
 from projections.errors import DatabaseError, ProjectionMismatch, ProjectionMissing
 from projections.postgres.connect import Connection, Targets
@@ -13,6 +14,7 @@ from projections.runner.status import projection_status
 from projections.settings import Settings
 from projections.sink import Checkpoint, SinkName
 from projections.sinks import _checkpoint
+from tests.commands import Commands
 from tests.logs import append_raw, bridge, walk, write_log
 
 SETTINGS = Settings()
@@ -191,3 +193,59 @@ def test_a_rebuild_that_swaps_beside_a_check_is_no_difference(
 
     monkeypatch.setattr(_checkpoint, "load", rebuild_meanwhile)
     assert [r.differing for r in check(log, one_database, SETTINGS, only=sink)] == [0]
+
+
+def door(pg: psycopg.Connection) -> None:
+    """What somebody might do who takes the map for theirs to write to."""
+    pg.execute(
+        "SELECT * FROM cypher('semantic_map', $$ CREATE (:Door)-[:HINGE]->(:Door) RETURN 1 $$)"
+        " AS (n agtype)"
+    )
+    pg.execute('CREATE TABLE semantic_map."a table" AS SELECT 7 AS n')
+    pg.execute('CREATE VIEW semantic_map."a ""view""" AS SELECT 7 AS n')
+    pg.execute(
+        "INSERT INTO semantic_map._ag_label_vertex (id, properties) VALUES (_graphid(1, 1), '{}')"
+    )
+
+
+FOREIGN = {
+    "Door": ("vertex label", 2),
+    "HINGE": ("edge label", 1),
+    "_ag_label_vertex": ("vertices without a label", 1),
+    'a "view"': ("view", 1),
+    "a table": ("table", 1),
+}
+
+
+def test_labels_and_tables_that_are_not_ours_are_found_kept_and_removed_as_told(
+    log: Path, one_database: Targets, pg: psycopg.Connection
+) -> None:
+    rebuild(log, one_database, SETTINGS)
+    door(pg)
+    graph, vectors = check(log, one_database, SETTINGS)
+    assert {t.table: (t.what, t.rows) for t in graph.foreign} == FOREIGN
+    assert (graph.differing, graph.sound, vectors.sound) == (0, False, True)
+    with psycopg.connect(one_database.graph_url) as anyone:
+        for table in graph.foreign:
+            anyone.execute(table.keep)  # type: ignore[arg-type]
+            anyone.execute(table.remove)  # type: ignore[arg-type]
+    assert all(report.sound for report in check(log, one_database, SETTINGS))
+    for table in FOREIGN:
+        count = sql.SQL("SELECT count(*) FROM {}").format(sql.Identifier("public", table))
+        assert pg.execute(count).fetchone() == (FOREIGN[table][1],)
+
+
+def test_the_command_names_them_and_repair_does_not_drop_them(
+    log: Path, one_database: Targets, pg: psycopg.Connection
+) -> None:
+    mapfold = Commands.in_folder(log.parent)
+    rebuild(log, one_database, SETTINGS)
+    door(pg)
+    pg.execute('CREATE TABLE semantic_map."red \x1b[31m" ()')
+    pg.execute('DELETE FROM semantic_map."HAS_KEYFRAME"')
+    said = mapfold("db", "check", "log", "--db", one_database.graph_url, "--repair", code=3)
+    assert "not ours: vertex label 'Door' with 2 rows; a rebuild drops it" in said.out
+    assert "SELECT ag_catalog.drop_label('semantic_map', 'Door')" in said.out
+    assert "not rebuilt" in said.err
+    assert "\x1b" not in said.out
+    assert len(check(log, one_database, SETTINGS)[0].foreign) == len(FOREIGN) + 1
