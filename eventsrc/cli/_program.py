@@ -8,8 +8,9 @@ Exit codes: 0 done · 1 failed · 2 misuse · 3 done, with loss or findings · 1
 """
 
 import contextlib
+import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final, NoReturn
 
 import typer
@@ -23,6 +24,12 @@ from ._streams import OutputLost, give_up_stdout, secure_streams
 EXIT_INTERRUPTED: Final = 130
 EXIT_READER_GONE: Final = 141
 """What a shell shows of a program that writes to a closed pipe: neither done nor failed."""
+
+
+# Of typer itself or of click, as typer's version has it.
+_UsageError: Any = typer.BadParameter.__base__
+_DATABASE: Final = re.compile(r"--(vector-)?db\b")
+_SECRET: Final = re.compile(r"://|password", re.IGNORECASE)
 
 
 class _Interrupted(Exception):
@@ -41,9 +48,23 @@ def _handed_through() -> Iterator[None]:
         raise _Interrupted from None
     except BrokenPipeError:
         raise _ReaderGone from None
-    except typer.BadParameter as error:
-        error.message = error.message.removeprefix("Value error, ")  # typer's inside showing
+    except _UsageError as error:
+        told = error.message.removeprefix("Value error, ")  # typer's inside showing
+        error.message = _without_secrets(told, sys.argv)
         raise
+
+
+def _without_secrets(message: str, arguments: Sequence[str]) -> str:
+    """A usage error's message without words that may be a database's URL, or a part of one.
+
+    An URL without quotes falls apart at its spaces: ``--db host=h password=…`` leaves an argument
+    that no command takes.
+    """
+    apart = "extra argument" in message and any(_DATABASE.match(a) for a in arguments)
+    if not apart and not _SECRET.search(message):
+        return message
+    head = re.split(r"[('\"]", message, maxsplit=1)[0].rstrip()
+    return f"{head} (not shown, it may hold a password)".lstrip()
 
 
 class Program(TyperGroup):

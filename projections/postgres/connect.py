@@ -4,15 +4,16 @@ The graph and the vectors may share one database (the default) or live in two. W
 ``--db`` and ``--vector-db``, else MAPFOLD_DB and MAPFOLD_VECTOR_DB, else the embedded server. The
 vectors go where the graph goes unless told otherwise.
 
-Messages name host, port and database, never a password.
+Messages name host, port and database, never a password, and nothing of a URL that cannot be parsed.
 """
 
 import contextlib
 import json
 import logging
 import os
+import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, LiteralString
 
 import psycopg
@@ -56,6 +57,8 @@ _SESSION: Final[Mapping[str, str]] = {
     "tcp_keepalives_interval": "10",
     "tcp_keepalives_count": "3",
 }
+_PUBLIC: Final = ("host", "port", "dbname", "user")
+"""The parts of a URL that a message may show."""
 _PACKAGES: Final[Mapping[str, str]] = {"age": "Apache AGE", "vector": "pgvector"}
 
 
@@ -63,8 +66,8 @@ _PACKAGES: Final[Mapping[str, str]] = {"age": "Apache AGE", "vector": "pgvector"
 class Targets:
     """The databases of one projection. ``embedded`` is ours to restart when it dies."""
 
-    graph_url: str
-    vector_url: str
+    graph_url: str = field(repr=False)
+    vector_url: str = field(repr=False)
     embedded: EmbeddedServer | None = None
 
     @property
@@ -81,11 +84,8 @@ class Targets:
 @contextlib.contextmanager
 def open_targets(db: str | None = None, vector_db: str | None = None) -> Iterator[Targets]:
     """The databases to use; the embedded server runs while the context is open, if it is needed."""
-    graph_url = db or os.environ.get("MAPFOLD_DB") or None
-    vector_url = vector_db or os.environ.get("MAPFOLD_VECTOR_DB") or graph_url
-    for url in (graph_url, vector_url):
-        if url is not None:
-            check_url(url)
+    graph_url = _given(db, "--db", "MAPFOLD_DB")
+    vector_url = _given(vector_db, "--vector-db", "MAPFOLD_VECTOR_DB") or graph_url
     if graph_url is not None and vector_url is not None:
         yield Targets(graph_url, vector_url)
         return
@@ -93,20 +93,45 @@ def open_targets(db: str | None = None, vector_db: str | None = None) -> Iterato
         yield Targets(graph_url or server.url, vector_url or server.url, server)
 
 
-def check_url(url: str) -> None:
-    """Refuse what is no PostgreSQL URL, before anything tries to connect."""
-    try:
-        if not url.startswith(("postgresql://", "postgres://")):
-            raise MisuseError(
-                f"{_without_password(url)}: not a PostgreSQL URL; write it as"
-                " postgresql://user:password@host:port/database"
-            )
-        conninfo_to_dict(url)
-    except psycopg.ProgrammingError as error:
+def _given(option: str | None, name: str, variable: str) -> str | None:
+    """What an option or else an environment variable says, checked."""
+    url, given_as = (option, name) if option else (os.environ.get(variable), variable)
+    if not url:
+        return None
+    check_url(url, given_as)
+    return url
+
+
+def check_url(url: str, given_as: str = "the database's URL") -> None:
+    """Refuse what is no PostgreSQL URL, before anything tries to connect.
+
+    Nothing of it is shown, nor what libpq says of it, which quotes parts: what cannot be parsed may
+    be a password anywhere. libpq itself takes ``//u:pa/ss@host`` for host ``u`` and port ``pa``.
+    """
+    if not _plain(url):
         raise MisuseError(
-            f"{_without_password(url)}: not a PostgreSQL URL: {_first_line(error)}; write it as"
-            " postgresql://user:password@host:port/database"
-        ) from None
+            f"{given_as}: not a PostgreSQL URL (not shown, it may hold a password); write it as"
+            " postgresql://user:password@host:port/database, with %40 for @, %2F for / and %25 for"
+            " % in user and password"
+        )
+
+
+def _plain(url: str) -> bool:
+    """Whether libpq reads a URL, and reads it as a person would."""
+    try:
+        said = conninfo_to_dict(url)
+    except (psycopg.Error, ValueError):  # ValueError: characters that have no UTF-8
+        return False
+    authority, _, path = url.partition("?")[0].partition("://")[2].partition("/")
+    ports = [port for port in str(said.get("port") or "").split(",") if port]
+    return (
+        url.startswith(("postgresql://", "postgres://"))
+        and "\0" not in url  # libpq would end there
+        and all(str(said.get(name) or "").isprintable() for name in _PUBLIC)
+        and authority.count("@") <= 1
+        and "@" not in path
+        and all(re.fullmatch("[0-9]{1,5}", port) and 0 < int(port) < 65536 for port in ports)
+    )
 
 
 def connect(url: str, *, application: str = "mapfold", autocommit: bool = False) -> Connection:
@@ -122,8 +147,8 @@ def connect(url: str, *, application: str = "mapfold", autocommit: bool = False)
             application_name=application,
             connect_timeout=CONNECT_SECONDS,
         )
-    except psycopg.OperationalError as error:
-        told = f"{_first_line(error)}; {_advice(error, url)}"
+    except psycopg.Error as error:  # also a value in the URL that libpq finds wrong only now
+        told = f"{_without_values(_first_line(error), url)}; {_advice(error, url)}"
         raise DatabaseUnavailable(f"{place(url)}: {told}") from None
 
 
@@ -208,7 +233,7 @@ def place(url: str) -> str:
     try:
         parts = conninfo_to_dict(url)
     except psycopg.ProgrammingError:
-        return _without_password(url)
+        return "a database whose URL cannot be read"
     host = parts.get("host") or "local socket"
     port = parts.get("port") or 5432
     return f"database {parts.get('dbname') or parts.get('user') or 'default'} at {host}:{port}"
@@ -255,7 +280,7 @@ def _missing(name: str, where: str) -> str:
     )
 
 
-def _advice(error: psycopg.OperationalError, url: str) -> str:
+def _advice(error: psycopg.Error, url: str) -> str:
     text = str(error)
     log = embedded_log(url)
     if log is not None:
@@ -275,8 +300,10 @@ def _first_line(error: Exception) -> str:
     return told.rstrip(".;")
 
 
-def _without_password(url: str) -> str:
-    head, at, tail = url.rpartition("@")
-    scheme, colon, rest = head.partition("://")
-    user = rest.partition(":")[0]
-    return f"{scheme}{colon}{user}{at}{tail}" if at else url
+def _without_values(text: str, url: str) -> str:
+    """``text`` without what libpq quotes of the URL's other parts: ``invalid sslmode: "…"``."""
+    said = conninfo_to_dict(url)
+    public = {said.get(name) for name in _PUBLIC}
+    for value in set(said.values()) - public:
+        text = text.replace(f'"{value}"', '"…"')
+    return text
