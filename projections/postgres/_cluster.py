@@ -3,18 +3,17 @@
 The server is a projection's store, not the truth, and it is for one machine's owner:
 
 * It listens on a unix socket only. The socket stands in the data folder, which is 0700, so the
-  folder's permissions are the authentication (``trust`` means: whoever may open the socket). A path
-  too long for a socket (107 bytes) gets a 0700 folder under the temporary directory instead.
+  folder's permissions are the authentication (``trust`` means: whoever may open the socket). For a
+  path too long for a socket (107 bytes) see `_socket_folder`. A data folder that belongs to another
+  user, or that others may write, is refused.
 * A new data folder is made beside its place and renamed, so a killed ``initdb`` leaves no half one.
 * PostgreSQL refuses to run as root; `_system_user` says as whom it runs then.
 """
 
 import contextlib
-import hashlib
 import os
 import shutil
 import socket
-import stat
 import subprocess
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -24,7 +23,14 @@ from typing import Final
 
 from projections.errors import EmbeddedServerError
 
-from ._system_user import give_to_server_user, let_server_user_enter, server_identity
+from . import _socket_folder
+from ._system_user import (
+    give_to_server_user,
+    let_server_user_enter,
+    server_identity,
+    server_uid,
+    server_user,
+)
 
 SUPERUSER: Final = "postgres"
 START_SECONDS: Final = 60
@@ -89,10 +95,14 @@ class Cluster:
         Not asked of the process table: where process 1 does not reap, as in many containers, a
         killed server stays there for ever.
         """
+        self._refuse_others()
+        folder = self.socket_dir()
+        if folder is None:
+            return False
         with socket.socket(socket.AF_UNIX) as probe:
             probe.settimeout(PROBE_SECONDS)
             try:
-                probe.connect(str(self.socket_dir() / SOCKET_NAME))
+                probe.connect(str(folder / SOCKET_NAME))
             except (FileNotFoundError, ConnectionRefusedError):
                 return False
             except (TimeoutError, BlockingIOError):  # there, and busy
@@ -101,16 +111,18 @@ class Cluster:
 
     def start(self) -> None:
         """Start the server and wait until it takes connections."""
-        socket_dir = self._make_socket_dir()
+        self._refuse_others()
+        with _as_one_line("start", self.data):
+            folder = self.data if self._holds_socket() else _socket_folder.find_or_make(self.data)
         options = " ".join(
             f"-c {name}={_quoted(value)}"
-            for name, value in {**SETTINGS, "unix_socket_directories": str(socket_dir)}.items()
+            for name, value in {**SETTINGS, "unix_socket_directories": str(folder)}.items()
         )
         with contextlib.suppress(FileNotFoundError):
             (self.data / LOG_NAME).replace(self.data / f"{LOG_NAME}.1")
         with _as_one_line("start", self.data):
             let_server_user_enter(self.data, self.programs)
-            self._forget_dead_server()
+            _forget_dead_server(self.data / "postmaster.pid", folder / f"{SOCKET_NAME}.lock")
             self._run(
                 "pg_ctl", "start", "--wait", "--timeout", str(START_SECONDS), "--silent",
                 "--pgdata", str(self.data), "--log", str(self.data / LOG_NAME),
@@ -127,36 +139,27 @@ class Cluster:
                 "--silent", "--pgdata", str(self.data),
             )  # fmt: skip
 
-    def socket_dir(self) -> Path:
-        """Where the server's socket stands, or will stand: the same for every process."""
-        if len(os.fsencode(self.data / SOCKET_NAME)) <= MAX_SOCKET_PATH:
+    def socket_dir(self) -> Path | None:
+        """Where the server's socket stands; None when that is chosen at its next start."""
+        if self._holds_socket():
             return self.data
-        name = hashlib.sha256(os.fsencode(self.data)).hexdigest()[:12]
-        # Not $TMPDIR: two shells may disagree on it, and it may be long itself.
-        return Path("/tmp") / f"mapfold-{os.getuid()}-{name}"  # noqa: S108 - made 0700, and checked
+        return _socket_folder.find(self.data)
 
-    def _forget_dead_server(self) -> None:
-        """Remove the lock files of a killed server that PostgreSQL would take for alive."""
-        for lock in (self.data / "postmaster.pid", self.socket_dir() / f"{SOCKET_NAME}.lock"):
-            # No such file, no such process, or no /proc on this system: nothing to forget.
-            with contextlib.suppress(OSError, IndexError):
-                pid = lock.read_text().split()[0]
-                status = Path("/proc", pid, "stat").read_text()
-                if status.rpartition(")")[2].split()[0] == "Z":
-                    lock.unlink()
+    def _holds_socket(self) -> bool:
+        return len(os.fsencode(self.data / SOCKET_NAME)) <= MAX_SOCKET_PATH
 
-    def _make_socket_dir(self) -> Path:
-        folder = self.socket_dir()
-        if folder == self.data:
-            return folder
-        folder.mkdir(mode=0o700, exist_ok=True)
-        give_to_server_user(folder)
-        status = folder.lstat()
-        if not stat.S_ISDIR(status.st_mode) or status.st_mode & 0o077:
+    def _refuse_others(self) -> None:
+        """Raise EmbeddedServerError when the data folder is not ours alone, as PostgreSQL would."""
+        try:
+            status = self.data.stat()
+        except FileNotFoundError:
+            return
+        if status.st_uid != server_uid() or status.st_mode & 0o027:
             raise EmbeddedServerError(
-                f"{folder}: open to other users, so no place for a socket; remove it"
+                f"{self.data}: of user {status.st_uid}, mode {status.st_mode & 0o777:o}: only a"
+                f" folder that {server_user()} alone can write is trusted; set MAPFOLD_HOME to"
+                " another folder, or give a database of your own with --db"
             )
-        return folder
 
     def _run(self, program: str, *arguments: str) -> None:
         # Output goes to a file: the server inherits it, and a pipe would never see its end.
@@ -175,6 +178,17 @@ class Cluster:
             text = output.read().decode("utf-8", "replace")
         if result.returncode:
             raise subprocess.CalledProcessError(result.returncode, program, text)
+
+
+def _forget_dead_server(*locks: Path) -> None:
+    """Remove the lock files of a killed server that PostgreSQL would take for alive."""
+    for lock in locks:
+        # No such file, no such process, or no /proc on this system: nothing to forget.
+        with contextlib.suppress(OSError, IndexError):
+            pid = lock.read_text().split()[0]
+            status = Path("/proc", pid, "stat").read_text()
+            if status.rpartition(")")[2].split()[0] == "Z":
+                lock.unlink()
 
 
 @contextlib.contextmanager

@@ -282,6 +282,8 @@ def _missing(name: str, where: str) -> str:
 
 def _advice(error: psycopg.Error, url: str) -> str:
     text = str(error)
+    if "requirepeer" in text:
+        return "another user's server answers there; stop it, or set MAPFOLD_HOME to another folder"
     log = embedded_log(url)
     if log is not None:
         return f"the embedded server went away; its log: {log}"

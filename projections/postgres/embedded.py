@@ -27,10 +27,12 @@ from psycopg.conninfo import conninfo_to_dict
 from projections.errors import EmbeddedServerError
 
 from ._cluster import LOG_NAME, SUPERUSER, Cluster
+from ._system_user import server_user
 
 DEFAULT_HOME: Final = ".mapfold"
 RETRY_SECONDS: Final = 10.0
 """After a killed server its children need a moment to notice; until then a start is refused."""
+ASK_SECONDS: Final = 10
 
 
 def mapfold_home() -> Path:
@@ -65,6 +67,10 @@ def embedded_log(url: str) -> Path | None:
     return server.data / LOG_NAME if host == str(server.socket_dir()) else None
 
 
+def _not_through_a_link(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+
+
 @contextlib.contextmanager
 def _signals_wait() -> Iterator[None]:
     """Ctrl-C and SIGTERM wait until a start is through: half-started, nobody would stop it."""
@@ -92,9 +98,15 @@ class EmbeddedServer:
         return self.url_of("postgres")
 
     def url_of(self, database: str) -> str:
-        """URL of one database of the server."""
-        socket_dir = quote(str(self._cluster.socket_dir()), safe="")
-        return f"postgresql://{SUPERUSER}@/{quote(database, safe='')}?host={socket_dir}"
+        """URL of one database of the server; a client with it refuses another user's server."""
+        folder = self._cluster.socket_dir()
+        if folder is None:
+            raise EmbeddedServerError(
+                f"{self.data}: too long a path for a socket, which gets a folder when the server"
+                " starts; run mapfold db start"
+            )
+        where = f"host={quote(str(folder), safe='')}&requirepeer={quote(server_user(), safe='')}"
+        return f"postgresql://{SUPERUSER}@/{quote(database, safe='')}?{where}"
 
     @property
     def data(self) -> Path:
@@ -117,11 +129,12 @@ class EmbeddedServer:
             self._cluster.create()
             if not self._cluster.running():
                 self._start_patiently()
+            self._refuse_another_server()
             if self._share is None:
                 self._share = self._open("pg.users")
                 fcntl.flock(self._share, fcntl.LOCK_SH)
             if keep:
-                (self.home / "pg.keep").touch()
+                self._open("pg.keep").close()
         return self
 
     def stop(self, *, discard_keep: bool = False) -> bool:
@@ -169,6 +182,24 @@ class EmbeddedServer:
             else:
                 return
 
+    def _refuse_another_server(self) -> None:
+        """Raise EmbeddedServerError unless what answers is the server of our data folder."""
+        try:
+            with psycopg.connect(self.url, connect_timeout=ASK_SECONDS) as connection:
+                row = connection.execute("SHOW data_directory").fetchone()
+        except psycopg.OperationalError as error:
+            if "requirepeer" not in str(error):
+                return  # still recovering, or full: the command's own connection will say so
+            row = None
+        with contextlib.suppress(OSError):
+            if row is not None and Path(str(row[0])).samefile(self.data):
+                return
+        raise EmbeddedServerError(
+            f"{self.data}: another server answers on its socket"
+            f" ({'data folder ' + str(row[0]) if row else 'it belongs to another user'}); stop that"
+            " one, set MAPFOLD_HOME to another folder, or give a database of your own with --db"
+        )
+
     def _nobody_else(self) -> bool:
         with self._open("pg.users") as users:
             try:
@@ -186,7 +217,7 @@ class EmbeddedServer:
     def _open(self, name: str) -> IO[bytes]:
         try:
             self.home.mkdir(parents=True, exist_ok=True)
-            return (self.home / name).open("ab")
+            return open(self.home / name, "ab", opener=_not_through_a_link)
         except OSError as error:
             raise EmbeddedServerError(
                 f"{self.home / name}: {error.strerror}; set MAPFOLD_HOME to a folder you may write"
