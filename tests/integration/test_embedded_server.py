@@ -142,13 +142,6 @@ def test_starts_again_after_the_server_itself_was_killed(home: Path) -> None:
         assert answers(server)
 
 
-def test_a_path_too_long_for_a_socket(home: Path) -> None:
-    deep = home / ("d" * 60) / ("e" * 60)
-    with EmbeddedServer(deep) as server:
-        assert answers(server)
-    assert not server.running
-
-
 def test_a_path_with_spaces_quotes_and_percent(home: Path) -> None:
     with EmbeddedServer(home / "my robot's 100% café") as server:
         assert answers(server)
