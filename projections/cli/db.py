@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from eventsrc.cli._shell import display, emit, finish, say
+from eventsrc.terminal import visible
 from eventsrc.words import counted
 from projections.postgres.embedded import EmbeddedServer
 from projections.runner import rebuild
@@ -156,5 +157,5 @@ def _tell(reports: list[CheckReport]) -> None:
             rows = "rows" if table.rows is None else counted(table.rows, "row")
             display(
                 f"  not ours: {table.what} {table.table!r} with {rows}; a rebuild drops it."
-                f" Keep a copy: {table.keep}; remove it: {table.remove};"
+                f" Keep a copy: {visible(table.keep)}; remove it: {visible(table.remove)};"
             )

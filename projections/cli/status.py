@@ -6,6 +6,7 @@ import typer
 
 from eventsrc.cli._shell import display, emit, finish, say
 from eventsrc.log import LogInfo, log_info
+from eventsrc.terminal import visible
 from eventsrc.words import counted
 from projections.runner.status import SinkStatus, Status, projection_status
 
@@ -65,14 +66,14 @@ def _tell(info: LogInfo, found: Status) -> None:
         if sink.note:
             say(f"         {sink.note}")
         if sink.unwanted_writers:
-            typer.echo(f"         {_open_to(sink.unwanted_writers)}")
+            display(f"         {_open_to(sink.unwanted_writers)}")
         for letter in sink.dead_letters:
             run = f" (run {letter.run_id})" if letter.run_id else ""
             display(f"         parked: offset {letter.offset:,}{run}: {letter.reason}")
 
 
 def _open_to(roles: tuple[str, ...]) -> str:
-    them = ", ".join(roles)
+    them = ", ".join(map(visible, roles))
     return (
         f"not read-only: {them} may only read the graph, but Apache AGE lets them change it through"
         " cypher(); run mapfold replay with AGE 1.7 or later, or what mapfold db roles prints and"
