@@ -20,6 +20,7 @@ behind it; no offset is given twice. What was recorded in the old file is told a
 
 import errno
 import os
+import secrets
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -35,7 +36,7 @@ from ._file_fault import (
     set_aside,
 )
 from ._group import Group, GroupBuilder
-from ._head import file_head, head_metadata
+from ._head import MARK_SEED, file_head, head_metadata
 from ._naming import ACTIVE, NEW, segment_path
 from .event import NewEvent
 from .fsync import FsyncPolicy, replace_durably, sync_file, write_all
@@ -76,11 +77,13 @@ class ActiveSegment:
     def _name_file(self, base: int) -> None:
         self.file_base = base
         self.path = segment_path(self._log, base, ACTIVE)
+        self._mark_seed = secrets.randbits(32)
 
     def create(self) -> None:
         """Make the file, before the first `write`; events may be taken earlier. Raises OSError."""
         temporary = segment_path(self._log, self.file_base, NEW)
-        head = file_head(head_metadata(self._log_id, self.file_base))
+        seed = {MARK_SEED: f"{self._mark_seed:08x}"}
+        head = file_head(head_metadata(self._log_id, self.file_base, seed))
         fd = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
         try:
             write_all(fd, head)
@@ -159,7 +162,7 @@ class ActiveSegment:
         found = fault_of(self._fd, self.path, self.size)
         if found is not None:
             return found
-        head, body, mark = group.pieces(self.file_base)
+        head, body, mark = group.pieces(self.file_base, self._mark_seed)
         write_all(self._fd, head)
         write_all(self._fd, body)
         if self._syncs:

@@ -6,8 +6,10 @@ from pathlib import Path
 
 from . import _mcap
 from ._bytes import FileBytes
+from ._head import mark_seed
 from ._mcap import BadRecord, Channel
 from ._naming import SEALED, segment_path
+from ._resync import Stretch, resume
 from .segment import ChunkRef, SegmentFile, Unreadable
 
 
@@ -17,6 +19,7 @@ class ActiveFile(SegmentFile):
     def __init__(self, path: Path, base: int) -> None:
         super().__init__(path, base)
         self.position = self.head_bytes
+        self._seed = mark_seed(self.head)
         try:
             self.refresh()
         except BaseException:
@@ -40,7 +43,8 @@ class ActiveFile(SegmentFile):
             return False
         head = _mcap.decode_chunk_head(head_bytes)
         mark_at = self.position + head.length
-        first, following = _mcap.decode_mark(os.pread(self._fd, _mcap.MARK_BYTES, mark_at))
+        mark = os.pread(self._fd, _mcap.MARK_BYTES, mark_at)
+        first, following = _mcap.decode_mark(mark, self._seed)
         if first != self.next_offset:
             raise BadRecord("a commit mark contradicts the one before it")
         chunk = ChunkRef(self.position, head.length, first, following)
@@ -62,13 +66,22 @@ class ActiveFile(SegmentFile):
         no commit mark can follow what was never synced; so where one does, bytes have rotted."""
         while self.position < self.size():
             with FileBytes(self._fd, self.position) as rest:
-                promised = max(_mcap.marks_in(rest), default=0)
+                promised = self._promised_in(rest)
             before = self.next_offset
             if self.refresh() == before:  # else a writer was at work between the two looks
                 if promised <= before:
                     return None
                 return Unreadable(before, promised - 1, f"damaged at byte {self.position}")
         return None
+
+    def _promised_in(self, rest: FileBytes) -> int:
+        """How far marks in ``rest``, which cannot be read, say that the segment was recorded."""
+        stretch = Stretch(0, self.next_offset)
+        at, promised = 0, self.next_offset
+        while at < len(rest):
+            at, said = resume(rest, at, stretch, self._seed)
+            promised = max(promised, said)
+        return promised
 
     def channels_of(self, body: bytes) -> dict[int, Channel]:
         """By id, from the records that lead the chunk."""

@@ -34,10 +34,10 @@ class Group:
     parts: list[bytes]
     schemas: list[bytes]
 
-    def pieces(self, base: int) -> tuple[bytes, bytes, bytes]:
-        """What to write into a file that begins at offset ``base``, in this order: the chunk's
-        head, its messages, its commit mark. The first two are not joined, for the messages are
-        megabytes."""
+    def pieces(self, base: int, mark_seed: int) -> tuple[bytes, bytes, bytes]:
+        """What to write into a file that begins at offset ``base`` and has that mark seed, in this
+        order: the chunk's head, its messages, its commit mark. The first two are not joined, for
+        the messages are megabytes."""
         parts, definitions = self.parts, self.definitions
         if base != self.base:
             if base == self.first:
@@ -49,7 +49,7 @@ class Group:
         size = len(lead) + len(body)
         crc = zlib.crc32(body, zlib.crc32(lead))
         head = _mcap.encode_plain_chunk_head(size, crc, self.first_ns, self.last_ns)
-        return head + lead, body, _mcap.encode_mark(self.first, self.following)
+        return head + lead, body, _mcap.encode_mark(self.first, self.following, mark_seed)
 
 
 class GroupBuilder:

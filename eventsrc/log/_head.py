@@ -9,6 +9,9 @@ from ._mcap import BadRecord, Header, Metadata, Opcode
 
 FORMAT = "1"
 SEGMENT_METADATA = "mapfold.segment"
+MARK_SEED = "mark_seed"
+"""In the head of an active segment: what its commit marks are made with, in hex. Segments of
+earlier versions have none, which is seed 0."""
 HEAD_BYTES = 4096
 """More than any head of ours takes."""
 
@@ -23,6 +26,11 @@ def file_head(metadata: Metadata) -> bytes:
     """Magic, header and our metadata."""
     header = Header(profile=_mcap.PROFILE, library=_mcap.LIBRARY)
     return _mcap.MAGIC + _mcap.encode_all([header, metadata])
+
+
+def mark_seed(head: dict[str, str]) -> int:
+    """The mark seed that the head of an active segment names."""
+    return int(head.get(MARK_SEED, "0"), 16)
 
 
 def head_of(path: Path, base: int) -> dict[str, str]:

@@ -9,7 +9,9 @@ opcode byte, a u64 length and its content, all little-endian.
 
 The *commit mark* is ours: opcode 0x80, from the range the specification leaves to applications, so
 other readers skip it. Content: u64 first offset and u64 next offset of the chunk before it, and
-the CRC-32 of the record up to there. It is written after that chunk is synced.
+the CRC-32 of the record up to there, XORed with the random *mark seed* of its segment: whoever
+publishes bytes that look like a mark does not know the seed. It is written after that chunk is
+synced.
 """
 
 import struct
@@ -38,8 +40,6 @@ from mcap.records import (
     Statistics,
     SummaryOffset,
 )
-
-from ._bytes import FileBytes
 
 MAGIC = b"\x89MCAP0\r\n"
 PROFILE = "mapfold"
@@ -231,31 +231,26 @@ def encode_message_index(channel: int, flat: list[int]) -> bytes:
     return FRAME.pack(Opcode.MESSAGE_INDEX, len(content)) + content
 
 
-def encode_mark(first: int, following: int) -> bytes:
+def encode_mark(first: int, following: int, seed: int) -> bytes:
     """The commit mark of a chunk that holds offsets ``first`` … ``following`` - 1."""
     mark = _MARK.pack(MARK_OPCODE, MARK_BYTES - FRAME.size, first, following)
-    return mark + _CRC.pack(zlib.crc32(mark))
+    return mark + _CRC.pack(zlib.crc32(mark) ^ seed)
 
 
-def decode_mark(data: bytes) -> tuple[int, int]:
-    """First and next offset of a commit mark."""
+def decode_mark(data: bytes, seed: int) -> tuple[int, int]:
+    """First and next offset of a commit mark of a segment with that mark seed."""
     if len(data) < MARK_BYTES:
         raise BadRecord("cut short inside a commit mark")
     opcode, _, first, following = _MARK.unpack_from(data)
-    (crc,) = _CRC.unpack_from(data, _MARK.size)
-    if opcode != MARK_OPCODE or crc != zlib.crc32(data[: _MARK.size]):
+    if opcode != MARK_OPCODE or seed_of_mark(data) != seed:
         raise BadRecord("no commit mark where one should stand")
     return first, following
 
 
-def marks_in(data: FileBytes) -> Iterator[int]:
-    """The next offset of every good commit mark anywhere in ``data``."""
-    at = -1
-    while (at := data.find(MARK_PATTERN, at + 1)) >= 0:
-        try:
-            yield decode_mark(data[at : at + MARK_BYTES])[1]
-        except BadRecord:
-            continue
+def seed_of_mark(mark: bytes) -> int:
+    """The mark seed of the segment, if ``mark`` is a good commit mark."""
+    (crc,) = _CRC.unpack_from(mark, _MARK.size)
+    return int(crc) ^ zlib.crc32(mark[: _MARK.size])
 
 
 def walk(body: bytes) -> Iterator[tuple[int, int, int, int, int, int]]:

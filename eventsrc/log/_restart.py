@@ -26,6 +26,7 @@ from eventsrc.errors import LogDamaged, NotALog
 
 from . import _mcap
 from ._active_file import ActiveFile
+from ._head import head_of, mark_seed
 from ._naming import ACTIVE, SegmentPath, leftovers, list_segments, segment_path
 from ._scan import Scan, scan_active
 from ._seal import NO_PREVIOUS, SegmentPlan, file_sha256, seal
@@ -171,7 +172,8 @@ def _finish(left: _Leftover) -> None:
         if left.marked < len(left.scan.chunks):
             os.ftruncate(fd, last.position + last.length)
             sync_file(fd)
-            write_all(fd, _mcap.encode_mark(last.first, last.following))
+            seed = mark_seed(head_of(left.segment.path, left.segment.base))
+            write_all(fd, _mcap.encode_mark(last.first, last.following, seed))
         elif os.fstat(fd).st_size > left.position:
             os.ftruncate(fd, left.position)
         sync_file(fd)

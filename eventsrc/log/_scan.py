@@ -1,8 +1,7 @@
 """What can still be read of an active segment, whatever happened to its bytes.
 
 The file is a row of chunks and commit marks. A chunk counts when its CRC holds and its sequence
-numbers continue. Where no good chunk stands, the next one is searched for: close by (a damaged
-mark or head), else behind the next commit mark. Then:
+numbers continue. Where no good chunk stands, `_resync` says where reading can go on. Then:
 
 * Bytes at the end that no good chunk and no commit mark follows are *torn*: the write that a crash
   cut short. They were never synced, so nobody was told that they are recorded.
@@ -10,19 +9,24 @@ mark or head), else behind the next commit mark. Then:
   synced once. Its offsets are known from what stands around it, and named as a gap.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Final, NamedTuple
 
 from eventsrc.errors import LogDamaged, NotALog
 
 from . import _mcap
 from ._bytes import FileBytes
-from ._head import HEAD_BYTES, read_head
+from ._head import HEAD_BYTES, mark_seed, read_head
 from ._mcap import BadRecord, Channel
+from ._resync import Stretch, resume
 from .segment import ChunkRef
 
-_NEAR = 4096
 _IN_A_CHUNK = (_mcap.Opcode.SCHEMA, _mcap.Opcode.CHANNEL, _mcap.Opcode.MESSAGE)
+_MOST_TRIED: Final = 64
+"""So many times the size of a file is spent on what seems to be a chunk in it, at most; a sparse
+file may be of any size."""
 
 
 @dataclass(slots=True)
@@ -83,28 +87,90 @@ def scan_active(path: Path, base: int) -> Scan:
         return _Scanner(path, base, data).run()
 
 
+class _Row(NamedTuple):
+    """Bytes ``start`` to ``end`` are good chunks and their marks, made with ``seed``."""
+
+    start: int
+    end: int
+    seed: int | None
+
+
 class _Scanner:
     def __init__(self, path: Path, base: int, data: FileBytes) -> None:
         self._path = path
         self._data = data
         self._at = 0
+        self._good_end = 0
         self._promised = base
+        self._seed: int | None = None
         self.result = Scan(base, None, next_offset=base)
 
     def run(self) -> Scan:
         self._read_head()
         while self._at < len(self._data):
             if not self._take_chunk(self._at):
-                self._resync()
+                self._pass_by()
         self.result.gap_up_to(self._promised)
         return self.result
 
     def _read_head(self) -> None:
         try:
             head, self._at = read_head(self._path, self._data[:HEAD_BYTES], self.result.base)
-            self.result.log_id = head["log_id"]
         except (LogDamaged, NotALog):
-            self._resync()
+            self._find_first_chunk()
+        else:
+            self.result.log_id = head["log_id"]
+            self._seed = mark_seed(head)
+        self._good_end = self._at
+
+    def _find_first_chunk(self) -> None:
+        """Where the head of the file is damaged, the row of good chunks that ends last tells the
+        seed, for nothing in a chunk ends behind it; reading starts with the first row of that seed.
+        """
+        rows = list(self._rows())
+        if rows:
+            self._seed = max(rows, key=lambda row: row.end).seed
+        starts = [row.start for row in rows if row.seed == self._seed]
+        self._at = min(starts, default=len(self._data))
+        self._lose(0)
+
+    def _rows(self) -> Iterator[_Row]:
+        """Good chunks with their marks, one directly behind the other, wherever they stand."""
+        at = -1
+        effort = _MOST_TRIED * min(len(self._data), _mcap.MAX_CHUNK_BYTES)
+        while effort > 0 and (at := self._data.find(b"\x06", at + 1)) >= 0:
+            try:
+                head = _mcap.decode_chunk_head(self._data[at : at + _mcap.PLAIN_CHUNK_HEAD])
+            except BadRecord:
+                continue
+            effort -= head.length if at + head.length <= len(self._data) else 0
+            row = self._row_at(at)
+            if row is not None:
+                yield row
+                at = row.end - 1
+
+    def _row_at(self, start: int) -> _Row | None:
+        seed: int | None = None
+        end = at = start
+        while True:
+            try:
+                length, first, following = chunk_extent(self._data, at, self.result)
+            except BadRecord:
+                return _Row(start, end, seed) if end > start else None
+            end = at = at + length
+            found = self._seed_of(at, first, following)
+            if found is None or seed not in (None, found):
+                return _Row(start, end, seed)
+            seed = found
+            at += _mcap.MARK_BYTES
+
+    def _seed_of(self, at: int, first: int, following: int) -> int | None:
+        """The seed of the mark at byte ``at``, if it is that of a chunk of these offsets."""
+        mark = self._data[at : at + _mcap.MARK_BYTES]
+        if len(mark) < _mcap.MARK_BYTES:
+            return None
+        seed = _mcap.seed_of_mark(mark)
+        return seed if mark == _mcap.encode_mark(first, following, seed) else None
 
     def _take_chunk(self, at: int) -> bool:
         """Accept the chunk at ``at`` and its mark; False when none is there."""
@@ -116,45 +182,23 @@ class _Scanner:
             return False
         self.result.take(ChunkRef(at, length, first, following))
         self._at = at + length
-        self._take_mark()
+        if self._seed is not None and self._seed_of(self._at, first, following) == self._seed:
+            self._at += _mcap.MARK_BYTES
+        self._good_end = self._at
         return True
 
-    def _take_mark(self) -> None:
-        try:
-            _, following = _mcap.decode_mark(self._data[self._at : self._at + _mcap.MARK_BYTES])
-        except BadRecord:
-            return
-        self._promised = max(self._promised, following)
-        self._at += _mcap.MARK_BYTES
-
-    def _resync(self) -> None:
-        """Move to where reading can go on: a good chunk close by, behind a mark, or the end."""
+    def _pass_by(self) -> None:
+        """Move on from a record that cannot be read."""
         start = self._at
-        self._at = self._near_chunk(start) or self._after_mark(start) or len(self._data)
+        stretch = Stretch(self._good_end, self.result.next_offset)
+        self._at, promised = resume(self._data, start, stretch, self._seed)
+        self._promised = max(self._promised, promised)
+        self._lose(start)
+
+    def _lose(self, start: int) -> None:
         self.result.lost_bytes += self._at - start
         if self._at == len(self._data):
             self.result.torn_events += _count_begun(self._data, start)
-
-    def _near_chunk(self, start: int) -> int | None:
-        at = start
-        while (at := self._data.find(b"\x06", at + 1, start + _NEAR)) >= 0:
-            try:
-                chunk_extent(self._data, at, self.result)
-            except BadRecord:
-                continue
-            return at
-        return None
-
-    def _after_mark(self, start: int) -> int | None:
-        at = start - 1
-        while (at := self._data.find(_mcap.MARK_PATTERN, at + 1)) >= 0:
-            try:
-                _, following = _mcap.decode_mark(self._data[at : at + _mcap.MARK_BYTES])
-            except BadRecord:
-                continue
-            self._promised = max(self._promised, following)
-            return at + _mcap.MARK_BYTES
-        return None
 
 
 def _count_begun(data: FileBytes, torn: int) -> int:

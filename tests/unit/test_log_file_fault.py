@@ -9,7 +9,8 @@ import pytest
 from mcap.reader import SeekingReader
 
 from eventsrc.errors import LogDamaged, LogError
-from eventsrc.log import LogReader, LogWriter, _active, recover_log, verify_log
+from eventsrc.log import LogReader, LogWriter, _active, _mcap, recover_log, verify_log
+from eventsrc.log._head import head_of, mark_seed
 from eventsrc.log._naming import ACTIVE, SEALED, segment_path
 from eventsrc.log._schemas import schema_of
 from eventsrc.system_events import LOSS_KEY
@@ -126,6 +127,24 @@ def test_recovery_puts_losses_in_the_place_of_what_is_gone(log_path: Path, tampe
     events = read_log(log_path)
     assert [event.key for event in events] == [LOSS_KEY] * BEFORE + [KEY] * 3
     assert not {"gap", "chain", "crc"} & {finding.kind for finding in verify_log(log_path).findings}
+
+
+def test_the_new_file_has_a_mark_seed_of_its_own(log_path: Path) -> None:
+    """By which its marks are read, while it grows, and which nobody learns from the old file."""
+    writer = LogWriter(log_path, fsync=BY_HAND)
+    write(writer, range(BEFORE))
+    old = growing(log_path)
+    rename(old)
+    write(writer, range(BEFORE, 6))
+    new = growing(log_path)
+    assert [event.payload for event in read_log(log_path, BEFORE)] == [b"3", b"4", b"5"]
+    seeds = [mark_seed(head_of(*file)) for file in ((old.with_name("elsewhere"), 0), (new, BEFORE))]
+    assert seeds[0] != seeds[1]
+    for file, seed, first in zip((old.with_name("elsewhere"), new), seeds, (0, 3), strict=True):
+        for number in range(first, first + 3):
+            assert _mcap.encode_mark(number, number + 1, seed) in file.read_bytes()
+    with pytest.raises(LogError):
+        writer.close()
 
 
 def test_what_was_not_cut_off_is_read(log_path: Path) -> None:

@@ -19,7 +19,7 @@ from eventsrc.log import (
     recover_log,
     verify_log,
 )
-from eventsrc.log._head import file_head, head_metadata
+from eventsrc.log._head import HEAD_BYTES, read_head
 from eventsrc.log._naming import ACTIVE, SEALED, segment_path
 from eventsrc.log._sealer import Sealer
 from tests.fixtures_log import KEY, flip, read_log
@@ -163,7 +163,7 @@ def test_a_segment_that_was_deleted_before_it_was_sealed_is_told(log_path: Path)
 
 def with_a_cut_message(data: bytes) -> bytes:
     """The last byte of the message goes, and every length and checksum around it is made right."""
-    at = len(file_head(head_metadata("0" * 32, 0)))
+    at = read_head(Path("a segment"), data[:HEAD_BYTES], 0)[1]
     head = _mcap.decode_chunk_head(data[at:])
     body = _mcap.decode_chunk(data[at : at + head.length])[:-1]
     made = _mcap.encode_plain_chunk_head(len(body), zlib.crc32(body), 0, 0)

@@ -52,9 +52,9 @@ def chunk(body: bytes) -> bytes:
     return record(0x06, times + sizes + text("") + struct.pack("<Q", len(body)) + body)
 
 
-def mark(first: int, following: int) -> bytes:
+def mark(first: int, following: int, seed: int = 0) -> bytes:
     start = struct.pack("<BQQQ", 0x80, 20, first, following)
-    return start + struct.pack("<I", zlib.crc32(start))
+    return start + struct.pack("<I", zlib.crc32(start) ^ seed)
 
 
 def schema_and_channel() -> bytes:
@@ -121,13 +121,15 @@ def test_our_writer_makes_the_same_chunks(log_path: Path) -> None:
         writer.append(LOSS_KEY, b"two", logged_ns=7, stamp_ns=8, version=1)
         writer.sync()
         data = next(log_path.glob("*.active")).read_bytes()
+    at = data.index(b"mark_seed") + len(b"mark_seed")
+    seed = int(data[at + 4 : at + 12], 16)
     metadata = mapping({"mapfold.envelope_version": "1"})
     channel = record(0x04, struct.pack("<HH", 1, 1) + text(LOSS_KEY) + text("json") + metadata)
     body = channel + record(0x05, struct.pack("<HIQQ", 1, 1, 7, 8) + b"two")
     sizes = struct.pack("<QI", len(body), zlib.crc32(body))
     times = struct.pack("<QQ", 7, 7)
     last = record(0x06, times + sizes + text("") + struct.pack("<Q", len(body)) + body)
-    assert data.endswith(mark(0, 1) + last + mark(1, 2))
+    assert data.endswith(mark(0, 1, seed) + last + mark(1, 2, seed))
 
 
 @pytest.fixture
