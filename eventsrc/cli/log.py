@@ -1,5 +1,6 @@
 """`mapfold log …`: look at a log."""
 
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,6 +20,7 @@ from eventsrc.log import (
     verify_log,
 )
 from eventsrc.log.reader import OnGap
+from eventsrc.log.recover import UNASKED_LOSSES
 from eventsrc.log.whence import resolve, resolve_start
 from eventsrc.terminal import visible
 from eventsrc.words import counted
@@ -171,23 +173,33 @@ def _finding_text(finding: Finding) -> str:
 
 
 @log_app.command()
-def recover(log: LogArgument, json_: JsonOption = False) -> None:
+def recover(
+    log: LogArgument,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Add however many loss events the log asks for.")
+    ] = False,
+    json_: JsonOption = False,
+) -> None:
     """Bring a damaged or left-over log back in order, keeping everything that can be read.
 
-    Originals in which something recorded is damaged stay beside as *.damaged; lost offsets become
-    mapfold/loss events. Exit 0: nothing was lost, 3: something was.
+    Originals in which something recorded is damaged stay beside as *.damaged, segments of other
+    logs as *.foreign, those that others hold as *.duplicate; files with exchanged names get their
+    own back. Lost offsets become mapfold/loss events; without --yes at most 100,000 more than the
+    damaged bytes can have held. Exit 0: nothing was lost or out of place, 3: something was.
     """
-    report = recover_log(log)
+    report = recover_log(log, most_losses=sys.maxsize if yes else UNASKED_LOSSES)
     if json_:
         emit({**asdict(report), "path": str(log)})
+    for moved in report.moved:
+        say(f"{moved.name}: is now {moved.now}: {moved.reason}")
     for segment in report.segments:
         say(_recovery_text(segment))
     say(
         f"{log}: {counted(report.events, 'event')}"
-        if report.segments
+        if report.segments or report.moved
         else f"{log}: nothing to recover"
     )
-    finish(findings=report.lost)
+    finish(findings=report.findings)
 
 
 def _recovery_text(segment: SegmentRecovery) -> str:

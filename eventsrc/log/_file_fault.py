@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from ._naming import DAMAGED
+from ._naming import DAMAGED, free_name
 
 
 class Identity(NamedTuple):
@@ -83,15 +83,8 @@ def fault_of(fd: int, path: Path, size: int) -> Found | None:
 
 def set_aside(path: Path) -> None:
     """Rename what stands at ``path``, if anything does, as recovery names what it replaces."""
-    number = 1
-    while True:
-        suffix = DAMAGED if number == 1 else f"{DAMAGED}-{number}"
-        copy = path.with_name(path.name + suffix)
-        if not copy.exists():
-            break
-        number += 1
     if path.exists():
-        path.rename(copy)
+        path.rename(free_name(path, DAMAGED))
 
 
 def is_readable_segment(path: Path, head_size: int) -> bool:

@@ -18,17 +18,18 @@ _HEAD = struct.Struct("<QQQII")
 _U64 = struct.Struct("<Q")
 
 
-def check_size(what: str, size: int) -> None:
+def check_size(what: str, size: int, most: int) -> None:
     """BadRecord when a ``what`` declares a ``size`` that is over the limit."""
-    if size > MAX_FOREIGN_BYTES:
+    if size > most:
         raise BadRecord(
-            f"a {what} declares {size:,} bytes, more than {MAX_FOREIGN_BYTES:,} are read; if that "
+            f"a {what} declares {size:,} bytes, more than {most:,} are read; if that "
             "is right, write the file again in smaller chunks (`mcap compress --chunk-size`)"
         )
 
 
-def foreign_body(content: bytes) -> bytes:
-    """The records in the chunk whose record has this content. Raises BadRecord."""
+def foreign_body(content: bytes, most: int) -> bytes:
+    """The records in the chunk whose record has this content, ``most`` bytes of them at most.
+    Raises BadRecord."""
     try:
         _, _, size, crc, name_size = _HEAD.unpack_from(content)
         data_at = _HEAD.size + name_size + _U64.size
@@ -36,7 +37,7 @@ def foreign_body(content: bytes) -> bytes:
     except struct.error:
         raise BadRecord("a chunk's head is cut short") from None
     name = content[_HEAD.size : _HEAD.size + name_size]
-    check_size("chunk", size)
+    check_size("chunk", size, most)
     if data_at + data_size > len(content):
         raise BadRecord("a chunk's content is longer than the chunk")
     body = _plain(name, content[data_at : data_at + data_size], size)

@@ -1,5 +1,6 @@
 """The head of every segment: magic, MCAP header, and metadata that say whose segment it is."""
 
+import re
 from pathlib import Path
 
 from eventsrc.errors import LogDamaged, NotALog
@@ -9,9 +10,12 @@ from ._mcap import BadRecord, Header, Metadata, Opcode
 
 FORMAT = "1"
 SEGMENT_METADATA = "mapfold.segment"
+PREVIOUS = "previous_sha256"
+"""In the head of a sealed segment, and of no active one: the hash of the segment before."""
 MARK_SEED = "mark_seed"
 """In the head of an active segment: what its commit marks are made with, in hex. Segments of
 earlier versions have none, which is seed 0."""
+_BASE = re.compile(r"\d{1,20}", re.ASCII)
 HEAD_BYTES = 4096
 """More than any head of ours takes."""
 
@@ -33,18 +37,39 @@ def mark_seed(head: dict[str, str]) -> int:
     return int(head.get(MARK_SEED, "0"), 16)
 
 
+class WrongPlace(LogDamaged):
+    """A whole segment under the name of another one. Inside ``eventsrc.log`` only."""
+
+
 def head_of(path: Path, base: int) -> dict[str, str]:
     """Our metadata at the head of the segment at ``path``; see `read_head`."""
     with path.open("rb") as file:
         return read_head(path, file.read(HEAD_BYTES), base)[0]
 
 
+def claims_of(path: Path) -> dict[str, str]:
+    """The same, whatever base the head names."""
+    with path.open("rb") as file:
+        return _read_head(path, file.read(HEAD_BYTES))[0]
+
+
 def read_head(path: Path, data: bytes, base: int) -> tuple[dict[str, str], int]:
-    """Our metadata at the head of a segment and the byte after it."""
+    """Our metadata at the head of a segment and the byte after it. Raises WrongPlace when it is not
+    the segment at offset ``base``, LogDamaged when it cannot be read, NotALog when it is none."""
+    values, end = _read_head(path, data)
+    if values["base"] != str(base):
+        raise WrongPlace(
+            f"{path} was written as the segment at offset {values['base']}, not {base}; "
+            f"run `mapfold log recover {path.parent}`, which gives files their right names"
+        )
+    return values, end
+
+
+def _read_head(path: Path, data: bytes) -> tuple[dict[str, str], int]:
     if not data.startswith(_mcap.MAGIC) and not _mcap.MAGIC.startswith(data):
         raise NotALog(f"{path} is no MCAP file; it does not belong into a log, move it away")
     try:
-        head = _find_head(data, base)
+        head = _find_head(data)
     except BadRecord as error:
         raise LogDamaged(
             f"{path}: damaged head: {error}; run `mapfold log recover {path.parent}`"
@@ -54,29 +79,30 @@ def read_head(path: Path, data: bytes, base: int) -> tuple[dict[str, str], int]:
     return head
 
 
-def _find_head(data: bytes, base: int) -> tuple[dict[str, str], int] | None:
+def _find_head(data: bytes) -> tuple[dict[str, str], int] | None:
     """None for an MCAP head that is not ours."""
     at = len(_mcap.MAGIC)
-    profile = _mcap.PROFILE
+    ours = True
     try:
         for opcode, content in _mcap.records(data[at:]):
             at += _mcap.FRAME.size + len(content)
             if opcode == Opcode.HEADER:
-                profile = _mcap.decode_as(Header, content).profile
+                header = _mcap.decode_as(Header, content)
+                ours = (header.profile, header.library) == (_mcap.PROFILE, _mcap.LIBRARY)
             elif opcode == Opcode.METADATA:
                 metadata = _mcap.decode_as(Metadata, content)
                 if metadata.name == SEGMENT_METADATA:
-                    return _checked_head(metadata, base), at
+                    return _checked_head(metadata), at
     except BadRecord:
-        if profile == _mcap.PROFILE:
+        if ours:
             raise
-    if profile == _mcap.PROFILE:
+    if ours:
         raise BadRecord("it ends before the segment's metadata")
     return None
 
 
-def _checked_head(metadata: Metadata, base: int) -> dict[str, str]:
+def _checked_head(metadata: Metadata) -> dict[str, str]:
     values = _mcap.checked_metadata(metadata)
-    if values["base"] != str(base):
-        raise BadRecord(f"it was written as the segment at offset {values['base']}, not {base}")
+    if not _BASE.fullmatch(values.get("base", "")) or "log_id" not in values:
+        raise BadRecord("the segment's metadata names no log or no base")
     return values

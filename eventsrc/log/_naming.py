@@ -4,6 +4,8 @@
     00000000000000004711.mcap.active   growing, or left over and not sealed yet
     ….mcap.new / .mcap.sealing         being made; means nothing until renamed, safe to delete
     ….mcap.damaged, .mcap.active.damaged   what `mapfold log recover` replaced, kept for a person
+    ….foreign, ….duplicate                 what it set aside: of another log; held by other segments
+    ….misnamed                             a segment that it is giving its right name
     lock                               held by the one writer
 
 A segment is named by its base, the offset of its first event. While a sealed file takes the place
@@ -19,9 +21,13 @@ ACTIVE = ".mcap.active"
 NEW = ".mcap.new"
 SEALING = ".mcap.sealing"
 DAMAGED = ".damaged"
+FOREIGN = ".foreign"
+DUPLICATE = ".duplicate"
+MISNAMED = ".misnamed"
 LOCK = "lock"
 
 _NAME = re.compile(r"(\d{20})(\.mcap|\.mcap\.active)")
+_MISNAMED = re.compile(_NAME.pattern + r"\.misnamed(-\d+)?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,14 +47,24 @@ def segment_path(log: Path, base: int, suffix: str) -> Path:
 def list_segments(log: Path) -> list[SegmentPath]:
     """The segments of ``log`` in offset order, one for each base."""
     found: dict[int, SegmentPath] = {}
-    for entry in log.iterdir():
-        match = _NAME.fullmatch(entry.name)
-        if match is None:
-            continue
-        segment = SegmentPath(entry, int(match[1]), match[2] == SEALED)
+    for segment in segment_files(log):
         if segment.sealed or segment.base not in found:
             found[segment.base] = segment
     return [found[base] for base in sorted(found)]
+
+
+def segment_files(log: Path) -> list[SegmentPath]:
+    """Every file of ``log`` that is named as a segment; two of one base while one is sealed."""
+    matches = ((entry, _NAME.fullmatch(entry.name)) for entry in log.iterdir())
+    return sorted(
+        (SegmentPath(entry, int(m[1]), m[2] == SEALED) for entry, m in matches if m is not None),
+        key=lambda segment: segment.path.name,
+    )
+
+
+def half_renamed(log: Path) -> list[Path]:
+    """Segments that a recovery was giving their right names when it was interrupted."""
+    return sorted(p for p in log.iterdir() if _MISNAMED.fullmatch(p.name))
 
 
 def list_growing(log: Path) -> list[SegmentPath]:
@@ -65,3 +81,14 @@ def list_growing(log: Path) -> list[SegmentPath]:
 def leftovers(log: Path) -> list[Path]:
     """Half-made files that a crash left behind; they hold nothing that is not elsewhere."""
     return sorted(p for p in log.iterdir() if p.name.endswith((NEW, SEALING)))
+
+
+def free_name(path: Path, suffix: str) -> Path:
+    """``path`` with a suffix that no other file has."""
+    number = 1
+    while True:
+        counted = suffix if number == 1 else f"{suffix}-{number}"
+        free = path.with_name(path.name + counted)
+        if not free.exists():
+            return free
+        number += 1

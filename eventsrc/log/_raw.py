@@ -13,6 +13,8 @@ from .segment import ChunkRef
 
 def read_body(fd: int, chunk: ChunkRef) -> bytes:
     """The body of a chunk that has been checked already."""
+    if chunk.body is not None:
+        return chunk.body()
     return _mcap.read_chunk(partial(os.pread, fd), chunk.length, chunk.position)
 
 

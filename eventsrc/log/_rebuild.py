@@ -9,6 +9,7 @@ when the log was recovered says nothing about when that was which is lost.
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from eventsrc.envelope import ENVELOPE_VERSION
@@ -102,4 +103,33 @@ def _losses(base: int, channel: int, first: int, following: int, when: Moment) -
             channel, offset - base, when.logged_ns, when.stamp_ns, len(payload)
         )
         parts += (head, payload)
+    return b"".join(parts)
+
+
+def trimmed(source: Path, scan: Scan, first: int, end: int) -> Scan:
+    """What ``scan`` found in ``source`` from offset ``first`` to before ``end``, as a segment of
+    its own; offsets that are missing at its end are left out of it."""
+    rest = Scan(first, scan.log_id, next_offset=first, channels=scan.channels)
+    for chunk in scan.chunks:
+        offsets = range(max(first, chunk.first), min(end, chunk.following))
+        if offsets:
+            body = partial(_cut_out, source, chunk, scan.base, offsets, first)
+            rest.take(ChunkRef(0, chunk.length, offsets.start, offsets.stop, body=body))
+    return rest
+
+
+def _cut_out(source: Path, chunk: ChunkRef, base: int, offsets: range, new_base: int) -> bytes:
+    """The messages of a chunk that have these offsets, counted from another base."""
+    fd = os.open(source, os.O_RDONLY)
+    try:
+        body = read_body(fd, chunk)
+    finally:
+        os.close(fd)
+    schemas, channels = _mcap.definitions(body)
+    parts = [_mcap.encode_all([*schemas, *channels])]
+    for channel, sequence, log_ns, stamp_ns, at, end in _mcap.walk(body):
+        offset = base + sequence
+        if offset in offsets:
+            head = _mcap.encode_message_head(channel, offset - new_base, log_ns, stamp_ns, end - at)
+            parts += (head, body[at:end])
     return b"".join(parts)

@@ -27,7 +27,14 @@ from eventsrc.errors import LogDamaged, NotALog
 from . import _mcap
 from ._active_file import ActiveFile
 from ._head import head_of, mark_seed
-from ._naming import ACTIVE, SegmentPath, leftovers, list_segments, segment_path
+from ._naming import (
+    ACTIVE,
+    SegmentPath,
+    half_renamed,
+    leftovers,
+    list_segments,
+    segment_path,
+)
 from ._scan import Scan, scan_active
 from ._seal import NO_PREVIOUS, SegmentPlan, file_sha256, seal
 from ._sealed_file import SealedFile
@@ -75,13 +82,15 @@ class _Leftover:
 def restart(log: Path) -> Restart:
     """Put in order what is left over. The caller holds the writer lock.
 
-    Raises LogDamaged for rot in what a writer goes by, and when the first and the last segment and
-    those that are left over are not of one log.
+    Raises LogDamaged for rot in what a writer goes by, when the segments are not all of one log,
+    and when one has the name of another.
     """
     for path in leftovers(log):
         unlink_quietly(path)
+    for path in half_renamed(log):
+        raise LogDamaged(f"{path}: a recovery was interrupted; run `mapfold log recover {log}`")
     segments = list_segments(log)
-    log_id_of([*segments[:1], *(s for s in segments[1:-1] if not s.sealed), *segments[-1:]])
+    log_id_of(segments)
     for segment in [s for s in segments if s.sealed][-1:]:
         SealedFile(segment.path, segment.base).close()  # before anything is changed
     for segment in segments:
@@ -133,6 +142,11 @@ def _look_at(segment: SegmentPath, reach: int | None) -> _Leftover:
     scan = scan_active(segment.path, segment.base)
     scan.gap_up_to(reach or segment.base)
     _refuse_rot(segment.path, scan)
+    if scan.rewritten:
+        raise LogDamaged(
+            f"{segment.path}: another program has rewritten it; "
+            f"run `mapfold log recover {segment.path.parent}`"
+        )
     if not scan.chunks:
         return _Leftover(segment, scan, 0, 0)
     file = ActiveFile(segment.path, segment.base)

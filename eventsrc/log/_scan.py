@@ -18,9 +18,10 @@ from eventsrc.errors import LogDamaged, NotALog
 
 from . import _mcap
 from ._bytes import FileBytes
-from ._head import HEAD_BYTES, mark_seed, read_head
+from ._head import HEAD_BYTES, WrongPlace, mark_seed, read_head
 from ._mcap import BadRecord, Channel
 from ._resync import Stretch, resume
+from ._rewritten import is_rewritten, take_messages
 from .segment import ChunkRef
 
 _IN_A_CHUNK = (_mcap.Opcode.SCHEMA, _mcap.Opcode.CHANNEL, _mcap.Opcode.MESSAGE)
@@ -44,6 +45,8 @@ class Scan:
     torn_events: int = 0
     """Events that had begun to be written in the torn end; none of them was synced."""
     next_offset: int = 0
+    rewritten: bool = False
+    """Whether another program has written the file that it is in now."""
     channels: dict[int, Channel] = field(default_factory=dict)
     """What the segment's index says of channels; its chunks name their own as well."""
 
@@ -81,10 +84,15 @@ def chunk_extent(data: FileBytes, at: int, scan: Scan) -> tuple[int, int, int]:
     return head.length, scan.base + first, scan.base + following
 
 
-def scan_active(path: Path, base: int) -> Scan:
-    """Look at every byte of an active segment."""
+def scan_active(path: Path, base: int, following: int | None = None) -> Scan:
+    """Look at every byte of an active segment; ``following`` is the base of the next one, if there
+    is one. Raises WrongPlace for a segment of another base."""
     with FileBytes.of(path) as data:
-        return _Scanner(path, base, data).run()
+        scan = _Scanner(path, base, data).run()
+        scan.rewritten = is_rewritten(data[:HEAD_BYTES])
+    if scan.rewritten:
+        take_messages(path, scan, following)
+    return scan
 
 
 class _Row(NamedTuple):
@@ -116,6 +124,8 @@ class _Scanner:
     def _read_head(self) -> None:
         try:
             head, self._at = read_head(self._path, self._data[:HEAD_BYTES], self.result.base)
+        except WrongPlace:
+            raise
         except (LogDamaged, NotALog):
             self._find_first_chunk()
         else:

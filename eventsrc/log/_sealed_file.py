@@ -101,9 +101,8 @@ class SealedFile(SegmentFile):
         return _mcap.checked_metadata(_mcap.decode_as(Metadata, content))
 
     def _take_chunks(self, indexes: list[tuple[int, int, frozenset[int]]]) -> None:
-        edges = [self.base + int(n) for n in self.seal["chunk_edges"].split(",")]
-        ascending = all(one < other for one, other in pairwise(edges))
-        if len(edges) != len(indexes) + 1 or edges[0] != self.base or not ascending:
+        edges = sealed_edges(self.seal["chunk_edges"], self.base)
+        if len(edges) != len(indexes) + 1:
             raise BadRecord("the seal does not fit the index")
         self.next_offset = edges[-1]
         self.chunks = [
@@ -112,6 +111,15 @@ class SealedFile(SegmentFile):
                 indexes, pairwise(edges), strict=True
             )
         ]
+
+
+def sealed_edges(text: str, base: int) -> list[int]:
+    """The offsets at which the chunks of a segment begin and the last one ends, from its seal.
+    Raises ValueError."""
+    edges = [base + int(number) for number in text.split(",")]
+    if edges[0] != base or any(one >= other for one, other in pairwise(edges)):
+        raise BadRecord("the seal names chunks in no order")
+    return edges
 
 
 def _place(index: ChunkIndex, size: int) -> tuple[int, int, frozenset[int]]:

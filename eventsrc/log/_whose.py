@@ -1,32 +1,50 @@
-"""Whose segments are these? Each says at its head which log it belongs to.
+"""Check that all segments carry the same log id.
 
 Somebody copies, restores, mixes up: a segment of another log has the right name, and every checksum
-in it holds. Nobody but a person knows which file is the wrong one, so nothing is guessed: a reader
-stops at it, a writer does not start, recovery touches nothing.
+in it holds. A reader stops at it and a writer does not start. Recovery goes by the majority, and
+does nothing where there is none.
 """
 
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 
 from eventsrc.errors import LogDamaged, NotALog
 
-from ._head import head_of
+from ._head import WrongPlace, head_of
 from ._naming import SegmentPath
 
 
 def log_id_of(segments: Iterable[SegmentPath]) -> str | None:
     """The log that ``segments`` belong to, as far as their heads can be read. Raises LogDamaged
-    when they name two."""
+    when they name two, and when one has the name of another segment."""
     found: tuple[Path, str] | None = None
     for segment in segments:
         try:
             log_id = head_of(segment.path, segment.base)["log_id"]
+        except WrongPlace:
+            raise
         except (LogDamaged, NotALog):
             continue
         if found is not None and log_id != found[1]:
             raise LogDamaged(mixed_up(segment.path, log_id, *found))
         found = found or (segment.path, log_id)
     return None if found is None else found[1]
+
+
+def majority_of(log_ids: Iterable[tuple[Path, str]]) -> str | None:
+    """The log id that most of these segments carry. Raises LogDamaged when two ids are carried by
+    equally many, for only a person knows then which files are the wrong ones."""
+    by_path = dict(log_ids)
+    ranked = Counter(by_path.values()).most_common(2)
+    if len(ranked) == 2 and ranked[0][1] == ranked[1][1]:
+        one, other = ((p, i) for i, _ in ranked for p in [_first(by_path, i)])
+        raise LogDamaged(mixed_up(*one, *other))
+    return ranked[0][0] if ranked else None
+
+
+def _first(by_path: dict[Path, str], log_id: str) -> Path:
+    return min(path for path, carried in by_path.items() if carried == log_id)
 
 
 def mixed_up(one: Path, log_id: str, other: Path, other_id: str) -> str:

@@ -7,22 +7,35 @@ chunk or a message is passed by in pieces.
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import BinaryIO, Final, NamedTuple
 
 from . import _mcap
-from ._foreign_chunk import check_size, foreign_body
+from ._foreign_chunk import MAX_FOREIGN_BYTES, check_size, foreign_body
 from ._mcap import FRAME, MAGIC, BadRecord, Channel, Opcode
 
 _PIECE: Final = 1024 * 1024
 _MESSAGE: Final = struct.Struct("<HIQQ")
 _CRC: Final = struct.Struct("<I")
-_READ: Final = (Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK, Opcode.DATA_END)
+_OF_MESSAGES: Final = (Opcode.CHANNEL, Opcode.MESSAGE)
 
 
 class ForeignDamage(ValueError):
-    """The file is torn, rotten, or more than is read; says where."""
+    """The file is torn, rotten, or more than is read; says where, which is at byte ``at``."""
+
+    def __init__(self, text: str, at: int) -> None:
+        super().__init__(text)
+        self.at = at
+
+
+class ForeignRecord(NamedTuple):
+    """A record, and the byte at which it stands, or the chunk that it is in."""
+
+    opcode: int
+    content: bytes
+    at: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,11 +59,28 @@ class _Named(NamedTuple):
 def foreign_messages(file: BinaryIO) -> Iterator[ForeignMessage]:
     """Every message, with CRCs checked. Raises ForeignDamage after the last good one."""
     source = _Source(file)
+    with _damage_in(source):
+        yield from _messages(_records(source, _OF_MESSAGES, MAX_FOREIGN_BYTES))
+
+
+def foreign_records(
+    file: BinaryIO, opcodes: Collection[int], most_bytes: int
+) -> Iterator[ForeignRecord]:
+    """Every record of these opcodes, in chunks or not, with CRCs checked; neither it nor its chunk
+    has more than ``most_bytes``. Raises ForeignDamage after the last good one."""
+    source = _Source(file)
+    with _damage_in(source):
+        yield from _records(source, opcodes, most_bytes)
+
+
+@contextmanager
+def _damage_in(source: "_Source") -> Iterator[None]:
     try:
-        yield from _Reading(source).messages()
+        yield
     except BadRecord as error:
+        at = source.record_at
         raise ForeignDamage(
-            f"torn or damaged, or more than is read, at byte {source.record_at:,}: {error}"
+            f"torn or damaged, or more than is read, at byte {at:,}: {error}", at
         ) from None
 
 
@@ -88,68 +118,71 @@ class _Source:
             yield piece
 
 
-class _Reading:
-    def __init__(self, source: _Source) -> None:
-        self._source = source
-        self._channels: dict[int, _Named] = {}
+def _records(source: _Source, opcodes: Collection[int], most: int) -> Iterator[ForeignRecord]:
+    _check_magic(source)
+    while True:
+        source.begin_record()
+        crc = source.crc
+        opcode, length = FRAME.unpack(source.read(FRAME.size))
+        if opcode == 0:  # as in a hole of a sparse file, which may be gigabytes of such "records"
+            raise BadRecord("zeros where a record should stand")
+        if opcode not in (Opcode.CHUNK, Opcode.DATA_END, *opcodes):
+            source.skip(length)
+            if opcode == Opcode.FOOTER:
+                return _check_magic(source)
+            continue
+        check_size("record", length, most)
+        content = source.read(length)
+        if opcode == Opcode.CHUNK:
+            body = foreign_body(content, most)
+            del content
+            for inner, data in _mcap.records(body):
+                if inner in opcodes:
+                    yield ForeignRecord(inner, data, source.record_at)
+        elif opcode == Opcode.DATA_END:
+            _check_data(content, crc)
+        else:
+            yield ForeignRecord(opcode, content, source.record_at)
+
+
+def _check_magic(source: _Source) -> None:
+    if source.read(len(MAGIC)) != MAGIC:
+        raise BadRecord("no MCAP magic")
+
+
+def _check_data(content: bytes, crc: int) -> None:
+    if len(content) < _CRC.size or _CRC.unpack_from(content)[0] not in (0, crc):
+        raise BadRecord("the data does not match its CRC")
+
+
+def _messages(records: Iterator[ForeignRecord]) -> Iterator[ForeignMessage]:
+    channels = _Channels()
+    for opcode, content, _ in records:
+        if opcode == Opcode.CHANNEL:
+            channels.take(content)
+        else:
+            yield channels.message(content)
+
+
+class _Channels:
+    def __init__(self) -> None:
+        self._named: dict[int, _Named] = {}
         self._names_size = 0
 
-    def messages(self) -> Iterator[ForeignMessage]:
-        source = self._source
-        self._check_magic()
-        while True:
-            source.begin_record()
-            crc = source.crc
-            opcode, length = FRAME.unpack(source.read(FRAME.size))
-            if opcode not in _READ:
-                source.skip(length)
-                if opcode == Opcode.FOOTER:
-                    return self._check_magic()
-                continue
-            check_size("record", length)
-            content = source.read(length)
-            if opcode == Opcode.CHUNK:
-                body = foreign_body(content)
-                del content
-                yield from self._messages_in(body)
-            elif opcode == Opcode.DATA_END:
-                self._check_data(content, crc)
-            else:
-                yield from self._take(opcode, content)
-
-    def _check_magic(self) -> None:
-        if self._source.read(len(MAGIC)) != MAGIC:
-            raise BadRecord("no MCAP magic")
-
-    def _check_data(self, content: bytes, crc: int) -> None:
-        if len(content) < _CRC.size or _CRC.unpack_from(content)[0] not in (0, crc):
-            raise BadRecord("the data does not match its CRC")
-
-    def _messages_in(self, body: bytes) -> Iterator[ForeignMessage]:
-        for opcode, content in _mcap.records(body):
-            if opcode in (Opcode.CHANNEL, Opcode.MESSAGE):
-                yield from self._take(opcode, content)
-
-    def _take(self, opcode: int, content: bytes) -> Iterator[ForeignMessage]:
-        if opcode == Opcode.CHANNEL:
-            self._take_channel(content)
-        else:
-            yield self._message(content)
-
-    def _take_channel(self, content: bytes) -> None:
+    def take(self, content: bytes) -> None:
         _mcap.check_definitions(len(content))
         channel = _mcap.decode_as(Channel, content)
         named = _Named(channel.topic, channel.message_encoding)
-        if self._channels.get(channel.id) != named:
+        if self._named.get(channel.id) != named:
             self._names_size += len(named.key) + len(named.encoding)
             _mcap.check_definitions(self._names_size)
-            self._channels[channel.id] = named
+            self._named[channel.id] = named
 
-    def _message(self, content: bytes) -> ForeignMessage:
+    def message(self, content: bytes) -> ForeignMessage:
         if len(content) < _MESSAGE.size:
             raise BadRecord("a message is cut short")
         id_, _, logged_ns, published_ns = _MESSAGE.unpack_from(content)
-        if id_ not in self._channels:
+        if id_ not in self._named:
             raise BadRecord(f"a message of channel {id_}, which nothing defines")
         payload = content[_MESSAGE.size :]
-        return ForeignMessage(*self._channels[id_], logged_ns, published_ns, payload)
+        return ForeignMessage(*self._named[id_], logged_ns, published_ns, payload)

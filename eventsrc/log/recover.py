@@ -9,26 +9,48 @@ log is about to lose.
 """
 
 import uuid
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Final
 
 from eventsrc import _ledger_cache  # which reads logs by this package's reader
 from eventsrc.clock import Clock, system_clock
 from eventsrc.errors import LogDamaged, LogError, NotALog
 
 from ._active import ActiveSegment
+from ._arrange import Arrangement, Moved, set_aside
 from ._check import check_sealed
 from ._head import head_of
 from ._lock import WriterLock
+from ._mcap import MESSAGE_HEAD
 from ._moment import moment_between
-from ._naming import ACTIVE, DAMAGED, SEALED, SegmentPath, leftovers, list_segments, segment_path
-from ._rebuild import rebuild
+from ._naming import (
+    ACTIVE,
+    DAMAGED,
+    DUPLICATE,
+    SEALED,
+    SegmentPath,
+    half_renamed,
+    leftovers,
+    list_segments,
+    segment_path,
+)
+from ._rebuild import rebuild, trimmed
 from ._scan import Scan, scan_active
 from ._scan_sealed import scan_sealed
 from ._seal import NO_PREVIOUS, REPLACES, SegmentPlan, file_sha256
-from ._whose import log_id_of
 from .fsync import GROUP_COMMIT, keep_copy, sync_directory, unlink_quietly
 from .reader import segments_of
+
+UNASKED_LOSSES: Final = 100_000
+"""So many loss events recovery adds unasked, besides those that the damaged bytes can have held."""
+_MOST_IN_A_SEGMENT: Final = 1 << 31
+_BLOCK_BYTES: Final = 512
+"""What `st_blocks` counts, on every file system."""
+
+
+class TooManyLosses(LogError):
+    """Recovery would add more loss events than it was allowed to."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,25 +70,33 @@ class SegmentRecovery:
 
 @dataclass(frozen=True, slots=True)
 class RecoveryReport:
-    """Empty ``segments``: there was nothing to recover."""
+    """``segments`` were rewritten, ``moved`` have other names now. Both empty: there was nothing to
+    recover."""
 
     path: Path
     events: int
     segments: tuple[SegmentRecovery, ...]
+    moved: tuple[Moved, ...]
 
     @property
-    def lost(self) -> bool:
-        """Whether anything is gone, recorded or not."""
-        return any(s.lost_events or s.torn_events or s.lost_bytes for s in self.segments)
+    def findings(self) -> bool:
+        """Whether anything is gone, recorded or not, or did not belong where it stood."""
+        lost = any(s.lost_events or s.torn_events or s.lost_bytes for s in self.segments)
+        return lost or bool(self.moved)
 
 
-def recover_log(log: Path, *, clock: Clock = system_clock) -> RecoveryReport:
+def recover_log(
+    log: Path, *, most_losses: int = UNASKED_LOSSES, clock: Clock = system_clock
+) -> RecoveryReport:
     """Recover a log. Raises LogNotFound, NotALog, LogBusy, LogDamaged when its segments are of two
-    logs, or LogError when the disk refuses."""
-    segments_of(log)
+    logs equally often or one was made by another program, TooManyLosses when more than
+    ``most_losses`` events would be added that the damaged bytes cannot have held, or LogError when
+    the disk refuses."""
+    if not (log.is_dir() and half_renamed(log)):
+        segments_of(log)
     try:
         with WriterLock(log, clock):
-            return _Recovery(log).run()
+            return _Recovery(log, most_losses).run()
     except OSError as error:
         raise LogError(
             f"{log}: {error.strerror or error}; nothing was replaced by less than it held. "
@@ -75,8 +105,11 @@ def recover_log(log: Path, *, clock: Clock = system_clock) -> RecoveryReport:
 
 
 class _Recovery:
-    def __init__(self, log: Path) -> None:
+    def __init__(self, log: Path, most_losses: int) -> None:
         self._log = log
+        self._losses_left = most_losses
+        self._spare: list[SegmentPath] = []
+        """Segments set aside because they overlap others, by base."""
         self._done: list[SegmentRecovery] = []
         self._next = 0
         self._previous: SegmentPath | None = None
@@ -84,14 +117,25 @@ class _Recovery:
     def run(self) -> RecoveryReport:
         for path in leftovers(self._log):
             unlink_quietly(path)
+        arrangement = Arrangement(self._log)
+        arrangement.run()
+        self._moved = arrangement.moved
+        if self._moved:
+            _ledger_cache.forget(self._log)
+        self._log_id = arrangement.log_id or uuid.uuid4().hex
         segments = list_segments(self._log)
-        self._log_id = log_id_of(segments) or uuid.uuid4().hex
         for index, segment in enumerate(segments):
             following = segments[index + 1] if index + 1 < len(segments) else None
             if segment.base > self._next:
+                self._use_spares(segment)
+            if segment.base > self._next:
                 self._replace_missing(segment)
-            self._visit(segment, following)
-        return RecoveryReport(self._log, self._next, tuple(self._done))
+            if segment.base < self._next:
+                self._set_aside_overlapping(segment)
+            else:
+                self._visit(segment, following)
+        self._use_spares(None)
+        return RecoveryReport(self._log, self._next, tuple(self._done), tuple(self._moved))
 
     def _replace_missing(self, following: SegmentPath) -> None:
         """A whole segment is gone: its offsets become losses."""
@@ -100,25 +144,66 @@ class _Recovery:
         self._rewrite(None, scan, following)
 
     def _visit(self, segment: SegmentPath, following: SegmentPath | None) -> None:
-        reach = following.base if following is not None else None
+        reach = following.base if following is not None and not self._spare else None
         if segment.sealed:
             unlink_quietly(segment_path(self._log, segment.base, ACTIVE))
-            scan = scan_sealed(segment.path, segment.base, reach)
-            sound = not scan.gaps and scan.index_fault is None
-            if sound and check_sealed(segment.path).fault is None:
+            scan = _scan(segment, reach)
+            good = not (scan.gaps or scan.rewritten or scan.index_fault)
+            if good and check_sealed(segment.path).fault is None:
                 self._next = scan.next_offset
                 self._previous = segment
                 return
         else:
-            scan = scan_active(segment.path, segment.base)
-            scan.gap_up_to(reach or segment.base)
+            scan = _scan(segment, reach)
             if segment.base == 0 and scan.log_id and scan == Scan(0, scan.log_id):
                 return  # an empty log, and whole
         self._rewrite(segment, scan, following)
 
+    def _set_aside_overlapping(self, segment: SegmentPath) -> None:
+        """A segment that begins before the one in front of it ends, out of a backup for example."""
+        reason = f"it begins before offset {self._next}, where the segment before it ends"
+        _ledger_cache.forget(self._log)
+        moved = set_aside(segment.path, DUPLICATE, reason)
+        self._moved.append(moved)
+        self._spare.append(replace(segment, path=self._log / moved.now))
+
+    def _use_spares(self, following: SegmentPath | None) -> None:
+        """Take from overlapping segments what would be missing otherwise."""
+        for spare in self._spare:
+            scan = _scan(spare, None)
+            if scan.next_offset > self._next:
+                end = scan.next_offset if following is None else following.base
+                rest = trimmed(spare.path, scan, self._next, end)
+                if rest.chunks:
+                    self._rewrite(None, rest, following)
+
+    def _ask(self, segment: SegmentPath | None, scan: Scan, following: SegmentPath | None) -> None:
+        """Raise TooManyLosses rather than add losses without end at the word of one number."""
+        losses = sum(last - first + 1 for first, last in scan.gaps)
+        self._losses_left -= max(0, losses - _damaged_bytes(segment, scan) // MESSAGE_HEAD)
+        if self._losses_left >= 0 and losses <= _MOST_IN_A_SEGMENT:
+            return
+        said = f"{following.path.name} begins there" if following else "its end says so"
+        way_out = (
+            f"If that is right, run `mapfold log recover {self._log} --yes`; else move the file "
+            "that is wrong out of the log"
+            if losses <= _MOST_IN_A_SEGMENT
+            else "No log is that long: move the file that is wrong out of the log"
+        )
+        raise TooManyLosses(
+            f"{self._log}: {losses:,} events from offset {scan.gaps[0][0]} to {scan.gaps[-1][1]} "
+            f"seem to be lost ({said}), more than the damaged bytes can have held, and each would "
+            f"get a loss event. {way_out}{self._moved_so_far()}"
+        )
+
+    def _moved_so_far(self) -> str:
+        names = ", ".join(f"{moved.name} is now {moved.now}" for moved in self._moved)
+        return f" (done before: {names})" if names else ""
+
     def _rewrite(
         self, segment: SegmentPath | None, scan: Scan, following: SegmentPath | None
     ) -> None:
+        self._ask(segment, scan, following)
         _ledger_cache.forget(self._log)
         copy = self._keep_copy(segment, scan)
         if scan.next_offset > scan.base:
@@ -155,7 +240,7 @@ class _Recovery:
         return SegmentPath(segment_path(self._log, base, SEALED), base, True)
 
     def _keep_copy(self, segment: SegmentPath | None, scan: Scan) -> str | None:
-        if segment is None or not (segment.sealed or scan.gaps):
+        if segment is None or not (segment.sealed or scan.gaps or scan.rewritten):
             return None
         number = 1
         while True:
@@ -168,6 +253,22 @@ class _Recovery:
             else:
                 sync_directory(self._log)
                 return copy.name
+
+
+def _scan(segment: SegmentPath, reach: int | None) -> Scan:
+    """Look at a segment, which ends at ``reach`` if that is known."""
+    if segment.sealed:
+        return scan_sealed(segment.path, segment.base, reach)
+    scan = scan_active(segment.path, segment.base, reach)
+    scan.gap_up_to(reach or segment.base)
+    return scan
+
+
+def _damaged_bytes(segment: SegmentPath | None, scan: Scan) -> int:
+    """How many bytes are damaged that can have held events; the holes of a sparse file cannot."""
+    if segment is None:
+        return 0
+    return min(scan.lost_bytes, segment.path.stat().st_blocks * _BLOCK_BYTES)
 
 
 def _replaces(following: SegmentPath | None) -> dict[str, str]:

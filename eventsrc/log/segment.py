@@ -1,7 +1,7 @@
 """Segments, read side: where each chunk of events stands, and the events of one chunk."""
 
 import os
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,13 +17,15 @@ from .event import Event
 
 @dataclass(frozen=True, slots=True)
 class ChunkRef:
-    """Where a chunk stands and which offsets it holds. ``channels`` is None where not known."""
+    """Where a chunk stands and which offsets it holds. ``channels`` is None where not known.
+    ``body`` gives the records where the events do not stand in a chunk of ours."""
 
     position: int
     length: int
     first: int
     following: int
     channels: frozenset[int] | None = None
+    body: Callable[[], bytes] | None = None
 
 
 @dataclass(frozen=True, slots=True)

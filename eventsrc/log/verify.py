@@ -13,7 +13,7 @@ from eventsrc.errors import LogDamaged, LogError, NotALog
 from eventsrc.words import counted
 
 from ._check import check_sealed
-from ._head import head_of
+from ._head import WrongPlace, claims_of, head_of
 from ._lock import is_held
 from ._naming import SEALED, SegmentPath, segment_path
 from ._raw import raw_events
@@ -21,6 +21,7 @@ from ._scan import Scan, scan_active
 from ._scan_sealed import scan_sealed
 from ._seal import NO_PREVIOUS, REPLACES
 from ._verify_events import EventFindings
+from ._whose import majority_of
 from .findings import Finding, Kind
 from .reader import segments_of
 
@@ -59,7 +60,7 @@ class _Verifier:
         self._live = is_held(log)
         self._found: list[Finding] = []
         self._events = EventFindings()
-        self._log_id: str | None = None
+        self._log_id = _usual_log_id(segments)
         self._next = 0
         self._count = 0
         self._known_as: set[str] = {NO_PREVIOUS}
@@ -88,11 +89,14 @@ class _Verifier:
             last = max(segment.base - 1, self._next)
             self._add("gap", "events before this segment are missing", name, self._next, last)
         head = self._check_head(segment)
+        if head is None:
+            self._pass_over(segment, reach)
+            return segment.path.stat().st_size
         if segment.sealed:
             scan = scan_sealed(segment.path, segment.base, reach)
             self._check_file(segment, scan, head)
         else:
-            scan = scan_active(segment.path, segment.base)
+            scan = scan_active(segment.path, segment.base, reach)
             if reach is not None:
                 scan.gap_up_to(reach)
             self._check_end(name, scan)
@@ -103,9 +107,21 @@ class _Verifier:
         self._next = scan.next_offset
         return segment.path.stat().st_size
 
-    def _check_head(self, segment: SegmentPath) -> dict[str, str]:
+    def _pass_over(self, segment: SegmentPath, reach: int | None) -> None:
+        """A segment that does not belong here holds none of the offsets that it stands for."""
+        if reach is not None:
+            text = "the segment for these events is missing"
+            self._add("gap", text, segment.path.name, segment.base, reach - 1)
+            self._next = reach
+        self._known_as = set()
+
+    def _check_head(self, segment: SegmentPath) -> dict[str, str] | None:
+        """None for a segment of another log or of another base; empty for a damaged head."""
         try:
             head = head_of(segment.path, segment.base)
+        except WrongPlace as error:
+            self._add("chain", str(error), segment.path.name)
+            return None
         except (LogDamaged, NotALog) as error:
             self._add("crc", str(error), segment.path.name)
             return {}
@@ -113,6 +129,7 @@ class _Verifier:
         if head["log_id"] != self._log_id:
             text = f"belongs to log {head['log_id']}, not {self._log_id}"
             self._add("log_id", text, segment.path.name)
+            return None
         return head
 
     def _check_file(self, segment: SegmentPath, scan: Scan, head: dict[str, str]) -> None:
@@ -121,8 +138,11 @@ class _Verifier:
         if check.fault is not None:
             known = "" if scan.gaps else "; no event is affected"
             self._add("crc", f"{check.fault}{known}", name)
-        elif scan.index_fault is not None:
+        elif scan.index_fault is not None and not scan.rewritten:
             self._add("crc", scan.index_fault, name)
+        if scan.rewritten:
+            text = "another program has rewritten it; `mapfold log recover` puts it in order"
+            self._add("crc", text, name)
         previous = head.get("previous_sha256", NO_PREVIOUS)
         if head and self._known_as and previous not in self._known_as:
             self._add("chain", "was not written after the segment before it", name)
@@ -156,3 +176,17 @@ class _Verifier:
         if count is None:
             count = 1 if first is None or last is None else last - first + 1
         self._found.append(Finding(kind, message, segment, first, last, count))
+
+
+def _usual_log_id(segments: list[SegmentPath]) -> str | None:
+    """The log id that most segments carry; None where there is none such, and the first counts."""
+    carried = []
+    for segment in segments:
+        try:
+            carried.append((segment.path, claims_of(segment.path)["log_id"]))
+        except (LogDamaged, NotALog):
+            continue
+    try:
+        return majority_of(carried)
+    except LogDamaged:
+        return None

@@ -38,7 +38,7 @@ def head() -> bytes:
     # docs/log-format.md: CRC-32 of each key and value with its length before it, by key
     canonical = "".join(f"{len(k)}:{k}{len(v)}:{v}" for k, v in sorted(values.items()))
     values["crc32"] = f"{zlib.crc32(canonical.encode()):08x}"
-    header = record(0x01, text("mapfold") + text("by hand"))
+    header = record(0x01, text("mapfold") + text("mapfold"))
     return MAGIC + header + record(0x0C, text("mapfold.segment") + mapping(values))
 
 
