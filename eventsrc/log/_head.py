@@ -15,6 +15,7 @@ PREVIOUS = "previous_sha256"
 MARK_SEED = "mark_seed"
 """In the head of an active segment: what its commit marks are made with, in hex. Segments of
 earlier versions have none, which is seed 0."""
+_SEED = re.compile(r"[0-9a-f]{1,8}")
 _BASE = re.compile(r"\d{1,20}", re.ASCII)
 HEAD_BYTES = 4096
 """More than any head of ours takes."""
@@ -105,4 +106,6 @@ def _checked_head(metadata: Metadata) -> dict[str, str]:
     values = _mcap.checked_metadata(metadata)
     if not _BASE.fullmatch(values.get("base", "")) or "log_id" not in values:
         raise BadRecord("the segment's metadata names no log or no base")
+    if not _SEED.fullmatch(values.get(MARK_SEED, "0")):
+        raise BadRecord("the segment's metadata names no good mark seed")
     return values

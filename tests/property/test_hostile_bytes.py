@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from eventsrc.errors import LogDamaged
 from eventsrc.log import ALWAYS, LogReader, LogWriter, _mcap, recover_log, verify_log
 from eventsrc.log._head import (
     HEAD_BYTES,
@@ -195,6 +196,16 @@ def test_a_forged_mark_in_a_key_stops_nobody(folder: Path, torn: int) -> None:
         assert again.next_offset == 1
     (event,) = read_log(path)
     assert event.payload == b"first"
+
+
+@pytest.mark.parametrize("seed", ["", "none", "-1", "123456789"])
+def test_a_head_with_a_seed_that_is_no_number_is_damaged(folder: Path, seed: str) -> None:
+    file = folder / f"{0:020d}.mcap.active"
+    file.write_bytes(file_head(head_metadata("log", 0, {MARK_SEED: seed})))
+    with pytest.raises(LogDamaged, match="mark seed"):
+        read_log(folder)
+    recover_log(folder)
+    assert read_log(folder) == []
 
 
 def test_marks_of_segments_without_a_seed_are_read(folder: Path) -> None:
