@@ -77,7 +77,9 @@ def test_a_database_that_is_down(lone: Commands) -> None:
 def test_a_database_url_that_is_none(lone: Commands) -> None:
     lone("import", "L", "-", stdin=payload(envelope()))
     said = lone("replay", "L", "--db", "not a url", code=2)
-    assert "not a url" in one_line(said.err)
+    line = one_line(said.err)
+    assert "--db: not a PostgreSQL URL" in line
+    assert "not a url" not in line, "it may hold a password"
 
 
 def test_a_missing_file(lone: Commands) -> None:
