@@ -23,11 +23,12 @@ from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError
 
 from .envelope import Int64
 from .log._lineage import lineage, still_holds
-from .log.fsync import sync_directory, unlink_quietly, write_all
+from .log._naming import LEDGER
+from .log.fsync import unlink_quietly, write_all
 from .log.reader import LogReader
 from .losses import GapLedger, RunState, sound
 
-NAME: Final = ".ledger.json"
+NAME: Final = LEDGER
 MAX_BYTES: Final = 8 * 1024 * 1024
 """Half a million gaps. A larger ledger is not saved: reading it would cost more memory than the log
 it is of."""
@@ -148,9 +149,3 @@ def _write(path: Path, data: bytes) -> None:
     finally:
         os.close(fd)
     temporary.replace(path / NAME)
-
-
-def forget(path: Path) -> None:
-    """Delete the saved ledger, so that not even a power cut brings it back. Raises OSError."""
-    unlink_quietly(path / NAME)
-    sync_directory(path)

@@ -17,6 +17,7 @@ from . import _ledger_cache
 from ._ledger_cache import Note
 from .envelope import ENVELOPE_VERSION, Int64
 from .log.event import Event
+from .log.fsync import delete_durably
 from .log.reader import LogReader
 from .losses import DEFAULT_SETTLE_NS, GapLedger, gap_of
 from .system_events import LOSS_KEY, Loss, is_system_key
@@ -100,7 +101,7 @@ def save_ledger(path: Path, log_id: str, next_offset: int, ledger: GapLedger) ->
 def forget_ledger(path: Path) -> None:
     """Delete the saved ledger of the log at ``path``: the log has lost events that it knows."""
     with contextlib.suppress(OSError):  # it is not believed either while a segment is missing
-        _ledger_cache.forget(path)
+        delete_durably(path / _ledger_cache.NAME)
 
 
 def fold_ledger(events: Iterable[Event], ledger: GapLedger, now_ns: int) -> GapLedger:

@@ -10,8 +10,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from eventsrc.errors import LogError
-from eventsrc.log import Event, log_info
+from eventsrc.log import Event
 from eventsrc.log.whence import time_of
+from eventsrc.log_info import log_info
 from eventsrc.system_events import is_system_key
 from eventsrc.terminal import visible
 from eventsrc.words import counted

@@ -8,20 +8,11 @@ from typing import Annotated, Any
 import typer
 
 from eventsrc.errors import MisuseError
-from eventsrc.log import (
-    Finding,
-    LogInfo,
-    LogReader,
-    SegmentInfo,
-    SegmentRecovery,
-    Unreadable,
-    log_info,
-    recover_log,
-    verify_log,
-)
+from eventsrc.log import Finding, LogReader, SegmentRecovery, Unreadable, recover_log, verify_log
 from eventsrc.log.reader import OnGap
 from eventsrc.log.recover import UNASKED_LOSSES
 from eventsrc.log.whence import resolve, resolve_start
+from eventsrc.log_info import LogInfo, SegmentInfo, log_info
 from eventsrc.terminal import visible
 from eventsrc.words import counted
 

@@ -5,7 +5,6 @@ from ._lineage import lineage, still_holds
 from .event import Event, NewEvent
 from .findings import Finding
 from .fsync import ALWAYS, GROUP_COMMIT, NEVER, FsyncPolicy, parse_fsync
-from .info import LogInfo, SegmentInfo, log_info
 from .reader import LogReader
 from .recover import RecoveryReport, SegmentRecovery, recover_log
 from .segment import Unreadable
@@ -21,19 +20,16 @@ __all__ = [
     "FileFault",
     "Finding",
     "FsyncPolicy",
-    "LogInfo",
     "LogReader",
     "LogWriter",
     "NewEvent",
     "RecoveryReport",
     "Sealing",
-    "SegmentInfo",
     "SegmentRecovery",
     "Unreadable",
     "Verification",
     "follow",
     "lineage",
-    "log_info",
     "parse_fsync",
     "recover_log",
     "still_holds",

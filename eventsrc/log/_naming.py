@@ -7,6 +7,7 @@
     ….foreign, ….duplicate                 what it set aside: of another log; held by other segments
     ….misnamed                             a segment that it is giving its right name
     lock                               held by the one writer
+    .ledger.json                       the gap ledger, folded from the events: a cache
 
 A segment is named by its base, the offset of its first event. While a sealed file takes the place
 of its active one, both exist for an instant; the sealed one counts.
@@ -25,6 +26,7 @@ FOREIGN = ".foreign"
 DUPLICATE = ".duplicate"
 MISNAMED = ".misnamed"
 LOCK = "lock"
+LEDGER = ".ledger.json"
 
 _NAME = re.compile(r"(\d{20})(\.mcap|\.mcap\.active)")
 _MISNAMED = re.compile(_NAME.pattern + r"\.misnamed(-\d+)?")

@@ -107,6 +107,12 @@ def _copy_durably(path: Path, copy: Path) -> None:
             raise
 
 
+def delete_durably(path: Path) -> None:
+    """Delete a file if it is there, so that not even a power cut brings it back. Raises OSError."""
+    unlink_quietly(path)
+    sync_directory(path.parent)
+
+
 def unlink_quietly(path: Path) -> None:
     """Remove ``path`` if it is there."""
     with contextlib.suppress(FileNotFoundError):

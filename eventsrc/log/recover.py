@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from eventsrc import _ledger_cache  # which reads logs by this package's reader
 from eventsrc.clock import Clock, system_clock
 from eventsrc.errors import LogDamaged, LogError, NotALog
 
@@ -28,6 +27,7 @@ from ._naming import (
     ACTIVE,
     DAMAGED,
     DUPLICATE,
+    LEDGER,
     SEALED,
     SegmentPath,
     half_renamed,
@@ -39,7 +39,7 @@ from ._rebuild import rebuild, trimmed
 from ._scan import Scan, scan_active
 from ._scan_sealed import scan_sealed
 from ._seal import NO_PREVIOUS, REPLACES, SegmentPlan, file_sha256
-from .fsync import GROUP_COMMIT, keep_copy, sync_directory, unlink_quietly
+from .fsync import GROUP_COMMIT, delete_durably, keep_copy, sync_directory, unlink_quietly
 from .reader import segments_of
 
 UNASKED_LOSSES: Final = 100_000
@@ -121,7 +121,7 @@ class _Recovery:
         arrangement.run()
         self._moved = arrangement.moved
         if self._moved:
-            _ledger_cache.forget(self._log)
+            delete_durably(self._log / LEDGER)
         self._log_id = arrangement.log_id or uuid.uuid4().hex
         segments = list_segments(self._log)
         for index, segment in enumerate(segments):
@@ -162,7 +162,7 @@ class _Recovery:
     def _set_aside_overlapping(self, segment: SegmentPath) -> None:
         """A segment that begins before the one in front of it ends, out of a backup for example."""
         reason = f"it begins before offset {self._next}, where the segment before it ends"
-        _ledger_cache.forget(self._log)
+        delete_durably(self._log / LEDGER)
         moved = set_aside(segment.path, DUPLICATE, reason)
         self._moved.append(moved)
         self._spare.append(replace(segment, path=self._log / moved.now))
@@ -204,7 +204,7 @@ class _Recovery:
         self, segment: SegmentPath | None, scan: Scan, following: SegmentPath | None
     ) -> None:
         self._ask(segment, scan, following)
-        _ledger_cache.forget(self._log)
+        delete_durably(self._log / LEDGER)
         copy = self._keep_copy(segment, scan)
         if scan.next_offset > scan.base:
             plan = SegmentPlan(

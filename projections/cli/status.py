@@ -5,7 +5,7 @@ from dataclasses import asdict
 import typer
 
 from eventsrc.cli._shell import display, emit, finish, say
-from eventsrc.log import LogInfo, log_info
+from eventsrc.log_info import LogInfo, log_info
 from eventsrc.terminal import visible
 from eventsrc.words import counted
 from projections.runner.status import SinkStatus, Status, projection_status

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from typing import Final
 
 from eventsrc._zenoh import ZenohOptions
-from eventsrc.log import LogReader, log_info
+from eventsrc.log import LogReader
+from eventsrc.log_info import log_info
 from eventsrc.router import Router
 from eventsrc.sim import SimulatedRun
 from eventsrc.system_events import is_system_key

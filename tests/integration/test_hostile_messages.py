@@ -12,7 +12,8 @@ from eventsrc._zenoh import Received, Session
 from eventsrc.append import append_payload
 from eventsrc.errors import TransportError
 from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES
-from eventsrc.log import LogReader, LogWriter, log_info, verify_log
+from eventsrc.log import LogReader, LogWriter, verify_log
+from eventsrc.log_info import log_info
 from eventsrc.recorder import Recorder
 from eventsrc.refusals import Refusals, refusal_key
 from eventsrc.system_events import LOSS_KEY, REJECTED_KEY, Loss, RejectedPayload

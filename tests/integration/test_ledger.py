@@ -12,7 +12,8 @@ from eventsrc._ledger_cache import NAME
 from eventsrc.append import append_payload
 from eventsrc.errors import LogDamaged
 from eventsrc.ledger import fold_ledger, keep_ledger, ledger_of, save_ledger, unread_events
-from eventsrc.log import NEVER, Event, LogReader, LogWriter, _parts, log_info, recover, recover_log
+from eventsrc.log import NEVER, Event, LogReader, LogWriter, _parts, recover, recover_log
+from eventsrc.log_info import log_info
 from eventsrc.losses import Gap, GapLedger
 from eventsrc.system_events import LOSS_KEY, Loss
 from tests.envelopes import detection, envelope, payload

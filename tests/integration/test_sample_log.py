@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from eventsrc.log import LogReader, log_info
+from eventsrc.log import LogReader
+from eventsrc.log_info import log_info
 from eventsrc.sim import simulate_run
 
 SAMPLE = Path(__file__).resolve().parents[2] / "logs" / "sample"

@@ -33,12 +33,12 @@ from eventsrc.log import (
     LogWriter,
     _sealer,
     follow,
-    log_info,
     recover_log,
     verify_log,
 )
 from eventsrc.log._aside import ProcessGone
 from eventsrc.log._mcap import MARK_BYTES
+from eventsrc.log_info import log_info
 from tests.fixtures_log import BY_HAND, MEMORY_DISK
 
 KEYS = ["tb/detections", "other/key", "mapfold/loss"]

@@ -18,12 +18,12 @@ from eventsrc.log import (
     LogWriter,
     _active,
     _sealer,
-    log_info,
     parse_fsync,
     verify_log,
 )
 from eventsrc.log._seal import SegmentPlan, seal
 from eventsrc.log.fsync import FsyncPolicy
+from eventsrc.log_info import log_info
 from tests.fixtures_log import BY_HAND, KEY, read_log
 
 TIMEOUT_S = 30

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from eventsrc._zenoh import ZenohOptions, open_session
-from eventsrc.log import LogWriter, _active, log_info
+from eventsrc.log import LogWriter, _active
 from eventsrc.log.fsync import FsyncPolicy
+from eventsrc.log_info import log_info
 from eventsrc.recorder import Recorder
 
 from .payloads import KEY

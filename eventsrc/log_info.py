@@ -1,0 +1,197 @@
+"""What `mapfold log info` tells: counted from the indexes, hardly reading any events.
+
+Above the log, because what is missing from a run is computed by the gap ledger, which reads logs.
+
+The stamps are those of robots' events: mapfold's own are stamped when they were written, which for
+a log imported today is months after the run. A sealed segment names the bounds of all its stamps,
+exact where it has no event of ours. Else its chunks are read if that could still move the answer;
+mostly it cannot, for the segments around it are exact.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from .errors import LogDamaged
+from .ledger import ledger_of
+from .log import Event, LogReader, _mcap
+from .log._active_file import ActiveFile
+from .log._mcap import Channel
+from .log._naming import SegmentPath
+from .log._sealed_file import SealedFile
+from .log.reader import OpenSegment
+from .losses import gap_of
+from .system_events import LOSS_KEY, REJECTED_KEY, Loss, is_system_key
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentInfo:
+    """One segment: ``events`` are the durable ones, ``size_bytes`` what the file takes."""
+
+    name: str
+    base: int
+    events: int
+    size_bytes: int
+    sealed: bool
+
+
+@dataclass(frozen=True, slots=True)
+class LogInfo:
+    """A log at a glance. Times are int nanoseconds, None while the log is empty; the first is the
+    earliest and the last the latest, whatever their order in the log; stamps are those of the
+    robots' events, not of our own. ``lost`` is what the log says was lost, less the keyframes that
+    came late after all."""
+
+    log_id: str
+    path: Path
+    events: int
+    size_bytes: int
+    segments: tuple[SegmentInfo, ...]
+    keys: dict[str, int]
+    rejected: int
+    lost: int
+    first_logged_ns: int | None
+    last_logged_ns: int | None
+    first_stamp_ns: int | None
+    last_stamp_ns: int | None
+
+
+@dataclass(slots=True)
+class _RobotStamps:
+    """Stamps of robots' events in int nanoseconds: ``first`` and ``last``, None while there are
+    none."""
+
+    first: int | None = None
+    last: int | None = None
+    _doubtful: list[tuple[int, int, SegmentPath]] = field(default_factory=list)
+
+    def take(self, stamp_ns: int) -> None:
+        """The stamp of one robot's event."""
+        self.first = stamp_ns if self.first is None else min(self.first, stamp_ns)
+        self.last = stamp_ns if self.last is None else max(self.last, stamp_ns)
+
+    def take_sealed(self, entry: SegmentPath, segment: SealedFile) -> None:
+        """The bounds that a sealed segment names."""
+        first, last = segment.first_stamp_ns, segment.last_stamp_ns
+        if _holds_ours(segment):
+            self._doubtful.append((first, last, entry))
+        else:
+            self.take(first)
+            self.take(last)
+
+    def settle(self, reader: LogReader) -> None:
+        """Read the segments that leave it open, as far as they can be read."""
+        for first, last, entry in sorted(self._doubtful, key=lambda d: d[1], reverse=True):
+            if self.first is None or self.last is None or first < self.first or last > self.last:
+                for stamp_ns in _stamps(reader.open_segment(entry)):
+                    self.take(stamp_ns)
+
+
+@dataclass(slots=True)
+class _Tally:
+    keys: Counter[str]
+    logged: list[int]
+    stamps: _RobotStamps
+
+
+def log_info(path: Path, *, note: Callable[[str], None] | None = None) -> LogInfo:
+    """Count a log. Raises LogNotFound, NotALog or LogDamaged. ``note`` takes a line for people: why
+    a ledger saved beside the log is not used."""
+    tally = _Tally(Counter(), [], _RobotStamps())
+    with LogReader(path) as reader:
+        segments = tuple(_count(reader, entry, tally) for entry in reader.segments)
+        tally.stamps.settle(reader)
+        return LogInfo(
+            log_id=reader.log_id,
+            path=path,
+            events=reader.next_offset,
+            size_bytes=sum(s.size_bytes for s in segments),
+            segments=segments,
+            keys={key: tally.keys[key] for key in sorted(tally.keys)},
+            rejected=tally.keys[REJECTED_KEY],
+            lost=_count_lost(reader, note) if tally.keys[LOSS_KEY] else 0,
+            first_logged_ns=min(tally.logged, default=None),
+            last_logged_ns=max(tally.logged, default=None),
+            first_stamp_ns=tally.stamps.first,
+            last_stamp_ns=tally.stamps.last,
+        )
+
+
+def _count(reader: LogReader, entry: SegmentPath, tally: _Tally) -> SegmentInfo:
+    segment = reader.open_segment(entry)
+    if isinstance(segment, SealedFile):
+        _count_sealed(segment, tally)
+        tally.stamps.take_sealed(entry, segment)
+    else:
+        _count_growing(segment, tally)
+    return SegmentInfo(
+        name=segment.path.name,
+        base=segment.base,
+        events=segment.next_offset - segment.base,
+        size_bytes=segment.size(),
+        sealed=isinstance(segment, SealedFile),
+    )
+
+
+def _count_sealed(segment: SealedFile, tally: _Tally) -> None:
+    statistics = segment.statistics
+    for channel, count in statistics.channel_message_counts.items():
+        tally.keys[segment.channels[channel].topic] += count
+    tally.logged += (statistics.message_start_time, statistics.message_end_time)
+
+
+def _count_growing(segment: ActiveFile, tally: _Tally) -> None:
+    for chunk in segment.chunks:
+        body = segment.read_chunk(chunk)
+        channels = segment.channels_of(body)
+        robots = _robots_of(channels)
+        for channel, _, log_ns, stamp_ns, _, _ in _mcap.walk(body):
+            tally.keys[channels[channel].topic] += 1
+            tally.logged.append(log_ns)
+            if channel in robots:
+                tally.stamps.take(stamp_ns)
+
+
+def _count_lost(reader: LogReader, note: Callable[[str], None] | None = None) -> int:
+    """How many events a log lacks: reported losses, less the keyframes that came late after all.
+
+    Reads the losses, and for gaps of keyframes, which may be closed, the log's gap ledger.
+    ``note`` is told why a saved one is not used."""
+    losses = [loss for event in reader.read(keys={LOSS_KEY}) if (loss := _loss(event)) is not None]
+    others = [loss.count for loss in losses if gap_of(loss) is None]
+    if len(others) == len(losses):
+        return sum(others)
+    return sum(others) + ledger_of(reader, note=note).missing_reported()
+
+
+def _loss(event: Event) -> Loss | None:
+    try:
+        return Loss.model_validate_json(event.payload)
+    except ValidationError:  # `log verify` names it
+        return None
+
+
+def _robots_of(channels: dict[int, Channel]) -> set[int]:
+    """The ids of the channels that are not mapfold's own."""
+    return {id_ for id_, channel in channels.items() if not is_system_key(channel.topic)}
+
+
+def _holds_ours(segment: SealedFile) -> bool:
+    robots = _robots_of(segment.channels)
+    counts = segment.statistics.channel_message_counts
+    return any(count and channel not in robots for channel, count in counts.items())
+
+
+def _stamps(segment: OpenSegment) -> Iterator[int]:
+    for chunk in segment.chunks:
+        try:
+            body = segment.read_chunk(chunk)
+        except LogDamaged:  # whoever reads the events will be told
+            continue
+        robots = _robots_of(segment.channels_of(body))
+        for channel, _, _, stamp_ns, _, _ in _mcap.walk(body):
+            if channel in robots:
+                yield stamp_ns
