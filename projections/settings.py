@@ -9,8 +9,13 @@ from collections.abc import Iterable
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import ErrorDetails
+
+from eventsrc.envelope import Text, fault
 
 from .errors import SettingsError
+
+_MOST_SHOWN = 80
 
 
 class Settings(BaseModel):
@@ -26,7 +31,7 @@ class Settings(BaseModel):
     """An observation may fuse with an Object whose mean position is within this distance."""
     fusion_similarity: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.7
     """… and whose mean embedding has at least this cosine with the observation's."""
-    embedding_model: str | None = None
+    embedding_model: Text | None = None
     """The map's embedding model; None takes that of the first embedded detection."""
     embedding_dim: Annotated[int, Field(ge=1, le=16_000)] | None = None
     """The map's embedding dimension; None takes that of the first embedded detection."""
@@ -50,15 +55,17 @@ class Settings(BaseModel):
             name, equals, value = text.partition("=")
             name = name.strip()
             if not equals:
-                raise SettingsError(f"{option} {text}: write it as name=value, such as eps_m=1.0")
+                raise SettingsError(
+                    f"{option} {_plain(text)}: write it as name=value, such as eps_m=1.0"
+                )
             if name not in values or name == "neighbourhood":
-                raise SettingsError(f"{option} {text}: {_no_setting(name)}")
+                raise SettingsError(f"{option} {_plain(text)}: {_no_setting(name)}")
             values[name] = None if value.strip() in ("", "none") else value.strip()
         try:
             return Settings.model_validate(values)
         except ValidationError as error:
             first = error.errors()[0]
-            told = f"{first['loc'][0]}={first['input']}: {first['msg'].lower()}"
+            told = f"{first['loc'][0]}={_plain(str(first['input']))}: {_rule(first)}"
             raise SettingsError(f"{option} {told}") from None
 
     @classmethod
@@ -73,12 +80,30 @@ class Settings(BaseModel):
             name = str(first["loc"][0])
             if first["type"] == "extra_forbidden":
                 raise SettingsError(_no_setting(name)) from None
-            raise SettingsError(f"{name} is {first['input']!r}: {first['msg'].lower()}") from None
+            told = f"{name} is {_shown(first['input'])}: {_rule(first)}"
+            raise SettingsError(told) from None
         if settings.neighbourhood is not None:
             raise SettingsError(_no_setting("neighbourhood"))
         return settings
 
 
+def _rule(error: ErrorDetails) -> str:
+    """The rule a value breaks, as the end of a sentence."""
+    said = fault(error)
+    return said[:1].lower() + said[1:]
+
+
+def _shown(value: object) -> str:
+    """A wrong value, as much of it as helps."""
+    text = repr(value)
+    return text if len(text) <= _MOST_SHOWN else f"{text[: _MOST_SHOWN - 3]}..."
+
+
+def _plain(text: str) -> str:
+    """What was typed: as it is, or escaped and cut when a terminal would not show it in a line."""
+    return text if text.isprintable() and len(text) <= _MOST_SHOWN else _shown(text)
+
+
 def _no_setting(name: str) -> str:
     names = ", ".join(sorted(Settings.model_fields.keys() - {"neighbourhood"}))
-    return f"no setting {name!r}; there are {names}"
+    return f"no setting {_shown(name)}; there are {names}"

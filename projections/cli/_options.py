@@ -56,7 +56,7 @@ def _settings_of_file(file: Path) -> Settings:
         raise SettingsError(f"--settings {file}: {error.strerror}") from None
     except SettingsError as error:
         raise SettingsError(f"--settings {file}: {error}") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise SettingsError(f"--settings {file}: not JSON: {error}") from None
 
 

@@ -25,6 +25,10 @@ def test_none_gives_a_setting_back() -> None:
         ("eps_m=0", "--set eps_m=0: input should be greater than 0"),
         ("eps_m=nan", "--set eps_m=nan"),
         ("min_samples=2.5", "--set min_samples=2.5"),
+        ("eps_m=\x1b[2J", r"--set eps_m='\x1b[2J': input should be a valid number"),
+        ("embedding_model=\ud800", "--set embedding_model='\\ud800': "),
+        (f"eps_m={'x' * 9_999}", f"--set eps_m='{'x' * 76}...: "),
+        (f"{'x' * 9_999}=1", f"no setting '{'x' * 76}...; there are"),
     ],
 )
 def test_a_wrong_assignment_is_refused_in_words(text: str, says: str) -> None:
@@ -53,12 +57,19 @@ def test_settings_out_of_a_document() -> None:
         ({"eps": 1}, "no setting 'eps'; there are embedding_dim, embedding_model, eps_m"),
         ({"eps_m": "wide"}, "eps_m is 'wide': input should be a valid number"),
         ({"neighbourhood": "walls"}, "no setting 'neighbourhood'; there are"),
+        (
+            {"embedding_model": "\x07"},
+            "embedding_model is '\\x07': has the control character U+",
+        ),
+        ({"embedding_model": "x" * 300}, f"embedding_model is '{'x' * 76}...: is 300 characters"),
+        ({"eps_m": ["x"] * 9_999}, "eps_m is ['x', "),
     ],
 )
 def test_a_wrong_document_is_refused_in_words(document: object, says: str) -> None:
     with pytest.raises(SettingsError) as caught:
         Settings.from_document(document)
     assert str(caught.value).startswith(says)
+    assert len(str(caught.value)) < 500
 
 
 def test_the_fingerprint_tells_settings_apart() -> None:
