@@ -17,6 +17,10 @@ import numpy as np
 MAGIC = b"mapfold snapshot 1\n"
 _TYPES = frozenset({"<i4", "<i8", "<f8", "|u1", "<u4", "|i1"})
 _LENGTH_BYTES = 8
+_MOST_UNFOLDED = 16
+_SMALL_BYTES = 64 * 1024 * 1024
+"""A snapshot that unfolds to more than this, and to more than so many times its size, is none of
+ours: those measured unfold to four times their size."""
 
 
 class NotAContainer(ValueError):
@@ -52,7 +56,7 @@ def unpack(data: bytes) -> dict[str, Any]:
     body = data[head:]
     if hashlib.sha256(body).digest() != data[len(MAGIC) : head]:
         raise NotAContainer("its checksum does not match")
-    content = zlib.decompress(body)
+    content = _decompress(body)
     start = _LENGTH_BYTES + int.from_bytes(content[:_LENGTH_BYTES], "little")
     index = json.loads(content[_LENGTH_BYTES:start])
     values: dict[str, Any] = index["plain"]
@@ -62,3 +66,13 @@ def unpack(data: bytes) -> dict[str, Any]:
         flat = np.frombuffer(content, dtype, math.prod(shape), start + at)
         values[name] = flat.reshape(shape).copy()
     return values
+
+
+def _decompress(body: bytes) -> bytes:
+    """At most as much as a snapshot may hold: the checksum is no proof against a forger."""
+    most = max(_SMALL_BYTES, _MOST_UNFOLDED * len(body))
+    stream = zlib.decompressobj()
+    content = stream.decompress(body, most)
+    if not stream.eof:
+        raise NotAContainer(f"it is torn, or unfolds to more than {most:,} bytes")
+    return content

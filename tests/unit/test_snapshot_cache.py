@@ -1,6 +1,7 @@
 """The cache beside a log: used when sound, passed over with a note when not."""
 
 import contextlib
+import hashlib
 import zlib
 from pathlib import Path
 from typing import Any
@@ -242,3 +243,11 @@ def test_a_container_holds_no_objects() -> None:
     body = zlib.compress(b"")
     with pytest.raises(NotAContainer, match="checksum"):
         unpack(MAGIC + b"0" * 32 + body)
+
+
+def test_a_snapshot_that_unfolds_to_very_much_is_refused() -> None:
+    squeeze = zlib.compressobj(1)
+    body = b"".join(squeeze.compress(bytes(1_000_000)) for _ in range(500)) + squeeze.flush()
+    assert len(body) < 4_000_000
+    with pytest.raises(NotAContainer, match="unfolds to more than"):
+        unpack(MAGIC + hashlib.sha256(body).digest() + body)
