@@ -2,6 +2,7 @@
 
 import functools
 import json
+import re
 
 from pydantic import BaseModel
 
@@ -11,6 +12,10 @@ from eventsrc.system_events import LOSS_KEY, REJECTED_KEY, Loss, RejectedPayload
 from ._mcap import Channel
 
 ENVELOPE_VERSION_KEY = "mapfold.envelope_version"
+UNREADABLE_VERSION = 0
+"""Of a channel that says something else than a number: another program's, or forged. Its events are
+read, and not folded."""
+_A_VERSION = re.compile(r"[0-9]{1,9}")
 
 _SYSTEM_MODELS: dict[str, type[BaseModel]] = {REJECTED_KEY: RejectedPayload, LOSS_KEY: Loss}
 
@@ -43,4 +48,7 @@ def key_channel(channel_id: int, schema_id: int, key: str, version: int) -> Chan
 
 def envelope_version(channel: Channel) -> int:
     """The version of the envelopes on a channel; the current one where none is said."""
-    return int(channel.metadata.get(ENVELOPE_VERSION_KEY, ENVELOPE_VERSION))
+    said = channel.metadata.get(ENVELOPE_VERSION_KEY)
+    if said is None:
+        return ENVELOPE_VERSION
+    return int(said) if _A_VERSION.fullmatch(said) else UNREADABLE_VERSION

@@ -9,6 +9,7 @@ from eventsrc.append import append_payload
 from eventsrc.envelope import ENVELOPE_VERSION, Envelope
 from eventsrc.ingest import Accepted, Rejected
 from eventsrc.log import Event, LogReader, LogWriter
+from eventsrc.log._schemas import ENVELOPE_VERSION_KEY, envelope_version, key_channel
 from eventsrc.upcast import LADDER, guess_version, read_envelope
 from projections.folding import fold_log
 from projections.settings import Settings
@@ -75,3 +76,10 @@ def test_a_log_of_both_forms_keeps_the_bytes_and_folds(log_path: Path) -> None:
         _, view = fold_log(reader, Settings())
     counts = view.counts()
     assert (counts["keyframes"], counts["observations"], counts["places"]) == (2, 2, 0)
+
+
+@pytest.mark.parametrize("said", ["", "two", "\x00", "-1", "9" * 5_000])
+def test_a_channel_that_says_no_version_a_reader_knows_stops_no_reader(said: str) -> None:
+    channel = key_channel(1, 1, KEY, ENVELOPE_VERSION)
+    channel.metadata[ENVELOPE_VERSION_KEY] = said
+    assert isinstance(read_envelope(event(envelope(1), envelope_version(channel))), Rejected)
