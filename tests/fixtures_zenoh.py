@@ -6,8 +6,9 @@ import subprocess
 import sys
 import threading
 import urllib.request
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from pathlib import Path
 from typing import IO
 
 import pytest
@@ -58,13 +59,23 @@ def connected(endpoint: str) -> Iterator[Callable[[], Session]]:
 class Program:
     """Python code in a process of its own; its stderr is read line by line."""
 
-    def __init__(self, code: str, arguments: Sequence[str]) -> None:
+    def __init__(
+        self,
+        code: str,
+        arguments: Sequence[str],
+        *,
+        stdout: int | IO[str] = subprocess.PIPE,
+        env: Mapping[str, str] | None = None,
+        cwd: Path | None = None,
+    ) -> None:
         self.process = subprocess.Popen(
             [sys.executable, "-c", code, *arguments],
             stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
+            stdout=stdout,
             stderr=subprocess.PIPE,
             text=True,
+            env=env,
+            cwd=cwd,
         )
         self.lines: list[str] = []
         self._said = threading.Condition()

@@ -13,8 +13,8 @@ import pytest
 
 from eventsrc.errors import LogError
 from eventsrc.log import ALWAYS, LogWriter, recover_log, verify_log
-from eventsrc.log._naming import list_segments
 from eventsrc.system_events import LOSS_KEY
+from tests.attack.maul import maul
 from tests.fixtures_log import BY_HAND, KEY, envelope, read_log, read_with_gaps
 
 EVENTS = 25
@@ -37,26 +37,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     writer._active.close()
     writer._lock.release()
     return log
-
-
-def maul(log: Path, chance: random.Random) -> None:
-    """Damage one to three segments."""
-    for _ in range(chance.choice([1, 1, 2, 3])):
-        path = chance.choice(list_segments(log)).path
-        data = bytearray(path.read_bytes())
-        at = chance.randrange(len(data) or 1)
-        match chance.choice(["flip", "zeros", "cut", "again", "more"]):
-            case "flip" if data:
-                data[at] ^= 1 << chance.randrange(8)
-            case "zeros":
-                data[at : at + 64] = bytes(len(data[at : at + 64]))
-            case "cut":
-                del data[at:]
-            case "again":
-                data[at:at] = data[max(0, at - 100) : at]
-            case "more":
-                data += chance.randbytes(50)
-        path.write_bytes(data)
 
 
 def readable(log: Path) -> dict[int, bytes]:

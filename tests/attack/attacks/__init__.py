@@ -1,0 +1,30 @@
+"""One attack a file; each plays one round in an `Arena`."""
+
+from tests.attack.arena import Attack
+
+from . import (
+    bombs,
+    connections,
+    damage,
+    doors,
+    files,
+    junk,
+    kills,
+    projections,
+    publishers,
+    questions,
+)
+
+ATTACKS: dict[str, Attack] = {
+    "kills": kills.attack,
+    "files": files.attack,
+    "publishers": publishers.attack,
+    "junk": junk.attack,
+    "damage": damage.attack,
+    "bombs": bombs.attack,
+    "questions": questions.attack,
+    "connections": connections.attack,
+    "projections": projections.attack,
+    "doors": doors.attack,
+}
+"""In the order in which they are played."""

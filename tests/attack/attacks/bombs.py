@@ -1,0 +1,117 @@
+"""Small files that unfold into large ones, and files that only say that they are large. Each is
+refused or read, in bounded memory and time, by every command that meets it."""
+
+import hashlib
+import zlib
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from eventsrc.log import LogWriter
+from projections.settings import Settings
+from projections.snapshot.container import MAGIC as SNAPSHOT_MAGIC
+from tests.attack.arena import Arena
+from tests.attack.explosives import gzip_line, mcap_with, mcap_with_large_message, zstd_chunk
+from tests.envelopes import envelope, payload
+from tests.fixtures_log import BY_HAND, KEY
+
+GB = 1_000_000_000
+UNFOLDED = 3_200_000_000
+PATIENCE_S = 60.0
+
+
+def zstd_import(arena: Arena) -> None:
+    """98 kB of an MCAP file are 3.2 GB of a chunk."""
+    bomb = arena.folder / "bomb.mcap"
+    mcap_with(bomb, zstd_chunk(UNFOLDED))
+    _import(arena, bomb)
+
+
+def zstd_import_that_lies(arena: Arena) -> None:
+    """… and the head of the chunk says that they are 100 bytes."""
+    bomb = arena.folder / "liar.mcap"
+    mcap_with(bomb, zstd_chunk(UNFOLDED, said=100))
+    _import(arena, bomb)
+
+
+def large_message(arena: Arena) -> None:
+    """One message of 300 MB."""
+    bomb = arena.folder / "large.mcap"
+    mcap_with_large_message(bomb, 300_000_000)
+    _import(arena, bomb)
+
+
+def gzip_import(arena: Arena) -> None:
+    """A line of 2 GB in 9 MB."""
+    bomb = arena.folder / "bomb.jsonl.gz"
+    gzip_line(bomb, 2 * GB)
+    _import(arena, bomb)
+
+
+def sparse_segment(arena: Arena) -> None:
+    """A growing segment of 20 GB that takes no room on the disk."""
+    log = _log(arena, "sparse")
+    (active,) = log.glob("*.active")
+    with active.open("r+b") as file:
+        file.truncate(20 * GB)
+    _read(arena, log)
+
+
+def zstd_in_segment(arena: Arena) -> None:
+    """A bomb stands behind the last chunk of a growing segment."""
+    log = _log(arena, "bomb")
+    (active,) = log.glob("*.active")
+    with active.open("ab") as file:
+        file.write(zstd_chunk(UNFOLDED))
+    _read(arena, log)
+
+
+def snapshot(arena: Arena) -> None:
+    """A snapshot beside a log unfolds into 2 GB; its checksum is right."""
+    log = _log(arena, "log")
+    squeeze = zlib.compressobj(1)
+    body = b"".join(squeeze.compress(bytes(GB // 50)) for _ in range(100)) + squeeze.flush()
+    folder = log.with_name(f"{log.name}.snapshots")
+    folder.mkdir()
+    name = f"{Settings().fingerprint()}-{5:020d}.map"
+    data = SNAPSHOT_MAGIC + hashlib.sha256(body).digest() + body
+    (folder / name).write_bytes(data)
+    arena.run("reader", "state", log, "--digest", codes=(0,), patience_s=PATIENCE_S)
+
+
+CASES: tuple[Callable[[Arena], None], ...] = (
+    *(zstd_import, zstd_import_that_lies, large_message, gzip_import),
+    *(sparse_segment, zstd_in_segment, snapshot),
+)
+
+
+def attack(arena: Arena) -> None:
+    """Round 0: all of them; later one by chance."""
+    for bomb in CASES if arena.round == 0 else [arena.chance.choice(CASES)]:
+        arena.attempt(bomb.__name__, partial(bomb, arena))
+
+
+def _import(arena: Arena, bomb: Path) -> None:
+    log = arena.folder / f"{bomb.name}.log"
+    arena.run("reader", "import", log, bomb, codes=(1, 2, 3), patience_s=PATIENCE_S)
+
+
+def _log(arena: Arena, name: str) -> Path:
+    """A log of ten events that nobody closed."""
+    log = arena.folder / name
+    writer = LogWriter(log, fsync=BY_HAND)
+    for k in range(10):
+        writer.append(KEY, payload(envelope(k)))
+    writer.sync()
+    writer._sealer.finish()
+    writer._active.close()
+    writer._lock.release()
+    return log
+
+
+def _read(arena: Arena, log: Path) -> None:
+    for command in ("verify", "info", "recover"):
+        arena.run("reader", "log", command, log, codes=(0, 1, 3), patience_s=PATIENCE_S)
+    said = arena.run("reader", "log", "cat", log, "--json", codes=(0,), patience_s=PATIENCE_S)
+    if said.output().count("\n") < 10:
+        arena.complain(f"{log.name}: {said.output().count(chr(10))} of 10 events are left")

@@ -1,0 +1,77 @@
+"""What was sent and what was acknowledged, kept outside of the processes that are attacked."""
+
+import hashlib
+import threading
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from eventsrc.log import LogReader
+from eventsrc.log.segment import Unreadable
+from eventsrc.system_events import is_system_key
+
+
+def digest(payload: bytes) -> bytes:
+    """The name of a payload."""
+    return hashlib.sha256(payload).digest()
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """Acknowledged events that the log lacks, and events in it that nobody sent or that have
+    another offset than before."""
+
+    acknowledged: int
+    lost: int
+    invented: int
+
+
+class Oracle:
+    """Digests of payloads: sent, acknowledged, and seen at which offset. For many threads."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._sent: set[bytes] = set()
+        self._acknowledged: set[bytes] = set()
+        self._at: dict[int, bytes] = {}
+        self.destroyed: set[bytes] = set()
+        """What the attacker took from the disk after it was acknowledged: no recorder's fault."""
+
+    def sent(self, payload: bytes) -> None:
+        """Somebody sends this."""
+        with self._lock:
+            self._sent.add(digest(payload))
+
+    def acknowledged(self, digests: Iterable[bytes]) -> None:
+        """A recorder said that it has these on disk."""
+        with self._lock:
+            self._acknowledged.update(digests)
+
+    def wrote(self, offset: int, payload: bytes) -> None:
+        """This is synced at ``offset``."""
+        with self._lock:
+            self._sent.add(digest(payload))
+            self._acknowledged.add(digest(payload))
+            self._at[offset] = digest(payload)
+
+    def forget_promises(self) -> None:
+        """The attacker destroyed what he could not tell: events may be missing, but none made up
+        and none at another offset."""
+        with self._lock:
+            self.destroyed |= self._acknowledged
+
+    def judge(self, log: Path) -> Judgement:
+        """Read all of ``log`` that can be read, and compare."""
+        found: set[bytes] = set()
+        invented = 0
+        gaps: list[Unreadable] = []
+        with LogReader(log) as reader, self._lock:
+            for event in reader.read(on_gap=gaps.append):
+                if is_system_key(event.key):
+                    continue
+                name = digest(event.payload)
+                found.add(name)
+                if name not in self._sent or self._at.setdefault(event.offset, name) != name:
+                    invented += 1
+            lost = self._acknowledged - found - self.destroyed
+            return Judgement(len(self._acknowledged), len(lost), invented)
