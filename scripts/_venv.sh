@@ -15,7 +15,7 @@ find_python() {
     exit 1
 }
 
-ensure_venv() { # ensure_venv [pip arguments beyond the package itself]
+ensure_venv() { # ensure_venv [run | a group of pyproject.toml's]
     local stamp want
     stamp=".venv/.installed-${1:-run}"
     want=$(cksum pyproject.toml | cut -d' ' -f1)
@@ -25,8 +25,8 @@ ensure_venv() { # ensure_venv [pip arguments beyond the package itself]
     if [ "$(cat "$stamp" 2>/dev/null || true)" != "$want" ]; then
         echo "installing mapfold into .venv …" >&2
         .venv/bin/python -m pip install --quiet --disable-pip-version-check --upgrade 'pip>=25.1' >&2
-        if [ "${1:-run}" = dev ]; then
-            .venv/bin/python -m pip install --quiet --disable-pip-version-check --editable . --group dev >&2
+        if [ "${1:-run}" != run ]; then
+            .venv/bin/python -m pip install --quiet --disable-pip-version-check --editable . --group "$1" >&2
         else
             .venv/bin/python -m pip install --quiet --disable-pip-version-check --editable . >&2
         fi

@@ -1,0 +1,30 @@
+"""One target under atheris, which sees what an input reaches and keeps those that reach more.
+
+python -m tests.fuzz.guided TARGET CORPUS [libFuzzer options]
+"""
+
+import random
+import sys
+
+import atheris
+
+with atheris.instrument_imports(include=["eventsrc", "projections", "mcap"]):
+    from tests.fuzz.targets import TARGETS
+
+
+def main() -> None:
+    """Never returns: libFuzzer ends the process."""
+    target = TARGETS[sys.argv.pop(1)]
+
+    def mutate(data: bytes, max_size: int, seed: int) -> bytes:
+        chance = random.Random(seed)
+        if chance.random() < 0.2:
+            return bytes(atheris.Mutate(data, max_size))
+        return target.maul(data, chance)[:max_size]
+
+    atheris.Setup(sys.argv, target.check, custom_mutator=mutate)
+    atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main()

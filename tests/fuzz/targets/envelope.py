@@ -1,0 +1,40 @@
+"""`eventsrc.ingest`: never raises; what it accepts is encoded and accepted again."""
+
+import random
+from collections.abc import Sequence
+
+from eventsrc.ingest import Accepted, Rejected, check_all, ingest
+from tests.attack.json_maul import maul_json
+from tests.envelopes import detection, envelope, payload
+from tests.fuzz.target import Target
+from tests.logs import walk
+
+MAX_REASON = 2_000
+
+
+class EnvelopeTarget(Target):
+    """One payload of a robot."""
+
+    def seeds(self) -> Sequence[bytes]:
+        """Envelopes with and without pose, detections and embeddings."""
+        odd = detection("☕", [0.5, -1.0, 2.0], det_id="d-1", extra={"x": [1, None]})
+        documents = [*walk(5, seed=1), envelope(1, None), envelope(2, detections=[odd])]
+        return [payload(document) for document in documents]
+
+    def maul(self, data: bytes, chance: random.Random) -> bytes:
+        """One value becomes another."""
+        return maul_json(data, chance)
+
+    def check(self, data: bytes) -> None:
+        """Both doors say the same, shortly."""
+        said = ingest(data)
+        (kept,) = check_all((data,))
+        assert isinstance(said, Rejected) == isinstance(kept, Rejected)
+        if isinstance(said, Rejected):
+            assert 0 < len(said.reason) <= MAX_REASON
+            assert said == kept
+        else:
+            assert isinstance(said, Accepted)
+            assert said.envelope == kept
+            assert len(said.det_ids) == len(said.vectors) == len(said.envelope.detections)
+            assert 0 <= said.envelope.stamp_ns < 2**63

@@ -1,0 +1,50 @@
+"""A snapshot beside a log: a fold and a view that go on as before, or SnapshotRefused."""
+
+import hashlib
+import random
+import zlib
+from collections.abc import Sequence
+from contextlib import suppress
+
+from projections.settings import Settings
+from projections.snapshot.codec import SnapshotRefused, restore, snapshot
+from projections.snapshot.container import MAGIC
+from tests.attack.json_maul import maul_bytes, maul_json
+from tests.folds import fold
+from tests.fuzz.target import Target
+from tests.logs import walk
+
+_HEAD = len(MAGIC) + hashlib.sha256().digest_size
+_LENGTH_BYTES = 8
+
+
+class SnapshotTarget(Target):
+    """The bytes of the file."""
+
+    def seeds(self) -> Sequence[bytes]:
+        """A small map, and an empty one."""
+        folded = [fold(walk(count, seed=2)) for count in (0, 12)]
+        return [snapshot(one.map, one.view, "log") for one in folded]
+
+    def maul(self, data: bytes, chance: random.Random) -> bytes:
+        """The file itself, its index or its arrays, with lengths and checksum made right."""
+        if chance.random() < 0.1:
+            return maul_bytes(data, chance)
+        try:
+            content = zlib.decompress(data[_HEAD:])
+        except zlib.error:
+            return maul_bytes(data, chance)
+        start = _LENGTH_BYTES + int.from_bytes(content[:_LENGTH_BYTES], "little")
+        index, arrays = content[_LENGTH_BYTES:start], content[start:]
+        if chance.random() < 0.6:
+            index = maul_json(index, chance)
+        else:
+            arrays = maul_bytes(arrays, chance)
+        body = zlib.compress(len(index).to_bytes(_LENGTH_BYTES, "little") + index + arrays, 1)
+        return MAGIC + hashlib.sha256(body).digest() + body
+
+    def check(self, data: bytes) -> None:
+        """Refused, or restored. That what is restored is true, no reader can know: whoever can
+        write here can make a false map, checksum and all."""
+        with suppress(SnapshotRefused):
+            restore(data, Settings(), "log")
