@@ -7,8 +7,9 @@ uvicorn waits for a request for ever, on as many connections as the process may 
 * an answer must have been read after ``ANSWER_S``, and all answers that wait to be read may hold
   ``MAX_UNREAD`` bytes;
 * ``MAX_CONNECTIONS`` are open at most. A newcomer takes the place of one that waits for its peer:
-  of the peer with the most connections the one that has waited longest. So half-open ones give
-  way and honest clients get in.
+  of the peer with the most connections the one that has waited longest. When all are being
+  answered, the peer with the most loses its newest to one with fewer. So half-open ones give way,
+  and whoever asks on very many at once, and honest clients get in.
 
 A body must say its length: one sent in a million chunks would keep the event loop busy for seconds.
 Refusals have the form of all others.
@@ -47,9 +48,10 @@ class Connections:
         self._tell, self._most = tell, most
 
     def admit(self, newcomer: "Connection") -> bool:
-        """Make room for a newcomer; False when all others are being answered."""
+        """Make room for a newcomer; False when all others are being answered, and no peer has more
+        of them than the newcomer's."""
         if len(self._open) >= self._most:
-            self._evict()
+            self._evict(newcomer.peer)
         if len(self._open) >= self._most:
             self.note(f"{self._most} were open, all being answered")
             return False
@@ -84,12 +86,17 @@ class Connections:
             self.drop(longest, "its answer is long and was not read")
             del unread[longest]
 
-    def _evict(self) -> None:
+    def _evict(self, newcomer: str) -> None:
         crowd = Counter(connection.peer for connection in self._open)
         waiting = [connection for connection in self._open if connection.waits_since is not None]
         if waiting:
             oldest = min(waiting, key=lambda c: (-crowd[c.peer], c.waits_since))
             self.drop(oldest, f"{self._most} were open, and it had no request under way")
+            return
+        heaviest, count = crowd.most_common(1)[0]
+        if count > crowd[newcomer] + 1:
+            newest = next(c for c in reversed(self._open) if c.peer == heaviest)
+            self.drop(newest, f"{self._most} were open, all being answered, {count} for its peer")
 
 
 class _Requests(h11.Connection):

@@ -1,7 +1,7 @@
 """The HTTP server: a bound address, TLS, and uvicorn behind an accept loop of our own.
 
 asyncio accepts whatever comes, and has TLS handshakes in progress that nobody counts. Here each
-connection is counted from the moment it is accepted (`connections`), and one is accepted in each
+connection is counted from the moment it is accepted (`connections`), and a few are accepted in each
 turn of the event loop, so that those which are there already are heard in between.
 """
 
@@ -26,6 +26,9 @@ from .notices import Notices
 _BACKLOG: Final = 1024
 _KEEP_ALIVE_S: Final = 5
 _PAUSE_S: Final = 0.1
+_AT_ONCE: Final = 32
+"""Connections accepted in a turn of the event loop. A turn takes milliseconds when many are being
+answered, so that one a turn let a newcomer wait four seconds behind a thousand others."""
 
 
 def bind(host: str, port: int) -> socket.socket:
@@ -105,6 +108,8 @@ class _Server(uvicorn.Server):
                 await asyncio.sleep(_PAUSE_S)
                 continue
             self._begin(accepted)
+            for more in waiting(listener, _AT_ONCE - 1):
+                self._begin(more)
             await asyncio.sleep(0)
 
     def _begin(self, accepted: socket.socket) -> None:
@@ -126,6 +131,13 @@ class _Server(uvicorn.Server):
             await loop.connect_accepted_socket(lambda: connection, accepted, **self._tls)
         except OSError:  # no TLS, or the handshake took too long
             self._connections.forget(connection)
+
+
+def waiting(listener: socket.socket, most: int) -> Iterator[socket.socket]:
+    """Accept what has connected already."""
+    with contextlib.suppress(OSError):  # none waits, or none can be had: the next turn tells
+        for _ in range(most):
+            yield listener.accept()[0]
 
 
 @contextlib.contextmanager

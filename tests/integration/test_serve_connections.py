@@ -1,6 +1,7 @@
 """HTTP connections that never end and requests that are none: real sockets, a small application."""
 
 import json
+import socket
 import ssl
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
@@ -12,7 +13,7 @@ from starlette.responses import Response
 from starlette.types import Receive, Scope, Send
 
 from projections.serve import connections
-from projections.serve.listening import bind, serving, tls_context
+from projections.serve.listening import bind, serving, tls_context, waiting
 from tests.fixtures_tls import Certificate
 from tests.http_attacks import DEADLINE_S, answer, ask, connect, request, status
 
@@ -22,8 +23,15 @@ START = Callable[..., int]
 
 
 async def application(scope: Scope, receive: Receive, send: Send) -> None:
-    """Answers with the length of the body; at /long with more than a socket's buffers take."""
+    """Answers with the length of the body; at /long with more than a socket's buffers take; at
+    /begin it begins to answer, and goes on as long as somebody listens."""
     asked = Request(scope, receive)
+    if scope["path"] == "/begin":
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+        await send({"type": "http.response.body", "body": b"begun", "more_body": True})
+        while (await receive())["type"] != "http.disconnect":
+            pass
+        return
     try:
         body = await asked.body()
     except ClientDisconnect:
@@ -135,6 +143,18 @@ class TestFull:
             others[-1].sendall(request("POST", "/", b"123"))
             assert answer(others[-1]).endswith(b"\r\n\r\n3")
 
+    def test_the_peer_with_most_answers_under_way_loses_the_newest(self, start: START) -> None:
+        port = start(most=4, seconds=DEADLINE_S)
+        with ExitStack() as held:
+            others = [held.enter_context(connect(port, "127.0.0.3")) for _ in range(4)]
+            for other in others:
+                other.sendall(request("GET", "/begin"))
+                assert b"200" in other.recv(65_536)
+            assert ask(port, request("POST", "/", b"1"), source="127.0.0.3") == b""
+            mine = ask(port, request("POST", "/", b"12345"), source="127.0.0.2")
+            assert mine.endswith(b"\r\n\r\n5")
+            assert not answer(others[-1]).endswith(b"0\r\n\r\n"), "cut off in the middle"
+
     def test_handshakes_that_do_not_end_count_too(
         self, start: START, certificate: Certificate
     ) -> None:
@@ -208,3 +228,14 @@ def test_an_end_waits_for_no_half_request(start: START) -> None:
 )
 def test_who_is_behind_an_address(address: str, peer: str) -> None:
     assert connections.peer_of(address) == peer
+
+
+def test_those_who_stand_in_line_are_accepted_a_few_at_a_time() -> None:
+    with bind("127.0.0.1", 0) as listener, ExitStack() as clients:
+        listener.setblocking(False)
+        listener.listen(16)
+        for _ in range(5):
+            clients.enter_context(socket.create_connection(listener.getsockname(), DEADLINE_S))
+        for most, accepted in ((3, 3), (10, 2), (10, 0)):
+            taken = [clients.enter_context(one) for one in waiting(listener, most)]
+            assert len(taken) == accepted
