@@ -137,12 +137,19 @@ def _look_at(path: Path, named: SegmentPath) -> _File:
     except LogDamaged:
         return _File(path, named, None)
     except NotALog:
-        if _is_mcap(path):
+        damaged = _File(path, named, None)
+        if _is_mcap(path) and not _grew_here(damaged):
             raise LogDamaged(_not_ours(path)) from None
-        return _File(path, named, None)
+        return damaged
     base, sealed = int(claims["base"]), PREVIOUS in claims
     where = segment_path(path.parent, base, SEALED if sealed else ACTIVE)
     return _File(path, SegmentPath(where, base, sealed), claims["log_id"])
+
+
+def _grew_here(file: _File) -> bool:
+    """Whether a growing segment whose head is damaged has chunks as only a writer of ours makes
+    them; no other program names a file ``.mcap.active``."""
+    return not file.wanted.sealed and bool(_scan(file).chunks)
 
 
 def _is_mcap(path: Path) -> bool:

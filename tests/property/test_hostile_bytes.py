@@ -176,6 +176,24 @@ def test_rot_anywhere_makes_nothing_up(data: st.DataObject) -> None:
             assert event == was or (event.key == LOSS_KEY and event.offset == was.offset)
 
 
+def test_a_growing_segment_whose_header_is_damaged_is_not_taken_for_another_programs(
+    folder: Path,
+) -> None:
+    path = folder / "log"
+    writer = LogWriter(path, fsync=BY_HAND)
+    for payload in (b"first", b"second"):
+        writer.append(KEY, payload)
+        writer.sync()
+    file = next(path.glob("*.active"))
+    writer._active.close()
+    writer._lock.release()
+    content = bytearray(file.read_bytes())
+    content[10:40] = bytes(30)
+    file.write_bytes(content)
+    recover_log(path)
+    assert [event.payload for event in read_log(path)] == [b"first", b"second"]
+
+
 @pytest.mark.parametrize("torn", [10, 100, 140])
 def test_a_forged_mark_in_a_key_stops_nobody(folder: Path, torn: int) -> None:
     path = folder / "log"
