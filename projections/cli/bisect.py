@@ -9,7 +9,7 @@ import typer
 
 from eventsrc.cli._shell import display, emit, say
 from projections.timetravel import Expression, ExpressionError
-from projections.timetravel.expression import functions_help
+from projections.timetravel.condition_functions import functions_help
 from projections.timetravel.text import search_text
 
 from ._options import SetOption, SettingsOption

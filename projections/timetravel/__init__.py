@@ -6,8 +6,8 @@ condition true. `what_if` folds the log under other settings and compares.
 """
 
 from .causes import Cause
+from .conditions import Expression, ExpressionError
 from .difference import Difference
-from .expression import Expression, ExpressionError
 from .lookup import NoSuchThing
 from .search import Search, Turn
 from .story import Entry, Story

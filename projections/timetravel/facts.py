@@ -9,7 +9,7 @@ from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Iterable
 
-from .expression.values import Names
+from .condition_functions import Names
 from .history import NEVER, History
 from .lives import count_before
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from .causes import Cause
-from .expression import Direction, Expression
-from .expression.values import Value
+from .condition_functions import Direction, Value
+from .conditions import Expression
 from .facts import HistoryFacts
 
 Readings = tuple[tuple[str, Value], ...]

@@ -25,8 +25,8 @@ from projections.snapshot import SnapshotCache
 from projections.view import MapView
 
 from .causes import Cause
+from .conditions import Expression
 from .difference import Difference, difference_of
-from .expression import Expression
 from .facts import HistoryFacts, Tallies
 from .history import History
 from .lives import Merge

@@ -4,12 +4,8 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from projections.timetravel.expression import (
-    FUNCTIONS,
-    Expression,
-    ExpressionError,
-    functions_help,
-)
+from projections.timetravel.condition_functions import FUNCTIONS, functions_help
+from projections.timetravel.conditions import Expression, ExpressionError
 
 
 @dataclass
