@@ -11,10 +11,10 @@ from collections.abc import Iterable
 from datetime import UTC, datetime, timedelta
 from typing import Final
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from eventsrc.frozen import frozen
 from projections.deltas import Delta, ObservationAdded, Pose, UnitVector
 from projections.exact import UM_PER_M, to_float32
 from projections.view import MapView
@@ -24,8 +24,7 @@ _REALS: Final = struct.Struct("4f")
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 
 
-@frozen(eq=False)
-class VectorRow:
+class VectorRow(msgspec.Struct, frozen=True, eq=False, gc=False):
     """One row, as the delta that adds it says it; what the columns hold is worked out when asked.
 
     ``at`` is the keyframe's pose; the event was logged at ``logged_ns``.

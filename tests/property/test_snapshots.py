@@ -1,6 +1,5 @@
 """A snapshot taken anywhere, restored and folded on, equals the fold from the start."""
 
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from tests.property.test_fold_recounts import SETTINGS, runs
 
 
 def _plain(delta: Delta) -> tuple[Any, ...]:
-    values = (getattr(delta, field.name) for field in fields(delta))
+    values = (getattr(delta, name) for name in delta.__struct_fields__)
     return type(delta), *(v.tolist() if isinstance(v, np.ndarray) else v for v in values)
 
 
