@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import chain, islice
 from typing import Any, Final, cast
 
+import msgspec
 import numpy as np
 import pybase64
 from numpy.typing import NDArray
@@ -18,7 +19,6 @@ from pydantic import TypeAdapter, ValidationError
 from pydantic_core import from_json
 
 from .envelope import Detection, Envelope, NotFinite, fault, holds_not_finite
-from .frozen import frozen
 from .ids import DetId, default_det_id
 from .terminal import visible
 
@@ -39,8 +39,7 @@ _validate_json: Callable[[bytes], Envelope] = TypeAdapter(Envelope).validator.va
 """``Envelope.model_validate_json`` without the layer of Python around it, a twentieth of it."""
 
 
-@frozen
-class Accepted:
+class Accepted(msgspec.Struct, frozen=True, gc=False):
     """A valid envelope with its vectors decoded.
 
     ``det_ids`` and ``vectors`` run parallel to ``envelope.detections``. A vector is float32 of
@@ -53,8 +52,7 @@ class Accepted:
     vectors: tuple[Vector | None, ...]
 
 
-@frozen
-class Rejected:
+class Rejected(msgspec.Struct, frozen=True, gc=False):
     """A payload that is not an envelope: ``reason`` names the field, its value and the rule."""
 
     reason: str
