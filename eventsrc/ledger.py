@@ -13,8 +13,7 @@ from typing import Final
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from . import _ledger_cache
-from ._ledger_cache import Note
+from ._ledger_cache import NAME, Note, load, save
 from .envelope import ENVELOPE_VERSION, Int64
 from .log.event import Event
 from .log.fsync import delete_durably
@@ -77,7 +76,7 @@ def _resume(
 ) -> tuple[int, GapLedger]:
     """The saved ledger and the offset behind what it knows; an empty one and 0 if there is none."""
     ledger = GapLedger(settle_ns)
-    saved = _ledger_cache.load(reader, note)
+    saved = load(reader, note)
     if saved is None:
         return 0, ledger
     ledger.restore(saved.states(), now_ns)
@@ -86,7 +85,7 @@ def _resume(
 
 def unread_events(reader: LogReader) -> int:
     """How many events `ledger_of` would have to read."""
-    saved = _ledger_cache.load(reader)
+    saved = load(reader)
     return reader.next_offset - (0 if saved is None else saved.next_offset)
 
 
@@ -95,13 +94,13 @@ def save_ledger(path: Path, log_id: str, next_offset: int, ledger: GapLedger) ->
 
     They must be durable, with everything the ledger reported among them.
     """
-    _ledger_cache.save(path, log_id, next_offset, ledger)
+    save(path, log_id, next_offset, ledger)
 
 
 def forget_ledger(path: Path) -> None:
     """Delete the saved ledger of the log at ``path``: the log has lost events that it knows."""
     with contextlib.suppress(OSError):  # it is not believed either while a segment is missing
-        delete_durably(path / _ledger_cache.NAME)
+        delete_durably(path / NAME)
 
 
 def fold_ledger(events: Iterable[Event], ledger: GapLedger, now_ns: int) -> GapLedger:

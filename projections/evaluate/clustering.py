@@ -11,6 +11,8 @@ from collections import Counter
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
+from projections.partitions import adjusted_rand_of_pairs
+
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
@@ -48,12 +50,8 @@ def _adjusted_rand(
     by_cluster: Counter[Hashable],
     total: int,
 ) -> float:
+    together, in_class, in_cluster = (
+        sum(n * (n - 1) // 2 for n in counts.values()) for counts in (both, by_class, by_cluster)
+    )
     pairs = total * (total - 1) // 2
-    together = sum(n * (n - 1) // 2 for n in both.values())
-    in_class = sum(n * (n - 1) // 2 for n in by_class.values())
-    in_cluster = sum(n * (n - 1) // 2 for n in by_cluster.values())
-    if not pairs or in_class + in_cluster in (0, 2 * pairs):  # both trivial in the same way
-        return 1.0
-    expected = in_class * in_cluster / pairs
-    most = (in_class + in_cluster) / 2
-    return 1.0 if most == expected else (together - expected) / (most - expected)
+    return float(adjusted_rand_of_pairs(pairs, together, in_class, in_cluster))

@@ -10,9 +10,9 @@ import psycopg
 
 from projections.errors import ProjectionMissing
 from projections.postgres.connect import Connection, database_errors, place_of
+from projections.sinks._sql import statements, tables
 from projections.sinks.agtype import text
 
-from ._statements import statements, tables
 from .place_graph import PlaceGraph, PlaceNode
 
 _NUMBER = (1 << 48) - 1

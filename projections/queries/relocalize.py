@@ -35,10 +35,10 @@ from projections.relocalize import (
     rank,
 )
 from projections.relocalize.exact_search import check_space
+from projections.sinks._sql import statements, tables
 from projections.sinks.labels import LABEL_IDS
 
 from ._origin import refuse_mixed
-from ._statements import statements, tables
 
 _LABELS = {"observation": LABEL_IDS["Observation"]}
 _NUMBER = (1 << 48) - 1

@@ -2,8 +2,7 @@
 
 import math
 
-from .answer import Answer, RankedPlace
-from .confidence import UNKNOWN_BELOW
+from projections.relocalize import UNKNOWN_BELOW, Answer, RankedPlace
 
 
 def answer_text(answer: Answer) -> str:

@@ -11,6 +11,8 @@ from typing import LiteralString, cast
 
 from psycopg import sql
 
+from .labels import GRAPH, LABELS
+
 _NAME = re.compile(r"^-- name: (\w+)$", re.MULTILINE)
 
 
@@ -25,3 +27,9 @@ def statements(file: str) -> dict[str, sql.SQL]:
         for name, body in zip(parts[::2], parts[1::2], strict=True)
     }
     return {name: sql.SQL(body) for name, body in bodies.items()}
+
+
+@cache
+def tables() -> dict[str, sql.Identifier]:
+    """The graph's label tables under their names in lower case, for the ``{braces}``."""
+    return {label.lower(): sql.Identifier(GRAPH, label) for label in LABELS}

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from projections.evaluate.truth import Truth
+from projections.partitions import PartitionComparison, Regrouping, compare_partitions
 from projections.settings import Settings
 
 from .alternatives import changed_settings, settings_name
 from .outcome import Outcome, objects_part, places_part
 from .parallel import Progress, fold_all
-from .partition import PartitionComparison, Regrouping, compare_partitions
 
 
 @dataclass(frozen=True, slots=True)

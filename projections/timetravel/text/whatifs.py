@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from projections.timetravel.partition import Regrouping
+from projections.partitions import Regrouping
 from projections.timetravel.whatif import Alternative, WhatIf
 
 from .table import shortened, table

@@ -71,10 +71,15 @@ def adjusted_rand(pairs: Counter[tuple[str | None, str | None]]) -> Fraction:
     together = sum(_pairs(n) for (a, b), n in pairs.items() if a is not None and b is not None)
     in_first = sum(map(_pairs, rows.values()))
     in_second = sum(map(_pairs, columns.values()))
-    all_pairs = _pairs(pairs.total())
+    return adjusted_rand_of_pairs(_pairs(pairs.total()), together, in_first, in_second)
+
+
+def adjusted_rand_of_pairs(total: int, together: int, in_first: int, in_second: int) -> Fraction:
+    """The index from numbers of pairs of things: all of them, those that share a group in both
+    partitions, and those that share one in the first and in the second."""
     if in_first == in_second == together:
         return Fraction(1)
-    by_chance = Fraction(in_first * in_second, all_pairs)
+    by_chance = Fraction(in_first * in_second, total)
     return (together - by_chance) / (Fraction(in_first + in_second, 2) - by_chance)
 
 
