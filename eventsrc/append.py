@@ -9,12 +9,13 @@ in silence.
 from collections.abc import Sequence
 from typing import TypeAlias
 
-from eventsrc.envelope import ENVELOPE_VERSION, Envelope
-from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES, Rejected, quoted
-from eventsrc.keys import fault_in_log
-from eventsrc.log import LogWriter, NewEvent
-from eventsrc.system_events import REJECTED_KEY, RejectedPayload
-from eventsrc.upcast import Arrival, check_envelopes, guess_version
+from eventsrc.transport.config import fault_in_log
+
+from .envelope import ENVELOPE_VERSION, Envelope
+from .ingest import DEFAULT_MAX_PAYLOAD_BYTES, Rejected, quoted
+from .log import LogWriter, NewEvent
+from .system_events import REJECTED_KEY, RejectedPayload
+from .upcast import Arrival, check_envelopes, guess_version
 
 Judged: TypeAlias = tuple[NewEvent, Envelope | Rejected]
 """What gets into the log for one payload, and what the door said to it."""

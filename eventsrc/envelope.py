@@ -4,12 +4,17 @@ The models say what a *valid* envelope is. They are strict: an int is not a stri
 number. Unknown fields need only be JSON; they are ignored here and kept in the log, which stores
 the payload verbatim. Making one from bytes, with every refusal named, is the job of
 `eventsrc.ingest`.
+
+Names for the integers and strings that identify things.
+
+An ``Offset`` is the index of an event in its log: 0, 1, 2 … without holes. It is the only order and
+the only progress marker; times and keyframe ids are data.
 """
 
 import math
 import unicodedata
 from decimal import Decimal
-from typing import Annotated, Any
+from typing import Annotated, Any, NewType
 
 from pydantic import (
     AfterValidator,
@@ -143,3 +148,14 @@ class Envelope(_Model):
         if 0 < len(part) <= 9 and "e" not in part:
             return int(whole + part.ljust(9, "0"))  # the quick way to the same
         return int(Decimal(text).scaleb(9).to_integral_value())
+
+
+Offset = NewType("Offset", int)
+RunId = NewType("RunId", str)
+KeyframeId = NewType("KeyframeId", int)
+DetId = NewType("DetId", str)
+
+
+def default_det_id(run_id: str, keyframe_id: int, index: int) -> DetId:
+    """The id of the ``index``-th detection (from 0) of a keyframe that names none itself."""
+    return DetId(f"{run_id}_kf{keyframe_id}_d{index}")

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import from_json
 
-from .envelope import Detection, Envelope, NotFinite, fault, holds_not_finite
-from .ids import DetId, default_det_id
-from .terminal import visible
+from .envelope import Detection, DetId, Envelope, NotFinite, default_det_id, fault, holds_not_finite
+from .text import visible
 
 DEFAULT_MAX_PAYLOAD_BYTES = 16 * 1024 * 1024
 MAX_PAYLOAD_BYTES = 2 * DEFAULT_MAX_PAYLOAD_BYTES

@@ -15,15 +15,17 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
+from eventsrc.log import mcap_records as _mcap
+from eventsrc.log.active_file import ActiveFile
+from eventsrc.log.format import SegmentPath
+from eventsrc.log.mcap_records import Channel
+from eventsrc.log.reader import OpenSegment
+from eventsrc.log.sealed_segment import SealedFile
+
 from .errors import LogDamaged
-from .ledger import ledger_of
-from .log import Event, LogReader, _mcap
-from .log._active_file import ActiveFile
-from .log._mcap import Channel
-from .log._naming import SegmentPath
-from .log._sealed_file import SealedFile
-from .log.reader import OpenSegment
-from .losses import gap_of
+from .gap_history import ledger_of
+from .gaps import gap_of
+from .log import Event, LogReader
 from .system_events import LOSS_KEY, REJECTED_KEY, Loss, is_system_key
 
 

@@ -20,13 +20,7 @@ from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
-from .envelope import (
-    ENVELOPE_VERSION,
-    MAX_DETECTIONS,
-    Detection,
-    Envelope,
-    holds_not_finite,
-)
+from .envelope import ENVELOPE_VERSION, MAX_DETECTIONS, Detection, Envelope, holds_not_finite
 from .ingest import (
     DEFAULT_MAX_PAYLOAD_BYTES,
     Accepted,

@@ -18,15 +18,19 @@ which up to 2¹² of them one product is enough, and two up to 2³² (`long_dot`
 Positions are integer micrometres, correctly rounded from the float that came; ±10¹³ (10,000 km,
 guarded by the envelope). Squared distances reach 8·10²⁶, so they are Python integers, never int64,
 unless the caller has bounded the difference first.
+
+Plane geometry in integer micrometres, and neighbourhoods other than plain distance.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .deltas import UnitVector
+from .deltas import Pose, UnitVector
 
 Units: TypeAlias = tuple[NDArray[np.float64], UnitVector, int]
 """A unit vector twice, the same integers, multiples of 2⁻²⁰, in float64 and in int32; and its exact
@@ -130,3 +134,24 @@ def long_dot(vector_sum: NDArray[np.float64], unit: NDArray[np.float64]) -> int:
     high = np.floor(np.ldexp(vector_sum, -_HALF_BITS))
     low = vector_sum - np.ldexp(high, _HALF_BITS)
     return (int(high.dot(unit)) << _HALF_BITS) + int(low.dot(unit))
+
+
+@dataclass(frozen=True, slots=True)
+class Neighbourhood:
+    """``holds(a, b)`` says whether two poses are neighbours.
+
+    It must be symmetric and pure. It is asked only for two poses that differ by at most
+    ``reach_um`` in x and in y; others are none, and a pose is its own neighbour whatever it says.
+
+    ``name`` stands for all of it in `Settings.neighbourhood`, and so in the fingerprint: a rule
+    that would say otherwise of any two poses needs another name.
+    """
+
+    name: str
+    reach_um: int
+    holds: Callable[[Pose, Pose], bool]
+
+
+def distance_um(ax: int, ay: int, bx: int, by: int) -> int:
+    """The distance of two points, rounded down to whole micrometres."""
+    return math.isqrt((ax - bx) ** 2 + (ay - by) ** 2)

@@ -36,7 +36,7 @@ class Settings(BaseModel):
     embedding_dim: Annotated[int, Field(ge=1, le=16_000)] | None = None
     """The map's embedding dimension; None takes that of the first embedded detection."""
     neighbourhood: str | None = None
-    """The name of the `projections.geometry.Neighbourhood` that takes the place of plain distance,
+    """The name of the `projections.exact.Neighbourhood` that takes the place of plain distance,
     and of ``eps_m``. A rule is code: only a program can give one, no command."""
 
     def fingerprint(self) -> str:

@@ -1,7 +1,7 @@
 """Waiting for what a rebuild leaves the server to do: dropping what was replaced."""
 
-from projections.postgres.connect import Targets, connect
-from projections.sinks._leaving import wait_for_drop
+from projections.database.connection import Targets, connect
+from projections.database.swap import wait_for_drop
 
 
 def wait_for_drops(targets: Targets) -> None:

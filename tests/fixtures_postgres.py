@@ -12,8 +12,8 @@ import psycopg
 import pytest
 from psycopg import sql
 
-from projections.postgres.connect import Targets, connect, ensure_extension
-from projections.postgres.embedded import EmbeddedServer
+from projections.database.connection import Targets, connect, ensure_extension
+from projections.database.embedded import EmbeddedServer
 
 _TEMPLATE = f"mapfold_template_{os.getpid()}"
 _numbers = count()

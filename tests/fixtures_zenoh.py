@@ -13,13 +13,12 @@ from typing import IO
 
 import pytest
 
-from eventsrc._zenoh import Session, ZenohOptions, open_session
-from eventsrc.router import Router
+from eventsrc.transport.session import Router, Session, ZenohOptions, open_session
 
 MAPFOLD = "from projections.cli import main; main()"
 PUBLISHER = """
 import sys
-from eventsrc._zenoh import ZenohOptions, open_session
+from eventsrc.transport.session import ZenohOptions, open_session
 endpoint, key, *payloads = sys.argv[1:]
 with open_session(ZenohOptions(connect=(endpoint,)), mode="client") as session:
     publisher = session.publisher(key)

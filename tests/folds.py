@@ -11,10 +11,10 @@ from sklearn.cluster import DBSCAN
 
 from eventsrc.ingest import Accepted, ingest
 from projections.deltas import Delta
-from projections.geometry import Neighbourhood
+from projections.exact import Neighbourhood
+from projections.model.view import MapView
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
-from projections.view import MapView
 
 from .envelopes import payload
 

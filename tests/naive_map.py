@@ -2,7 +2,7 @@
 
 It shares no line with what it checks: it reads documents, not the door's envelopes; it computes in
 fractions and Python integers; after every keyframe it counts all anew. Only the rules of DESIGN 3
-and 5 are the same, and the words of `projections.digest`, which it writes by itself.
+and 5 are the same, and the words of `projections.model.digest`, which it writes by itself.
 """
 
 import base64
@@ -152,7 +152,7 @@ class NaiveMap:
         return [None if k["pose"] is None else next(coming) for k in self.keyframes]
 
     def digest(self) -> str:
-        """What `projections.digest.map_digest` must say."""
+        """What `projections.model.digest.map_digest` must say."""
         labels = self._labels()
         sections = {
             "runs": [(run, min(times)) for run, times in self.runs.items()],

@@ -10,9 +10,9 @@ from typing import Any
 import psycopg
 from psycopg import sql
 
+from projections.database.connection import Targets
 from projections.exact import Q40
-from projections.postgres.connect import Targets
-from projections.view import MapView
+from projections.model.view import MapView
 
 ORDER = (
     "Run", "Keyframe", "Pose", "Observation", "Object", "Place", "HAS_KEYFRAME", "HAS_POSE",

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import psycopg
 
-from projections.postgres.connect import connect, ensure_extension
-from projections.postgres.embedded import EmbeddedServer
+from projections.database.connection import connect, ensure_extension
+from projections.database.embedded import EmbeddedServer
 
 WAIT_S = 120.0
 

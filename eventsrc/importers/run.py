@@ -17,9 +17,8 @@ from eventsrc.ingest import Rejected
 from eventsrc.log import FsyncPolicy, LogWriter
 from eventsrc.system_events import LOSS_KEY, REJECTED_KEY
 
-from .json_lines import JsonLines
-from .other_logs import MCAP_MAGIC, McapFile, OtherLog
-from .record import Imported, Source
+from .json_lines import Imported, JsonLines, Source
+from .mcap_files import MCAP_MAGIC, McapFile, OtherLog
 
 DEFAULT_KEY = "tb/detections"
 STDIN = "-"

@@ -1,15 +1,15 @@
 """The log: an append-only directory of MCAP segments, the only truth (docs/log-format.md)."""
 
-from ._file_fault import FileFault
-from ._lineage import lineage, still_holds
+from .durable_files import ALWAYS, GROUP_COMMIT, NEVER, FsyncPolicy, parse_fsync
 from .event import Event, NewEvent
-from .findings import Finding
-from .fsync import ALWAYS, GROUP_COMMIT, NEVER, FsyncPolicy, parse_fsync
+from .file_fault import FileFault
+from .log_identity import lineage, still_holds
 from .reader import LogReader
 from .recover import RecoveryReport, SegmentRecovery, recover_log
 from .segment import Unreadable
 from .tail import follow
 from .verify import Verification, verify_log
+from .verify_events import Finding
 from .writer import LogWriter, Sealing
 
 __all__ = [

@@ -14,11 +14,11 @@ from pathlib import Path
 
 from eventsrc.errors import LogDamaged, LogError, LogNotFound, NotALog
 
-from ._active_file import ActiveFile
-from ._naming import ACTIVE, SEALED, SegmentPath, list_growing, segment_path
-from ._sealed_file import SealedFile
-from ._whose import mixed_up
+from .active_file import ActiveFile
 from .event import Event
+from .format import ACTIVE, SEALED, SegmentPath, list_growing, segment_path
+from .log_identity import mixed_up
+from .sealed_segment import SealedFile
 from .segment import Unreadable, chunk_events
 
 _OPEN_SEGMENTS = 8

@@ -16,14 +16,10 @@ from typing import Final
 from eventsrc.clock import Clock, system_clock
 from eventsrc.errors import LogDamaged, LogError, NotALog
 
-from ._active import ActiveSegment
-from ._arrange import Arrangement, Moved, set_aside
-from ._check import check_sealed
-from ._head import head_of
-from ._lock import WriterLock
-from ._mcap import MESSAGE_HEAD
-from ._moment import moment_between
-from ._naming import (
+from .active_segment import ActiveSegment
+from .arrange import Arrangement, Moved, set_aside
+from .durable_files import GROUP_COMMIT, delete_durably, keep_copy, sync_directory, unlink_quietly
+from .format import (
     ACTIVE,
     DAMAGED,
     DUPLICATE,
@@ -31,16 +27,19 @@ from ._naming import (
     SEALED,
     SegmentPath,
     half_renamed,
+    head_of,
     leftovers,
     list_segments,
     segment_path,
 )
-from ._rebuild import rebuild, trimmed
-from ._scan import Scan, scan_active
-from ._scan_sealed import scan_sealed
-from ._seal import NO_PREVIOUS, REPLACES, SegmentPlan, file_sha256
-from .fsync import GROUP_COMMIT, delete_durably, keep_copy, sync_directory, unlink_quietly
+from .lock import WriterLock
+from .mcap_records import MESSAGE_HEAD
 from .reader import segments_of
+from .rebuild_segment import moment_between, rebuild, trimmed
+from .scan import Scan, scan_active
+from .scan_sealed import scan_sealed
+from .seal import NO_PREVIOUS, REPLACES, SegmentPlan, file_sha256
+from .sealed_segment import check_sealed
 
 UNASKED_LOSSES: Final = 100_000
 """So many loss events recovery adds unasked, besides those that the damaged bytes can have held."""

@@ -8,11 +8,10 @@ from pathlib import Path
 
 from eventsrc.errors import LogDamaged
 
-from . import _mcap
-from ._head import HEAD_BYTES, read_head
-from ._mcap import BadRecord, Channel
-from ._schemas import envelope_version
+from . import mcap_records as _mcap
 from .event import Event
+from .format import HEAD_BYTES, envelope_version, read_head
+from .mcap_records import BadRecord, Channel
 
 
 @dataclass(frozen=True, slots=True)

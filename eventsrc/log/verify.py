@@ -10,20 +10,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from eventsrc.errors import LogDamaged, LogError, NotALog
-from eventsrc.words import counted
+from eventsrc.text import counted
 
-from ._check import check_sealed
-from ._head import WrongPlace, claims_of, head_of
-from ._lock import is_held
-from ._naming import SEALED, SegmentPath, segment_path
-from ._raw import raw_events
-from ._scan import Scan, scan_active
-from ._scan_sealed import scan_sealed
-from ._seal import NO_PREVIOUS, REPLACES
-from ._verify_events import EventFindings
-from ._whose import majority_of
-from .findings import Finding, Kind
+from .format import SEALED, SegmentPath, WrongPlace, claims_of, head_of, segment_path
+from .lock import is_held
+from .log_identity import majority_of
 from .reader import segments_of
+from .scan import Scan, raw_events, scan_active
+from .scan_sealed import scan_sealed
+from .seal import NO_PREVIOUS, REPLACES
+from .sealed_segment import check_sealed
+from .verify_events import EventFindings, Finding, Kind
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,16 +18,16 @@ from eventsrc.clock import Clock, system_clock
 from eventsrc.envelope import ENVELOPE_VERSION
 from eventsrc.errors import LogError, MapfoldError, NotALog
 
-from ._active import ActiveSegment
-from ._commits import Commits, OverlappedCommits
-from ._file_fault import FileFault
-from ._lock import WriterLock
-from ._mcap import MAX_EVENT_BYTES
-from ._naming import LOCK, leftovers, list_segments
-from ._restart import Restart, restart
-from ._sealer import Sealer
+from .active_segment import ActiveSegment
+from .commit_thread import Commits, OverlappedCommits
+from .durable_files import GROUP_COMMIT, FsyncPolicy, make_directory_durably, unlink_quietly
 from .event import NewEvent
-from .fsync import GROUP_COMMIT, FsyncPolicy, make_directory_durably, unlink_quietly
+from .file_fault import FileFault
+from .format import LOCK, leftovers, list_segments
+from .lock import WriterLock
+from .mcap_records import MAX_EVENT_BYTES
+from .restart import Restart, restart
+from .seal_worker import Sealer
 
 ROTATE_BYTES = 64 * 1024 * 1024
 ROTATE_EVENTS = 1_000_000

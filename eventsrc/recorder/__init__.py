@@ -1,7 +1,7 @@
 """Zenoh to log: callback → bounded queue → one writer thread."""
 
-from .inbox import DEFAULT_QUEUE_SIZE
+from .queue import DEFAULT_QUEUE_SIZE
 from .recorder import DEFAULT_KEYS, Recorder
-from .report import RecorderReport
+from .writer_thread import RecorderReport
 
 __all__ = ["DEFAULT_KEYS", "DEFAULT_QUEUE_SIZE", "Recorder", "RecorderReport"]

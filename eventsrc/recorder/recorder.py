@@ -5,17 +5,15 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Final
 
-from eventsrc._zenoh import Bound, Number, Received, Session, check_keys
-from eventsrc.acks import ACK_PREFIX
 from eventsrc.errors import TransportError
+from eventsrc.gaps import GapLedger
 from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES
 from eventsrc.log import LogWriter
-from eventsrc.losses import GapLedger
-from eventsrc.sent import MAX_SENT_BYTES, sent_key
+from eventsrc.robot.acks import ACK_PREFIX, MAX_SENT_BYTES, sent_key
+from eventsrc.transport.session import Bound, Number, Received, Session, check_keys
 
-from .inbox import DEFAULT_QUEUE_SIZE, Inbox
-from .report import RecorderReport
-from .writing import Writing
+from .queue import DEFAULT_QUEUE_SIZE, Inbox
+from .writer_thread import RecorderReport, Writing
 
 DEFAULT_KEYS: Final = ("tb/detections",)
 _REJECTED_WHOLE: Final = 2
@@ -28,7 +26,7 @@ class Recorder:
     """Records everything under ``keys`` from an open session into an open log.
 
     Subscribed when the constructor returns: from then on nothing published passes it by. ``ledger``
-    is what the log already holds (see `eventsrc.ledger`); without it, a gap between an earlier
+    is what the log already holds (see `eventsrc.gap_history`); without it, a gap between an earlier
     recorder's last keyframe and this one's first is not seen, and no ledger is saved.
     ``report_gaps`` off is for robots that do not count their keyframes by one.
     """

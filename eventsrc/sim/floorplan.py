@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .chance import happens, stream, uniform
+from .random_streams import happens, stream, uniform
 from .shapes import Point, Rect, Segment
 
 DOOR_M = 1.0

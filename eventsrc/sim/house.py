@@ -14,9 +14,9 @@ import numpy as np
 from eventsrc.errors import MapfoldError
 
 from .catalogue import DINING_SET, FURNITURE, MODELS, Model
-from .chance import stream, uniform
 from .floorplan import Door, FloorPlan, Room, build_floor_plan
 from .grid import DriveGrid
+from .random_streams import stream, uniform
 from .shapes import Point, Rect, Walls
 
 _ATTEMPTS = 40

@@ -4,18 +4,30 @@ Run ``a`` explores: every viewpoint of every room and of the hall with a look ar
 end one more in the wide opening between living and dining room. Any other run starts somewhere in
 the house with a look around, as a robot does that was carried there, and then visits all rooms in
 its own order, looking around in about half of them.
+
+From stops to keyframes: the robot turns, drives, looks around.
+
+The robot drives after a carrot on its path (pure pursuit): it steers at a point ``_CARROT_M``
+ahead, stands still while it looks too far away from it, and turns while it drives otherwise. Time
+runs in ticks of 50 ms. A keyframe is due after 0.5 m or 15° since the last one.
+
+Twenty ticks of straight driving are 0.5 m but for the last bits of a sine, and those depend on the
+C library. So every threshold here is a micrometre or a microradian generous (``_SLACK``): what is
+equal in mathematics is equal everywhere.
 """
 
 import itertools
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from .chance import happens, stream, uniform
 from .floorplan import HALL, OPENING_M, Room
+from .grid import DriveGrid
 from .house import House
-from .shapes import Point
+from .random_streams import happens, stream, uniform
+from .shapes import Point, wrap
 
 EXPLORER = "a"
 _TWO_VIEWS_FROM_M = 5.0
@@ -89,3 +101,106 @@ def _opening(house: House) -> Point:
 def _way_m(house: House, start: Point, goal: Point) -> float:
     points = house.grid.route(start, goal)
     return sum(math.dist(a, b) for a, b in itertools.pairwise(points))
+
+
+KEYFRAME_M = 0.5
+KEYFRAME_RAD = math.radians(15.0)
+
+_TICK_S = 0.05
+_STEP_M = 0.5 * _TICK_S
+_TURN_RAD = math.radians(40.0) * _TICK_S
+_CARROT_M = 0.3
+_STAND_RAD = math.radians(35.0)
+_PAUSE_S = 0.5
+_SLACK = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class TruePose:
+    """Where the robot truly is, ``time_s`` seconds after its start: metres, radians."""
+
+    time_s: float
+    x: float
+    y: float
+    yaw_rad: float
+
+
+def walk(grid: DriveGrid, stops: Sequence[Stop]) -> Iterator[TruePose]:
+    """Every tick of the drive along ``stops``."""
+    robot = _Robot(*stops[0].spot)
+    yield robot.pose
+    for index, stop in enumerate(stops):
+        if index:
+            yield from robot.follow(grid.route(robot.spot, stop.spot))
+        if stop.look_around:
+            yield from robot.look_around()
+
+
+def keyframes(poses: Iterator[TruePose]) -> Iterator[TruePose]:
+    """The poses at which a keyframe is due; the first one always is."""
+    last: TruePose | None = None
+    for pose in poses:
+        if last is None or _due(last, pose):
+            last = pose
+            yield pose
+
+
+def _due(last: TruePose, pose: TruePose) -> bool:
+    if math.hypot(pose.x - last.x, pose.y - last.y) >= KEYFRAME_M - _SLACK:
+        return True
+    return abs(wrap(pose.yaw_rad - last.yaw_rad)) >= KEYFRAME_RAD - _SLACK
+
+
+class _Robot:
+    def __init__(self, x: float, y: float) -> None:
+        self._x, self._y, self._yaw, self._ticks = x, y, 0.0, 0
+
+    @property
+    def spot(self) -> Point:
+        return self._x, self._y
+
+    @property
+    def pose(self) -> TruePose:
+        return TruePose(self._ticks * _TICK_S, self._x, self._y, self._yaw)
+
+    def follow(self, path: Sequence[Point]) -> Iterator[TruePose]:
+        track = list(_densified(path))
+        carrot = 0
+        while True:
+            while (
+                carrot < len(track) - 1 and math.dist(self.spot, track[carrot]) < _CARROT_M + _SLACK
+            ):
+                carrot += 1
+            left = math.dist(self.spot, track[carrot])
+            if left < 1e-6:
+                return
+            self._steer(track[carrot], left)
+            yield self._tick()
+
+    def look_around(self) -> Iterator[TruePose]:
+        for _ in range(round(2 * math.pi / _TURN_RAD)):
+            self._yaw = wrap(self._yaw + _TURN_RAD)
+            yield self._tick()
+        self._ticks += round(_PAUSE_S / _TICK_S)
+
+    def _steer(self, target: Point, left: float) -> None:
+        error = wrap(math.atan2(target[1] - self._y, target[0] - self._x) - self._yaw)
+        if left <= _STEP_M + _SLACK and abs(error) < math.pi / 2:
+            self._x, self._y = target  # the last step: arrive
+            return
+        self._yaw = wrap(self._yaw + max(-_TURN_RAD, min(_TURN_RAD, error)))
+        if abs(error) < _STAND_RAD + _SLACK:
+            step = min(_STEP_M, left) * math.cos(error)
+            self._x += step * math.cos(self._yaw)
+            self._y += step * math.sin(self._yaw)
+
+    def _tick(self) -> TruePose:
+        self._ticks += 1
+        return self.pose
+
+
+def _densified(path: Sequence[Point]) -> Iterator[Point]:
+    for a, b in itertools.pairwise(path):
+        count = max(1, math.ceil(math.dist(a, b) / 0.05))
+        for k in range(1, count + 1):
+            yield a[0] + (b[0] - a[0]) * k / count, a[1] + (b[1] - a[1]) * k / count

@@ -14,11 +14,11 @@ if TYPE_CHECKING:
 
 COMMANDS: "Mapping[str, str]" = {
     "demo": "projections.cli.demo",
-    "record": "eventsrc.cli.record",
-    "import": "eventsrc.cli.import_",
-    "log": "eventsrc.cli.log",
-    "router": "eventsrc.cli.router",
-    "simulate": "eventsrc.cli.simulate",
+    "record": "projections.cli.record",
+    "import": "projections.cli.import_",
+    "log": "projections.cli.log",
+    "router": "projections.cli.router",
+    "simulate": "projections.cli.simulate",
     "replay": "projections.cli.replay",
     "tail": "projections.cli.tail",
     "status": "projections.cli.status",
@@ -40,7 +40,7 @@ COMMANDS: "Mapping[str, str]" = {
 
 def command_line(names: "Iterable[str]" = tuple(COMMANDS)) -> "typer.Typer":
     """The program with these commands."""
-    from ._program import compose  # here, so that `main` is there before typer is
+    from .start import compose  # here, so that `main` is there before typer is
 
     return compose(names, COMMANDS)
 
@@ -48,7 +48,7 @@ def command_line(names: "Iterable[str]" = tuple(COMMANDS)) -> "typer.Typer":
 def main() -> None:
     """Entry point of the ``mapfold`` program; it ends by SystemExit."""
     try:
-        from ._start import start
+        from .start import start
     except KeyboardInterrupt:
         os.write(2, b"mapfold: interrupted\n")
         os._exit(130)

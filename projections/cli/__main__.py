@@ -1,5 +1,5 @@
 """`python -m projections.cli`: the ``mapfold`` command without its entry point installed."""
 
-from . import main
+from projections.cli import main
 
 main()

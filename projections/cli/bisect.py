@@ -7,14 +7,13 @@ from typing import Annotated
 
 import typer
 
-from eventsrc.cli._shell import display, emit, say
-from projections.timetravel import Expression, ExpressionError
-from projections.timetravel.condition_functions import functions_help
-from projections.timetravel.text import search_text
+from projections.history import Expression, ExpressionError
+from projections.history.condition_functions import functions_help
+from projections.history.rendering import search_text
 
-from ._options import SetOption, SettingsOption
-from ._point import W, point
-from ._timeline import MOST_LINES, AllOption, JsonOption, LogArgument, timeline
+from .options import SetOption, SettingsOption, W, point
+from .terminal import display, emit, say
+from .timeline_options import MOST_LINES, AllOption, JsonOption, LogArgument, timeline
 
 _HELP = f"""The first event that made a condition over the map true.
 

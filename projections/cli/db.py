@@ -5,25 +5,17 @@ from typing import Annotated
 
 import typer
 
-from eventsrc.cli._shell import display, emit, finish, say
-from eventsrc.terminal import visible
-from eventsrc.words import counted
-from projections.postgres.embedded import EmbeddedServer
-from projections.runner import rebuild
-from projections.runner.check import CheckReport
-from projections.runner.check import check as check_projections
-from projections.runner.retry import retry
-from projections.sinks.roles import roles_sql
+from eventsrc.text import counted, visible
+from projections.database import rebuild
+from projections.database.check import CheckReport
+from projections.database.check import check as check_projections
+from projections.database.embedded import EmbeddedServer
+from projections.database.grants import roles_sql
+from projections.database.retry import retry
 
-from ._options import (
-    DbOption,
-    SetOption,
-    SettingsOption,
-    VectorDbOption,
-    databases,
-    settings_from,
-)
+from .options import DbOption, SetOption, SettingsOption, VectorDbOption, databases, settings_from
 from .replay import JsonOption, LogArgument, OnlyOption, only_of
+from .terminal import display, emit, finish, say
 
 group = typer.Typer(
     help="The embedded PostgreSQL server, and a check of any database against a log.",

@@ -5,9 +5,10 @@ from typing import Annotated
 
 import typer
 
-from eventsrc.cli._shell import emit, finish, say
 from eventsrc.sim import DEFAULT_SEED
-from projections.cli._options import DbOption, VectorDbOption, sigterm_unwinds
+
+from .options import DbOption, VectorDbOption, sigterm_unwinds
+from .terminal import emit, finish, say
 
 
 def demo(

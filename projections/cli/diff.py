@@ -4,12 +4,11 @@ from typing import Annotated
 
 import typer
 
-from eventsrc.cli._shell import display, emit
-from projections.timetravel.text import difference_text
+from projections.history.rendering import difference_text
 
-from ._options import SetOption, SettingsOption
-from ._point import W, point
-from ._timeline import MOST_LINES, AllOption, JsonOption, LogArgument, timeline
+from .options import SetOption, SettingsOption, W, point
+from .terminal import display, emit
+from .timeline_options import MOST_LINES, AllOption, JsonOption, LogArgument, timeline
 
 
 def diff(

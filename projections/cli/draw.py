@@ -5,15 +5,14 @@ from typing import Annotated
 
 import typer
 
-from eventsrc.cli._shell import say
 from eventsrc.log import LogReader
-from eventsrc.words import counted
-from projections.cli._options import SetOption, SettingsOption, settings_from
-from projections.cli._picture import check_picture
-from projections.cli._point import W, point
-from projections.folding import fold_events
+from eventsrc.text import counted
+from projections.model.fold import fold_events
+from projections.model.view import MapView
 from projections.reducers.semantic_map import SemanticMap
-from projections.view import MapView
+
+from .options import SetOption, SettingsOption, W, check_picture, point, settings_from
+from .terminal import say
 
 
 def draw(
@@ -45,7 +44,7 @@ def draw(
     # Here and not above: matplotlib takes longer to import than most commands take to run.
     from eventsrc.sim import build_house
     from projections.drawing import draw_map, floor_of
-    from projections.drawing.merges import bridges_of, fold_with_merges
+    from projections.drawing.picture import bridges_of, fold_with_merges
 
     check_picture(out)
     settings = settings_from(settings_file, set_)

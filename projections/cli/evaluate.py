@@ -1,22 +1,31 @@
-"""`mapfold evaluate`: how good are the places, the objects and the re-localisation."""
+"""`mapfold evaluate`: how good are the places, the objects and the re-localisation.
 
+Scores against a truth that says nothing of the map look perfect; people are told so.
+"""
+
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from eventsrc.cli._shell import display, emit, say
-from projections.cli._options import SetOption, SettingsOption, settings_from
-from projections.cli._picture import check_picture
-from projections.cli._point import W
-from projections.cli._question import HfovOption, ImageOption, camera_from
-from projections.cli._truth import warn_of_no_truth
-from projections.cli.relocalize import method_from
 from projections.evaluate import evaluate as score
 from projections.evaluate import read_truth
 from projections.evaluate.picture import draw_failures
 from projections.evaluate.questions import DEFAULT_SEED
-from projections.evaluate.text import scores_text
+from projections.evaluate.run import scores_text
+
+from .options import SetOption, SettingsOption, W, check_picture, settings_from
+from .question_options import HfovOption, ImageOption, camera_from
+from .relocalize import method_from
+from .terminal import display, emit, say
+
+
+def warn_of_no_truth(log: Path, scores: Mapping[str, Any] | None) -> None:
+    """Say so when none of a map's keyframes and observations has truth; None is no scores."""
+    if scores is None or scores["places"]["rooms"] or scores["objects"]["instances"]:
+        return
+    say(f"no truth for any keyframe of {log}: its places and objects are not scored; see --truth")
 
 
 def evaluate(

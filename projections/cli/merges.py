@@ -5,17 +5,15 @@ from typing import Annotated
 
 import typer
 
-from eventsrc.cli._shell import display, emit, say
 from eventsrc.errors import MisuseError
-from projections.timetravel import Timeline
-from projections.timetravel.lives import Merge
-from projections.timetravel.merge_story import merge_document
-from projections.timetravel.text import merge_text, merges_text
+from projections.history import Timeline
+from projections.history.merges import merge_document
+from projections.history.records import Merge
+from projections.history.rendering import merge_text, merges_text
 
-from ._options import SetOption, SettingsOption
-from ._picture import check_picture
-from ._point import point
-from ._timeline import AtOption, JsonOption, LogArgument, timeline
+from .options import SetOption, SettingsOption, check_picture, point
+from .terminal import display, emit, say
+from .timeline_options import AtOption, JsonOption, LogArgument, timeline
 
 
 def merges(
@@ -68,7 +66,7 @@ def merges(
 
 def _draw(opened: Timeline, merge: Merge, out: Path) -> None:
     # Here and not above: matplotlib takes longer to import than most commands take to run.
-    from projections.timetravel.picture import draw_merge
+    from projections.history.picture import draw_merge
 
     draw_merge(opened, merge, out)
     say(f"wrote {out}: merge {merge.number}, before and after")

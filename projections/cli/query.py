@@ -7,21 +7,10 @@ from typing import Annotated, Any
 
 import typer
 
-from eventsrc.cli._shell import display, emit
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
-from projections.cli._options import (
-    DbOption,
-    SetOption,
-    SettingsOption,
-    VectorDbOption,
-    databases,
-)
-from projections.cli._past import past_settings, say_defaults
-from projections.cli._point import W, point
-from projections.cli._question import QuestionArgument, question_from
-from projections.folding import fold_log
-from projections.postgres.connect import connect
+from projections.database.connection import connect
+from projections.model.fold import fold_log
 from projections.queries.ask import (
     Asker,
     LiveAsker,
@@ -34,6 +23,20 @@ from projections.queries.ask import (
 )
 from projections.queries.relocalize import Reader, prepare_graph
 from projections.settings import Settings
+
+from .options import (
+    DbOption,
+    SetOption,
+    SettingsOption,
+    VectorDbOption,
+    W,
+    databases,
+    past_settings,
+    point,
+    say_defaults,
+)
+from .question_options import QuestionArgument, question_from
+from .terminal import display, emit
 
 AtOption = Annotated[
     str | None,

@@ -1,32 +1,66 @@
-"""`mapfold relocalize`: which Place is this, from a few object crops."""
+"""`mapfold relocalize`: which Place is this, from a few object crops.
 
+An answer as people read it.
+"""
+
+import math
 from pathlib import Path
 from typing import Annotated, cast, get_args
 
 import typer
 
-from eventsrc.cli._shell import display, emit, say
 from eventsrc.errors import MisuseError
-from projections.cli._options import (
+from projections.queries.relocalize import relocalize as ask
+from projections.relocalize import UNKNOWN_BELOW, Answer, Camera, Crop, Method, RankedPlace
+from projections.relocalize.exact_search import relocalize_as_of
+
+from .options import (
     DbOption,
     SetOption,
     SettingsOption,
     VectorDbOption,
+    W,
     databases,
+    past_settings,
+    say_defaults,
 )
-from projections.cli._past import past_settings, say_defaults
-from projections.cli._point import W
-from projections.cli._question import (
-    HfovOption,
-    ImageOption,
-    QuestionArgument,
-    camera_from,
-    question_from,
-)
-from projections.queries.relocalize import relocalize as ask
-from projections.relocalize import UNKNOWN_BELOW, Answer, Camera, Crop, Method
-from projections.relocalize.as_of import relocalize_as_of
-from projections.relocalize.text import answer_text
+from .question_options import HfovOption, ImageOption, QuestionArgument, camera_from, question_from
+from .terminal import display, emit, say
+
+
+def answer_text(answer: Answer) -> str:
+    """A few lines: where, how sure, and what speaks for it."""
+    lines = [_verdict(answer), _pose_line(answer)]
+    for number, place in enumerate(answer.places, start=1):
+        lines += _place_line(number, place)
+    return "\n".join(line for line in lines if line) + "\n"
+
+
+def _verdict(answer: Answer) -> str:
+    sure = f"confidence {answer.confidence:.2f}"
+    if not answer.places:
+        return f"unknown: nothing in the map looks like these crops ({sure})"
+    if answer.unknown:
+        return f"unknown: {sure} is below {UNKNOWN_BELOW}; the likeliest places would be"
+    return f"{answer.places[0].place_id} ({sure})"
+
+
+def _pose_line(answer: Answer) -> str:
+    pose = answer.pose
+    if pose is None:
+        return ""
+    yaw = "" if pose.yaw is None else f", facing {math.degrees(pose.yaw):.0f}°"
+    return f"pose ({pose.x:.2f}, {pose.y:.2f}) m{yaw}, spread {pose.spread_m:.2f} m"
+
+
+def _place_line(number: int, place: RankedPlace) -> list[str]:
+    centre = f"({place.centroid_x:.2f}, {place.centroid_y:.2f}) m"
+    lines = [f"{number}. {place.place_id}  score {place.score:.3f}  centroid {centre}"]
+    lines += [
+        f"   {e.similarity:.3f}  {e.class_name}  {e.object_id or 'no object'}  {e.det_id}"
+        for e in place.evidence
+    ]
+    return lines
 
 
 def relocalize(

@@ -1,23 +1,118 @@
-"""`mapfold serve`: answer lost robots over Zenoh and HTTP until a signal ends it."""
+"""`mapfold serve`: answer lost robots over Zenoh and HTTP until a signal ends it.
+
+Where `mapfold serve` listens for HTTP, and who may ask there.
+
+An address that others can reach demands a token; everything is checked before a database is
+opened.
+"""
 
 import dataclasses
-from contextlib import ExitStack
+import os
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final, Self
 
 import typer
 
-from eventsrc._zenoh import open_session
-from eventsrc.cli._shell import say
-from eventsrc.cli._signals import stop_on_signals
-from eventsrc.cli._zenoh_options import ConfigOption, ConnectOption, ListenOption, zenoh_options
 from eventsrc.errors import MisuseError
-from projections.cli._http import HttpDoor, HttpOptions
-from projections.cli._options import DbOption, VectorDbOption
-from projections.cli._question import HfovOption, ImageOption, camera_from
-from projections.postgres.connect import open_targets
+from eventsrc.transport.session import open_session
+from projections.database.connection import open_targets
 from projections.serve import Answerer, Pools, Room, ZenohService
 from projections.serve.answering import DEFAULT_MAX_BYTES
+
+from .options import DbOption, VectorDbOption
+from .question_options import HfovOption, ImageOption, camera_from
+from .signals import stop_on_signals
+from .terminal import say
+from .zenoh_options import ConfigOption, ConnectOption, ListenOption, zenoh_options
+
+if TYPE_CHECKING:  # what needs the extra [serve] is imported when it is asked for
+    import socket
+    import ssl
+
+    from projections.serve import Answerer, Room
+
+
+@dataclass(frozen=True, slots=True)
+class HttpOptions:
+    """The options beside ``--http``."""
+
+    token_file: Path | None
+    tls_cert: Path | None
+    tls_key: Path | None
+    hosts: tuple[str, ...]
+
+    def refuse_without_http(self) -> None:
+        """Raise MisuseError when one of them is given, as they mean nothing without ``--http``."""
+        for name, value in (
+            ("--token-file", self.token_file),
+            ("--tls-cert", self.tls_cert),
+            ("--tls-key", self.tls_key),
+            ("--allow-host", self.hosts),
+        ):
+            if value:
+                raise MisuseError(f"{name} is for HTTP; give --http HOST:PORT too")
+
+
+@dataclass(frozen=True, slots=True)
+class HttpDoor:
+    """A bound address, and who may ask there."""
+
+    host: str
+    listener: "socket.socket"
+    token: str | None
+    tls: "ssl.SSLContext | None"
+    hosts: tuple[str, ...]
+
+    @classmethod
+    @contextmanager
+    def opened(cls, http: str, options: HttpOptions) -> Iterator[Self]:
+        """Bind ``http``, which is HOST:PORT. Raises MisuseError when it must not be served so."""
+        host, colon, port = http.rpartition(":")
+        if not colon or not port.isdecimal() or int(port) > 65_535:
+            raise MisuseError(f"--http {http}: write it as HOST:PORT, such as 127.0.0.1:8080")
+        host = host.strip("[]") or "127.0.0.1"
+        try:
+            from projections.serve.guard import TOKEN_VARIABLE, read_token
+            from projections.serve.listening import bind, is_loopback, tls_context
+        except ModuleNotFoundError as error:
+            raise MisuseError(
+                f"--http needs {error.name}, which is not installed; pip install 'mapfold[serve]'"
+            ) from None
+        if (options.tls_cert is None) != (options.tls_key is None):
+            raise MisuseError("--tls-cert and --tls-key need each other; give both")
+        token, tls = read_token(options.token_file, os.environ, say), None
+        if options.tls_cert is not None and options.tls_key is not None:
+            tls = tls_context(options.tls_cert, options.tls_key)
+        with closing(bind(host, int(port))) as listener:
+            local = is_loopback(listener)
+            if token is None and not local:
+                raise MisuseError(
+                    f"--http {http} can be reached by others, so it needs a token: openssl rand"
+                    f" -hex 32 > FILE, then --token-file FILE or {TOKEN_VARIABLE}; or give --http"
+                    f" 127.0.0.1:{port}"
+                )
+            if tls is None and not local:
+                say(
+                    f"warning: --http {http} without TLS: others on the way can read the token and"
+                    " all answers; give --tls-cert and --tls-key"
+                )
+            yield cls(host, listener, token, tls, options.hosts)
+
+    @contextmanager
+    def serving(self, answerer: "Answerer", room: "Room") -> Iterator[str]:
+        """Answer until the end of the block; yields the URL."""
+        from projections.serve.guard import Guard
+        from projections.serve.http import create_app
+        from projections.serve.listening import serving
+
+        guarded = Guard(create_app(answerer, room), self.token, (self.host, *self.hosts))
+        with serving(guarded, self.listener, self.tls, say) as port:
+            shown = f"[{self.host}]" if ":" in self.host else self.host
+            yield f"{'http' if self.tls is None else 'https'}://{shown}:{port}"
+
 
 _LARGEST_BYTES: Final = 16 * 1024 * 1024
 """What Zenoh puts together of one question. A longer one gets no answer; a shorter one that is over

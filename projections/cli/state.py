@@ -5,15 +5,14 @@ from typing import Annotated
 
 import typer
 
-from eventsrc.cli._shell import display, emit, say
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
-from projections.cli._options import SetOption, SettingsOption, settings_from
-from projections.cli._point import W, point
-from projections.digest import map_digest
-from projections.folding import fold_log_cached
-from projections.state_json import state_document
-from projections.state_text import state_text
+from projections.model.digest import map_digest
+from projections.model.export import state_document, state_text
+from projections.model.fold import fold_log_cached
+
+from .options import SetOption, SettingsOption, W, point, settings_from
+from .terminal import display, emit, say
 
 
 def state(

@@ -4,21 +4,13 @@ from dataclasses import asdict
 
 import typer
 
-from eventsrc.cli._shell import display, emit, finish, say
 from eventsrc.log_info import LogInfo, log_info
-from eventsrc.terminal import visible
-from eventsrc.words import counted
-from projections.runner.status import SinkStatus, Status, projection_status
+from eventsrc.text import counted, visible
+from projections.database.status import SinkStatus, Status, projection_status
 
-from ._options import (
-    DbOption,
-    SetOption,
-    SettingsOption,
-    VectorDbOption,
-    databases,
-    settings_from,
-)
+from .options import DbOption, SetOption, SettingsOption, VectorDbOption, databases, settings_from
 from .replay import JsonOption, LogArgument
+from .terminal import display, emit, finish, say
 
 
 def register(app: typer.Typer) -> None:

@@ -11,30 +11,14 @@ from typing import Annotated
 
 import typer
 
-from eventsrc.cli._shell import emit, finish, say, say_metrics
-from eventsrc.endpoints import parse_address
 from eventsrc.log import LogReader
-from eventsrc.words import counted
-from projections.runner import TailProgress, TailReport, tail
+from eventsrc.text import counted
+from eventsrc.transport.config import parse_address
+from projections.database import TailProgress, TailReport, tail
 
-from ._bar import Bar
-from ._options import (
-    DbOption,
-    SetOption,
-    SettingsOption,
-    VectorDbOption,
-    databases,
-    settings_from,
-)
-from .replay import (
-    JsonOption,
-    LoaderOption,
-    Loaders,
-    LogArgument,
-    OnlyOption,
-    loader_of,
-    only_of,
-)
+from .options import DbOption, SetOption, SettingsOption, VectorDbOption, databases, settings_from
+from .replay import JsonOption, LoaderOption, Loaders, LogArgument, OnlyOption, loader_of, only_of
+from .terminal import Bar, emit, finish, say, say_metrics
 
 
 def register(app: typer.Typer) -> None:
@@ -94,7 +78,7 @@ def _metrics(address: tuple[str, int] | None, progress: TailProgress, log: Path)
     if address is None:
         yield
         return
-    from projections.runner.metrics import serving_tail_metrics  # costs nothing unless asked for
+    from projections.database.progress import serving_tail_metrics  # costs nothing unless asked for
 
     with serving_tail_metrics(address, progress, log) as port:
         say_metrics(address, port)

@@ -5,20 +5,17 @@ from typing import Annotated
 
 import typer
 
-from eventsrc.cli._shell import display, emit, say
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
-from eventsrc.words import counted
+from eventsrc.text import counted
 from projections.evaluate.truth import read_truth
-from projections.timetravel.alternatives import alternatives, assigned
-from projections.timetravel.text import whatif_text
-from projections.timetravel.whatif import Alternative, WhatIf, what_if
+from projections.history.rendering import whatif_text
+from projections.history.whatif import Alternative, WhatIf, alternatives, assigned, what_if
 
-from ._options import SettingsOption, settings_from
-from ._picture import check_picture
-from ._point import point
-from ._timeline import MOST_LINES, AllOption, AtOption, FoldBar, JsonOption, LogArgument
-from ._truth import warn_of_no_truth
+from .evaluate import warn_of_no_truth
+from .options import SettingsOption, check_picture, point, settings_from
+from .terminal import display, emit, say
+from .timeline_options import MOST_LINES, AllOption, AtOption, FoldBar, JsonOption, LogArgument
 
 
 def whatif(
@@ -105,7 +102,7 @@ def whatif(
 
 def _draw(found: WhatIf, out: Path) -> None:
     # Here and not above: matplotlib takes longer to import than most commands take to run.
-    from projections.timetravel.picture import draw_maps
+    from projections.history.picture import draw_maps
 
     maps = [(_title(each), each.outcome.view) for each in found.all]
     draw_maps([(title, view) for title, view in maps if view is not None], out)

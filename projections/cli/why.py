@@ -4,14 +4,13 @@ from typing import Annotated
 
 import typer
 
-from eventsrc.cli._shell import display, emit
 from eventsrc.errors import MisuseError
-from projections.timetravel import Story, Timeline
-from projections.timetravel.text import story_text
+from projections.history import Story, Timeline
+from projections.history.rendering import story_text
 
-from ._options import SetOption, SettingsOption
-from ._point import point
-from ._timeline import AtOption, JsonOption, LogArgument, timeline
+from .options import SetOption, SettingsOption, point
+from .terminal import display, emit
+from .timeline_options import AtOption, JsonOption, LogArgument, timeline
 
 
 def why(

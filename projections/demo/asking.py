@@ -16,11 +16,11 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from eventsrc.sim import SimulatedRun
+from projections.database.connection import Targets
 from projections.drawing import LostRobot, Spot
-from projections.postgres.connect import Targets
+from projections.model.view import MapView
 from projections.queries.relocalize import Reader
 from projections.relocalize import Answer, rank, read_crops
-from projections.view import MapView
 
 from .folder import DemoFolder
 

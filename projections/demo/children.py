@@ -26,7 +26,7 @@ class Children:
         """Start ``mapfold *arguments``; its stderr goes to the file ``said``."""
         with said.open("wb") as errors:
             self._running[name] = subprocess.Popen(  # noqa: S603  # our own program and arguments
-                [sys.executable, "-m", "projections.demo.child", *arguments],
+                [sys.executable, "-m", "projections.cli.child_process", *arguments],
                 stdin=subprocess.PIPE,  # closed by our end, see `child`
                 stdout=subprocess.DEVNULL,
                 stderr=errors,

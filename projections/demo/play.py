@@ -1,9 +1,17 @@
 """The stages in order: record, replay, map, ask, draw. Each tells what it did when it is done.
 
 House and runs are made before the clock starts: they stand for the world, not for mapfold.
+
+What a user can do next with what the demo leaves, as commands to copy.
+
+They are run by a test. Values are quoted for a POSIX shell.
 """
 
 import contextlib
+import os
+import shlex
+import shutil
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -11,21 +19,52 @@ from pathlib import Path
 from typing import Any, Final
 
 from eventsrc.sim import DEFAULT_SEED, simulate_run
+from projections.database import rebuild
+from projections.database.connection import Targets, open_targets
+from projections.database.embedded import EmbeddedServer
 from projections.drawing import draw_map, floor_of
-from projections.drawing.merges import bridges_of
-from projections.postgres.connect import Targets, open_targets
-from projections.postgres.embedded import EmbeddedServer
-from projections.runner import rebuild
+from projections.drawing.picture import bridges_of
 from projections.settings import Settings
 
 from . import story
 from .asking import ask_lost, rooms_of
 from .folder import DemoFolder, fresh_folder
-from .following import fingerprint
-from .mapping import fold_with_rooms, most_telling, places_with
-from .next_steps import commands
-from .numbers import Played, document
+from .mapping import MergeMoment, fingerprint, fold_with_rooms, most_telling, places_with
 from .recording import record_run
+from .story import Played, document
+
+MAPFOLD = "mapfold"
+
+
+def commands(
+    folder: DemoFolder, merge: MergeMoment | None, db: str | None, vector_db: str | None
+) -> Iterator[str]:
+    """Lines to paste; comments say what for."""
+    if shutil.which(MAPFOLD) is None:
+        activate = Path(sys.prefix) / "bin" / "activate"
+        yield f"   . {_quoted(_near(activate))}    # puts mapfold on the path"
+    if db is None:
+        yield f"   export MAPFOLD_HOME={_quoted(folder.path)}    # where the databases are"
+    if db is not None or vector_db is not None:  # a URL may hold a password: not said here
+        yield "   # and MAPFOLD_DB, MAPFOLD_VECTOR_DB set to what --db and --vector-db were given"
+    log, settings = _quoted(folder.log), f"--settings {_quoted(folder.settings)}"
+    yield f"   mapfold state {log} {settings}"
+    if merge is not None:
+        yield f"   mapfold diff {log} {merge.offset} {merge.offset + 1} {settings}    # that merge"
+        yield f"   mapfold merges {log} {settings}"
+    yield f"   mapfold relocalize {_quoted(folder.question(1))}"
+    yield f"   mapfold status {log} {settings}"
+
+
+def _near(path: Path) -> Path:
+    """Relative to the current folder where it is inside it: shorter, and easier to read."""
+    here = Path.cwd()
+    return path.relative_to(here) if path.is_relative_to(here) else path
+
+
+def _quoted(path: Path) -> str:
+    return shlex.quote(os.fspath(path))
+
 
 SETTINGS: Final = Settings(eps_m=0.75, min_samples=8)
 """A look around puts 22 keyframes on one spot and a drive through a door three or four within

@@ -7,18 +7,17 @@ import time
 from dataclasses import dataclass
 from typing import Final
 
-from eventsrc._zenoh import ZenohOptions
 from eventsrc.log import LogReader
 from eventsrc.log_info import log_info
-from eventsrc.router import Router
 from eventsrc.sim import SimulatedRun
 from eventsrc.system_events import is_system_key
-from projections.postgres.connect import Targets
+from eventsrc.transport.session import Router, ZenohOptions
+from projections.database.connection import Targets
 from projections.settings import Settings
 
 from .children import Children
 from .folder import DemoFolder
-from .following import Followed, Follower
+from .mapping import Followed, Follower
 
 _ANY_PORT: Final = ZenohOptions(listen=("tcp/127.0.0.1:0",))
 _PATIENCE_S: Final = 40.0

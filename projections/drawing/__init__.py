@@ -4,7 +4,6 @@ matplotlib is used through its objects alone: no pyplot, no global state.
 """
 
 from .picture import draw_map
-from .scene import Bridge, Floor, LostRobot, Spot
-from .simulated import floor_of
+from .scene import Bridge, Floor, LostRobot, Spot, floor_of
 
 __all__ = ["Bridge", "Floor", "LostRobot", "Spot", "draw_map", "floor_of"]

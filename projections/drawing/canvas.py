@@ -1,5 +1,9 @@
-"""The sheet a map is drawn on: axes in metres, and the boxes that text already takes."""
+"""The sheet a map is drawn on: axes in metres, and the boxes that text already takes.
 
+Colours that stay apart: one for each place, the rest of the picture in greys.
+"""
+
+import colorsys
 import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +15,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
 
 from eventsrc.errors import MisuseError
-from projections.view import MapView
+from projections.model.view import MapView
 
 from .labels import Extent
 from .scene import Floor, drives
@@ -103,3 +107,31 @@ def _bounds(view: MapView, floor: Floor) -> Bounds:
     x, y = (x0 + x1) / 2, (y0 + y1) / 2
     dx, dy = wide / 2 + _MARGIN_M, high / 2 + _MARGIN_M
     return (x - dx, y - dy, x + dx, y + dy)
+
+
+INK = "#22262b"
+FAINT = "#8b939c"
+WALL = "#3b4149"
+FLOOR = "#fbfaf7"
+FURNITURE = "#e9e5dc"
+FURNITURE_EDGE = "#d8d2c4"
+ROOM_NAME = "#6a7179"
+SMALL_PRINT = "#4b525a"
+LEADER = "#9aa1a9"
+BRIDGE = "#8a1c7c"
+TRUTH = "#0b0d10"
+ESTIMATE = "#d3262e"
+
+_BASE = (
+    *("#3b82c4", "#e08a1e", "#3a9d5d", "#c2508f", "#7a63c7", "#b3a12a"),
+    *("#2aa5a8", "#d9634c", "#7d8f2b", "#a2583b", "#5f7fe0", "#cf78c6"),
+)
+_GOLDEN = 0.618033988749895
+
+
+def place_colour(index: int) -> str:
+    """The colour of the ``index``-th place as #rrggbb: twelve chosen ones, then hues between."""
+    if index < len(_BASE):
+        return _BASE[index]
+    red, green, blue = colorsys.hls_to_rgb((index * _GOLDEN) % 1.0, 0.45, 0.5)
+    return f"#{round(red * 255):02x}{round(green * 255):02x}{round(blue * 255):02x}"

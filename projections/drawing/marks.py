@@ -9,9 +9,9 @@ from collections.abc import Sequence
 
 from matplotlib.patches import Circle
 
-from projections.view import MapView
+from projections.model.view import MapView
 
-from . import palette
+from . import canvas as palette
 from .canvas import HALO, Canvas
 from .labels import Extent, Wanted, place_labels
 from .scene import Bridge, Floor, LostRobot, Spot, object_groups, place_names

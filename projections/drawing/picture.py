@@ -2,15 +2,19 @@
 
 Objects stand where the fold has them, which is where the *robot* was when it saw them (mean); their
 labels are moved aside to stay legible, a hairline leads back.
+
+Which keyframes made places one, gathered while a log is folded.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from eventsrc.words import counted
-from projections.view import MapView
+from eventsrc.text import counted
+from projections.deltas import PlacesMerged
+from projections.model.fold import FoldedEvent
+from projections.model.view import MapView
 
-from . import palette
+from . import canvas as palette
 from .canvas import Canvas, check_name, new_canvas
 from .ground import draw_drives, draw_floor, draw_regions, draw_walls
 from .marks import (
@@ -21,7 +25,7 @@ from .marks import (
     draw_place_names,
     draw_room_names,
 )
-from .scene import Bridge, Floor, LostRobot
+from .scene import Bridge, Floor, LostRobot, place_names, spot_of
 
 LEGEND = (
     "■ start    ● keyframe, in its place's colour    ◆ object, drawn where the robot saw it from "
@@ -97,3 +101,26 @@ def _legend(lost: LostRobot | None, bridges: Sequence[Bridge], left_out: int) ->
     if left_out:
         parts.append(f"{counted(left_out, 'object label')} had no room")
     return [LEGEND, "    ".join(parts)]
+
+
+def fold_with_merges(events: Iterable[FoldedEvent], view: MapView) -> list[PlacesMerged]:
+    """Apply every event to ``view`` and return its merges, in offset order."""
+    merges: list[PlacesMerged] = []
+    for event in events:
+        view.apply_event(event.offset, event.deltas)
+        merges += (delta for delta in event.deltas if isinstance(delta, PlacesMerged))
+    return merges
+
+
+def bridges_of(view: MapView, merges: Iterable[PlacesMerged]) -> list[Bridge]:
+    """One mark for each merge, where its bridging keyframe was taken."""
+    names = place_names(view)
+    marks: list[Bridge] = []
+    for merge in merges:
+        keyframe = view.keyframes[merge.bridge]
+        spot = spot_of(keyframe)
+        if spot is not None:
+            absorbed = " and ".join(names[place] for place in merge.absorbed)
+            text = f"{absorbed} into {names[merge.survivor]}, keyframe {keyframe.keyframe_id}"
+            marks.append(Bridge(*spot, text))
+    return marks

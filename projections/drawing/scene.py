@@ -1,11 +1,14 @@
-"""What a picture shows besides the map itself. All lengths in metres, all angles in radians."""
+"""What a picture shows besides the map itself. All lengths in metres, all angles in radians.
+
+The plan of a simulated house, for the background of a picture.
+"""
 
 import math
 from collections import Counter, defaultdict
 from dataclasses import dataclass
 
-from projections.records import KeyframeRecord, ObjectRecord
-from projections.view import MapView
+from eventsrc.sim import House
+from projections.model.view import KeyframeRecord, MapView, ObjectRecord
 
 _NEAR_M = 1.0
 
@@ -140,3 +143,16 @@ def place_spots(view: MapView) -> dict[int, list[tuple[float, float]]]:
         ordinal: [s for k in place.members if (s := spot_of(view.keyframes[k])) is not None]
         for ordinal, place in view.places.items()
     }
+
+
+def floor_of(house: House) -> Floor:
+    """Walls, standing furniture and room names of ``house``."""
+    standing = (thing.footprint for thing in house.things if thing.model.stands)
+    return Floor(
+        walls=tuple((wall.x0, wall.y0, wall.x1, wall.y1) for wall in house.plan.walls),
+        furniture=tuple((rect.x0, rect.y0, rect.x1, rect.y1) for rect in standing),
+        rooms=tuple(
+            (room.name, (room.rect.x0, room.rect.y0, room.rect.x1, room.rect.y1))
+            for room in house.plan.rooms
+        ),
+    )

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from eventsrc.errors import MisuseError
-from projections.view import MapView
+from projections.model.view import MapView
 
-from .summary import right
+from .run import right
 from .trials import Trial
 
 _GOOD, _BAD, _UNKNOWN, _DRIVE = "#2a7f62", "#c0392b", "#8e8e8e", "#d9d9d9"

@@ -6,10 +6,10 @@
 from collections.abc import Sequence
 from typing import Any, Protocol
 
+from projections.database.connection import Connection
 from projections.errors import QuestionError
-from projections.postgres.connect import Connection
+from projections.model.view import MapView
 from projections.relocalize import Candidates, Crop
-from projections.view import MapView
 
 from .graph_reads import read_holders, read_object, read_objects_of_place, read_place_graph
 from .place_graph import PlaceGraph

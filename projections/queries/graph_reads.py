@@ -1,17 +1,20 @@
 """Reading Places and Objects from the graph's tables; every function is one round trip or two.
 
 Ids and class names are bind parameters, encoded as agtype strings; they may hold anything.
+
+Places and Objects near a position, nearest first.
 """
 
 import json
+import math
 from typing import Any
 
 import psycopg
 
+from projections.database.connection import Connection, database_errors, place_of
+from projections.database.graph_render import text
+from projections.database.statements import statements, tables
 from projections.errors import ProjectionMissing
-from projections.postgres.connect import Connection, database_errors, place_of
-from projections.sinks._sql import statements, tables
-from projections.sinks.agtype import text
 
 from .place_graph import PlaceGraph, PlaceNode
 
@@ -80,3 +83,27 @@ def _rows(connection: Connection, name: str, **values: Any) -> list[Any]:
             raise ProjectionMissing(
                 f"{place_of(connection)}: nothing has been projected there yet; run mapfold replay"
             ) from None
+
+
+def places_near(connection: Connection, x: float, y: float, radius: float) -> list[dict[str, Any]]:
+    """Places whose centroid is within ``radius`` metres, with ``distance_m``."""
+    found = read_near(connection, "places", x, y, radius)
+    return _nearest(found, "centroid_x", "centroid_y", "place_id", x, y, radius)
+
+
+def objects_near(connection: Connection, x: float, y: float, radius: float) -> list[dict[str, Any]]:
+    """Objects seen from within ``radius`` metres on average, with ``distance_m``."""
+    found = read_near(connection, "objects", x, y, radius)
+    return _nearest(found, "mean_x", "mean_y", "object_id", x, y, radius)
+
+
+def _nearest(
+    found: list[Any], x_key: str, y_key: str, id_key: str, x: float, y: float, radius: float
+) -> list[dict[str, Any]]:
+    measured = [
+        {**thing, "distance_m": math.hypot(thing[x_key] - x, thing[y_key] - y)} for thing in found
+    ]
+    return sorted(
+        (thing for thing in measured if thing["distance_m"] <= radius),
+        key=lambda thing: (thing["distance_m"], thing[id_key]),
+    )

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from projections.errors import QuestionError
-from projections.view import MapView
+from projections.model.view import MapView
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,12 @@
 
 A `Reader` holds the connections and fetches candidates; `relocalize` is the whole question from
 databases to answer. What the ranking does with the candidates is `projections.relocalize`.
+
+Graph and vectors are one map only if the same log and the same settings made both.
+
+Each carries a checkpoint of its own, and ``replay --only`` or ``tail --only`` may have made one of
+them from something else. Numbers of observations then name other things on the other side, and an
+answer made of both would be wrong without anybody noticing.
 """
 
 import contextlib
@@ -14,13 +20,14 @@ import psycopg
 from pgvector.psycopg import register_vector
 from psycopg import sql
 
-from projections.errors import ExtensionMissing, ProjectionMissing, QuestionError
-from projections.postgres.connect import (
-    Connection,
-    Targets,
-    connect,
-    database_errors,
-    place_of,
+from projections.database.connection import Connection, Targets, connect, database_errors, place_of
+from projections.database.labels import LABEL_IDS
+from projections.database.statements import statements, tables
+from projections.errors import (
+    ExtensionMissing,
+    ProjectionMismatch,
+    ProjectionMissing,
+    QuestionError,
 )
 from projections.relocalize import (
     DEFAULT_CAMERA,
@@ -35,10 +42,27 @@ from projections.relocalize import (
     rank,
 )
 from projections.relocalize.exact_search import check_space
-from projections.sinks._sql import statements, tables
-from projections.sinks.labels import LABEL_IDS
 
-from ._origin import refuse_mixed
+
+def refuse_mixed(
+    vectors: str | None, graph: str | None, vectors_place: str, graph_place: str
+) -> None:
+    """Raise ProjectionMismatch unless both origins, each ``log id, space, fingerprint``, agree."""
+    if vectors is None or graph is None or vectors == graph:
+        return
+    log, _, _ = vectors.rpartition(" ")
+    graph_log, _, _ = graph.rpartition(" ")
+    told = (
+        f"made with other settings than the graph, both from log {log}"
+        if log == graph_log
+        else f"made from log {log}, the graph from log {graph_log}"
+    )
+    where = "" if vectors_place == graph_place else f" (the graph is in {graph_place})"
+    raise ProjectionMismatch(
+        f"{vectors_place}: the vectors there were {told}{where}; run mapfold replay LOG without"
+        " --only, so that one log and one set of settings make both"
+    )
+
 
 _LABELS = {"observation": LABEL_IDS["Observation"]}
 _NUMBER = (1 << 48) - 1

@@ -30,8 +30,7 @@ from numpy.typing import NDArray
 
 from projections.deltas import ObjectFound, ObjectSeen
 from projections.exact import MAX_IN_A_SUM, MAX_IN_ONE_DOT, Q40, long_dot, metres_to_um
-
-from ._state import State
+from projections.reducers import State
 
 Bucket = tuple[str, int, int]
 

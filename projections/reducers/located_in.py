@@ -6,8 +6,7 @@ has a place is nowhere.
 """
 
 from projections.deltas import ObjectMoved
-
-from ._state import State
+from projections.reducers import State
 
 
 class LocatedIn:

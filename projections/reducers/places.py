@@ -26,18 +26,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from projections.deltas import (
-    Delta,
-    KeyframePlaced,
-    Link,
-    PlaceChanged,
-    PlaceFormed,
-    PlacesMerged,
-)
+from projections.deltas import Delta, KeyframePlaced, Link, PlaceChanged, PlaceFormed, PlacesMerged
+from projections.reducers import State, part, prefixed
 
-from ._crowd import Crowd
-from ._ruled_crowd import RuledCrowd
-from ._state import State, part, prefixed
+from .core_index import Crowd
+from .rule_index import RuledCrowd
 
 NOISE = -1
 

@@ -10,6 +10,12 @@ Per keyframe, in this order (DESIGN section 5):
 4.  Located-in and adjacency hear what places and landmarks said, in its order, and settle.
 
 The fold has no clock, chance, disk, network or database. The same events give the same deltas.
+
+One map has one embedding space: a model and a dimension.
+
+What the settings leave open, the first embedded detection that agrees with them decides. A vector
+of another space is *foreign*: it is counted, but neither fused nor searched. A detection that names
+no model is of the unnamed model, which is a model like any other.
 """
 
 from collections.abc import Sequence
@@ -32,19 +38,44 @@ from projections.deltas import (
     RunSeen,
 )
 from projections.errors import SettingsError
-from projections.exact import Units, metres_to_um, unit_vectors
-from projections.geometry import Neighbourhood
+from projections.exact import Neighbourhood, Units, metres_to_um, unit_vectors
+from projections.reducers import State, part, prefixed
 from projections.settings import Settings
 
-from ._crowd import Crowd
-from ._ruled_crowd import RuledCrowd
-from ._seen import Seen, content_digest
-from ._spaces import Space
-from ._state import State, part, prefixed
 from .adjacency import Adjacency
+from .core_index import Crowd
+from .folded_ids import Seen, content_digest
 from .landmarks import Landmarks
 from .located_in import LocatedIn
 from .places import Places
+from .rule_index import RuledCrowd
+
+
+class Space:
+    """The map's embedding space; open until it is decided."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._wanted_model = settings.embedding_model
+        self._wanted_dim = settings.embedding_dim
+        self.is_decided = False
+        self.model: str | None = None
+        self.dim = 0
+
+    def decide(self, model: str | None, dim: int) -> None:
+        """Fix the space."""
+        self.is_decided, self.model, self.dim = True, model, dim
+
+    def has(self, model: str | None, dim: int) -> bool:
+        """True when a vector of this model and dimension is in the map; the first one decides."""
+        if model == self.model and dim == self.dim:
+            return True
+        if not self.is_decided:
+            if self._wanted_model not in (None, model) or self._wanted_dim not in (None, dim):
+                return False
+            self.decide(model, dim)
+            return True
+        return False
+
 
 Sighting: TypeAlias = tuple[int, str, str, NDArray[np.float64], int]
 """An observation that can be fused: ordinal, det_id, class name, unit vector, squared norm."""

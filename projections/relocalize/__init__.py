@@ -7,10 +7,10 @@
 from .answer import Answer, Evidence, PoseHypothesis, RankedPlace
 from .camera import Camera
 from .candidates import NEIGHBOURS, Candidates, Match, Spot
-from .confidence import UNKNOWN_BELOW
-from .crops import Crop, parse_json, parse_question, read_crops, shown
 from .exact_search import ExactIndex
-from .rank import DEFAULT_CAMERA, Method, rank
+from .pose import UNKNOWN_BELOW
+from .question import Crop, parse_json, parse_question, read_crops, shown
+from .ranking import DEFAULT_CAMERA, Method, rank
 
 __all__ = [
     "DEFAULT_CAMERA",

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from .confidence import UNKNOWN_BELOW
+from .pose import UNKNOWN_BELOW
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ exact search (`projections.relocalize.exact_search`); which of the two it was ma
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from .crops import Box
+from .question import Box
 
 NEIGHBOURS = 64
 """Observations fetched per crop. From 48 on, the measures in docs/relocalization.md stay the same;

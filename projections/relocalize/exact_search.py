@@ -2,19 +2,29 @@
 
 Unit vectors are multiples of 2⁻²⁰ and multiplied in float64, so every sum is exact whatever BLAS
 does (see `projections.exact`): the same map and crops give the same candidates to the last bit.
+
+The same question to a past map: the log folded to a point, searched exactly.
 """
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
-from eventsrc.words import counted
+from eventsrc.log import LogReader
+from eventsrc.log.seek import Note, resolve
+from eventsrc.text import counted
 from projections.errors import QuestionError
 from projections.exact import Q40, quantise
-from projections.view import MapView
+from projections.model.fold import fold_log
+from projections.model.view import MapView
+from projections.settings import Settings
 
+from .answer import Answer
+from .camera import Camera
 from .candidates import NEIGHBOURS, Candidates, Match, Spot
-from .crops import Crop
+from .question import Crop
+from .ranking import DEFAULT_CAMERA, Method, rank
 
 
 class ExactIndex:
@@ -78,3 +88,24 @@ def check_space(crop: Crop, dimension: int, model: str | None) -> None:
             f"the question's embeddings are of model {crop.model!r}, the map's of {model!r};"
             " ask with the model that made the map"
         )
+
+
+def relocalize_as_of(
+    log: Path,
+    whence: str,
+    settings: Settings,
+    crops: Sequence[Crop],
+    *,
+    top: int = 3,
+    method: Method = "joint",
+    camera: Camera = DEFAULT_CAMERA,
+    note: Note | None = None,
+) -> Answer:
+    """Where the robot is by the map as of ``whence``: offset, ISO time, run:keyframe or end.
+
+    ``note`` is told what a reader of ``whence`` might wonder about (`eventsrc.log.seek.resolve`).
+    """
+    with LogReader(log) as reader:
+        _, view = fold_log(reader, settings, resolve(reader, whence, note=note))
+    candidates = ExactIndex(view).search(crops)
+    return rank(crops, candidates, top=top, method=method, camera=camera)

@@ -8,9 +8,9 @@ import numpy as np
 
 from .camera import Camera, Floats, views
 from .candidates import Match
-from .crops import Crop
 from .landmarks import Landmark, find_landmarks
 from .model import Model
+from .question import Crop
 from .sessions import Sessions, session_shifts, sessions_of, unshifted
 
 _NEAREST_M, _FARTHEST_M = 0.5, 6.0

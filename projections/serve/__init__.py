@@ -3,6 +3,6 @@
 from .answering import Answerer
 from .pools import Pools
 from .room import Room
-from .zenoh_side import ZenohService
+from .zenoh import ZenohService
 
 __all__ = ["Answerer", "Pools", "Room", "ZenohService"]

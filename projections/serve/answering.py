@@ -2,12 +2,17 @@
 
 A question is what ``mapfold relocalize`` takes; an object with crops may also say ``top`` and
 ``method``. Every refusal is ``{"error": {"kind", "message"}}`` with one of the kinds below.
+
+How much a service takes on: questions a second, and questions that wait.
+
+Lines for people about what may happen often: the first at once, its like once a minute.
 """
 
 import contextlib
 import json
 import math
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final, cast, get_args
 
@@ -19,7 +24,7 @@ from projections.errors import (
     ProjectionMissing,
     QuestionError,
 )
-from projections.queries.near import objects_near, places_near
+from projections.queries.graph_reads import objects_near, places_near
 from projections.relocalize import (
     DEFAULT_CAMERA,
     Camera,
@@ -31,9 +36,64 @@ from projections.relocalize import (
     shown,
 )
 
-from .limits import Bucket, BusyError, TooMuchError
-from .notices import Notices
 from .pools import Pools
+
+
+class TooMuchError(MapfoldError):
+    """The service has more questions than it may answer; ask again later."""
+
+
+class BusyError(TooMuchError):
+    """Too many questions wait already, or this one has waited for too long."""
+
+
+class Bucket:
+    """At most ``per_second`` questions a second in the long run, twice as many at once."""
+
+    def __init__(self, per_second: float, now: Callable[[], float] = time.monotonic) -> None:
+        self._rate, self._size = per_second, max(1.0, 2.0 * per_second)
+        self._now, self._lock = now, threading.Lock()
+        self._tokens, self._filled = self._size, now()
+
+    def take(self) -> None:
+        """Take one token. Raises TooMuchError when there is none."""
+        with self._lock:
+            now = self._now()
+            self._tokens = min(self._size, self._tokens + (now - self._filled) * self._rate)
+            self._filled = now
+            if self._tokens < 1.0:
+                raise TooMuchError(
+                    f"more than {self._rate:g} questions a second; ask again in a second"
+                )
+            self._tokens -= 1.0
+
+
+EVERY_S: Final = 60.0
+_MOST: Final = 100
+
+
+class Notices:
+    """Passes lines on to ``tell``, from any thread; counts those that it holds back."""
+
+    def __init__(
+        self, tell: Callable[[str], None], now: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._tell, self._now, self._lock = tell, now, threading.Lock()
+        self._told: dict[str, tuple[float, int]] = {}  # when last told, and how often since
+
+    def __call__(self, line: str) -> None:
+        """Tell the line, unless it was told within the last minute."""
+        with self._lock:
+            now = self._now()
+            at, count = self._told.get(line, (-EVERY_S, 0))
+            if now - at < EVERY_S:
+                self._told[line] = (at, count + 1)
+                return
+            if len(self._told) >= _MOST:
+                self._told.clear()
+            self._told[line] = (now, 0)
+        self._tell(f"{line} (and {count} more like it since)" if count else line)
+
 
 MAX_TOP: Final = 100
 DEFAULT_RADIUS_M: Final = 3.0

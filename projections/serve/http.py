@@ -18,9 +18,8 @@ from eventsrc.errors import MapfoldError
 from projections.errors import QuestionError
 from projections.relocalize import shown
 
-from .answering import DEFAULT_RADIUS_M, MAX_TOP, Answerer, encode, refusal
+from .answering import DEFAULT_RADIUS_M, MAX_TOP, Answerer, TooMuchError, encode, refusal
 from .connections import peer_of
-from .limits import TooMuchError
 from .room import Room
 
 _EXAMPLE = {"crops": [{"class": "cup", "bbox": [120, 80, 250, 310], "embedding": "<base64>"}]}

@@ -20,8 +20,8 @@ from starlette.types import ASGIApp
 
 from eventsrc.errors import MisuseError, TransportError
 
+from .answering import Notices
 from .connections import MAX_CONNECTIONS, REQUEST_S, Connection, Connections
-from .notices import Notices
 
 _BACKLOG: Final = 1024
 _KEEP_ALIVE_S: Final = 5

@@ -4,23 +4,61 @@ A connection that the server has dropped is noticed when it is used. Then the se
 back if it is ours, waited for a little if not, and the question is asked once more on a fresh
 connection; so a restart of the database costs no answer. Of a server that stays away questions hear
 at once.
+
+A database that is away: how long questions wait for it, and one line for people each way.
 """
 
 import contextlib
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Final, Self, TypeVar
 
 from psycopg_pool import ConnectionPool, PoolTimeout
 
+from projections.database import checkpoints as _checkpoint
+from projections.database.connection import Connection, Targets, connect, database_errors, place
+from projections.database.sink import SinkName
 from projections.errors import DatabaseUnavailable, ProjectionMissing
-from projections.postgres.connect import Connection, Targets, connect, database_errors, place
 from projections.queries.relocalize import fetch, prepare_graph, prepare_vectors
 from projections.relocalize import Candidates, Crop
-from projections.sink import SinkName
-from projections.sinks import _checkpoint
 
-from .outage import Outage
+PATIENCE_S: Final = 10.0
+"""Questions asked before that many seconds of an outage wait for its end, later ones do not."""
+
+
+class Outage:
+    """Begins with the first failure and ends with the first success; for many threads."""
+
+    def __init__(self, tell: Callable[[str], None], now: Callable[[], float] = time.monotonic):
+        self._tell, self._now, self._lock = tell, now, threading.Lock()
+        self._until: float | None = None
+
+    @property
+    def is_on(self) -> bool:
+        """Whether the last thing known is a failure."""
+        return self._until is not None
+
+    def begin(self, error: Exception) -> None:
+        """Something failed."""
+        with self._lock:
+            if self._until is None:
+                self._until = self._now() + PATIENCE_S
+                self._tell(f"{error}; trying again")
+
+    def end(self) -> None:
+        """Something went well."""
+        with self._lock:
+            if self._until is not None:
+                self._until = None
+                self._tell("the database answers again")
+
+    @property
+    def worth_waiting(self) -> bool:
+        """Whether it is young enough for a question to wait for its end."""
+        until = self._until
+        return until is not None and self._now() < until
+
 
 Result = TypeVar("Result")
 

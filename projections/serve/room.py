@@ -16,7 +16,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, Final, Self, TypeVar
 
-from .limits import BusyError
+from .answering import BusyError
 
 Result = TypeVar("Result")
 

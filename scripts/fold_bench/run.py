@@ -18,12 +18,12 @@ from streams import DIM, MODEL, house_walk, keyframes, random_walk
 from eventsrc.ingest import Accepted, ingest
 from eventsrc.log import LogReader, LogWriter
 from projections.exact import unit_vectors
-from projections.folding import AHEAD, fold_events, fold_log, no_cycle_search
-from projections.reducers._crowd import Crowd
+from projections.model.fold import AHEAD, fold_events, fold_log, no_cycle_search
+from projections.model.view import MapView
+from projections.reducers.core_index import Crowd
 from projections.reducers.places import NOISE, Places
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
-from projections.view import MapView
 
 QUICK = "--quick" in sys.argv
 EPS_UM, LEAST = 1_500_000, 3

@@ -6,8 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from eventsrc.envelope import Detection, Envelope
-from eventsrc.ids import DetId
+from eventsrc.envelope import Detection, DetId, Envelope
 from eventsrc.ingest import Accepted
 
 WIDTH_M, DEPTH_M = 20.0, 15.0

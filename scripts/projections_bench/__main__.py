@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from projections.postgres.embedded import EmbeddedServer
+from projections.database.embedded import EmbeddedServer
 
 from . import floor, live, queries, whole
 

@@ -25,15 +25,15 @@ import psycopg
 from psycopg import sql
 
 from eventsrc.log import LogReader
-from projections.folding import fold_log
-from projections.postgres.connect import Targets, connect
-from projections.postgres.embedded import EmbeddedServer
-from projections.runner import rebuild
+from projections.database import graph_schema as _graph_ddl
+from projections.database import rebuild
+from projections.database.connection import Targets, connect
+from projections.database.embedded import EmbeddedServer
+from projections.database.labels import GRAPH, LABELS
+from projections.database.statements import statements
+from projections.database.swap import wait_for_drop
+from projections.model.fold import fold_log
 from projections.settings import Settings
-from projections.sinks import _graph_ddl
-from projections.sinks._leaving import wait_for_drop
-from projections.sinks._sql import statements
-from projections.sinks.labels import GRAPH, LABELS
 
 from .world import make_log
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from eventsrc.append import append_payload
 from eventsrc.log import LogReader, LogWriter, parse_fsync
-from projections.postgres.connect import Targets, connect_for_cypher
-from projections.postgres.embedded import EmbeddedServer
-from projections.runner import TailProgress, TailReport, rebuild, tail
+from projections.database import TailProgress, TailReport, rebuild, tail
+from projections.database.connection import Targets, connect_for_cypher
+from projections.database.embedded import EmbeddedServer
 from projections.settings import Settings
 
 from .world import KEY, World, make_log

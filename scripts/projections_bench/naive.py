@@ -22,9 +22,9 @@ from typing import Any, LiteralString
 import psycopg
 from pgvector.psycopg import register_vector
 
+from projections.database.connection import connect, connect_for_cypher
 from projections.exact import to_float32
-from projections.postgres.connect import connect, connect_for_cypher
-from projections.view import MapView
+from projections.model.view import MapView
 
 VERTICES = ("Run", "Keyframe", "Pose", "Observation", "Object", "Place")
 EDGES = ("HAS_KEYFRAME", "HAS_POSE", "HAS_OBSERVATION", "OBSERVES", "LOCATED_IN", "IN_PLACE",

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import psycopg
 
-from projections.postgres.connect import Targets, connect_for_cypher
-from projections.postgres.embedded import EmbeddedServer
-from projections.runner import rebuild
+from projections.database import rebuild
+from projections.database.connection import Targets, connect_for_cypher
+from projections.database.embedded import EmbeddedServer
 from projections.settings import Settings
 
 from .world import make_log

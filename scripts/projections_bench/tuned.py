@@ -9,8 +9,8 @@ from typing import Any, LiteralString
 
 import psycopg
 
-from projections.postgres.connect import connect_for_cypher
-from projections.view import MapView
+from projections.database.connection import connect_for_cypher
+from projections.model.view import MapView
 
 GRAPH: LiteralString = "tuned_map"
 

@@ -8,8 +8,8 @@ import time
 from pathlib import Path
 
 from eventsrc.log import LogReader
-from projections.folding import fold_log
-from projections.postgres.embedded import EmbeddedServer
+from projections.database.embedded import EmbeddedServer
+from projections.model.fold import fold_log
 from projections.settings import Settings
 
 from .naive import write_naively

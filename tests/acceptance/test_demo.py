@@ -16,9 +16,9 @@ import pytest
 
 from eventsrc.log import LogReader
 from eventsrc.sim import simulate_run
-from projections.cli._options import settings_from
-from projections.digest import map_digest
-from projections.folding import fold_log
+from projections.cli.options import settings_from
+from projections.model.digest import map_digest
+from projections.model.fold import fold_log
 
 _COMMAND = [sys.executable, "-m", "projections.cli", "demo", "--speed", "300"]
 _DEADLINE_S = 120.0

@@ -9,7 +9,7 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.records import Channel, DataEnd, Footer, Header, Schema
 
-from eventsrc.log._mcap import FRAME, MAGIC, encode
+from eventsrc.log.mcap_records import FRAME, MAGIC, encode
 from tests.envelopes import envelope
 
 _CHUNK = struct.Struct("<BQQQQII")

@@ -3,7 +3,7 @@
 import random
 from pathlib import Path
 
-from eventsrc.log._naming import list_segments
+from eventsrc.log.format import list_segments
 
 
 def maul(log: Path, chance: random.Random) -> None:

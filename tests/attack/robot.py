@@ -4,8 +4,8 @@ import json
 import threading
 from pathlib import Path
 
-from eventsrc._zenoh import ZenohOptions
-from eventsrc.publisher import EnvelopePublisher
+from eventsrc.robot.publisher import EnvelopePublisher
+from eventsrc.transport.session import ZenohOptions
 from tests.envelopes import envelope
 
 from .oracle import Oracle, digest

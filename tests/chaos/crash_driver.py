@@ -16,8 +16,8 @@ from typing import Any
 
 import psycopg
 
-from projections.postgres.connect import Targets
-from projections.runner import rebuild, tail
+from projections.database import rebuild, tail
+from projections.database.connection import Targets
 from projections.settings import Settings
 from tests.rows import all_rows
 

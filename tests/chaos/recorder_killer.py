@@ -23,13 +23,11 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from eventsrc._zenoh import Received, ZenohOptions, open_session
-from eventsrc.acks import Ack, ack_key
 from eventsrc.log import LogReader, LogWriter
-from eventsrc.publisher import EnvelopePublisher
-from eventsrc.refusals import fingerprint
-from eventsrc.router import Router
-from projections.folding import fold_log
+from eventsrc.robot.acks import Ack, ack_key, fingerprint
+from eventsrc.robot.publisher import EnvelopePublisher
+from eventsrc.transport.session import Received, Router, ZenohOptions, open_session
+from projections.model.fold import fold_log
 from projections.settings import Settings
 from tests.envelopes import envelope, payload
 from tests.fixtures_zenoh import LOOPBACK, MAPFOLD, Program

@@ -15,13 +15,13 @@ from typing import Any
 import psycopg
 import pytest
 
+from projections.database import RebuildProgress, rebuild
+from projections.database.connection import Targets, connect, place
+from projections.database.embedded import EmbeddedServer
+from projections.database.loader import CopyLoader, Load, TypeName
+from projections.database.vector_sink import VectorSink
 from projections.errors import DatabaseError, DatabaseUnavailable
-from projections.postgres.connect import Targets, connect, place
-from projections.postgres.embedded import EmbeddedServer
-from projections.runner import RebuildProgress, rebuild
 from projections.settings import Settings
-from projections.sinks.loader import CopyLoader, Load, TypeName
-from projections.sinks.vectors import VectorSink
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows
 from tests.servers import server_to_kill
@@ -45,10 +45,10 @@ def log(tmp_path: Path) -> Path:
 
 def in_small_streams(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the thread write while the fold goes on, also for a small log."""
-    monkeypatch.setattr("projections.sinks.graph.STREAM_ROWS", 20)
-    monkeypatch.setattr("projections.sinks.vectors.STREAM_ROWS", 10)
+    monkeypatch.setattr("projections.database.graph_sink.STREAM_ROWS", 20)
+    monkeypatch.setattr("projections.database.vector_sink.STREAM_ROWS", 10)
     # The package's name for it is the function.
-    monkeypatch.setattr(sys.modules["projections.runner.rebuild"], "TICK_EVENTS", 8)
+    monkeypatch.setattr(sys.modules["projections.database.rebuild"], "TICK_EVENTS", 8)
 
 
 def at_stage(stage: str, act: Callable[[], None]) -> Callable[[RebuildProgress], None]:

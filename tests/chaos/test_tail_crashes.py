@@ -12,13 +12,13 @@ from typing import Any
 import psycopg
 import pytest
 
+from projections.database import TailProgress, TailReport, rebuild, tail
+from projections.database import checkpoints as _checkpoint
+from projections.database.connection import Connection, Targets, connect
+from projections.database.embedded import EmbeddedServer
+from projections.database.sink import Checkpoint, SinkName
 from projections.errors import CheckpointMoved, DatabaseUnavailable
-from projections.postgres.connect import Connection, Targets, connect
-from projections.postgres.embedded import EmbeddedServer
-from projections.runner import TailProgress, TailReport, rebuild, tail
 from projections.settings import Settings
-from projections.sink import Checkpoint, SinkName
-from projections.sinks import _checkpoint
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows
 from tests.servers import kill_postgres, server_to_kill
@@ -158,7 +158,7 @@ def test_commits_lost_while_nothing_comes_are_made_again(
     tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It is the heartbeat that finds the connection lost, and no batch is at hand to compare."""
-    monkeypatch.setattr("projections.runner._tail_pass.HEARTBEAT_S", 0.0)
+    monkeypatch.setattr(sys.modules["projections.database.tail"], "HEARTBEAT_S", 0.0)
     log = write_log(tmp_path / "log", walk(40))
     progress, stop, lost = TailProgress(), threading.Event(), threading.Event()
 
@@ -203,7 +203,7 @@ def test_a_connection_cut_again_while_it_asks_what_is_in(
             cuts.append(None)
             cut_connections(one_database.graph_url)
 
-    monkeypatch.setattr("projections.sinks._checkpoint.load", cut_first)
+    monkeypatch.setattr("projections.database.checkpoints.load", cut_first)
     report = tail(log, one_database, SETTINGS, once=True, batch_events=10, on_batch=cut)
     assert (report.next_offset, len(cuts)) == (40, again + 1)
 
@@ -218,7 +218,7 @@ def test_a_database_away_when_a_new_pass_begins_is_waited_for(
         if report.next_offset == 30 and not report.restarts:
             cut_connections(one_database.graph_url)
             rebuild(log, one_database, SETTINGS, until=13)
-            monkeypatch.setattr("projections.sinks._checkpoint.begin", cut_first)
+            monkeypatch.setattr("projections.database.checkpoints.begin", cut_first)
 
     def cut_first(*args: Any) -> None:
         if len(cuts) < 2:

@@ -6,8 +6,7 @@ python -m tests.docs.places_picture        draws it anew
 from pathlib import Path
 
 from projections.deltas import PlacesMerged
-from projections.reducers._crowd import Crowd
-from projections.reducers._grid import cell_side_um
+from projections.reducers.core_index import Crowd, cell_side_um
 from projections.reducers.places import NOISE, Places
 
 PICTURE = Path(__file__).parents[2] / "docs" / "images" / "place-merge.svg"

@@ -5,13 +5,13 @@ import signal
 from collections.abc import Callable
 from pathlib import Path
 
-from eventsrc._zenoh import ZenohOptions, open_session
-from eventsrc.endpoints import DEFAULT_ENDPOINT
 from eventsrc.metrics import serving_metrics
 from eventsrc.recorder import DEFAULT_QUEUE_SIZE, RecorderReport
-from eventsrc.recorder.inbox import DEFAULT_QUEUE_BYTES
-from eventsrc.sending import WINDOW
-from eventsrc.spool import DEFAULT_SPOOL_BYTES
+from eventsrc.recorder.queue import DEFAULT_QUEUE_BYTES
+from eventsrc.robot.sender import WINDOW
+from eventsrc.robot.spool import DEFAULT_SPOOL_BYTES
+from eventsrc.transport.config import DEFAULT_ENDPOINT
+from eventsrc.transport.session import ZenohOptions, open_session
 from tests.fixtures_zenoh import Program, scrape
 
 PAGE = (Path(__file__).parents[2] / "docs" / "recording.md").read_text()

@@ -1,7 +1,7 @@
 """docs/time-travel.md explains every condition; that its commands are true is tested with those of
 the other documents."""
 
-from projections.timetravel.condition_functions import FUNCTIONS
+from projections.history.condition_functions import FUNCTIONS
 from tests.docs.console import ROOT
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from mcap.opcode import Opcode
 
-from eventsrc.log._mcap import FRAME, MAGIC, MARK_OPCODE
+from eventsrc.log.mcap_records import FRAME, MAGIC, MARK_OPCODE
 from tests.attack.json_maul import maul_bytes
 
 _CHUNK = struct.Struct("<QQQII")

@@ -11,11 +11,19 @@ import pytest
 import zstandard
 
 from eventsrc.errors import LogDamaged, LogError
-from eventsrc.log import LogReader, LogWriter, _mcap, _seal, recover_log
-from eventsrc.log._head import file_head, head_metadata
-from eventsrc.log._mcap import ChunkIndex, Statistics
-from eventsrc.log._naming import ACTIVE, SEALED, list_segments, segment_path
-from eventsrc.log._whose import log_id_of
+from eventsrc.log import LogReader, LogWriter, recover_log
+from eventsrc.log import mcap_records as _mcap
+from eventsrc.log import seal as _seal
+from eventsrc.log.format import (
+    ACTIVE,
+    SEALED,
+    file_head,
+    head_metadata,
+    list_segments,
+    segment_path,
+)
+from eventsrc.log.log_identity import log_id_of
+from eventsrc.log.mcap_records import ChunkIndex, Statistics
 from eventsrc.log.recover import TooManyLosses
 from tests.fixtures_log import BY_HAND, KEY, envelope, flip, read_log, write_log
 from tests.memory import MOST_MIB, run_measured

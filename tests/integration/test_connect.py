@@ -10,8 +10,7 @@ import psycopg
 import pytest
 
 from eventsrc.errors import MisuseError
-from projections.errors import DatabaseUnavailable, ExtensionMissing
-from projections.postgres.connect import (
+from projections.database.connection import (
     Targets,
     connect,
     connect_for_cypher,
@@ -19,7 +18,8 @@ from projections.postgres.connect import (
     open_targets,
     place,
 )
-from projections.postgres.embedded import EmbeddedServer
+from projections.database.embedded import EmbeddedServer
+from projections.errors import DatabaseUnavailable, ExtensionMissing
 from projections.queries.relocalize import Reader
 
 
@@ -88,7 +88,7 @@ def test_trouble_with_the_embedded_server_is_not_about_urls(
 
 CUT = """
 import sys
-from projections.postgres.connect import connect, database_errors
+from projections.database.connection import connect, database_errors
 from projections.errors import DatabaseUnavailable
 url = sys.argv[1]
 with connect(url, autocommit=True) as killer, connect(url) as connection:

@@ -1,19 +1,20 @@
 """`db check` finds every kind of damage, names it, and `--repair` undoes it."""
 
+import sys
 from pathlib import Path
 
 import psycopg
 import pytest
 from psycopg import sql
 
+from projections.database import checkpoints as _checkpoint
+from projections.database import rebuild, tail
+from projections.database.check import NAMED, check
+from projections.database.connection import Connection, Targets
+from projections.database.sink import Checkpoint, SinkName
+from projections.database.status import projection_status
 from projections.errors import DatabaseError, ProjectionMismatch, ProjectionMissing
-from projections.postgres.connect import Connection, Targets
-from projections.runner import rebuild, tail
-from projections.runner.check import NAMED, check
-from projections.runner.status import projection_status
 from projections.settings import Settings
-from projections.sink import Checkpoint, SinkName
-from projections.sinks import _checkpoint
 from tests.commands import Commands
 from tests.logs import append_raw, bridge, walk, write_log
 
@@ -180,7 +181,7 @@ def test_a_rebuild_that_swaps_beside_a_check_is_no_difference(
     log: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch, sink: SinkName
 ) -> None:
     """To the check's snapshot the tables of such a rebuild would be empty."""
-    monkeypatch.setattr("projections.runner._lock_out.PATIENCE_S", 0.3)
+    monkeypatch.setattr(sys.modules["projections.database.rebuild"], "PATIENCE_S", 0.3)
     rebuild(log, one_database, SETTINGS)
     load = _checkpoint.load
 

@@ -7,10 +7,9 @@ import threading
 import time
 from pathlib import Path
 
-from eventsrc._zenoh import ZenohOptions
 from eventsrc.errors import LogBusy
 from eventsrc.log import LogWriter
-from eventsrc.router import Router
+from eventsrc.transport.session import Router, ZenohOptions
 from projections.demo.children import Children
 
 STARTER = """

@@ -28,11 +28,11 @@ from pathlib import Path
 import numpy as np
 from eventsrc.ingest import ingest
 from eventsrc.log import Event
-from projections.digest import map_digest
-from projections.folding import AHEAD, fold_events
+from projections.model.digest import map_digest
+from projections.model.fold import AHEAD, fold_events
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
-from projections.view import MapView
+from projections.model.view import MapView
 
 settings = Settings(eps_m=0.75, min_samples=8)
 fold, view, vectors = SemanticMap(settings), MapView(settings), []

@@ -11,8 +11,8 @@ from pathlib import Path
 import psycopg
 import pytest
 
+from projections.database.embedded import EmbeddedServer
 from projections.errors import EmbeddedServerError
-from projections.postgres.embedded import EmbeddedServer
 
 WAIT_S = 60
 
@@ -20,7 +20,7 @@ HOLDER = """
 import sys, signal
 # A shell that runs the tests in its background has its children ignore Ctrl-C.
 signal.signal(signal.SIGINT, signal.default_int_handler)
-from projections.cli._options import databases
+from projections.cli.options import databases
 with databases(None, None) as targets:
     print(targets.graph_url, flush=True)
     sys.stdin.read()

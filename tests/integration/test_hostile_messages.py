@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc._zenoh import Received, Session
 from eventsrc.append import append_payload
 from eventsrc.errors import TransportError
 from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES
 from eventsrc.log import LogReader, LogWriter, verify_log
 from eventsrc.log_info import log_info
 from eventsrc.recorder import Recorder
-from eventsrc.refusals import Refusals, refusal_key
+from eventsrc.robot.acks import Refusals, refusal_key
 from eventsrc.system_events import LOSS_KEY, REJECTED_KEY, Loss, RejectedPayload
+from eventsrc.transport.session import Received, Session
 from tests.envelopes import envelope, payload
 from tests.fixtures_zenoh import DEADLINE_S
 
@@ -25,8 +25,8 @@ LONG_KEYS = ("t/" + "é" * 11_000, "t/" + "k" * 22_000, "t/" + "k" * 60_000)
 
 PANIC = """
 import sys
-from eventsrc._zenoh import ZenohOptions, open_session
-from eventsrc._zenoh_ends import clear_errors
+from eventsrc.transport.session import ZenohOptions, open_session
+from eventsrc.transport.declarations import clear_errors
 from eventsrc.errors import TransportError
 
 session = open_session(ZenohOptions(connect=(sys.argv[1],)), mode="client")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.cli._program import EXIT_INTERRUPTED, EXIT_READER_GONE
+from projections.cli.program import EXIT_INTERRUPTED, EXIT_READER_GONE
 from tests.commands import PROGRAM, TIMEOUT_S, Commands
 from tests.docs.console import ROOT
 from tests.fixtures_timetravel import write_damaged_log, write_log
@@ -45,7 +45,7 @@ def mapfold(tmp_path: Path) -> Commands:
     ("module", "args"),
     [
         ("contextlib", ("log", "info", "log")),  # the first thing that is imported
-        ("projections.cli._start", ("log", "info", "log")),
+        ("projections.cli.start", ("log", "info", "log")),
         ("typer", ("state", "log")),
         ("projections.cli.state", ("state", "log")),
         ("numpy", ("state", "log")),
@@ -169,7 +169,7 @@ def test_news_that_find_no_room_change_nothing(mapfold: Commands) -> None:
 
 def test_a_program_without_streams_gives_their_numbers_to_no_file(mapfold: Commands) -> None:
     program = (
-        "import os; from pathlib import Path; from eventsrc.cli._program import run_app\n"
+        "import os; from pathlib import Path; from projections.cli.program import run_app\n"
         "def app():\n"
         "    fds = [os.readlink(f'/proc/self/fd/{number}') for number in range(3)]\n"
         "    Path('fds').write_text(str([*fds, os.open('first', os.O_CREAT) > 2]))\n"

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.cli._signals import ctrl_c_between_steps
 from eventsrc.importers import ImportCut, ImportReport, import_files
 from eventsrc.log import LogWriter
+from projections.cli.signals import ctrl_c_between_steps
 from tests.commands import PROGRAM, TIMEOUT_S, Commands
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import read_log

@@ -7,14 +7,21 @@ from typing import Any
 
 import pytest
 
-from eventsrc import ledger as ledger_module
-from eventsrc._ledger_cache import NAME
+from eventsrc import gap_history as ledger_module
 from eventsrc.append import append_payload
 from eventsrc.errors import LogDamaged
-from eventsrc.ledger import fold_ledger, keep_ledger, ledger_of, save_ledger, unread_events
-from eventsrc.log import NEVER, Event, LogReader, LogWriter, _parts, recover, recover_log
+from eventsrc.gap_history import (
+    NAME,
+    fold_ledger,
+    keep_ledger,
+    ledger_of,
+    save_ledger,
+    unread_events,
+)
+from eventsrc.gaps import Gap, GapLedger
+from eventsrc.log import NEVER, Event, LogReader, LogWriter, recover, recover_log
+from eventsrc.log import seal as _parts
 from eventsrc.log_info import log_info
-from eventsrc.losses import Gap, GapLedger
 from eventsrc.system_events import LOSS_KEY, Loss
 from tests.envelopes import detection, envelope, payload
 from tests.fixtures_log import BY_HAND, flip

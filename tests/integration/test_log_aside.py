@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 
 from eventsrc.errors import LogDamaged
-from eventsrc.log import ALWAYS, LogWriter, _sealer, verify_log
-from eventsrc.log._active_file import ActiveFile
-from eventsrc.log._aside import ProcessGone, SealingProcess
-from eventsrc.log._seal import NO_PREVIOUS, SegmentPlan, seal
+from eventsrc.log import ALWAYS, LogWriter, verify_log
+from eventsrc.log import seal_worker as _sealer
+from eventsrc.log.active_file import ActiveFile
+from eventsrc.log.seal import NO_PREVIOUS, SegmentPlan, seal
+from eventsrc.log.seal_worker import ProcessGone, SealingProcess
 from tests.fixtures_log import KEY, read_log
 
 ROOT = Path(__file__).parents[2]

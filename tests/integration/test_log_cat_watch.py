@@ -3,8 +3,8 @@ inside a range by times, and keys that no event has."""
 
 import pytest
 
-from eventsrc.cli._event_text import iso_time
 from eventsrc.log import LogWriter
+from projections.cli.log import iso_time
 from tests.commands import Commands
 from tests.fixtures_log import KEY, envelope
 

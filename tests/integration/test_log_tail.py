@@ -14,7 +14,7 @@ import pytest
 
 from eventsrc.errors import LogDamaged, LogError, LogNotFound
 from eventsrc.log import Event, LogReader, LogWriter, follow
-from eventsrc.log._mcap import MARK_BYTES
+from eventsrc.log.mcap_records import MARK_BYTES
 from tests.chaos.log_writer import payload_at
 from tests.fixtures_log import BY_HAND, KEY, flip, write_log
 

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc._zenoh import Received, Session, ZenohOptions, open_session
-from eventsrc.acks import ack_key
 from eventsrc.log import LogReader
+from eventsrc.robot.acks import ack_key
+from eventsrc.transport.session import Received, Session, ZenohOptions, open_session
 from tests.envelopes import envelope, payload
 from tests.fixtures_zenoh import DEADLINE_S, Program
 

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc._metrics_server import MAX_CONNECTIONS
 from eventsrc.errors import TransportError
-from eventsrc.metrics import serving_metrics
+from eventsrc.metrics import MAX_CONNECTIONS, serving_metrics
 from eventsrc.recorder import RecorderReport
 from tests.envelopes import envelope, payload
 from tests.fixtures_zenoh import Program, scrape
@@ -63,7 +62,7 @@ def test_connections_held_open_keep_no_scrape_out_and_give_way(tmp_path: Path) -
 
 
 def test_a_silent_connection_is_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("eventsrc._metrics_server._Handler.timeout", 0.2)
+    monkeypatch.setattr("eventsrc.metrics._Handler.timeout", 0.2)
     with serving_metrics(("127.0.0.1", 0), lambda: REPORT, tmp_path) as port:
         assert ask(port, b"GET /metrics HTTP/1.1\r\n") == b""
 

@@ -10,16 +10,16 @@ import psycopg
 import pytest
 from psycopg import sql
 
+from projections.database import RebuildProgress, rebuild, tail
+from projections.database import cluster as _cluster
+from projections.database.check import check
+from projections.database.connection import Targets, connect, settle
+from projections.database.embedded import EmbeddedServer
+from projections.database.grants import roles_sql
+from projections.database.loader import LoaderName
+from projections.database.status import projection_status
 from projections.errors import DatabaseError
-from projections.postgres import _cluster
-from projections.postgres.connect import Targets, connect, settle
-from projections.postgres.embedded import EmbeddedServer
-from projections.runner import RebuildProgress, rebuild, tail
-from projections.runner.check import check
-from projections.runner.status import projection_status
 from projections.settings import Settings
-from projections.sinks.loader import LoaderName
-from projections.sinks.roles import roles_sql
 from tests.drops import wait_for_drops
 from tests.logs import walk, write_log
 from tests.rows import all_rows

@@ -8,14 +8,14 @@ import psycopg
 import pytest
 
 from eventsrc.log import LogReader
-from projections.digest import map_digest
+from projections.database import rebuild, tail
+from projections.database.connection import Targets
+from projections.database.loader import LoaderName
 from projections.errors import DatabaseError, FoldError, ProjectionMismatch
-from projections.folding import fold_log
-from projections.postgres.connect import Targets
-from projections.runner import rebuild, tail
+from projections.model.digest import map_digest
+from projections.model.fold import fold_log
+from projections.model.view import MapView
 from projections.settings import Settings
-from projections.sinks.loader import LoaderName
-from projections.view import MapView
 from tests.drops import wait_for_drops
 from tests.envelopes import detection, envelope
 from tests.logs import WEIRD, append_raw, bridge, walk, write_log

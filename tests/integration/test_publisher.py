@@ -9,16 +9,22 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc._zenoh import Received, Session, ZenohOptions
-from eventsrc.acks import Ack, ack_key
 from eventsrc.errors import InvalidEnvelope, MisuseError, SpoolFull, TransportError
 from eventsrc.log import LogReader, LogWriter
-from eventsrc.publisher import EnvelopePublisher
-from eventsrc.refusals import Refusal, Refusals, fingerprint, refusal_key
-from eventsrc.router import Router
-from eventsrc.sending import Sender
-from eventsrc.sent import Sent, sent_key
+from eventsrc.robot.acks import (
+    Ack,
+    Refusal,
+    Refusals,
+    Sent,
+    ack_key,
+    fingerprint,
+    refusal_key,
+    sent_key,
+)
+from eventsrc.robot.publisher import EnvelopePublisher
+from eventsrc.robot.sender import Sender
 from eventsrc.system_events import REJECTED_KEY
+from eventsrc.transport.session import Received, Router, Session, ZenohOptions
 from tests.envelopes import envelope, payload
 from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK, Program
 

@@ -6,8 +6,10 @@ from pathlib import Path
 import pytest
 
 from eventsrc.log import LogReader
-from projections.folding import fold_log
-from projections.postgres.connect import Targets, connect
+from projections.database import rebuild
+from projections.database.connection import Targets, connect
+from projections.model.fold import fold_log
+from projections.model.view import MapView
 from projections.queries.ask import (
     Asker,
     LiveAsker,
@@ -18,9 +20,7 @@ from projections.queries.ask import (
     where_is,
 )
 from projections.queries.relocalize import prepare_graph
-from projections.runner import rebuild
 from projections.settings import Settings
-from projections.view import MapView
 from tests.commands import Commands
 from tests.logs import walk, write_log
 

@@ -8,13 +8,13 @@ import psycopg
 import pytest
 from psycopg import sql
 
+from projections.database import RebuildProgress, rebuild
+from projections.database.check import check
+from projections.database.connection import Connection, Targets, connect
+from projections.database.swap import may_drop
+from projections.database.vector_sink import build_hnsw
 from projections.errors import DatabaseError
-from projections.postgres.connect import Connection, Targets, connect
-from projections.runner import RebuildProgress, rebuild
-from projections.runner.check import check
 from projections.settings import Settings
-from projections.sinks._leaving import may_drop
-from projections.sinks.hnsw import build_hnsw
 from tests.drops import wait_for_drops
 from tests.logs import walk, write_log
 from tests.rows import all_rows
@@ -55,7 +55,7 @@ def test_what_the_server_could_not_drop_the_next_rebuild_drops(
 ) -> None:
     rebuild(log, one_database, SETTINGS, until=30)
     with monkeypatch.context() as patched:
-        patched.setattr("projections.sinks._leaving.leave_with", nobody_drops)
+        patched.setattr("projections.database.swap.leave_with", nobody_drops)
         rebuild(log, one_database, SETTINGS)
     rows = all_rows(one_database)
     assert left_over(pg) == {"semantic_map_old", "mapfold_old"}
@@ -100,7 +100,7 @@ def test_what_fails_after_the_swap_does_not_sound_as_if_the_old_map_were_served(
     pg.execute("CREATE TABLE public.taken (n int)")
     pg.execute("CREATE INDEX detection_embeddings_hnsw ON public.taken (n)")
     for_any_table = partial(build_hnsw, threshold=1)
-    monkeypatch.setattr(sys.modules["projections.runner.rebuild"], "build_hnsw", for_any_table)
+    monkeypatch.setattr(sys.modules["projections.database.rebuild"], "build_hnsw", for_any_table)
     with pytest.raises(DatabaseError, match="already exists; the new map is in place"):
         rebuild(log, one_database, SETTINGS)
     assert [r.differing for r in check(log, one_database, SETTINGS)] == [0, 0]

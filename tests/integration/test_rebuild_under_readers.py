@@ -1,5 +1,6 @@
 """Readers run the queries of DESIGN section 6 in a loop while maps are rebuilt under them."""
 
+import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -7,11 +8,11 @@ from pathlib import Path
 import psycopg
 import pytest
 
+from projections.database import RebuildProgress, rebuild, tail
+from projections.database.connection import Targets, connect_for_cypher
+from projections.database.vector_sink import VectorSink
 from projections.errors import DatabaseError, ProjectionBusy
-from projections.postgres.connect import Targets, connect_for_cypher
-from projections.runner import RebuildProgress, rebuild, tail
 from projections.settings import Settings
-from projections.sinks.vectors import VectorSink
 from tests.drops import wait_for_drops
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows
@@ -104,7 +105,7 @@ def test_a_reader_in_a_long_transaction_keeps_its_graph_and_the_next_rebuild_cle
     tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It read only the table so far; its later look at the graph must still find a whole one."""
-    monkeypatch.setattr("projections.sinks._swap_guard.WAIT_SECONDS", 0.2)
+    monkeypatch.setattr("projections.database.swap.WAIT_SECONDS", 0.2)
     log = write_log(tmp_path / "log", walk(60))
     rebuild(log, one_database, SETTINGS)
     with connect_for_cypher(one_database.graph_url) as reader:
@@ -218,7 +219,7 @@ def test_between_swap_and_commit_a_reader_waits_at_its_first_table(
 def test_a_reader_that_will_not_go_stops_the_swap_in_words(
     tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("projections.runner._lock_out.PATIENCE_S", 0.3)
+    monkeypatch.setattr(sys.modules["projections.database.rebuild"], "PATIENCE_S", 0.3)
     log = write_log(tmp_path / "log", walk(60))
     rebuild(log, one_database, SETTINGS, until=30)
     old = all_rows(one_database)

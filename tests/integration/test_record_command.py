@@ -15,15 +15,12 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from eventsrc._ledger_cache import NAME
-from eventsrc._zenoh import Received, Session, ZenohOptions
-from eventsrc.acks import Ack, ack_key
 from eventsrc.append import append_payload
-from eventsrc.ledger import unread_events
+from eventsrc.gap_history import NAME, unread_events
 from eventsrc.log import LogReader, LogWriter
-from eventsrc.publisher import EnvelopePublisher
-from eventsrc.refusals import fingerprint
-from eventsrc.router import Router
+from eventsrc.robot.acks import Ack, ack_key, fingerprint
+from eventsrc.robot.publisher import EnvelopePublisher
+from eventsrc.transport.session import Received, Router, Session, ZenohOptions
 from tests.commands import PROGRAM
 from tests.envelopes import envelope, payload
 from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK, PUBLISHER, Program

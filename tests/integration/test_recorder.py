@@ -11,21 +11,29 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from eventsrc._zenoh import Received, Session, ZenohOptions, open_session
-from eventsrc.acks import MOST_PER_ACK, Ack, ack_key
 from eventsrc.append import append_payload
 from eventsrc.clock import system_clock
 from eventsrc.errors import LogDamaged, LogError, MisuseError
-from eventsrc.ledger import ledger_of, save_ledger
+from eventsrc.gap_history import ledger_of, save_ledger
+from eventsrc.gaps import Gap
 from eventsrc.log import Event, FsyncPolicy, LogReader, LogWriter
-from eventsrc.losses import Gap
 from eventsrc.recorder import Recorder, RecorderReport
-from eventsrc.recorder.inbox import Inbox
-from eventsrc.recorder.writing import Writing
-from eventsrc.refusals import Refusal, Refusals, fingerprint, refusal_key
-from eventsrc.router import Router
-from eventsrc.sent import MAX_SENT_BYTES, Sent, sent_key
+from eventsrc.recorder.queue import Inbox
+from eventsrc.recorder.writer_thread import Writing
+from eventsrc.robot.acks import (
+    MAX_SENT_BYTES,
+    MOST_PER_ACK,
+    Ack,
+    Refusal,
+    Refusals,
+    Sent,
+    ack_key,
+    fingerprint,
+    refusal_key,
+    sent_key,
+)
 from eventsrc.system_events import LOSS_KEY, REJECTED_KEY, Loss, RejectedPayload
+from eventsrc.transport.session import Received, Router, Session, ZenohOptions, open_session
 from tests.envelopes import detection, envelope, payload
 from tests.fixtures_log import flip
 from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK, Program

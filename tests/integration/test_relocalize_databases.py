@@ -8,14 +8,14 @@ import psycopg
 import pytest
 
 from eventsrc.log import LogReader
+from projections.database import rebuild
+from projections.database.connection import Targets
 from projections.errors import ProjectionMismatch, ProjectionMissing, QuestionError
-from projections.folding import fold_log
-from projections.postgres.connect import Targets
+from projections.model.fold import fold_log
+from projections.model.view import MapView
 from projections.queries.relocalize import Reader, relocalize
 from projections.relocalize import Candidates, Crop, ExactIndex, rank, read_crops
-from projections.runner import rebuild
 from projections.settings import Settings
-from projections.view import MapView
 from tests.commands import Commands
 from tests.envelopes import detection
 from tests.logs import walk, write_log

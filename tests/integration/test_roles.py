@@ -6,14 +6,14 @@ from pathlib import Path
 import psycopg
 import pytest
 
+from projections.database import rebuild, tail
+from projections.database.age_version import enforces_row_security
+from projections.database.check import check
+from projections.database.connection import Targets, connect, connect_for_cypher, extension_version
+from projections.database.grants import roles_sql
+from projections.database.status import projection_status
 from projections.errors import DatabaseError, ExtensionMissing
-from projections.postgres.age import enforces_row_security
-from projections.postgres.connect import Targets, connect, connect_for_cypher, extension_version
-from projections.runner import rebuild, tail
-from projections.runner.check import check
-from projections.runner.status import projection_status
 from projections.settings import Settings
-from projections.sinks.roles import roles_sql
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows
 

@@ -15,18 +15,18 @@ from typing import Any
 
 import pytest
 
-from eventsrc._zenoh import Session, ZenohOptions, open_session
 from eventsrc.errors import TransportError
+from eventsrc.transport.session import Session, ZenohOptions, open_session
+from projections.database import rebuild
+from projections.database.connection import Connection, Targets, connect
+from projections.database.embedded import EmbeddedServer
 from projections.errors import DatabaseUnavailable, ProjectionMissing
-from projections.postgres.connect import Connection, Targets, connect
-from projections.postgres.embedded import EmbeddedServer
 from projections.queries.relocalize import relocalize
 from projections.relocalize import parse_question
-from projections.runner import rebuild
 from projections.serve import Answerer, Pools, Room, ZenohService
+from projections.serve.answering import Bucket, TooMuchError
 from projections.serve.guard import Guard
 from projections.serve.http import create_app
-from projections.serve.limits import Bucket, TooMuchError
 from projections.serve.listening import bind, serving
 from projections.settings import Settings
 from tests.envelopes import detection
@@ -342,7 +342,7 @@ class TestKilledServer:
     def test_another_is_waited_for_a_little_and_missed_at_once_after_that(
         self, server: EmbeddedServer, room: Room, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("projections.serve.outage.PATIENCE_S", 0.5)
+        monkeypatch.setattr("projections.serve.pools.PATIENCE_S", 0.5)
         told: list[str] = []
         with Pools(Targets(server.url, server.url), 4, told.append) as pools:
             answerer = Answerer(pools, per_second=10_000.0)

@@ -12,12 +12,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from eventsrc._zenoh import Session
+from eventsrc.transport.session import Session
+from projections.database import rebuild
+from projections.database.connection import Targets
+from projections.database.connection import connect as connect_database
+from projections.database.embedded import EmbeddedServer
 from projections.errors import QuestionError
-from projections.postgres.connect import Targets
-from projections.postgres.connect import connect as connect_database
-from projections.postgres.embedded import EmbeddedServer
-from projections.runner import rebuild
 from projections.serve import Answerer, Pools, Room, ZenohService
 from projections.serve.answering import encode
 from projections.settings import Settings

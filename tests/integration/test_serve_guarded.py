@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from projections.postgres.connect import Targets
-from projections.runner import rebuild
+from projections.database import rebuild
+from projections.database.connection import Targets
 from projections.settings import Settings
 from tests.commands import Commands
 from tests.fixtures_tls import Certificate

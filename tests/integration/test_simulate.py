@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc._zenoh import Received, Session
 from eventsrc.sim import simulate_run
+from eventsrc.transport.session import Received, Session
 from tests.fixtures_zenoh import DEADLINE_S, Program
 
 

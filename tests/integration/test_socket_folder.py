@@ -16,9 +16,9 @@ from urllib.parse import parse_qs, urlsplit
 import psycopg
 import pytest
 
+from projections.database.connection import connect
+from projections.database.embedded import EmbeddedServer
 from projections.errors import DatabaseUnavailable, EmbeddedServerError
-from projections.postgres.connect import connect
-from projections.postgres.embedded import EmbeddedServer
 
 NOBODY = 65534
 SOCKET = ".s.PGSQL.5432"

@@ -77,7 +77,7 @@ def test_the_document_says_what_was_seen(mapfold: Commands, log: Path) -> None:
 
 
 def test_the_digest_is_that_of_the_same_envelopes_folded_here(mapfold: Commands, log: Path) -> None:
-    from projections.digest import map_digest
+    from projections.model.digest import map_digest
 
     said = mapfold("state", log, "--digest").out
     assert said == map_digest(fold(DOCUMENTS).view) + "\n"
@@ -93,7 +93,7 @@ def test_at_counts_events_and_includes_a_time_or_a_keyframe(mapfold: Commands, l
 
 
 def test_state_at_n_is_a_log_of_the_first_n_events(mapfold: Commands, tmp_path: Path) -> None:
-    from projections.digest import map_digest
+    from projections.model.digest import map_digest
 
     path = tmp_path / "plain"
     with LogWriter(path) as writer:

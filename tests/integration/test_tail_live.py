@@ -12,12 +12,12 @@ import pytest
 from eventsrc.append import append_payload
 from eventsrc.log import ALWAYS, Event, LogWriter
 from eventsrc.upcast import read_envelope
+from projections.database import RebuildProgress, TailProgress, TailReport, rebuild, tail
+from projections.database.connection import Targets
+from projections.database.progress import serving_tail_metrics
+from projections.database.retry import retry
+from projections.database.status import projection_status
 from projections.errors import ProjectionBusy, ProjectionMismatch
-from projections.postgres.connect import Targets
-from projections.runner import RebuildProgress, TailProgress, TailReport, rebuild, tail
-from projections.runner.metrics import serving_tail_metrics
-from projections.runner.retry import retry
-from projections.runner.status import projection_status
 from projections.settings import Settings
 from tests.envelopes import envelope, payload
 from tests.logs import append_raw, bridge, walk, write_log
@@ -204,9 +204,9 @@ def test_parked_events_are_tried_again(
         mended = replace(event, payload=event.payload.replace(b'"none"', b"[]"))
         return read_envelope(mended, max_bytes=max_bytes)
 
-    monkeypatch.setattr("projections.runner.retry.read_envelope", lenient)
+    monkeypatch.setattr("projections.database.retry.read_envelope", lenient)
     monkeypatch.setattr(
-        "projections.folding.read_envelopes",
+        "projections.model.fold.read_envelopes",
         lambda events, *, max_bytes: [lenient(event, max_bytes=max_bytes) for event in events],
     )
     reports = retry(log, one_database, SETTINGS)

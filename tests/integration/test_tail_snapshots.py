@@ -1,5 +1,6 @@
 """A tail begins at the nearest snapshot that is surely of its own fold, and leaves one."""
 
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -7,12 +8,12 @@ from typing import Any
 import pytest
 
 from eventsrc.log import Event, LogReader
-from projections.folding import fold_log
-from projections.postgres.connect import Targets
-from projections.runner import rebuild, tail
-from projections.runner._fold import LiveFold
+from projections.database import rebuild, tail
+from projections.database.connection import Targets
+from projections.database.shared_fold import LiveFold
+from projections.model.fold import fold_log
+from projections.model.snapshot_cache import SnapshotCache
 from projections.settings import Settings
-from projections.snapshot import SnapshotCache
 from tests.logs import append_raw, bridge, walk, write_log
 from tests.rows import all_rows
 
@@ -107,7 +108,7 @@ def test_nothing_beyond_a_parked_event_is_taken_from_a_snapshot(
 def test_it_leaves_one_if_it_folded_much(
     log: Path, one_database: Targets, folded: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("projections.runner._tail_pass.WORTH_A_SNAPSHOT", 50)
+    monkeypatch.setattr(sys.modules["projections.database.tail"], "WORTH_A_SNAPSHOT", 50)
     report = tail(log, one_database, SETTINGS, once=True)
     assert cache_of(log).offsets() == [report.next_offset]
     write_log(log, walk(10, run_id="run-d"))

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import projections.cli
-from projections.postgres.connect import Targets
+from projections.database.connection import Targets
 from tests.commands import Commands
 from tests.envelopes import detection, envelope
 from tests.fixtures_timetravel import write_log
@@ -71,6 +71,7 @@ def test_no_command_takes_a_point_of_a_log_in_its_own_way() -> None:
         module.name
         for module in modules
         for node in ast.walk(ast.parse(module.read_text("utf-8")))
-        if isinstance(node, ast.ImportFrom) and node.module == "eventsrc.log.whence"
+        if isinstance(node, ast.ImportFrom) and node.module == "eventsrc.log.seek"
     }
-    assert taking == {"_point.py"}
+    # `log cat` shows events, not a map: a range of offsets and times, in its own words.
+    assert taking == {"options.py", "log.py"}

@@ -8,9 +8,16 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from eventsrc._zenoh import Asked, Number, Received, Session, ZenohOptions, open_session
 from eventsrc.errors import MapfoldError, MisuseError, TransportError
-from eventsrc.router import Router
+from eventsrc.transport.session import (
+    Asked,
+    Number,
+    Received,
+    Router,
+    Session,
+    ZenohOptions,
+    open_session,
+)
 from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK
 
 Sessions = Callable[[], Session]

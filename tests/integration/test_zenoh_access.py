@@ -12,11 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc._zenoh import Received, Session, ZenohOptions, open_session
-from eventsrc.acks import ACK_PREFIX
 from eventsrc.errors import TransportError
-from eventsrc.publisher import EnvelopePublisher
-from eventsrc.sent import sent_key
+from eventsrc.robot.acks import ACK_PREFIX, sent_key
+from eventsrc.robot.publisher import EnvelopePublisher
+from eventsrc.transport.session import Received, Session, ZenohOptions, open_session
 from tests.docs.console import ROOT
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import read_log

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from projections.sinks import agtype
-from projections.sinks.loader import CopyLoader, InsertLoader, Loader
+from projections.database import graph_render as agtype
+from projections.database.loader import CopyLoader, InsertLoader, Loader
 
 ODD = ["\\", "\\\\n", '"', "'", "\t", "\\.", "\\N", "$$", "\u2028", "\x7f", "\x85", "😀"]
 finite = st.floats(allow_nan=False, allow_infinity=False)

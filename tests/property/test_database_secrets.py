@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from psycopg.conninfo import conninfo_to_dict
 
 from eventsrc.errors import MapfoldError
-from projections.postgres.connect import Targets, connect, open_targets, place
-from projections.runner.status import projection_status
+from projections.database.connection import Targets, connect, open_targets, place
+from projections.database.status import projection_status
 from projections.settings import Settings
 from tests.commands import Commands
 from tests.logs import walk, write_log

@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn import metrics
 
-from projections.evaluate.calibration import auroc, expected_calibration_error, percentile
-from projections.evaluate.clustering import agreement
+from projections.evaluate.scores import agreement, auroc, expected_calibration_error, percentile
 
 LABELS = st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4)), max_size=40)
 SCORES = st.lists(st.sampled_from([0.0, 0.1, 0.25, 0.5, 0.75, 1.0]), max_size=15)

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.timetravel.conditions import Expression, ExpressionError
+from projections.history.conditions import Expression, ExpressionError
 from tests.unit.test_expression import FakeFacts
 
 numbers = st.one_of(

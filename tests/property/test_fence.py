@@ -5,8 +5,8 @@ from decimal import Decimal, localcontext
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from projections.reducers._fence import Fence, turned
-from projections.reducers._grid import NEIGHBOUR_CELLS, cell_side_um
+from projections.reducers.core_index import NEIGHBOUR_CELLS, cell_side_um
+from projections.reducers.reach_index import Fence, turned
 
 EPS_UM = 1_500_000
 EPS = st.sampled_from([0, 1, 2, 3, 5, 7, 13, 50, 1000, 1_500_000, 10**9])

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from projections.deltas import KeyframeAdded, ObjectFound, ObjectSeen, ObservationAdded
-from projections.digest import map_digest
-from projections.view import MapView
+from projections.model.digest import map_digest
+from projections.model.view import MapView
 from tests.envelopes import detection, envelope
 from tests.folds import (
     Folded,

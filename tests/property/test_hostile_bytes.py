@@ -13,16 +13,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eventsrc.errors import LogDamaged
-from eventsrc.log import ALWAYS, LogReader, LogWriter, _mcap, recover_log, verify_log
-from eventsrc.log._head import (
+from eventsrc.log import ALWAYS, LogReader, LogWriter, recover_log, verify_log
+from eventsrc.log import mcap_records as _mcap
+from eventsrc.log.format import (
     HEAD_BYTES,
     MARK_SEED,
     file_head,
     head_metadata,
+    key_channel,
     mark_seed,
     read_head,
 )
-from eventsrc.log._schemas import key_channel
 from eventsrc.system_events import LOSS_KEY
 from tests.fixtures_log import BY_HAND, KEY, MEMORY_DISK, read_log
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.relocalize.clusters import Points, clusters, points_of, settle
+from projections.relocalize.landmarks import Points, clusters, points_of, settle
 from projections.relocalize.model import MODEL
 
 Spot = tuple[float, float]

@@ -13,12 +13,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc import _ledger_cache
-from eventsrc._ledger_cache import MAX_BYTES, NAME, encode
+from eventsrc import gap_history as _ledger_cache
 from eventsrc.append import append_payload
-from eventsrc.ledger import keep_ledger, ledger_of
+from eventsrc.gap_history import MAX_BYTES, NAME, encode, keep_ledger, ledger_of
+from eventsrc.gaps import GapLedger, RunState, sound
 from eventsrc.log import LogReader, LogWriter
-from eventsrc.losses import GapLedger, RunState, sound
 from tests.envelopes import envelope, payload
 
 KEYFRAMES = (1, 2, 5, 6, 9)

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from eventsrc.errors import LogError
 from eventsrc.log import Event, LogWriter
-from eventsrc.log._mcap import MARK_BYTES
-from eventsrc.log._scan import scan_active
-from eventsrc.log.fsync import ALWAYS
+from eventsrc.log.durable_files import ALWAYS
+from eventsrc.log.mcap_records import MARK_BYTES
+from eventsrc.log.scan import scan_active
 from tests.fixtures_log import BY_HAND, KEY, read_log, read_with_gaps
 
 MEMORY_DISK = Path("/dev/shm")

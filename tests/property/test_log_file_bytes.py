@@ -7,7 +7,7 @@ from pathlib import Path
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc.log._bytes import _BLOCK, FileBytes
+from eventsrc.log.durable_files import _BLOCK, FileBytes
 
 PATTERN = b"\x80\x00\x00z"
 HOLE = 1 << 16

@@ -10,10 +10,11 @@ from typing import Any
 import pytest
 
 from eventsrc.errors import LogError
-from eventsrc.log import LogReader, LogWriter, _sealer, recover_log
-from eventsrc.log._aside import SealingProcess, answer
-from eventsrc.log._seal import SegmentPlan
-from eventsrc.log.fsync import ALWAYS, FsyncPolicy
+from eventsrc.log import LogReader, LogWriter, recover_log
+from eventsrc.log import seal_worker as _sealer
+from eventsrc.log.durable_files import ALWAYS, FsyncPolicy
+from eventsrc.log.seal import SegmentPlan
+from eventsrc.log.seal_worker import SealingProcess, answer
 from tests.fixtures_log import BY_HAND, KEY, read_log
 from tests.power_loss import Call, Tracer, power_cuts
 

@@ -11,9 +11,13 @@ import pytest
 
 from eventsrc.errors import LogDamaged, LogError
 from eventsrc.log import ALWAYS, LogReader, LogWriter, recover_log, verify_log
-from eventsrc.log._head import file_head, head_metadata
-from eventsrc.log._mcap import encode_mark, encode_message_head, encode_plain_chunk_head, zlib
-from eventsrc.log._naming import ACTIVE, SEALED, segment_path
+from eventsrc.log.format import ACTIVE, SEALED, file_head, head_metadata, segment_path
+from eventsrc.log.mcap_records import (
+    encode_mark,
+    encode_message_head,
+    encode_plain_chunk_head,
+    zlib,
+)
 from eventsrc.log.recover import TooManyLosses
 from eventsrc.system_events import LOSS_KEY
 from tests.commands import Commands
@@ -37,7 +41,7 @@ def leave_active(path: Path, base: int) -> Path:
     with LogReader(path) as reader:
         log_id = reader.log_id
     segment_path(path, base, SEALED).unlink()
-    from eventsrc.log._active import ActiveSegment
+    from eventsrc.log.active_segment import ActiveSegment
     from eventsrc.log.event import NewEvent
 
     active = ActiveSegment(path, log_id, base, ALWAYS)
@@ -199,8 +203,8 @@ def test_a_backup_that_overlaps(quick_path: Path, tail_gone: bool) -> None:
 
 
 def by_hand(log_id: str, base: int, messages: list[tuple[int, bytes]]) -> bytes:
-    from eventsrc.log._mcap import encode
-    from eventsrc.log._schemas import key_channel
+    from eventsrc.log.format import key_channel
+    from eventsrc.log.mcap_records import encode
 
     body = encode(key_channel(1, 0, KEY, 2))
     body += b"".join(encode_message_head(1, s, 5, 5, len(p)) + p for s, p in messages)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.metrics import adjusted_rand_score
 
-from projections.partitions import compare_partitions
+from projections.model.partitions import compare_partitions
 
 labels = st.sampled_from([None, "a", "b", "c"])
 labellings = st.lists(st.tuples(labels, labels), max_size=24)

@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from projections.deltas import PlacesMerged, Pose
-from projections.geometry import Neighbourhood
-from projections.reducers._crowd import Crowd
-from projections.reducers._ruled_crowd import RuledCrowd
+from projections.exact import Neighbourhood
+from projections.reducers.core_index import Crowd
 from projections.reducers.places import NOISE, Places
+from projections.reducers.rule_index import RuledCrowd
 from tests.folds import NaivePlaces, batch_dbscan, near_matrix
 
 Point = tuple[int, int, float]

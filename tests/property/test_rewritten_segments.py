@@ -11,7 +11,7 @@ from mcap.writer import CompressionType
 
 from eventsrc.errors import LogDamaged, LogError
 from eventsrc.log import ALWAYS, LogReader, LogWriter, recover_log, verify_log
-from eventsrc.log._naming import ACTIVE, SEALED, segment_path
+from eventsrc.log.format import ACTIVE, SEALED, segment_path
 from eventsrc.system_events import LOSS_KEY
 from tests.commands import Commands
 from tests.fixtures_log import KEY, envelope, read_log
@@ -156,8 +156,8 @@ def test_a_rewritten_growing_segment_is_refused_and_recovered(log: Path) -> None
         log_id = reader.log_id
     rewrite(path, metadata=(), in_log_time=True)
     made = path.read_bytes()
-    from eventsrc.log import _mcap
-    from eventsrc.log._head import head_metadata
+    from eventsrc.log import mcap_records as _mcap
+    from eventsrc.log.format import head_metadata
 
     header_end = next(iter(_header_ends(made)))
     head = _mcap.encode(head_metadata(log_id, 2 * EACH, {"mark_seed": "00000007"}))

@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 
 from eventsrc.errors import LogDamaged, LogError
-from eventsrc.log import ALWAYS, Event, LogReader, LogWriter, _mcap, _parts, recover_log, verify_log
+from eventsrc.log import ALWAYS, Event, LogReader, LogWriter, recover_log, verify_log
+from eventsrc.log import mcap_records as _mcap
+from eventsrc.log import seal as _parts
 from eventsrc.log_info import log_info
 from eventsrc.system_events import LOSS_KEY, REJECTED_KEY, Loss
 from tests.fixtures_log import (

@@ -7,12 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from projections.deltas import Delta, Pose
-from projections.digest import map_digest
-from projections.geometry import Neighbourhood
+from projections.exact import Neighbourhood
+from projections.model.digest import map_digest
+from projections.model.snapshot import restore, snapshot, unpack
 from projections.reducers.adjacency import Adjacency
 from projections.settings import Settings
-from projections.snapshot import restore, snapshot
-from projections.snapshot.container import unpack
 from tests.folds import Folded, fold
 from tests.property.test_fold_recounts import SETTINGS, runs
 

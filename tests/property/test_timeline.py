@@ -13,16 +13,16 @@ from hypothesis import HealthCheck, assume, event, given, settings
 from hypothesis import strategies as st
 
 from eventsrc.log import LogReader
-from projections.digest import map_digest
-from projections.folding import fold_log
+from projections.history import Expression, Timeline
+from projections.history.bisect import Search
+from projections.history.diff import rows_of
+from projections.history.merges import chains_of
+from projections.history.records import Merge
+from projections.model.digest import map_digest
+from projections.model.export import state_document
+from projections.model.fold import fold_log
+from projections.model.view import MapView
 from projections.settings import Settings
-from projections.state_json import state_document
-from projections.timetravel import Expression, Timeline
-from projections.timetravel.bridging import chains_of
-from projections.timetravel.lives import Merge
-from projections.timetravel.rows import rows_of
-from projections.timetravel.search import Search
-from projections.view import MapView
 from tests.fixtures_timetravel import walks, write_log
 
 RULES = Settings(eps_m=0.7, min_samples=3, fusion_radius_m=2.0)

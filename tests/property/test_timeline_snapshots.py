@@ -8,11 +8,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from eventsrc.log import LogReader
-from projections.digest import map_digest
-from projections.folding import fold_log
+from projections.history import Timeline
+from projections.model.digest import map_digest
+from projections.model.fold import fold_log
+from projections.model.snapshot_cache import SnapshotCache
 from projections.settings import Settings
-from projections.snapshot import SnapshotCache
-from projections.timetravel import Timeline
 from tests.fixtures_timetravel import walks, write_log
 
 RULES = Settings(eps_m=0.7, min_samples=3, fusion_radius_m=2.0)

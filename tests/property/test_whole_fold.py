@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from projections.deltas import Pose
-from projections.digest import map_digest
-from projections.geometry import Neighbourhood
+from projections.exact import Neighbourhood
+from projections.model.digest import map_digest
+from projections.model.snapshot import restore, snapshot
 from projections.settings import Settings
-from projections.snapshot import restore, snapshot
 from tests.envelopes import detection, envelope
 from tests.folds import Folded
 from tests.naive_map import NaiveMap, Posed

@@ -21,13 +21,13 @@ from typing import Any
 
 import numpy as np
 
-from eventsrc._zenoh import ZenohOptions, open_session
 from eventsrc.log import NEVER, LogWriter
-from projections.postgres.connect import Targets
-from projections.postgres.embedded import EmbeddedServer
+from eventsrc.transport.session import ZenohOptions, open_session
+from projections.database import rebuild
+from projections.database.connection import Targets
+from projections.database.embedded import EmbeddedServer
 from projections.queries.relocalize import Reader
 from projections.relocalize import Crop, rank
-from projections.runner import rebuild
 from projections.settings import Settings
 from tests.relocalization.buildings import Building
 from tests.relocalization.drives import drive

@@ -5,8 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from eventsrc.envelope import Envelope
-from eventsrc.ids import DetId
+from eventsrc.envelope import DetId, Envelope
 from eventsrc.ingest import Accepted
 from tests.relocalization.buildings import (
     FOCAL,

@@ -1,4 +1,4 @@
-"""Fit the weights of `projections.relocalize.confidence` on generated buildings; print them.
+"""Fit the weights of `projections.relocalize.pose` on generated buildings; print them.
 
 Buildings 0 … 9 are fitted on; 10 … 13 are held out and reported beside them. Each is asked with one
 to three crops, mapped whole and by its first third only, by its own second session and by another
@@ -15,11 +15,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from projections.evaluate.calibration import auroc, expected_calibration_error
+from projections.evaluate.scores import auroc, expected_calibration_error
 from projections.relocalize import Camera, ExactIndex
-from projections.relocalize.confidence import WEIGHTS, features
 from projections.relocalize.model import MODEL
-from projections.relocalize.rank import weigh
+from projections.relocalize.pose import WEIGHTS, features
+from projections.relocalize.ranking import weigh
 from tests.relocalization.buildings import Building, Keyframe
 from tests.relocalization.drives import drive
 from tests.relocalization.rooms import crops_of, fold

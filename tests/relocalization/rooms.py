@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from projections.exact import quantise, to_float32
+from projections.model.view import MapView
 from projections.reducers.semantic_map import SemanticMap
 from projections.relocalize import Candidates, Crop, ExactIndex, Match, Spot
 from projections.settings import Settings
-from projections.view import MapView
 from tests.relocalization.buildings import Keyframe
 
 

@@ -26,18 +26,10 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from eventsrc.errors import LogError
-from eventsrc.log import (
-    Event,
-    FsyncPolicy,
-    LogReader,
-    LogWriter,
-    _sealer,
-    follow,
-    recover_log,
-    verify_log,
-)
-from eventsrc.log._aside import ProcessGone
-from eventsrc.log._mcap import MARK_BYTES
+from eventsrc.log import Event, FsyncPolicy, LogReader, LogWriter, follow, recover_log, verify_log
+from eventsrc.log import seal_worker as _sealer
+from eventsrc.log.mcap_records import MARK_BYTES
+from eventsrc.log.seal_worker import ProcessGone
 from eventsrc.log_info import log_info
 from tests.fixtures_log import BY_HAND, MEMORY_DISK
 

@@ -27,13 +27,13 @@ from hypothesis.stateful import (
 )
 
 from eventsrc.log import LogReader
+from projections.database import rebuild, tail
+from projections.database.connection import Targets, connect
+from projections.database.loader import LoaderName
+from projections.database.memory_sink import MemorySink
+from projections.database.shared_fold import LiveFold
 from projections.errors import FoldError
-from projections.postgres.connect import Targets, connect
-from projections.runner import rebuild, tail
-from projections.runner._fold import LiveFold
 from projections.settings import Settings
-from projections.sinks.loader import LoaderName
-from projections.sinks.memory import MemorySink
 from tests.drops import wait_for_drops
 from tests.envelopes import envelope
 from tests.logs import append_raw, bridge, walk, write_log

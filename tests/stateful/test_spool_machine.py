@@ -8,11 +8,9 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from eventsrc._set_aside import Refused
-from eventsrc.acks import Ack
 from eventsrc.errors import SpoolFull
-from eventsrc.refusals import Refusal, Refusals, fingerprint
-from eventsrc.spool import Spool, Spooled
+from eventsrc.robot.acks import Ack, Refusal, Refusals, fingerprint
+from eventsrc.robot.spool import Refused, Spool, Spooled
 
 MAX_BYTES = 60
 runs = st.sampled_from(["run-a", "run-b"])

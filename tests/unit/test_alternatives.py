@@ -3,8 +3,8 @@
 import pytest
 
 from projections.errors import SettingsError
+from projections.history.whatif import alternatives, settings_name
 from projections.settings import Settings
-from projections.timetravel.alternatives import alternatives, settings_name
 
 BASE = Settings()
 

@@ -7,12 +7,11 @@ from pathlib import Path
 import pytest
 
 from eventsrc.errors import MisuseError
+from projections.history import Timeline
+from projections.history.merges import chains_of, reason
+from projections.history.picture import draw_merge
+from projections.history.story import keyframe_name
 from projections.settings import Settings
-from projections.timetravel import Timeline
-from projections.timetravel.bridging import chains_of
-from projections.timetravel.links import reason
-from projections.timetravel.picture import draw_merge
-from projections.timetravel.story import keyframe_name
 from tests.envelopes import envelope
 from tests.fixtures_timetravel import write_log
 

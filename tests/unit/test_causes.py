@@ -12,13 +12,13 @@ from projections.deltas import (
     PlacesMerged,
     Pose,
 )
+from projections.history.history import History
+from projections.history.merges import merge_document, merge_row
+from projections.history.records import Cause, cause_of
+from projections.history.rendering import merge_text, story_text
+from projections.history.same_place import same_story
+from projections.history.stories import place_story
 from projections.settings import Settings
-from projections.timetravel.causes import Cause, cause_of
-from projections.timetravel.history import History
-from projections.timetravel.merge_story import merge_document, merge_row
-from projections.timetravel.place_story import place_story
-from projections.timetravel.same_story import same_story
-from projections.timetravel.text import merge_text, story_text
 
 
 def keyframe(number: int) -> list[Delta]:

@@ -4,15 +4,14 @@ from dataclasses import replace
 
 import pytest
 
+from projections.database import RebuildReport
+from projections.database.labels import LABELS, TABLE
 from projections.demo import story
-from projections.demo.following import Followed
-from projections.demo.mapping import Folded, MergeMoment, Part, most_telling
-from projections.demo.numbers import Played
+from projections.demo.mapping import Folded, Followed, MergeMoment, Part, most_telling
 from projections.demo.recording import Recorded
-from projections.runner import RebuildReport
+from projections.demo.story import Played
+from projections.model.view import MapView
 from projections.settings import Settings
-from projections.sinks.labels import LABELS, TABLE
-from projections.view import MapView
 
 RECORDED = Recorded(
     run_id="sim-1-a",

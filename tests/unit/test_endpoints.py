@@ -2,8 +2,8 @@
 
 import pytest
 
-from eventsrc.endpoints import check_endpoint, check_endpoints, is_loopback, parse_address
 from eventsrc.errors import MisuseError
+from eventsrc.transport.config import check_endpoint, check_endpoints, is_loopback, parse_address
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from projections.timetravel.condition_functions import FUNCTIONS, functions_help
-from projections.timetravel.conditions import Expression, ExpressionError
+from projections.history.condition_functions import FUNCTIONS, functions_help
+from projections.history.conditions import Expression, ExpressionError
 
 
 @dataclass

@@ -1,6 +1,6 @@
 """The room at a position: by other keyframes of this building, never by the one that asks."""
 
-from projections.evaluate.floor_plan import FloorPlan
+from projections.evaluate.trials import FloorPlan
 from projections.evaluate.truth import TrueKeyframe, Truth
 from tests.relocalization.buildings import Building
 from tests.relocalization.drives import drive

@@ -8,7 +8,7 @@ from eventsrc.log import Event
 from eventsrc.system_events import LOSS_KEY
 from projections.deltas import KeyframeAdded
 from projections.errors import FoldError
-from projections.folding import fold_event, fold_events, no_cycle_search
+from projections.model.fold import fold_event, fold_events, no_cycle_search
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 from tests.envelopes import detection, envelope, payload

@@ -4,11 +4,11 @@ import threading
 
 import pytest
 
-from eventsrc._zenoh import Number, Received
-from eventsrc.losses import Gap
-from eventsrc.recorder import inbox as inbox_module
-from eventsrc.recorder.inbox import MOST_KEYS, OTHER_KEYS, Inbox
-from eventsrc.sent import sent_key
+from eventsrc.gaps import Gap
+from eventsrc.recorder import queue as inbox_module
+from eventsrc.recorder.queue import MOST_KEYS, OTHER_KEYS, Inbox
+from eventsrc.robot.acks import sent_key
+from eventsrc.transport.session import Number, Received
 from tests.fixtures_zenoh import DEADLINE_S
 
 

@@ -3,7 +3,7 @@
 import pytest
 
 from eventsrc.errors import MisuseError
-from eventsrc.keys import check_key
+from eventsrc.transport.config import check_key
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from projections.runner._loading import WAITING_JOBS, Loading, short_turns
+from projections.database.loading_thread import WAITING_JOBS, Loading, short_turns
 
 
 def test_jobs_are_done_in_order_and_elsewhere() -> None:

@@ -10,19 +10,11 @@ from typing import Any
 import pytest
 
 from eventsrc.errors import LogError, MisuseError
-from eventsrc.log import (
-    ALWAYS,
-    GROUP_COMMIT,
-    NEVER,
-    LogReader,
-    LogWriter,
-    _active,
-    _sealer,
-    parse_fsync,
-    verify_log,
-)
-from eventsrc.log._seal import SegmentPlan, seal
-from eventsrc.log.fsync import FsyncPolicy
+from eventsrc.log import ALWAYS, GROUP_COMMIT, NEVER, LogReader, LogWriter, parse_fsync, verify_log
+from eventsrc.log import active_segment as _active
+from eventsrc.log import seal_worker as _sealer
+from eventsrc.log.durable_files import FsyncPolicy
+from eventsrc.log.seal import SegmentPlan, seal
 from eventsrc.log_info import log_info
 from tests.fixtures_log import BY_HAND, KEY, read_log
 

@@ -6,8 +6,8 @@ import pytest
 from mcap.reader import SeekingReader
 
 from eventsrc.log import LogReader, LogWriter, recover_log, verify_log
-from eventsrc.log._parts import CHUNK_BYTES
-from eventsrc.log.fsync import GROUP_BYTES
+from eventsrc.log.durable_files import GROUP_BYTES
+from eventsrc.log.seal import CHUNK_BYTES
 from tests.fixtures_log import KEY, envelope, flip, read_log
 
 SIZE = 8_000_000

@@ -8,8 +8,8 @@ import pytest
 
 from eventsrc.errors import LogDamaged
 from eventsrc.log import LogReader, LogWriter, recover_log
-from eventsrc.log._mcap import MARK_BYTES
-from eventsrc.log.fsync import FsyncPolicy
+from eventsrc.log.durable_files import FsyncPolicy
+from eventsrc.log.mcap_records import MARK_BYTES
 from eventsrc.system_events import LOSS_KEY
 from tests.fixtures_log import KEY, read_log
 

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from eventsrc.errors import LogError
 from eventsrc.log import ALWAYS, GROUP_COMMIT, LogReader, LogWriter, NewEvent
-from eventsrc.log._active import ActiveSegment
-from eventsrc.log._commits import SLACK
-from eventsrc.log.fsync import FsyncPolicy
+from eventsrc.log.active_segment import ActiveSegment
+from eventsrc.log.commit_thread import SLACK
+from eventsrc.log.durable_files import FsyncPolicy
 from tests.fixtures_log import BY_HAND, KEY, read_log
 
 TIMEOUT_S = 30

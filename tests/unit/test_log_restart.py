@@ -6,16 +6,10 @@ from pathlib import Path
 import pytest
 
 from eventsrc.errors import LogDamaged, LogError
-from eventsrc.log import (
-    ALWAYS,
-    LogReader,
-    LogWriter,
-    _mcap,
-    _sealer,
-    recover_log,
-    verify_log,
-)
-from eventsrc.log._naming import ACTIVE, SEALED, segment_path
+from eventsrc.log import ALWAYS, LogReader, LogWriter, recover_log, verify_log
+from eventsrc.log import mcap_records as _mcap
+from eventsrc.log import seal_worker as _sealer
+from eventsrc.log.format import ACTIVE, SEALED, segment_path
 from tests.fixtures_log import BY_HAND, KEY, read_log
 
 TIMEOUT_S = 30

@@ -10,18 +10,11 @@ from pathlib import Path
 import pytest
 
 from eventsrc.errors import LogError
-from eventsrc.log import (
-    ALWAYS,
-    LogReader,
-    LogWriter,
-    _mcap,
-    _sealer,
-    recover_log,
-    verify_log,
-)
-from eventsrc.log._head import HEAD_BYTES, read_head
-from eventsrc.log._naming import ACTIVE, SEALED, segment_path
-from eventsrc.log._sealer import Sealer
+from eventsrc.log import ALWAYS, LogReader, LogWriter, recover_log, verify_log
+from eventsrc.log import mcap_records as _mcap
+from eventsrc.log import seal_worker as _sealer
+from eventsrc.log.format import ACTIVE, HEAD_BYTES, SEALED, read_head, segment_path
+from eventsrc.log.seal_worker import Sealer
 from tests.fixtures_log import KEY, flip, read_log
 
 TIMEOUT_S = 30
@@ -176,7 +169,7 @@ def test_a_full_disk_is_no_question_of_rights(
     def refuse(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("eventsrc.log._active.sync_file", refuse)
+    monkeypatch.setattr("eventsrc.log.active_segment.sync_file", refuse)
     with pytest.raises(LogError, match="No space left on device; free space on its disk"):
         LogWriter(log_path)
 

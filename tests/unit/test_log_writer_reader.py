@@ -11,7 +11,7 @@ import pytest
 
 from eventsrc.errors import LogBusy, LogError, LogNotFound, NotALog
 from eventsrc.log import LogReader, LogWriter, verify_log
-from eventsrc.log._lock import is_held
+from eventsrc.log.lock import is_held
 from eventsrc.log_info import log_info
 from tests.fixtures_log import BY_HAND, KEY, envelope, read_log, write_log
 

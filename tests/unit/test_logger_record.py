@@ -5,8 +5,7 @@ import json
 
 import pytest
 
-from eventsrc.importers.logger_record import read_line
-from eventsrc.importers.record import Imported
+from eventsrc.importers.json_lines import Imported, read_line
 
 TS = 1740000000.123
 TS_NS = 1740000000123000000

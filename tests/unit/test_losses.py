@@ -2,7 +2,7 @@
 
 import pytest
 
-from eventsrc.losses import Gap, GapLedger
+from eventsrc.gaps import Gap, GapLedger
 
 SETTLE_NS = 10
 

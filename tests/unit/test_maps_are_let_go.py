@@ -12,12 +12,12 @@ from pathlib import Path
 import pytest
 
 from eventsrc.log import LogReader
-from projections.folding import fold_log
-from projections.runner._fold import LiveFold
+from projections.database.graph_sink import GraphSink
+from projections.database.shared_fold import LiveFold
+from projections.database.vector_sink import VectorSink
+from projections.history.history import History
+from projections.model.fold import fold_log
 from projections.settings import Settings
-from projections.sinks.graph import GraphSink
-from projections.sinks.vectors import VectorSink
-from projections.timetravel.history import History
 
 SAMPLE = Path(__file__).parents[2] / "logs" / "sample"
 

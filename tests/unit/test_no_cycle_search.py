@@ -4,7 +4,7 @@ import gc
 
 import pytest
 
-from projections.folding import no_cycle_search
+from projections.model.fold import no_cycle_search
 
 
 def _is_young(thing: object) -> bool:

@@ -1,6 +1,6 @@
 """Lines about what happens often are held back, and counted."""
 
-from projections.serve.notices import EVERY_S, Notices
+from projections.serve.answering import EVERY_S, Notices
 
 
 def test_a_line_is_told_at_once_and_then_once_a_minute_with_a_count() -> None:

@@ -4,9 +4,9 @@ import random
 
 import pytest
 
-from eventsrc._zenoh import Number
-from eventsrc.losses import Gap
-from eventsrc.recorder.numbering import MOST_SOURCES, Numbering
+from eventsrc.gaps import Gap
+from eventsrc.recorder.queue import MOST_SOURCES, Numbering
+from eventsrc.transport.session import Number
 
 SETTLE_NS = 10
 

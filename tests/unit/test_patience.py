@@ -1,6 +1,6 @@
 """When the robot asks again, and when it sends everything again."""
 
-from eventsrc.sending import Patience
+from eventsrc.robot.sender import Patience
 
 RESEND_AFTER_S = 2.0
 

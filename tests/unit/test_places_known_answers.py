@@ -13,7 +13,7 @@ from projections.deltas import (
     PlacesLinked,
     PlacesMerged,
 )
-from projections.reducers._crowd import Crowd
+from projections.reducers.core_index import Crowd
 from projections.reducers.places import NOISE, Places
 from tests.envelopes import envelope
 from tests.folds import fold

@@ -9,7 +9,7 @@ import pytest
 
 from projections.errors import QuestionError
 from projections.relocalize import parse_question, read_crops
-from projections.relocalize.crops import MAX_CROPS
+from projections.relocalize.question import MAX_CROPS
 from tests.envelopes import MODEL, detection, embedding, envelope
 
 VECTOR = [3.0, 4.0, 0.0]

@@ -3,9 +3,8 @@
 import dataclasses
 from pathlib import Path
 
-from eventsrc.cli._recorder_end import summary
-from eventsrc.cli._recorder_line import RecorderLine
 from eventsrc.recorder import RecorderReport
+from projections.cli.recorder_text import RecorderLine, summary
 
 NOTHING = RecorderReport(
     recorded=0,

@@ -5,9 +5,16 @@ import hashlib
 import pytest
 from pydantic import ValidationError
 
-from eventsrc.acks import ACK_PREFIX, Ack, ack_key
-from eventsrc.refusals import Refusal, Refusals, refusal_key
-from eventsrc.sent import Sent, sent_key
+from eventsrc.robot.acks import (
+    ACK_PREFIX,
+    Ack,
+    Refusal,
+    Refusals,
+    Sent,
+    ack_key,
+    refusal_key,
+    sent_key,
+)
 
 
 def test_an_ack_names_the_bytes() -> None:

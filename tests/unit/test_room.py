@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.serve.limits import BusyError
+from projections.serve.answering import BusyError
 from projections.serve.room import Room
 
 DEADLINE_S = 30.0

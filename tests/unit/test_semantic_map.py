@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from projections.deltas import EventSkipped, KeyframeAdded, ObjectFound, ObservationAdded, RunSeen
-from projections.digest import map_digest
 from projections.errors import SettingsError
-from projections.geometry import Neighbourhood
+from projections.exact import Neighbourhood
+from projections.model.digest import map_digest
 from projections.reducers import landmarks
-from projections.reducers._seen import content_digest
+from projections.reducers.folded_ids import content_digest
 from projections.reducers.landmarks import object_id
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings

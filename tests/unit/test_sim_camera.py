@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import pytest
 
-from eventsrc.sim.camera import FOCAL_PX, HEIGHT_PX, WIDTH_PX, Sighting, sightings
 from eventsrc.sim.catalogue import MODELS
+from eventsrc.sim.detector import FOCAL_PX, HEIGHT_PX, WIDTH_PX, Sighting, sightings
 from eventsrc.sim.floorplan import FloorPlan
 from eventsrc.sim.house import House, Thing, build_house
 from eventsrc.sim.shapes import Rect, Segment
-from eventsrc.sim.walk import TruePose
+from eventsrc.sim.tour import TruePose
 
 FAR_WALL = Segment(-50.0, -50.0, -50.0, 50.0)
 

@@ -7,7 +7,10 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from eventsrc.sim import camera, embedding, simulate_run, walk
+from eventsrc.sim import detector as camera
+from eventsrc.sim import detector as embedding
+from eventsrc.sim import simulate_run
+from eventsrc.sim import tour as walk
 
 Function = Callable[..., float]
 

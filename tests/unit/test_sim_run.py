@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from eventsrc.ingest import Accepted, ingest
 from eventsrc.sim import SimulatedRun, simulate_run
-from eventsrc.sim.embedding import DIM
-from eventsrc.sim.publish import truth_path, write_run
+from eventsrc.sim.detector import DIM
+from eventsrc.sim.run import truth_path, write_run
 
 WITNESS_SHA256 = "f82a71e2193354310bd068bc8511907b6972614add60546300a3515dc79960f6"
 """Of run a of house 7, its payloads joined by line ends. It moves only when the simulator does."""

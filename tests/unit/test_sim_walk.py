@@ -8,8 +8,7 @@ import pytest
 from eventsrc.sim.grid import ROBOT_RADIUS_M
 from eventsrc.sim.house import House, build_house
 from eventsrc.sim.shapes import Segment, wrap
-from eventsrc.sim.tour import plan_tour
-from eventsrc.sim.walk import KEYFRAME_M, KEYFRAME_RAD, TruePose, keyframes, walk
+from eventsrc.sim.tour import KEYFRAME_M, KEYFRAME_RAD, TruePose, keyframes, plan_tour, walk
 
 SEEDS_AND_RUNS = [(7, "a"), (7, "b"), (3, "a"), (12, "c")]
 Drive = tuple[House, str, list[TruePose]]

@@ -10,13 +10,22 @@ import numpy as np
 import pytest
 
 from eventsrc.log import ALWAYS, LogReader, LogWriter, recover_log
-from projections import folding
-from projections.digest import map_digest
-from projections.folding import fold_log, fold_log_cached
-from projections.geometry import Neighbourhood
+from projections.exact import Neighbourhood
+from projections.model import fold as folding
+from projections.model import snapshot as codec
+from projections.model.digest import map_digest
+from projections.model.fold import fold_log, fold_log_cached
+from projections.model.snapshot import (
+    MAGIC,
+    NotAContainer,
+    SnapshotRefused,
+    pack,
+    restore,
+    snapshot,
+    unpack,
+)
+from projections.model.snapshot_cache import SnapshotCache
 from projections.settings import Settings
-from projections.snapshot import SnapshotCache, SnapshotRefused, codec, restore, snapshot
-from projections.snapshot.container import MAGIC, NotAContainer, pack, unpack
 from tests.envelopes import detection, envelope, payload
 from tests.folds import Folded, fold
 

@@ -9,11 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc._set_aside import Refused
-from eventsrc.acks import Ack
 from eventsrc.errors import SpoolError, SpoolFull
-from eventsrc.refusals import Refusal, Refusals, fingerprint
-from eventsrc.spool import Spool, Spooled
+from eventsrc.robot.acks import Ack, Refusal, Refusals, fingerprint
+from eventsrc.robot.spool import Refused, Spool, Spooled
 
 
 def _ack(*payloads: bytes) -> Ack:
@@ -118,7 +116,7 @@ def test_what_was_refused_gives_way_but_is_not_forgotten(spool: Spool) -> None:
 
 def test_what_waits_is_there_for_the_next_process(tmp_path: Path) -> None:
     code = (
-        "import os, sys; from pathlib import Path; from eventsrc.spool import Spool\n"
+        "import os, sys; from pathlib import Path; from eventsrc.robot.spool import Spool\n"
         "spool = Spool(Path(sys.argv[1])); spool.add('run-a', 7, b'kept'); os._exit(9)"
     )
     path = tmp_path / "deep" / "spool"

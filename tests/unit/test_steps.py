@@ -4,7 +4,7 @@ import signal
 
 import pytest
 
-from eventsrc.cli._signals import ctrl_c_between_steps
+from projections.cli.signals import ctrl_c_between_steps
 
 _HANDLER = signal.getsignal(signal.SIGINT)
 

@@ -7,9 +7,9 @@ import pytest
 
 from eventsrc.log import LogWriter
 from projections.errors import WhenceError
+from projections.history import ExpressionError, NoSuchThing, Timeline
+from projections.history.merges import merge_document
 from projections.settings import Settings
-from projections.timetravel import ExpressionError, NoSuchThing, Timeline
-from projections.timetravel.merge_story import merge_document
 from tests.envelopes import detection, envelope
 from tests.fixtures_timetravel import write_log
 

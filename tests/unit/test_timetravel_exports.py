@@ -3,16 +3,16 @@
 import subprocess
 import sys
 
-import projections.timetravel
+import projections.history
 
 
 def test_what_is_public_is_sorted_and_there() -> None:
-    names = projections.timetravel.__all__
+    names = projections.history.__all__
     assert names == sorted(names)
-    assert all(hasattr(projections.timetravel, name) for name in names)
+    assert all(hasattr(projections.history, name) for name in names)
 
 
 def test_importing_it_loads_no_drawing_and_no_database() -> None:
-    code = "import projections.timetravel, sys; print(*sys.modules)"
+    code = "import projections.history, sys; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert not {"matplotlib", "psycopg", "zenoh", "typer"} & set(done.stdout.split())

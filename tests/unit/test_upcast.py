@@ -9,9 +9,9 @@ from eventsrc.append import append_payload
 from eventsrc.envelope import ENVELOPE_VERSION, Envelope
 from eventsrc.ingest import Accepted, Rejected
 from eventsrc.log import Event, LogReader, LogWriter
-from eventsrc.log._schemas import ENVELOPE_VERSION_KEY, envelope_version, key_channel
+from eventsrc.log.format import ENVELOPE_VERSION_KEY, envelope_version, key_channel
 from eventsrc.upcast import LADDER, guess_version, read_envelope
-from projections.folding import fold_log
+from projections.model.fold import fold_log
 from projections.settings import Settings
 from tests.fixtures_log import KEY, envelope, read_log
 

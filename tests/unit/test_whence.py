@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 
 from eventsrc.errors import LogDamaged, MisuseError
-from eventsrc.log import LogReader, LogWriter, Unreadable, _parts
-from eventsrc.log.whence import resolve, resolve_start
+from eventsrc.log import LogReader, LogWriter, Unreadable
+from eventsrc.log import seal as _parts
+from eventsrc.log.seek import resolve, resolve_start
 from tests.fixtures_log import BY_HAND, KEY, envelope, flip
 
 SECOND = 1_000_000_000

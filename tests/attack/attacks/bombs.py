@@ -8,8 +8,8 @@ from functools import partial
 from pathlib import Path
 
 from eventsrc.log import LogWriter
+from projections.model.snapshot import MAGIC as SNAPSHOT_MAGIC
 from projections.settings import Settings
-from projections.snapshot.container import MAGIC as SNAPSHOT_MAGIC
 from tests.attack.arena import Arena
 from tests.attack.explosives import gzip_line, mcap_with, mcap_with_large_message, zstd_chunk
 from tests.envelopes import envelope, payload

@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import Any
 from urllib.parse import urlsplit
 
-from eventsrc._zenoh import ZenohOptions, open_session
+from eventsrc.transport.session import ZenohOptions, open_session
 from tests.attack.arena import Arena
 from tests.attack.json_maul import maul_json
 from tests.attack.questioner import Questioner, question

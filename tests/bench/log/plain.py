@@ -8,7 +8,7 @@ from typing import Self
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
 
-from eventsrc.log.fsync import GROUP_COMMIT, sync_file
+from eventsrc.log.durable_files import GROUP_COMMIT, sync_file
 
 from .payloads import Payloads
 

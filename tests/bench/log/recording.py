@@ -9,26 +9,27 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from eventsrc._zenoh import ZenohOptions, open_session
-from eventsrc.log import LogWriter, _active
-from eventsrc.log.fsync import FsyncPolicy
+from eventsrc.log import LogWriter
+from eventsrc.log import active_segment as _active
+from eventsrc.log.durable_files import FsyncPolicy
 from eventsrc.log_info import log_info
 from eventsrc.recorder import Recorder
+from eventsrc.transport.session import ZenohOptions, open_session
 
 from .payloads import KEY
 from .plain import PlainFile
 
 ROUTER = """
 import sys
-from eventsrc._zenoh import ZenohOptions
-from eventsrc.router import Router
+from eventsrc.transport.session import ZenohOptions
+from eventsrc.transport.session import Router
 with Router(ZenohOptions(listen=("tcp/127.0.0.1:0",))) as router:
     print(router.endpoints[0], flush=True)
     sys.stdin.read()
 """
 PUBLISHER = """
 import sys, time
-from eventsrc._zenoh import ZenohOptions, open_session
+from eventsrc.transport.session import ZenohOptions, open_session
 from tests.bench.log.payloads import KEY, Payloads
 endpoint, rate, seconds = sys.argv[1], float(sys.argv[2]), float(sys.argv[3])
 payloads = Payloads()

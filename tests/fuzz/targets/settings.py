@@ -5,7 +5,7 @@ import random
 from collections.abc import Sequence
 from pathlib import Path
 
-from projections.cli._options import settings_from
+from projections.cli.options import settings_from
 from projections.errors import SettingsError
 from projections.settings import Settings
 from tests.attack.json_maul import maul_json

@@ -6,9 +6,8 @@ import zlib
 from collections.abc import Sequence
 from contextlib import suppress
 
+from projections.model.snapshot import MAGIC, SnapshotRefused, restore, snapshot
 from projections.settings import Settings
-from projections.snapshot.codec import SnapshotRefused, restore, snapshot
-from projections.snapshot.container import MAGIC
 from tests.attack.json_maul import maul_bytes, maul_json
 from tests.folds import fold
 from tests.fuzz.target import Target

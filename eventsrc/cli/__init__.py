@@ -1,1 +1,0 @@
-"""The commands about the log: record, import, simulate, router, log …"""

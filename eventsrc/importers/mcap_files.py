@@ -1,0 +1,73 @@
+"""Messages out of MCAP files and other mapfold logs, in file order."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from eventsrc.errors import MapfoldError
+from eventsrc.log import LogReader
+from eventsrc.log.foreign_mcap import ForeignDamage, foreign_messages
+
+from .json_lines import Imported
+
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+
+
+class McapFile:
+    """Any MCAP file. Channels that do not say ``json`` (images, ROS messages) are passed over and
+    counted."""
+
+    def __init__(self, name: str, file: BinaryIO, size_bytes: int | None) -> None:
+        self.name = name
+        self.unit = "message"
+        self.at: int | None = None
+        self.size_bytes = size_bytes
+        self.skipped = 0
+        self._file = file
+        self._read = 0
+
+    def position(self) -> int:
+        """Bytes of the file consumed."""
+        return self._file.tell() if self.size_bytes else self._read
+
+    def records(self) -> Iterator[Imported]:
+        """The JSON messages."""
+        try:
+            for number, message in enumerate(foreign_messages(self._file), start=1):
+                self.at = number
+                self._read += len(message.payload)
+                if message.encoding == "json":
+                    yield Imported(
+                        message.payload, message.key, message.logged_ns, message.published_ns
+                    )
+                else:
+                    self.skipped += 1
+        except ForeignDamage as error:
+            raise MapfoldError(
+                f"{self.name}: {error}; the messages before it are in the log"
+            ) from None
+
+
+class OtherLog:
+    """Another log, from its first event to its last durable one."""
+
+    def __init__(self, path: Path) -> None:
+        self.name = str(path)
+        self.unit = "offset"
+        self.at: int | None = None
+        self._reader = LogReader(path)
+        self.size_bytes: int | None = None
+        self.skipped = 0
+        self._read = 0
+
+    def position(self) -> int:
+        """Bytes of payload read."""
+        return self._read
+
+    def records(self) -> Iterator[Imported]:
+        """Its events, system events included."""
+        with self._reader as reader:
+            for event in reader.read():
+                self.at = event.offset
+                self._read += len(event.payload)
+                yield Imported(event.payload, event.key, event.logged_ns, event.stamp_ns)

@@ -1,0 +1,257 @@
+"""The head of every segment: magic, MCAP header, and metadata that say whose segment it is.
+
+Channels and the JSON schemas behind them, generated from the models that check the payloads.
+
+Names of the files of a log.
+
+    00000000000000000000.mcap          sealed: immutable, compressed, indexed
+    00000000000000004711.mcap.active   growing, or left over and not sealed yet
+    ….mcap.new / .mcap.sealing         being made; means nothing until renamed, safe to delete
+    ….mcap.damaged, .mcap.active.damaged   what `mapfold log recover` replaced, kept for a person
+    ….foreign, ….duplicate                 what it set aside: of another log; held by other segments
+    ….misnamed                             a segment that it is giving its right name
+    lock                               held by the one writer
+    .ledger.json                       the gap ledger, folded from the events: a cache
+
+A segment is named by its base, the offset of its first event. While a sealed file takes the place
+of its active one, both exist for an instant; the sealed one counts.
+"""
+
+import functools
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from pydantic import BaseModel
+
+from eventsrc.envelope import ENVELOPE_VERSION, Envelope
+from eventsrc.errors import LogDamaged, NotALog
+from eventsrc.system_events import LOSS_KEY, REJECTED_KEY, Loss, RejectedPayload, is_system_key
+
+from . import mcap_records as _mcap
+from .mcap_records import BadRecord, Channel, Header, Metadata, Opcode
+
+FORMAT = "1"
+SEGMENT_METADATA = "mapfold.segment"
+PREVIOUS = "previous_sha256"
+"""In the head of a sealed segment, and of no active one: the hash of the segment before."""
+MARK_SEED = "mark_seed"
+"""In the head of an active segment: what its commit marks are made with, in hex. Segments of
+earlier versions have none, which is seed 0."""
+_SEED = re.compile(r"[0-9a-f]{1,8}")
+_BASE = re.compile(r"\d{1,20}", re.ASCII)
+HEAD_BYTES = 4096
+"""More than any head of ours takes."""
+
+
+def head_metadata(log_id: str, base: int, extra: dict[str, str] | None = None) -> Metadata:
+    """What stands at the head of every segment, active and sealed."""
+    values = {"format": FORMAT, "log_id": log_id, "base": str(base), **(extra or {})}
+    return _mcap.own_metadata(SEGMENT_METADATA, values)
+
+
+def file_head(metadata: Metadata) -> bytes:
+    """Magic, header and our metadata."""
+    header = Header(profile=_mcap.PROFILE, library=_mcap.LIBRARY)
+    return _mcap.MAGIC + _mcap.encode_all([header, metadata])
+
+
+def mark_seed(head: dict[str, str]) -> int:
+    """The mark seed that the head of an active segment names."""
+    return int(head.get(MARK_SEED, "0"), 16)
+
+
+class WrongPlace(LogDamaged):
+    """A whole segment under the name of another one. Inside ``eventsrc.log`` only."""
+
+
+def head_of(path: Path, base: int) -> dict[str, str]:
+    """Our metadata at the head of the segment at ``path``; see `read_head`."""
+    with path.open("rb") as file:
+        return read_head(path, file.read(HEAD_BYTES), base)[0]
+
+
+def claims_of(path: Path) -> dict[str, str]:
+    """The same, whatever base the head names."""
+    with path.open("rb") as file:
+        return _read_head(path, file.read(HEAD_BYTES))[0]
+
+
+def read_head(path: Path, data: bytes, base: int) -> tuple[dict[str, str], int]:
+    """Our metadata at the head of a segment and the byte after it. Raises WrongPlace when it is not
+    the segment at offset ``base``, LogDamaged when it cannot be read, NotALog when it is none."""
+    values, end = _read_head(path, data)
+    if values["base"] != str(base):
+        raise WrongPlace(
+            f"{path} was written as the segment at offset {values['base']}, not {base}; "
+            f"run `mapfold log recover {path.parent}`, which gives files their right names"
+        )
+    return values, end
+
+
+def _read_head(path: Path, data: bytes) -> tuple[dict[str, str], int]:
+    if not data.startswith(_mcap.MAGIC) and not _mcap.MAGIC.startswith(data):
+        raise NotALog(f"{path} is no MCAP file; it does not belong into a log, move it away")
+    try:
+        head = _find_head(data)
+    except BadRecord as error:
+        raise LogDamaged(
+            f"{path}: damaged head: {error}; run `mapfold log recover {path.parent}`"
+        ) from None
+    if head is None:
+        raise NotALog(f"{path} is an MCAP file but no segment of a log; `mapfold import` reads it")
+    return head
+
+
+def _find_head(data: bytes) -> tuple[dict[str, str], int] | None:
+    """None for an MCAP head that is not ours."""
+    at = len(_mcap.MAGIC)
+    ours = True
+    try:
+        for opcode, content in _mcap.records(data[at:]):
+            at += _mcap.FRAME.size + len(content)
+            if opcode == Opcode.HEADER:
+                header = _mcap.decode_as(Header, content)
+                ours = (header.profile, header.library) == (_mcap.PROFILE, _mcap.LIBRARY)
+            elif opcode == Opcode.METADATA:
+                metadata = _mcap.decode_as(Metadata, content)
+                if metadata.name == SEGMENT_METADATA:
+                    return _checked_head(metadata), at
+    except BadRecord:
+        if ours:
+            raise
+    if ours:
+        raise BadRecord("it ends before the segment's metadata")
+    return None
+
+
+def _checked_head(metadata: Metadata) -> dict[str, str]:
+    values = _mcap.checked_metadata(metadata)
+    if not _BASE.fullmatch(values.get("base", "")) or "log_id" not in values:
+        raise BadRecord("the segment's metadata names no log or no base")
+    if not _SEED.fullmatch(values.get(MARK_SEED, "0")):
+        raise BadRecord("the segment's metadata names no good mark seed")
+    return values
+
+
+ENVELOPE_VERSION_KEY = "mapfold.envelope_version"
+UNREADABLE_VERSION = 0
+"""Of a channel that says something else than a number: another program's, or forged. Its events are
+read, and not folded."""
+_A_VERSION = re.compile(r"[0-9]{1,9}")
+
+_SYSTEM_MODELS: dict[str, type[BaseModel]] = {REJECTED_KEY: RejectedPayload, LOSS_KEY: Loss}
+
+
+def schema_of(key: str) -> tuple[str, bytes]:
+    """Name and JSON schema text of what ``key`` carries."""
+    if not is_system_key(key):
+        return "mapfold.Envelope", _json_schema(Envelope)
+    model = _SYSTEM_MODELS.get(key)
+    if model is None:
+        return "mapfold.System", b'{"type": "object"}'
+    return f"mapfold.{model.__name__}", _json_schema(model)
+
+
+@functools.cache
+def _json_schema(model: type[BaseModel]) -> bytes:
+    return json.dumps(model.model_json_schema(by_alias=True), sort_keys=True).encode()
+
+
+def key_channel(channel_id: int, schema_id: int, key: str, version: int) -> Channel:
+    """The channel of a key whose envelopes are of ``version``."""
+    return Channel(
+        id=channel_id,
+        topic=key,
+        message_encoding="json",
+        schema_id=schema_id,
+        metadata={ENVELOPE_VERSION_KEY: str(version)},
+    )
+
+
+def envelope_version(channel: Channel) -> int:
+    """The version of the envelopes on a channel; the current one where none is said."""
+    said = channel.metadata.get(ENVELOPE_VERSION_KEY)
+    if said is None:
+        return ENVELOPE_VERSION
+    return int(said) if _A_VERSION.fullmatch(said) else UNREADABLE_VERSION
+
+
+SEALED = ".mcap"
+ACTIVE = ".mcap.active"
+NEW = ".mcap.new"
+SEALING = ".mcap.sealing"
+DAMAGED = ".damaged"
+FOREIGN = ".foreign"
+DUPLICATE = ".duplicate"
+MISNAMED = ".misnamed"
+LOCK = "lock"
+LEDGER = ".ledger.json"
+
+_NAME = re.compile(r"(\d{20})(\.mcap|\.mcap\.active)")
+_MISNAMED = re.compile(_NAME.pattern + r"\.misnamed(-\d+)?")
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentPath:
+    """A segment on disk: its base offset and whether it is sealed."""
+
+    path: Path
+    base: int
+    sealed: bool
+
+
+def segment_path(log: Path, base: int, suffix: str) -> Path:
+    """Where the segment that starts at offset ``base`` stands."""
+    return log / f"{base:020d}{suffix}"
+
+
+def list_segments(log: Path) -> list[SegmentPath]:
+    """The segments of ``log`` in offset order, one for each base."""
+    found: dict[int, SegmentPath] = {}
+    for segment in segment_files(log):
+        if segment.sealed or segment.base not in found:
+            found[segment.base] = segment
+    return [found[base] for base in sorted(found)]
+
+
+def segment_files(log: Path) -> list[SegmentPath]:
+    """Every file of ``log`` that is named as a segment; two of one base while one is sealed."""
+    matches = ((entry, _NAME.fullmatch(entry.name)) for entry in log.iterdir())
+    return sorted(
+        (SegmentPath(entry, int(m[1]), m[2] == SEALED) for entry, m in matches if m is not None),
+        key=lambda segment: segment.path.name,
+    )
+
+
+def half_renamed(log: Path) -> list[Path]:
+    """Segments that a recovery was giving their right names when it was interrupted."""
+    return sorted(p for p in log.iterdir() if _MISNAMED.fullmatch(p.name))
+
+
+def list_growing(log: Path) -> list[SegmentPath]:
+    """`list_segments` beside a writer: a folder that is read while a file takes another's place may
+    show neither. Bases only ever join, so two listings with the same ones missed nothing."""
+    before = list_segments(log)
+    while True:
+        now = list_segments(log)
+        if [s.base for s in now] == [s.base for s in before]:
+            return now
+        before = now
+
+
+def leftovers(log: Path) -> list[Path]:
+    """Half-made files that a crash left behind; they hold nothing that is not elsewhere."""
+    return sorted(p for p in log.iterdir() if p.name.endswith((NEW, SEALING)))
+
+
+def free_name(path: Path, suffix: str) -> Path:
+    """``path`` with a suffix that no other file has."""
+    number = 1
+    while True:
+        counted = suffix if number == 1 else f"{suffix}-{number}"
+        free = path.with_name(path.name + counted)
+        if not free.exists():
+            return free
+        number += 1

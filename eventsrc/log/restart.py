@@ -1,0 +1,218 @@
+"""Bringing a log that was left in the middle of things back in order.
+
+On the next start, by itself: half-made files go, and every left-over active segment keeps all
+events whose CRC holds, synced or not. A torn end is what a crash leaves and is cut off without
+asking: nothing in it was ever called recorded. Rot is not: the writer refuses to start and names
+`mapfold log recover`, which a person must run.
+
+Sealing takes a second for each segment, and a recorder that restarts must listen at once. So a
+left-over is *finished* first, which is quick: its torn end is cut off, and a last chunk that was
+written but not marked gets its mark. Then it is like any segment behind a rotation, and is sealed
+in the background as those are. One that cannot be brought into that form (a mark has rotted, or a
+sealed segment stands behind it) is sealed at once, and with it all the others.
+
+The last left-over is read byte by byte, for a crash may have torn it. Those before it were whole
+when it was begun: where their marks say so they are taken at their word, for a recorder that was
+killed under load leaves many. Should one have rotted since, sealing finds it and says so.
+
+An active file is deleted only after the sealed one that replaces it is synced under its name.
+"""
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from eventsrc.errors import LogDamaged, NotALog
+
+from . import mcap_records as _mcap
+from .active_file import ActiveFile
+from .durable_files import sync_directory, sync_file, unlink_quietly, write_all
+from .format import (
+    ACTIVE,
+    SegmentPath,
+    half_renamed,
+    head_of,
+    leftovers,
+    list_segments,
+    mark_seed,
+    segment_path,
+)
+from .log_identity import log_id_of
+from .scan import Scan, scan_active
+from .seal import NO_PREVIOUS, SegmentPlan, file_sha256, seal
+from .sealed_segment import SealedFile
+
+
+@dataclass(slots=True)
+class Restart:
+    """Where a writer goes on, and what its predecessor left undone.
+
+    ``torn_bytes`` and ``torn_events`` were being written when it died and were never synced.
+    """
+
+    log_id: str | None = None
+    next_offset: int = 0
+    previous_sha256: str = NO_PREVIOUS
+    recovered_segments: int = 0
+    recovered_events: int = 0
+    torn_bytes: int = 0
+    torn_events: int = 0
+    unsealed: list[tuple[int, int]] = field(default_factory=list)
+    """Base and next offset of the left-over segments that are finished and still to be sealed, in
+    order."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Leftover:
+    segment: SegmentPath
+    scan: Scan
+    marked: int
+    """How many of the chunks that the scan found have their marks, one behind the other."""
+    position: int
+    """Where these end."""
+
+    @property
+    def finishable(self) -> bool:
+        """Whether at most a last chunk lacks its mark."""
+        chunks = self.scan.chunks
+        if self.marked + 1 < len(chunks):
+            return False
+        return self.marked == len(chunks) or chunks[-1].position == self.position
+
+
+def restart(log: Path) -> Restart:
+    """Put in order what is left over. The caller holds the writer lock.
+
+    Raises LogDamaged for rot in what a writer goes by, when the segments are not all of one log,
+    and when one has the name of another.
+    """
+    for path in leftovers(log):
+        unlink_quietly(path)
+    for path in half_renamed(log):
+        raise LogDamaged(f"{path}: a recovery was interrupted; run `mapfold log recover {log}`")
+    segments = list_segments(log)
+    log_id_of(segments)
+    for segment in [s for s in segments if s.sealed][-1:]:
+        SealedFile(segment.path, segment.base).close()  # before anything is changed
+    for segment in segments:
+        if segment.sealed:
+            unlink_quietly(segment_path(log, segment.base, ACTIVE))
+    state = Restart()
+    found = _look_at_leftovers(log, segments, state)
+    last_sealed = max((s.base for s in segments if s.sealed), default=-1)
+    if all(left.finishable and left.segment.base > last_sealed for left in found):
+        for left in found:
+            _finish(left)
+            state.unsealed.append((left.segment.base, left.scan.next_offset))
+    else:
+        for left in found:
+            _seal_now(log, left)
+    _read_end(log, state, found)
+    return state
+
+
+def _look_at_leftovers(log: Path, segments: list[SegmentPath], state: Restart) -> list[_Leftover]:
+    """Those with events; what holds none is deleted."""
+    found = []
+    for index, segment in enumerate(segments):
+        if segment.sealed:
+            continue
+        reach = segments[index + 1].base if index + 1 < len(segments) else None
+        left = _look_at(segment, reach)
+        state.torn_bytes += left.scan.lost_bytes
+        state.torn_events += left.scan.torn_events
+        state.log_id = state.log_id or left.scan.log_id
+        if left.scan.chunks:
+            state.recovered_segments += 1
+            state.recovered_events += left.scan.next_offset - segment.base
+            found.append(left)
+        else:
+            if left.scan.log_id is not None:
+                # The writer had come to this offset, even if files before it are gone by now.
+                state.next_offset = max(state.next_offset, segment.base)
+            segment.path.unlink()
+            sync_directory(log)
+    return found
+
+
+def _look_at(segment: SegmentPath, reach: int | None) -> _Leftover:
+    """``reach`` is the base of the next segment: this one was whole before that was begun."""
+    finished = None if reach is None else _finished(segment, reach)
+    if finished is not None:
+        return finished
+    scan = scan_active(segment.path, segment.base)
+    scan.gap_up_to(reach or segment.base)
+    _refuse_rot(segment.path, scan)
+    if scan.rewritten:
+        raise LogDamaged(
+            f"{segment.path}: another program has rewritten it; "
+            f"run `mapfold log recover {segment.path.parent}`"
+        )
+    if not scan.chunks:
+        return _Leftover(segment, scan, 0, 0)
+    file = ActiveFile(segment.path, segment.base)
+    places = [chunk.position for chunk in file.chunks]
+    file.close()
+    marked = len(places) if places == [c.position for c in scan.chunks[: len(places)]] else -1
+    return _Leftover(segment, scan, marked, file.position)
+
+
+def _finished(segment: SegmentPath, reach: int) -> _Leftover | None:
+    """A segment whose marks reach the next one, taken at their word; None for one to look into."""
+    try:
+        file = ActiveFile(segment.path, segment.base)
+    except (LogDamaged, NotALog):
+        return None
+    file.close()
+    if file.next_offset != reach:
+        return None
+    scan = Scan(segment.base, file.log_id, chunks=file.chunks, next_offset=reach)
+    return _Leftover(segment, scan, len(file.chunks), file.position)
+
+
+def _refuse_rot(path: Path, scan: Scan) -> None:
+    if scan.gaps:
+        first, last = scan.gaps[0]
+        raise LogDamaged(
+            f"{path}: offsets {first} to {last} were recorded and cannot be read any more; "
+            f"run `mapfold log recover {path.parent}` to keep the rest"
+        )
+
+
+def _finish(left: _Leftover) -> None:
+    """Leave marked chunks and nothing else. A chunk is synced before its mark says so."""
+    last = left.scan.chunks[-1]
+    fd = os.open(left.segment.path, os.O_RDWR | os.O_APPEND)
+    try:
+        if left.marked < len(left.scan.chunks):
+            os.ftruncate(fd, last.position + last.length)
+            sync_file(fd)
+            seed = mark_seed(head_of(left.segment.path, left.segment.base))
+            write_all(fd, _mcap.encode_mark(last.first, last.following, seed))
+        elif os.fstat(fd).st_size > left.position:
+            os.ftruncate(fd, left.position)
+        sync_file(fd)
+    finally:
+        os.close(fd)
+
+
+def _seal_now(log: Path, left: _Leftover) -> None:
+    before = [s for s in list_segments(log) if s.base < left.segment.base]
+    previous = file_sha256(before[-1].path) if before else NO_PREVIOUS
+    file = ActiveFile(left.segment.path, left.segment.base)
+    plan = SegmentPlan(log, file.log_id, left.segment.base, previous, left.scan.next_offset)
+    seal(plan, (file.read_chunk(chunk) for chunk in left.scan.chunks))
+    left.segment.path.unlink()
+    sync_directory(log)
+
+
+def _read_end(log: Path, state: Restart, found: list[_Leftover]) -> None:
+    """Fill in where the log ends and what the next segment to be sealed carries on from."""
+    sealed = [segment for segment in list_segments(log) if segment.sealed]
+    if sealed:
+        last = SealedFile(sealed[-1].path, sealed[-1].base)
+        state.log_id = last.log_id
+        state.next_offset = max(state.next_offset, last.next_offset)
+        state.previous_sha256 = file_sha256(sealed[-1].path)
+    if state.unsealed:
+        state.next_offset = max(state.next_offset, found[-1].scan.next_offset)

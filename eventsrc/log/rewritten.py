@@ -1,0 +1,164 @@
+"""Segments that another program has rewritten, as `mcap sort` does.
+
+Such a file has other chunks in another order, but the metadata still say which log and base it is
+of and each message has its sequence number, so every event that is there has its right offset. The
+reader of foreign files reads it, against the limits of our own segments. What it cannot read, or
+what is more than a segment holds, counts as lost bytes.
+"""
+
+import struct
+from bisect import bisect_right
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from . import mcap_records as _mcap
+from .foreign_mcap import ForeignDamage, ForeignRecord, foreign_records
+from .mcap_records import FRAME, BadRecord, Header, Opcode
+from .sealed_segment import SEAL_METADATA
+from .segment import ChunkRef
+
+if TYPE_CHECKING:
+    from .scan import Scan
+
+_MOST_BYTES: Final = 1 << 28
+"""Of messages that are taken from one file, for they are all in memory; a segment holds a quarter
+of that, unless single events are larger."""
+_OVERHEAD_BYTES: Final = 256
+"""What a message takes in memory besides its bytes."""
+_RUN_BYTES: Final = 1 << 24
+"""Messages that are put together in one chunk."""
+_TAKEN: Final = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.METADATA)
+_SEQUENCES: Final = 1 << 32
+_HEAD: Final = struct.Struct("<HIQQ")
+"""Of a message: channel, sequence number, log and publish time."""
+
+
+def is_rewritten(data: bytes) -> bool:
+    """Whether the MCAP file that begins with ``data`` was written by another program."""
+    try:
+        opcode, content = next(_mcap.records(data[len(_mcap.MAGIC) :]))
+        return opcode == Opcode.HEADER and _mcap.decode_as(Header, content).library != _mcap.LIBRARY
+    except (BadRecord, StopIteration):
+        return False
+
+
+def take_messages(path: Path, scan: "Scan", following: int | None) -> None:
+    """Take into ``scan`` every message of the file that is in none of its chunks. Those from offset
+    ``following`` on, where the next segment begins, are that one's."""
+    taken = _Taken(scan, following)
+    unread = 0
+    with path.open("rb") as file:
+        size = path.stat().st_size
+        try:
+            for record in foreign_records(file, _TAKEN, _mcap.MAX_CHUNK_BYTES):
+                if not taken.take(record):
+                    unread = size - record.at
+                    break
+        except ForeignDamage as error:
+            unread = size - error.at
+    taken.merge()
+    scan.lost_bytes, scan.torn_events = unread, 0
+
+
+class _Taken:
+    """The messages of a file by offset, and the schemas and channels that they need."""
+
+    def __init__(self, scan: "Scan", following: int | None) -> None:
+        self._scan = scan
+        self._end = scan.base + _SEQUENCES if following is None else following
+        self._known = list(scan.chunks)
+        self._starts = [chunk.first for chunk in self._known]
+        self._channels: set[int] = set()
+        self._definitions: dict[bytes, None] = {}
+        self._messages: dict[int, bytes] = {}
+        self._definition_bytes = self._message_bytes = 0
+
+    def take(self, record: ForeignRecord) -> bool:
+        """False when that is more than a segment holds, or cannot be read."""
+        opcode, content, _ = record
+        if opcode == Opcode.MESSAGE:
+            return self._take_message(content)
+        try:
+            _mcap.check_definitions(len(content))
+            if opcode == Opcode.METADATA:
+                metadata = _mcap.decode_as(_mcap.Metadata, content)
+                self._scan.gap_up_to(self._scan.base + _sealed_count(metadata))
+                return True
+            if opcode == Opcode.CHANNEL:
+                self._channels.add(_mcap.decode_as(_mcap.Channel, content).id)
+            else:
+                _mcap.decode_as(_mcap.Schema, content)
+            return self._take_definition(_framed(opcode, content))
+        except BadRecord:
+            return False
+
+    def _take_definition(self, record: bytes) -> bool:
+        if record not in self._definitions:
+            self._definition_bytes += len(record)
+            _mcap.check_definitions(self._definition_bytes)
+            self._definitions[record] = None
+        return True
+
+    def _take_message(self, content: bytes) -> bool:
+        if len(content) < _HEAD.size:
+            return False
+        channel, sequence, _, _ = _HEAD.unpack_from(content)
+        offset = self._scan.base + sequence
+        wanted = offset < self._end and offset not in self._messages and not self._has(offset)
+        if wanted and channel in self._channels:
+            self._message_bytes += len(content) + _OVERHEAD_BYTES
+            if self._message_bytes > _MOST_BYTES:
+                return False
+            self._messages[offset] = _framed(Opcode.MESSAGE, content)
+        return True
+
+    def _has(self, offset: int) -> bool:
+        index = bisect_right(self._starts, offset) - 1
+        return index >= 0 and offset < self._known[index].following
+
+    def merge(self) -> None:
+        """Put the messages between the chunks that were good already."""
+        scan = self._scan
+        definitions = b"".join(self._definitions)
+        chunks = list(self._known)
+        for first, run in _runs(self._messages):
+            size = len(definitions) + sum(map(len, run))
+            body = partial(b"".join, [definitions, *run])
+            chunks.append(ChunkRef(0, size, first, first + len(run), body=body))
+        end = scan.next_offset
+        scan.chunks, scan.gaps, scan.next_offset = [], [], scan.base
+        for chunk in sorted(chunks, key=lambda chunk: chunk.first):
+            scan.take(chunk)
+        scan.gap_up_to(end)
+
+
+def _framed(opcode: int, content: bytes) -> bytes:
+    return FRAME.pack(opcode, len(content)) + content
+
+
+def _sealed_count(record: _mcap.Metadata) -> int:
+    """How many events the segment held when it was sealed, if this is its seal."""
+    try:
+        if record.name == SEAL_METADATA:
+            return int(_mcap.checked_metadata(record)["chunk_edges"].rsplit(",", 1)[-1])
+    except (KeyError, ValueError):
+        pass
+    return 0
+
+
+def _runs(messages: dict[int, bytes]) -> Iterator[tuple[int, list[bytes]]]:
+    """Messages of consecutive offsets, with the first of these; some mebibytes at once."""
+    first, size = 0, 0
+    run: list[bytes] = []
+    for offset in sorted(messages):
+        if run and (offset != first + len(run) or size > _RUN_BYTES):
+            yield first, run
+            run, size = [], 0
+        if not run:
+            first = offset
+        run.append(messages[offset])
+        size += len(messages[offset])
+    if run:
+        yield first, run

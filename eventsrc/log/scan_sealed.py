@@ -1,0 +1,114 @@
+"""What can still be read of a sealed segment: by its index, or, where that is gone, by searching
+the bytes for chunks. Every chunk is decompressed and its CRC and sequence checked."""
+
+import contextlib
+from collections.abc import Iterable, Iterator
+from itertools import pairwise
+from pathlib import Path
+
+from eventsrc.errors import LogDamaged, NotALog
+
+from . import mcap_records as _mcap
+from .durable_files import FileBytes
+from .format import HEAD_BYTES, WrongPlace, read_head
+from .mcap_records import BadRecord, Metadata
+from .rewritten import is_rewritten, take_messages
+from .scan import Scan, chunk_extent
+from .sealed_segment import SEAL_METADATA, SealedFile, sealed_edges
+from .segment import ChunkRef
+
+
+def scan_sealed(path: Path, base: int, following: int | None) -> Scan:
+    """Look at every chunk. ``following`` is the base of the next segment, if there is one: how far
+    this one reached when its own index cannot say. Raises WrongPlace for a segment of another
+    base."""
+    with FileBytes.of(path) as data:
+        scan = _scan(path, data, base, following)
+        scan.rewritten = is_rewritten(data[:HEAD_BYTES])
+    if scan.rewritten:
+        take_messages(path, scan, following)
+    return scan
+
+
+def _scan(path: Path, data: FileBytes, base: int, following: int | None) -> Scan:
+    scan = Scan(base, _log_id(path, base, data), next_offset=base)
+    edges: set[tuple[int, int]] | None = None
+    try:
+        index = SealedFile(path, base)
+        promised = index.next_offset
+        scan.channels = index.channels
+        places: Iterable[int] = [chunk.position for chunk in index.chunks]
+    except (LogDamaged, NotALog) as error:
+        scan.index_fault = str(error)
+        places = _chunk_places(data)
+        offsets = _sealed_edges(data, base, max(_chunk_places(data), default=0))
+        promised = offsets[-1]
+        edges = set(pairwise(offsets)) or None
+    end = 0
+    for at in places:
+        if at < end:  # bytes of the chunk before, which may look like anything
+            continue
+        try:
+            length, first, after = chunk_extent(data, at, scan)
+        except BadRecord:
+            continue
+        if first >= scan.next_offset and (edges is None or (first, after) in edges):
+            scan.take(ChunkRef(at, length, first, after))
+            end = at + length
+    scan.gap_up_to(max(promised, following or base))
+    scan.lost_bytes = _unread_bytes(len(data), scan)
+    return scan
+
+
+def _log_id(path: Path, base: int, data: FileBytes) -> str | None:
+    try:
+        return read_head(path, data[:HEAD_BYTES], base)[0]["log_id"]
+    except WrongPlace:
+        raise
+    except (LogDamaged, NotALog):
+        return None
+
+
+def _chunk_places(data: FileBytes) -> Iterator[int]:
+    """Where chunks seem to start. What is in a chunk is other people's bytes, so where the head of
+    one is good its content is not searched, whatever has become of it."""
+    at = -1
+    while (at := data.find(_mcap.ZSTD_PATTERN, at + 1)) >= 0:
+        start = at - _mcap.ZSTD_PATTERN_AT
+        try:
+            head = _mcap.decode_chunk_head(data[max(0, start) : start + _mcap.ZSTD_CHUNK_HEAD])
+        except BadRecord:
+            continue
+        yield start
+        if start + head.length <= len(data):
+            at = start + head.length - 1
+
+
+def _sealed_edges(data: FileBytes, base: int, last_chunk: int) -> list[int]:
+    """The offsets at which chunks begin and the last one ends, by the seal, if that can be found
+    behind the last chunk; else the base alone."""
+    name = SEAL_METADATA.encode()
+    with contextlib.suppress(BadRecord):
+        head = _mcap.decode_chunk_head(data[last_chunk : last_chunk + _mcap.ZSTD_CHUNK_HEAD])
+        last_chunk += head.length
+    at = data.rfind(name, last_chunk)
+    while at >= 0:
+        try:
+            start = at - 4
+            content = data[start : start + _mcap.MAX_DEFINITIONS_BYTES]
+            metadata = _mcap.decode_as(Metadata, content)
+            edges = _mcap.checked_metadata(metadata)["chunk_edges"]
+            return sealed_edges(edges, base)
+        except (KeyError, ValueError):
+            at = data.rfind(name, last_chunk, at)
+    return [base]
+
+
+def _unread_bytes(size: int, scan: Scan) -> int:
+    """Bytes between the chunks around each gap, indexes that stand there included."""
+    lost, end, expected = 0, 0, scan.base
+    for chunk in scan.chunks:
+        if chunk.first > expected:
+            lost += chunk.position - end
+        end, expected = chunk.position + chunk.length, chunk.following
+    return lost + (size - end if scan.next_offset > expected else 0)

@@ -1,0 +1,346 @@
+"""Making a sealed segment: chunked, zstd, indexed, with every byte under some checksum.
+
+    magic · Header · Metadata "mapfold.segment" · ( chunk · message indexes )* ·
+    Metadata "mapfold.seal" · DataEnd with the CRC of all before it ·
+    summary with its CRC · Footer · magic
+
+The file is written beside (``.mcap.sealing``), synced and renamed, so a sealed name never holds
+half a segment. Bodies of active chunks are joined as they are into chunks of about 1 MiB: the
+events' bytes are not taken apart, only their heads are walked for the index.
+
+The seal says how many events each chunk holds, which the MCAP index does not, so that an offset is
+found without reading chunks; and the SHA-256 of the segment before, which makes the chain.
+
+What goes into each chunk of a sealed segment.
+
+The chunks of a growing segment are as large as its commits happened to be. Sealed ones are of about
+`CHUNK_BYTES`: what one flipped bit can cost, and what one event takes to read. Small bodies are
+joined, large ones parted, and every part is led by the channels it needs.
+"""
+
+import hashlib
+import os
+import struct
+import zlib
+from bisect import bisect_left
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+
+from eventsrc.errors import LogDamaged
+
+from . import mcap_records as _mcap
+from .durable_files import replace_durably, sync_file, unlink_quietly, write_all
+from .format import (
+    ACTIVE,
+    SEALED,
+    SEALING,
+    SEGMENT_METADATA,
+    file_head,
+    head_metadata,
+    segment_path,
+)
+from .mcap_records import (
+    FRAME,
+    MAX_MESSAGES,
+    MESSAGE,
+    BadRecord,
+    Channel,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Metadata,
+    MetadataIndex,
+    Opcode,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+from .sealed_segment import SEAL_METADATA
+
+CHUNK_BYTES = 1024 * 1024
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """The body of one chunk and, parallel to one another, what its messages' heads say.
+
+    ``positions`` are where in the body they start; ``definitions`` are the records of schemas and
+    channels that come with this part and did not come with one before.
+    """
+
+    body: bytes
+    channels: Sequence[int]
+    log_ns: Sequence[int]
+    stamp_ns: Sequence[int]
+    positions: Sequence[int]
+    definitions: bytes
+
+    def entries(self) -> dict[int, list[int]]:
+        """By channel: log time and position of each message, by turns, as an index has them."""
+        entries: dict[int, list[int]] = {channel: [] for channel in self.channels}
+        for channel, log_ns, position in zip(
+            self.channels, self.log_ns, self.positions, strict=True
+        ):
+            entries[channel] += (log_ns, position)
+        return entries
+
+
+def parts_of(bodies: Iterable[bytes]) -> Iterator[Part]:
+    """Bodies of chunks in offset order, joined or parted to about `CHUNK_BYTES`."""
+    waiting: list[bytes] = []
+    size = 0
+    for body in bodies:
+        waiting.append(body)
+        size += len(body)
+        if size >= CHUNK_BYTES:
+            yield from _parted(b"".join(waiting))
+            waiting, size = [], 0
+    if waiting:
+        yield from _parted(b"".join(waiting))
+
+
+def _parted(body: bytes) -> Iterator[Part]:
+    """One part, or several of about the same size where it is two chunks large or more."""
+    rows, starts, others = _layout(body)
+    _, _, channels, _, log_ns, stamp_ns = zip(*rows, strict=True)
+    definitions = b"".join(body[start:end] for start, end in others)
+    lead = b""
+    edges = _edges(len(body), starts)
+    for first, last in pairwise(edges):
+        at = starts[first] if first else 0
+        end = starts[last] if last < len(starts) else len(body)
+        shift = len(lead) - at
+        yield Part(
+            lead + body[at:end] if len(edges) > 2 else body,
+            channels[first:last],
+            log_ns[first:last],
+            stamp_ns[first:last],
+            [start + shift for start in starts[first:last]],
+            b"" if first else definitions,
+        )
+        lead = lead or _mcap.encode_all(_mcap.definitions(definitions)[1])
+
+
+def _edges(size: int, starts: list[int]) -> list[int]:
+    """Indexes of the messages that the parts begin with, and how many messages there are."""
+    count = max(1, size // CHUNK_BYTES)
+    inner = {bisect_left(starts, size * part // count) for part in range(1, count)}
+    return sorted({0, len(starts)} | inner)
+
+
+def _layout(body: bytes) -> tuple[list[tuple[int, ...]], list[int], list[tuple[int, int]]]:
+    """Heads and starts of all messages, and start and end of everything else."""
+    at, size, unpack, message = 0, len(body), MESSAGE.unpack_from, int(Opcode.MESSAGE)
+    rows: list[tuple[int, ...]] = []
+    starts: list[int] = []
+    others: list[tuple[int, int]] = []
+    try:
+        while at < size:
+            if body[at] == message:
+                row = unpack(body, at)
+                rows.append(row)
+                if len(rows) > MAX_MESSAGES:
+                    raise BadRecord(f"a chunk of more than {MAX_MESSAGES:,} messages")
+                starts.append(at)
+                at += FRAME.size + row[1]
+            else:
+                start, at = at, at + FRAME.size + FRAME.unpack_from(body, at)[1]
+                others.append((start, at))
+    except struct.error:
+        raise BadRecord("a record is cut short in a chunk") from None
+    if at != size:
+        raise BadRecord("a record does not fit its chunk")
+    return rows, starts, others
+
+
+NO_PREVIOUS = ""
+REPLACES = "replaces_sha256"
+"""In the head of a recovered segment: the hash its successor knows its original by."""
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentPlan:
+    """What a sealed segment says of itself: its log, its base and the hash of the one before.
+
+    ``following`` is the offset behind its last event. Bodies that end elsewhere are not sealed:
+    something has rotted, and the file they came from is all there is of the rest.
+    """
+
+    log: Path
+    log_id: str
+    base: int
+    previous_sha256: str
+    following: int
+    notes: dict[str, str] = field(default_factory=dict)
+
+
+def seal(plan: SegmentPlan, bodies: Iterable[bytes]) -> str:
+    """Write the sealed segment from chunk bodies in offset order and put it in its place; its
+    SHA-256. Raises OSError when the disk refuses; nothing is left behind then."""
+    temporary = segment_path(plan.log, plan.base, SEALING)
+    sha256 = write_sealed(plan, bodies, temporary)
+    replace_durably(temporary, segment_path(plan.log, plan.base, SEALED))
+    return sha256
+
+
+def write_sealed(plan: SegmentPlan, bodies: Iterable[bytes], temporary: Path) -> str:
+    """Write it beside, synced but not yet in its place; see `seal`. Raises OSError, and LogDamaged
+    for bodies that are not what a writer makes."""
+    fd = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+    try:
+        builder = _Builder(fd, plan)
+        for part in parts_of(bodies):
+            builder.add_chunk(part)
+        builder.expect_end(plan)
+        builder.finish()
+        sync_file(fd)
+    except BadRecord as error:
+        unlink_quietly(temporary)
+        raise LogDamaged(f"{segment_path(plan.log, plan.base, ACTIVE)}: {error}") from None
+    except BaseException:
+        unlink_quietly(temporary)
+        raise
+    finally:
+        os.close(fd)
+    return builder.sha256.hexdigest()
+
+
+class _Builder:
+    """Writes front to back, keeping position, checksums and the index."""
+
+    def __init__(self, fd: int, plan: SegmentPlan) -> None:
+        self._fd = fd
+        self._at = 0
+        self._crc = 0
+        self.sha256 = hashlib.sha256()
+        self._squeeze = _mcap.compressor()
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        self._counts: dict[int, int] = defaultdict(int)
+        self._chunks: list[ChunkIndex] = []
+        self._metadata: list[MetadataIndex] = []
+        self._edges = [0]
+        self._log_ns: list[int] = []
+        self._stamp_ns: list[int] = []
+        head = head_metadata(
+            plan.log_id, plan.base, {"previous_sha256": plan.previous_sha256, **plan.notes}
+        )
+        start = file_head(head)
+        length = len(_mcap.encode(head))
+        self._metadata.append(MetadataIndex(len(start) - length, length, SEGMENT_METADATA))
+        self._write(start)
+
+    def _write(self, data: bytes) -> None:
+        write_all(self._fd, data)
+        self._at += len(data)
+        self._crc = zlib.crc32(data, self._crc)
+        self.sha256.update(data)
+
+    def add_chunk(self, part: Part) -> None:
+        """One chunk and the index of its messages."""
+        schemas, channels = _mcap.definitions(part.definitions)
+        self._schemas.update((s.id, s) for s in schemas)
+        self._channels.update((c.id, c) for c in channels)
+        self._edges.append(self._edges[-1] + len(part.log_ns))
+        first_ns, last_ns = min(part.log_ns), max(part.log_ns)
+        self._log_ns += (first_ns, last_ns)
+        self._stamp_ns += (min(part.stamp_ns), max(part.stamp_ns))
+        entries = part.entries()
+        for channel_id, flat in entries.items():
+            self._counts[channel_id] += len(flat) // 2
+        self._write_chunk(part.body, first_ns, last_ns, entries)
+
+    def _write_chunk(
+        self, body: bytes, first_ns: int, last_ns: int, entries: dict[int, list[int]]
+    ) -> None:
+        chunk = _mcap.encode_chunk(self._squeeze, body, first_ns, last_ns)
+        start = self._at
+        self._write(chunk)
+        indexes_at = self._at
+        offsets: dict[int, int] = {}
+        for channel_id in sorted(entries):
+            offsets[channel_id] = self._at
+            self._write(_mcap.encode_message_index(channel_id, entries[channel_id]))
+        self._chunks.append(
+            ChunkIndex(
+                chunk_length=len(chunk),
+                chunk_start_offset=start,
+                compression="zstd",
+                compressed_size=len(chunk) - _mcap.ZSTD_CHUNK_HEAD,
+                message_end_time=last_ns,
+                message_index_length=self._at - indexes_at,
+                message_index_offsets=offsets,
+                message_start_time=first_ns,
+                uncompressed_size=len(body),
+            )
+        )
+
+    def expect_end(self, plan: SegmentPlan) -> None:
+        """Raise BadRecord unless everything up to the end of the plan was added."""
+        reached = plan.base + self._edges[-1]
+        if reached != plan.following:
+            raise BadRecord(
+                f"offsets {reached} to {plan.following - 1} were recorded and cannot be read"
+            )
+
+    def finish(self) -> None:
+        """Seal, end of data, summary, footer."""
+        seal_record = _mcap.encode(self._seal())
+        self._metadata.append(MetadataIndex(self._at, len(seal_record), SEAL_METADATA))
+        self._write(seal_record)
+        self._write(_mcap.encode(DataEnd(self._crc)))
+        self._write_summary()
+
+    def _seal(self) -> Metadata:
+        return _mcap.own_metadata(
+            SEAL_METADATA,
+            {
+                "chunk_edges": ",".join(map(str, self._edges)),
+                "first_stamp_ns": str(min(self._stamp_ns)),
+                "last_stamp_ns": str(max(self._stamp_ns)),
+            },
+        )
+
+    def _write_summary(self) -> None:
+        start = self._at
+        summary = b""
+        groups: list[SummaryOffset] = []
+        for opcode, data in self._summary_groups():
+            groups.append(SummaryOffset(opcode, start + len(summary), len(data)))
+            summary += data
+        offsets_start = start + len(summary)
+        summary += _mcap.encode_all(groups)
+        footer = _mcap.encode(Footer(start, offsets_start, 0))
+        crc = zlib.crc32(footer[:-4], zlib.crc32(summary))
+        self._write(summary + _mcap.encode(Footer(start, offsets_start, crc)) + _mcap.MAGIC)
+
+    def _summary_groups(self) -> list[tuple[Opcode, bytes]]:
+        return [
+            (Opcode.SCHEMA, _mcap.encode_all(self._schemas.values())),
+            (Opcode.CHANNEL, _mcap.encode_all(self._channels.values())),
+            (Opcode.STATISTICS, _mcap.encode(self._statistics())),
+            (Opcode.CHUNK_INDEX, _mcap.encode_all(self._chunks)),
+            (Opcode.METADATA_INDEX, _mcap.encode_all(self._metadata)),
+        ]
+
+    def _statistics(self) -> Statistics:
+        return Statistics(
+            attachment_count=0,
+            channel_count=len(self._channels),
+            channel_message_counts=dict(self._counts),
+            chunk_count=len(self._chunks),
+            message_count=self._edges[-1],
+            message_end_time=max(self._log_ns),
+            message_start_time=min(self._log_ns),
+            metadata_count=len(self._metadata),
+            schema_count=len(self._schemas),
+        )
+
+
+def file_sha256(path: Path) -> str:
+    """The hash a following segment carries of this one."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

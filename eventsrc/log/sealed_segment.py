@@ -1,0 +1,209 @@
+"""A sealed segment, known from its summary and its seal: they name every chunk, its first offset
+and its channels, so nothing before the wanted event is read.
+
+Is every byte of a sealed segment what was sealed?
+
+The CRC in DataEnd covers everything before it, the CRC in the footer the summary and the footer,
+and the magic ends the file; so there is no byte that nothing checks.
+"""
+
+import hashlib
+import os
+import zlib
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+from eventsrc.errors import LogDamaged
+
+from . import mcap_records as _mcap
+from .mcap_records import (
+    BadRecord,
+    Channel,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Metadata,
+    MetadataIndex,
+    Opcode,
+    Statistics,
+)
+from .segment import ChunkRef, SegmentFile
+
+SEAL_METADATA = "mapfold.seal"
+_MAX_CHUNKS = 1 << 16
+"""In one segment: a chunk is a mebibyte or a single event, and a segment is full at 64 MiB."""
+
+
+class SealedFile(SegmentFile):
+    """An immutable segment, known from its summary."""
+
+    def __init__(self, path: Path, base: int) -> None:
+        super().__init__(path, base)
+        self.channels: dict[int, Channel] = {}
+        try:
+            self._read_summary()
+        except (ValueError, KeyError) as error:
+            self.close()
+            raise LogDamaged(
+                f"{path}: the index at its end cannot be read, which leaves offsets from {base} "
+                f"unreadable: {error}; run `mapfold log recover {path.parent}`"
+            ) from None
+        except BaseException:
+            self.close()
+            raise
+
+    def channels_of(self, body: bytes) -> dict[int, Channel]:  # noqa: ARG002
+        """The same for all chunks, from the summary."""
+        return self.channels
+
+    def _read_summary(self) -> None:
+        size = self.size()
+        tail = os.pread(self._fd, _mcap.TAIL_BYTES, max(0, size - _mcap.TAIL_BYTES))
+        if not tail.endswith(_mcap.MAGIC) or tail[0] != Opcode.FOOTER:
+            raise BadRecord("no footer")
+        footer = _mcap.decode_as(Footer, tail[_mcap.FRAME.size :])
+        if not 0 < footer.summary_start <= size - _mcap.TAIL_BYTES:
+            raise BadRecord("the footer points nowhere")
+        length = size - _mcap.TAIL_BYTES - footer.summary_start
+        if length > _mcap.MAX_SUMMARY_BYTES:
+            raise BadRecord(f"a summary of {length:,} bytes, more than {_mcap.MAX_SUMMARY_BYTES:,}")
+        summary = os.pread(self._fd, length, footer.summary_start)
+        if zlib.crc32(tail[: _mcap.FOOTER_BYTES - 4], zlib.crc32(summary)) != footer.summary_crc:
+            raise BadRecord("the summary does not match its CRC")
+        self._take(summary, size)
+
+    def _take(self, summary: bytes, size: int) -> None:
+        indexes: list[tuple[int, int, frozenset[int]]] = []
+        statistics, seal = None, None
+        definitions = 0
+        for opcode, content in _mcap.records(summary):
+            if opcode == Opcode.CHUNK_INDEX:
+                indexes.append(_place(_mcap.decode_as(ChunkIndex, content), size))
+                if len(indexes) > _MAX_CHUNKS:
+                    raise BadRecord(f"an index of more than {_MAX_CHUNKS:,} chunks")
+            elif opcode == Opcode.CHANNEL:
+                definitions += len(content)
+                _mcap.check_definitions(definitions)
+                channel = _mcap.decode_as(Channel, content)
+                self.channels[channel.id] = channel
+            elif opcode == Opcode.STATISTICS:
+                statistics = _mcap.decode_as(Statistics, content)
+            elif opcode == Opcode.METADATA_INDEX:
+                index = _mcap.decode_as(MetadataIndex, content)
+                if index.name == SEAL_METADATA:
+                    seal = self._metadata(index, size)
+        if statistics is None or seal is None:
+            raise BadRecord("no statistics or no seal")
+        if not self.channels.keys() >= statistics.channel_message_counts.keys():
+            raise BadRecord("statistics of channels that nothing defines")
+        self.statistics, self.seal = statistics, seal
+        self.first_stamp_ns = int(seal["first_stamp_ns"])
+        self.last_stamp_ns = int(seal["last_stamp_ns"])
+        self._take_chunks(indexes)
+
+    def _metadata(self, index: MetadataIndex, size: int) -> dict[str, str]:
+        if index.length > _mcap.MAX_DEFINITIONS_BYTES or index.offset + index.length > size:
+            raise BadRecord("the seal is out of bounds")
+        record = os.pread(self._fd, index.length, index.offset)
+        content = record[_mcap.FRAME.size :]
+        return _mcap.checked_metadata(_mcap.decode_as(Metadata, content))
+
+    def _take_chunks(self, indexes: list[tuple[int, int, frozenset[int]]]) -> None:
+        edges = sealed_edges(self.seal["chunk_edges"], self.base)
+        if len(edges) != len(indexes) + 1:
+            raise BadRecord("the seal does not fit the index")
+        self.next_offset = edges[-1]
+        self.chunks = [
+            ChunkRef(position, length, first, following, channels)
+            for (position, length, channels), (first, following) in zip(
+                indexes, pairwise(edges), strict=True
+            )
+        ]
+
+
+def sealed_edges(text: str, base: int) -> list[int]:
+    """The offsets at which the chunks of a segment begin and the last one ends, from its seal.
+    Raises ValueError."""
+    edges = [base + int(number) for number in text.split(",")]
+    if edges[0] != base or any(one >= other for one, other in pairwise(edges)):
+        raise BadRecord("the seal names chunks in no order")
+    return edges
+
+
+def _place(index: ChunkIndex, size: int) -> tuple[int, int, frozenset[int]]:
+    """Where a chunk stands and how long it is, and its channels."""
+    position, length = index.chunk_start_offset, index.chunk_length
+    if position + length > size:
+        raise BadRecord(
+            f"a chunk of {length:,} bytes at byte {position:,} of a file of {size:,} bytes"
+        )
+    return position, length, frozenset(index.message_index_offsets)
+
+
+_BLOCK = 1024 * 1024
+_DATA_END_BYTES = _mcap.FRAME.size + 4
+
+
+@dataclass(frozen=True, slots=True)
+class FileCheck:
+    """``sha256`` of the whole file; ``fault`` is None when every checksum holds."""
+
+    sha256: str
+    fault: str | None
+
+
+def check_sealed(path: Path) -> FileCheck:
+    """Read the whole file, a block at a time."""
+    try:
+        return _check(path)
+    except OSError as error:  # a bad sector
+        return FileCheck("", f"the disk cannot read it: {error.strerror or error}")
+
+
+def _check(path: Path) -> FileCheck:
+    with path.open("rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        tail = os.pread(file.fileno(), _mcap.TAIL_BYTES, max(0, size - _mcap.TAIL_BYTES))
+        summary_start, fault = _summary_start(tail, size)
+        if fault is not None:
+            return FileCheck("", fault)  # it is not what was sealed, whatever its hash
+        data_end_at = summary_start - _DATA_END_BYTES
+        sha256 = hashlib.sha256()
+        crc = 0
+        at = 0
+        while block := file.read(_BLOCK):
+            sha256.update(block)
+            crc = zlib.crc32(block[: max(0, data_end_at - at)], crc)
+            at += len(block)
+        fault = _data_end_fault(file.fileno(), data_end_at, crc)
+        if fault is None:
+            fault = _summary_fault(file.fileno(), summary_start, size, tail)
+    return FileCheck(sha256.hexdigest(), fault)
+
+
+def _summary_start(tail: bytes, size: int) -> tuple[int, str | None]:
+    if len(tail) < _mcap.TAIL_BYTES or not tail.endswith(_mcap.MAGIC):
+        return _DATA_END_BYTES, "no magic at its end"
+    start = int.from_bytes(tail[9:17], "little")
+    if not _DATA_END_BYTES < start < size:
+        return _DATA_END_BYTES, "the footer points nowhere"
+    if size - start > _mcap.MAX_SUMMARY_BYTES + _mcap.TAIL_BYTES:
+        return _DATA_END_BYTES, f"the footer claims a summary of {size - start:,} bytes"
+    return start, None
+
+
+def _data_end_fault(fd: int, at: int, crc: int) -> str | None:
+    if os.pread(fd, _DATA_END_BYTES, at) != _mcap.encode(DataEnd(crc)):
+        return "the data section does not match its CRC"
+    return None
+
+
+def _summary_fault(fd: int, start: int, size: int, tail: bytes) -> str | None:
+    crc = 0
+    for at in range(start, size - _mcap.TAIL_BYTES, _BLOCK):
+        crc = zlib.crc32(os.pread(fd, min(_BLOCK, size - _mcap.TAIL_BYTES - at), at), crc)
+    footer = tail[: _mcap.FOOTER_BYTES]
+    if zlib.crc32(footer[:-4], crc) != int.from_bytes(footer[-4:], "little"):
+        return "the summary does not match its CRC"
+    return None

@@ -1,0 +1,1 @@
+"""What runs on the robot: publish envelopes, keep them until a recorder has acknowledged them."""

@@ -1,0 +1,136 @@
+"""The robot's side: publish envelopes so that none is lost while the link or the recorder is away.
+
+* `EnvelopePublisher.publish` writes the envelope into the spool and returns; it never waits for
+  the network. One thread does all the sending (`eventsrc.robot.sender`), in the order of
+  publishing.
+* An envelope leaves the spool when a recorder's ack names its bytes, and an ack names what is
+  synced in a log. Until then it is sent again. So it may arrive more than once, which the fold
+  absorbs: the first one counts.
+* What no recorder would accept is refused here, by the same door (`eventsrc.ingest`). A recorder
+  may have narrower rules (`--max-payload`) or older ones; what it refuses, with the bytes and the
+  reason in its log, is set aside and no longer sent: see `EnvelopePublisher.refused`.
+"""
+
+import json
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from eventsrc.errors import InvalidEnvelope, MisuseError
+from eventsrc.ingest import Rejected, ingest
+from eventsrc.system_events import RESERVED_PREFIX, is_system_key
+from eventsrc.transport.config import check_key
+from eventsrc.transport.session import ZenohOptions, check_options
+
+from .sender import RESEND_AFTER_S, WINDOW, Sender
+from .spool import DEFAULT_SPOOL_BYTES, Refused, Spool
+
+
+class EnvelopePublisher:
+    """Publishes one robot's envelopes under ``key``; a context manager, usable from any thread.
+
+    The constructor opens the spool and begins to send what an earlier process left in it. It raises
+    SpoolError if the spool cannot be used, and MisuseError if the key is one of mapfold's own or
+    malformed, an endpoint malformed or the configuration file none; but nothing when nobody answers
+    there: the sending thread tries until somebody does.
+    """
+
+    def __init__(
+        self,
+        options: ZenohOptions,
+        spool: Path,
+        key: str = "tb/detections",
+        *,
+        max_spool_bytes: int = DEFAULT_SPOOL_BYTES,
+        window: int = WINDOW,
+        resend_after_s: float = RESEND_AFTER_S,
+    ) -> None:
+        if is_system_key(key):
+            raise MisuseError(
+                f"key {key!r}: every recorder refuses envelopes under {RESERVED_PREFIX}; "
+                "choose another"
+            )
+        check_key(key, "key")
+        check_options(options)
+        self._spool = Spool(spool, max_spool_bytes)
+        self._sender = Sender(
+            options, key, self._spool, window=window, resend_after_s=resend_after_s
+        )
+        self._thread = threading.Thread(
+            target=self._sender.run, name="envelope-sender", daemon=True
+        )
+        self._thread.start()
+        self._left: int | None = None
+
+    def publish(self, envelope: Mapping[str, Any] | bytes) -> None:
+        """Take one envelope: a dictionary, or its JSON as bytes, which are sent as they are.
+
+        Raises InvalidEnvelope with the reason a recorder would give, SpoolFull when the spool has
+        no room, SpoolError when the spool is closed or its disk fails, TransportError when the
+        sending thread has died.
+        """
+        payload = envelope if isinstance(envelope, bytes) else _encode(envelope)
+        outcome = ingest(payload)
+        if isinstance(outcome, Rejected):
+            raise InvalidEnvelope(f"envelope not published: {outcome.reason}")
+        self._sender.raise_failure()
+        self._spool.add(outcome.envelope.run_id, outcome.envelope.keyframe_id, payload)
+        self._sender.wake()
+
+    @property
+    def unacknowledged(self) -> int:
+        """How many envelopes wait for a recorder's answer."""
+        return len(self._spool)
+
+    @property
+    def refused_count(self) -> int:
+        """How many envelopes a recorder has refused; they are set aside in the spool."""
+        return self._spool.refused_count
+
+    def refused(self, limit: int = 100) -> list[Refused]:
+        """The oldest envelopes that were refused: which, by the recorder of which log, and why."""
+        return self._spool.refused(limit)
+
+    def retry_refused(self) -> int:
+        """Send what was refused once more, for a recorder that was mended; how many envelopes.
+        Those whose bytes gave way to new envelopes stay `refused`; the log named there has them."""
+        retried = self._spool.retry_refused()
+        self._sender.wake()
+        return retried
+
+    def discard_refused(self) -> int:
+        """Forget what was refused; how many envelopes that were."""
+        return self._spool.discard_refused()
+
+    def flush(self, timeout_s: float) -> bool:
+        """Wait until everything published is answered. True when all of it is acknowledged; False
+        when it was not in time, or when envelopes are set aside as `refused`."""
+        return self._sender.wait_until_answered(timeout_s) and not self.refused_count
+
+    def close(self, timeout_s: float = 0.0) -> int:
+        """`flush`, then stop. How many envelopes wait in the spool, for the next process."""
+        if self._left is None:
+            if timeout_s > 0:
+                self.flush(timeout_s)
+            self._sender.stop()
+            self._thread.join()
+            self._left = len(self._spool)
+            self._spool.close()
+        return self._left
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _encode(envelope: Mapping[str, Any]) -> bytes:
+    try:
+        return json.dumps(envelope, ensure_ascii=False, allow_nan=False).encode()
+    except (TypeError, ValueError) as error:
+        raise InvalidEnvelope(f"envelope not published: not JSON: {error}") from None

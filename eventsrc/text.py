@@ -1,0 +1,51 @@
+r"""Numbers in sentences.
+
+Text from outside, made fit for a terminal.
+
+A terminal obeys what it is sent: escape sequences, which begin with a C0 or C1 control, move its
+cursor, set its title or type answers; bidirectional overrides and isolates show a name in another
+order than it has; and a line break in a name forges a line. mapfold prints none of these on
+purpose but the ends of its own lines, so they are shown as escapes: ``\x1b``, ``\u202e``, ``\n``.
+"""
+
+import re
+from typing import Final
+
+
+def counted(number: int, word: str) -> str:
+    """``1 keyframe``, ``2 keyframes``, ``3,000 keyframes``."""
+    return f"{number:,} {word}" if number == 1 else f"{number:,} {word}s"
+
+
+_UNSAFE: Final = re.compile(
+    "[\x00-\x1f\x7f-\x9f"  # C0, DEL, C1
+    "\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069"  # bidirectional marks, overrides, isolates
+    "\u2028\u2029\ufeff]"  # line and paragraph separator, byte order mark
+)
+
+
+def visible(text: str) -> str:
+    """``text`` on one line with nothing in it that a terminal would obey: a key, a name, a path."""
+    return text if text.isprintable() else _UNSAFE.sub(_escaped, text)
+
+
+def visible_lines(text: str) -> str:
+    """``text`` that has been laid out in lines, with nothing but their ends for a terminal to obey.
+
+    What came from outside and went into it has gone through `visible` first, or it adds lines."""
+    return "\n".join(map(visible, text.split("\n")))
+
+
+def visible_json(text: str) -> str:
+    """JSON text, indented or not, of the same value, with nothing that a terminal would obey."""
+    if text.isascii() and "\x7f" not in text:
+        return text  # JSON itself escapes C0
+    return "\n".join(_UNSAFE.sub(_escaped_in_json, line) for line in text.split("\n"))
+
+
+def _escaped(match: re.Match[str]) -> str:
+    return ascii(match[0])[1:-1]
+
+
+def _escaped_in_json(match: re.Match[str]) -> str:
+    return f"\\u{ord(match[0]):04x}"

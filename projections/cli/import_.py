@@ -1,0 +1,153 @@
+"""`mapfold import`: messages that others kept, into a log."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+    TransferSpeedColumn,
+)
+
+from eventsrc.importers import (
+    DEFAULT_KEY,
+    LAZY_COMMIT,
+    ImportCut,
+    ImportReport,
+    check_sources,
+    import_files,
+)
+from eventsrc.importers.json_lines import Source
+from eventsrc.log import LogWriter
+from eventsrc.text import counted, visible
+from eventsrc.transport.config import check_key
+
+from .recorder_text import restart_as_json, say_restart
+from .signals import ctrl_c_between_steps
+from .terminal import emit, finish, people, say
+
+_MOST_REJECTS: Final = 5
+
+
+def import_(
+    log: Annotated[
+        Path, typer.Argument(metavar="LOG", help="The log to append to; made if there is none.")
+    ],
+    files: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="FILE",
+            help="JSON lines (plain or gzip), logger records, MCAP files, other logs; - is stdin.",
+        ),
+    ],
+    key: Annotated[str, typer.Option(help="Key for messages whose file names none.")] = DEFAULT_KEY,
+    json_: Annotated[bool, typer.Option("--json", help="Counts as JSON on stdout.")] = False,
+) -> None:
+    """Append recorded envelopes to a log, in the order of the files.
+
+    What is no envelope is kept with its bytes and the reason under mapfold/rejected, and makes the
+    command exit with 3. Ctrl-C keeps what is in the log by then and says how far that is.
+    """
+    check_sources(files)
+    check_key(key, "--key")
+    rejects = _Rejects()
+    try:
+        with LogWriter(log, fsync=LAZY_COMMIT) as writer, _progress() as show:
+            say_restart(log, writer)
+            with ctrl_c_between_steps() as step:
+                report = import_files(
+                    writer, files, key=key, progress=show, on_reject=rejects.say, step=step
+                )
+    except ImportCut as cut:
+        rejects.say_rest()
+        say(_cut(log, cut))
+        raise
+    rejects.say_rest()
+    if json_:
+        emit({"log": str(log), **asdict(report), **restart_as_json(writer)})
+    say(_summary(log, report))
+    finish(findings=report.rejected > 0)
+
+
+class _Rejects:
+    """Says the first few rejects as they come, and how many more there were."""
+
+    def __init__(self) -> None:
+        self._count = 0
+
+    def say(self, place: str, reason: str) -> None:
+        self._count += 1
+        if self._count <= _MOST_REJECTS:
+            say(visible(f"{place}: rejected: {reason}"))
+
+    def say_rest(self) -> None:
+        if self._count > _MOST_REJECTS:
+            say(f"… and {self._count - _MOST_REJECTS:,} more rejected")
+
+
+def _cut(log: Path, cut: ImportCut) -> str:
+    report = cut.report
+    if cut.place is None:
+        return f"{log}: nothing was imported"
+    kept = counted(report.next_offset - report.first_offset, "event")
+    return (
+        f"{log}: kept {kept}, offsets {report.first_offset} to {report.next_offset - 1}, up to "
+        f"{cut.place}; import only what comes after that, or the log holds the rest twice"
+    )
+
+
+def _summary(log: Path, report: ImportReport) -> str:
+    parts = [f"imported {counted(report.accepted, 'envelope')} into {log}"]
+    if report.next_offset > report.first_offset:
+        parts.append(f"offsets {report.first_offset} to {report.next_offset - 1}")
+    if report.system:
+        parts.append(f"{counted(report.system, 'event')} of mapfold's own taken over")
+    if report.skipped:
+        parts.append(f"{counted(report.skipped, 'message')} other than JSON passed over")
+    parts.append(f"{report.rejected} rejected")
+    hint = f"; `mapfold log cat {log} --key mapfold/rejected` shows them" if report.rejected else ""
+    return ", ".join(parts) + hint
+
+
+@contextmanager
+def _progress() -> Iterator["_Show | None"]:
+    """A bar with rate and time left on a terminal, nothing elsewhere."""
+    if not people.is_terminal:
+        yield None
+        return
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TaskProgressColumn(),
+        TransferSpeedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=people, transient=True) as progress:
+        yield _Show(progress)
+
+
+class _Show:
+    """One task for each file."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+        self._tasks: dict[int, int] = {}
+
+    def __call__(self, source: Source) -> None:
+        task = self._tasks.get(id(source))
+        if task is None:
+            task = self._progress.add_task(visible(source.name), total=source.size_bytes)
+            self._tasks[id(source)] = task
+        self._progress.update(task, completed=source.position())  # type: ignore[arg-type]
+
+
+def register(app: typer.Typer) -> None:
+    """Add `import` to ``app``."""
+    app.command("import")(import_)

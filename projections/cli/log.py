@@ -1,0 +1,343 @@
+"""`mapfold log …`: look at a log.
+
+How `mapfold log cat` shows an event, to a program and to a person.
+
+Watching what `mapfold log cat` shows, for what its reader might wonder about.
+
+A range by times is one of offsets: from the first event stamped then or later to the last one
+stamped then or earlier. Where stamps run backwards in between (runs of last year imported after
+this year's), events of other times lie inside. And a key that no event has shows nothing.
+"""
+
+import base64
+import contextlib
+import json
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from eventsrc.errors import LogError, MisuseError
+from eventsrc.log import (
+    Event,
+    Finding,
+    LogReader,
+    SegmentRecovery,
+    Unreadable,
+    recover_log,
+    verify_log,
+)
+from eventsrc.log.reader import OnGap
+from eventsrc.log.recover import UNASKED_LOSSES
+from eventsrc.log.seek import resolve, resolve_start, time_of
+from eventsrc.log_info import LogInfo, SegmentInfo, log_info
+from eventsrc.system_events import is_system_key
+from eventsrc.text import counted, visible
+
+from .terminal import display, emit, emit_lines, finish, say
+
+_SHORT = 100
+
+
+def iso_time(time_ns: int) -> str:
+    """UTC to the microsecond; the number itself beyond what a calendar holds."""
+    try:
+        moment = datetime.fromtimestamp(time_ns // 1_000_000_000, UTC)
+    except (OverflowError, ValueError):
+        return f"{time_ns} ns"
+    return f"{moment:%Y-%m-%dT%H:%M:%S}.{time_ns // 1000 % 1_000_000:06d}Z"
+
+
+def event_document(event: Event) -> dict[str, Any]:
+    """``{"offset", "logged_ns", "stamp_ns", "key", "payload"}``. The payload is its JSON value, or
+    its text when it is no JSON; bytes that are no text come as ``payload_base64`` beside null."""
+    document: dict[str, Any] = {
+        "offset": event.offset,
+        "logged_ns": event.logged_ns,
+        "stamp_ns": event.stamp_ns,
+        "key": event.key,
+    }
+    try:
+        text = event.payload.decode()
+    except UnicodeDecodeError:
+        return {
+            **document,
+            "payload": None,
+            "payload_base64": base64.b64encode(event.payload).decode(),
+        }
+    return {**document, "payload": _value(text)}
+
+
+def _value(text: str) -> Any:
+    try:
+        return json.loads(text, parse_constant=_refuse)
+    except (ValueError, RecursionError):
+        return text
+
+
+def _refuse(name: str) -> None:
+    raise ValueError(f"{name} is no JSON")
+
+
+def event_line(event: Event) -> str:
+    """Offset, time, key and the gist."""
+    text = f"{event.offset:>8}  {iso_time(event.stamp_ns)}  {event.key}  {_gist(event)}"
+    return visible(text)
+
+
+def _gist(event: Event) -> str:
+    value = _value(event.payload.decode(errors="replace"))
+    if isinstance(value, dict) and isinstance(value.get("detections"), list):
+        classes = [str(d.get("class", "?")) for d in value["detections"] if isinstance(d, dict)]
+        seen = ", ".join(classes) or "nothing"
+        return f"{value.get('run_id')}:{value.get('keyframe_id')} saw {seen}"
+    text = event.payload.decode(errors="replace").replace("\n", " ")
+    return text if len(text) <= _SHORT else text[: _SHORT - 1] + "…"
+
+
+class Watch:
+    """Over the events of a range that ``--from`` and ``--to`` name, of ``keys`` if any."""
+
+    def __init__(self, first: str, last: str, keys: Sequence[str]) -> None:
+        self._first_ns, self._last_ns = time_of(first), time_of(last)
+        self._times = " or ".join(
+            f"{side} {text}"
+            for side, text, time_ns in (
+                ("before", first, self._first_ns),
+                ("after", last, self._last_ns),
+            )
+            if time_ns is not None
+        )
+        self._missing = dict.fromkeys(keys)
+        self._outside = 0
+
+    def over(self, events: Iterable[Event]) -> Iterable[Event]:
+        """The same events."""
+        return self._watched(events) if self._times or self._missing else events
+
+    def _watched(self, events: Iterable[Event]) -> Iterator[Event]:
+        for event in events:
+            self._missing.pop(event.key, None)
+            if not is_system_key(event.key):  # ours are stamped when we wrote them
+                self._outside += self._is_outside(event.stamp_ns)
+            yield event
+
+    def _is_outside(self, stamp_ns: int) -> bool:
+        early = self._first_ns is not None and stamp_ns < self._first_ns
+        return early or (self._last_ns is not None and stamp_ns > self._last_ns)
+
+    def told(self, log: Path) -> Iterator[str]:
+        """Lines for people, once all events have gone by."""
+        if self._outside:
+            verb = "is" if self._outside == 1 else "are"
+            yield (
+                f"{log}: {counted(self._outside, 'event')} of these {verb} stamped {self._times}: "
+                "stamps run backwards in this log; offsets or RUN:KEYFRAME say what you mean"
+            )
+        if self._missing:
+            yield from self._missing_keys(log)
+
+    def _missing_keys(self, log: Path) -> Iterator[str]:
+        with contextlib.suppress(LogError):  # a damaged log: what can be read has been shown
+            there = log_info(log).keys
+            for key in self._missing:
+                if key not in there:
+                    names = ", ".join(map(visible, there)) or "none, as the log is empty"
+                    yield f"{log}: no event has the key {key!r}; there are {names}"
+
+
+LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="The log's folder.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Data as JSON on stdout.")]
+
+log_app = typer.Typer(help="Look at a log: info, cat, verify, recover.", no_args_is_help=True)
+
+
+@log_app.command()
+def info(log: LogArgument, json_: JsonOption = False) -> None:
+    """What a log holds: id, segments, offsets, counts by key, rejected, losses, times."""
+    report = log_info(log, note=say)
+    if json_:
+        emit(_info_document(report))
+    else:
+        display(_info_text(report))
+
+
+def _info_document(report: LogInfo) -> dict[str, Any]:
+    return {
+        **asdict(report),
+        "path": str(report.path),
+        "segments": [asdict(s) for s in report.segments],
+    }
+
+
+def _info_text(report: LogInfo) -> str:
+    rows = [
+        ("log", f"{report.path} ({report.log_id})"),
+        ("events", f"{report.events} in {report.size_bytes:,} bytes"),
+        ("rejected", str(report.rejected)),
+        ("lost", str(report.lost)),
+    ]
+    if report.first_logged_ns is not None and report.last_logged_ns is not None:
+        rows.append(("logged", _span(report.first_logged_ns, report.last_logged_ns)))
+    if report.first_stamp_ns is not None and report.last_stamp_ns is not None:
+        rows.append(("stamped", _span(report.first_stamp_ns, report.last_stamp_ns)))
+    rows += [("key", f"{visible(key)}: {count}") for key, count in report.keys.items()]
+    rows += [("segment", _segment_text(segment)) for segment in report.segments]
+    return "".join(f"{name:<9} {value}\n" for name, value in rows)
+
+
+def _segment_text(segment: SegmentInfo) -> str:
+    state = "sealed" if segment.sealed else "active"
+    return (
+        f"{segment.name}: {counted(segment.events, 'event')}, {segment.size_bytes:,} bytes, {state}"
+    )
+
+
+def _span(first_ns: int, last_ns: int) -> str:
+    return f"{iso_time(first_ns)} to {iso_time(last_ns)}"
+
+
+@log_app.command()
+def cat(
+    log: LogArgument,
+    from_: Annotated[str, typer.Option("--from", metavar="W", help="Where to start.")] = "0",
+    to: Annotated[str, typer.Option("--to", metavar="W", help="Where to stop.")] = "end",
+    key: Annotated[
+        list[str] | None, typer.Option(metavar="K", help="Only this key; may be given again.")
+    ] = None,
+    skip_damage: Annotated[
+        bool, typer.Option("--skip-damage", help="Name unreadable offsets and go on (exit 3).")
+    ] = False,
+    json_: JsonOption = False,
+) -> None:
+    """The events of a log, in order, one a line.
+
+    W is an offset, an ISO time, RUN:KEYFRAME or end. Offsets go from --from to before --to; a
+    keyframe or a time is included at either end.
+    """
+    gaps: list[Unreadable] = []
+
+    def note(gap: Unreadable) -> None:
+        if any(known.first <= gap.first and gap.last <= known.last for known in gaps):
+            return  # met before, on the way to --from or --to
+        gaps.append(gap)
+        say(f"{log}: offsets {gap.first} to {gap.last} cannot be read: {gap.reason}")
+
+    with LogReader(log) as reader:
+        on_gap = note if skip_damage else None
+        start = resolve_start(reader, from_, on_gap=on_gap)
+        end = _end(reader, to, start, on_gap)
+        last = reader.next_offset if end is None else end
+        if start > last:
+            raise MisuseError(
+                f"--from {from_} is offset {start}, behind --to {to}, which is {last}"
+            )
+        watch = Watch(from_, to, key or ())
+        events = watch.over(reader.read(start, end, keys=key or None, on_gap=on_gap))
+        if json_:
+            emit_lines(map(event_document, events))
+        else:
+            for event in events:
+                display(event_line(event))
+    for line in watch.told(log):
+        say(line)
+    finish(findings=bool(gaps))
+
+
+def _end(reader: LogReader, to: str, start: int, on_gap: OnGap | None) -> int | None:
+    """Where a range from offset ``start`` on ends. None: at the end of the log, or at the damage on
+    the way to ``to``, where reading will stop; what is before that is shown first."""
+    if to == "end":
+        return None
+    if on_gap is not None:
+        return resolve(reader, to, on_gap=on_gap)
+    met: list[Unreadable] = []
+    try:
+        end = resolve(reader, to, on_gap=met.append)
+    except MisuseError:
+        if not met:
+            raise
+        end = 0  # it may be among what cannot be read
+    if met and met[0].last < start:
+        return resolve(reader, to)  # which says so
+    return None if met else end
+
+
+@log_app.command()
+def verify(log: LogArgument, json_: JsonOption = False) -> None:
+    """Read every byte of a log and say what is not as it should be; exit 3 if anything is not.
+
+    Checks magic, CRCs, hash chain, dense offsets and every payload; reports keyframes that stand
+    twice, clocks that ran backwards, and losses.
+    """
+    result = verify_log(log)
+    if json_:
+        emit({**asdict(result), "path": str(log)})
+    else:
+        for finding in result.findings:
+            display(_finding_text(finding))
+    size = f"{counted(result.events, 'event')} in {counted(result.segments, 'segment')}"
+    found = counted(len(result.findings), "finding") if result.findings else "all good"
+    say(f"{log}: {size}, {result.size_bytes:,} bytes: {found}")
+    finish(findings=bool(result.findings))
+
+
+def _finding_text(finding: Finding) -> str:
+    where = [finding.segment] if finding.segment else []
+    if finding.first_offset is not None:
+        where.append(f"offsets {finding.first_offset} to {finding.last_offset}")
+    return visible(f"{finding.kind:<9} {': '.join([*where, finding.message])}")
+
+
+@log_app.command()
+def recover(
+    log: LogArgument,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Add however many loss events the log asks for.")
+    ] = False,
+    json_: JsonOption = False,
+) -> None:
+    """Bring a damaged or left-over log back in order, keeping everything that can be read.
+
+    Originals in which something recorded is damaged stay beside as *.damaged, segments of other
+    logs as *.foreign, those that others hold as *.duplicate; files with exchanged names get their
+    own back. Lost offsets become mapfold/loss events; without --yes at most 100,000 more than the
+    damaged bytes can have held. Exit 0: nothing was lost or out of place, 3: something was.
+    """
+    report = recover_log(log, most_losses=sys.maxsize if yes else UNASKED_LOSSES)
+    if json_:
+        emit({**asdict(report), "path": str(log)})
+    for moved in report.moved:
+        say(f"{moved.name}: is now {moved.now}: {moved.reason}")
+    for segment in report.segments:
+        say(_recovery_text(segment))
+    say(
+        f"{log}: {counted(report.events, 'event')}"
+        if report.segments or report.moved
+        else f"{log}: nothing to recover"
+    )
+    finish(findings=report.findings)
+
+
+def _recovery_text(segment: SegmentRecovery) -> str:
+    kept = counted(segment.kept_events, "event")
+    parts = [f"{segment.name}: kept {kept} ({segment.kept_bytes:,} bytes)"]
+    if segment.lost_events:
+        gaps = ", ".join(f"{first} to {last}" for first, last in segment.gaps)
+        parts.append(f"lost {counted(segment.lost_events, 'recorded event')} (offsets {gaps})")
+    if segment.lost_bytes:
+        parts.append(f"left out {segment.lost_bytes:,} bytes")
+    if segment.torn_events:
+        parts.append(f"with {counted(segment.torn_events, 'event')} never synced")
+    if segment.kept_copy:
+        parts.append(f"original kept as {segment.kept_copy}")
+    return ", ".join(parts)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the `log` group to ``app``."""
+    app.add_typer(log_app, name="log")

@@ -1,0 +1,134 @@
+"""`mapfold record`: Zenoh to log, until a signal ends it."""
+
+import dataclasses
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from eventsrc.errors import LogDamaged
+from eventsrc.gap_history import keep_ledger
+from eventsrc.gaps import GapLedger
+from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES, MAX_PAYLOAD_BYTES
+from eventsrc.log import LogReader, LogWriter, parse_fsync
+from eventsrc.recorder import DEFAULT_KEYS, DEFAULT_QUEUE_SIZE, Recorder
+from eventsrc.transport.config import parse_address
+from eventsrc.transport.session import check_keys, open_session
+
+from .recorder_text import EVERY_S, RecorderEnd, say_restart, watching
+from .signals import stop_on_signals
+from .terminal import say, say_metrics
+from .zenoh_options import ConfigOption, ConnectOption, ListenOption, zenoh_options
+
+_LARGEST_BYTES: Final = 128 * 1024 * 1024
+"""What Zenoh puts together of one message, however small ``--max-payload``: it tells nobody of what
+it drops, so most of what is too large should come this far and be counted."""
+
+
+def record(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="The log; made if it is not there.")],
+    connect: ConnectOption = None,
+    listen: ListenOption = None,
+    zenoh_config: ConfigOption = None,
+    key: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--key",
+            metavar="KEY",
+            help="Key expression to record; wildcards * and ** work; may be repeated. "
+            f"[default: {DEFAULT_KEYS[0]}]",
+        ),
+    ] = None,
+    fsync: Annotated[
+        str,
+        typer.Option(metavar="POLICY", help="always, <N>ms or never: when events reach the disk."),
+    ] = "50ms",
+    queue: Annotated[
+        int, typer.Option(min=1, help="How many messages may wait for the disk.")
+    ] = DEFAULT_QUEUE_SIZE,
+    max_payload: Annotated[
+        int,
+        typer.Option(
+            min=1, max=MAX_PAYLOAD_BYTES, metavar="BYTES", help="Larger messages are rejected."
+        ),
+    ] = DEFAULT_MAX_PAYLOAD_BYTES,
+    max_events: Annotated[
+        int | None, typer.Option(min=1, help="Stop after so many messages.")
+    ] = None,
+    gaps: Annotated[
+        bool,
+        typer.Option(
+            "--gaps/--no-gaps",
+            help="Missing keyframe ids are losses; off for robots that do not count by one.",
+        ),
+    ] = True,
+    metrics: Annotated[
+        str | None,
+        typer.Option(metavar="PORT", help="Serve Prometheus metrics; PORT or HOST:PORT."),
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="The final numbers as JSON.")] = False,
+) -> None:
+    """Record what robots publish over Zenoh, until Ctrl-C.
+
+    Exit 3 when anything was rejected, lost or is missing.
+    """
+    policy = parse_fsync(fsync)
+    options = dataclasses.replace(
+        zenoh_options(connect, listen, zenoh_config),
+        largest_message_bytes=max(_LARGEST_BYTES, 4 * max_payload),
+    )
+    keys = tuple(key or DEFAULT_KEYS)
+    check_keys(keys)
+    address = None if metrics is None else parse_address(metrics, "--metrics")
+    with (
+        RecorderEnd(log, json=json) as end,
+        stop_on_signals() as stop,
+        open_session(options, mode=options.mode) as session,
+        LogWriter(log, fsync=policy, overlap=True) as writer,
+    ):
+        say_restart(log, writer)
+        recorder = Recorder(
+            session,
+            writer,
+            keys,
+            queue_size=queue,
+            max_events=max_events,
+            ledger=_ledger(log),
+            report_gaps=gaps,
+            max_payload_bytes=max_payload,
+        )
+        end.watch(writer, recorder)
+        with _measured(address, recorder, log), watching(log) as watch:
+            named = ", ".join(keys)
+            say(f"recording {named} to {log} from offset {writer.next_offset}; Ctrl-C ends it")
+            recorder.run(stop, every_s=EVERY_S, watch=watch)
+    end.finish()
+
+
+def _ledger(log: Path) -> GapLedger | None:
+    """What the log lacks so far. Damage in an old segment is no reason not to record."""
+    try:
+        with LogReader(log) as reader:
+            return keep_ledger(reader, note=say)
+    except LogDamaged as error:
+        say(f"recording all the same, without knowing what the log lacks so far: {error}")
+        return None
+
+
+@contextmanager
+def _measured(address: tuple[str, int] | None, recorder: Recorder, log: Path) -> Iterator[None]:
+    if address is None:
+        yield
+        return
+    from eventsrc.metrics import serving_metrics  # costs nothing unless asked for
+
+    with serving_metrics(address, recorder.report, log) as port:
+        say_metrics(address, port)
+        yield
+
+
+def register(app: typer.Typer) -> None:
+    """Add `record` to ``app``."""
+    app.command()(record)

@@ -1,0 +1,95 @@
+"""`mapfold simulate`: a run through a simulated house, published or written down."""
+
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import typer
+
+from eventsrc.errors import MisuseError
+from eventsrc.sim import DEFAULT_SEED, SimulatedRun, simulate_run
+from eventsrc.sim.run import publish_run, write_run
+from eventsrc.text import counted
+from eventsrc.transport.config import check_key
+from eventsrc.transport.session import ZenohOptions, open_session
+
+from .signals import stop_on_signals
+from .terminal import emit, finish, say
+from .zenoh_options import ConfigOption, ConnectOption, ListenOption, zenoh_options
+
+_LONGEST_NAME: Final = 100
+
+
+def simulate(
+    seed: Annotated[int, typer.Option(help="Which house.", min=0)] = DEFAULT_SEED,
+    run: Annotated[
+        str, typer.Option(help="Which run: a explores, b, c … are other sessions and tours.")
+    ] = "a",
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Write FILE.jsonl or .jsonl.gz (and its truth); publish nothing."
+        ),
+    ] = None,
+    key: Annotated[str, typer.Option(help="Zenoh key to publish under.")] = "tb/detections",
+    speed: Annotated[
+        float, typer.Option(help="Times as fast as the robot drives; 0: no waiting.", min=0.0)
+    ] = 10.0,
+    wait: Annotated[
+        float, typer.Option(metavar="SECONDS", help="How long to wait for a subscriber.", min=0.0)
+    ] = 30.0,
+    json_: Annotated[bool, typer.Option("--json", help="Numbers as JSON on stdout.")] = False,
+    connect: ConnectOption = None,
+    listen: ListenOption = None,
+    zenoh_config: ConfigOption = None,
+) -> None:
+    """A seeded house run, over Zenoh or into a file.
+
+    A robot drives through a simulated house and publishes what it sees, or writes it down. The
+    ground truth (room and instance) goes to a file beside --out, never into the messages.
+    """
+    if not run.isprintable() or not 1 <= len(run) <= _LONGEST_NAME:
+        raise MisuseError(
+            f"--run {run!r}: give a name of 1 to {_LONGEST_NAME} printable characters"
+        )
+    check_key(key, "--key")
+    simulated = simulate_run(seed, run)
+    document = _numbers(simulated)
+    if out is not None:
+        truth = write_run(simulated, out)
+        say(f"{_summary(document)}: wrote {out}, truth in {truth}")
+        document |= {"out": str(out), "truth": str(truth)}
+    else:
+        options = zenoh_options(connect, listen, zenoh_config)
+        document["published"] = _publish(simulated, options, key, speed, wait)
+        say(f"{_summary(document)}: published {document['published']} on {key}")
+    if json_:
+        emit(document)
+    finish(findings=document.get("published", document["keyframes"]) < document["keyframes"])
+
+
+def _publish(
+    simulated: SimulatedRun, options: ZenohOptions, key: str, speed: float, wait_s: float
+) -> int:
+    with stop_on_signals() as stop, open_session(options, mode=options.mode) as session:
+        return publish_run(session, simulated, key, speed=speed, wait_s=wait_s, stop=stop)
+
+
+def _numbers(simulated: SimulatedRun) -> dict[str, Any]:
+    return {
+        "run_id": simulated.run_id,
+        "keyframes": len(simulated.envelopes),
+        "detections": sum(len(envelope["detections"]) for envelope in simulated.envelopes),
+        "seconds": round(simulated.true_poses[-1].time_s, 1),
+    }
+
+
+def _summary(document: dict[str, Any]) -> str:
+    return (
+        f"{document['run_id']}: {counted(document['keyframes'], 'keyframe')}, "
+        f"{counted(document['detections'], 'detection')} in {document['seconds']} s of driving"
+    )
+
+
+def register(app: typer.Typer) -> None:
+    """Add `simulate` to ``app``."""
+    app.command()(simulate)

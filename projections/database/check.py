@@ -1,0 +1,315 @@
+"""Prove that the databases hold exactly what the log says, row by row.
+
+Each sink is compared at its own checkpoint, in one read-only snapshot, so that a tail may go on
+writing. Both sides stream in the order of their ids and are merged: nothing is held in memory but
+the map itself. Properties are compared as values with their types, not as text: the server orders
+keys and writes floats in its own way.
+
+Find what somebody else keeps in the schema of our graph: labels, tables, rows without a label.
+
+``CREATE (n:Door)`` makes a label, which is a table; rows without a label stand in the tables that
+all labels inherit from. A rebuild replaces the graph and so drops both.
+"""
+
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from itertools import groupby
+from operator import itemgetter
+from pathlib import Path
+from typing import Any, Final, Literal, TypeAlias
+
+import psycopg
+from psycopg import IsolationLevel, sql
+
+from eventsrc.log import Event, LogReader
+from projections.errors import ProjectionMissing
+from projections.settings import Settings
+
+from . import checkpoints as _checkpoint
+from .checkpoints import command
+from .connection import Connection, Targets, connect, database_errors, place, settle
+from .cypher_guard import PARENTS
+from .graph_render import Row, expected_rows
+from .labels import GRAPH, LABELS, TABLE, VERTEX_LABELS
+from .origin import gone, refuse_misfit
+from .shared_fold import LiveFold, batches
+from .sink import Checkpoint, Sink, SinkName
+from .statements import statements
+from .vector_rows import VectorRow
+from .vector_sink import VectorSink
+
+_KINDS: Final = {"v": "VIEW", "m": "MATERIALIZED VIEW", "f": "FOREIGN TABLE"}
+
+
+@dataclass(frozen=True, slots=True)
+class ForeignTable:
+    """A table in the graph's schema with rows that are not ours.
+
+    ``rows`` is None when they are not for us to read. ``keep`` is SQL that copies them elsewhere,
+    ``remove`` is SQL that drops them.
+    """
+
+    table: str
+    what: str
+    rows: int | None
+    keep: str
+    remove: str
+
+
+def foreign_tables(connection: Connection) -> tuple[ForeignTable, ...]:
+    """All of them, by name."""
+    values = {"graph": GRAPH, "ours": list(LABELS)}
+    found = []
+    for name, kind, label, readable in connection.execute(
+        statements("foreign_tables")["tables"], values
+    ).fetchall():
+        rows = _count(connection, name) if readable else None
+        if name in PARENTS and not rows:
+            continue
+        found.append(_described(connection, name, kind, label, rows))
+    return tuple(found)
+
+
+def _count(connection: Connection, name: str) -> int:
+    query = sql.SQL("SELECT count(*) FROM ONLY {}").format(sql.Identifier(GRAPH, name))
+    row = connection.execute(query).fetchone()
+    return 0 if row is None else int(row[0])
+
+
+def _described(
+    connection: Connection, name: str, kind: str, label: str | None, rows: int | None
+) -> ForeignTable:
+    table, copy = sql.Identifier(GRAPH, name), sql.Identifier("public", name)
+    if name in PARENTS:
+        what = f"{'vertices' if name == PARENTS[0] else 'edges'} without a label"
+        remove = sql.SQL("DELETE FROM ONLY {}").format(table)
+    elif label is not None:
+        what = f"{'vertex' if label == 'v' else 'edge'} label"
+        call = sql.SQL("SELECT ag_catalog.drop_label({}, {})")
+        remove = call.format(sql.Literal(GRAPH), sql.Literal(name))
+    else:
+        what = _KINDS.get(kind, "TABLE").lower()
+        remove = sql.SQL("DROP {} {}").format(sql.SQL(_KINDS.get(kind, "TABLE")), table)
+    # A table of its own leaves the schema whole; a label would stay a part of the graph.
+    keep = sql.SQL("CREATE TABLE {} AS SELECT * FROM ONLY {}").format(copy, table)
+    return ForeignTable(name, what, rows, keep.as_string(connection), remove.as_string(connection))
+
+
+Kind: TypeAlias = Literal["missing", "extra", "different"]
+Keyed: TypeAlias = tuple[int, Any]
+"""A row's id and the rest of it, in a form that compares."""
+NAMED: Final = 100
+"""This many differences are named; all are counted."""
+STREAM_ROWS: Final = 2_000
+BATCH_EVENTS: Final = 256
+_NONE: Final[dict[SinkName, str]] = {"graph": "no graph has", "vectors": "no vectors have"}
+
+_TABLES: Final[dict[SinkName, list[sql.Identifier]]] = {
+    "graph": [sql.Identifier(GRAPH, label) for label in LABELS],
+    "vectors": [sql.Identifier("public", TABLE)],
+}
+_VECTORS: Final = """
+SELECT det_pk, run_id, det_id, keyframe_id, class_name, confidence, bbox, map_x, map_y, map_yaw,
+       embedding_model, embedding::real[],
+       (extract(epoch FROM ingested_at) * 1000000)::bigint
+FROM public.detection_embeddings ORDER BY det_pk
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """A row that is missing, extra or different; ``id`` is its graphid or det_pk."""
+
+    table: str
+    id: int
+    kind: Kind
+    expected: str | None
+    found: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class CheckReport:
+    """One sink at its checkpoint. ``differences`` names the first of ``differing``.
+
+    ``foreign`` is what somebody else keeps in the graph's schema; a rebuild would drop it.
+    """
+
+    sink: SinkName
+    next_offset: int
+    rows: int
+    differing: int
+    differences: tuple[Difference, ...]
+    foreign: tuple[ForeignTable, ...] = ()
+
+    @property
+    def sound(self) -> bool:
+        """True when the sink holds what the log says and nothing else."""
+        return not self.differing and not self.foreign
+
+
+def check(
+    log: Path, targets: Targets, settings: Settings, *, only: SinkName | None = None
+) -> list[CheckReport]:
+    """Compare what is there with the fold. Raises ProjectionMissing and ProjectionMismatch."""
+    sinks: tuple[tuple[SinkName, str], ...] = (
+        ("graph", targets.graph_url),
+        ("vectors", targets.vector_url),
+    )
+    return [_check(log, sink, url, settings) for sink, url in sinks if only in (None, sink)]
+
+
+def _check(log: Path, sink: SinkName, url: str, settings: Settings) -> CheckReport:
+    tally = _Tally()
+    with LogReader(log) as reader, connect(url, application="mapfold check") as connection:
+        connection.isolation_level = IsolationLevel.REPEATABLE_READ
+        connection.read_only = True
+        with database_errors(url):
+            settle(connection)
+            connection.commit()
+            held = _hold(connection, sink)
+            checkpoint = _checkpoint.load(connection, sink)
+            if checkpoint is None:
+                raise ProjectionMissing(
+                    f"{place(url)}: {_NONE[sink]} been projected there;"
+                    f" run: {command('replay', log, settings)}"
+                )
+            if not held:
+                raise gone(checkpoint, sink, place(url), log, settings)
+            refuse_misfit(checkpoint, sink, place(url), log, reader, settings)
+            compare = _compare_graph if sink == "graph" else _compare_vectors
+            compare(connection, reader, checkpoint, settings, tally)
+            foreign = foreign_tables(connection) if sink == "graph" else ()
+    return CheckReport(
+        sink, checkpoint.next_offset, tally.rows, tally.differing, tuple(tally.differences), foreign
+    )
+
+
+def _hold(connection: Connection, sink: SinkName) -> bool:
+    """Keep rebuilds from swapping until the transaction ends; False when there is nothing to swap.
+
+    Before its first look at anything: to a snapshot from before a swap the new tables are empty.
+    """
+    tables = sql.SQL(", ").join(_TABLES[sink])
+    try:
+        connection.execute(sql.SQL("LOCK TABLE {} IN ACCESS SHARE MODE").format(tables))
+    except (psycopg.errors.UndefinedTable, psycopg.errors.InvalidSchemaName):
+        connection.rollback()
+        return False
+    return True
+
+
+class _Tally:
+    """Merges two streams ordered by id and keeps what differs."""
+
+    def __init__(self) -> None:
+        self.rows = 0
+        self.differing = 0
+        self.differences: list[Difference] = []
+
+    def merge(self, table: str, expected: Iterator[Keyed], found: Iterator[Keyed]) -> None:
+        want, have = next(expected, None), next(found, None)
+        while want is not None or have is not None:
+            self.rows += 1
+            if have is None or (want is not None and want[0] < have[0]):
+                self._differs(table, "missing", want, None)
+                want = next(expected, None)
+            elif want is None or have[0] < want[0]:
+                self._differs(table, "extra", None, have)
+                have = next(found, None)
+            else:
+                if want[1] != have[1]:
+                    self._differs(table, "different", want, have)
+                want, have = next(expected, None), next(found, None)
+
+    def _differs(self, table: str, kind: Kind, want: Keyed | None, have: Keyed | None) -> None:
+        self.differing += 1
+        row = want or have
+        if row is not None and len(self.differences) < NAMED:
+            said = [None if side is None else _shortened(side[1]) for side in (want, have)]
+            self.differences.append(Difference(table, row[0], kind, said[0], said[1]))
+
+
+def _events(
+    connection: Connection, reader: LogReader, checkpoint: Checkpoint, sink: SinkName
+) -> Iterator[tuple[Event, bool]]:
+    """The events of the projection, and whether each was parked."""
+    parked = {letter.offset for letter in _checkpoint.parked(connection, sink)}
+    for event in reader.read(0, checkpoint.next_offset):
+        yield event, event.offset in parked
+
+
+def _compare_graph(
+    connection: Connection,
+    reader: LogReader,
+    checkpoint: Checkpoint,
+    settings: Settings,
+    tally: _Tally,
+) -> None:
+    fold = LiveFold(settings)
+    for _ in _folded(fold, _events(connection, reader, checkpoint, "graph"), []):
+        pass
+    for label in LABELS:
+        columns = ["id"] if label in VERTEX_LABELS else ["id", "start_id", "end_id"]
+        ids = sql.SQL(", ").join(sql.SQL("{}::text").format(sql.Identifier(c)) for c in columns)
+        query = sql.SQL("SELECT {}, properties FROM {} ORDER BY {}.id USING OPERATOR(ag_catalog.<)")
+        table = sql.Identifier(GRAPH, label)
+        with connection.cursor(name="check") as cursor:
+            cursor.itersize = STREAM_ROWS
+            cursor.execute(query.format(ids, table, sql.Identifier(label)))
+            expected = (_graph_row(row) for row in expected_rows(fold.view, label))
+            tally.merge(label, expected, (_graph_row(row) for row in cursor))
+
+
+def _compare_vectors(
+    connection: Connection,
+    reader: LogReader,
+    checkpoint: Checkpoint,
+    settings: Settings,
+    tally: _Tally,
+) -> None:
+    fold, sink = LiveFold(settings), VectorSink()
+    events = _events(connection, reader, checkpoint, "vectors")
+    expected = (
+        _vector_row(row) for _ in _folded(fold, events, [sink]) for row in sink.take(fold.view)
+    )
+    # Binary, so that a float32 arrives as the float32 it is.
+    with connection.cursor(name="check", binary=True) as cursor:
+        cursor.itersize = STREAM_ROWS
+        cursor.execute(_VECTORS)
+        tally.merge(TABLE, expected, ((row[0], row[1:]) for row in cursor))
+
+
+def _folded(
+    fold: LiveFold, events: Iterable[tuple[Event, bool]], sinks: list[Sink[Any]]
+) -> Iterator[None]:
+    for parked, group in groupby(events, key=itemgetter(1)):
+        for batch in batches((event for event, _ in group), BATCH_EVENTS):
+            if parked:
+                for event in batch:
+                    fold.skip(event.offset)
+                continue
+            for failed in fold.feed(batch, lambda _: sinks):
+                if failed is not None:
+                    raise failed
+                yield
+
+
+def _graph_row(row: Row | tuple[Any, ...]) -> Keyed:
+    *ends, properties = row
+    # Floats as marked text, so that 1.0 is not 1 and -0.0 is not 0.0.
+    values = json.loads(properties, parse_float=lambda text: f"float {float(text)!r}", strict=False)
+    return int(ends[0]), (tuple(map(int, ends[1:])), values)
+
+
+def _vector_row(row: VectorRow) -> Keyed:
+    pose, added = row.pose or (None, None, None), row.added
+    return row.det_pk, (
+        added.run_id, added.det_id, added.keyframe_id, added.class_name, added.confidence,
+        list(row.bbox), *pose, added.embedding_model, row.embedding.tolist(), row.ingested_us,
+    )  # fmt: skip
+
+
+def _shortened(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 300 else text[:297] + "..."

@@ -1,0 +1,64 @@
+"""A rebuild makes new tables; whoever might read or write the old ones may do so with the new.
+
+Least privilege: the SQL for a role that only reads and one that only tails.
+"""
+
+from collections.abc import Collection
+from typing import Final
+
+from psycopg import sql
+
+from .age_version import FIRST_TO_ENFORCE
+from .connection import Connection
+from .statements import statements
+
+_PRIVILEGES: Final = {
+    "SELECT": sql.SQL("SELECT"),
+    "INSERT": sql.SQL("INSERT"),
+    "UPDATE": sql.SQL("UPDATE"),
+    "DELETE": sql.SQL("DELETE"),
+    "USAGE": sql.SQL("USAGE"),
+}
+"""Those worth carrying over: what readers and writers of rows need."""
+_SCHEMA_GRANTS: Final = """
+SELECT coalesce(r.rolname, ''), a.privilege_type
+FROM pg_namespace n CROSS JOIN aclexplode(n.nspacl) a LEFT JOIN pg_roles r ON r.oid = a.grantee
+WHERE n.nspname = %s AND a.grantee <> n.nspowner
+"""
+_TABLE_GRANTS: Final = """
+SELECT c.relname, coalesce(r.rolname, ''), a.privilege_type
+FROM pg_class c CROSS JOIN aclexplode(c.relacl) a LEFT JOIN pg_roles r ON r.oid = a.grantee
+WHERE c.relnamespace = (SELECT oid FROM pg_namespace WHERE nspname = %s)
+  AND a.grantee <> c.relowner AND c.relkind = 'r' AND (%s::text IS NULL OR c.relname = %s)
+"""
+
+
+def copy_privileges(
+    connection: Connection, old: str, new: str, *, table: str | None = None
+) -> None:
+    """Grant on schema ``new`` what is granted on ``old``, for all tables or only ``table``.
+
+    With ``table`` the schemas' own privileges are left as they are.
+    """
+    if table is None:
+        for role, privilege in connection.execute(_SCHEMA_GRANTS, [old]).fetchall():
+            _grant(connection, privilege, sql.SQL("SCHEMA {}").format(sql.Identifier(new)), role)
+    for name, role, privilege in connection.execute(_TABLE_GRANTS, [old, table, table]).fetchall():
+        _grant(connection, privilege, sql.Identifier(new, name), role)
+
+
+def _grant(connection: Connection, privilege: str, what: sql.Composable, role: str) -> None:
+    if privilege in _PRIVILEGES:
+        # The catalogue has no name for everybody.
+        who = sql.Identifier(role) if role else sql.SQL("PUBLIC")
+        connection.execute(
+            sql.SQL("GRANT {} ON {} TO {}").format(_PRIVILEGES[privilege], what, who)
+        )
+
+
+def roles_sql(sinks: Collection[str] = ("graph", "vectors")) -> str:
+    """The statements for a database that holds ``sinks``, ready for psql."""
+    parts = statements("roles")
+    wanted = ["reader", "writer", *(name for name in ("graph", "vectors") if name in sinks)]
+    first = sql.Literal(list(FIRST_TO_ENFORCE))
+    return "\n\n".join(parts[name].format(first=first).as_string() for name in wanted) + "\n"

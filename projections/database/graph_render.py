@@ -1,0 +1,199 @@
+"""What a row of the graph says: its graphid, its ends, and its properties as agtype text.
+
+The bulk of a map's floats is written by ``repr``, which is what `agtype.number` does for a float.
+They are finite: the envelope lets nothing else in, and the server would refuse it.
+
+Values as agtype text: what AGE's input function reads back as exactly the same value.
+
+agtype's text is JSON with two differences that matter: integer and float are different types, and a
+number is a float exactly when it is written with a point or an exponent. Python's ``repr`` of a
+float always has one of the two and is the shortest text that names that float; the server reads it
+back to the same bits. Strings are escaped as JSON has it: quote, backslash and control characters.
+
+Nothing here is query text. The result is a *value*: a bind parameter or a field of COPY data.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from json.encoder import encode_basestring
+from typing import Final
+
+from projections.exact import Q40, UM_PER_M
+from projections.model.view import KeyframeRecord, MapView
+
+from .labels import LABELS, Label, adjacency_number, graphid_base
+
+
+def text(value: str) -> str:
+    """A string. It must hold no NUL and no lone surrogate, which PostgreSQL cannot store."""
+    return encode_basestring(value)
+
+
+def number(value: float) -> str:
+    """A finite float, -0.0 and 1e22 included; ints are written by ``str``."""
+    written = repr(float(value))
+    if written[-1] in "fn":  # inf, nan
+        raise ValueError(f"{value} is no number a graph can hold")
+    return written
+
+
+VertexRow = tuple[int, str]
+"""graphid, properties as agtype text."""
+EdgeRow = tuple[int, int, int, str]
+"""graphid, start, end, properties as agtype text."""
+Row = VertexRow | EdgeRow
+
+_NONE: Final = "{}"
+BASE: Final = {label: graphid_base(label) + 1 for label in LABELS}
+"""The graphid of ordinal 0 of each label."""
+
+
+def expected_rows(view: MapView, label: Label) -> Iterator[Row]:
+    """Every row of a label that the map has, by graphid: what a table must hold, streamed."""
+    keyframes, observations = range(len(view.keyframes)), range(len(view.observations))
+    objects = range(len(view.objects))
+    rows: dict[Label, Callable[[], Iterator[Row]]] = {
+        "Run": lambda: run_rows(view, range(len(view.runs))),
+        "Keyframe": lambda: keyframe_rows(view, keyframes),
+        "Pose": lambda: pose_rows(view, keyframes),
+        "Observation": lambda: observation_rows(view, observations),
+        "Object": lambda: object_rows(view, objects),
+        "Place": lambda: place_rows(view, sorted(view.places)),
+        "HAS_KEYFRAME": lambda: has_keyframe_rows(view, keyframes),
+        "HAS_POSE": lambda: has_pose_rows(view, keyframes),
+        "HAS_OBSERVATION": lambda: has_observation_rows(view, observations),
+        "OBSERVES": lambda: observes_rows(view, observations),
+        "LOCATED_IN": lambda: located_in_rows(view, objects),
+        "IN_PLACE": lambda: in_place_rows(view, keyframes),
+        "ADJACENT_TO": lambda: adjacent_to_rows(view, sorted(view.adjacency)),
+    }
+    return rows[label]()
+
+
+def run_rows(view: MapView, runs: Iterable[int]) -> Iterator[VertexRow]:
+    """Runs."""
+    for i in runs:
+        run = view.runs[i]
+        properties = f'{{"run_id": {text(run.run_id)}, "started_at": {number(run.started_at)}}}'
+        yield BASE["Run"] + i, properties
+
+
+def keyframe_rows(view: MapView, keyframes: Iterable[int]) -> Iterator[VertexRow]:
+    """Keyframes."""
+    base = BASE["Keyframe"]
+    for i in keyframes:
+        k = view.keyframes[i]
+        yield base + i, f'{{{_said_by(k)}, "timestamp": {k.timestamp!r}}}'
+
+
+def pose_rows(view: MapView, keyframes: Iterable[int]) -> Iterator[VertexRow]:
+    """The Poses of those keyframes that have one."""
+    base = BASE["Pose"]
+    for i in keyframes:
+        k = view.keyframes[i]
+        if (pose := k.pose) is not None:
+            properties = (
+                f'{{{_said_by(k)}, "map_x": {pose.x_um / UM_PER_M!r},'
+                f' "map_y": {pose.y_um / UM_PER_M!r}, "map_yaw": {pose.yaw_rad!r}}}'
+            )
+            yield base + i, properties
+
+
+def observation_rows(view: MapView, observations: Iterable[int]) -> Iterator[VertexRow]:
+    """Observations."""
+    base, keyframe, said = BASE["Observation"], -1, ""
+    for i in observations:
+        o = view.observations[i]
+        if o.keyframe != keyframe:
+            keyframe, said = o.keyframe, _said_by(view.keyframes[o.keyframe])
+        x0, y0, x1, y1 = o.bbox
+        properties = (
+            f'{{"det_id": {text(o.det_id)}, "class_name": {text(o.class_name)},'
+            f' "confidence": {o.confidence!r}, "bbox": [{x0!r}, {y0!r}, {x1!r}, {y1!r}], {said}}}'
+        )
+        yield base + i, properties
+
+
+def object_rows(view: MapView, objects: Iterable[int]) -> Iterator[VertexRow]:
+    """Objects."""
+    base = BASE["Object"]
+    for i in objects:
+        o = view.objects[i]
+        properties = (
+            f'{{"object_id": {text(o.object_id)}, "class_name": {text(o.class_name)},'
+            f' "mean_x": {o.mean_x!r}, "mean_y": {o.mean_y!r}, "obs_count": {o.obs_count},'
+            f' "first_seen": {o.first_seen!r}, "last_seen": {o.last_seen!r}}}'
+        )
+        yield base + i, properties
+
+
+def place_rows(view: MapView, places: Iterable[int]) -> Iterator[VertexRow]:
+    """Places, also those that were absorbed."""
+    base = BASE["Place"]
+    for i in places:
+        p = view.all_places[i]
+        properties = (
+            f'{{"place_id": {text(p.place_id)}, "centroid_x": {number(p.centroid_x)},'
+            f' "centroid_y": {number(p.centroid_y)}, "keyframe_count": {p.keyframe_count}}}'
+        )
+        yield base + i, properties
+
+
+def has_keyframe_rows(view: MapView, keyframes: Iterable[int]) -> Iterator[EdgeRow]:
+    """The edges from their runs to keyframes."""
+    edge, run, keyframe = BASE["HAS_KEYFRAME"], BASE["Run"], BASE["Keyframe"]
+    return ((edge + k, run + view.keyframes[k].run, keyframe + k, _NONE) for k in keyframes)
+
+
+def has_pose_rows(view: MapView, keyframes: Iterable[int]) -> Iterator[EdgeRow]:
+    """The edges to the poses of those keyframes that have one."""
+    edge, keyframe, pose = BASE["HAS_POSE"], BASE["Keyframe"], BASE["Pose"]
+    posed = (k for k in keyframes if view.keyframes[k].pose is not None)
+    return ((edge + k, keyframe + k, pose + k, _NONE) for k in posed)
+
+
+def has_observation_rows(view: MapView, observations: Iterable[int]) -> Iterator[EdgeRow]:
+    """The edges from their keyframes to observations."""
+    edge, keyframe, seen = BASE["HAS_OBSERVATION"], BASE["Keyframe"], BASE["Observation"]
+    records = view.observations
+    return ((edge + o, keyframe + records[o].keyframe, seen + o, _NONE) for o in observations)
+
+
+def observes_rows(view: MapView, observations: Iterable[int]) -> Iterator[EdgeRow]:
+    """The edges from those observations that were fused to their objects."""
+    edge, seen, fused = BASE["OBSERVES"], BASE["Observation"], BASE["Object"]
+    for i in observations:
+        o = view.observations[i]
+        if o.object is not None and o.similarity_q40 is not None:
+            properties = f'{{"similarity": {o.similarity_q40 / Q40!r}}}'
+            yield edge + i, seen + i, fused + o.object, properties
+
+
+def located_in_rows(view: MapView, objects: Iterable[int]) -> Iterator[EdgeRow]:
+    """The edges of those objects that are in a place."""
+    for o in objects:
+        place = view.objects[o].place
+        if place is not None:
+            yield BASE["LOCATED_IN"] + o, BASE["Object"] + o, BASE["Place"] + place, _NONE
+
+
+def in_place_rows(view: MapView, keyframes: Iterable[int]) -> Iterator[EdgeRow]:
+    """The edges of those keyframes that are in a place."""
+    for k in keyframes:
+        place = view.keyframes[k].place
+        if place is not None:
+            yield BASE["IN_PLACE"] + k, BASE["Keyframe"] + k, BASE["Place"] + place, _NONE
+
+
+def adjacent_to_rows(view: MapView, links: Iterable[tuple[int, int]]) -> Iterator[EdgeRow]:
+    """The edges of those pairs of places that still have one."""
+    base = graphid_base("ADJACENT_TO")
+    for a, b in links:
+        shared = view.adjacency.get((a, b))
+        if shared is not None:
+            properties = f'{{"shared_transitions": {shared}}}'
+            edge = base + adjacency_number(a, b)
+            yield edge, BASE["Place"] + a, BASE["Place"] + b, properties
+
+
+def _said_by(keyframe: KeyframeRecord) -> str:
+    return f'"run_id": {text(keyframe.run_id)}, "keyframe_id": {keyframe.keyframe_id}'

@@ -1,0 +1,160 @@
+"""Making, finding, indexing and swapping graphs.
+
+AGE keeps a graph as a schema, so a graph is *ours* when the schema carries our mark as its comment.
+Anything else under our names is somebody's and is refused, never touched.
+
+The old graph is renamed by the swap, and dropped later, when every transaction that may still have
+its name has ended (see `_leaving`).
+"""
+
+from collections.abc import Collection
+from typing import Final
+
+from psycopg import sql
+
+from projections.errors import DatabaseError
+
+from . import swap as _leaving
+from .connection import Connection, place_of
+from .cypher_guard import PARENTS, guard
+from .labels import (
+    CHANGING_EDGES,
+    EDGE_LABELS,
+    GRAPH,
+    KEYS,
+    LABEL_IDS,
+    LABELS,
+    MATCHED,
+    OLD_GRAPH,
+    VERTEX_LABELS,
+    Label,
+)
+from .statements import statements
+
+_MARK: Final = "mapfold"
+
+
+def exists(connection: Connection, graph: str) -> bool:
+    """Whether a graph of ours has this name. Raises DatabaseError when it is somebody else's."""
+    row = connection.execute(statements("graph")["state"], {"graph": graph}).fetchone()
+    if row is None:
+        return False
+    if not row[0] or not str(row[1]).startswith(_MARK):
+        raise DatabaseError(
+            f"{place_of(connection)}: has a {'graph' if row[0] else 'schema'} {graph} that mapfold"
+            " did not make; rename or drop it, or use another database"
+        )
+    return True
+
+
+def create(connection: Connection, graph: str) -> None:
+    """An empty graph with all labels, in the order that gives them their constant ids."""
+    _use_age(connection)
+    run = statements("graph")
+    connection.execute(run["create_graph"], {"graph": graph})
+    connection.execute(run["mark"].format(graph=sql.Identifier(graph)))
+    for label in VERTEX_LABELS:
+        connection.execute(run["create_vlabel"], {"graph": graph, "label": label})
+    for edge in EDGE_LABELS:
+        connection.execute(run["create_elabel"], {"graph": graph, "label": edge})
+    for name in LABELS:
+        table = sql.Identifier(graph, name)
+        connection.execute(run["no_statistics"].format(table=table))
+    guard(connection, graph)
+    found: dict[str, int] = dict(connection.execute(run["label_ids"], {"graph": graph}).fetchall())
+    if any(found.get(label) != number for label, number in LABEL_IDS.items()):
+        raise DatabaseError(
+            f"{place_of(connection)}: this version of Apache AGE numbers labels in another way"
+            f" ({found}); use AGE 1.5 to 1.8"
+        )
+
+
+def index(
+    connection: Connection, graph: str, labels: Collection[Label] = frozenset(LABELS)
+) -> None:
+    """The indexes of our queries and upserts, but for those that AGE has made itself."""
+    run = statements("graph")
+    rows = connection.execute(run["indexed"], {"graph": graph}).fetchall()
+    unique = {(table, column): is_unique for table, column, is_unique in rows}
+    schema = sql.Identifier(graph)
+    for label in filter(labels.__contains__, LABELS):
+        table = sql.Identifier(label)
+        if (label in VERTEX_LABELS or label in CHANGING_EDGES) and not unique.get((label, "id")):
+            column = sql.Identifier("id")
+            connection.execute(run["index_unique"].format(graph=schema, label=table, column=column))
+        for end in ("start_id", "end_id") if label in EDGE_LABELS else ():
+            if (label, end) not in unique:
+                column = sql.Identifier(end)
+                connection.execute(run["index"].format(graph=schema, label=table, column=column))
+    for vertex, key in KEYS.items():
+        if vertex not in labels:
+            continue
+        literal = sql.Literal(f'"{key}"')
+        table = sql.Identifier(vertex)
+        connection.execute(run["index_key"].format(graph=schema, label=table, key=literal))
+    for vertex in filter(labels.__contains__, MATCHED):
+        connection.execute(run["index_match"].format(graph=schema, label=sql.Identifier(vertex)))
+
+
+def counts(connection: Connection, graph: str) -> dict[str, int]:
+    """Rows by label."""
+    each = [
+        sql.SQL("SELECT {}, count(*) FROM {}").format(
+            sql.Literal(label), sql.Identifier(graph, label)
+        )
+        for label in LABELS
+    ]
+    return dict(connection.execute(sql.SQL(" UNION ALL ").join(each)).fetchall())
+
+
+def lock(connection: Connection, graph: str) -> None:
+    """Lock all tables of a graph exclusively, if it is there."""
+    if exists(connection, graph):
+        tables = sql.SQL(", ").join(sql.Identifier(graph, name) for name in (*PARENTS, *LABELS))
+        connection.execute(statements("graph")["lock"].format(tables=tables))
+
+
+def swap_in(connection: Connection, shadow: str) -> None:
+    """Give ``shadow`` the readers' name; what had it becomes the old graph."""
+    _use_age(connection)
+    run = statements("graph")
+    if exists(connection, GRAPH):
+        connection.execute(run["rename_graph"], {"graph": GRAPH, "new_name": OLD_GRAPH})
+    connection.execute(run["rename_graph"], {"graph": shadow, "new_name": GRAPH})
+
+
+def drop(connection: Connection, graph: str) -> None:
+    """Drop a graph of ours, if it is there."""
+    if exists(connection, graph):
+        _use_age(connection)
+        with connection.cursor() as cursor:
+            cursor.execute("SET LOCAL client_min_messages = warning")
+            cursor.execute(statements("graph")["drop_graph"], {"graph": graph})
+
+
+def leave_dropping(connection: Connection, graph: str) -> None:
+    """Have the server drop a graph of ours, if it is there; closes the connection then."""
+    if exists(connection, graph):
+        connection.execute("SET search_path = ag_catalog, public")
+        _leaving.leave_with(
+            connection, statements("graph")["drop_named"].format(graph=sql.Literal(graph))
+        )
+
+
+def analyze(connection: Connection, graph: str) -> None:
+    """Gather statistics, so that the planner knows which labels are large.
+
+    Inside a transaction. What readers look up is all but unique, which a small sample shows.
+    """
+    connection.execute(statements("graph")["sample"])
+    for label in LABELS:
+        connection.execute(
+            statements("graph")["analyze"].format(
+                graph=sql.Identifier(graph), label=sql.Identifier(label)
+            )
+        )
+
+
+def _use_age(connection: Connection) -> None:
+    """AGE's own functions find their operator classes by the search path only."""
+    connection.execute("SET LOCAL search_path = ag_catalog, public")

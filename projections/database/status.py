@@ -1,0 +1,170 @@
+"""Where the databases stand beside a log: lag, liveness, dead letters, versions.
+
+A sink is *following* when a tail that lives holds it, whether it has every event or not yet,
+*stalled* when the tail that holds it has not been heard of for a while, *rebuilding* when a replay
+is at work on it; with nobody on it, it is *idle* when it has every event and *behind* when not. It
+is *other* when it was made from another log or with other settings.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal
+
+from eventsrc.log import LogReader
+from projections.errors import DatabaseError, ProjectionMismatch
+from projections.settings import Settings
+
+from . import checkpoints as _checkpoint
+from .checkpoints import DeadLetter, command, remake
+from .connection import Connection, Targets, connect, database_errors, extension_version, place
+from .cypher_guard import unwanted_writers
+from .sink import Checkpoint, SinkName
+
+STALLED_S: Final = 20.0
+"""A living tail says so every 5 s."""
+
+Condition = Literal[
+    "missing", "other", "idle", "following", "rebuilding", "stalled", "behind", "unreachable"
+]
+
+
+@dataclass(frozen=True, slots=True)
+class SinkStatus:
+    """One sink. Ages are seconds; ``note`` explains ``other`` and ``unreachable``.
+
+    ``lag`` is None when it was made from another log, or a longer one: there is nothing to count.
+    ``unwanted_writers`` are roles without the privilege that Apache AGE lets write all the same.
+    """
+
+    sink: SinkName
+    place: str
+    condition: Condition
+    note: str | None = None
+    next_offset: int | None = None
+    lag: int | None = None
+    checkpoint_age_s: float | None = None
+    heartbeat_age_s: float | None = None
+    writer: str | None = None
+    digest: str | None = None
+    dead_letters: tuple[DeadLetter, ...] = ()
+    versions: dict[str, str] | None = None
+    unwanted_writers: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """A log's end and the two sinks."""
+
+    log_id: str
+    log_next_offset: int
+    sinks: tuple[SinkStatus, ...]
+
+    @property
+    def healthy(self) -> bool:
+        """True when nothing is missing, stalled, of another origin, parked, or open to readers."""
+        good = ("idle", "following", "rebuilding")
+        return all(
+            s.condition in good and not s.dead_letters and not s.unwanted_writers
+            for s in self.sinks
+        )
+
+
+def projection_status(log: Path, targets: Targets, settings: Settings) -> Status:
+    """Look at both sinks. A database that cannot be reached is a finding, not a failure."""
+    with LogReader(log) as reader:
+        log_id, end = reader.log_id, reader.next_offset
+    sinks: tuple[tuple[SinkName, str], ...] = (
+        ("graph", targets.graph_url),
+        ("vectors", targets.vector_url),
+    )
+    found = tuple(_status(sink, url, log, log_id, end, settings) for sink, url in sinks)
+    return Status(log_id, end, found)
+
+
+def _status(
+    sink: SinkName, url: str, log: Path, log_id: str, end: int, settings: Settings
+) -> SinkStatus:
+    try:
+        opened = connect(url, application="mapfold status", autocommit=True)
+        with opened as connection, database_errors(url):
+            return _look(connection, sink, log, log_id, end, settings)
+    except DatabaseError as error:
+        return SinkStatus(sink, place(url), "unreachable", note=str(error))
+
+
+def _look(
+    connection: Connection, sink: SinkName, log: Path, log_id: str, end: int, settings: Settings
+) -> SinkStatus:
+    where = place(connection.info.dsn)
+    versions = _versions(connection)
+    found = _checkpoint.load(connection, sink)
+    writer = _checkpoint.writer_of(connection, sink)
+    if found is None and writer is not None:
+        return SinkStatus(sink, where, _at_work(writer), writer=writer, versions=versions)
+    if found is None:
+        advice = f"nothing has been projected there; run: {command('replay', log, settings)}"
+        return SinkStatus(sink, where, "missing", note=advice, versions=versions)
+    if not _checkpoint.is_there(connection, sink):
+        told = f"somebody has dropped what its {found.next_offset:,} events were in"
+        advice = f"{told}; {remake(log, settings)}"
+        return SinkStatus(sink, where, "missing", note=advice, versions=versions)
+    moved, beaten = _checkpoint.ages(connection, sink)
+    condition, note = _condition(found, sink, where, log, log_id, end, settings, writer, beaten)
+    return SinkStatus(
+        sink,
+        where,
+        condition,
+        note,
+        found.next_offset,
+        end - found.next_offset if found.log_id == log_id and found.next_offset <= end else None,
+        round(moved, 3),
+        None if beaten is None else round(beaten, 3),
+        writer,
+        found.digest,
+        tuple(_checkpoint.parked(connection, sink)),
+        versions,
+        tuple(unwanted_writers(connection)) if sink == "graph" else (),
+    )
+
+
+def _condition(
+    found: Checkpoint,
+    sink: SinkName,
+    where: str,
+    log: Path,
+    log_id: str,
+    end: int,
+    settings: Settings,
+    writer: str | None,
+    beaten: float | None,
+) -> tuple[Condition, str | None]:
+    advice = remake(log, settings)
+    try:
+        _checkpoint.refuse_other_origin(found, sink, where, log_id, settings, advice)
+    except ProjectionMismatch as error:
+        return "other", str(error)
+    if found.next_offset > end:
+        return "other", f"the log has only {end:,} events; {advice}"
+    if writer == "mapfold tail" and (beaten is None or beaten > STALLED_S):
+        return "stalled", "a tail holds it but has not been heard of; look at that process"
+    if writer is not None:
+        return _at_work(writer), None
+    if found.next_offset == end:
+        return "idle", None
+    return "behind", f"nobody writes it; run: {command('tail', log, settings)}"
+
+
+def _at_work(writer: str) -> Literal["following", "rebuilding"]:
+    return "following" if writer == "mapfold tail" else "rebuilding"
+
+
+def _versions(connection: Connection) -> dict[str, str]:
+    versions = {"postgresql": str(connection.info.server_version // 10000)}
+    row = connection.execute("SHOW server_version").fetchone()
+    if row is not None:
+        versions["postgresql"] = str(row[0])
+    for name in ("age", "vector"):
+        version = extension_version(connection, name)
+        if version is not None:
+            versions[name] = version
+    return versions

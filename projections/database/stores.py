@@ -1,0 +1,130 @@
+"""The databases of a run, and which sinks live in which: what shares one, commits together."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import psycopg
+
+from projections.errors import DatabaseError
+from projections.settings import Settings
+
+from . import checkpoints as _checkpoint
+from .connection import Connection, Targets, connect, database_errors, place, settle
+from .graph_sink import GraphSink
+from .loader import LoaderName
+from .sink import Sink, SinkName
+from .vector_sink import VectorSink
+
+Only: TypeAlias = SinkName | None
+
+
+@dataclass(slots=True)
+class Store:
+    """One database: its open autocommit connection and the sinks that are written through it."""
+
+    url: str
+    application: str
+    sinks: tuple[Sink[Any], ...]
+    connection: Connection
+
+    @property
+    def place(self) -> str:
+        """Where it is, for messages."""
+        return place(self.url)
+
+    def reconnect(self) -> None:
+        """Replace a lost connection; the sinks' locks are taken again."""
+        self.connection.close()
+        self.connection = _open(self.url, self.application, self.sinks)
+
+    @contextlib.contextmanager
+    def aside(self) -> Iterator[Connection]:
+        """A second connection, for dropping graphs.
+
+        AGE 1.5 keeps labels of a dropped graph in the session's cache and may end the session over
+        them later; so that had better be a session without a future.
+        """
+        opened = connect(self.url, application=self.application, autocommit=True)
+        with opened as connection, database_errors(self.url):
+            connection.execute("SET client_min_messages = warning")
+            settle(connection)
+            yield connection
+
+    def do(self, job: Callable[[Connection], None]) -> None:
+        """Do ``job`` with the connection; of two stores, an error names the right one."""
+        with database_errors(self.url):
+            job(self.connection)
+
+    def close(self) -> None:
+        """Close the connection, which gives the locks back."""
+        self.connection.close()
+
+
+@contextlib.contextmanager
+def open_stores(
+    targets: Targets,
+    settings: Settings,
+    *,
+    only: Only,
+    application: str,
+    loader: LoaderName = "copy",
+) -> Iterator[list[Store]]:
+    """The stores of ``targets``, each sink's writer lock held. Raises ProjectionBusy."""
+    stores: list[Store] = []
+    try:
+        for url, sinks in _layout(targets, settings, only, loader):
+            stores.append(Store(url, application, sinks, _open(url, application, sinks)))
+        yield stores
+    finally:
+        for store in stores:
+            store.close()
+
+
+def _layout(
+    targets: Targets, settings: Settings, only: Only, loader: LoaderName
+) -> list[tuple[str, tuple[Sink[Any], ...]]]:
+    graph = GraphSink(loader)
+    vectors = VectorSink(loader, dimension=settings.embedding_dim)
+    if only == "graph":
+        return [(targets.graph_url, (graph,))]
+    if only == "vectors":
+        return [(targets.vector_url, (vectors,))]
+    if targets.one_database:
+        return [(targets.graph_url, (graph, vectors))]
+    return [(targets.graph_url, (graph,)), (targets.vector_url, (vectors,))]
+
+
+def _open(url: str, application: str, sinks: tuple[Sink[Any], ...]) -> Connection:
+    connection = connect(url, application=application, autocommit=True)
+    try:
+        _refuse_encoding(connection, url)
+        with database_errors(url):
+            # AGE and the schema commands talk; only what goes wrong is of interest.
+            connection.execute("SET client_min_messages = warning")
+            settle(connection)
+            for sink in sinks:
+                _checkpoint.lock_writer(connection, sink.name)
+            _ensure_store(connection)
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def _refuse_encoding(connection: Connection, url: str) -> None:
+    encoding = connection.info.parameter_status("server_encoding")
+    if encoding not in ("UTF8", "SQL_ASCII"):
+        raise DatabaseError(
+            f"{place(url)}: its encoding is {encoding}, which cannot hold every name in a log; make"
+            " a database with createdb --encoding UTF8 --template template0"
+        )
+
+
+def _ensure_store(connection: Connection) -> None:
+    try:
+        with connection.transaction():
+            _checkpoint.ensure_store(connection)
+    except (psycopg.errors.DuplicateSchema, psycopg.errors.UniqueViolation):
+        pass  # the other sink's service made it in the same moment

@@ -1,0 +1,108 @@
+"""From deltas to rows of ``detection_embeddings``: one row for each searchable detection.
+
+Searchable means: it has an embedding of the map's own space. Rows are written once and never
+change. ``det_pk`` is the observation's ordinal + 1 and ``ingested_at`` is when the event was
+*logged*, so a row follows from the log alone, to the last bit, whoever writes it and when.
+"""
+
+import math
+import struct
+from collections.abc import Iterable
+from datetime import UTC, datetime, timedelta
+from typing import Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from projections.deltas import Delta, ObservationAdded, Pose, UnitVector
+from projections.exact import UM_PER_M, to_float32
+from projections.model.view import MapView
+
+_REAL: Final = struct.Struct("f")
+_REALS: Final = struct.Struct("4f")
+_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+class VectorRow(msgspec.Struct, frozen=True, eq=False, gc=False):
+    """One row, as the delta that adds it says it; what the columns hold is worked out when asked.
+
+    ``at`` is the keyframe's pose; the event was logged at ``logged_ns``.
+    """
+
+    added: ObservationAdded
+    at: Pose | None
+    logged_ns: int
+
+    @property
+    def det_pk(self) -> int:
+        """The key: the observation's ordinal + 1."""
+        return self.added.observation + 1
+
+    @property
+    def bbox(self) -> tuple[float, float, float, float]:
+        """Rounded to float32, as ``real[]`` holds it; a corner beyond float32 is ±inf."""
+        try:
+            x0, y0, x1, y1 = _REALS.unpack(_REALS.pack(*self.added.bbox))
+        except OverflowError:
+            x0, y0, x1, y1 = map(_real, self.added.bbox)
+        return x0, y0, x1, y1
+
+    @property
+    def pose(self) -> tuple[float, float, float] | None:
+        """Metres and radians; None when the robot had no pose."""
+        at = self.at
+        return None if at is None else (at.x_um / UM_PER_M, at.y_um / UM_PER_M, at.yaw_rad)
+
+    @property
+    def unit(self) -> UnitVector:
+        """The embedding as the fold has it. Only what has one is a row."""
+        assert self.added.embedding is not None  # noqa: S101 - see `VectorRows.note`
+        return self.added.embedding
+
+    @property
+    def embedding(self) -> NDArray[np.float32]:
+        """The embedding as the table has it, shape (dim,)."""
+        return to_float32(self.unit)
+
+    @property
+    def ingested_us(self) -> int:
+        """µs since the epoch."""
+        return self.logged_ns // 1000
+
+    @property
+    def ingested_at(self) -> datetime:
+        """The same as PostgreSQL's timestamptz has it."""
+        return _EPOCH + timedelta(microseconds=self.ingested_us)
+
+
+class VectorRows:
+    """Collects the rows a stream of deltas adds."""
+
+    def __init__(self) -> None:
+        self._waiting: list[tuple[ObservationAdded, int]] = []
+
+    def note(self, deltas: Iterable[Delta], logged_ns: int) -> None:
+        """Remember those of ``deltas`` that add a row; their event was logged at ``logged_ns``."""
+        for delta in deltas:
+            if type(delta) is ObservationAdded and delta.embedding is not None:
+                self._waiting.append((delta, logged_ns))
+
+    @property
+    def waiting(self) -> int:
+        """How many rows `take` would give."""
+        return len(self._waiting)
+
+    def take(self, view: MapView) -> list[VectorRow]:
+        """The rows added since the last take."""
+        waiting, self._waiting = self._waiting, []
+        keyframes = view.keyframes
+        return [VectorRow(added, keyframes[added.keyframe].pose, ns) for added, ns in waiting]
+
+
+def _real(value: float) -> float:
+    try:
+        rounded: float = _REAL.unpack(_REAL.pack(value))[0]
+    except OverflowError:
+        return math.copysign(math.inf, value)
+    return rounded

@@ -1,0 +1,339 @@
+"""What is different between two maps: a difference applied to the first gives the second.
+
+A map as rows by id: what a difference between two maps is taken of.
+
+Ids, not ordinals, so that the rows of two logs or two settings can stand side by side too.
+"""
+
+import math
+from collections.abc import Callable, Hashable, Iterable
+from dataclasses import dataclass
+from typing import Any, Generic, TypeAlias, TypeVar
+
+from projections.model.view import MapView
+
+from .records import Cause
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceRow:
+    """A standing place; its centroid in metres."""
+
+    place_id: str
+    centroid_x: float
+    centroid_y: float
+    keyframe_count: int
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectRow:
+    """An object; its mean position in metres, its sightings in order."""
+
+    object_id: str
+    class_name: str
+    mean_x: float
+    mean_y: float
+    place_id: str | None
+    first_seen: float
+    last_seen: float
+    det_ids: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframeRow:
+    """A keyframe and its place; the pose is metres and radians, None when there was none."""
+
+    run_id: str
+    keyframe_id: int
+    pose: tuple[float, float, float] | None
+    place_id: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeRow:
+    """Two places next to each other."""
+
+    a: str
+    b: str
+    shared_transitions: int
+
+
+K = TypeVar("K", bound=Hashable)
+R = TypeVar("R")
+
+
+@dataclass(frozen=True, slots=True)
+class Changes(Generic[K, R]):
+    """What turns one table into another: rows that came, went, and changed (before, after)."""
+
+    came: tuple[R, ...]
+    went: tuple[R, ...]
+    changed: tuple[tuple[R, R], ...]
+
+    @property
+    def none(self) -> bool:
+        """Whether nothing changed."""
+        return not (self.came or self.went or self.changed)
+
+    def apply(self, rows: dict[K, R], key: Callable[[R], K]) -> dict[K, R]:
+        """The table after the changes; ``rows`` is the one before."""
+        gone = {key(row) for row in self.went}
+        kept = {k: row for k, row in rows.items() if k not in gone}
+        return kept | {key(after): after for _, after in self.changed} | _by(key, self.came)
+
+
+def changes(before: dict[K, R], after: dict[K, R]) -> Changes[K, R]:
+    """What turns ``before`` into ``after``, in the order of the tables."""
+    return Changes(
+        came=tuple(row for key, row in after.items() if key not in before),
+        went=tuple(row for key, row in before.items() if key not in after),
+        changed=tuple(
+            (row, after[key]) for key, row in before.items() if key in after and after[key] != row
+        ),
+    )
+
+
+Keyframes: TypeAlias = dict[tuple[str, int], KeyframeRow]
+Edges: TypeAlias = dict[tuple[str, str], EdgeRow]
+
+
+@dataclass(frozen=True, slots=True)
+class MapRows:
+    """A whole map by id."""
+
+    keyframes: Keyframes
+    places: dict[str, PlaceRow]
+    objects: dict[str, ObjectRow]
+    edges: Edges
+
+
+def rows_of(view: MapView) -> MapRows:
+    """The rows of a map, each table in the order of founding."""
+    ids = [place.place_id for place in view.all_places]
+    return MapRows(
+        keyframes=_by(keyframe_key, _keyframe_rows(view, ids)),
+        places=_by(
+            place_key,
+            (
+                PlaceRow(p.place_id, p.centroid_x, p.centroid_y, p.keyframe_count)
+                for p in view.places.values()
+            ),
+        ),
+        objects=_by(object_key, _object_rows(view, ids)),
+        edges=_by(edge_key, (EdgeRow(ids[a], ids[b], n) for a, b, n in view.edges())),
+    )
+
+
+def keyframe_key(row: KeyframeRow) -> tuple[str, int]:
+    return row.run_id, row.keyframe_id
+
+
+def place_key(row: PlaceRow) -> str:
+    return row.place_id
+
+
+def object_key(row: ObjectRow) -> str:
+    return row.object_id
+
+
+def edge_key(row: EdgeRow) -> tuple[str, str]:
+    return row.a, row.b
+
+
+def _by(key: Callable[[R], K], rows: Iterable[R]) -> dict[K, R]:
+    return {key(row): row for row in rows}
+
+
+def _keyframe_rows(view: MapView, ids: list[str]) -> Iterable[KeyframeRow]:
+    for k in view.keyframes:
+        place = k.place
+        pose = None if k.pose is None else (k.pose.x_um / 1e6, k.pose.y_um / 1e6, k.pose.yaw_rad)
+        yield KeyframeRow(k.run_id, k.keyframe_id, pose, None if place is None else ids[place])
+
+
+def _object_rows(view: MapView, ids: list[str]) -> Iterable[ObjectRow]:
+    observations = view.observations
+    for o in view.objects:
+        yield ObjectRow(
+            o.object_id,
+            o.class_name,
+            o.mean_x,
+            o.mean_y,
+            None if o.place is None else ids[o.place],
+            o.first_seen,
+            o.last_seen,
+            tuple(observations[number].det_id for number in o.observations),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """What turns the map after ``start`` events into that after ``end``.
+
+    ``absorbed`` says into which place, and because of what, a place went that is gone; it is empty
+    when time runs backwards (``end`` < ``start``).
+    """
+
+    start: int
+    end: int
+    digests: tuple[str, str]
+    counts: tuple[dict[str, int], dict[str, int]]
+    keyframes: Changes[tuple[str, int], KeyframeRow]
+    places: Changes[str, PlaceRow]
+    objects: Changes[str, ObjectRow]
+    edges: Changes[tuple[str, str], EdgeRow]
+    absorbed: dict[str, tuple[str, Cause]]
+
+    @property
+    def same(self) -> bool:
+        """Whether the two maps are equal, by their digests."""
+        return self.digests[0] == self.digests[1]
+
+    def apply(self, rows: MapRows) -> MapRows:
+        """The second map's rows, from the first one's."""
+        return MapRows(
+            keyframes=self.keyframes.apply(rows.keyframes, keyframe_key),
+            places=self.places.apply(rows.places, place_key),
+            objects=self.objects.apply(rows.objects, object_key),
+            edges=self.edges.apply(rows.edges, edge_key),
+        )
+
+    def document(self) -> dict[str, Any]:
+        """JSON: the digests first, then what changed in each table."""
+        return {
+            "from": self.start,
+            "to": self.end,
+            "same": self.same,
+            "digests": list(self.digests),
+            "counts": {name: [n, self.counts[1][name]] for name, n in self.counts[0].items()},
+            "places": self._places(),
+            "objects": _objects(self.objects),
+            "keyframes": _keyframes(self.keyframes),
+            "adjacency": _edges(self.edges),
+        }
+
+    def _places(self) -> dict[str, Any]:
+        return {
+            "formed": [_place(row) for row in self.places.came],
+            "gone": [
+                {**_place(row), **_into(self.absorbed.get(row.place_id))}
+                for row in self.places.went
+            ],
+            "changed": [
+                {
+                    "place_id": before.place_id,
+                    "before": _place(before),
+                    "after": _place(after),
+                    "moved_m": place_shift_m(before, after),
+                }
+                for before, after in self.places.changed
+            ],
+        }
+
+
+def difference_of(
+    start: int,
+    end: int,
+    rows: tuple[MapRows, MapRows],
+    digests: tuple[str, str],
+    counts: tuple[dict[str, int], dict[str, int]],
+    absorbed: dict[str, tuple[str, Cause]],
+) -> Difference:
+    """Take the difference of two maps given as rows."""
+    before, after = rows
+    return Difference(
+        start=start,
+        end=end,
+        digests=digests,
+        counts=counts,
+        keyframes=changes(before.keyframes, after.keyframes),
+        places=changes(before.places, after.places),
+        objects=changes(before.objects, after.objects),
+        edges=changes(before.edges, after.edges),
+        absorbed=absorbed,
+    )
+
+
+def place_shift_m(before: PlaceRow, after: PlaceRow) -> float:
+    """How far a centroid moved."""
+    return math.hypot(after.centroid_x - before.centroid_x, after.centroid_y - before.centroid_y)
+
+
+def object_shift_m(before: ObjectRow, after: ObjectRow) -> float:
+    """How far a mean position moved."""
+    return math.hypot(after.mean_x - before.mean_x, after.mean_y - before.mean_y)
+
+
+def _place(row: PlaceRow) -> dict[str, Any]:
+    return {
+        "place_id": row.place_id,
+        "centroid_x": row.centroid_x,
+        "centroid_y": row.centroid_y,
+        "keyframe_count": row.keyframe_count,
+    }
+
+
+def _into(absorbed: tuple[str, Cause] | None) -> dict[str, Any]:
+    return {} if absorbed is None else {"into": absorbed[0], "by": absorbed[1].document()}
+
+
+def _object(row: ObjectRow) -> dict[str, Any]:
+    return {
+        "object_id": row.object_id,
+        "class_name": row.class_name,
+        "mean_x": row.mean_x,
+        "mean_y": row.mean_y,
+        "obs_count": len(row.det_ids),
+        "place_id": row.place_id,
+        "first_seen": row.first_seen,
+        "last_seen": row.last_seen,
+    }
+
+
+def _objects(found: Changes[str, ObjectRow]) -> dict[str, Any]:
+    return {
+        "new": [{**_object(row), "det_ids": list(row.det_ids)} for row in found.came],
+        "gone": [_object(row) for row in found.went],
+        "changed": [
+            {
+                "object_id": before.object_id,
+                "before": _object(before),
+                "after": _object(after),
+                "moved_m": object_shift_m(before, after),
+                "relocated": before.place_id != after.place_id,
+                "new_det_ids": list(after.det_ids[len(before.det_ids) :]),
+            }
+            for before, after in found.changed
+        ],
+    }
+
+
+def _keyframes(found: Changes[tuple[str, int], KeyframeRow]) -> dict[str, Any]:
+    return {
+        "new": [_keyframe(row) for row in found.came],
+        "gone": [_keyframe(row) for row in found.went],
+        "changed": [
+            {**_keyframe(after), "before": before.place_id} for before, after in found.changed
+        ],
+    }
+
+
+def _keyframe(row: KeyframeRow) -> dict[str, Any]:
+    x, y, yaw = row.pose or (None, None, None)
+    return {
+        "run_id": row.run_id,
+        "keyframe_id": row.keyframe_id,
+        "map_x": x,
+        "map_y": y,
+        "map_yaw": yaw,
+        "place_id": row.place_id,
+    }
+
+
+def _edges(found: Changes[tuple[str, str], EdgeRow]) -> list[dict[str, Any]]:
+    came = [(row, 0, row.shared_transitions) for row in found.came]
+    went = [(row, row.shared_transitions, 0) for row in found.went]
+    changed = [(b, b.shared_transitions, a.shared_transitions) for b, a in found.changed]
+    return [
+        {"a": row.a, "b": row.b, "before": b, "after": a} for row, b, a in came + went + changed
+    ]

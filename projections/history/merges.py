@@ -1,0 +1,208 @@
+"""Merges as people and programs read them.
+
+How one keyframe made two places one: the chain of core points that joins them.
+
+Places merge when a path of core points, each within ε of the next, leads from one to the other. The
+keyframe that came last need not be on that path: standing near a point, it may give it the last
+neighbour that a core point needs. So the path leads from an old core point of the one place, over
+points that this event made core, to an old core point of the other; the shortest one is told.
+
+When an event joins several places, the chains make a tree: each further place hangs on one that is
+joined already.
+
+Why two places became one, in words and as JSON.
+"""
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+from projections.deltas import Link
+
+from .history import History
+from .records import EdgeChange, Merge
+from .story import keyframe_name, listed, place_name
+
+
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """Core points from place ``joined`` to the absorbed place ``absorbed``, ends included.
+
+    ``points`` are keyframe ordinals; all but the first and the last were made core by this event.
+    ``distances_um`` are the steps between them.
+    """
+
+    joined: int
+    absorbed: int
+    points: tuple[int, ...]
+    distances_um: tuple[int, ...]
+
+    @property
+    def made_core(self) -> tuple[int, ...]:
+        """The points that this event made core."""
+        return self.points[1:-1]
+
+
+def chains_of(history: History, merge: Merge) -> list[Chain]:
+    """A chain for each absorbed place, nearest to the survivor first.
+
+    Empty when the merge was made by another rule than plain distance.
+    """
+    made = history.neighbours.made_core(merge.bridge, merge.cause.offset)
+    doors = {keyframe: _doors(history, merge, keyframe) for keyframe in made}
+    joined, waiting, chains = {merge.survivor}, set(merge.absorbed), list[Chain]()
+    while waiting:
+        chain = _shortest(history, merge, doors, joined, waiting)
+        if chain is None:
+            break
+        chains.append(chain)
+        joined.add(chain.absorbed)
+        waiting.remove(chain.absorbed)
+    return chains
+
+
+def _doors(history: History, merge: Merge, keyframe: int) -> dict[int, int]:
+    """By place the nearest old core point within ε of a new one."""
+    offset, neighbours = merge.cause.offset, history.neighbours
+    doors: dict[int, int] = {}
+    near = (k for k in neighbours.of(keyframe, offset + 1) if neighbours.is_core(k, offset))
+    for old in sorted(near, key=lambda k: (neighbours.distance_um(keyframe, k), k)):
+        place = history.place_at(old, offset)
+        if place is not None:
+            doors.setdefault(place, old)
+    return doors
+
+
+def _shortest(
+    history: History,
+    merge: Merge,
+    doors: dict[int, dict[int, int]],
+    joined: set[int],
+    waiting: set[int],
+) -> Chain | None:
+    """Breadth first over the new core points, from joined places to one that waits."""
+    paths: deque[tuple[int, tuple[int, ...]]] = deque(
+        (place, (old, new)) for new in doors for place, old in doors[new].items() if place in joined
+    )
+    seen = {path[-1] for _, path in paths}
+    while paths:
+        place, path = paths.popleft()
+        for goal in sorted(doors[path[-1]].keys() & waiting):
+            return _chain(history, place, goal, (*path, doors[path[-1]][goal]))
+        for new in _next(history, merge, path[-1], doors):
+            if new not in seen:
+                seen.add(new)
+                paths.append((place, (*path, new)))
+    return None
+
+
+def _next(
+    history: History, merge: Merge, keyframe: int, doors: dict[int, dict[int, int]]
+) -> Iterator[int]:
+    near = history.neighbours.of(keyframe, merge.cause.offset + 1)
+    return (k for k in near if k in doors)
+
+
+def _chain(history: History, joined: int, absorbed: int, points: tuple[int, ...]) -> Chain:
+    distances = tuple(history.neighbours.distance_um(a, b) for a, b in pairwise(points))
+    return Chain(joined, absorbed, points, distances)
+
+
+def reason(history: History, merge: Merge) -> str:
+    """Who bridged, what that made core, and the chain of core points to each absorbed place."""
+    if merge.cause.kind != "keyframe":
+        return merge.cause.name
+    chains = chains_of(history, merge)
+    bridge = keyframe_name(history, merge.bridge)
+    if not chains:
+        links = "; ".join(_link_text(history, link) for link in merge.links)
+        return f"{bridge} bridged them: {links}"
+    made = dict.fromkeys(point for chain in chains for point in chain.made_core)
+    names = ["itself" if k == merge.bridge else keyframe_name(history, k) for k in made]
+    what = "a core point" if len(made) == 1 else "core points"
+    joins = "; ".join(chain_text(history, chain) for chain in chains)
+    return f"{bridge} made {listed(names)} {what}: {joins}"
+
+
+def chain_text(history: History, chain: Chain) -> str:
+    """``run:2 (run_p0) –0.900 m– run:3 –1.000 m– run:5 (run_p1)``."""
+    names = [keyframe_name(history, point) for point in chain.points]
+    names[0] += f" ({place_name(history, chain.joined)})"
+    names[-1] += f" ({place_name(history, chain.absorbed)})"
+    steps = [
+        f"{name} –{d / 1e6:.3f} m–" for name, d in zip(names, chain.distances_um, strict=False)
+    ]
+    return " ".join([*steps, names[-1]])
+
+
+def _link_text(history: History, link: Link) -> str:
+    core, neighbour = keyframe_name(history, link.core), keyframe_name(history, link.neighbour)
+    return f"{core} and {neighbour} are core points {link.distance_um / 1e6:.3f} m apart"
+
+
+def link_document(history: History, link: Link) -> dict[str, Any]:
+    """A link of the merge, as the fold states it."""
+    return {
+        "core": keyframe_name(history, link.core),
+        "neighbour": keyframe_name(history, link.neighbour),
+        "distance_m": link.distance_um / 1e6,
+    }
+
+
+def chain_document(history: History, chain: Chain) -> dict[str, Any]:
+    """A chain of core points from a joined place to an absorbed one."""
+    return {
+        "from": place_name(history, chain.joined),
+        "to": place_name(history, chain.absorbed),
+        "points": [keyframe_name(history, point) for point in chain.points],
+        "distances_m": [distance / 1e6 for distance in chain.distances_um],
+        "made_core": [keyframe_name(history, point) for point in chain.made_core],
+    }
+
+
+HEADER = ("#", "offset", "time", "bridge", "survivor", "absorbed", "keyframes", "objects", "edges")
+
+
+def merge_document(history: History, merge: Merge) -> dict[str, Any]:
+    """One merge as JSON; ``run_id`` and ``keyframe_id`` name the bridging keyframe."""
+    bridge = history.keyframes[merge.bridge]
+    return {
+        **merge.cause.document(),
+        "run_id": bridge.run_id,
+        "keyframe_id": bridge.keyframe_id,
+        "number": merge.number,
+        "survivor": place_name(history, merge.survivor),
+        "survivor_size": merge.survivor_size,
+        "absorbed": [place_name(history, place) for place in merge.absorbed],
+        "absorbed_sizes": list(merge.absorbed_sizes),
+        "links": [link_document(history, link) for link in merge.links],
+        "chains": [chain_document(history, chain) for chain in chains_of(history, merge)],
+        "objects": [history.objects[number].object_id for number in merge.objects],
+        "edges": [_edge_document(history, edge) for edge in merge.edges],
+    }
+
+
+def _edge_document(history: History, edge: EdgeChange) -> dict[str, Any]:
+    return {
+        "a": place_name(history, edge.a),
+        "b": place_name(history, edge.b),
+        "before": edge.before,
+        "after": edge.after,
+    }
+
+
+def merge_row(history: History, merge: Merge) -> tuple[str, ...]:
+    """One row of the table under `HEADER`."""
+    return (
+        str(merge.number),
+        f"{merge.cause.offset:,}",
+        merge.cause.when,
+        keyframe_name(history, merge.bridge),
+        place_name(history, merge.survivor),
+        ", ".join(place_name(history, place) for place in merge.absorbed),
+        " + ".join(str(size) for size in (merge.survivor_size, *merge.absorbed_sizes)),
+        str(len(merge.objects)),
+        str(len(merge.edges)),
+    )

@@ -1,0 +1,199 @@
+"""What time travel remembers of each thing: plain records that `history` fills from deltas.
+
+Keyframes, places and objects are meant by ordinal here, as in the deltas; ids are for people and
+are put in where something is told. Places and objects never leave a history: an absorbed place
+keeps its life, and where it ended.
+
+What made something happen: today always a keyframe, later also an operator's command.
+
+Everything time travel reports carries a `Cause`, and nothing but this module looks at which kind it
+is. A command on ``mapfold/command`` will be one more kind with a text of its own; the chronicle,
+the diff and the merge table then name it without a change.
+"""
+
+from bisect import bisect_left
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from operator import attrgetter
+from typing import Any, Literal, Protocol, TypeVar
+
+from projections.deltas import (
+    Delta,
+    KeyframeAdded,
+    KeyframePlaced,
+    Link,
+    ObjectFound,
+    ObjectMoved,
+    ObjectSeen,
+    PlaceChanged,
+    PlaceFormed,
+)
+
+CauseKind = Literal["keyframe", "command"]
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """The event at ``offset`` and what it was.
+
+    ``time_s`` is the robot's time in seconds, ``run_id`` and ``keyframe_id`` name the keyframe; all
+    three are None for a cause that is not a keyframe. ``what`` is then its text.
+    """
+
+    offset: int
+    kind: CauseKind
+    time_s: float | None = None
+    run_id: str | None = None
+    keyframe_id: int | None = None
+    what: str | None = None
+
+    @property
+    def name(self) -> str:
+        """``run:keyframe``, or what a command said."""
+        if self.kind == "keyframe":
+            return f"{self.run_id}:{self.keyframe_id}"
+        return self.what or f"{self.kind} at offset {self.offset}"
+
+    @property
+    def time(self) -> str | None:
+        """The time as ISO 8601 in UTC."""
+        return None if self.time_s is None else iso_time(self.time_s)
+
+    @property
+    def when(self) -> str:
+        """Its time for people, its name where it has none."""
+        return self.time or self.name
+
+    @property
+    def title(self) -> str:
+        """Name and time, ``run:keyframe, 2026-03-24T13:00:00.000Z``."""
+        return self.name if self.time is None else f"{self.name}, {self.time}"
+
+    def document(self) -> dict[str, Any]:
+        """The fields every JSON answer says a cause with."""
+        return {
+            "offset": self.offset,
+            "time": self.time,
+            "cause": self.kind,
+            "run_id": self.run_id,
+            "keyframe_id": self.keyframe_id,
+        }
+
+
+def cause_of(offset: int, deltas: Iterable[Delta]) -> Cause:
+    """The cause of the deltas of one event: the keyframe it added, if it added one."""
+    for delta in deltas:
+        if isinstance(delta, KeyframeAdded):
+            return Cause(offset, "keyframe", delta.timestamp, delta.run_id, delta.keyframe_id)
+    return Cause(offset, "command")
+
+
+def iso_time(time_s: float) -> str:
+    """Robot seconds since the epoch as ISO 8601 UTC with milliseconds, ending in Z."""
+    moment = datetime.fromtimestamp(time_s, UTC)
+    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeChange:
+    """Shared transitions of two places before and after an event; 0 is no edge."""
+
+    a: int
+    b: int
+    before: int
+    after: int
+
+
+@dataclass(frozen=True, slots=True)
+class Merge:
+    """Places became one, and everything that changed hands with it.
+
+    ``number`` counts merges from 1. Sizes are members before the merge; ``absorbed`` and
+    ``absorbed_sizes`` run parallel. ``objects`` are those whose place was absorbed and that are in
+    the survivor now. ``edges`` are all adjacency changes of the event that touch the places.
+    """
+
+    number: int
+    cause: Cause
+    bridge: int
+    survivor: int
+    survivor_size: int
+    absorbed: tuple[int, ...]
+    absorbed_sizes: tuple[int, ...]
+    links: tuple[Link, ...]
+    objects: tuple[int, ...]
+    edges: tuple[EdgeChange, ...]
+
+    @property
+    def places(self) -> tuple[int, ...]:
+        """The survivor and the absorbed ones."""
+        return (self.survivor, *self.absorbed)
+
+
+@dataclass(slots=True)
+class PlaceLife:
+    """A place from its founding on. The lists are in order of offset."""
+
+    formed: PlaceFormed
+    cause: Cause
+    joined: list[KeyframePlaced] = field(default_factory=list)
+    """Its own joins, without those of places merged in."""
+    changes: list[PlaceChanged] = field(default_factory=list)
+    merges: list[Merge] = field(default_factory=list)
+    """Merges it survived."""
+    absorbed: Merge | None = None
+    """The merge that ended it."""
+
+    @property
+    def place_id(self) -> str:
+        return self.formed.place_id
+
+    def stands(self, end: int) -> bool:
+        """Whether it is there, formed and not absorbed, after the events below ``end``."""
+        return self.formed.offset < end and (
+            self.absorbed is None or self.absorbed.cause.offset >= end
+        )
+
+    def change(self, end: int) -> PlaceChanged | None:
+        """Its size and sums after the events below ``end``."""
+        return last_before(self.changes, end)
+
+
+@dataclass(slots=True)
+class ObjectLife:
+    """An object from its first sighting on. The lists are in order of offset."""
+
+    found: ObjectFound
+    cause: Cause
+    seen: list[ObjectSeen] = field(default_factory=list)
+    located: list[ObjectMoved] = field(default_factory=list)
+
+    @property
+    def object_id(self) -> str:
+        return self.found.object_id
+
+    def place(self, end: int) -> int | None:
+        """The place it joined last by the events below ``end``."""
+        moved = last_before(self.located, end)
+        return None if moved is None else moved.place
+
+
+class _HasOffset(Protocol):
+    @property
+    def offset(self) -> int: ...
+
+
+_T = TypeVar("_T", bound=_HasOffset)
+_offset = attrgetter("offset")
+
+
+def count_before(items: Sequence[_HasOffset], end: int) -> int:
+    """How many items, sorted by offset, were caused by events below ``end``."""
+    return bisect_left(items, end, key=_offset)
+
+
+def last_before(items: Sequence[_T], end: int) -> _T | None:
+    """The last item, sorted by offset, of the events below ``end``."""
+    count = bisect_left(items, end, key=_offset)
+    return items[count - 1] if count else None

@@ -1,0 +1,360 @@
+"""`mapfold diff` for people: the digests, a line per kind, then the things that changed.
+
+A plain table: columns as wide as their widest cell, two spaces between, no lines.
+
+`mapfold merges` for people.
+
+`mapfold bisect` for people.
+
+`mapfold why` for people: the summary first, then the chronicle.
+
+`mapfold whatif` for people: one row per setting, then how each differs from the first.
+"""
+
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+from eventsrc.text import counted
+from projections.model.partitions import Regrouping
+
+from .bisect import Search, Turn
+from .diff import Difference, ObjectRow, PlaceRow, object_shift_m, place_shift_m
+from .history import History
+from .merges import HEADER, merge_row, reason
+from .records import EdgeChange, Merge
+from .story import Story, place_name
+from .whatif import Alternative, WhatIf
+
+
+def table(
+    header: Sequence[str], rows: Iterable[Sequence[str]], *, right: Collection[str] = ()
+) -> str:
+    """The rows under the header, a line each; ``right`` names the columns aligned to the right."""
+    cells = [list(header), *(list(row) for row in rows)]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(header))]
+    to_right = [name in right for name in header]
+    lines = (
+        "  ".join(
+            cell.rjust(width) if flush else cell.ljust(width)
+            for cell, width, flush in zip(row, widths, to_right, strict=True)
+        ).rstrip()
+        for row in cells
+    )
+    return "".join(f"{line}\n" for line in lines)
+
+
+def shortened(lines: Sequence[str], most: int | None, hint: str) -> list[str]:
+    """The first ``most`` lines, and how many more there are."""
+    if most is None or len(lines) <= most:
+        return list(lines)
+    return [*lines[:most], f"… and {len(lines) - most:,} more ({hint})"]
+
+
+HINT = "--all shows them"
+_MOVED_M = 0.005
+"""Less than this is not told as a move: it would print as 0.00 m."""
+
+
+def difference_text(diff: Difference, *, most: int | None) -> str:
+    """What changed; ``most`` things are named of each kind, all of them for None."""
+    return "".join(f"{line}\n" for line in _lines(diff, most))
+
+
+def _lines(diff: Difference, most: int | None) -> Iterator[str]:
+    first, second = diff.digests
+    if diff.same:
+        yield f"the same map at {diff.start:,} and {diff.end:,}: digest {first[:16]}"
+        return
+    yield f"from {diff.start:,} to {diff.end:,}: digest {first[:16]} → {second[:16]}"
+    yield f"keyframes  {_keyframes(diff)}"
+    for title, summary, groups in (_places(diff), _objects(diff), _edges(diff)):
+        yield f"{title:<11}{summary}"
+        for group in groups:
+            yield from (f"  {line}" for line in shortened(group, most, HINT))
+
+
+def _keyframes(diff: Difference) -> str:
+    found = diff.keyframes
+    relabelled = [(b.place_id, a.place_id) for b, a in found.changed]
+    out_of_noise = sum(before is None for before, _ in relabelled)
+    parts = [
+        (len(found.came), "new"),
+        (len(found.went), "gone"),
+        (out_of_noise, "left noise"),
+        (len(relabelled) - out_of_noise, "changed place"),
+    ]
+    return _parts(parts)
+
+
+def _parts(parts: Sequence[tuple[int, str]]) -> str:
+    return ", ".join(f"{count:,} {what}" for count, what in parts if count) or "unchanged"
+
+
+def _places(diff: Difference) -> tuple[str, str, list[list[str]]]:
+    found = diff.places
+    parts = [
+        (len(found.came), "formed"),
+        (len(found.went), "gone"),
+        (len(found.changed), "changed"),
+    ]
+    groups = [
+        [f"+ {_place_row_text(row)}" for row in found.came],
+        [f"- {row.place_id}{_into(diff, row)}" for row in found.went],
+        [f"~ {_place_change(before, after)}" for before, after in found.changed],
+    ]
+    return "places", _parts(parts), groups
+
+
+def _size(row: PlaceRow) -> str:
+    return counted(row.keyframe_count, "keyframe")
+
+
+def _place_row_text(row: PlaceRow) -> str:
+    x, y = row.centroid_x, row.centroid_y
+    return f"{row.place_id}: {_size(row)} around ({x:.2f}, {y:.2f})"
+
+
+def _into(diff: Difference, row: PlaceRow) -> str:
+    if row.place_id not in diff.absorbed:
+        return f" ({_size(row)})"
+    survivor, cause = diff.absorbed[row.place_id]
+    return f" ({_size(row)}) into {survivor} at {cause.offset:,} ({cause.name})"
+
+
+def _place_change(before: PlaceRow, after: PlaceRow) -> str:
+    moved = place_shift_m(before, after)
+    shift = f", centre moved {moved:.2f} m" if moved >= _MOVED_M else ""
+    return f"{after.place_id}: {before.keyframe_count:,} → {_size(after)}{shift}"
+
+
+@dataclass(frozen=True, slots=True)
+class _ObjectChange:
+    before: ObjectRow
+    after: ObjectRow
+
+    @property
+    def relocated(self) -> bool:
+        return self.before.place_id != self.after.place_id
+
+    @property
+    def seen(self) -> int:
+        return len(self.after.det_ids) - len(self.before.det_ids)
+
+    def text(self) -> str:
+        after, shift = self.after, object_shift_m(self.before, self.after)
+        parts = [f"{after.object_id} {after.class_name}:"]
+        if self.relocated:
+            parts.append(f"{self.before.place_id or 'no place'} → {after.place_id or 'no place'}")
+        if self.seen:
+            now = counted(len(after.det_ids), "time")
+            parts.append(f"seen {len(self.before.det_ids):,} → {now}")
+        if shift >= _MOVED_M:
+            parts.append(f"moved {shift:.2f} m")
+        return parts[0] + " " + ", ".join(parts[1:])
+
+
+def _objects(diff: Difference) -> tuple[str, str, list[list[str]]]:
+    found = diff.objects
+    changed = [_ObjectChange(before, after) for before, after in found.changed]
+    relocated = [change for change in changed if change.relocated]
+    others = [change for change in changed if not change.relocated]
+    parts = [
+        (len(found.came), "new"),
+        (len(found.went), "gone"),
+        (sum(change.seen > 0 for change in changed), "seen again"),
+        (len(relocated), "relocated"),
+    ]
+    groups = [
+        [f"+ {o.object_id} {o.class_name} in {o.place_id or 'no place'}" for o in found.came],
+        [f"- {o.object_id} {o.class_name}" for o in found.went],
+        [f"> {change.text()}" for change in relocated],
+        [f"~ {change.text()}" for change in others],
+    ]
+    return "objects", _parts(parts), groups
+
+
+def _edges(diff: Difference) -> tuple[str, str, list[list[str]]]:
+    found = diff.edges
+    parts = [(len(found.came), "new"), (len(found.went), "gone"), (len(found.changed), "changed")]
+    groups = [
+        [f"+ {e.a} – {e.b}: {counted(e.shared_transitions, 'transition')}" for e in found.came],
+        [f"- {e.a} – {e.b}" for e in found.went],
+        [
+            f"~ {after.a} – {after.b}: {before.shared_transitions:,} → {after.shared_transitions:,}"
+            for before, after in found.changed
+        ],
+    ]
+    return "adjacency", _parts(parts), groups
+
+
+MOST = 12
+
+
+def merges_text(history: History, merges: Sequence[Merge], end: int) -> str:
+    """The table of merges, or that there are none."""
+    if not merges:
+        formed = sum(life.formed.offset < end for life in history.places)
+        return f"no merges: {counted(end, 'event')} formed {counted(formed, 'place')}\n"
+    rows = [merge_row(history, merge) for merge in merges]
+    return table(HEADER, rows, right=("#", "offset", "objects", "edges"))
+
+
+def merge_text(history: History, merge: Merge) -> str:
+    """One merge with everything that made it and that changed hands."""
+    cause, after = merge.cause, merge.cause.offset + 1
+    lines = [
+        f"merge {merge.number} at offset {cause.offset:,} ({cause.when}), shows from --at {after}",
+        f"because   {reason(history, merge)}",
+        f"survivor  {_place(history, merge.survivor, merge.survivor_size)}",
+    ]
+    for place, size in zip(merge.absorbed, merge.absorbed_sizes, strict=True):
+        lines.append(f"absorbed  {_place(history, place, size)}")
+    objects = [history.objects[number] for number in merge.objects]
+    named = [f"object    {o.object_id} ({o.found.class_name})" for o in objects]
+    lines += shortened(named, MOST, "--json lists all")
+    lines += shortened([_edge_text(history, e) for e in merge.edges], MOST, "--json lists all")
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _place(history: History, place: int, size: int) -> str:
+    return f"{place_name(history, place)}, {counted(size, 'keyframe')}"
+
+
+def _edge_text(history: History, edge: EdgeChange) -> str:
+    a, b = place_name(history, edge.a), place_name(history, edge.b)
+    return f"edge      {a} – {b}: {edge.before:,} → {counted(edge.after, 'shared transition')}"
+
+
+def search_text(search: Search, *, most: int | None) -> str:
+    """When it turned true and what made it, with the values on both sides; then other turns."""
+    lines = [_verdict(search)]
+    if search.found is not None:
+        lines += _values(search.found)
+    else:
+        lines += [f"  {name}: {_value(value)} at the end" for name, value in search.at_end]
+    others = [turn for turn in search.turns if turn is not search.found]
+    lines += shortened([_turn(turn) for turn in others], most, "--json lists all")
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _verdict(search: Search) -> str:
+    if search.found is not None:
+        cause = search.found.cause
+        return (
+            f"became true at offset {cause.offset:,} ({cause.title}), "
+            f"shows from --at {cause.offset + 1}"
+        )
+    span = f"from --at {search.start} to {search.end}"
+    if search.holds[0] and search.holds[1] and not search.turns:
+        return f"true all along {span}"
+    if search.holds[0]:
+        return f"true at --at {search.start}, then false; it does not become true again {span}"
+    return f"never true {span}"
+
+
+def _values(turn: Turn) -> list[str]:
+    after = dict(turn.after)
+    return [
+        f"  {name}: {_value(value)} → {_value(after[name])}"
+        if value != after[name]
+        else f"  {name}: {_value(value)}, before and after"
+        for name, value in turn.before
+    ]
+
+
+def _turn(turn: Turn) -> str:
+    word = "true" if turn.becomes else "false"
+    cause = turn.cause
+    return f"  turned {word} at offset {cause.offset:,} ({cause.title})"
+
+
+def _value(value: object) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return "none" if value is None else str(value)
+
+
+def story_text(story: Story) -> str:
+    """The story, one entry a line: offset, time, what happened."""
+    subject = story.subject if story.kind == "same" else f"{story.kind} {story.subject}"
+    lines = [f"{subject}: {story.summary}"]
+    width = max((len(f"{e.cause.offset:,}") for e in story.entries), default=1)
+    for entry in story.entries:
+        time = entry.cause.when
+        lines.append(f"  {entry.cause.offset:>{width},}  {time}  {entry.text}")
+    return "".join(f"{line}\n" for line in lines)
+
+
+_HEADER = ("settings", "places", "noise", "merges", "objects", "places ARI", "objects ARI")
+_TRUTH_HEADER = ("rooms V", "instances V")
+WHATIF_HINT = "--json lists all"
+
+
+def whatif_text(found: WhatIf, *, most: int | None) -> str:
+    """The table, and below it which places split and joined, ``most`` of them per setting."""
+    truth = found.base.outcome.scores is not None
+    header = (*_HEADER, *_TRUTH_HEADER) if truth else _HEADER
+    rows = [_row(each, truth=truth) for each in found.all]
+    lines = [line for each in found.alternatives for line in _differences(each, most)]
+    return table(header, rows, right=header[1:]) + "".join(f"{x}\n" for x in lines)
+
+
+def _row(each: Alternative, *, truth: bool) -> tuple[str, ...]:
+    counts = each.outcome.counts
+    row = (
+        each.name,
+        f"{counts['places']:,}",
+        f"{counts['noise']:,}",
+        f"{each.outcome.merges:,}",
+        f"{counts['objects']:,}",
+        f"{float(each.places.adjusted_rand):.3f}",
+        f"{float(each.objects.adjusted_rand):.3f}",
+    )
+    return (*row, *_scores(each)) if truth else row
+
+
+def _scores(each: Alternative) -> tuple[str, ...]:
+    scores = each.outcome.scores or {}
+    return tuple(
+        f"{scores[table]['v_measure']:.3f}" if scores[table][scored] else "-"
+        for table, scored in (("places", "keyframes"), ("objects", "observations"))
+    )
+
+
+def _differences(each: Alternative, most: int | None) -> Iterator[str]:
+    yield ""
+    yield f"{each.name}: {_partings(each)}"
+    splits = [f"  {_split(found)}" for found in each.places.splits]
+    joins = [f"  {_join(found)}" for found in each.places.joins]
+    yield from shortened([*splits, *joins], most, WHATIF_HINT)
+
+
+def _partings(each: Alternative) -> str:
+    if each.parted_places is None and each.parted_objects is None:
+        return "the same map, event by event"
+    return "; ".join(
+        _parting(what, offset, same=compared.same)
+        for what, offset, compared in (
+            ("places", each.parted_places, each.places),
+            ("objects", each.parted_objects, each.objects),
+        )
+    )
+
+
+def _parting(what: str, offset: int | None, *, same: bool) -> str:
+    if offset is None:
+        return f"{what} are the same"
+    return f"{what} part ways at offset {offset:,}" + (" and end the same" if same else "")
+
+
+def _split(found: Regrouping) -> str:
+    return f"{found.group} splits into {_pieces(found)}"
+
+
+def _join(found: Regrouping) -> str:
+    return f"{found.group} joins {_pieces(found)}"
+
+
+def _pieces(found: Regrouping) -> str:
+    shown = [f"{p.group or 'noise'} ({p.count:,})" for p in found.pieces]
+    return ", ".join(shown[:8]) + (f" and {len(shown) - 8} more" if len(shown) > 8 else "")

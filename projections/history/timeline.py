@@ -1,0 +1,214 @@
+"""One log under one setting, and every moment of its map.
+
+A timeline folds its log once, when something is first asked, and keeps the history; after that
+every question is a look-up. An event at offset o, and a merge it causes, shows in ``at(o + 1)``.
+"""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TypeAlias
+
+from eventsrc.log import LogReader
+from eventsrc.text import counted
+from projections.errors import WhenceError
+from projections.model.digest import map_digest
+from projections.model.fold import AHEAD, FoldedEvent, fold_events, fold_log_cached, no_cycle_search
+from projections.model.snapshot_cache import SnapshotCache
+from projections.model.view import MapView
+from projections.reducers.semantic_map import SemanticMap
+from projections.settings import Settings
+
+from .bisect import HistoryFacts, Search, Searcher, Tallies
+from .conditions import Expression
+from .diff import Difference, difference_of, rows_of
+from .history import History
+from .moments import view_at
+from .records import Cause, Merge
+from .same_place import NoSuchThing, find_keyframe, find_object, find_place, same_story
+from .stories import object_story, place_story
+from .story import Story, place_name
+
+Progress: TypeAlias = Callable[[int, int], None]
+"""Told (events folded, events in all) from time to time."""
+
+_PROGRESS_EVERY = 500
+
+
+class Timeline:
+    """A context manager over a log; questions at an ``end``: the map after that many events.
+
+    ``progress`` is told while events are folded, ``note`` of snapshots that could not be used.
+    """
+
+    def __init__(
+        self,
+        log: Path,
+        settings: Settings | None = None,
+        *,
+        progress: Progress | None = None,
+        note: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self.settings = settings or Settings()
+        self.reader = LogReader(log)
+        self._progress = progress
+        self._note = note
+        self._asked_before = False
+        self._map = SemanticMap(self.settings)
+        self._latest = MapView(self.settings, keep_embeddings=False)
+        self._history = History(self.settings)
+        self._tallies: Tallies | None = None
+
+    def __enter__(self) -> "Timeline":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.reader.close()
+
+    @property
+    def end(self) -> int:
+        """The number of events in the log as of opening or the last `refresh`."""
+        return self.reader.next_offset
+
+    def refresh(self) -> int:
+        """Take in what was recorded since; the new `end`."""
+        return self.reader.refresh()
+
+    @property
+    def history(self) -> History:
+        """What happened so far; folds what is not folded yet. Raises FoldError at a bad event."""
+        if self._history.next_offset < self.end:
+            self._tallies = None
+            with no_cycle_search():
+                self._fold_to(self.end)
+        return self._history
+
+    def at(self, end: int | None = None) -> MapView:
+        """The map after the first ``end`` events, all of them for None; yours to change.
+
+        Its observations carry no embeddings, only their checksums. The first time it is taken from
+        the nearest snapshot beside the log, if there is one; who asks again gets the history
+        folded, and from then on it is a look-up.
+        """
+        wanted = self._end(end)
+        if self._history.next_offset < wanted and not self._asked_before:
+            self._asked_before = True
+            if (view := self._from_snapshot(wanted)) is not None:
+                return view
+        history = self.history
+        with no_cycle_search():
+            return view_at(history, self._latest, wanted, self.settings)
+
+    def deltas(self, start: int = 0, end: int | None = None) -> Iterator[FoldedEvent]:
+        """What each event from ``start`` to before ``end`` changed, by a fold of its own that
+        starts from the nearest snapshot."""
+        found = self._snapshots().latest(self._end(start))
+        semantic_map = SemanticMap(self.settings) if found is None else found[0]
+        events = self.reader.read(semantic_map.next_offset, self._end(end))
+        folded = fold_events(events, semantic_map, ahead=AHEAD)
+        return (event for event in folded if event.offset >= start)
+
+    def merges(self, end: int | None = None) -> list[Merge]:
+        """Every merge of places by the first ``end`` events, in order."""
+        before = self._end(end)
+        return [merge for merge in self.history.merges if merge.cause.offset < before]
+
+    def why(self, thing: str, end: int | None = None) -> Story:
+        """The chronicle of a place or an object; raises NoSuchThing with the nearest names."""
+        history = self.history
+        if thing in history.object_numbers:
+            life = find_object(history, thing)
+            det_ids = [self._latest.observations[seen.observation].det_id for seen in life.seen]
+            return object_story(history, det_ids, life, self._end(end))
+        if thing not in history.place_numbers and thing.startswith("obj-"):
+            raise NoSuchThing("object", thing, history.object_numbers)
+        return place_story(history, find_place(history, thing), self._end(end))
+
+    def why_same(self, first: str, second: str, end: int | None = None) -> Story:
+        """Since when, and by which merges, two keyframes (``run:keyframe``) are in one place."""
+        a, b = (find_keyframe(self.history, text) for text in (first, second))
+        return same_story(self.history, a, b, self._end(end))
+
+    def diff(self, start: int, end: int | None = None) -> Difference:
+        """What turns the map after ``start`` events into that after ``end``."""
+        last = self._end(end)
+        before, after = self.at(start), self.at(last)
+        return difference_of(
+            start,
+            last,
+            (rows_of(before), rows_of(after)),
+            (map_digest(before), map_digest(after)),
+            (before.counts(), after.counts()),
+            self._absorbed(start, last),
+        )
+
+    def facts(self, end: int | None = None) -> HistoryFacts:
+        """The map after ``end`` events as expressions ask it."""
+        history = self.history
+        if self._tallies is None:
+            self._tallies = Tallies(history)
+        return HistoryFacts(history, self._tallies, self._end(end))
+
+    def bisect(
+        self,
+        expression: Expression | str,
+        start: int = 0,
+        end: int | None = None,
+        *,
+        scan: bool = False,
+    ) -> Search:
+        """The first event from ``start`` on that made a condition true; with ``scan``, all turns.
+
+        Raises ExpressionError for a text that cannot be read or names what is not in the log.
+        """
+        asked = Expression(expression) if isinstance(expression, str) else expression
+        facts = self.facts(end)
+        if self._end(start) > facts.end:
+            raise WhenceError(f"from {start} to {facts.end} nothing happens; swap them")
+        self._check_names(asked, facts)
+        return Searcher(asked, facts, self.history.cause_at).search(start, facts.end, scan=scan)
+
+    def _end(self, end: int | None) -> int:
+        if end is None:
+            return self.end
+        if not 0 <= end <= self.end:
+            raise WhenceError(
+                f"{end} is no point in {self.reader.path}, which holds "
+                f"{counted(self.end, 'event')}; give 0 to {self.end}"
+            )
+        return end
+
+    def _fold_to(self, end: int) -> None:
+        events = self.reader.read(self._history.next_offset, end)
+        for folded in fold_events(events, self._map, ahead=AHEAD):
+            self._latest.apply_event(folded.offset, folded.deltas)
+            self._history.apply(folded.offset, folded.deltas)
+            if self._progress and folded.offset % _PROGRESS_EVERY == 0:
+                self._progress(folded.offset, end)
+        if self._progress:
+            self._progress(end, end)
+
+    def _from_snapshot(self, end: int) -> MapView | None:
+        """The map at ``end`` from the nearest snapshot; None when there is none below."""
+        if not any(offset <= end for offset in self._snapshots().offsets()):
+            return None
+        return fold_log_cached(self.reader, self.settings, end, note=self._note)[1]
+
+    def _snapshots(self) -> SnapshotCache:
+        return SnapshotCache(self.reader.path, self.reader.log_id, self.settings, self._note)
+
+    def _check_names(self, expression: Expression, facts: HistoryFacts) -> None:
+        """A misspelt id would make any condition quietly false; say so instead."""
+        for mention in expression.mentions():
+            names = facts.names(mention.kind)
+            if mention.text not in names:
+                error = NoSuchThing(mention.kind.value, mention.text, names)
+                raise expression.error_at(mention.column, str(error))
+
+    def _absorbed(self, start: int, end: int) -> dict[str, tuple[str, Cause]]:
+        history = self.history
+        return {
+            place_name(history, place): (place_name(history, merge.survivor), merge.cause)
+            for merge in history.merges
+            if start <= merge.cause.offset < end
+            for place in merge.absorbed
+        }

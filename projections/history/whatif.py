@@ -1,0 +1,192 @@
+"""What would have become of a log under other settings, side by side with what it is.
+
+Which settings a what-if tries: from ``--set``, ``--try`` and ``--grid`` to `Settings`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from projections.errors import SettingsError
+from projections.evaluate.truth import Truth
+from projections.model.partitions import PartitionComparison, Regrouping, compare_partitions
+from projections.settings import Settings
+
+from .outcome import Outcome, objects_part, places_part
+from .parallel import Progress, fold_all
+
+MOST_ALTERNATIVES = 200
+
+
+def alternatives(
+    base: Settings, sets: Sequence[str], tries: Sequence[str], grids: Sequence[str]
+) -> list[Settings]:
+    """The settings to try beside ``base``, each once, in the order given.
+
+    ``sets`` together make one alternative (``eps_m=1.0``), and hold for all of the grid; each of
+    ``tries`` is one of its own, several assignments in it parted by spaces or commas; ``grids``
+    (``eps_m=0.5,1.0``) make every combination. Raises SettingsError that names the bad one.
+    """
+    common = base.with_assignments(sets)
+    axes = [_axis(text) for text in grids]
+    size = len(tries)
+    for axis in axes:
+        size = max(size, 1) * len(axis)
+    if size > MOST_ALTERNATIVES:
+        raise SettingsError(f"--grid: {size:,} combinations; try at most {MOST_ALTERNATIVES}")
+    found = [common] if sets and not axes else []
+    found += [assigned(base, text, "--try") for text in tries]
+    if axes:
+        found += [common.with_assignments(each, "--grid") for each in product(*axes)]
+    return list(dict.fromkeys(found))
+
+
+def assigned(settings: Settings, text: str, option: str) -> Settings:
+    """``settings`` changed by several assignments in the text of an option, parted by spaces or
+    commas."""
+    return settings.with_assignments(text.replace(",", " ").split(), option)
+
+
+def _axis(text: str) -> list[str]:
+    """``eps_m=0.5,1.0`` → ``eps_m=0.5``, ``eps_m=1.0``."""
+    name, equals, values = text.partition("=")
+    if not equals or not values.strip():
+        raise SettingsError(f"--grid {text}: write it as name=value,value such as eps_m=0.5,1.0")
+    return [f"{name}={value}" for value in values.split(",")]
+
+
+def changed_settings(base: Settings, other: Settings) -> dict[str, object]:
+    """The settings in which ``other`` differs from ``base``, with its values."""
+    before = base.model_dump()
+    return {name: value for name, value in other.model_dump().items() if value != before[name]}
+
+
+def settings_name(base: Settings, other: Settings) -> str:
+    """``eps_m=1.0 min_samples=8``: what is different from the base."""
+    changed = changed_settings(base, other)
+    return " ".join(f"{name}={value}" for name, value in changed.items()) or "no change"
+
+
+@dataclass(frozen=True, slots=True)
+class Alternative:
+    """One alternative beside the base: how its places and objects differ, and since which event.
+
+    ``parted_places`` and ``parted_objects`` are offsets of the first event after which they are
+    different, None for never.
+    """
+
+    name: str
+    outcome: Outcome
+    places: PartitionComparison
+    objects: PartitionComparison
+    parted_places: int | None
+    parted_objects: int | None
+
+    @property
+    def same(self) -> bool:
+        """Whether the map is the base's."""
+        return self.places.same and self.objects.same
+
+
+@dataclass(frozen=True, slots=True)
+class WhatIf:
+    """The base first, then its alternatives; all of the first ``end`` events of one log."""
+
+    end: int
+    base: Alternative
+    alternatives: tuple[Alternative, ...]
+
+    @property
+    def all(self) -> tuple[Alternative, ...]:
+        """The base and its alternatives."""
+        return (self.base, *self.alternatives)
+
+    def document(self) -> dict[str, Any]:
+        """JSON: settings in full for the base, changed ones for each alternative."""
+        base = self.base.outcome.settings
+        return {
+            "events": self.end,
+            "settings": base.model_dump(),
+            "base": _document(self.base, base),
+            "alternatives": [_document(each, base) for each in self.alternatives],
+        }
+
+
+def what_if(
+    log: Path,
+    base: Settings,
+    others: Sequence[Settings],
+    end: int,
+    *,
+    truth: Truth | None = None,
+    processes: int | None = None,
+    progress: Progress | None = None,
+    keep_views: bool = False,
+) -> WhatIf:
+    """Fold the first ``end`` events of a log under ``base`` and ``others``, and compare.
+
+    A setting that stands several times is folded once. With ``keep_views`` each outcome has its
+    map too.
+    """
+    wanted = list(dict.fromkeys((base, *others)))
+    folded = fold_all(
+        log, wanted, end,
+        truth=truth, processes=processes, progress=progress, keep_views=keep_views,
+    )  # fmt: skip
+    outcomes = dict(zip(wanted, folded, strict=True))
+    first = outcomes[base]
+    changed = base != Settings()
+    base_name = f"base: {settings_name(Settings(), base) if changed else 'defaults'}"
+    return WhatIf(
+        end=end,
+        base=_compare(first, first, base_name),
+        alternatives=tuple(
+            _compare(first, outcomes[each], settings_name(base, each)) for each in others
+        ),
+    )
+
+
+def _compare(base: Outcome, other: Outcome, name: str) -> Alternative:
+    posed = base.posed
+    return Alternative(
+        name=name,
+        outcome=other,
+        places=compare_partitions(
+            [base.places[k] for k in posed], [other.places[k] for k in posed]
+        ),
+        objects=compare_partitions(base.objects, other.objects),
+        parted_places=places_part(base, other),
+        parted_objects=objects_part(base, other),
+    )
+
+
+def _document(each: Alternative, base: Settings) -> dict[str, Any]:
+    outcome, counts = each.outcome, each.outcome.counts
+    return {
+        "set": changed_settings(base, outcome.settings),
+        "digest": outcome.digest,
+        "places": counts["places"],
+        "noise": counts["noise"],
+        "merges": outcome.merges,
+        "objects": counts["objects"],
+        "same": each.same,
+        "places_adjusted_rand": float(each.places.adjusted_rand),
+        "objects_adjusted_rand": float(each.objects.adjusted_rand),
+        "places_part_at": each.parted_places,
+        "objects_part_at": each.parted_objects,
+        "places_split": [_regrouping(found) for found in each.places.splits],
+        "places_joined": [_regrouping(found) for found in each.places.joins],
+        "objects_split": len(each.objects.splits),
+        "objects_joined": len(each.objects.joins),
+        "truth": outcome.scores,
+        "fold_seconds": round(outcome.seconds, 3),
+    }
+
+
+def _regrouping(found: Regrouping) -> dict[str, Any]:
+    return {
+        "place_id": found.group,
+        "pieces": [{"place_id": p.group, "keyframes": p.count} for p in found.pieces],
+    }

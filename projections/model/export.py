@@ -1,0 +1,135 @@
+"""A map as one JSON document, ``mapfold state --json`` (DESIGN section 8).
+
+A map in a few lines for people, what ``mapfold state`` prints.
+"""
+
+from typing import Any
+
+from eventsrc.text import counted
+from projections.settings import Settings
+
+from .view import MapView
+
+
+def state_document(view: MapView, digest: str) -> dict[str, Any]:
+    """The document. Every list is in the order in which the fold met or founded its things."""
+    return {
+        "offset": view.next_offset,
+        "settings": view.settings.model_dump(),
+        "digest": digest,
+        "counts": view.counts(),
+        "keyframes": _keyframes(view),
+        "places": _places(view),
+        "objects": _objects(view),
+        "adjacency": [
+            {"a": view.place_id(a), "b": view.place_id(b), "shared_transitions": transitions}
+            for a, b, transitions in view.edges()
+        ],
+    }
+
+
+def _keyframes(view: MapView) -> list[dict[str, Any]]:
+    return [
+        {
+            "run_id": k.run_id,
+            "keyframe_id": k.keyframe_id,
+            "map_x": None if k.pose is None else k.pose.x_m,
+            "map_y": None if k.pose is None else k.pose.y_m,
+            "map_yaw": None if k.pose is None else k.pose.yaw_rad,
+            "place_id": view.place_id(k.place),
+        }
+        for k in view.keyframes
+    ]
+
+
+def _places(view: MapView) -> list[dict[str, Any]]:
+    return [
+        {
+            "place_id": p.place_id,
+            "centroid_x": p.centroid_x,
+            "centroid_y": p.centroid_y,
+            "keyframe_count": p.keyframe_count,
+        }
+        for p in view.places.values()
+    ]
+
+
+def _objects(view: MapView) -> list[dict[str, Any]]:
+    return [
+        {
+            "object_id": o.object_id,
+            "class_name": o.class_name,
+            "mean_x": o.mean_x,
+            "mean_y": o.mean_y,
+            "obs_count": o.obs_count,
+            "place_id": view.place_id(o.place),
+            "first_seen": o.first_seen,
+            "last_seen": o.last_seen,
+            "det_ids": [view.observations[i].det_id for i in o.observations],
+        }
+        for o in view.objects
+    ]
+
+
+_MOST = 40
+
+
+def state_text(view: MapView, digest: str) -> str:
+    """The text, with a newline at its end."""
+    lines = [
+        f"after {counted(view.next_offset, 'event')}: {_counts(view)}",
+        f"settings {_settings(view.settings)}",
+        f"digest   {digest}",
+    ]
+    lines += _place_lines(view)
+    return "\n".join(lines) + "\n"
+
+
+def _counts(view: MapView) -> str:
+    counts = view.counts()
+    words = ("run", "keyframe", "observation", "object", "place")
+    text = ", ".join(counted(counts[f"{word}s"], word) for word in words)
+    rare = {
+        "noise": "{} in no place",
+        "duplicates": "{} seen twice",
+        "conflicts": "{} with other content ignored",
+        "det_ids_reused": "{} left out for a det_id used before",
+        "foreign_embeddings": "{} of another embedding space",
+    }
+    things = {"det_ids_reused": "observation", "foreign_embeddings": "observation"}
+    for key, told in rare.items():
+        if counts[key]:
+            text += ", " + told.format(counted(counts[key], things.get(key, "keyframe")))
+    return text
+
+
+def _settings(settings: Settings) -> str:
+    default = Settings().model_dump()
+    changed = {k: v for k, v in settings.model_dump().items() if v != default[k]}
+    shown = changed or {k: v for k, v in default.items() if v is not None}
+    text = ", ".join(f"{name}={value}" for name, value in shown.items())
+    return text if changed else f"default: {text}"
+
+
+def _place_lines(view: MapView) -> list[str]:
+    if not view.places:
+        return ["no places yet"]
+    neighbours: dict[int, list[str]] = {place: [] for place in view.places}
+    for a, b, transitions in view.edges():
+        neighbours[a].append(f"{view.place_id(b)} ×{transitions}")
+        neighbours[b].append(f"{view.place_id(a)} ×{transitions}")
+    objects = dict.fromkeys(view.places, 0)
+    for found in view.objects:
+        if found.place is not None:
+            objects[found.place] += 1
+    width = max(len(place.place_id) for place in view.places.values())
+    lines = [f"{'place':<{width}}  keyframes  objects  centroid (m)        next to"]
+    for ordinal, place in list(view.places.items())[:_MOST]:
+        centroid = f"({place.centroid_x:.2f}, {place.centroid_y:.2f})"
+        lines.append(
+            f"{place.place_id:<{width}}  {place.keyframe_count:>9}  {objects[ordinal]:>7}  "
+            f"{centroid:<18}  {', '.join(neighbours[ordinal])}".rstrip()
+        )
+    if len(view.places) > _MOST:
+        lines.append(f"… and {len(view.places) - _MOST} more places; --json lists all")
+    return lines

@@ -1,0 +1,312 @@
+"""A fold and its view as one container, and back.
+
+Named numpy arrays and JSON values as bytes, and back. No code is ever run to read one.
+
+    magic · SHA-256 of all that follows · zlib of (length of the index, index, arrays end to end)
+
+The index is JSON: the JSON values, and for each array its dtype, shape and place. Only plain
+number types are read; whatever else the bytes say is refused.
+
+A `MapView` as columns, and back. What the semantic map's own state says is not said again.
+"""
+
+import hashlib
+import json
+import math
+import zlib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from eventsrc.log import still_holds
+from projections.deltas import Pose
+from projections.exact import Neighbourhood
+from projections.reducers import part, prefixed
+from projections.reducers.semantic_map import SemanticMap
+from projections.settings import Settings
+
+from .view import KeyframeRecord, MapView, ObjectRecord, ObservationRecord, PlaceRecord, RunRecord
+
+MAGIC = b"mapfold snapshot 1\n"
+_TYPES = frozenset({"<i4", "<i8", "<f8", "|u1", "<u4", "|i1"})
+_LENGTH_BYTES = 8
+_MOST_UNFOLDED = 16
+_SMALL_BYTES = 64 * 1024 * 1024
+"""A snapshot that unfolds to more than this, and to more than so many times its size, is none of
+ours: those measured unfold to four times their size."""
+
+
+class NotAContainer(ValueError):
+    """These bytes are no container, or a damaged one; the message says how."""
+
+
+def pack(values: dict[str, Any]) -> bytes:
+    """The bytes of a container."""
+    plain: dict[str, Any] = {}
+    arrays: dict[str, tuple[str, tuple[int, ...], int]] = {}
+    blobs: list[bytes] = []
+    at = 0
+    for name, value in values.items():
+        if not isinstance(value, np.ndarray):
+            plain[name] = value
+            continue
+        little = value.astype(value.dtype.newbyteorder("<"), copy=False)
+        if little.dtype.str not in _TYPES:
+            raise TypeError(f"{name} is an array of {little.dtype.str}, which no snapshot holds")
+        blobs.append(little.tobytes())
+        arrays[name] = (little.dtype.str, little.shape, at)
+        at += len(blobs[-1])
+    index = json.dumps({"plain": plain, "arrays": arrays}, allow_nan=False).encode()
+    body = zlib.compress(b"".join([len(index).to_bytes(_LENGTH_BYTES, "little"), index, *blobs]), 1)
+    return MAGIC + hashlib.sha256(body).digest() + body
+
+
+def unpack(data: bytes) -> dict[str, Any]:
+    """What `pack` was given. Raises NotAContainer."""
+    head = len(MAGIC) + hashlib.sha256().digest_size
+    if not data.startswith(MAGIC):
+        raise NotAContainer("it does not begin like a snapshot of this version")
+    body = data[head:]
+    if hashlib.sha256(body).digest() != data[len(MAGIC) : head]:
+        raise NotAContainer("its checksum does not match")
+    content = _decompress(body)
+    start = _LENGTH_BYTES + int.from_bytes(content[:_LENGTH_BYTES], "little")
+    index = json.loads(content[_LENGTH_BYTES:start])
+    values: dict[str, Any] = index["plain"]
+    for name, (dtype, shape, at) in index["arrays"].items():
+        if dtype not in _TYPES:
+            raise NotAContainer(f"{name} is of the type {dtype!r}")
+        flat = np.frombuffer(content, dtype, math.prod(shape), start + at)
+        values[name] = flat.reshape(shape).copy()
+    return values
+
+
+def _decompress(body: bytes) -> bytes:
+    """At most as much as a snapshot may hold: the checksum is no proof against a forger."""
+    most = max(_SMALL_BYTES, _MOST_UNFOLDED * len(body))
+    stream = zlib.decompressobj()
+    content = stream.decompress(body, most)
+    if not stream.eof:
+        raise NotAContainer(f"it is torn, or unfolds to more than {most:,} bytes")
+    return content
+
+
+State = dict[str, Any]
+_NONE = -1
+
+
+def dump_view(view: MapView) -> State:
+    """Everything but settings and embeddings."""
+    return {
+        "next_offset": view.next_offset,
+        "skipped": view.skipped,
+        "runs": [[r.run_id, r.started_at, r.keyframe_count] for r in view.runs],
+        "adjacency": view.edges(),
+        **_dump_keyframes(view),
+        **_dump_observations(view),
+        "objects": [
+            [o.object_id, o.class_name, o.obs_count, o.sum_x_um, o.sum_y_um, o.place]
+            for o in view.objects
+        ],
+        "object_times": _floats([(o.first_seen, o.last_seen) for o in view.objects], 2),
+        "places": [
+            [
+                p.place_id,
+                p.founder,
+                p.founded_offset,
+                p.keyframe_count,
+                p.sum_x_um,
+                p.sum_y_um,
+                p.current().ordinal,
+            ]
+            for p in view.all_places
+        ],
+    }
+
+
+def load_view(view: MapView, state: State) -> None:
+    """Fill a new view with what `dump_view` gave."""
+    view.next_offset = state["next_offset"]
+    view.skipped = state["skipped"]
+    view.runs = [RunRecord(i, *row) for i, row in enumerate(state["runs"])]
+    view.adjacency = {(a, b): n for a, b, n in state["adjacency"]}
+    _load_places(view, state["places"])
+    _load_keyframes(view, state)
+    _load_objects(view, state)
+    _load_observations(view, state)
+
+
+def _floats(rows: list[Any], width: int) -> np.ndarray[Any, np.dtype[np.float64]]:
+    return np.array(rows, np.float64).reshape(-1, width)
+
+
+def _dump_keyframes(view: MapView) -> State:
+    rows = [
+        (k.offset, k.run, k.keyframe_id, _NONE if k.place is None else k.place)
+        for k in view.keyframes
+    ]
+    poses = [(k.ordinal, k.pose.x_um, k.pose.y_um) for k in view.keyframes if k.pose is not None]
+    yaws = [k.pose.yaw_rad for k in view.keyframes if k.pose is not None]
+    return {
+        "keyframes": np.array(rows, np.int64).reshape(-1, 4),
+        "timestamps": np.array([k.timestamp for k in view.keyframes], np.float64),
+        "poses": np.array(poses, np.int64).reshape(-1, 3),
+        "yaws": np.array(yaws, np.float64),
+    }
+
+
+def _load_keyframes(view: MapView, state: State) -> None:
+    poses = {
+        keyframe: Pose(x_um, y_um, yaw)
+        for (keyframe, x_um, y_um), yaw in zip(
+            state["poses"].tolist(), state["yaws"].tolist(), strict=True
+        )
+    }
+    rows = zip(state["keyframes"].tolist(), state["timestamps"].tolist(), strict=True)
+    for ordinal, ((offset, run, keyframe_id, place), timestamp) in enumerate(rows):
+        run_id = view.runs[run].run_id
+        pose = poses.get(ordinal)
+        record = KeyframeRecord(ordinal, offset, run, run_id, keyframe_id, timestamp, pose)
+        if place != _NONE:
+            record.joined = view.all_places[place]
+            record.joined.unordered_members.append(ordinal)
+        view.keyframes.append(record)
+
+
+def _dump_observations(view: MapView) -> State:
+    names = sorted({o.class_name for o in view.observations})
+    models = sorted({o.embedding_model or "" for o in view.observations})
+    name_at = {name: i for i, name in enumerate(names)}
+    model_at = {model: i for i, model in enumerate(models)}
+    rows = [
+        (
+            o.keyframe,
+            name_at[o.class_name],
+            _NONE if o.embedding_model is None else model_at[o.embedding_model],
+            _NONE if o.embedding_crc is None else o.embedding_crc,
+            o.foreign_space,
+            _NONE if o.object is None else o.object,
+            _NONE if o.similarity_q40 is None else o.similarity_q40,
+        )
+        for o in view.observations
+    ]
+    return {
+        "class_names": names,
+        "models": models,
+        "det_ids": [o.det_id for o in view.observations],
+        "observations": np.array(rows, np.int64).reshape(-1, 7),
+        "boxes": _floats([(o.confidence, *o.bbox) for o in view.observations], 5),
+    }
+
+
+def _load_observations(view: MapView, state: State) -> None:
+    names, models = state["class_names"], state["models"]
+    rows = zip(
+        state["det_ids"], state["observations"].tolist(), state["boxes"].tolist(), strict=True
+    )
+    for ordinal, (det_id, row, (confidence, *box)) in enumerate(rows):
+        keyframe, name, model, crc, is_foreign, fused, q40 = row
+        record = ObservationRecord(
+            ordinal,
+            keyframe,
+            det_id,
+            names[name],
+            confidence,
+            (box[0], box[1], box[2], box[3]),
+            None if model == _NONE else models[model],
+            None,
+            None if crc == _NONE else crc,
+            bool(is_foreign),
+        )
+        view.observations.append(record)
+        seer = view.keyframes[keyframe]
+        seer.observations = [*seer.observations, ordinal]
+        if fused != _NONE:
+            record.object, record.similarity_q40 = fused, q40
+            view.objects[fused].observations.append(ordinal)
+
+
+def _load_objects(view: MapView, state: State) -> None:
+    rows = zip(state["objects"], state["object_times"].tolist(), strict=True)
+    for ordinal, ((object_id, name, count, x_um, y_um, place), (first, last)) in enumerate(rows):
+        view.objects.append(
+            ObjectRecord(ordinal, object_id, name, count, x_um, y_um, first, last, place)
+        )
+
+
+def _load_places(view: MapView, rows: list[list[Any]]) -> None:
+    view.all_places = [PlaceRecord(i, *row[:-1]) for i, row in enumerate(rows)]
+    for place, row in zip(view.all_places, rows, strict=True):
+        if row[-1] == place.ordinal:
+            view.places[place.ordinal] = place
+        else:
+            place.survivor = view.all_places[row[-1]]
+
+
+FOLD_VERSION = 2
+"""Raise it with every change of the reducers after which the same log gives another map."""
+
+
+class SnapshotRefused(ValueError):
+    """A snapshot cannot be used here; the message says why."""
+
+
+def snapshot(
+    semantic_map: SemanticMap, view: MapView, log_id: str, segments: Sequence[str] = ()
+) -> bytes:
+    """Both, as of ``semantic_map.next_offset``; the view's embeddings are left out. ``segments`` is
+    the `eventsrc.log.lineage` of the events they were folded from."""
+    about = {
+        "fold_version": FOLD_VERSION,
+        "log_id": log_id,
+        "segments": list(segments),
+        "fingerprint": semantic_map.settings.fingerprint(),
+        "offset": semantic_map.next_offset,
+    }
+    return pack(
+        prefixed("about", about)
+        | prefixed("map", semantic_map.dump())
+        | prefixed("view", dump_view(view))
+    )
+
+
+def restore(
+    data: bytes,
+    settings: Settings,
+    log_id: str,
+    neighbourhood: Neighbourhood | None = None,
+    lineage_at: Callable[[int], Sequence[str]] = lambda _: (),
+) -> tuple[SemanticMap, MapView]:
+    """The fold and the view of `snapshot`, the view without embeddings. ``lineage_at`` tells what
+    the log's first events are in now. Raises SnapshotRefused, and what ``lineage_at`` raises."""
+    semantic_map = SemanticMap(settings, neighbourhood)
+    view = MapView(settings, keep_embeddings=False)
+    try:
+        state = unpack(data)
+        about = part("about", state)
+        _check(about, settings, log_id)
+        _check_lineage(about["segments"], lineage_at(about["offset"]))
+        semantic_map.load(part("map", state))
+        load_view(view, part("view", state))
+    except (NotAContainer, zlib.error) as error:
+        raise SnapshotRefused(str(error)) from None
+    except SnapshotRefused:
+        raise
+    except (LookupError, TypeError, AttributeError, ValueError, OverflowError) as error:
+        raise SnapshotRefused(f"its content does not fit together: {error!r}") from None
+    return semantic_map, view
+
+
+def _check(about: dict[str, Any], settings: Settings, log_id: str) -> None:
+    if about["fold_version"] != FOLD_VERSION:
+        raise SnapshotRefused(f"it is of fold version {about['fold_version']}, not {FOLD_VERSION}")
+    if about["log_id"] != log_id:
+        raise SnapshotRefused(f"it is of the log {about['log_id']}, not of {log_id}")
+    if about["fingerprint"] != settings.fingerprint():
+        raise SnapshotRefused("it was made with other settings")
+
+
+def _check_lineage(before: Sequence[str], now: Sequence[str]) -> None:
+    if not still_holds(before, now):
+        raise SnapshotRefused("the log has lost events since it was made")

@@ -1,0 +1,97 @@
+"""The cache of snapshots beside a log: ``<log>.snapshots/<fingerprint>-<offset>.map``.
+
+Files appear whole (written beside, then renamed) and are never changed. Anything that goes wrong
+with the cache is a note and a slower fold, never an error; a snapshot of events that the log has
+lost since, by recovery or deletion, is not used. It keeps a few snapshots for each
+setting: the newest, and others spread out below it.
+"""
+
+import os
+import re
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from eventsrc.log import lineage
+from projections.exact import Neighbourhood
+from projections.reducers.semantic_map import SemanticMap
+from projections.settings import Settings
+
+from .snapshot import SnapshotRefused, restore, snapshot
+from .view import MapView
+
+Note = Callable[[str], None]
+_NAME = re.compile(r"([0-9a-f]{16})-(\d{20})\.map")
+_KEEP = 6
+
+
+class SnapshotCache:
+    """Snapshots of one log under one set of settings. ``note`` is told what could not be used."""
+
+    def __init__(
+        self,
+        log: Path,
+        log_id: str,
+        settings: Settings,
+        note: Note,
+        neighbourhood: Neighbourhood | None = None,
+    ) -> None:
+        self.folder = log.with_name(f"{log.name}.snapshots")
+        self._lineage = partial(lineage, log)
+        self._log_id = log_id
+        self._settings = settings
+        self._note = note
+        self._neighbourhood = neighbourhood
+        self._unsound: set[Path] = set()
+
+    def offsets(self) -> list[int]:
+        """The offsets there are snapshots for, ascending."""
+        try:
+            names = [entry.name for entry in self.folder.iterdir()]
+        except OSError:  # none yet, or not ours to read
+            return []
+        found = [m for name in names if (m := _NAME.fullmatch(name))]
+        return sorted(int(m[2]) for m in found if m[1] == self._settings.fingerprint())
+
+    def latest(self, until: int) -> tuple[SemanticMap, MapView] | None:
+        """The fold and view at the highest offset ≤ ``until`` whose snapshot is sound."""
+        for offset in reversed([offset for offset in self.offsets() if offset <= until]):
+            path = self._path(offset)
+            try:
+                data = path.read_bytes()
+                found = restore(
+                    data, self._settings, self._log_id, self._neighbourhood, self._lineage
+                )
+            except (OSError, SnapshotRefused) as error:
+                self._note(f"{path}: this snapshot is not used: {error}; it is safe to delete")
+                self._unsound.add(path)
+                continue
+            if found[0].next_offset == offset:
+                return found
+            self._note(f"{path}: this snapshot is of another offset; it is safe to delete")
+            self._unsound.add(path)
+        return None
+
+    def keep(self, semantic_map: SemanticMap, view: MapView) -> None:
+        """Put a snapshot down for the map's offset, unless there is one that may be sound."""
+        path = self._path(semantic_map.next_offset)
+        beside = path.with_suffix(f".{os.getpid()}.part")
+        try:
+            self.folder.mkdir(exist_ok=True)
+            if not path.exists() or path in self._unsound:
+                segments = self._lineage(semantic_map.next_offset)
+                beside.write_bytes(snapshot(semantic_map, view, self._log_id, segments))
+                beside.replace(path)
+                self._thin_out()
+        except OSError as error:
+            self._note(f"{path}: no snapshot was kept: {error.strerror}")
+
+    def _path(self, offset: int) -> Path:
+        return self.folder / f"{self._settings.fingerprint()}-{offset:020d}.map"
+
+    def _thin_out(self) -> None:
+        """Drop, while there are too many, the one whose neighbours are closest together."""
+        offsets = self.offsets()
+        while len(offsets) > _KEEP:
+            gaps = [(offsets[i + 1] - offsets[i - 1], i) for i in range(1, len(offsets) - 1)]
+            self._path(offsets.pop(min(gaps)[1])).unlink(missing_ok=True)

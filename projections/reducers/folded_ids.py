@@ -1,0 +1,120 @@
+"""What has been folded already: keyframes by run, det_ids, and a fingerprint of each content.
+
+A ``(run_id, keyframe_id)`` met again is a *duplicate* if its content is the same and a *conflict*
+if not. Content is what an envelope says, not how: key order, white space and unknown fields do not
+matter, an id written out and the same id by default are the same.
+"""
+
+import hashlib
+import marshal
+from array import array
+from operator import attrgetter
+from zlib import crc32
+
+import numpy as np
+
+from eventsrc.ingest import Accepted
+from projections.reducers import State
+
+_DIGEST_BYTES = 16
+_said_of_it = attrgetter("class_name", "confidence", "bbox", "embedding_model")
+
+
+def content_digest(accepted: Accepted) -> bytes:
+    """16 bytes that are equal for envelopes of equal content, and else differ.
+
+    Vectors enter by a 32-bit checksum: hashing all their bytes would cost a tenth of the fold, to
+    tell a conflict from a duplicate in the one of 4 billion that differs in nothing but a vector.
+    """
+    envelope, checksum = accepted.envelope, 0
+    lengths: list[int | None] = []
+    for vector in accepted.vectors:
+        if vector is None:
+            lengths.append(None)
+        else:
+            checksum = crc32(vector.data, checksum)
+            lengths.append(len(vector))
+    said = (
+        (envelope.timestamp, envelope.map_x, envelope.map_y, envelope.map_yaw),
+        accepted.det_ids,
+        [*map(_said_of_it, envelope.detections)],
+        lengths,
+        checksum,
+    )
+    # Version 2 writes values and nothing of how this process holds them.
+    return hashlib.blake2b(marshal.dumps(said, 2), digest_size=_DIGEST_BYTES).digest()
+
+
+class Seen:
+    """Keyframes and det_ids folded so far. A run's and a keyframe's ordinal count from 0."""
+
+    def __init__(self) -> None:
+        self.runs: dict[str, int] = {}
+        self.started: list[float] = []
+        self.keyframes: list[dict[int, int]] = []  # per run: keyframe_id → ordinal
+        self.keyframe_ids = array("q")
+        self.run_of = array("i")
+        self.offsets = array("q")
+        self.digests = bytearray()
+        self.det_ids: dict[str, int] = {}  # → ordinal of its keyframe, in order of arrival
+
+    def run(self, run_id: str, timestamp: float) -> tuple[int, bool]:
+        """The run's ordinal, and whether it is new or turns out to have started earlier."""
+        run = self.runs.get(run_id)
+        if run is None:
+            run = self.runs[run_id] = len(self.runs)
+            self.started.append(timestamp)
+            self.keyframes.append({})
+            return run, True
+        if timestamp < self.started[run]:
+            self.started[run] = timestamp
+            return run, True
+        return run, False
+
+    def find(self, run_id: str, keyframe_id: int) -> int | None:
+        """The ordinal of a keyframe that was folded, else None."""
+        run = self.runs.get(run_id)
+        return None if run is None else self.keyframes[run].get(keyframe_id)
+
+    def add(self, run: int, keyframe_id: int, offset: int, digest: bytes) -> int:
+        """Number a new keyframe."""
+        keyframe = len(self.offsets)
+        self.keyframes[run][keyframe_id] = keyframe
+        self.keyframe_ids.append(keyframe_id)
+        self.run_of.append(run)
+        self.offsets.append(offset)
+        self.digests += digest
+        return keyframe
+
+    def digest_of(self, keyframe: int) -> bytes:
+        """The content digest of a folded keyframe."""
+        start = keyframe * _DIGEST_BYTES
+        return bytes(self.digests[start : start + _DIGEST_BYTES])
+
+    def dump(self) -> State:
+        """Everything, for a snapshot."""
+        return {
+            "runs": list(self.runs),
+            "started": self.started,
+            "keyframe_ids": np.array(self.keyframe_ids, np.int64),
+            "run_of": np.array(self.run_of, np.int32),
+            "offsets": np.array(self.offsets, np.int64),
+            "digests": np.frombuffer(bytes(self.digests), np.uint8),
+            "det_ids": list(self.det_ids),
+            "det_keyframes": np.array(list(self.det_ids.values()), np.int32),
+        }
+
+    def load(self, state: State) -> None:
+        """Take over what `dump` gave."""
+        self.runs = {run_id: run for run, run_id in enumerate(state["runs"])}
+        self.started = state["started"]
+        self.keyframe_ids = array("q", state["keyframe_ids"].tobytes())
+        self.run_of = array("i", state["run_of"].tobytes())
+        self.offsets = array("q", state["offsets"].tobytes())
+        self.digests = bytearray(state["digests"].tobytes())
+        self.det_ids = dict(zip(state["det_ids"], state["det_keyframes"].tolist(), strict=True))
+        self.keyframes = [{} for _ in self.runs]
+        for keyframe, (run, keyframe_id) in enumerate(
+            zip(self.run_of, self.keyframe_ids, strict=True)
+        ):
+            self.keyframes[run][keyframe_id] = keyframe
