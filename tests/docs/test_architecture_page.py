@@ -1,0 +1,26 @@
+"""The architecture page names files and layers that exist, and every package."""
+
+import re
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = (ROOT / "docs" / "architecture.md").read_text("utf-8")
+
+
+def test_every_file_it_names_exists() -> None:
+    files = re.findall(r"`((?:eventsrc|projections)/[\w/]+\.py)`", PAGE)
+    assert len(files) > 20
+    assert [file for file in files if not (ROOT / file).is_file()] == []
+
+
+def test_it_names_every_package_and_layer() -> None:
+    for package in ("eventsrc", "projections"):
+        for folder in (ROOT / package).iterdir():
+            if (folder / "__init__.py").is_file():
+                assert f"`{folder.name}/`" in PAGE, folder.name
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["importlinter"]
+    for contract in contracts["contracts"]:
+        for layer in contract.get("layers", ()):
+            for name in re.split(r"\s*[|:]\s*", layer):
+                assert f"`{name}`" in PAGE or f"`{name}/`" in PAGE, name
