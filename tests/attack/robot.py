@@ -26,6 +26,7 @@ class Robot:
         self.publisher = EnvelopePublisher(options, spool, resend_after_s=0.5)
         self.sent: set[bytes] = set()
         """Digests of all that was published."""
+        self._publishing = threading.Lock()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._publish)
 
@@ -35,17 +36,20 @@ class Robot:
 
     def publish(self) -> None:
         """Publish one more. Robots of one run id differ in what they say."""
-        number = len(self.sent)
-        document = envelope(number, run_id=self._run_id, robot=self._name, note="x" * 2_000)
-        payload = json.dumps(document).encode()
-        self._oracle.sent(payload)
-        self.sent.add(digest(payload))
-        self.publisher.publish(payload)
+        with self._publishing:
+            number = len(self.sent)
+            document = envelope(number, run_id=self._run_id, robot=self._name, note="x" * 2_000)
+            payload = json.dumps(document).encode()
+            self._oracle.sent(payload)
+            self.sent.add(digest(payload))
+            self.publisher.publish(payload)
 
     def note_acknowledged(self) -> None:
         """Tell the oracle what has left the spool. Call it when no recorder runs."""
-        waiting = {digest(s.payload) for s in self.publisher._spool.after(0, 2**62)}
-        self._oracle.acknowledged(set(self.sent) - waiting)
+        # What is counted as published and not in the spool yet would look acknowledged.
+        with self._publishing:
+            waiting = {digest(s.payload) for s in self.publisher._spool.after(0, 2**62)}
+            self._oracle.acknowledged(self.sent - waiting)
 
     def finish(self, timeout_s: float) -> bool:
         """Stop publishing; whether everything was acknowledged in time."""
