@@ -143,7 +143,7 @@ HUGE_FILES = [
     sealed_with_a_hole_before_its_footer,
     growing_with_a_bomb,
     rewritten_with_a_hole_before_its_end,
-    rewritten_with_a_bomb,
+    pytest.param(rewritten_with_a_bomb, marks=pytest.mark.slow),
 ]
 
 
@@ -175,6 +175,7 @@ def test_no_command_takes_much_memory_or_ends_in_a_traceback(
         assert kept[:EVENTS] == [envelope(k) for k in range(EVENTS)], "all that was recorded"
 
 
+@pytest.mark.slow
 def test_of_a_bomb_in_a_rewritten_segment_as_much_is_kept_as_one_holds(log_path: Path) -> None:
     """Empty messages at offsets that no other segment has, two hundred times the file's size."""
     write_log(log_path, [envelope(k) for k in range(3)])
