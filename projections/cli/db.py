@@ -1,5 +1,6 @@
 """``mapfold db``: the embedded server, and whether the databases still agree with the log."""
 
+import sys
 from dataclasses import asdict
 from typing import Annotated
 
@@ -51,6 +52,7 @@ def start(as_json: JsonOption = False) -> None:
         emit({"url": address, "data": str(server.data), "running": True, "kept": True})
         return
     display(address)
+    sys.stdout.flush()  # so that it comes before the line on stderr also where both are one pipe
     say(f"running, with its data in {server.data}; stop it with: mapfold db stop")
 
 
