@@ -164,7 +164,7 @@ def _write(path: Path, data: bytes) -> None:
 SAVE_EVERY: Final = 50_000
 """Events; they take a second or two to read."""
 _MANY: Final = 100_000
-"""Events that take seconds to read; below it nobody notices."""
+"""Events that take seconds to read. With fewer no line is printed."""
 
 
 class _Identity(BaseModel):

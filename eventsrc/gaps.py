@@ -15,7 +15,7 @@ The rules:
 * A publisher may say how far it has got. When it said so the settle time ago, and the run's highest
   recorded keyframe is still a lower one, what lies behind that is a hole too. At a recorder's end
   a younger statement is disregarded: what it speaks of may still be on its way. So is one of a run
-  of which nothing is recorded, because nobody knows where it begins.
+  of which nothing is recorded, because its beginning is unknown.
 
 A ledger is folded over a log from its start (or from a saved one) when a recorder opens it, so a
 hole between two recorders' lives is found like any other.

@@ -9,9 +9,9 @@ opcode byte, a u64 length and its content, all little-endian.
 
 The *commit mark* is ours: opcode 0x80, from the range the specification leaves to applications, so
 other readers skip it. Content: u64 first offset and u64 next offset of the chunk before it, and
-the CRC-32 of the record up to there, XORed with the random *mark seed* of its segment: whoever
-publishes bytes that look like a mark does not know the seed. It is written after that chunk is
-synced.
+the CRC-32 of the record up to there, XORed with the random *mark seed* of its segment: a robot
+that publishes bytes which look like a mark does not know the seed. It is written after that chunk
+is synced.
 """
 
 import struct

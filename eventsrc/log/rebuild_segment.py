@@ -1,11 +1,9 @@
 """A new sealed segment from what a scan found good, every offset accounted for.
 
 An event that is gone leaves a ``mapfold/loss`` event at its offset, cause ``rot``: offsets are what
-checkpoints, maps and people point at, so none may move, and a loss that stands in the log is seen
-by everybody who reads it. It has the times of the event before it, or else of the one behind it:
-when the log was recovered says nothing about when that was which is lost.
-
-When what is gone may have happened: as its neighbours did.
+checkpoints, maps and people point at, so none may move, and every reader of the log sees a loss
+that is in it. Timestamps of lost events are estimated from their neighbours: those of the event
+before, or else of the one behind; the time of the recovery says nothing about them.
 """
 
 import os
