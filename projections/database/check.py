@@ -28,7 +28,14 @@ from projections.settings import Settings
 
 from . import checkpoints as _checkpoint
 from .checkpoints import command
-from .connection import Connection, Targets, connect, database_errors, place, settle
+from .connection import (
+    Connection,
+    Targets,
+    connect,
+    database_errors,
+    describe_target,
+    pin_session_settings,
+)
 from .cypher_guard import PARENTS
 from .graph_render import Row, expected_rows
 from .labels import GRAPH, LABELS, TABLE, VERTEX_LABELS
@@ -165,18 +172,18 @@ def _check(log: Path, sink: SinkName, url: str, settings: Settings) -> CheckRepo
         connection.isolation_level = IsolationLevel.REPEATABLE_READ
         connection.read_only = True
         with database_errors(url):
-            settle(connection)
+            pin_session_settings(connection)
             connection.commit()
             held = _hold(connection, sink)
             checkpoint = _checkpoint.load(connection, sink)
             if checkpoint is None:
                 raise ProjectionMissing(
-                    f"{place(url)}: {_NONE[sink]} been projected there;"
+                    f"{describe_target(url)}: {_NONE[sink]} been projected there;"
                     f" run: {command('replay', log, settings)}"
                 )
             if not held:
-                raise gone(checkpoint, sink, place(url), log, settings)
-            refuse_misfit(checkpoint, sink, place(url), log, reader, settings)
+                raise gone(checkpoint, sink, describe_target(url), log, settings)
+            refuse_misfit(checkpoint, sink, describe_target(url), log, reader, settings)
             compare = _compare_graph if sink == "graph" else _compare_vectors
             compare(connection, reader, checkpoint, settings, tally)
             foreign = foreign_tables(connection) if sink == "graph" else ()

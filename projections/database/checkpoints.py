@@ -20,7 +20,7 @@ from eventsrc.log import Event
 from projections.errors import CheckpointMoved, DatabaseError, ProjectionBusy, ProjectionMismatch
 from projections.settings import Settings
 
-from .connection import Connection, place_of
+from .connection import Connection, describe_connection
 from .labels import GRAPH, LABELS, TABLE
 from .sink import Checkpoint, SinkName
 from .statements import statements
@@ -123,8 +123,8 @@ def lock_writer(connection: Connection, sink: SinkName) -> None:
     # The writer itself may run on any machine; what the database knows is its session.
     who = f" ({holder[1]}; PostgreSQL serves it in process {holder[0]})" if holder else ""
     raise ProjectionBusy(
-        f"{place_of(connection)}: another rebuild or tail{who} is writing the {sink} there;"
-        " wait for it or stop it"
+        f"{describe_connection(connection)}: another rebuild or tail{who} is writing the {sink}"
+        " there; wait for it or stop it"
     )
 
 
@@ -142,8 +142,8 @@ def has_store(connection: Connection) -> bool:
         return False
     if not str(row[0]).startswith(_MARK):
         raise DatabaseError(
-            f"{place_of(connection)}: has a schema mapfold that mapfold did not make; use another"
-            " database"
+            f"{describe_connection(connection)}: has a schema mapfold that mapfold did not make;"
+            " use another database"
         )
     return True
 
@@ -203,7 +203,7 @@ def advance(
         return after
     found = load(connection, sink)
     raise CheckpointMoved(
-        f"{place_of(connection)}: the checkpoint of the {sink} was expected at offset"
+        f"{describe_connection(connection)}: the checkpoint of the {sink} was expected at offset"
         f" {before.next_offset:,} of log {before.log_id}, but is"
         f" {f'at {found.next_offset:,} of log {found.log_id}' if found else 'gone'}: something else"
         " writes there; stop it, then start again"

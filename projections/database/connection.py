@@ -149,10 +149,10 @@ def connect(url: str, *, application: str = "mapfold", autocommit: bool = False)
         )
     except psycopg.Error as error:  # also a value in the URL that libpq finds wrong only now
         told = f"{_without_values(_first_line(error), url)}; {_advice(error, url)}"
-        raise DatabaseUnavailable(f"{place(url)}: {told}") from None
+        raise DatabaseUnavailable(f"{describe_target(url)}: {told}") from None
 
 
-def settle(connection: Connection) -> None:
+def pin_session_settings(connection: Connection) -> None:
     """Let the session take its time and mean what it says, whatever is set for others there.
 
     A rebuild folds for minutes between two statements, an index of many vectors takes longer, and a
@@ -186,8 +186,8 @@ def load_age(connection: Connection) -> None:
         connection.execute("SELECT ag_catalog.agtype_build_map()")
     except (psycopg.errors.InvalidSchemaName, psycopg.errors.UndefinedFunction):
         raise ExtensionMissing(
-            f"{place_of(connection)}: the extension age is not created there; run mapfold replay,"
-            " or have a superuser run CREATE EXTENSION age"
+            f"{describe_connection(connection)}: the extension age is not created there; run"
+            " mapfold replay, or have a superuser run CREATE EXTENSION age"
         ) from None
     except psycopg.errors.InsufficientPrivilege:
         raise ExtensionMissing(_may_not_use_age(connection)) from None
@@ -199,7 +199,7 @@ def ensure_extension(connection: Connection, name: LiteralString) -> str:
     version = extension_version(connection, name)
     if version is not None:
         return version
-    where = place_of(connection)
+    where = describe_connection(connection)
     try:
         with connection.transaction():
             # Writing the graph puts ag_catalog first on the search path, and there the operators of
@@ -228,7 +228,7 @@ def extension_version(connection: Connection, name: str) -> str | None:
     return None if row is None else str(row[0])
 
 
-def place(url: str) -> str:
+def describe_target(url: str) -> str:
     """Host, port and database of a URL or connection string: what a message may show."""
     try:
         parts = conninfo_to_dict(url)
@@ -239,9 +239,9 @@ def place(url: str) -> str:
     return f"database {parts.get('dbname') or parts.get('user') or 'default'} at {host}:{port}"
 
 
-def place_of(connection: Connection) -> str:
+def describe_connection(connection: Connection) -> str:
     """The same for an open connection."""
-    return place(connection.info.dsn)
+    return describe_target(connection.info.dsn)
 
 
 @contextlib.contextmanager
@@ -251,20 +251,21 @@ def database_errors(url: str) -> Iterator[None]:
         yield
     except psycopg.OperationalError as error:
         raise DatabaseUnavailable(
-            f"{place(url)}: {_first_line(error)}; {_advice(error, url)}"
+            f"{describe_target(url)}: {_first_line(error)}; {_advice(error, url)}"
         ) from error
     except psycopg.errors.InsufficientPrivilege as error:
         raise DatabaseError(
-            f"{place(url)}: {_first_line(error)}; grant it (docs/projections.md has the roles)"
+            f"{describe_target(url)}: {_first_line(error)}; grant it (docs/projections.md has the"
+            " roles)"
         ) from error
     except psycopg.Error as error:
-        raise DatabaseError(f"{place(url)}: {_first_line(error)}") from error
+        raise DatabaseError(f"{describe_target(url)}: {_first_line(error)}") from error
 
 
 def _may_not_use_age(connection: Connection) -> str:
     connection.rollback()
     user, version = connection.info.user, extension_version(connection, "age") or ""
-    told = f"{place_of(connection)}: user {user} may not use Apache AGE"
+    told = f"{describe_connection(connection)}: user {user} may not use Apache AGE"
     if enforces_row_security(version):
         return f"{told}; have a superuser run GRANT USAGE ON SCHEMA ag_catalog TO {user}"
     return (

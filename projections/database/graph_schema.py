@@ -15,7 +15,7 @@ from psycopg import sql
 from projections.errors import DatabaseError
 
 from . import swap as _leaving
-from .connection import Connection, place_of
+from .connection import Connection, describe_connection
 from .cypher_guard import PARENTS, guard
 from .labels import (
     CHANGING_EDGES,
@@ -41,8 +41,8 @@ def exists(connection: Connection, graph: str) -> bool:
         return False
     if not row[0] or not str(row[1]).startswith(_MARK):
         raise DatabaseError(
-            f"{place_of(connection)}: has a {'graph' if row[0] else 'schema'} {graph} that mapfold"
-            " did not make; rename or drop it, or use another database"
+            f"{describe_connection(connection)}: has a {'graph' if row[0] else 'schema'} {graph}"
+            " that mapfold did not make; rename or drop it, or use another database"
         )
     return True
 
@@ -64,8 +64,8 @@ def create(connection: Connection, graph: str) -> None:
     found: dict[str, int] = dict(connection.execute(run["label_ids"], {"graph": graph}).fetchall())
     if any(found.get(label) != number for label, number in LABEL_IDS.items()):
         raise DatabaseError(
-            f"{place_of(connection)}: this version of Apache AGE numbers labels in another way"
-            f" ({found}); use AGE 1.5 to 1.8"
+            f"{describe_connection(connection)}: this version of Apache AGE numbers labels in"
+            f" another way ({found}); use AGE 1.5 to 1.8"
         )
 
 

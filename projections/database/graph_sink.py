@@ -14,7 +14,7 @@ from . import grants as _readers
 from . import graph_schema as _graph_ddl
 from . import swap as _leaving
 from . import swap as _swap_guard
-from .connection import Connection, ensure_extension, place_of
+from .connection import Connection, describe_connection, ensure_extension
 from .graph_rows import GraphChanges, GraphRows, WholeGraph
 from .labels import (
     COUNT_KEYS,
@@ -142,7 +142,7 @@ class GraphSink:
         ]
         if wrong:
             raise DatabaseError(
-                f"{place_of(connection)}: the rebuilt graph does not match the map"
+                f"{describe_connection(connection)}: the rebuilt graph does not match the map"
                 f" ({'; '.join(wrong)}); the old one stays, please report this"
             )
         return found

@@ -16,7 +16,7 @@ from projections.settings import Settings
 
 from . import checkpoints as _checkpoint
 from .checkpoints import DeadLetter
-from .connection import Targets, connect, database_errors, place
+from .connection import Targets, connect, database_errors, describe_target
 from .origin import refuse_misfit
 from .rebuild import rebuild
 from .sink import SinkName
@@ -50,7 +50,7 @@ def _retry(
         checkpoint = _checkpoint.load(connection, sink)
         if checkpoint is None or not letters:
             return RetryReport(sink, 0, (), rebuilt=False)
-        refuse_misfit(checkpoint, sink, place(url), log, reader, settings)
+        refuse_misfit(checkpoint, sink, describe_target(url), log, reader, settings)
         still = tuple(_still_failing(reader, letters))
     if not still:
         rebuild(log, targets, settings, until=checkpoint.next_offset, only=sink)

@@ -16,7 +16,15 @@ from projections.settings import Settings
 
 from . import checkpoints as _checkpoint
 from .checkpoints import DeadLetter, command, remake
-from .connection import Connection, Targets, connect, database_errors, extension_version, place
+from .connection import (
+    Connection,
+    Targets,
+    connect,
+    database_errors,
+    describe_connection,
+    describe_target,
+    extension_version,
+)
 from .cypher_guard import unwanted_writers
 from .sink import Checkpoint, SinkName
 
@@ -89,13 +97,13 @@ def _status(
         with opened as connection, database_errors(url):
             return _look(connection, sink, log, log_id, end, settings)
     except DatabaseError as error:
-        return SinkStatus(sink, place(url), "unreachable", note=str(error))
+        return SinkStatus(sink, describe_target(url), "unreachable", note=str(error))
 
 
 def _look(
     connection: Connection, sink: SinkName, log: Path, log_id: str, end: int, settings: Settings
 ) -> SinkStatus:
-    where = place(connection.info.dsn)
+    where = describe_connection(connection)
     versions = _versions(connection)
     found = _checkpoint.load(connection, sink)
     writer = _checkpoint.writer_of(connection, sink)

@@ -11,7 +11,14 @@ from projections.errors import DatabaseError
 from projections.settings import Settings
 
 from . import checkpoints as _checkpoint
-from .connection import Connection, Targets, connect, database_errors, place, settle
+from .connection import (
+    Connection,
+    Targets,
+    connect,
+    database_errors,
+    describe_target,
+    pin_session_settings,
+)
 from .graph_sink import GraphSink
 from .loader import LoaderName
 from .sink import Sink, SinkName
@@ -32,7 +39,7 @@ class Store:
     @property
     def place(self) -> str:
         """Where it is, for messages."""
-        return place(self.url)
+        return describe_target(self.url)
 
     def reconnect(self) -> None:
         """Replace a lost connection; the sinks' locks are taken again."""
@@ -49,7 +56,7 @@ class Store:
         opened = connect(self.url, application=self.application, autocommit=True)
         with opened as connection, database_errors(self.url):
             connection.execute("SET client_min_messages = warning")
-            settle(connection)
+            pin_session_settings(connection)
             yield connection
 
     def do(self, job: Callable[[Connection], None]) -> None:
@@ -103,7 +110,7 @@ def _open(url: str, application: str, sinks: tuple[Sink[Any], ...]) -> Connectio
         with database_errors(url):
             # AGE and the schema commands talk; only what goes wrong is of interest.
             connection.execute("SET client_min_messages = warning")
-            settle(connection)
+            pin_session_settings(connection)
             for sink in sinks:
                 _checkpoint.lock_writer(connection, sink.name)
             _ensure_store(connection)
@@ -117,8 +124,8 @@ def _refuse_encoding(connection: Connection, url: str) -> None:
     encoding = connection.info.parameter_status("server_encoding")
     if encoding not in ("UTF8", "SQL_ASCII"):
         raise DatabaseError(
-            f"{place(url)}: its encoding is {encoding}, which cannot hold every name in a log; make"
-            " a database with createdb --encoding UTF8 --template template0"
+            f"{describe_target(url)}: its encoding is {encoding}, which cannot hold every name in"
+            " a log; make a database with createdb --encoding UTF8 --template template0"
         )
 
 

@@ -31,7 +31,7 @@ from projections.settings import Settings
 
 from . import checkpoints as _checkpoint
 from .checkpoints import DeadLetter, dead_letter, event_hash, remake
-from .connection import Targets, database_errors, place
+from .connection import Targets, database_errors, describe_target
 from .loader import LoaderName
 from .origin import gone, refuse_misfit
 from .progress import TailProgress, TailReport
@@ -264,7 +264,7 @@ def tail(
         except LostCommits:
             report.restarts += 1
             # What lost them may happen again while the next pass begins.
-            at = place(targets.graph_url)
+            at = describe_target(targets.graph_url)
             outage = Backoff(at, plan.stop, on_trouble, plan.patience_s)
 
 

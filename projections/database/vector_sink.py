@@ -25,7 +25,7 @@ from projections.model.view import MapView
 
 from . import grants as _readers
 from . import swap as _leaving
-from .connection import Connection, ensure_extension, extension_version, place_of
+from .connection import Connection, describe_connection, ensure_extension, extension_version
 from .labels import TABLE
 from .loader import InsertLoader, Load, Loader, LoaderName, loader_of
 from .sink import SinkName
@@ -136,8 +136,8 @@ class VectorSink:
         expected = sum(o.embedding_crc is not None for o in view.observations)
         if found != expected:
             raise DatabaseError(
-                f"{place_of(connection)}: the rebuilt table has {found} rows, the map {expected}"
-                " searchable detections; the old one stays, please report this"
+                f"{describe_connection(connection)}: the rebuilt table has {found} rows, the map"
+                f" {expected} searchable detections; the old one stays, please report this"
             )
         return {TABLE: found}
 
@@ -167,7 +167,7 @@ class VectorSink:
                 connection.execute(_statement("drop", _PUBLIC))
         except psycopg.errors.DependentObjectsStillExist as error:
             raise DatabaseError(
-                f"{place_of(connection)}: something else depends on {TABLE}"
+                f"{describe_connection(connection)}: something else depends on {TABLE}"
                 f" ({error.diag.message_detail}); drop it, then run the rebuild again"
             ) from None
 
@@ -176,8 +176,8 @@ class VectorSink:
         row = connection.execute(statements("vectors")["old_state"]).fetchone()
         if row is not None and not str(row[0]).startswith(_MARK):
             raise DatabaseError(
-                f"{place_of(connection)}: has a schema mapfold_old that mapfold did not make;"
-                " rename or drop it, or use another database"
+                f"{describe_connection(connection)}: has a schema mapfold_old that mapfold did not"
+                " make; rename or drop it, or use another database"
             )
         return row is not None
 
@@ -196,8 +196,8 @@ class VectorSink:
             return None
         if not str(row[0]).startswith(_MARK):
             raise DatabaseError(
-                f"{place_of(connection)}: has a table {TABLE} that mapfold did not make; rename or"
-                " drop it, or use another database"
+                f"{describe_connection(connection)}: has a table {TABLE} that mapfold did not"
+                " make; rename or drop it, or use another database"
             )
         return int(row[1])
 
@@ -217,7 +217,8 @@ class VectorSink:
         row = connection.execute(statements("vectors")["is_owner"]).fetchone()
         if row is not None and not row[0]:
             raise DatabaseError(
-                f"{place_of(connection)}: the map's embeddings have {dimension} dimensions,"
+                f"{describe_connection(connection)}: the map's embeddings have {dimension}"
+                " dimensions,"
                 f" {TABLE} is for {self._dimension}, and only its owner may change that; have the"
                 " owner run mapfold replay, then start again"
             )

@@ -11,7 +11,7 @@ from typing import Any
 
 import psycopg
 
-from projections.database.connection import Connection, database_errors, place_of
+from projections.database.connection import Connection, database_errors, describe_connection
 from projections.database.graph_render import text
 from projections.database.statements import statements, tables
 from projections.errors import ProjectionMissing
@@ -81,7 +81,8 @@ def _rows(connection: Connection, name: str, **values: Any) -> list[Any]:
             return connection.execute(statement, values).fetchall()
         except (psycopg.errors.UndefinedTable, psycopg.errors.InvalidSchemaName):
             raise ProjectionMissing(
-                f"{place_of(connection)}: nothing has been projected there yet; run mapfold replay"
+                f"{describe_connection(connection)}: nothing has been projected there yet; run"
+                " mapfold replay"
             ) from None
 
 

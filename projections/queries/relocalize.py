@@ -20,7 +20,13 @@ import psycopg
 from pgvector.psycopg import register_vector
 from psycopg import sql
 
-from projections.database.connection import Connection, Targets, connect, database_errors, place_of
+from projections.database.connection import (
+    Connection,
+    Targets,
+    connect,
+    database_errors,
+    describe_connection,
+)
 from projections.database.labels import LABEL_IDS
 from projections.database.statements import statements, tables
 from projections.errors import (
@@ -104,8 +110,8 @@ def prepare_vectors(connection: Connection) -> None:
         register_vector(connection)
     except psycopg.ProgrammingError:
         raise ExtensionMissing(
-            f"{place_of(connection)}: nothing has been projected there yet, not even the extension"
-            " vector is created; run mapfold replay"
+            f"{describe_connection(connection)}: nothing has been projected there yet, not even"
+            " the extension vector is created; run mapfold replay"
         ) from None
     connection.execute("SELECT '[1]'::vector")  # loads the library, whose settings come next
     connection.execute(sql.SQL("SET hnsw.ef_search = {}").format(sql.Literal(_EF_SEARCH)))
@@ -165,7 +171,9 @@ def fetch(
     along = {row[1]: row[_NEAR:] for row in rows} if one else _along(graph, near)
     if near:
         first = along.get(near[0][1], (None,))
-        refuse_mixed(near[0][-1], first[-1], place_of(vectors), place_of(graph))
+        refuse_mixed(
+            near[0][-1], first[-1], describe_connection(vectors), describe_connection(graph)
+        )
     return _assemble(len(crops), near, along)
 
 
@@ -246,7 +254,8 @@ def _clear_errors(connection: Connection) -> Iterator[None]:
             yield
         except (psycopg.errors.UndefinedTable, psycopg.errors.InvalidSchemaName):
             raise ProjectionMissing(
-                f"{place_of(connection)}: nothing has been projected there yet; run mapfold replay"
+                f"{describe_connection(connection)}: nothing has been projected there yet; run"
+                " mapfold replay"
             ) from None
         except psycopg.errors.DataException as error:
             raise QuestionError(

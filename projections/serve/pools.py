@@ -17,7 +17,13 @@ from typing import Final, Self, TypeVar
 from psycopg_pool import ConnectionPool, PoolTimeout
 
 from projections.database import checkpoints as _checkpoint
-from projections.database.connection import Connection, Targets, connect, database_errors, place
+from projections.database.connection import (
+    Connection,
+    Targets,
+    connect,
+    database_errors,
+    describe_target,
+)
 from projections.database.sink import SinkName
 from projections.errors import DatabaseUnavailable, ProjectionMissing
 from projections.queries.relocalize import fetch, prepare_graph, prepare_vectors
@@ -161,7 +167,7 @@ class Pools:
                 yield connection
         except PoolTimeout:
             raise _NoneFreeError(
-                f"{place(url)}: none of the {self._size} connections came free within"
+                f"{describe_target(url)}: none of the {self._size} connections came free within"
                 f" {FIRST_WAIT_S + LAST_WAIT_S:.0f} s; ask again later, or give --workers more"
             ) from None
 
@@ -185,8 +191,8 @@ def _see(sink: SinkName, url: str) -> None:
     ):
         if _checkpoint.load(connection, sink) is None:
             raise ProjectionMissing(
-                f"{place(url)}: no {sink} there: nothing has been projected yet; run mapfold"
-                " replay LOG"
+                f"{describe_target(url)}: no {sink} there: nothing has been projected yet; run"
+                " mapfold replay LOG"
             )
 
 

@@ -16,7 +16,7 @@ import psycopg
 import pytest
 
 from projections.database import RebuildProgress, rebuild
-from projections.database.connection import Targets, connect, place
+from projections.database.connection import Targets, connect, describe_target
 from projections.database.embedded import EmbeddedServer
 from projections.database.loader import CopyLoader, Load, TypeName
 from projections.database.vector_sink import VectorSink
@@ -119,7 +119,7 @@ def test_of_two_databases_the_one_that_went_is_named(
                 " WHERE datname = current_database() AND application_name = 'mapfold replay'"
             )
 
-    with pytest.raises(DatabaseUnavailable, match=f"^{re.escape(place(url))}: "):
+    with pytest.raises(DatabaseUnavailable, match=f"^{re.escape(describe_target(url))}: "):
         rebuild(log, two_databases, SETTINGS, progress=at_stage(stage, end_sessions))
 
 

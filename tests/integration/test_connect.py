@@ -14,9 +14,9 @@ from projections.database.connection import (
     Targets,
     connect,
     connect_for_cypher,
+    describe_target,
     ensure_extension,
     open_targets,
-    place,
 )
 from projections.database.embedded import EmbeddedServer
 from projections.errors import DatabaseUnavailable, ExtensionMissing
@@ -183,8 +183,8 @@ def test_a_question_to_a_database_that_nothing_was_ever_projected_into(bare_pg_u
         Reader(Targets(bare_pg_url, bare_pg_url))
 
 
-def test_place_names_no_password() -> None:
-    assert place("postgresql://u:secret@h:5433/maps") == "database maps at h:5433"
+def test_a_described_target_has_no_password() -> None:
+    assert describe_target("postgresql://u:secret@h:5433/maps") == "database maps at h:5433"
 
 
 def test_the_embedded_server_is_the_default(

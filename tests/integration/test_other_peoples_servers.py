@@ -13,7 +13,7 @@ from psycopg import sql
 from projections.database import RebuildProgress, rebuild, tail
 from projections.database import cluster as _cluster
 from projections.database.check import check
-from projections.database.connection import Targets, connect, settle
+from projections.database.connection import Targets, connect, pin_session_settings
 from projections.database.embedded import EmbeddedServer
 from projections.database.grants import roles_sql
 from projections.database.loader import LoaderName
@@ -140,7 +140,7 @@ def test_a_peer_that_went_without_a_word_is_missed_within_a_minute(
     settings = {**_cluster.SETTINGS, "listen_addresses": HOST}  # a unix socket knows no such thing
     monkeypatch.setattr(_cluster, "SETTINGS", settings)
     with server_to_kill(), connect(f"postgresql://postgres@{HOST}/postgres") as connection:
-        settle(connection)
+        pin_session_settings(connection)
         for name, wanted in KEEPALIVES.items():
             row = connection.execute("SELECT current_setting(%s)", [f"tcp_{name}"]).fetchone()
             assert row == (wanted,)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from psycopg.conninfo import conninfo_to_dict
 
 from eventsrc.errors import MapfoldError
-from projections.database.connection import Targets, connect, open_targets, place
+from projections.database.connection import Targets, connect, describe_target, open_targets
 from projections.database.status import projection_status
 from projections.settings import Settings
 from tests.commands import Commands
@@ -74,7 +74,7 @@ def shown(url: str) -> str:
     with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said), _no_network():
         try:
             with open_targets(url, url) as targets:
-                said.write(f"{targets!r} {place(url)}")
+                said.write(f"{targets!r} {describe_target(url)}")
                 connect(targets.graph_url).close()
         except MapfoldError as error:
             said.write(f"{error} {error!r}")
