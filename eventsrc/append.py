@@ -9,7 +9,7 @@ in silence.
 from collections.abc import Sequence
 from typing import TypeAlias
 
-from eventsrc.transport.config import fault_in_log
+from eventsrc.transport.config import key_fault
 
 from .envelope import ENVELOPE_VERSION, Envelope
 from .ingest import DEFAULT_MAX_PAYLOAD_BYTES, Rejected, quoted
@@ -78,7 +78,7 @@ def _judge(arrivals: Sequence[Arrival], max_bytes: int) -> list[Envelope | Rejec
     """What the door says, but for keys that a log does not keep envelopes under."""
     verdicts = check_envelopes(arrivals, max_bytes=max_bytes)
     keys = {arrival.key for arrival in arrivals}  # one, as a rule
-    faults = {key: fault for key in keys if (fault := fault_in_log(key)) is not None}
+    faults = {key: fault for key in keys if (fault := key_fault(key)) is not None}
     for index, arrival in enumerate(arrivals if faults else ()):
         if arrival.key in faults:
             verdicts[index] = Rejected(f"key {quoted(arrival.key)} {faults[arrival.key]}")

@@ -31,7 +31,7 @@ from typing import Final
 from eventsrc.gaps import DEFAULT_SETTLE_NS, Gap, GapLedger
 from eventsrc.robot.acks import SENT_SUFFIX
 from eventsrc.transport.config import MAX_KEY_BYTES
-from eventsrc.transport.session import Number, Received
+from eventsrc.transport.session import Received, SequenceNumber
 
 MOST_SOURCES: Final = 4_096
 _NUMBERS: Final = 2**32
@@ -45,12 +45,12 @@ class Numbering:
         self._sources: dict[str, None] = {}
         self._forgotten: list[Gap] = []
 
-    def arrived(self, number: Number, now_ns: int) -> None:
+    def arrived(self, number: SequenceNumber, now_ns: int) -> None:
         """A message with this number has come."""
         self._ledger.record(number.source, self._unwrapped(number), now_ns)
         self._know(number.source)
 
-    def told(self, number: Number, now_ns: int) -> None:
+    def told(self, number: SequenceNumber, now_ns: int) -> None:
         """Its publisher says that this is the last number it has given."""
         value = self._unwrapped(number)
         if number.source in self._sources:
@@ -81,7 +81,7 @@ class Numbering:
             del self._sources[oldest]
             self._forgotten += self._ledger.forget(oldest)
 
-    def _unwrapped(self, number: Number) -> int:
+    def _unwrapped(self, number: SequenceNumber) -> int:
         """The number nearest to the source's highest that has these 32 bits."""
         highest = self._ledger.highest(number.source)
         if highest is None:
@@ -154,12 +154,12 @@ class Inbox:
             if self._taking:
                 self._filled.notify()
 
-    def told(self, number: Number) -> None:
+    def told(self, number: SequenceNumber) -> None:
         """Take in how far a publisher says it has got."""
         with self._lock:
             self._numbering.told(number, time.monotonic_ns())
 
-    def refuse(self, key: str, number: Number | None) -> None:
+    def refuse(self, key: str, number: SequenceNumber | None) -> None:
         """Count a message that is too large to be taken from Zenoh."""
         with self._lock:
             if number is not None:

@@ -10,7 +10,7 @@ from eventsrc.gaps import GapLedger
 from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES
 from eventsrc.log import LogWriter
 from eventsrc.robot.acks import ACK_PREFIX, MAX_SENT_BYTES, sent_key
-from eventsrc.transport.session import Bound, Number, Received, Session, check_keys
+from eventsrc.transport.session import Received, SequenceNumber, Session, SizeLimit, check_keys
 
 from .queue import DEFAULT_QUEUE_SIZE, Inbox
 from .writer_thread import RecorderReport, Writing
@@ -55,18 +55,18 @@ class Recorder:
             report_gaps=report_gaps,
             max_payload_bytes=max_payload_bytes,
         )
-        at_most = Bound(
+        limit = SizeLimit(
             _REJECTED_WHOLE * max(max_payload_bytes, DEFAULT_MAX_PAYLOAD_BYTES), self._refuse
         )
         # A longer one says nothing, like any that cannot be read: no event is lost with it.
-        sent_at_most = Bound(MAX_SENT_BYTES, lambda _key, _number: None)
+        sent_limit = SizeLimit(MAX_SENT_BYTES, lambda _key, _number: None)
         self._subscriptions = [
             subscription
             for key in keys
             for subscription in (
-                session.subscribe(key, self._receive, at_most=at_most),
-                session.subscribe(sent_key(key), self._inbox.put, at_most=sent_at_most),
-                session.heartbeats(key, self._inbox.told),
+                session.subscribe(key, self._receive, limit=limit),
+                session.subscribe(sent_key(key), self._inbox.put, limit=sent_limit),
+                session.subscribe_heartbeats(key, self._inbox.told),
             )
         ]
         session.confirm()
@@ -118,7 +118,7 @@ class Recorder:
         if not message.key.startswith(ACK_PREFIX):
             self._inbox.put(message)
 
-    def _refuse(self, key: str, number: Number | None) -> None:
+    def _refuse(self, key: str, number: SequenceNumber | None) -> None:
         if not key.startswith(ACK_PREFIX):
             self._inbox.refuse(key, number)
 

@@ -1,1 +1,1 @@
-"""The one door to Zenoh: sessions, what is declared on them, their configuration."""
+"""Zenoh: sessions, their configuration, and what is declared on them."""

@@ -1,32 +1,24 @@
-"""What every Zenoh session of ours is configured to do. It does not import zenoh.
+"""Zenoh options and their checks: endpoints, session configuration, keys. Does not import zenoh.
 
-The rules are those at the head of `eventsrc.transport.session`. A configuration file says the rest;
-the command line's endpoints go before the file's.
-
-Where Zenoh connects and listens: ``<protocol>/<address>``, such as ``tcp/127.0.0.1:7447``.
-
-Zenoh itself reports a malformed endpoint as "unable to connect", which sends people looking for a
-router that runs very well. So endpoints are checked here, before a session is opened. No I/O.
-
-What Zenoh says when something fails, in words that help. Text only: it does not import zenoh.
-
-Keys that envelopes can be published under: Zenoh's, without what only a subscriber may write,
-and not too long.
+* `check_endpoint`: an endpoint is ``<protocol>/<address>``, such as ``tcp/127.0.0.1:7447``. Zenoh
+  reports a malformed one as "unable to connect", so endpoints are checked before a session opens.
+* `configure`: the rules at the head of `eventsrc.transport.session`, applied to a configuration.
+  Endpoints of the command line take precedence over those of a configuration file.
+* `check_key`: keys that envelopes can be published under.
 """
 
 import ipaddress
 import json
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, Protocol
 
-from eventsrc.errors import MisuseError, TransportError
+from eventsrc.errors import MisuseError
 from eventsrc.system_events import RESERVED_PREFIX, is_system_key
 
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
-"""Where `mapfold router` listens and every other command connects unless told otherwise."""
+"""Where `mapfold router` listens and every other command connects by default."""
 
 _WITH_PORT: Final = ("tcp", "udp", "tls", "quic", "ws")
 _WITHOUT_PORT: Final = ("unixsock-stream", "unixpipe", "serial", "vsock")
@@ -34,7 +26,7 @@ _EXAMPLE: Final = f"write it as <protocol>/<host>:<port>, for example {DEFAULT_E
 
 
 def check_endpoint(text: str) -> str:
-    """Return ``text`` if it is an endpoint; raise MisuseError that says what is wrong if not."""
+    """Return ``text`` if it is an endpoint; raise MisuseError that says what is wrong otherwise."""
     protocol, slash, rest = text.partition("/")
     if not slash:
         raise MisuseError(f"endpoint {text!r} has no protocol; {_EXAMPLE}")
@@ -54,7 +46,7 @@ def check_endpoints(texts: Iterable[str]) -> tuple[str, ...]:
 
 
 def parse_address(text: str, option: str) -> tuple[str, int]:
-    """``PORT``, which means this machine only, or ``HOST:PORT``; MisuseError names ``option``."""
+    """Host and port of ``HOST:PORT``, or of ``PORT`` on loopback. MisuseError names ``option``."""
     host, colon, port = text.rpartition(":")
     if not _is_port(port) or (colon and not host):
         raise MisuseError(f"{option} {text!r} is neither PORT nor HOST:PORT; try {option} 9464")
@@ -62,7 +54,7 @@ def parse_address(text: str, option: str) -> tuple[str, int]:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine can connect to what listens on ``host``, as far as one can tell."""
+    """Whether ``host`` is a loopback address or ``localhost``."""
     try:
         return ipaddress.ip_address(host.strip("[]").partition("%")[0]).is_loopback
     except ValueError:
@@ -85,40 +77,42 @@ Mode = Literal["client", "peer", "router"]
 
 _OPEN_TIMEOUT_MS: Final = 5_000
 _LISTEN: Final = "listen/endpoints"
-_LARGEST_MESSAGE: Final = "transport/link/rx/max_message_size"
+_MAX_MESSAGE: Final = "transport/link/rx/max_message_size"
 
 
 @dataclass(frozen=True, slots=True)
 class ZenohOptions:
     """Where to connect, where to listen, and a Zenoh configuration file (JSON5) for the rest.
 
-    ``connect`` and ``listen`` go before what the file says. TLS, access control and scouting are
-    the file's business. ``largest_message_bytes`` is for a session that receives from strangers:
-    Zenoh drops a message that is larger, unless the file says how large one may be; its own bound
-    is 1 GiB, of each of several that may be under way.
+    ``connect`` and ``listen`` take precedence over the file. TLS, access control and scouting are
+    set in the file only. Zenoh drops messages of more than ``max_message_bytes``, unless the file
+    sets that bound; Zenoh's default is 1 GiB for each of several messages in transit.
     """
 
     connect: tuple[str, ...] = ()
     listen: tuple[str, ...] = ()
     config_file: Path | None = None
-    largest_message_bytes: int | None = None
+    max_message_bytes: int | None = None
 
     @property
     def mode(self) -> Literal["client", "peer"]:
-        """What a recorder or a publisher is with these options: a peer if others may call it."""
+        """The mode of a recorder or publisher with these options: a peer if it listens."""
         return "peer" if self.listen else "client"
 
 
 class Config(Protocol):
-    """The two methods of zenoh.Config that are needed; keys are paths, values JSON5."""
+    """The methods of zenoh.Config used here; keys are paths, values JSON5."""
 
     def get_json(self, key: str) -> Any: ...
     def insert_json5(self, key: str, value: Any) -> None: ...
 
 
-def configure(config: Config, zenoh: Config, options: ZenohOptions, mode: Mode) -> None:
-    """Apply ``options`` and the rules to ``config``, which is the file's or else like ``zenoh``,
-    what Zenoh itself says where nobody does. Raises MisuseError for a bad endpoint."""
+def configure(config: Config, defaults: Config, options: ZenohOptions, mode: Mode) -> None:
+    """Apply ``options`` and the rules to ``config``.
+
+    ``config`` comes from a file or equals ``defaults``, Zenoh's own. Raises MisuseError for a
+    malformed endpoint.
+    """
     connect, listen = check_endpoints(options.connect), check_endpoints(options.listen)
     if not connect and mode == "client" and _is_unset(config, "connect/endpoints"):
         connect = (DEFAULT_ENDPOINT,)
@@ -126,23 +120,23 @@ def configure(config: Config, zenoh: Config, options: ZenohOptions, mode: Mode) 
     _set(config, "transport/shared_memory/enabled", False)
     if connect:
         _set(config, "connect/endpoints", connect)
-    if listen or not _says_where_to_listen(config, zenoh, mode):
-        # Zenoh's own routers would listen on every address of the machine, to anybody.
-        nowhere_else = (DEFAULT_ENDPOINT,) if mode == "router" else ()
-        _set(config, _LISTEN, listen or nowhere_else)
-    largest = options.largest_message_bytes
-    if largest and config.get_json(_LARGEST_MESSAGE) == zenoh.get_json(_LARGEST_MESSAGE):
-        _set(config, _LARGEST_MESSAGE, largest)
+    if listen or not _file_sets_listen(config, defaults, mode):
+        # By default Zenoh's routers listen on every address of the machine.
+        loopback_or_none = (DEFAULT_ENDPOINT,) if mode == "router" else ()
+        _set(config, _LISTEN, listen or loopback_or_none)
+    max_bytes = options.max_message_bytes
+    if max_bytes and config.get_json(_MAX_MESSAGE) == defaults.get_json(_MAX_MESSAGE):
+        _set(config, _MAX_MESSAGE, max_bytes)
     _configure_scouting(config)
-    if mode == "peer":  # a router starts before the routers it is linked to; a peer's error counts
+    if mode == "peer":  # not for a router: it may start before the routers it connects to
         _set(config, "connect/exit_on_failure", True)
         _set(config, "connect/timeout_ms", _OPEN_TIMEOUT_MS)
     if mode == "router":
-        _set(config, "adminspace/enabled", True)  # where a router's real locators come from
+        _set(config, "adminspace/enabled", True)  # `Session.locators` asks it
 
 
 def _configure_scouting(config: Config) -> None:
-    """Off unless the file turns it on; and then no half second's wait for answers nobody gives."""
+    """Turn scouting off, and its delay of half a second with it, unless the file turns it on."""
     if _is_unset(config, "scouting/multicast/enabled"):
         _set(config, "scouting/multicast/enabled", False)
     scouts = json.loads(config.get_json("scouting/multicast/enabled"))
@@ -150,10 +144,12 @@ def _configure_scouting(config: Config) -> None:
         _set(config, "scouting/delay", 0)
 
 
-def _says_where_to_listen(config: Config, zenoh: Config, mode: Mode) -> bool:
-    """Whether the file does, for this mode. One that says what Zenoh says anyway, as a copy of its
-    example does, counts as one that says nothing."""
-    if config.get_json(_LISTEN) == zenoh.get_json(_LISTEN):
+def _file_sets_listen(config: Config, defaults: Config, mode: Mode) -> bool:
+    """Whether the file sets listen endpoints for ``mode``.
+
+    Endpoints equal to Zenoh's defaults, as in a copy of its example file, count as not set.
+    """
+    if config.get_json(_LISTEN) == defaults.get_json(_LISTEN):
         return False
     endpoints = json.loads(config.get_json(_LISTEN))
     return not isinstance(endpoints, dict) or mode in endpoints
@@ -167,57 +163,19 @@ def _is_unset(config: Config, key: str) -> bool:
     return json.loads(config.get_json(key)) in (None, [])
 
 
-_SOURCE_PLACE: Final = re.compile(r"\s+at /\S+\.rs:\d+\.?")
-_PANIC: Final = ("pyo3_runtime", "PanicException")
-_SYSTEM_ERROR: Final = re.compile(r"\[[^\]]*: (.+ \(os error \d+\))\]?")
-
-
-def is_panic(error: BaseException) -> bool:
-    """Whether Zenoh failed inside. What pyo3 raises then is no Exception and has no public name."""
-    kind = type(error)
-    return (kind.__module__, kind.__name__) == _PANIC
-
-
-def plain(error: BaseException) -> str:
-    """Zenoh's message on one line, without the places in its own source."""
-    text = " ".join(_SOURCE_PLACE.sub("", str(error)).split())
-    inner = _SYSTEM_ERROR.search(text)
-    return (inner.group(1) if inner else text).rstrip(" .!")
-
-
-def cannot_open(error: BaseException, connect: object, listen: object) -> TransportError:
-    """Why a session does not open; ``connect`` and ``listen`` are its configured endpoints."""
-    message = str(error)
-    if "listener" in message:
-        return TransportError(
-            f"cannot listen on {_joined(listen)}: {plain(error)}; "
-            "stop what listens there or choose another place with --listen"
-        )
-    if "Unable to connect" in message:
-        return TransportError(
-            f"no Zenoh router or peer answers at {_joined(connect)}; "
-            "start one with `mapfold router` or say where it is with --connect"
-        )
-    return TransportError(f"no Zenoh session: {plain(error)}; check --zenoh-config")
-
-
-def _joined(endpoints: object) -> str:
-    return ", ".join(map(str, endpoints)) if isinstance(endpoints, list) else str(endpoints)
-
-
 MAX_KEY_BYTES: Final = 1024
-"""Bound of a key in UTF-8. A log repeats it in each of its chunks, and an answer's key is made of
-it; Zenoh itself fails inside on keys of 64 kB."""
-_ONLY_IN_EXPRESSIONS = frozenset("*$?#")
+"""Bound of a key in UTF-8. A log repeats the key in each chunk, and the key of a refusal is built
+from it; Zenoh itself panics on keys of 64 kB."""
+_WILDCARDS = frozenset("*$?#")
 
 
 def check_key(key: str, option: str) -> str:
-    """Return ``key`` if messages can bear it; MisuseError that names ``option`` if not."""
+    """``key``, if envelopes can be published under it; else MisuseError that names ``option``."""
     if is_system_key(key):
         raise MisuseError(
             f"{option} {key!r}: keys under {RESERVED_PREFIX} are mapfold's own; choose another"
         )
-    fault = _fault(key)
+    fault = _publish_fault(key)
     if fault:
         raise MisuseError(
             f"{option} {key!r}: {fault}, so nothing can be published under it; "
@@ -226,11 +184,11 @@ def check_key(key: str, option: str) -> str:
     return key
 
 
-def fault_in_log(key: str) -> str | None:
-    """Why a log does not keep envelopes under ``key``, whoever sends them; None if it does."""
+def key_fault(key: str) -> str | None:
+    """Why a log does not keep envelopes under ``key``; None if it does."""
     if is_system_key(key):
         return "is reserved for mapfold's own events"
-    if key.isascii() and len(key) <= MAX_KEY_BYTES:  # as a rule, and quickly told
+    if key.isascii() and len(key) <= MAX_KEY_BYTES:  # the usual case
         return None
     try:
         size = len(key.encode())
@@ -239,12 +197,12 @@ def fault_in_log(key: str) -> str | None:
     return f"is {size} bytes long, more than {MAX_KEY_BYTES}" if size > MAX_KEY_BYTES else None
 
 
-def _fault(key: str) -> str | None:
-    if any(character in _ONLY_IN_EXPRESSIONS for character in key):
+def _publish_fault(key: str) -> str | None:
+    if any(character in _WILDCARDS for character in key):
         return "it is a pattern for many keys"
     if any(character.isspace() or not character.isprintable() for character in key):
         return "it holds white space"
     if not all(key.split("/")):
         return "a part of it is empty"
-    in_log = fault_in_log(key)
-    return None if in_log is None else f"it {in_log}"
+    fault = key_fault(key)
+    return None if fault is None else f"it {fault}"

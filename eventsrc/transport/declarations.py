@@ -1,29 +1,29 @@
-"""What is declared on a Zenoh session: publishers, subscriptions, questions. A part of the door,
-`eventsrc.transport.session`, through which everybody else gets them; the rules stand there.
+"""What a Zenoh session declares: publishers, subscriptions, queryables; and what it receives.
+
+Other packages use it through `eventsrc.transport.session`, where the rules stand.
 """
 
-import contextlib
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
 import zenoh
 
 from eventsrc.errors import TransportError
 
-from .config import is_panic, plain
+from .errors import ignore_transport_errors, transport_errors
 
-_MOST_KEY_BYTES: Final = 16 * 1024
-"""Zenoh panics when a key does not fit one batch of 64 KiB beside what else stands in it."""
+_MAX_KEY_BYTES: Final = 16 * 1024
+"""Zenoh panics when a key does not fit into one batch of 64 KiB with the rest of its content."""
 _HEARTBEATS: Final = "@adv/pub/"
-"""What stands between a key and the session and entity id of an advanced publisher under it."""
-_NUMBER_BYTES: Final = 4
+"""In a heartbeat's key: between the publisher's key and its session and entity id."""
+_HEARTBEAT_BYTES: Final = 4
 
 
-class Number(NamedTuple):
-    """The number ``value`` (32 bits, then 0 again) that ``source`` has given to a message.
+class SequenceNumber(NamedTuple):
+    """The number that an advanced publisher gave to a message.
 
-    Zenoh's advanced publishers number their messages; ``source`` is ``<session id>:<entity id>``.
+    ``source`` is the publisher's ``<session id>:<entity id>``, ``value`` has 32 bits and wraps.
     """
 
     source: str
@@ -31,27 +31,30 @@ class Number(NamedTuple):
 
 
 class Received(NamedTuple):
-    """One message, with its publisher's number if it has one. Zenoh's timestamp is not read: it
-    may be missing, equal to another or earlier than the one before, and nothing depends on it."""
+    """One message, with its publisher's number if it has one.
+
+    Zenoh's timestamp is not read: it may be missing, repeated or out of order.
+    """
 
     key: str
     payload: bytes
-    number: Number | None = None
+    number: SequenceNumber | None = None
 
 
-class Bound(NamedTuple):
-    """Messages over ``size_bytes`` are not taken; ``refuse`` is called with the key of each and its
-    publisher's number, if it has one."""
+class SizeLimit(NamedTuple):
+    """Messages over ``size_bytes`` are not received; ``refuse`` is called with the key of each and
+    its publisher's number, if it has one."""
 
     size_bytes: int
-    refuse: Callable[[str, Number | None], None]
+    refuse: Callable[[str, SequenceNumber | None], None]
 
 
-class Asked:
-    """A question under a queryable. Answer or refuse it once, from any thread; that ends it.
+class Query:
+    """A query to a queryable. Reply once, from any thread; that ends it.
 
-    ``key`` is what was asked, which may hold wildcards. ``size`` and ``selector_size`` are the
-    bytes of the payload and of the key with its parameters, known before any of them is read.
+    ``key`` is the key expression of the query, which may hold wildcards. ``size`` and
+    ``selector_size`` are the bytes of the payload and of the key with its parameters, known
+    without reading either.
     """
 
     def __init__(self, query: zenoh.Query) -> None:
@@ -63,24 +66,24 @@ class Asked:
 
     @property
     def parameters(self) -> dict[str, str]:
-        """What stands behind the ``?`` of the selector."""
+        """The parameters, after the ``?`` of the selector."""
         return _parameters(str(self._query.parameters))
 
     @property
     def payload(self) -> bytes:
-        """A copy of what came with the question."""
+        """A copy of the payload; empty if the query has none."""
         return self._query.payload.to_bytes() if self._query.payload is not None else b""
 
-    def answer(self, key: str, payload: bytes) -> None:
-        """Send the answer, under ``key``."""
+    def reply(self, key: str, payload: bytes) -> None:
+        """Reply under ``key``."""
         self._end(lambda: self._query.reply(key, payload))
 
-    def refuse(self, payload: bytes) -> None:
-        """Send an error instead of an answer."""
+    def reply_error(self, payload: bytes) -> None:
+        """Reply with an error."""
         self._end(lambda: self._query.reply_err(payload))
 
     def _end(self, send: Callable[[], None]) -> None:
-        with quietly():  # who asked may be gone: nobody is left to tell
+        with ignore_transport_errors():  # the peer that asked may be gone
             send()
         self._query.drop()  # type: ignore[no-untyped-call]
         self.ended = True
@@ -93,34 +96,34 @@ class Publisher:
         check_key_length(key)
         self.key = key
         self.departures = 0
-        """How often the last subscriber has left."""
-        with clear_errors(f"key {key!r} cannot be published to"):
+        """How many times the last subscriber has left."""
+        with transport_errors(f"key {key!r} cannot be published to"):
             self._sender: Any = session.declare_publisher(
                 key,
                 congestion_control=zenoh.CongestionControl.BLOCK,
                 reliability=zenoh.Reliability.RELIABLE,
             )
-            self._listener: Any = self._sender.declare_matching_listener(self._note)
+            self._listener: Any = self._sender.declare_matching_listener(self._on_matching)
 
-    def _note(self, status: Any) -> None:
+    def _on_matching(self, status: Any) -> None:
         self.departures += not status.matching
 
     def put(self, payload: bytes) -> None:
-        """Send. Returns when Zenoh has taken it, which is not yet when anybody has received it."""
-        with clear_errors(f"key {self.key!r}: not sent"):
+        """Send. Returns when Zenoh has accepted the message; nobody need have received it yet."""
+        with transport_errors(f"key {self.key!r}: not sent"):
             self._sender.put(payload)
 
     @property
     def has_subscriber(self) -> bool:
-        """Whether somebody subscribes to this key now, as far as this session knows."""
-        with clear_errors(f"key {self.key!r}: the session is gone"):
-            status: Any = self._sender.matching_status  # its stubs say bool, which it is not
+        """Whether this session knows of a subscriber to this key."""
+        with transport_errors(f"key {self.key!r}: the session is gone"):
+            status: Any = self._sender.matching_status  # not a bool, as its stubs say
             return bool(status.matching)
 
     def wait_for_subscriber(self, timeout_s: float) -> bool:
-        """Wait until somebody subscribes to this key; False when nobody did in time."""
+        """Wait for a subscriber to this key; False when there was none in time."""
         matched = threading.Event()
-        with clear_errors(f"key {self.key!r}: the session is gone"):
+        with transport_errors(f"key {self.key!r}: the session is gone"):
             listener = self._sender.declare_matching_listener(
                 lambda status: matched.set() if status.matching else None
             )
@@ -131,20 +134,20 @@ class Publisher:
 
     def close(self) -> None:
         """Stop publishing under this key."""
-        with quietly():
+        with ignore_transport_errors():
             self._listener.undeclare()
             self._sender.undeclare()
 
 
 class Subscription:
-    """A declared subscription. Closing it, or its session, ends the calls."""
+    """A declared subscription or queryable. Closing it, or its session, ends the calls."""
 
     def __init__(self, *declared: Any) -> None:
         self._declared = declared
 
     def close(self) -> None:
         """Stop receiving."""
-        with quietly():
+        with ignore_transport_errors():
             for entity in self._declared:
                 entity.undeclare()
 
@@ -155,17 +158,17 @@ def _parameters(text: str) -> dict[str, str]:
     return {name: value for name, _, value in pairs}
 
 
-def received(sample: zenoh.Sample) -> Received:
-    """What we take of a message."""
-    return Received(str(sample.key_expr), sample.payload.to_bytes(), number_of(sample))
+def to_received(sample: zenoh.Sample) -> Received:
+    """Copy a message out of Zenoh."""
+    return Received(str(sample.key_expr), sample.payload.to_bytes(), sequence_number(sample))
 
 
-def number_of(sample: zenoh.Sample) -> Number | None:
-    """The number that an advanced publisher gave to ``sample``."""
+def sequence_number(sample: zenoh.Sample) -> SequenceNumber | None:
+    """The number of ``sample``; None if no advanced publisher sent it."""
     info = sample.source_info
     if info is None:
         return None
-    return Number(f"{info.source_id.zid}:{info.source_id.eid}", info.source_sn)
+    return SequenceNumber(f"{info.source_id.zid}:{info.source_id.eid}", info.source_sn)
 
 
 def heartbeats_under(key_expr: str) -> str:
@@ -173,39 +176,18 @@ def heartbeats_under(key_expr: str) -> str:
     return f"{key_expr}/{_HEARTBEATS}**"
 
 
-def heartbeat(sample: zenoh.Sample) -> Number | None:
-    """The last number its publisher has given, if ``sample`` is a heartbeat as we know them."""
+def parse_heartbeat(sample: zenoh.Sample) -> SequenceNumber | None:
+    """The last number its publisher gave; None if ``sample`` is no heartbeat of a known form."""
     source = str(sample.key_expr).rpartition(_HEARTBEATS)[2].split("/")
-    if len(source) < 2 or len(sample.payload) != _NUMBER_BYTES:
+    if len(source) < 2 or len(sample.payload) != _HEARTBEAT_BYTES:
         return None
-    return Number(":".join(source[:2]), int.from_bytes(sample.payload.to_bytes(), "little"))
-
-
-@contextlib.contextmanager
-def clear_errors(place: str) -> Iterator[None]:
-    """Whatever Zenoh raises as a TransportError that says ``place``. A panic, after which the
-    session may be of no more use, says so."""
-    try:
-        yield
-    except zenoh.ZError as error:
-        raise TransportError(f"{place}: {plain(error)}") from None
-    except BaseException as error:
-        if not is_panic(error):
-            raise
-        raise TransportError(f"{place}: Zenoh failed inside: {plain(error)}") from None
-
-
-@contextlib.contextmanager
-def quietly() -> Iterator[None]:
-    """Ending something whatever Zenoh raises: what is told nobody can act on."""
-    with contextlib.suppress(TransportError), clear_errors("ending"):
-        yield
+    return SequenceNumber(":".join(source[:2]), int.from_bytes(sample.payload.to_bytes(), "little"))
 
 
 def check_key_length(key: str) -> None:
-    """TransportError for a key that Zenoh would fail inside on, and the session with it."""
+    """TransportError for a key so long that Zenoh would panic and take the session with it."""
     size = len(key.encode())
-    if size > _MOST_KEY_BYTES:
+    if size > _MAX_KEY_BYTES:
         raise TransportError(
-            f"key {key[:80]!r}…: {size:,} bytes are more than {_MOST_KEY_BYTES:,}; choose a shorter"
+            f"key {key[:80]!r}…: {size:,} bytes are more than {_MAX_KEY_BYTES:,}; choose a shorter"
         )

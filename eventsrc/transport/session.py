@@ -1,20 +1,16 @@
-"""The one door to Zenoh: but for its own parts, nothing else in mapfold imports it.
+"""Zenoh sessions and a router. Only `eventsrc.transport` imports zenoh.
 
-What holds behind this door:
-
-* Multicast scouting is off unless a configuration file turns it on: a recorder never joins a
-  network it was not pointed at.
-* A session listens nowhere, and a router on loopback only, unless told otherwise: by an endpoint or
-  by a configuration file.
-* Shared memory is off, always. Payloads over 3 kB would travel through it and can vanish with the
+* Multicast scouting is off unless a configuration file turns it on: a recorder joins no network
+  that it was not pointed at.
+* A session does not listen, and a router listens on loopback only, unless an endpoint or a
+  configuration file says otherwise.
+* Shared memory is always off. Payloads over 3 kB would travel through it and can vanish with the
   process that owns the segment.
-* Publishers are reliable and block. Zenoh's default drops when a queue is full, and says nothing.
-* Subscribers are plain. Advanced ones drop what bears an earlier timestamp than a message before.
+* Publishers are reliable and block. Zenoh's default drops messages silently when a queue is full.
+* Subscribers are plain. Advanced ones drop a message with an earlier timestamp than one before it.
 * A session is a context manager and is always closed. Every failure to open, declare or send is a
-  TransportError of one line that says where and what to do; Zenoh's own log is silent unless
-  ``RUST_LOG`` asks for it.
-
-A Zenoh router inside this process, so that nothing else need be installed.
+  TransportError of one line with the place and the next step. Zenoh's own log is silent unless
+  ``RUST_LOG`` is set.
 """
 
 import itertools
@@ -28,31 +24,30 @@ import zenoh
 
 from eventsrc.errors import MisuseError
 
-from .config import Mode, ZenohOptions, cannot_open, check_endpoints, configure, is_panic, plain
+from .config import Mode, ZenohOptions, check_endpoints, configure
 from .declarations import (
-    Asked,
-    Bound,
-    Number,
     Publisher,
+    Query,
     Received,
+    SequenceNumber,
+    SizeLimit,
     Subscription,
     check_key_length,
-    clear_errors,
-    heartbeat,
     heartbeats_under,
-    number_of,
-    quietly,
-    received,
+    parse_heartbeat,
+    sequence_number,
+    to_received,
 )
+from .errors import ignore_transport_errors, is_panic, one_line, open_error, transport_errors
 
 __all__ = [
-    "Asked",
-    "Bound",
     "Mode",
-    "Number",
     "Publisher",
+    "Query",
     "Received",
+    "SequenceNumber",
     "Session",
+    "SizeLimit",
     "Subscription",
     "ZenohOptions",
     "check_keys",
@@ -67,81 +62,83 @@ class Session:
 
     def __init__(self, raw: zenoh.Session) -> None:
         self.raw = raw
-        """Zenoh's own object; for the door and nobody else."""
+        """The zenoh.Session; not for use outside this package."""
 
     def publisher(self, key: str) -> Publisher:
         """Declare a publisher on ``key``."""
         return Publisher(self.raw, key)
 
     def subscribe(
-        self, key_expr: str, handler: Callable[[Received], None], at_most: Bound | None = None
+        self, key_expr: str, handler: Callable[[Received], None], limit: SizeLimit | None = None
     ) -> Subscription:
         """Call ``handler`` for every message under ``key_expr``, from a thread of Zenoh's.
 
-        The handler must only hand over: while it works nothing else is received, and after five
-        seconds of that Zenoh gives up links and loses messages without a word. The subscription is
-        a plain one, because an advanced one drops what bears an earlier timestamp than a message
-        before it. What is larger than ``at_most`` is not copied out of Zenoh.
+        The handler must return quickly: nothing else is received meanwhile, and after five seconds
+        Zenoh closes links and loses messages silently. Messages over ``limit`` are not copied out
+        of Zenoh.
         """
 
         def receive(sample: zenoh.Sample) -> None:
-            if at_most is not None and len(sample.payload) > at_most.size_bytes:
-                at_most.refuse(str(sample.key_expr), number_of(sample))
+            if limit is not None and len(sample.payload) > limit.size_bytes:
+                limit.refuse(str(sample.key_expr), sequence_number(sample))
             else:
-                handler(received(sample))
+                handler(to_received(sample))
 
         check_key_length(key_expr)
-        with clear_errors(f"key expression {key_expr!r} cannot be subscribed to"):
+        with transport_errors(f"key expression {key_expr!r} cannot be subscribed to"):
             return Subscription(self.raw.declare_subscriber(key_expr, receive))
 
-    def heartbeats(self, key_expr: str, handler: Callable[[Number], None]) -> Subscription:
-        """Call ``handler`` with the last number of every advanced publisher under ``key_expr``, as
-        often as it tells; like `subscribe` from a thread of Zenoh's."""
+    def subscribe_heartbeats(
+        self, key_expr: str, handler: Callable[[SequenceNumber], None]
+    ) -> Subscription:
+        """Call ``handler`` with the last number of an advanced publisher under ``key_expr`` at each
+        of its heartbeats; like `subscribe` from a thread of Zenoh's."""
 
         def receive(sample: zenoh.Sample) -> None:
-            number = heartbeat(sample)
+            number = parse_heartbeat(sample)
             if number is not None:
                 handler(number)
 
         expression = heartbeats_under(key_expr)
         check_key_length(expression)
-        with clear_errors(f"key expression {expression!r} cannot be subscribed to"):
+        with transport_errors(f"key expression {expression!r} cannot be subscribed to"):
             return Subscription(self.raw.declare_subscriber(expression, receive))
 
     def send(self, key: str, payload: bytes) -> None:
-        """Send one message that may be dropped if the network is full; never blocks on it."""
+        """Send one message without blocking; it is dropped if the network is full."""
         check_key_length(key)
-        with clear_errors(f"key {key!r}: not sent"):
+        with transport_errors(f"key {key!r}: not sent"):
             self.raw.put(key, payload, congestion_control=zenoh.CongestionControl.DROP)
 
     def confirm(self) -> None:
-        """Return when the other end has taken in everything declared so far.
+        """Return when the router or peer has processed everything declared so far.
 
-        A question that nobody answers travels the same way as the declarations before it; when
-        the router says there is no answer, it has read those too.
+        It sends a query that nobody replies to. The query follows the declarations on the same
+        link, so when it ends, they have been read.
         """
         self.get(f"mapfold/confirm/{self.raw.zid()}", timeout_s=_CONFIRM_TIMEOUT_S)
 
     def get(self, selector: str, payload: bytes | None = None, *, timeout_s: float) -> list[bytes]:
-        """Ask everybody who answers under ``selector``; the payloads of the good answers."""
-        answers = self.ask(selector, payload, timeout_s=timeout_s)
-        return [answer for good, answer in answers if good]
+        """Query every queryable under ``selector``; the payloads of the good replies."""
+        replies = self.get_replies(selector, payload, timeout_s=timeout_s)
+        return [reply for good, reply in replies if good]
 
-    def questions(self, key: str, take: Callable[[Asked], None]) -> Subscription:
-        """Hand over every question under ``key`` to ``take``, which must not work on it itself."""
+    def queryable(self, key: str, handler: Callable[[Query], None]) -> Subscription:
+        """Call ``handler`` for every query under ``key``, from a thread of Zenoh's; it must return
+        quickly."""
 
-        def hand_over(query: zenoh.Query) -> None:
-            take(Asked(query))
+        def receive(query: zenoh.Query) -> None:
+            handler(Query(query))
 
-        with clear_errors(f"key {key!r} cannot be answered on"):
-            return Subscription(self.raw.declare_queryable(key, hand_over, complete=True))
+        with transport_errors(f"key {key!r} cannot be answered on"):
+            return Subscription(self.raw.declare_queryable(key, receive, complete=True))
 
-    def ask(
+    def get_replies(
         self, selector: str, payload: bytes | None = None, *, timeout_s: float
     ) -> list[tuple[bool, bytes]]:
-        """Like `get`, with the refusals: (True, answer) and (False, error) as they came."""
+        """Like `get`, with the errors: (True, payload) or (False, error) for each reply."""
         check_key_length(selector)
-        with clear_errors(f"selector {selector!r} cannot be asked"):
+        with transport_errors(f"selector {selector!r} cannot be asked"):
             return [
                 (True, reply.ok.payload.to_bytes())
                 if reply.ok is not None
@@ -150,20 +147,20 @@ class Session:
             ]
 
     @property
-    def linked(self) -> bool:
-        """Whether at least one router or peer is connected now."""
+    def is_connected(self) -> bool:
+        """Whether at least one router or peer is connected."""
         return bool(self.raw.info.transports())
 
     @property
     def locators(self) -> list[str]:
-        """Where a router session listens, with the ports it really got."""
+        """The endpoints a router session listens on, with the actual ports."""
         for document in self.get(f"@/{self.raw.zid()}/router", timeout_s=_CONFIRM_TIMEOUT_S):
             return [str(locator) for locator in json.loads(document)["locators"]]
         return []
 
     def close(self) -> None:
         """Undeclare everything and close. May be called twice."""
-        with quietly():
+        with ignore_transport_errors():
             self.raw.close()  # type: ignore[no-untyped-call]
 
     def __enter__(self) -> Self:
@@ -176,13 +173,13 @@ class Session:
 
 
 def check_keys(key_exprs: Sequence[str]) -> None:
-    """Raise MisuseError if one is malformed or two overlap: a message under both comes twice."""
+    """Raise MisuseError if one is malformed or two overlap: messages under both come twice."""
     parsed = []
     for text in key_exprs:
         try:
             parsed.append(zenoh.KeyExpr(text))
         except zenoh.ZError as error:
-            raise MisuseError(f"key expression {text!r}: {plain(error)}") from None
+            raise MisuseError(f"key expression {text!r}: {one_line(error)}") from None
     for one, other in itertools.combinations(parsed, 2):
         if one.intersects(other):
             raise MisuseError(
@@ -192,7 +189,7 @@ def check_keys(key_exprs: Sequence[str]) -> None:
 
 
 def check_options(options: ZenohOptions) -> None:
-    """Raise MisuseError for what `open_session` would refuse wherever the network is."""
+    """Raise MisuseError where `open_session` would, without connecting."""
     check_endpoints((*options.connect, *options.listen))
     _config_from_file(options.config_file)
 
@@ -211,7 +208,7 @@ def open_session(options: ZenohOptions, *, mode: Mode) -> Session:
         return Session(zenoh.open(config))
     except BaseException as error:
         if isinstance(error, zenoh.ZError) or is_panic(error):
-            raise cannot_open(error, json.loads(connect), json.loads(listen)) from None
+            raise open_error(error, json.loads(connect), json.loads(listen)) from None
         raise
 
 
@@ -223,14 +220,14 @@ def _config_from_file(path: Path | None) -> zenoh.Config:
     try:
         return zenoh.Config.from_file(path)
     except zenoh.ZError as error:
-        raise MisuseError(f"{path}: not a Zenoh configuration: {plain(error)}") from None
+        raise MisuseError(f"{path}: not a Zenoh configuration: {one_line(error)}") from None
 
 
 class Router:
     """A running router: ``with Router(ZenohOptions(listen=("tcp/127.0.0.1:0",))) as router: …``.
 
-    ``endpoints`` is where it listens; port 0 asks the system for a free port, and stands there
-    with the number it got. Raises TransportError if it cannot listen.
+    It runs in this process. ``endpoints`` are those it listens on; port 0 takes a free port, and
+    ``endpoints`` has its number. Raises TransportError if it cannot listen.
     """
 
     def __init__(self, options: ZenohOptions) -> None:

@@ -77,7 +77,7 @@ def record(
     policy = parse_fsync(fsync)
     options = dataclasses.replace(
         zenoh_options(connect, listen, zenoh_config),
-        largest_message_bytes=max(_LARGEST_BYTES, 4 * max_payload),
+        max_message_bytes=max(_LARGEST_BYTES, 4 * max_payload),
     )
     keys = tuple(key or DEFAULT_KEYS)
     check_keys(keys)

@@ -177,7 +177,7 @@ def serve(
     camera = camera_from(hfov, image)
     options = dataclasses.replace(
         zenoh_options(connect, listen, zenoh_config),
-        largest_message_bytes=max(_LARGEST_BYTES, 4 * max_bytes),
+        max_message_bytes=max(_LARGEST_BYTES, 4 * max_bytes),
     )
     given = HttpOptions(token_file, tls_cert, tls_key, tuple(allow_host or ()))
     with ExitStack() as stack:

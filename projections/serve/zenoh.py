@@ -10,7 +10,7 @@ from concurrent.futures import Future
 from typing import Any, Final, Self
 
 from eventsrc.errors import MapfoldError
-from eventsrc.transport.session import Asked, Session
+from eventsrc.transport.session import Query, Session
 from projections.errors import QuestionError
 
 from .answering import Answerer, encode, refusal
@@ -30,8 +30,8 @@ class ZenohService:
     def __init__(self, session: Session, answerer: Answerer, room: Room) -> None:
         self._answerer, self._room = answerer, room
         self._declared = [
-            session.questions(RELOCALIZE, self._take),
-            session.questions(f"{STATE}/**", self._take),
+            session.queryable(RELOCALIZE, self._take),
+            session.queryable(f"{STATE}/**", self._take),
         ]
         session.confirm()
 
@@ -41,23 +41,23 @@ class ZenohService:
             declared.close()
         self._declared = []
 
-    def _take(self, asked: Asked) -> None:
+    def _take(self, query: Query) -> None:
         most = self._answerer.max_bytes
-        if asked.size > most or asked.selector_size > MAX_SELECTOR:
+        if query.size > most or query.selector_size > MAX_SELECTOR:
             error = QuestionError(
-                f"the question has {asked.size} bytes behind a selector of {asked.selector_size};"
+                f"the question has {query.size} bytes behind a selector of {query.selector_size};"
                 f" at most {most} and {MAX_SELECTOR} are taken"
             )
-            asked.refuse(encode(refusal(error)[1]))
+            query.reply_error(encode(refusal(error)[1]))
             return
-        answered = self._room.submit(_PEER, lambda: self._document(asked))
-        answered.add_done_callback(lambda future: _reply(asked, future))
+        answered = self._room.submit(_PEER, lambda: self._document(query))
+        answered.add_done_callback(lambda future: _reply(query, future))
 
-    def _document(self, asked: Asked) -> tuple[str, dict[str, Any]]:
-        if asked.key == RELOCALIZE:
-            return RELOCALIZE, self._answerer.relocalize(asked.payload, asked.parameters)
-        what = asked.key.removeprefix(f"{STATE}/")
-        return asked.key, self._answerer.state(what, asked.parameters)
+    def _document(self, query: Query) -> tuple[str, dict[str, Any]]:
+        if query.key == RELOCALIZE:
+            return RELOCALIZE, self._answerer.relocalize(query.payload, query.parameters)
+        what = query.key.removeprefix(f"{STATE}/")
+        return query.key, self._answerer.state(what, query.parameters)
 
     def __enter__(self) -> Self:
         return self
@@ -66,13 +66,13 @@ class ZenohService:
         self.close()
 
 
-def _reply(asked: Asked, answered: "Future[tuple[str, dict[str, Any]]]") -> None:
+def _reply(query: Query, answered: "Future[tuple[str, dict[str, Any]]]") -> None:
     try:
         key, document = answered.result()
-        asked.answer(key, encode(document))
+        query.reply(key, encode(document))
     except MapfoldError as error:
-        asked.refuse(encode(refusal(error)[1]))
+        query.reply_error(encode(refusal(error)[1]))
     finally:
-        if not asked.ended:  # a mistake of ours, which is logged; still no silence
-            asked.refuse(encode(refusal(MapfoldError())[1]))
+        if not query.ended:  # a mistake of ours, which is logged; still no silence
+            query.reply_error(encode(refusal(MapfoldError())[1]))
             _log.error("a question could not be answered", exc_info=answered.exception())

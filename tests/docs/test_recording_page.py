@@ -49,7 +49,7 @@ def test_the_configuration_is_one_that_zenoh_reads(endpoint: str, tmp_path: Path
     file.write_text(_block("json5"))
     options = ZenohOptions(connect=(endpoint,), config_file=file)
     with open_session(options, mode="client") as session:
-        assert session.linked
+        assert session.is_connected
 
 
 def test_the_numbers_on_the_page_are_those_in_the_code() -> None:

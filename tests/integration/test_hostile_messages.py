@@ -26,19 +26,19 @@ LONG_KEYS = ("t/" + "é" * 11_000, "t/" + "k" * 22_000, "t/" + "k" * 60_000)
 PANIC = """
 import sys
 from eventsrc.transport.session import ZenohOptions, open_session
-from eventsrc.transport.declarations import clear_errors
+from eventsrc.transport.errors import transport_errors
 from eventsrc.errors import TransportError
 
 session = open_session(ZenohOptions(connect=(sys.argv[1],)), mode="client")
 for _ in range(2):  # from the second on a lock of Zenoh's is poisoned
     try:
-        with clear_errors("here"):
+        with transport_errors("here"):
             session.raw.put("t/" + "k" * 70_000, b"")
     except TransportError as error:
         print(error)
 session.close()
 try:
-    with clear_errors("here"):
+    with transport_errors("here"):
         raise KeyboardInterrupt
 except KeyboardInterrupt:
     print("interrupted")

@@ -19,7 +19,7 @@ def test_it_says_where_it_listens_and_ends_cleanly(start: Start, number: int) ->
     program = start("router", "--listen", "tcp/127.0.0.1:0")
     endpoint = program.wait_for("router listening on").split()[3].rstrip(";")
     with open_session(ZenohOptions(connect=(endpoint,)), mode="client") as session:
-        assert session.linked
+        assert session.is_connected
     assert program.end(number) == 0
     assert program.lines[-1] == "router ended"
 

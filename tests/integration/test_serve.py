@@ -73,7 +73,7 @@ def question(number: int = 0) -> bytes:
 
 
 def ask(session: Session, selector: str, payload: bytes | None = None) -> tuple[bool, Any]:
-    ((good, answer),) = session.ask(selector, payload, timeout_s=DEADLINE_S)
+    ((good, answer),) = session.get_replies(selector, payload, timeout_s=DEADLINE_S)
     return good, json.loads(answer)
 
 
@@ -176,7 +176,7 @@ class TestZenoh:
         threads = [
             threading.Thread(
                 target=lambda: answers.extend(
-                    session.ask("mapfold/relocalize", question(), timeout_s=DEADLINE_S)
+                    session.get_replies("mapfold/relocalize", question(), timeout_s=DEADLINE_S)
                 )
             )
             for _ in range(4)
@@ -189,7 +189,7 @@ class TestZenoh:
         for thread in threads:
             thread.join()
         assert all(json.loads(answer) for _, answer in answers)
-        assert session.ask("mapfold/relocalize", question(), timeout_s=1.0) == []
+        assert session.get_replies("mapfold/relocalize", question(), timeout_s=1.0) == []
 
 
 def test_too_many_questions_are_refused_not_queued_forever(pools: Pools) -> None:

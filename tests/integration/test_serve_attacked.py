@@ -157,13 +157,15 @@ class TestOverZenoh:
         ]
         for number, selector in enumerate(selectors):
             payload = JUNK[number] if number < len(JUNK) else b"[]"
-            for good, got in asking.ask(selector, payload, timeout_s=DEADLINE_S):
+            for good, got in asking.get_replies(selector, payload, timeout_s=DEADLINE_S):
                 error = json.loads(got)["error"]
                 assert (good, error["kind"]) == (False, "bad_question"), selector[:50]
                 assert len(error["message"]) < 500
 
     def test_a_question_is_measured_before_it_is_read(self, asking: Session) -> None:
-        ((good, got),) = asking.ask("mapfold/relocalize", bytes(10**7), timeout_s=DEADLINE_S)
+        ((good, got),) = asking.get_replies(
+            "mapfold/relocalize", bytes(10**7), timeout_s=DEADLINE_S
+        )
         assert not good
         assert "has 10000000 bytes" in json.loads(got)["error"]["message"]
 
@@ -174,9 +176,9 @@ def test_zenoh_puts_together_no_question_that_is_far_too_long(
     args = ("--connect", endpoint, "--http", "127.0.0.1:0", "--db", targets.graph_url)
     with served(*args) as service:
         asking, before = connected(), service.peak_bytes
-        asking.ask("mapfold/relocalize", bytes(300 * MEBIBYTE), timeout_s=5.0)
+        asking.get_replies("mapfold/relocalize", bytes(300 * MEBIBYTE), timeout_s=5.0)
         assert status(ask(service.port, question())) == 200
-        ((good, _),) = asking.ask("mapfold/relocalize", b"nonsense", timeout_s=DEADLINE_S)
+        ((good, _),) = asking.get_replies("mapfold/relocalize", b"nonsense", timeout_s=DEADLINE_S)
         assert not good
         assert service.peak_bytes - before < 150 * MEBIBYTE
 

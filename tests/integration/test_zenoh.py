@@ -10,10 +10,10 @@ import zenoh
 
 from eventsrc.errors import MapfoldError, MisuseError, TransportError
 from eventsrc.transport.session import (
-    Asked,
-    Number,
+    Query,
     Received,
     Router,
+    SequenceNumber,
     Session,
     ZenohOptions,
     open_session,
@@ -47,10 +47,10 @@ def test_bytes_arrive_as_sent_and_in_order(connected: Sessions) -> None:
 
 def test_an_advanced_publishers_numbers_arrive_and_the_last_one_again(connected: Sessions) -> None:
     arrived: queue.SimpleQueue[Received] = queue.SimpleQueue()
-    told: queue.SimpleQueue[Number] = queue.SimpleQueue()
+    told: queue.SimpleQueue[SequenceNumber] = queue.SimpleQueue()
     subscriber = connected()
     subscriber.subscribe("tb/**", arrived.put)
-    subscriber.heartbeats("tb/**", told.put)
+    subscriber.subscribe_heartbeats("tb/**", told.put)
     subscriber.confirm()
     publisher = zenoh.ext.declare_advanced_publisher(
         connected().raw,
@@ -61,19 +61,19 @@ def test_an_advanced_publishers_numbers_arrive_and_the_last_one_again(connected:
         publisher.put(b"x")
     numbers = [arrived.get(timeout=DEADLINE_S).number for _ in range(3)]
     source = f"{publisher.id.zid}:{publisher.id.eid}"
-    assert numbers == [Number(source, value) for value in range(3)]
-    while told.get(timeout=DEADLINE_S) != Number(source, 2):
+    assert numbers == [SequenceNumber(source, value) for value in range(3)]
+    while told.get(timeout=DEADLINE_S) != SequenceNumber(source, 2):
         pass
 
 
 def test_what_is_no_heartbeat_tells_nothing(connected: Sessions) -> None:
-    told: queue.SimpleQueue[Number] = queue.SimpleQueue()
+    told: queue.SimpleQueue[SequenceNumber] = queue.SimpleQueue()
     subscriber, sender = connected(), connected()
-    subscriber.heartbeats("tb/x", told.put)
+    subscriber.subscribe_heartbeats("tb/x", told.put)
     subscriber.confirm()
     for key, payload in [("a/1/_", b"short"), ("a", b"1234"), ("a/1/_", b""), ("b/2", b"\1\0\0\0")]:
         sender.publisher(f"tb/x/@adv/pub/{key}").put(payload)
-    assert told.get(timeout=DEADLINE_S) == Number("b:2", 1)
+    assert told.get(timeout=DEADLINE_S) == SequenceNumber("b:2", 1)
 
 
 def test_a_publisher_knows_whether_anybody_listens(connected: Sessions) -> None:
@@ -108,26 +108,26 @@ def test_confirm_means_the_router_knows(connected: Sessions) -> None:
 
 
 def test_a_question_is_answered_or_refused(connected: Sessions) -> None:
-    def turn_around(asked: Asked) -> None:
-        if asked.payload:
-            asked.answer(asked.key, asked.payload[::-1])
+    def turn_around(query: Query) -> None:
+        if query.payload:
+            query.reply(query.key, query.payload[::-1])
         else:
-            asked.refuse(b"nothing asked")
+            query.reply_error(b"nothing asked")
 
     server = connected()
-    server.questions("mapfold/relocalize", turn_around)
+    server.queryable("mapfold/relocalize", turn_around)
     server.confirm()
     asking = connected()
     assert asking.get("mapfold/relocalize", b"abc", timeout_s=DEADLINE_S) == [b"cba"]
     assert asking.get("mapfold/nobody", timeout_s=DEADLINE_S) == []
     assert asking.get("mapfold/relocalize", timeout_s=DEADLINE_S) == [], "a refusal is no answer"
-    refused = asking.ask("mapfold/relocalize", timeout_s=DEADLINE_S)
+    refused = asking.get_replies("mapfold/relocalize", timeout_s=DEADLINE_S)
     assert refused == [(False, b"nothing asked")]
 
 
 def test_a_peer_can_be_called_directly() -> None:
     with open_session(LOOPBACK, mode="peer") as peer:
-        assert not peer.linked
+        assert not peer.is_connected
 
 
 def test_a_free_port_is_named_and_freed() -> None:
@@ -161,7 +161,7 @@ def test_one_of_two_routers_is_enough(endpoint: str) -> None:
     with Router(LOOPBACK) as gone:
         (away,) = gone.endpoints
     with open_session(ZenohOptions(connect=(away, endpoint)), mode="client") as session:
-        assert session.linked
+        assert session.is_connected
 
 
 @pytest.mark.parametrize("mode", ["client", "peer", "router"])
@@ -189,7 +189,7 @@ def test_the_configuration_file_says_where(tmp_path: Path, endpoint: str) -> Non
     file = tmp_path / "zenoh.json5"
     file.write_text(f"{{ connect: {{ endpoints: ['{endpoint}'] }} }}")
     with open_session(ZenohOptions(config_file=file), mode="client") as session:
-        assert session.linked
+        assert session.is_connected
 
 
 def test_the_command_line_goes_before_the_file(tmp_path: Path, endpoint: str) -> None:
@@ -197,7 +197,7 @@ def test_the_command_line_goes_before_the_file(tmp_path: Path, endpoint: str) ->
     file.write_text("{ mode: 'router', connect: { endpoints: ['tcp/127.0.0.1:1'] } }")
     options = ZenohOptions(connect=(endpoint,), config_file=file)
     with open_session(options, mode="client") as session:
-        assert session.linked
+        assert session.is_connected
 
 
 @pytest.mark.parametrize("text", [None, "{ mode: 12 }", "not json5 {"])

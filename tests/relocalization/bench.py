@@ -172,7 +172,7 @@ def client(payloads: Sequence[bytes], seconds: list[float]) -> None:
     with open_session(ZenohOptions(connect=(ENDPOINT,)), mode="client") as session:
         for question in payloads:
             began = time.perf_counter()
-            ((good, answer),) = session.ask("mapfold/relocalize", question, timeout_s=30.0)
+            ((good, answer),) = session.get_replies("mapfold/relocalize", question, timeout_s=30.0)
             seconds.append(time.perf_counter() - began)
             assert good, answer
 

@@ -8,7 +8,7 @@ from eventsrc.gaps import Gap
 from eventsrc.recorder import queue as inbox_module
 from eventsrc.recorder.queue import MOST_KEYS, OTHER_KEYS, Inbox
 from eventsrc.robot.acks import sent_key
-from eventsrc.transport.session import Number, Received
+from eventsrc.transport.session import Received, SequenceNumber
 from tests.fixtures_zenoh import DEADLINE_S
 
 
@@ -59,7 +59,7 @@ def test_what_was_turned_away_has_come_all_the_same() -> None:
     """A message is lost in the queue or on the way, never both."""
     inbox = Inbox(1, patience_s=0)
     for value in (0, 1, 4):
-        inbox.put(Received("tb/detections", b"x", Number("zid:1", value)))
+        inbox.put(Received("tb/detections", b"x", SequenceNumber("zid:1", value)))
     assert inbox.take_missed(None) == [Gap("zid:1", 2, 3)]
     assert inbox.take_missed(None) == []
     assert (inbox.overflowed, inbox.missed) == (2, 2)

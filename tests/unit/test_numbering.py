@@ -6,7 +6,7 @@ import pytest
 
 from eventsrc.gaps import Gap
 from eventsrc.recorder.queue import MOST_SOURCES, Numbering
-from eventsrc.transport.session import Number
+from eventsrc.transport.session import SequenceNumber
 
 SETTLE_NS = 10
 
@@ -14,7 +14,7 @@ SETTLE_NS = 10
 def _numbering(*values: int, source: str = "a:1") -> Numbering:
     numbering = Numbering(SETTLE_NS)
     for value in values:
-        numbering.arrived(Number(source, value), 0)
+        numbering.arrived(SequenceNumber(source, value), 0)
     return numbering
 
 
@@ -22,7 +22,7 @@ def test_a_gap_is_told_once_when_it_has_settled() -> None:
     numbering = _numbering(0, 1, 4, 9, 8)
     assert numbering.due(SETTLE_NS - 1) == []
     assert numbering.due(SETTLE_NS) == [Gap("a:1", 2, 3), Gap("a:1", 5, 7)]
-    numbering.arrived(Number("a:1", 2), SETTLE_NS)
+    numbering.arrived(SequenceNumber("a:1", 2), SETTLE_NS)
     assert numbering.flush() == []
 
 
@@ -35,15 +35,15 @@ def test_order_and_repetition_are_no_loss(seed: int) -> None:
 
 def test_the_last_are_missed_when_their_publisher_tells_of_them() -> None:
     numbering = _numbering(5, 6)
-    numbering.told(Number("a:1", 8), 0)
+    numbering.told(SequenceNumber("a:1", 8), 0)
     assert numbering.due(SETTLE_NS) == [Gap("a:1", 7, 8)]
 
 
 def test_of_an_unknown_publisher_only_what_follows_is_missed() -> None:
     numbering = Numbering(SETTLE_NS)
-    numbering.told(Number("a:1", 8), 0)
-    numbering.arrived(Number("b:1", 7), 0)
-    numbering.arrived(Number("a:1", 10), 0)
+    numbering.told(SequenceNumber("a:1", 8), 0)
+    numbering.arrived(SequenceNumber("b:1", 7), 0)
+    numbering.arrived(SequenceNumber("a:1", 10), 0)
     assert numbering.flush() == [Gap("a:1", 9, 9)]
 
 
@@ -55,7 +55,7 @@ def test_numbers_go_on_after_the_last() -> None:
 def test_forged_publishers_do_not_fill_the_memory_and_hide_no_loss() -> None:
     numbering = _numbering(0, 2)
     for number in range(3 * MOST_SOURCES):
-        numbering.arrived(Number(f"forged:{number}", 1), 0)
+        numbering.arrived(SequenceNumber(f"forged:{number}", 1), 0)
     assert len(numbering._sources) == MOST_SOURCES
     assert len(numbering._ledger.state()) == MOST_SOURCES
     assert numbering.due(0) == [Gap("a:1", 1, 1)]

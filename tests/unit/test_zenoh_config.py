@@ -26,7 +26,7 @@ def _configured(
         file = folder / "zenoh.json5"
         file.write_text(text)
         config = zenoh.Config.from_file(file)
-        options = ZenohOptions(listen=listen, config_file=file, largest_message_bytes=largest)
+        options = ZenohOptions(listen=listen, config_file=file, max_message_bytes=largest)
     configure(config, zenoh.Config(), options, mode)
     return config
 

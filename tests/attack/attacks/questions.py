@@ -76,7 +76,9 @@ def attack(arena: Arena) -> None:
             askers.submit(_ask_again_and_again, arena, service.url, payloads) for _ in range(ASKERS)
         ]
         for payload in payloads:
-            for good, answer in session.ask("mapfold/relocalize", payload, timeout_s=PATIENCE_S):
+            for good, answer in session.get_replies(
+                "mapfold/relocalize", payload, timeout_s=PATIENCE_S
+            ):
                 _judge(arena, payload, 200 if good else 400, answer)
         for asked in asking:
             asked.result()

@@ -1,0 +1,70 @@
+"""Zenoh's failures as a TransportError with a message of one line."""
+
+import contextlib
+import re
+from collections.abc import Iterator
+from typing import Final
+
+import zenoh
+
+from eventsrc.errors import TransportError
+
+_SOURCE_PLACE: Final = re.compile(r"\s+at /\S+\.rs:\d+\.?")
+_PANIC: Final = ("pyo3_runtime", "PanicException")
+_SYSTEM_ERROR: Final = re.compile(r"\[[^\]]*: (.+ \(os error \d+\))\]?")
+
+
+def is_panic(error: BaseException) -> bool:
+    """Whether ``error`` is a panic of Zenoh. pyo3 raises a BaseException without a public name."""
+    kind = type(error)
+    return (kind.__module__, kind.__name__) == _PANIC
+
+
+def one_line(error: BaseException) -> str:
+    """Zenoh's message on one line, without locations in its source."""
+    text = " ".join(_SOURCE_PLACE.sub("", str(error)).split())
+    inner = _SYSTEM_ERROR.search(text)
+    return (inner.group(1) if inner else text).rstrip(" .!")
+
+
+def open_error(error: BaseException, connect: object, listen: object) -> TransportError:
+    """The error of a session that does not open; ``connect`` and ``listen`` are its endpoints."""
+    message = str(error)
+    if "listener" in message:
+        return TransportError(
+            f"cannot listen on {_joined(listen)}: {one_line(error)}; "
+            "stop what listens there or choose another place with --listen"
+        )
+    if "Unable to connect" in message:
+        return TransportError(
+            f"no Zenoh router or peer answers at {_joined(connect)}; "
+            "start one with `mapfold router` or say where it is with --connect"
+        )
+    return TransportError(f"no Zenoh session: {one_line(error)}; check --zenoh-config")
+
+
+def _joined(endpoints: object) -> str:
+    return ", ".join(map(str, endpoints)) if isinstance(endpoints, list) else str(endpoints)
+
+
+@contextlib.contextmanager
+def transport_errors(place: str) -> Iterator[None]:
+    """Turn what Zenoh raises into a TransportError that begins with ``place``.
+
+    The message names a panic as such: the session may be unusable afterwards.
+    """
+    try:
+        yield
+    except zenoh.ZError as error:
+        raise TransportError(f"{place}: {one_line(error)}") from None
+    except BaseException as error:
+        if not is_panic(error):
+            raise
+        raise TransportError(f"{place}: Zenoh failed inside: {one_line(error)}") from None
+
+
+@contextlib.contextmanager
+def ignore_transport_errors() -> Iterator[None]:
+    """Ignore what Zenoh raises while something is closed: nobody could act on it."""
+    with contextlib.suppress(TransportError), transport_errors("closing"):
+        yield
