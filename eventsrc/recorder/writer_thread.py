@@ -38,14 +38,14 @@ from eventsrc.gaps import Gap, GapLedger
 from eventsrc.ingest import Rejected
 from eventsrc.log import LogWriter
 from eventsrc.robot.acks import (
-    MOST_PER_ACK,
+    MAX_PER_ACK,
     SENT_SUFFIX,
     Ack,
     Refusal,
     Refusals,
     Sent,
     ack_key,
-    fingerprint,
+    payload_sha256,
     refusal_key,
 )
 from eventsrc.system_events import LOSS_KEY, Loss
@@ -75,7 +75,7 @@ def unsynced(offset: int, message: Received, judged: Judged) -> Unsynced:
         return Unsynced(offset, key, Refusal.of(message.payload, verdict.reason), None, 0, "")
     if event.version != ENVELOPE_VERSION:
         return Unsynced(offset, key, None, None, 0, "")
-    digest = fingerprint(message.payload)
+    digest = payload_sha256(message.payload)
     return Unsynced(offset, key, None, verdict.run_id, verdict.keyframe_id, digest)
 
 
@@ -96,8 +96,8 @@ class Answers:
     def messages(self, log_id: str) -> Iterator[tuple[str, bytes]]:
         """Key and payload of each."""
         for (run_id, key), digests in self._synced.items():
-            for start in range(0, len(digests), MOST_PER_ACK):
-                some = tuple(digests[start : start + MOST_PER_ACK])
+            for start in range(0, len(digests), MAX_PER_ACK):
+                some = tuple(digests[start : start + MAX_PER_ACK])
                 ack = Ack(run_id=run_id, key=key, log_id=log_id, sha256=some)
                 yield ack_key(run_id), ack.encode()
         for key, refused in self._refusals.items():

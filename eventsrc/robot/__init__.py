@@ -1,1 +1,1 @@
-"""What runs on the robot: publish envelopes, keep them until a recorder has acknowledged them."""
+"""What runs on the robot: envelopes are published, and kept until a recorder acknowledges them."""

@@ -1,25 +1,18 @@
-"""What a recorder tells robots: these envelopes of yours are on disk.
+"""Messages between recorders and robots: acknowledgements, refusals, progress. None is an event.
 
-An ack goes out on ``mapfold/ack/<run_id>`` after a sync and names the SHA-256 of every payload of
-that run which this sync has put on the disk, and the key they came under. So it can be wrong about
-nobody's envelopes, whatever run, keyframe or sender a message claims: who has the same bytes under
-the same key has them in the log. It is no event: it is not in the log, and a robot that has not
-heard it sends again and hears the next.
-
-What a recorder tells robots of payloads it will never acknowledge.
-
-A refused payload may have no run that can be read, so it is named by its size and SHA-256, and the
-refusals go out by the key it came under, on ``mapfold/ack/refused/<key>``: two parts behind the
-prefix, so no run's ack key, and behind that prefix because recorders of ``**`` pass over whatever
-is there. A refusal is sent when the ``mapfold/rejected`` event with the bytes and the reason is
-synced. It is no event itself: whoever missed it sends again and hears the next.
-
-What a robot tells recorders: how far it has got with a run.
-
-Without it, nobody could miss the last keyframes of a run: a gap shows when a keyframe behind it is
-recorded. It goes out on ``<key>/@mapfold/sent``, which no ``*`` or ``**`` matches, so that nobody
-receives it who does not ask for it. It is no event and is not in the log; what follows from it, a
-gap, is (`eventsrc.gaps`).
+* An `Ack` goes out on ``mapfold/ack/<run_id>`` after a sync. It names the key and the SHA-256 of
+  every payload of that run that the sync has brought to the disk. It names bytes, not keyframes, so
+  no other run, keyframe or sender can be acknowledged by mistake. A robot that missed it sends
+  again and gets the next.
+* `Refusals` name payloads that a recorder will never acknowledge, by size and SHA-256, since such a
+  payload may have no readable run. They go out on ``mapfold/ack/refused/<key>``, when the
+  ``mapfold/rejected`` event with the bytes and the reason is synced. That key has two parts behind
+  the ack prefix, so it is no run's ack key, and recorders of ``**`` ignore everything behind that
+  prefix. A robot that missed it sends again and gets the next.
+* `Sent` is a robot's progress: the last keyframe of a run that it has sent. Without it, a recorder
+  could not miss the last keyframes of a run: a gap shows only when a later keyframe is recorded. It
+  goes out on ``<key>/@mapfold/sent``, which no ``*`` or ``**`` matches, so only those who ask for
+  it receive it. The gap that follows from it is an event (`eventsrc.gaps`).
 """
 
 import hashlib
@@ -31,12 +24,21 @@ from pydantic import BaseModel, ConfigDict, FailFast, Field
 from eventsrc.transport.config import MAX_KEY_BYTES
 
 ACK_PREFIX: Final = "mapfold/ack/"
-MOST_PER_ACK: Final = 512
-"""Payloads one ack names: 34 kB, which Zenoh sends in one piece."""
+_REFUSAL_PREFIX: Final = f"{ACK_PREFIX}refused/"
+SENT_SUFFIX: Final = "/@mapfold/sent"
+MAX_PER_ACK: Final = 512
+"""Payloads named by one ack: 34 kB, which Zenoh sends in one piece."""
+MAX_SENT_BYTES: Final = 4_096
+"""Bound of an encoded `Sent`, more than any run id takes."""
+
+
+def payload_sha256(payload: bytes) -> str:
+    """The SHA-256 that names a payload, in hexadecimal."""
+    return hashlib.sha256(payload).hexdigest()
 
 
 def ack_key(run_id: str) -> str:
-    """The key of the acks for ``run_id``, which may hold what a key expression may not."""
+    """The key of the acks for ``run_id``; characters not allowed in a key are quoted."""
     return ACK_PREFIX + quote(run_id, safe="")
 
 
@@ -56,25 +58,20 @@ class Ack(BaseModel):
 
     @classmethod
     def decode(cls, payload: bytes) -> "Ack":
-        """Back from bytes; raises ValidationError for anything that is no ack."""
+        """From bytes; raises ValidationError for anything else."""
         return cls.model_validate_json(payload)
 
 
-_PREFIX: Final = f"{ACK_PREFIX}refused/"
-
-
 def refusal_key(key: str) -> str:
-    """The key of the refusals of what came under ``key``. One that is too long for an envelope is
-    named by its digest behind a ``=``, which `quote` leaves in nothing; else it would be longer."""
+    """The key of the refusals of payloads that came under ``key``.
+
+    A key that is too long for envelopes is replaced by ``=`` and its SHA-256. `quote` leaves no
+    ``=``, so the two forms cannot collide.
+    """
     raw = key.encode()
     if len(raw) > MAX_KEY_BYTES:
-        return f"{_PREFIX}={hashlib.sha256(raw).hexdigest()}"
-    return _PREFIX + quote(key, safe="")
-
-
-def fingerprint(payload: bytes) -> str:
-    """What names these bytes: their SHA-256, in hexadecimal."""
-    return hashlib.sha256(payload).hexdigest()
+        return f"{_REFUSAL_PREFIX}={hashlib.sha256(raw).hexdigest()}"
+    return _REFUSAL_PREFIX + quote(key, safe="")
 
 
 class Refusal(BaseModel):
@@ -88,8 +85,8 @@ class Refusal(BaseModel):
 
     @classmethod
     def of(cls, payload: bytes, reason: str) -> "Refusal":
-        """Say that ``payload`` was refused for ``reason``."""
-        return cls(sha256=fingerprint(payload), size=len(payload), reason=reason)
+        """The refusal of ``payload``."""
+        return cls(sha256=payload_sha256(payload), size=len(payload), reason=reason)
 
 
 class Refusals(BaseModel):
@@ -106,17 +103,12 @@ class Refusals(BaseModel):
 
     @classmethod
     def decode(cls, payload: bytes) -> "Refusals":
-        """Back from bytes; raises ValidationError for anything else."""
+        """From bytes; raises ValidationError for anything else."""
         return cls.model_validate_json(payload)
 
 
-SENT_SUFFIX: Final = "/@mapfold/sent"
-MAX_SENT_BYTES: Final = 4_096
-"""More than any run id takes."""
-
-
 def sent_key(key: str) -> str:
-    """Where it is told of what goes out under ``key``; both may be key expressions."""
+    """The key of the progress of what is sent under ``key``; both may be key expressions."""
     return key + SENT_SUFFIX
 
 
@@ -134,5 +126,5 @@ class Sent(BaseModel):
 
     @classmethod
     def decode(cls, payload: bytes) -> "Sent":
-        """Back from bytes; raises ValidationError for anything else."""
+        """From bytes; raises ValidationError for anything else."""
         return cls.model_validate_json(payload)

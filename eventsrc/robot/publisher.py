@@ -1,14 +1,13 @@
-"""The robot's side: publish envelopes so that none is lost while the link or the recorder is away.
+"""Publish envelopes from a robot, with none lost while the link or the recorder is away.
 
 * `EnvelopePublisher.publish` writes the envelope into the spool and returns; it never waits for
-  the network. One thread does all the sending (`eventsrc.robot.sender`), in the order of
-  publishing.
-* An envelope leaves the spool when a recorder's ack names its bytes, and an ack names what is
-  synced in a log. Until then it is sent again. So it may arrive more than once, which the fold
-  absorbs: the first one counts.
-* What no recorder would accept is refused here, by the same door (`eventsrc.ingest`). A recorder
-  may have narrower rules (`--max-payload`) or older ones; what it refuses, with the bytes and the
-  reason in its log, is set aside and no longer sent: see `EnvelopePublisher.refused`.
+  the network. One thread sends (`eventsrc.robot.sender`), in the order of publishing.
+* An envelope leaves the spool when a recorder's ack names its bytes; an ack names what is synced in
+  a log. Until then it is sent again, so it may arrive more than once; the fold counts the first.
+* What no recorder would accept is refused here, by the recorder's own validation
+  (`eventsrc.ingest`). A recorder may have narrower rules (`--max-payload`) or older ones. An
+  envelope that it refuses, with the bytes and the reason in its log, is quarantined in the spool
+  and no longer sent: see `EnvelopePublisher.refused`.
 """
 
 import json
@@ -32,9 +31,9 @@ class EnvelopePublisher:
     """Publishes one robot's envelopes under ``key``; a context manager, usable from any thread.
 
     The constructor opens the spool and begins to send what an earlier process left in it. It raises
-    SpoolError if the spool cannot be used, and MisuseError if the key is one of mapfold's own or
-    malformed, an endpoint malformed or the configuration file none; but nothing when nobody answers
-    there: the sending thread tries until somebody does.
+    SpoolError if the spool cannot be used, and MisuseError if the key is reserved or malformed, an
+    endpoint is malformed or the configuration file invalid. It does not raise when no router
+    answers: the sending thread tries until one does.
     """
 
     def __init__(
@@ -62,10 +61,10 @@ class EnvelopePublisher:
             target=self._sender.run, name="envelope-sender", daemon=True
         )
         self._thread.start()
-        self._left: int | None = None
+        self._waiting: int | None = None
 
     def publish(self, envelope: Mapping[str, Any] | bytes) -> None:
-        """Take one envelope: a dictionary, or its JSON as bytes, which are sent as they are.
+        """Spool one envelope: a dictionary, or its JSON as bytes, which are sent unchanged.
 
         Raises InvalidEnvelope with the reason a recorder would give, SpoolFull when the spool has
         no room, SpoolError when the spool is closed or its disk fails, TransportError when the
@@ -81,44 +80,49 @@ class EnvelopePublisher:
 
     @property
     def unacknowledged(self) -> int:
-        """How many envelopes wait for a recorder's answer."""
+        """How many envelopes wait for a recorder's acknowledgement."""
         return len(self._spool)
 
     @property
     def refused_count(self) -> int:
-        """How many envelopes a recorder has refused; they are set aside in the spool."""
+        """How many envelopes a recorder has refused; they are quarantined in the spool."""
         return self._spool.refused_count
 
     def refused(self, limit: int = 100) -> list[Refused]:
-        """The oldest envelopes that were refused: which, by the recorder of which log, and why."""
+        """The oldest refused envelopes, each with the refusing recorder's log and its reason."""
         return self._spool.refused(limit)
 
     def retry_refused(self) -> int:
-        """Send what was refused once more, for a recorder that was mended; how many envelopes.
-        Those whose bytes gave way to new envelopes stay `refused`; the log named there has them."""
+        """Send the refused envelopes again, for a recorder that was fixed; returns how many.
+
+        Those whose bytes were dropped for new envelopes stay `refused`; the log named there has
+        them.
+        """
         retried = self._spool.retry_refused()
         self._sender.wake()
         return retried
 
     def discard_refused(self) -> int:
-        """Forget what was refused; how many envelopes that were."""
+        """Drop the refused envelopes; returns how many."""
         return self._spool.discard_refused()
 
     def flush(self, timeout_s: float) -> bool:
-        """Wait until everything published is answered. True when all of it is acknowledged; False
-        when it was not in time, or when envelopes are set aside as `refused`."""
+        """Wait until everything published is acknowledged or refused.
+
+        True when all of it is acknowledged; False on a timeout or when any is `refused`.
+        """
         return self._sender.wait_until_answered(timeout_s) and not self.refused_count
 
     def close(self, timeout_s: float = 0.0) -> int:
-        """`flush`, then stop. How many envelopes wait in the spool, for the next process."""
-        if self._left is None:
+        """`flush`, then stop. Returns how many envelopes wait in the spool for the next process."""
+        if self._waiting is None:
             if timeout_s > 0:
                 self.flush(timeout_s)
             self._sender.stop()
             self._thread.join()
-            self._left = len(self._spool)
+            self._waiting = len(self._spool)
             self._spool.close()
-        return self._left
+        return self._waiting
 
     def __enter__(self) -> Self:
         return self

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from eventsrc.log import LogReader, LogWriter
-from eventsrc.robot.acks import Ack, ack_key, fingerprint
+from eventsrc.robot.acks import Ack, ack_key, payload_sha256
 from eventsrc.robot.publisher import EnvelopePublisher
 from eventsrc.transport.session import Received, Router, ZenohOptions, open_session
 from projections.model.fold import fold_log
@@ -58,7 +58,7 @@ class Robot:
         while not self._stop.wait(self._pause_s):
             message = payload(envelope(self.published, run_id=RUN, note="x" * 4_000))
             with self._lock:
-                self._keyframes[fingerprint(message)] = self.published
+                self._keyframes[payload_sha256(message)] = self.published
             self.publisher.publish(message)
             self.published += 1
 

@@ -17,7 +17,7 @@ from eventsrc.robot.acks import (
     Refusals,
     Sent,
     ack_key,
-    fingerprint,
+    payload_sha256,
     refusal_key,
     sent_key,
 )
@@ -34,7 +34,7 @@ KEY = "tb/detections"
 
 
 def _ack(*payloads: bytes, key: str = KEY) -> bytes:
-    digests = tuple(map(fingerprint, payloads))
+    digests = tuple(map(payload_sha256, payloads))
     return Ack(run_id="run-a", key=key, log_id="log", sha256=digests).encode()
 
 
@@ -438,7 +438,7 @@ def test_a_sending_thread_that_dies_is_told(
     def die(_: Sender) -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr(Sender, "_connect_and_serve", die)
+    monkeypatch.setattr(Sender, "_connect_and_send", die)
     with EnvelopePublisher(ZenohOptions(), tmp_path / "spool") as robot:
         robot._thread.join(DEADLINE_S)
         with pytest.raises(TransportError, match="the sending thread has died"):
@@ -486,7 +486,7 @@ def test_kill_9_loses_nothing_that_was_acknowledged_and_resending_fills_the_rest
 ) -> None:
     """Three recorders are killed under load; each time the log must hold what was acked by then."""
     sent = [payload(envelope(k, note="x" * 1_000)) for k in range(6_000)]
-    keyframes = {fingerprint(message): k for k, message in enumerate(sent)}
+    keyframes = {payload_sha256(message): k for k, message in enumerate(sent)}
     acked: set[int] = set()
     progress = threading.Condition()
 

@@ -18,7 +18,7 @@ import zenoh
 from eventsrc.append import append_payload
 from eventsrc.gap_history import NAME, unread_events
 from eventsrc.log import LogReader, LogWriter
-from eventsrc.robot.acks import Ack, ack_key, fingerprint
+from eventsrc.robot.acks import Ack, ack_key, payload_sha256
 from eventsrc.robot.publisher import EnvelopePublisher
 from eventsrc.transport.session import Received, Router, Session, ZenohOptions
 from tests.commands import PROGRAM
@@ -255,7 +255,7 @@ def test_a_full_disk_is_one_line_and_what_is_synced_stays(
     assert not any("Traceback" in said for said in recorder.lines)
     stored = _stored(log)
     assert stored == sent[: len(stored)]
-    assert acked <= set(map(fingerprint, stored))
+    assert acked <= set(map(payload_sha256, stored))
     numbers = json.loads(recorder.output())
     assert numbers["recorded"] == numbers["next_offset"] == len(stored)
     assert 0 < numbers["unwritten"] <= len(sent) - len(stored)

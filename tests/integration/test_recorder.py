@@ -21,14 +21,14 @@ from eventsrc.recorder import Recorder, RecorderReport
 from eventsrc.recorder.queue import Inbox
 from eventsrc.recorder.writer_thread import Writing
 from eventsrc.robot.acks import (
+    MAX_PER_ACK,
     MAX_SENT_BYTES,
-    MOST_PER_ACK,
     Ack,
     Refusal,
     Refusals,
     Sent,
     ack_key,
-    fingerprint,
+    payload_sha256,
     refusal_key,
     sent_key,
 )
@@ -183,7 +183,7 @@ def test_an_ack_names_what_is_synced_and_nothing_else(connected: Sessions, tmp_p
     acks: list[Ack] = []
     covered = threading.Event()
     sent = [*_keyframes(*range(600), run_id=run_id), *_keyframes(1, 2, run_id=run_id, note="b")]
-    wanted = set(map(fingerprint, sent))
+    wanted = set(map(payload_sha256, sent))
 
     def hear(message: Received) -> None:
         acks.append(Ack.decode(message.payload))
@@ -202,7 +202,7 @@ def test_an_ack_names_what_is_synced_and_nothing_else(connected: Sessions, tmp_p
         running.finish()
     assert {(ack.run_id, ack.key) for ack in acks} == {(run_id, KEY)}
     assert {digest for ack in acks for digest in ack.sha256} == wanted
-    assert max(len(ack.sha256) for ack in acks) <= MOST_PER_ACK
+    assert max(len(ack.sha256) for ack in acks) <= MAX_PER_ACK
     with LogReader(tmp_path / "log") as reader:
         assert {ack.log_id for ack in acks} == {reader.log_id}
 
@@ -238,7 +238,7 @@ def test_an_ack_does_not_rest_on_what_an_earlier_recorder_synced(
         publisher.put(message)
         assert acked.wait(DEADLINE_S)
         running.finish()
-    assert [ack.sha256 for ack in acks] == [(fingerprint(message),)]
+    assert [ack.sha256 for ack in acks] == [(payload_sha256(message),)]
 
 
 def test_a_refusal_follows_when_the_rejected_bytes_are_synced(

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from eventsrc.errors import SpoolFull
-from eventsrc.robot.acks import Ack, Refusal, Refusals, fingerprint
+from eventsrc.robot.acks import Ack, Refusal, Refusals, payload_sha256
 from eventsrc.robot.spool import Refused, Spool, Spooled
 
 MAX_BYTES = 60
@@ -58,7 +58,7 @@ class SpoolMachine(RuleBasedStateMachine):
         moved = [e for e in self.waiting if e[3] in refused and e[0] <= up_to]
         assert self.spool.refuse(Refusals(log_id="log", refused=said), up_to) == len(moved)
         self.waiting = [e for e in self.waiting if e not in moved]
-        shelved = [(*entry, fingerprint(entry[3])) for entry in moved]
+        shelved = [(*entry, payload_sha256(entry[3])) for entry in moved]
         self.aside = sorted([*self.aside, *shelved], key=lambda entry: entry[0])
 
     @rule()
@@ -82,7 +82,7 @@ class SpoolMachine(RuleBasedStateMachine):
         payloads = data.draw(
             st.lists(st.one_of(st.sampled_from([b"x", *known]), st.binary(max_size=3)), min_size=1)
         )
-        digests = tuple(map(fingerprint, payloads))
+        digests = tuple(map(payload_sha256, payloads))
         ack = Ack(run_id="run-a", key="tb/detections", log_id="log", sha256=digests)
         kept = [entry for entry in self.waiting if entry[3] not in payloads]
         assert self.spool.acknowledge(ack) == len(self.waiting) - len(kept)

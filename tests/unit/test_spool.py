@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 from eventsrc.errors import SpoolError, SpoolFull
-from eventsrc.robot.acks import Ack, Refusal, Refusals, fingerprint
+from eventsrc.robot.acks import Ack, Refusal, Refusals, payload_sha256
 from eventsrc.robot.spool import Refused, Spool, Spooled
 
 
 def _ack(*payloads: bytes) -> Ack:
-    digests = tuple(map(fingerprint, payloads))
+    digests = tuple(map(payload_sha256, payloads))
     return Ack(run_id="run-a", key="tb/detections", log_id="log", sha256=digests)
 
 

@@ -1,4 +1,4 @@
-"""What goes over the wire between recorders and robots, of this version and of others."""
+"""Acks, refusals and progress on the wire, of this version and of others."""
 
 import hashlib
 
@@ -17,7 +17,7 @@ from eventsrc.robot.acks import (
 )
 
 
-def test_an_ack_names_the_bytes() -> None:
+def test_an_ack_names_payloads_by_sha256() -> None:
     ack = Ack(run_id="run-a", key="tb/x", log_id="log", sha256=("00", "ff"))
     written = b'{"run_id":"run-a","key":"tb/x","log_id":"log","sha256":["00","ff"]}'
     assert ack.encode() == written
@@ -28,7 +28,7 @@ def test_an_ack_names_the_bytes() -> None:
             Ack.decode(wrong)
 
 
-def test_how_far_a_robot_has_got_reads_as_written() -> None:
+def test_progress_is_decoded_as_encoded() -> None:
     said = Sent(run_id="run-a", last=-(2**63))
     assert said.encode() == b'{"run_id":"run-a","last":-9223372036854775808}'
     assert Sent.decode(said.encode()) == said
@@ -42,7 +42,7 @@ def test_how_far_a_robot_has_got_reads_as_written() -> None:
             Sent.decode(wrong)
 
 
-def test_a_refusal_names_the_bytes() -> None:
+def test_a_refusal_names_a_payload_by_sha256_and_size() -> None:
     said = Refusals(log_id="log", refused=(Refusal.of(b"no json", "not JSON"),))
     sha256 = hashlib.sha256(b"no json").hexdigest()
     written = f'{{"log_id":"log","refused":[{{"sha256":"{sha256}","size":7,"reason":"not JSON"}}]}}'
@@ -55,7 +55,7 @@ def test_a_refusal_names_the_bytes() -> None:
 @pytest.mark.parametrize(
     "name", ["refused", "refused/tb", "tb/detections", "*", "a/**", "Küche 🤖"]
 )
-def test_no_run_is_called_like_the_refusals_of_a_key(name: str) -> None:
+def test_no_ack_key_equals_a_refusal_key(name: str) -> None:
     assert refusal_key("tb/detections") == "mapfold/ack/refused/tb%2Fdetections"
     behind = refusal_key(name).removeprefix(ACK_PREFIX)
     assert behind.count("/") == 1, "so a recorder of an older version passes it over"
@@ -64,12 +64,12 @@ def test_no_run_is_called_like_the_refusals_of_a_key(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["k" * 1024, "🤖" * 256, "🤖" * 257, "é/" * 10_000, "k" * 60_000])
-def test_the_key_of_an_answer_is_never_long(name: str) -> None:
+def test_a_refusal_key_is_bounded(name: str) -> None:
     assert len(refusal_key(name)) < 4_000
     assert len(ack_key(name[:256])) < 4_000, "a run id has at most 256 characters"
 
 
-def test_long_keys_have_refusals_of_their_own() -> None:
+def test_long_keys_have_distinct_refusal_keys() -> None:
     one, other = refusal_key("a" * 2_000), refusal_key("a" * 1_999 + "b")
     assert one != other
     assert one == refusal_key("a" * 2_000)
