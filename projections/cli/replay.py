@@ -14,8 +14,8 @@ import typer
 from eventsrc.log import LogReader
 from eventsrc.text import counted
 from projections.database import ForeignEmbedding, RebuildReport, rebuild
-from projections.database.checkpoints import command
 from projections.database.loader import LoaderName
+from projections.database.origin import command_line
 from projections.database.sink import SinkName
 from projections.settings import Settings
 
@@ -65,7 +65,7 @@ def _foreign(log: Path, settings: Settings, report: RebuildReport, first: Foreig
     else:
         wanted = _space(first.map_model or "an unnamed model", first.map_dim)
     came = _space(first.model or "an unnamed model", first.dim)
-    instead = command("replay", log, _of_space(settings, first))
+    instead = command_line("replay", log, _of_space(settings, first))
     return (
         f"{many} of another space: the map's are of {wanted}, {why}, but that of {first.det_id} at"
         f" offset {first.offset:,} is of {came}; to map that space instead run: {instead}"

@@ -1,6 +1,6 @@
 """Moving a log into the databases: at once (`rebuild`) or as it grows (`tail`)."""
 
-from .origin import ForeignEmbedding
+from .foreign_embedding import ForeignEmbedding
 from .progress import TailProgress, TailReport
 from .rebuild import RebuildProgress, RebuildReport, rebuild
 from .tail import tail

@@ -26,8 +26,7 @@ from eventsrc.log import Event, LogReader
 from projections.errors import ProjectionMissing
 from projections.settings import Settings
 
-from . import checkpoints as _checkpoint
-from .checkpoints import command
+from . import checkpoints
 from .connection import (
     Connection,
     Targets,
@@ -36,10 +35,10 @@ from .connection import (
     describe_target,
     pin_session_settings,
 )
-from .cypher_guard import PARENTS
+from .cypher import PARENTS
 from .graph_render import Row, expected_rows
 from .labels import GRAPH, LABELS, TABLE, VERTEX_LABELS
-from .origin import gone, refuse_misfit
+from .origin import command_line, refuse_mismatch, rows_dropped
 from .shared_fold import LiveFold, batches
 from .sink import Checkpoint, Sink, SinkName
 from .statements import statements
@@ -175,15 +174,15 @@ def _check(log: Path, sink: SinkName, url: str, settings: Settings) -> CheckRepo
             pin_session_settings(connection)
             connection.commit()
             held = _hold(connection, sink)
-            checkpoint = _checkpoint.load(connection, sink)
+            checkpoint = checkpoints.load(connection, sink)
             if checkpoint is None:
                 raise ProjectionMissing(
                     f"{describe_target(url)}: {_NONE[sink]} been projected there;"
-                    f" run: {command('replay', log, settings)}"
+                    f" run: {command_line('replay', log, settings)}"
                 )
             if not held:
-                raise gone(checkpoint, sink, describe_target(url), log, settings)
-            refuse_misfit(checkpoint, sink, describe_target(url), log, reader, settings)
+                raise rows_dropped(checkpoint, sink, describe_target(url), log, settings)
+            refuse_mismatch(checkpoint, sink, describe_target(url), log, reader, settings)
             compare = _compare_graph if sink == "graph" else _compare_vectors
             compare(connection, reader, checkpoint, settings, tally)
             foreign = foreign_tables(connection) if sink == "graph" else ()
@@ -241,7 +240,7 @@ def _events(
     connection: Connection, reader: LogReader, checkpoint: Checkpoint, sink: SinkName
 ) -> Iterator[tuple[Event, bool]]:
     """The events of the projection, and whether each was parked."""
-    parked = {letter.offset for letter in _checkpoint.parked(connection, sink)}
+    parked = {letter.offset for letter in checkpoints.parked(connection, sink)}
     for event in reader.read(0, checkpoint.next_offset):
         yield event, event.offset in parked
 

@@ -1,23 +1,13 @@
-"""Checkpoints, dead letters and the one-writer lock of a database, in its schema ``mapfold``.
-
-Commands to run next, with the settings they need, for messages about a checkpoint.
-
-What is kept of an event that could not be folded.
-"""
+"""Checkpoints, dead letters and the one-writer lock of a database, in its schema ``mapfold``."""
 
 import hashlib
 import json
-import shlex
 import time
-from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Final
-
-from pydantic import ValidationError
+from typing import Final
 
 from eventsrc.log import Event
-from projections.errors import CheckpointMoved, DatabaseError, ProjectionBusy, ProjectionMismatch
+from projections.errors import CheckpointMoved, DatabaseError, ProjectionBusy
 from projections.settings import Settings
 
 from .connection import Connection, describe_connection
@@ -25,66 +15,12 @@ from .labels import GRAPH, LABELS, TABLE
 from .sink import Checkpoint, SinkName
 from .statements import statements
 
-_BY_PROGRAMS_ONLY = "neighbourhood"
-
-
-def command(name: str, log: Path, settings: Settings, *options: str) -> str:
-    """``mapfold NAME LOG`` with ``options`` and the ``--set`` for all that is not as by default."""
-    default = Settings().model_dump()
-    changed = [key for key, value in settings.model_dump().items() if value != default[key]]
-    words = ["mapfold", name, shlex.quote(str(log)), *options, *_options(settings, changed)]
-    return " ".join(words)
-
-
-def remake(log: Path, settings: Settings) -> str:
-    """What to do about a projection that does not fit the log or the settings."""
-    return f"to make the map anew run: {command('replay', log, settings)}"
-
-
-def differences(before: str, settings: Settings) -> list[str]:
-    """What is another than in a checkpoint's settings: ``eps_m=0.75 there, 1.5 here``."""
-    old, new = json.loads(before), json.loads(settings.model_dump_json())
-    return [
-        f"{name}={old.get(name)} there, {new.get(name)} here" for name in _different(old, new)
-    ] or ["made by another version"]
-
-
-def fitting(before: str, settings: Settings) -> str | None:
-    """The ``--set`` options that make ``settings`` those of a checkpoint; None if none can."""
-    try:
-        old = Settings.model_validate_json(before)
-    except ValidationError:
-        return None
-    changed = _different(old.model_dump(), settings.model_dump())
-    if _BY_PROGRAMS_ONLY in changed:
-        return None
-    return " ".join(_options(old, changed)) or None
-
-
-def _options(settings: Settings, names: Iterable[str]) -> list[str]:
-    values = settings.model_dump()
-    return [
-        f"--set {shlex.quote(f'{name}={_said(values[name])}')}"
-        for name in names
-        if name != _BY_PROGRAMS_ONLY
-    ]
-
-
-def _said(value: object) -> str:
-    return "none" if value is None else str(value)
-
-
-def _different(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    return [name for name in sorted(old.keys() | new.keys()) if old.get(name) != new.get(name)]
-
-
 _LOCK_NUMBERS: Final[dict[SinkName, int]] = {"graph": 1, "vectors": 2}
 _ONE_OF: Final[dict[SinkName, str]] = {
     "graph": f'{GRAPH}."{LABELS[0]}"',
     "vectors": f"public.{TABLE}",
 }
 _MARK: Final = "mapfold"
-_WAS: Final[dict[SinkName, str]] = {"graph": "was", "vectors": "were"}
 LOCK_GRACE_S: Final = 1.0
 """A server notices only after a moment that the last writer's connection has ended."""
 LOCK_POLL_S: Final = 0.02
@@ -128,14 +64,14 @@ def lock_writer(connection: Connection, sink: SinkName) -> None:
     )
 
 
-def writer_of(connection: Connection, sink: SinkName) -> str | None:
+def writer(connection: Connection, sink: SinkName) -> str | None:
     """The application that holds the sink's lock, None when nobody does."""
     number = {"number": _LOCK_NUMBERS[sink]}
     row = connection.execute(statements("checkpoint")["lock_holder"], number).fetchone()
     return None if row is None else str(row[1])
 
 
-def has_store(connection: Connection) -> bool:
+def has_schema(connection: Connection) -> bool:
     """Whether the schema ``mapfold`` is there. Raises when somebody else's is."""
     row = connection.execute(statements("checkpoint")["schema_owner"]).fetchone()
     if row is None:
@@ -148,32 +84,32 @@ def has_store(connection: Connection) -> bool:
     return True
 
 
-def ensure_store(connection: Connection) -> None:
+def ensure_schema(connection: Connection) -> None:
     """Create the schema ``mapfold`` and its tables if they are missing."""
-    if not has_store(connection):
+    if not has_schema(connection):
         connection.execute(statements("checkpoint")["create"])
 
 
 def load(connection: Connection, sink: SinkName) -> Checkpoint | None:
     """The sink's checkpoint; None when nothing has been projected."""
-    if not has_store(connection):
+    if not has_schema(connection):
         return None
     row = connection.execute(statements("checkpoint")["load"], {"sink": sink}).fetchone()
     return None if row is None else Checkpoint(*row)
 
 
-def is_there(connection: Connection, sink: SinkName) -> bool:
+def rows_exist(connection: Connection, sink: SinkName) -> bool:
     """Whether the sink's rows have somewhere to be: somebody may have dropped it."""
     row = connection.execute(
-        statements("checkpoint")["is_there"], {"table": _ONE_OF[sink]}
+        statements("checkpoint")["rows_exist"], {"table": _ONE_OF[sink]}
     ).fetchone()
     return row is not None and bool(row[0])
 
 
-def begin(connection: Connection, sink: SinkName, log_id: str, settings: Settings) -> None:
+def create(connection: Connection, sink: SinkName, log_id: str, settings: Settings) -> None:
     """Make a checkpoint at offset 0, if there is none."""
     connection.execute(
-        statements("checkpoint")["begin"],
+        statements("checkpoint")["create_first"],
         {
             "sink": sink,
             "log_id": log_id,
@@ -243,39 +179,21 @@ def park(connection: Connection, sink: SinkName, letter: DeadLetter) -> None:
 
 def parked(connection: Connection, sink: SinkName) -> list[DeadLetter]:
     """The events left out, by offset."""
-    if not has_store(connection):
+    if not has_schema(connection):
         return []
     rows = connection.execute(statements("checkpoint")["parked"], {"sink": sink}).fetchall()
     return [DeadLetter(*row) for row in rows]
 
 
-def beat(connection: Connection, sink: SinkName) -> None:
+def write_heartbeat(connection: Connection, sink: SinkName) -> None:
     """Say that the sink's tail lives."""
-    connection.execute(statements("checkpoint")["beat"], {"sink": sink})
+    connection.execute(statements("checkpoint")["write_heartbeat"], {"sink": sink})
 
 
 def ages(connection: Connection, sink: SinkName) -> tuple[float, float | None]:
     """Seconds since the checkpoint moved, and since its tail last said that it lives."""
     row = connection.execute(statements("checkpoint")["ages"], {"sink": sink}).fetchone()
     return (0.0, None) if row is None else (row[0], row[1])
-
-
-def refuse_other_origin(
-    found: Checkpoint, sink: SinkName, where: str, log_id: str, settings: Settings, advice: str
-) -> None:
-    """Raise ProjectionMismatch when a checkpoint is of another log or other settings."""
-    if found.log_id != log_id:
-        raise ProjectionMismatch(
-            f"{where}: the {sink} there {_WAS[sink]} made from log {found.log_id}, not from"
-            f" {log_id}; {advice}"
-        )
-    if found.fingerprint != settings.fingerprint():
-        options = fitting(found.settings, settings)
-        raise ProjectionMismatch(
-            f"{where}: the {sink} there {_WAS[sink]} made with other settings"
-            f" ({', '.join(differences(found.settings, settings))});"
-            f"{f' to go on with them add {options};' if options else ''} {advice}"
-        )
 
 
 def dead_letter(event: Event, reason: str) -> DeadLetter:

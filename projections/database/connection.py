@@ -24,7 +24,6 @@ from psycopg.rows import TupleRow
 from eventsrc.errors import MisuseError
 from projections.errors import DatabaseError, DatabaseUnavailable, ExtensionMissing
 
-from .age_version import enforces_row_security
 from .embedded import EmbeddedServer, embedded_log
 
 Connection = psycopg.Connection[TupleRow]
@@ -165,35 +164,6 @@ def pin_session_settings(connection: Connection) -> None:
     )
 
 
-def connect_for_cypher(url: str, *, application: str = "mapfold query") -> Connection:
-    """An autocommit connection that speaks Cypher: AGE loaded, ag_catalog on the search path."""
-    connection = connect(url, application=application, autocommit=True)
-    try:
-        load_age(connection)
-    except BaseException:
-        connection.close()
-        raise
-    return connection
-
-
-def load_age(connection: Connection) -> None:
-    """What each session needs before ``cypher()``. Raises ExtensionMissing when it cannot be had.
-
-    LOAD is for superusers only. Calling any of AGE's C functions loads its library too, and that an
-    ordinary reader may do.
-    """
-    try:
-        connection.execute("SELECT ag_catalog.agtype_build_map()")
-    except (psycopg.errors.InvalidSchemaName, psycopg.errors.UndefinedFunction):
-        raise ExtensionMissing(
-            f"{describe_connection(connection)}: the extension age is not created there; run"
-            " mapfold replay, or have a superuser run CREATE EXTENSION age"
-        ) from None
-    except psycopg.errors.InsufficientPrivilege:
-        raise ExtensionMissing(_may_not_use_age(connection)) from None
-    connection.execute('SET search_path = ag_catalog, "$user", public')
-
-
 def ensure_extension(connection: Connection, name: LiteralString) -> str:
     """Create the extension ``age`` or ``vector`` if need be; returns its version."""
     version = extension_version(connection, name)
@@ -260,18 +230,6 @@ def database_errors(url: str) -> Iterator[None]:
         ) from error
     except psycopg.Error as error:
         raise DatabaseError(f"{describe_target(url)}: {_first_line(error)}") from error
-
-
-def _may_not_use_age(connection: Connection) -> str:
-    connection.rollback()
-    user, version = connection.info.user, extension_version(connection, "age") or ""
-    told = f"{describe_connection(connection)}: user {user} may not use Apache AGE"
-    if enforces_row_security(version):
-        return f"{told}; have a superuser run GRANT USAGE ON SCHEMA ag_catalog TO {user}"
-    return (
-        f"{told} {version}, which would let it change the graph whatever its privileges; ask as"
-        " the owner or as a member of mapfold_writer, or use AGE 1.7 or later"
-    )
 
 
 def _missing(name: str, where: str) -> str:

@@ -8,8 +8,8 @@ from typing import Final
 
 from psycopg import sql
 
-from .age_version import FIRST_TO_ENFORCE
 from .connection import Connection
+from .cypher import FIRST_ENFORCING_VERSION
 from .statements import statements
 
 _PRIVILEGES: Final = {
@@ -60,5 +60,5 @@ def roles_sql(sinks: Collection[str] = ("graph", "vectors")) -> str:
     """The statements for a database that holds ``sinks``, ready for psql."""
     parts = statements("roles")
     wanted = ["reader", "writer", *(name for name in ("graph", "vectors") if name in sinks)]
-    first = sql.Literal(list(FIRST_TO_ENFORCE))
+    first = sql.Literal(list(FIRST_ENFORCING_VERSION))
     return "\n\n".join(parts[name].format(first=first).as_string() for name in wanted) + "\n"

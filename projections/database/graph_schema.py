@@ -14,9 +14,9 @@ from psycopg import sql
 
 from projections.errors import DatabaseError
 
-from . import swap as _leaving
+from . import swap
 from .connection import Connection, describe_connection
-from .cypher_guard import PARENTS, guard
+from .cypher import PARENTS, add_policies
 from .labels import (
     CHANGING_EDGES,
     EDGE_LABELS,
@@ -60,7 +60,7 @@ def create(connection: Connection, graph: str) -> None:
     for name in LABELS:
         table = sql.Identifier(graph, name)
         connection.execute(run["no_statistics"].format(table=table))
-    guard(connection, graph)
+    add_policies(connection, graph)
     found: dict[str, int] = dict(connection.execute(run["label_ids"], {"graph": graph}).fetchall())
     if any(found.get(label) != number for label, number in LABEL_IDS.items()):
         raise DatabaseError(
@@ -136,7 +136,7 @@ def leave_dropping(connection: Connection, graph: str) -> None:
     """Have the server drop a graph of ours, if it is there; closes the connection then."""
     if exists(connection, graph):
         connection.execute("SET search_path = ag_catalog, public")
-        _leaving.leave_with(
+        swap.send_and_close(
             connection, statements("graph")["drop_named"].format(graph=sql.Literal(graph))
         )
 

@@ -9,12 +9,11 @@ from projections.deltas import Delta
 from projections.errors import DatabaseError
 from projections.model.view import MapView
 
-from . import cypher_guard as _cypher_guard
-from . import grants as _readers
 from . import graph_schema as _graph_ddl
-from . import swap as _leaving
-from . import swap as _swap_guard
+from . import swap
 from .connection import Connection, describe_connection, ensure_extension
+from .cypher import policies_apply
+from .grants import copy_privileges
 from .graph_rows import GraphChanges, GraphRows, WholeGraph
 from .labels import (
     COUNT_KEYS,
@@ -75,7 +74,7 @@ class GraphSink:
 
     def write(self, connection: Connection, changes: GraphChanges) -> None:
         """Insert, upsert and delete what was taken."""
-        copies = not self.few(changes) and not _cypher_guard.subject(connection)
+        copies = not self.few(changes) and not policies_apply(connection)
         loader = self._loader if copies else InsertLoader()
         for label, rows in changes.inserted.items():
             _new_rows(loader, GRAPH, label, rows)(connection)
@@ -96,7 +95,7 @@ class GraphSink:
         """
         ensure_extension(connection, "age")
         _graph_ddl.exists(connection, GRAPH)
-        if _leaving.may_drop(connection, self.name):
+        if swap.try_drop_lock(connection, self.name):
             for graph in (OLD_GRAPH, NEXT_GRAPH):
                 with connection.transaction():
                     _graph_ddl.drop(connection, graph)
@@ -149,17 +148,17 @@ class GraphSink:
 
     def lock(self, connection: Connection) -> None:
         """Keep readers away from the graph."""
-        _leaving.wait_for_drop(connection, self.name)
+        swap.wait_for_drop(connection, self.name)
         _graph_ddl.lock(connection, GRAPH)
 
     def swap(self, connection: Connection) -> None:
         """Put the shadow in the readers' place, open to the same roles."""
-        _readers.copy_privileges(connection, GRAPH, NEXT_GRAPH)
+        copy_privileges(connection, GRAPH, NEXT_GRAPH)
         _graph_ddl.swap_in(connection, NEXT_GRAPH)
 
     def tidy(self, connection: Connection) -> None:
         """Have the replaced graph dropped once its last reader is gone."""
-        if _swap_guard.earlier_transactions_ended(connection) and _leaving.may_drop(
+        if swap.wait_for_earlier_transactions(connection) and swap.try_drop_lock(
             connection, self.name
         ):
             _graph_ddl.leave_dropping(connection, OLD_GRAPH)

@@ -1,31 +1,102 @@
-"""Whether a projection was made from the beginning of this very log, with these settings.
+"""Check that a projection was made from this log with these settings; what to run if it was not."""
 
-Which embedding space a fold expected where it left embeddings out, and which one came.
-"""
-
-import sys
-from dataclasses import dataclass
+import json
+import shlex
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any, Final
 
-from eventsrc.ingest import Accepted
+from pydantic import ValidationError
+
 from eventsrc.log import LogReader
-from eventsrc.upcast import read_envelope
 from projections.errors import ProjectionMismatch, ProjectionMissing
 from projections.settings import Settings
 
-from .checkpoints import event_hash, refuse_other_origin, remake
-from .shared_fold import LiveFold
+from .checkpoints import event_hash
 from .sink import Checkpoint, SinkName
 
+_WAS: Final[dict[SinkName, str]] = {"graph": "was", "vectors": "were"}
+_NOT_AN_OPTION: Final = "neighbourhood"
+"""The setting that ``--set`` does not take."""
 
-def refuse_misfit(
+
+def command_line(name: str, log: Path, settings: Settings, *options: str) -> str:
+    """``mapfold NAME LOG`` with ``options``, and ``--set`` for all that is not the default."""
+    " default."""
+    default = Settings().model_dump()
+    changed = [key for key, value in settings.model_dump().items() if value != default[key]]
+    words = ["mapfold", name, shlex.quote(str(log)), *options, *_options(settings, changed)]
+    return " ".join(words)
+
+
+def replay_advice(log: Path, settings: Settings) -> str:
+    """What to do about a projection that does not match the log or the settings."""
+    return f"to make the map anew run: {command_line('replay', log, settings)}"
+
+
+def _settings_differences(before: str, settings: Settings) -> list[str]:
+    """Settings that differ from a checkpoint's, as text: ``eps_m=0.75 there, 1.5 here``."""
+    old, new = json.loads(before), json.loads(settings.model_dump_json())
+    return [
+        f"{name}={old.get(name)} there, {new.get(name)} here" for name in _changed_names(old, new)
+    ] or ["made by another version"]
+
+
+def _options_to_match(before: str, settings: Settings) -> str | None:
+    """The ``--set`` options that turn ``settings`` into a checkpoint's; None if none can."""
+    try:
+        old = Settings.model_validate_json(before)
+    except ValidationError:
+        return None
+    changed = _changed_names(old.model_dump(), settings.model_dump())
+    if _NOT_AN_OPTION in changed:
+        return None
+    return " ".join(_options(old, changed)) or None
+
+
+def _options(settings: Settings, names: Iterable[str]) -> list[str]:
+    values = settings.model_dump()
+    return [
+        f"--set {shlex.quote(f'{name}={_option_value(values[name])}')}"
+        for name in names
+        if name != _NOT_AN_OPTION
+    ]
+
+
+def _option_value(value: object) -> str:
+    return "none" if value is None else str(value)
+
+
+def _changed_names(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+    return [name for name in sorted(old.keys() | new.keys()) if old.get(name) != new.get(name)]
+
+
+def refuse_other_origin(
+    found: Checkpoint, sink: SinkName, where: str, log_id: str, settings: Settings, advice: str
+) -> None:
+    """Raise ProjectionMismatch when a checkpoint was made from another log or other settings."""
+    if found.log_id != log_id:
+        raise ProjectionMismatch(
+            f"{where}: the {sink} there {_WAS[sink]} made from log {found.log_id}, not from"
+            f" {log_id}; {advice}"
+        )
+    if found.fingerprint != settings.fingerprint():
+        options = _options_to_match(found.settings, settings)
+        raise ProjectionMismatch(
+            f"{where}: the {sink} there {_WAS[sink]} made with other settings"
+            f" ({', '.join(_settings_differences(found.settings, settings))});"
+            f"{f' to go on with them add {options};' if options else ''} {advice}"
+        )
+
+
+def refuse_mismatch(
     found: Checkpoint, sink: SinkName, where: str, log: Path, reader: LogReader, settings: Settings
 ) -> None:
-    """Raise ProjectionMismatch unless ``found`` is of ``log`` as it is, and of ``settings``.
+    """Raise ProjectionMismatch unless ``found`` was made from this log, as it is, and ``settings``.
 
-    ``where`` is the database, for the message.
+    ``where`` names the database in the message.
     """
-    advice = remake(log, settings)
+    advice = replay_advice(log, settings)
     refuse_other_origin(found, sink, where, reader.log_id, settings, advice)
     if found.next_offset > reader.next_offset:
         raise ProjectionMismatch(
@@ -40,43 +111,11 @@ def refuse_misfit(
             )
 
 
-def gone(
+def rows_dropped(
     found: Checkpoint, sink: SinkName, where: str, log: Path, settings: Settings
 ) -> ProjectionMissing:
-    """The error for a checkpoint whose rows somebody has dropped."""
+    """The error for a checkpoint whose graph or table was dropped."""
     return ProjectionMissing(
         f"{where}: {found.next_offset:,} events are in the {sink} by its checkpoint, but somebody"
-        f" has dropped what they were in; {remake(log, settings)}"
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class ForeignEmbedding:
-    """The first embedding that is not in the map's space. A model is None when it has no name.
-
-    ``map_dim`` is None for a map that has no embedding at all, as none fitted the settings.
-    """
-
-    offset: int
-    det_id: str
-    model: str | None
-    dim: int
-    map_model: str | None
-    map_dim: int | None
-
-
-def first_foreign(fold: LiveFold, reader: LogReader) -> ForeignEmbedding | None:
-    """What the first one is, None when there is none. The log still has what the fold dropped."""
-    first = next((o for o in fold.view.observations if o.foreign_space), None)
-    if first is None:
-        return None
-    offset, space = fold.view.keyframes[first.keyframe].offset, fold.map.space
-    (event,) = reader.read(offset, offset + 1)
-    door = read_envelope(event, max_bytes=sys.maxsize)
-    assert isinstance(door, Accepted)  # noqa: S101 - it was folded
-    vector = door.vectors[door.det_ids.index(first.det_id)]
-    assert vector is not None  # noqa: S101 - it was found to be of another space
-    dim = space.dim if space.is_decided else None
-    return ForeignEmbedding(
-        offset, first.det_id, first.embedding_model, len(vector), space.model, dim
+        f" has dropped what they were in; {replay_advice(log, settings)}"
     )

@@ -37,12 +37,12 @@ from projections.model.digest import map_digest
 from projections.model.fold import no_cycle_search
 from projections.settings import Settings
 
-from . import checkpoints as _checkpoint
-from .checkpoints import command
+from . import checkpoints
 from .connection import Connection, Targets, database_errors
+from .foreign_embedding import ForeignEmbedding, first_foreign_embedding
 from .loader import LoaderName
 from .loading_thread import Loading, short_turns
-from .origin import ForeignEmbedding, first_foreign
+from .origin import command_line
 from .shared_fold import LiveFold, batches
 from .sink import Checkpoint, Sink
 from .stores import Only, Store, open_stores
@@ -214,7 +214,7 @@ def rebuild(
                 settings.fingerprint(),
                 settings.model_dump_json(),
                 total,
-                _checkpoint.event_hash(last),
+                checkpoints.event_hash(last),
                 digest,
             )
             rows = _check(stores, fold, checkpoint)
@@ -235,7 +235,7 @@ def rebuild(
             folded - started,
             ended - started,
             index,
-            first_foreign(fold, reader),
+            first_foreign_embedding(fold, reader),
         )
 
 
@@ -274,10 +274,10 @@ def _fold_into(
 
 def _advice(log: Path, settings: Settings, offset: int) -> str:
     """What to do about an event that cannot be folded."""
-    before = command("replay", log, settings, "--until", str(offset))
+    before = command_line("replay", log, settings, "--until", str(offset))
     return (
         "the databases stay as they were; to leave it out run:"
-        f" {before} && {command('tail', log, settings)}"
+        f" {before} && {command_line('tail', log, settings)}"
     )
 
 
@@ -288,7 +288,7 @@ def _check(stores: list[Store], fold: LiveFold, checkpoint: Checkpoint) -> dict[
         for sink in store.sinks:
             with database_errors(store.url):
                 rows.update(sink.check(store.connection, fold.view))
-                _checkpoint.replace(store.connection, sink.name, checkpoint)
+                checkpoints.replace(store.connection, sink.name, checkpoint)
     return rows
 
 

@@ -14,10 +14,10 @@ from eventsrc.log import LogReader
 from eventsrc.upcast import read_envelope
 from projections.settings import Settings
 
-from . import checkpoints as _checkpoint
+from . import checkpoints
 from .checkpoints import DeadLetter
 from .connection import Targets, connect, database_errors, describe_target
-from .origin import refuse_misfit
+from .origin import refuse_mismatch
 from .rebuild import rebuild
 from .sink import SinkName
 
@@ -46,11 +46,11 @@ def _retry(
 ) -> RetryReport:
     opened = connect(url, application="mapfold retry")
     with LogReader(log) as reader, opened as connection, database_errors(url):
-        letters = _checkpoint.parked(connection, sink)
-        checkpoint = _checkpoint.load(connection, sink)
+        letters = checkpoints.parked(connection, sink)
+        checkpoint = checkpoints.load(connection, sink)
         if checkpoint is None or not letters:
             return RetryReport(sink, 0, (), rebuilt=False)
-        refuse_misfit(checkpoint, sink, describe_target(url), log, reader, settings)
+        refuse_mismatch(checkpoint, sink, describe_target(url), log, reader, settings)
         still = tuple(_still_failing(reader, letters))
     if not still:
         rebuild(log, targets, settings, until=checkpoint.next_offset, only=sink)

@@ -14,8 +14,8 @@ from eventsrc.log import LogReader
 from projections.errors import DatabaseError, ProjectionMismatch
 from projections.settings import Settings
 
-from . import checkpoints as _checkpoint
-from .checkpoints import DeadLetter, command, remake
+from . import checkpoints
+from .checkpoints import DeadLetter
 from .connection import (
     Connection,
     Targets,
@@ -25,7 +25,8 @@ from .connection import (
     describe_target,
     extension_version,
 )
-from .cypher_guard import unwanted_writers
+from .cypher import unwanted_writers
+from .origin import command_line, refuse_other_origin, replay_advice
 from .sink import Checkpoint, SinkName
 
 STALLED_S: Final = 20.0
@@ -105,18 +106,18 @@ def _look(
 ) -> SinkStatus:
     where = describe_connection(connection)
     versions = _versions(connection)
-    found = _checkpoint.load(connection, sink)
-    writer = _checkpoint.writer_of(connection, sink)
+    found = checkpoints.load(connection, sink)
+    writer = checkpoints.writer(connection, sink)
     if found is None and writer is not None:
         return SinkStatus(sink, where, _at_work(writer), writer=writer, versions=versions)
     if found is None:
-        advice = f"nothing has been projected there; run: {command('replay', log, settings)}"
+        advice = f"nothing has been projected there; run: {command_line('replay', log, settings)}"
         return SinkStatus(sink, where, "missing", note=advice, versions=versions)
-    if not _checkpoint.is_there(connection, sink):
+    if not checkpoints.rows_exist(connection, sink):
         told = f"somebody has dropped what its {found.next_offset:,} events were in"
-        advice = f"{told}; {remake(log, settings)}"
+        advice = f"{told}; {replay_advice(log, settings)}"
         return SinkStatus(sink, where, "missing", note=advice, versions=versions)
-    moved, beaten = _checkpoint.ages(connection, sink)
+    moved, beaten = checkpoints.ages(connection, sink)
     condition, note = _condition(found, sink, where, log, log_id, end, settings, writer, beaten)
     return SinkStatus(
         sink,
@@ -129,7 +130,7 @@ def _look(
         None if beaten is None else round(beaten, 3),
         writer,
         found.digest,
-        tuple(_checkpoint.parked(connection, sink)),
+        tuple(checkpoints.parked(connection, sink)),
         versions,
         tuple(unwanted_writers(connection)) if sink == "graph" else (),
     )
@@ -146,9 +147,9 @@ def _condition(
     writer: str | None,
     beaten: float | None,
 ) -> tuple[Condition, str | None]:
-    advice = remake(log, settings)
+    advice = replay_advice(log, settings)
     try:
-        _checkpoint.refuse_other_origin(found, sink, where, log_id, settings, advice)
+        refuse_other_origin(found, sink, where, log_id, settings, advice)
     except ProjectionMismatch as error:
         return "other", str(error)
     if found.next_offset > end:
@@ -159,7 +160,7 @@ def _condition(
         return _at_work(writer), None
     if found.next_offset == end:
         return "idle", None
-    return "behind", f"nobody writes it; run: {command('tail', log, settings)}"
+    return "behind", f"nobody writes it; run: {command_line('tail', log, settings)}"
 
 
 def _at_work(writer: str) -> Literal["following", "rebuilding"]:

@@ -10,7 +10,7 @@ import psycopg
 from projections.errors import DatabaseError
 from projections.settings import Settings
 
-from . import checkpoints as _checkpoint
+from . import checkpoints
 from .connection import (
     Connection,
     Targets,
@@ -112,7 +112,7 @@ def _open(url: str, application: str, sinks: tuple[Sink[Any], ...]) -> Connectio
             connection.execute("SET client_min_messages = warning")
             pin_session_settings(connection)
             for sink in sinks:
-                _checkpoint.lock_writer(connection, sink.name)
+                checkpoints.lock_writer(connection, sink.name)
             _ensure_store(connection)
     except BaseException:
         connection.close()
@@ -132,6 +132,6 @@ def _refuse_encoding(connection: Connection, url: str) -> None:
 def _ensure_store(connection: Connection) -> None:
     try:
         with connection.transaction():
-            _checkpoint.ensure_store(connection)
+            checkpoints.ensure_schema(connection)
     except (psycopg.errors.DuplicateSchema, psycopg.errors.UniqueViolation):
         pass  # the other sink's service made it in the same moment

@@ -33,7 +33,7 @@ WHERE datname = current_database() AND pid <> pg_backend_pid()
 """
 
 
-def earlier_transactions_ended(connection: Connection) -> bool:
+def wait_for_earlier_transactions(connection: Connection) -> bool:
     """True once they have; False if some reader sits in one for longer than we care to wait.
 
     Sessions of other users show no start time to an ordinary role; they are then not waited for,
@@ -54,7 +54,7 @@ def earlier_transactions_ended(connection: Connection) -> bool:
 _LOCK_NUMBERS: Final[dict[SinkName, int]] = {"graph": 17, "vectors": 18}
 
 
-def may_drop(connection: Connection, sink: SinkName) -> bool:
+def try_drop_lock(connection: Connection, sink: SinkName) -> bool:
     """Take the lock until the session ends; False while another session drops."""
     number = {"number": _LOCK_NUMBERS[sink]}
     row = connection.execute(statements("checkpoint")["lock"], number).fetchone()
@@ -67,7 +67,7 @@ def wait_for_drop(connection: Connection, sink: SinkName) -> None:
     connection.execute(statements("checkpoint")["wait_for_lock"], number)
 
 
-def leave_with(connection: Connection, statement: sql.Composed) -> None:
+def send_and_close(connection: Connection, statement: sql.Composed) -> None:
     """Send ``statement`` to the server and close the connection without waiting for it."""
     connection.pgconn.send_query(statement.as_bytes(connection))
     connection.close()

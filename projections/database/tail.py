@@ -29,11 +29,11 @@ from projections.model.fold import WORTH_A_SNAPSHOT
 from projections.model.snapshot_cache import SnapshotCache
 from projections.settings import Settings
 
-from . import checkpoints as _checkpoint
-from .checkpoints import DeadLetter, dead_letter, event_hash, remake
+from . import checkpoints
+from .checkpoints import DeadLetter, dead_letter, event_hash
 from .connection import Targets, database_errors, describe_target
 from .loader import LoaderName
-from .origin import gone, refuse_misfit
+from .origin import refuse_mismatch, replay_advice, rows_dropped
 from .progress import TailProgress, TailReport
 from .shared_fold import LiveFold, batches
 from .sink import Checkpoint, Sink, SinkName
@@ -130,23 +130,23 @@ class TailPass:
             with database_errors(store.url), store.connection.transaction():
                 for sink in store.sinks:
                     made = sink.ensure(store.connection)
-                    _checkpoint.begin(store.connection, sink.name, reader.log_id, plan.settings)
-                    found = _checkpoint.load(store.connection, sink.name)
+                    checkpoints.create(store.connection, sink.name, reader.log_id, plan.settings)
+                    found = checkpoints.load(store.connection, sink.name)
                     assert found is not None  # noqa: S101 - begun in this transaction
-                    refuse_misfit(found, sink.name, store.place, plan.log, reader, plan.settings)
+                    refuse_mismatch(found, sink.name, store.place, plan.log, reader, plan.settings)
                     if made and found.next_offset:
-                        raise gone(found, sink.name, store.place, plan.log, plan.settings)
+                        raise rows_dropped(found, sink.name, store.place, plan.log, plan.settings)
                     # At once: from here on the lock says that a tail is at work.
-                    _checkpoint.beat(store.connection, sink.name)
+                    checkpoints.write_heartbeat(store.connection, sink.name)
                     self.checkpoints[sink.name] = found
-                    letters = _checkpoint.parked(store.connection, sink.name)
+                    letters = checkpoints.parked(store.connection, sink.name)
                     parked.update((letter.offset, letter) for letter in letters)
         self.parked = parked
         self.report.next_offset = min(c.next_offset for c in self.checkpoints.values())
         self.plan.progress.update(self.report)
 
     def _advice(self) -> str:
-        return remake(self.plan.log, self.plan.settings)
+        return replay_advice(self.plan.log, self.plan.settings)
 
     def _fold(self, fold: LiveFold, batch: list[Event]) -> Event | None:
         """Fold a batch; its last event, None for an empty one."""

@@ -23,9 +23,9 @@ from projections.deltas import Delta
 from projections.errors import DatabaseError
 from projections.model.view import MapView
 
-from . import grants as _readers
-from . import swap as _leaving
+from . import swap
 from .connection import Connection, describe_connection, ensure_extension, extension_version
+from .grants import copy_privileges
 from .labels import TABLE
 from .loader import InsertLoader, Load, Loader, LoaderName, loader_of
 from .sink import SinkName
@@ -94,7 +94,7 @@ class VectorSink:
         """Drop a replaced table that was left; refuse early if the name in use is not ours."""
         self._find_type(connection)
         self._existing(connection)
-        if self._has_old(connection) and _leaving.may_drop(connection, self.name):
+        if self._has_old(connection) and swap.try_drop_lock(connection, self.name):
             connection.execute(statements("vectors")["drop_old"])
 
     def begin(self, connection: Connection) -> None:
@@ -143,14 +143,14 @@ class VectorSink:
 
     def lock(self, connection: Connection) -> None:
         """Keep readers away from the table."""
-        _leaving.wait_for_drop(connection, self.name)
+        swap.wait_for_drop(connection, self.name)
         if self._existing(connection) is not None:
             connection.execute(_statement("lock", _PUBLIC))
 
     def swap(self, connection: Connection) -> None:
         """Put the shadow in the readers' place, open to the same roles."""
         if self._existing(connection) is not None:
-            _readers.copy_privileges(connection, _PUBLIC, _SHADOW, table=TABLE)
+            copy_privileges(connection, _PUBLIC, _SHADOW, table=TABLE)
             self._refuse_dependents(connection)
             connection.execute(statements("vectors")["put_aside"])
         connection.execute(statements("vectors")["move"])
@@ -158,8 +158,8 @@ class VectorSink:
 
     def tidy(self, connection: Connection) -> None:
         """Have the replaced table dropped."""
-        if self._has_old(connection) and _leaving.may_drop(connection, self.name):
-            _leaving.leave_with(connection, statements("vectors")["drop_old"].format())
+        if self._has_old(connection) and swap.try_drop_lock(connection, self.name):
+            swap.send_and_close(connection, statements("vectors")["drop_old"].format())
 
     def _refuse_dependents(self, connection: Connection) -> None:
         try:

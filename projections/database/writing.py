@@ -29,7 +29,7 @@ from projections.errors import (
     EmbeddedServerError,
 )
 
-from . import checkpoints as _checkpoint
+from . import checkpoints
 from .checkpoints import DeadLetter
 from .connection import database_errors
 from .sink import Checkpoint, Sink, SinkName
@@ -127,7 +127,7 @@ class Writer:
             try:
                 with database_errors(self.store.url):
                     for sink in self.store.sinks:
-                        _checkpoint.beat(self.store.connection, sink.name)
+                        checkpoints.write_heartbeat(self.store.connection, sink.name)
                     return
             except DatabaseUnavailable as error:
                 self.trouble(str(error))
@@ -144,9 +144,9 @@ class Writer:
             for part in batch:
                 part.sink.write(connection, part.changes)
                 for letter in part.letters:
-                    _checkpoint.park(connection, part.sink.name, letter)
+                    checkpoints.park(connection, part.sink.name, letter)
             return [
-                _checkpoint.advance(
+                checkpoints.advance(
                     connection, part.sink.name, part.before, part.next_offset, part.last_event
                 )
                 for part in batch
@@ -171,7 +171,7 @@ class Writer:
                 # What a rolled back transaction had made is not there, whatever the sink thinks.
                 if sink.ensure(connection):
                     raise LostCommits  # all the rows are gone; the next pass finds out why
-                found[sink.name] = _checkpoint.load(connection, sink.name)
+                found[sink.name] = checkpoints.load(connection, sink.name)
         return found
 
     def _unchanged(self, found: Found) -> bool:

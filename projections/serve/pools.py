@@ -16,7 +16,7 @@ from typing import Final, Self, TypeVar
 
 from psycopg_pool import ConnectionPool, PoolTimeout
 
-from projections.database import checkpoints as _checkpoint
+from projections.database import checkpoints
 from projections.database.connection import (
     Connection,
     Targets,
@@ -189,7 +189,7 @@ def _see(sink: SinkName, url: str) -> None:
         connect(url, application="mapfold serve", autocommit=True) as connection,
         database_errors(url),
     ):
-        if _checkpoint.load(connection, sink) is None:
+        if checkpoints.load(connection, sink) is None:
             raise ProjectionMissing(
                 f"{describe_target(url)}: no {sink} there: nothing has been projected yet; run"
                 " mapfold replay LOG"

@@ -7,7 +7,8 @@ from pathlib import Path
 from eventsrc.append import append_payload
 from eventsrc.log import LogReader, LogWriter, parse_fsync
 from projections.database import TailProgress, TailReport, rebuild, tail
-from projections.database.connection import Targets, connect_for_cypher
+from projections.database.connection import Targets
+from projections.database.cypher import connect_for_cypher
 from projections.database.embedded import EmbeddedServer
 from projections.settings import Settings
 

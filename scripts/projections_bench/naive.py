@@ -22,7 +22,8 @@ from typing import Any, LiteralString
 import psycopg
 from pgvector.psycopg import register_vector
 
-from projections.database.connection import connect, connect_for_cypher
+from projections.database.connection import connect
+from projections.database.cypher import connect_for_cypher
 from projections.exact import to_float32
 from projections.model.view import MapView
 

@@ -10,7 +10,8 @@ import numpy as np
 import psycopg
 
 from projections.database import rebuild
-from projections.database.connection import Targets, connect_for_cypher
+from projections.database.connection import Targets
+from projections.database.cypher import connect_for_cypher
 from projections.database.embedded import EmbeddedServer
 from projections.settings import Settings
 

@@ -9,7 +9,7 @@ from typing import Any, LiteralString
 
 import psycopg
 
-from projections.database.connection import connect_for_cypher
+from projections.database.cypher import connect_for_cypher
 from projections.model.view import MapView
 
 GRAPH: LiteralString = "tuned_map"

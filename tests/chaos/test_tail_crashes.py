@@ -12,8 +12,7 @@ from typing import Any
 import psycopg
 import pytest
 
-from projections.database import TailProgress, TailReport, rebuild, tail
-from projections.database import checkpoints as _checkpoint
+from projections.database import TailProgress, TailReport, checkpoints, rebuild, tail
 from projections.database.connection import Connection, Targets, connect
 from projections.database.embedded import EmbeddedServer
 from projections.database.sink import Checkpoint, SinkName
@@ -190,7 +189,7 @@ def test_a_connection_cut_again_while_it_asks_what_is_in(
     tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch, again: int
 ) -> None:
     log = write_log(tmp_path / "log", walk(40))
-    load, cuts = _checkpoint.load, []
+    load, cuts = checkpoints.load, []
 
     def cut_first(connection: Connection, sink: SinkName) -> Checkpoint | None:
         if cuts and len(cuts) <= again:
@@ -212,13 +211,13 @@ def test_a_database_away_when_a_new_pass_begins_is_waited_for(
     tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = write_log(tmp_path / "log", walk(40))
-    begin, cuts = _checkpoint.begin, []
+    begin, cuts = checkpoints.create, []
 
     def go_back(report: TailReport) -> None:
         if report.next_offset == 30 and not report.restarts:
             cut_connections(one_database.graph_url)
             rebuild(log, one_database, SETTINGS, until=13)
-            monkeypatch.setattr("projections.database.checkpoints.begin", cut_first)
+            monkeypatch.setattr("projections.database.checkpoints.create", cut_first)
 
     def cut_first(*args: Any) -> None:
         if len(cuts) < 2:

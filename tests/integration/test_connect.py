@@ -13,11 +13,11 @@ from eventsrc.errors import MisuseError
 from projections.database.connection import (
     Targets,
     connect,
-    connect_for_cypher,
     describe_target,
     ensure_extension,
     open_targets,
 )
+from projections.database.cypher import connect_for_cypher
 from projections.database.embedded import EmbeddedServer
 from projections.errors import DatabaseUnavailable, ExtensionMissing
 from projections.queries.relocalize import Reader

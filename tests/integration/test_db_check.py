@@ -7,8 +7,7 @@ import psycopg
 import pytest
 from psycopg import sql
 
-from projections.database import checkpoints as _checkpoint
-from projections.database import rebuild, tail
+from projections.database import checkpoints, rebuild, tail
 from projections.database.check import NAMED, check
 from projections.database.connection import Connection, Targets
 from projections.database.sink import Checkpoint, SinkName
@@ -183,16 +182,16 @@ def test_a_rebuild_that_swaps_beside_a_check_is_no_difference(
     """To the check's snapshot the tables of such a rebuild would be empty."""
     monkeypatch.setattr(sys.modules["projections.database.rebuild"], "PATIENCE_S", 0.3)
     rebuild(log, one_database, SETTINGS)
-    load = _checkpoint.load
+    load = checkpoints.load
 
     def rebuild_meanwhile(connection: Connection, sink: SinkName) -> Checkpoint | None:
         found = load(connection, sink)
-        monkeypatch.setattr(_checkpoint, "load", load)
+        monkeypatch.setattr(checkpoints, "load", load)
         with pytest.raises(DatabaseError, match="readers kept the map locked"):
             rebuild(log, one_database, SETTINGS)
         return found
 
-    monkeypatch.setattr(_checkpoint, "load", rebuild_meanwhile)
+    monkeypatch.setattr(checkpoints, "load", rebuild_meanwhile)
     assert [r.differing for r in check(log, one_database, SETTINGS, only=sink)] == [0]
 
 

@@ -11,7 +11,7 @@ from psycopg import sql
 from projections.database import RebuildProgress, rebuild
 from projections.database.check import check
 from projections.database.connection import Connection, Targets, connect
-from projections.database.swap import may_drop
+from projections.database.swap import try_drop_lock
 from projections.database.vector_sink import build_hnsw
 from projections.errors import DatabaseError
 from projections.settings import Settings
@@ -55,7 +55,7 @@ def test_what_the_server_could_not_drop_the_next_rebuild_drops(
 ) -> None:
     rebuild(log, one_database, SETTINGS, until=30)
     with monkeypatch.context() as patched:
-        patched.setattr("projections.database.swap.leave_with", nobody_drops)
+        patched.setattr("projections.database.swap.send_and_close", nobody_drops)
         rebuild(log, one_database, SETTINGS)
     rows = all_rows(one_database)
     assert left_over(pg) == {"semantic_map_old", "mapfold_old"}
@@ -71,8 +71,8 @@ def test_a_rebuild_waits_for_the_drop_before_its_swap_only(
     rebuild(log, one_database, SETTINGS, until=30)
     wait_for_drops(one_database)
     dropping = connect(one_database.graph_url, autocommit=True)
-    assert may_drop(dropping, "graph")
-    assert may_drop(dropping, "vectors")
+    assert try_drop_lock(dropping, "graph")
+    assert try_drop_lock(dropping, "vectors")
     seen: list[str] = []
 
     def tell(at: RebuildProgress) -> None:

@@ -9,7 +9,8 @@ import psycopg
 import pytest
 
 from projections.database import RebuildProgress, rebuild, tail
-from projections.database.connection import Targets, connect_for_cypher
+from projections.database.connection import Targets
+from projections.database.cypher import connect_for_cypher
 from projections.database.vector_sink import VectorSink
 from projections.errors import DatabaseError, ProjectionBusy
 from projections.settings import Settings

@@ -7,9 +7,9 @@ import psycopg
 import pytest
 
 from projections.database import rebuild, tail
-from projections.database.age_version import enforces_row_security
 from projections.database.check import check
-from projections.database.connection import Targets, connect, connect_for_cypher, extension_version
+from projections.database.connection import Targets, connect, extension_version
+from projections.database.cypher import connect_for_cypher, enforces_row_security
 from projections.database.grants import roles_sql
 from projections.database.status import projection_status
 from projections.errors import DatabaseError, ExtensionMissing

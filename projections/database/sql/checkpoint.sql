@@ -33,10 +33,10 @@ CREATE TABLE mapfold.dead_letter (
 SELECT log_id, fingerprint, settings, next_offset, last_event, digest
 FROM mapfold.checkpoint WHERE sink = %(sink)s
 
--- name: is_there
+-- name: rows_exist
 SELECT to_regclass(%(table)s) IS NOT NULL
 
--- name: begin
+-- name: create_first
 -- A first checkpoint; two tails that both find none must not both get one.
 INSERT INTO mapfold.checkpoint (sink, log_id, fingerprint, settings, next_offset, last_event)
 VALUES (%(sink)s, %(log_id)s, %(fingerprint)s, %(settings)s, 0, '')
@@ -62,7 +62,7 @@ SET log_id = EXCLUDED.log_id, fingerprint = EXCLUDED.fingerprint, settings = EXC
     next_offset = EXCLUDED.next_offset, last_event = EXCLUDED.last_event,
     digest = EXCLUDED.digest, moved_at = now(), heartbeat_at = NULL
 
--- name: beat
+-- name: write_heartbeat
 UPDATE mapfold.checkpoint SET heartbeat_at = now() WHERE sink = %(sink)s
 
 -- name: ages

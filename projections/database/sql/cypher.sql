@@ -1,7 +1,6 @@
--- Row-level security that repeats the privileges of a graph's tables, for what AGE writes without
--- looking at them.
+-- Row-level security that repeats the privileges of a graph's tables; cypher() does not check them.
 
--- name: guard
+-- name: add_policies
 -- `{name}` is the table's name as a literal; as a regclass it keeps naming the table after a rename.
 ALTER TABLE {table} ENABLE ROW LEVEL SECURITY;
 CREATE POLICY mapfold_select ON {table} FOR SELECT USING (true);
@@ -14,7 +13,7 @@ CREATE POLICY mapfold_delete ON {table} FOR DELETE
 
 -- name: unwanted_writers
 -- Roles that may use AGE and enter the graph, but lack UPDATE or DELETE on a table of it that has no
--- row-level security, or whose AGE does not heed it.
+-- row-level security, or whose AGE does not enforce it.
 SELECT DISTINCT r.rolname
 FROM pg_class c CROSS JOIN pg_roles r
 WHERE c.relnamespace = (SELECT oid FROM pg_namespace WHERE nspname = %(graph)s) AND c.relkind = 'r'
@@ -26,6 +25,6 @@ WHERE c.relnamespace = (SELECT oid FROM pg_namespace WHERE nspname = %(graph)s) 
            AND has_table_privilege(r.oid, c.oid, 'DELETE'))
 ORDER BY 1
 
--- name: subject
--- Whether row-level security applies to us; COPY cannot write such a table.
+-- name: policies_apply
+-- Whether row-level security applies to this session; COPY cannot write such a table.
 SELECT row_security_active(%(table)s)
