@@ -166,7 +166,7 @@ class Spool:
         self.max_bytes = max_bytes
         self._lock = threading.Lock()
         self._count = self._bytes = 0
-        with self._clear_errors():
+        with self._spool_errors():
             path.parent.mkdir(parents=True, exist_ok=True)
             self._db = sqlite3.connect(
                 path, timeout=0, isolation_level=None, check_same_thread=False
@@ -189,7 +189,7 @@ class Spool:
 
     def add(self, run_id: str, keyframe_id: int, payload: bytes) -> None:
         """Keep one envelope until it is acknowledged. Raises SpoolFull if there is no room."""
-        with self._clear_errors(), self._lock:
+        with self._spool_errors(), self._lock:
             if not self._make_room(len(payload)):
                 raise SpoolFull(
                     f"{self.path}: {self._count} envelopes ({self._bytes} bytes) wait for a "
@@ -212,7 +212,7 @@ class Spool:
 
     def after(self, seq: int, limit: int) -> list[Spooled]:
         """The oldest waiting envelopes after ``seq`` in order, at most ``limit``."""
-        with self._clear_errors(), self._lock:
+        with self._spool_errors(), self._lock:
             rows = self._db.execute(
                 "select seq, run_id, keyframe_id, payload from spooled where seq > ? "
                 "order by seq limit ?",
@@ -222,13 +222,13 @@ class Spool:
 
     def oldest(self) -> int | None:
         """The seq of the oldest waiting envelope; None if there is none."""
-        with self._clear_errors(), self._lock:
+        with self._spool_errors(), self._lock:
             ((seq,),) = self._db.execute("select min(seq) from spooled")
             return None if seq is None else int(seq)
 
     def waiting_up_to(self, seq: int) -> int:
         """How many envelopes up to ``seq`` still wait."""
-        with self._clear_errors(), self._lock:
+        with self._spool_errors(), self._lock:
             rows = self._db.execute("select count(*) from spooled where seq <= ?", (seq,))
             (count,) = rows.fetchone()
             return int(count)
@@ -236,7 +236,7 @@ class Spool:
     def acknowledge(self, ack: Ack) -> int:
         """Remove what ``ack`` names; returns how many waiting envelopes were removed."""
         removed = 0
-        with self._clear_errors(), self._lock, self._transaction():
+        with self._spool_errors(), self._lock, self._transaction():
             for sha256 in ack.sha256:
                 rows = self._db.execute(
                     "delete from spooled where sha256 = ? returning length(payload)", (sha256,)
@@ -248,9 +248,9 @@ class Spool:
         return removed
 
     def refuse(self, refusals: Refusals, up_to: int) -> int:
-        """Quarantine what ``refusals`` name, up to the seq ``up_to``; returns how many envelopes."""
+        """Quarantine what ``refusals`` name, up to the seq ``up_to``; returns how many."""
         moved = 0
-        with self._clear_errors(), self._lock, self._transaction():
+        with self._spool_errors(), self._lock, self._transaction():
             for refusal in refusals.refused:
                 rows = self._db.execute(
                     "select seq, length(payload) from spooled where sha256 = ? and seq <= ?",
@@ -274,13 +274,13 @@ class Spool:
 
     def refused(self, limit: int) -> list[Refused]:
         """The oldest in quarantine, in order, at most ``limit``."""
-        with self._clear_errors(), self._lock:
+        with self._spool_errors(), self._lock:
             return self._quarantine.rows(limit)
 
     def retry_refused(self) -> int:
         """Move everything in quarantine that still has its bytes behind the waiting envelopes;
         returns how many."""
-        with self._clear_errors(), self._lock, self._transaction():
+        with self._spool_errors(), self._lock, self._transaction():
             count, size = self._quarantine.requeue()
             self._count += count
             self._bytes += size
@@ -288,7 +288,7 @@ class Spool:
 
     def discard_refused(self) -> int:
         """Empty the quarantine; returns how many envelopes were in it."""
-        with self._clear_errors(), self._lock:
+        with self._spool_errors(), self._lock:
             return self._quarantine.clear()
 
     def __len__(self) -> int:
@@ -308,7 +308,7 @@ class Spool:
             yield
 
     @contextmanager
-    def _clear_errors(self) -> Iterator[None]:
+    def _spool_errors(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:
