@@ -1,7 +1,4 @@
-"""`mapfold relocalize`: which Place is this, from a few object crops.
-
-An answer as people read it.
-"""
+"""`mapfold relocalize`: which Place is this, from a few object crops."""
 
 import math
 from pathlib import Path
@@ -10,9 +7,8 @@ from typing import Annotated, cast, get_args
 import typer
 
 from eventsrc.errors import MisuseError
-from projections.queries.relocalize import relocalize as ask
-from projections.relocalize import UNKNOWN_BELOW, Answer, Camera, Crop, Method, RankedPlace
-from projections.relocalize.exact_search import relocalize_as_of
+from projections.queries.relocalize import relocalize as ask_databases
+from projections.relocalize import UNKNOWN_BELOW, Answer, Method, RankedPlace, rank, search_log
 
 from .options import (
     DbOption,
@@ -26,41 +22,6 @@ from .options import (
 )
 from .question_options import HfovOption, ImageOption, QuestionArgument, camera_from, question_from
 from .terminal import display, emit, say
-
-
-def answer_text(answer: Answer) -> str:
-    """A few lines: where, how sure, and what speaks for it."""
-    lines = [_verdict(answer), _pose_line(answer)]
-    for number, place in enumerate(answer.places, start=1):
-        lines += _place_line(number, place)
-    return "\n".join(line for line in lines if line) + "\n"
-
-
-def _verdict(answer: Answer) -> str:
-    sure = f"confidence {answer.confidence:.2f}"
-    if not answer.places:
-        return f"unknown: nothing in the map looks like these crops ({sure})"
-    if answer.unknown:
-        return f"unknown: {sure} is below {UNKNOWN_BELOW}; the likeliest places would be"
-    return f"{answer.places[0].place_id} ({sure})"
-
-
-def _pose_line(answer: Answer) -> str:
-    pose = answer.pose
-    if pose is None:
-        return ""
-    yaw = "" if pose.yaw is None else f", facing {math.degrees(pose.yaw):.0f}°"
-    return f"pose ({pose.x:.2f}, {pose.y:.2f}) m{yaw}, spread {pose.spread_m:.2f} m"
-
-
-def _place_line(number: int, place: RankedPlace) -> list[str]:
-    centre = f"({place.centroid_x:.2f}, {place.centroid_y:.2f}) m"
-    lines = [f"{number}. {place.place_id}  score {place.score:.3f}  centroid {centre}"]
-    lines += [
-        f"   {e.similarity:.3f}  {e.class_name}  {e.object_id or 'no object'}  {e.det_id}"
-        for e in place.evidence
-    ]
-    return lines
 
 
 def relocalize(
@@ -94,26 +55,13 @@ def relocalize(
         raise MisuseError("--as-of asks a past map, which only the log knows; give --log LOG too")
     settings = past_settings(log, settings_file, set_)
     if log is None:
-        answer = _live(crops, top, how, camera, db, vector_db)
+        with databases(db, vector_db) as targets:
+            answer = ask_databases(targets, crops, top=top, method=how, camera=camera)
     else:
-        then = as_of or "end"
-        answer = relocalize_as_of(
-            log, then, settings, crops, top=top, method=how, camera=camera, note=say
-        )
+        candidates = search_log(log, as_of or "end", settings, crops, note=say)
+        answer = rank(crops, candidates, top=top, method=how, camera=camera)
         say_defaults(settings)
-    _tell(answer, json_)
-
-
-def _live(
-    crops: tuple[Crop, ...],
-    top: int,
-    method: Method,
-    camera: Camera,
-    db: str | None,
-    vector_db: str | None,
-) -> Answer:
-    with databases(db, vector_db) as targets:
-        return ask(targets, crops, top=top, method=method, camera=camera)
+    _print_answer(answer, json_)
 
 
 def method_from(text: str) -> Method:
@@ -123,13 +71,48 @@ def method_from(text: str) -> Method:
     raise MisuseError(f"--method {text}: there are joint and plain")
 
 
-def _tell(answer: Answer, as_json: bool) -> None:
+def _print_answer(answer: Answer, as_json: bool) -> None:
     if not as_json:
         display(answer_text(answer))
         return
     emit(answer.document())
     if answer.unknown:
         say(f"unknown: confidence {answer.confidence:.2f} is below {UNKNOWN_BELOW}")
+
+
+def answer_text(answer: Answer) -> str:
+    """The answer for people: place and confidence, pose, ranked places with their evidence."""
+    lines = [_first_line(answer), _pose_line(answer)]
+    for number, place in enumerate(answer.places, start=1):
+        lines += _place_lines(number, place)
+    return "\n".join(line for line in lines if line) + "\n"
+
+
+def _first_line(answer: Answer) -> str:
+    confidence = f"confidence {answer.confidence:.2f}"
+    if not answer.places:
+        return f"unknown: nothing in the map looks like these crops ({confidence})"
+    if answer.unknown:
+        return f"unknown: {confidence} is below {UNKNOWN_BELOW}; the likeliest places would be"
+    return f"{answer.places[0].place_id} ({confidence})"
+
+
+def _pose_line(answer: Answer) -> str:
+    pose = answer.pose
+    if pose is None:
+        return ""
+    yaw = "" if pose.yaw is None else f", facing {math.degrees(pose.yaw):.0f}°"
+    return f"pose ({pose.x:.2f}, {pose.y:.2f}) m{yaw}, spread {pose.spread_m:.2f} m"
+
+
+def _place_lines(number: int, place: RankedPlace) -> list[str]:
+    centroid = f"({place.centroid_x:.2f}, {place.centroid_y:.2f}) m"
+    lines = [f"{number}. {place.place_id}  score {place.score:.3f}  centroid {centroid}"]
+    lines += [
+        f"   {e.similarity:.3f}  {e.class_name}  {e.object_id or 'no object'}  {e.det_id}"
+        for e in place.evidence
+    ]
+    return lines
 
 
 def register(app: typer.Typer) -> None:

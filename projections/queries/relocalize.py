@@ -40,14 +40,14 @@ from projections.relocalize import (
     NEIGHBOURS,
     Answer,
     Camera,
+    CandidatePlace,
     Candidates,
     Crop,
     Match,
     Method,
-    Spot,
     rank,
 )
-from projections.relocalize.exact_search import check_space
+from projections.relocalize.candidates import check_space
 
 
 def refuse_mixed(
@@ -202,7 +202,7 @@ def _assemble(
     crops: int, near: Sequence[Sequence[Any]], along: Mapping[int, Sequence[Any]]
 ) -> Candidates:
     matches: list[list[Match]] = [[] for _ in range(crops)]
-    places: dict[int, Spot] = {}
+    places: dict[int, CandidatePlace] = {}
     for crop, det_pk, det_id, run_id, similarity, class_name, bbox, x, y, yaw, *_ in near:
         thing, its_id, its, there_id, there, _ = along.get(det_pk, (None,) * 6)
         found = None if thing is None else _properties(thing)
@@ -224,13 +224,17 @@ def _assemble(
     return Candidates(tuple(ordered), places)
 
 
-def _spot(places: dict[int, Spot], graphid: str | None, properties: str | None) -> int | None:
+def _spot(
+    places: dict[int, CandidatePlace], graphid: str | None, properties: str | None
+) -> int | None:
     if graphid is None or properties is None:
         return None
     ordinal = (int(graphid) & _NUMBER) - 1
     if ordinal not in places:
         place = _properties(properties)
-        places[ordinal] = Spot(place["place_id"], place["centroid_x"], place["centroid_y"])
+        places[ordinal] = CandidatePlace(
+            place["place_id"], place["centroid_x"], place["centroid_y"]
+        )
     return ordinal
 
 

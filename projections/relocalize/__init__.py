@@ -1,16 +1,22 @@
-"""Where am I? Ranked Places and a pose from a few object crops, as a pure ranking.
+"""Re-localisation: ranked Places and a pose from a few object crops, as a pure ranking.
 
-`rank` turns crops and candidates into an `Answer`; candidates come from the databases
-(`projections.queries.relocalize`) or from a folded map (`ExactIndex`).
+`rank` turns crops (`question`) and candidates into an `Answer`; candidates come from the databases
+(`projections.queries.relocalize`) or from a folded map (`ExactIndex`, `search_log`).
 """
 
-from .answer import Answer, Evidence, PoseHypothesis, RankedPlace
 from .camera import Camera
-from .candidates import NEIGHBOURS, Candidates, Match, Spot
-from .exact_search import ExactIndex
-from .pose import UNKNOWN_BELOW
-from .question import Crop, parse_json, parse_question, read_crops, shown
-from .ranking import DEFAULT_CAMERA, Method, rank
+from .candidates import NEIGHBOURS, CandidatePlace, Candidates, ExactIndex, Match, search_log
+from .question import Crop, describe_value, parse_json, parse_question, read_crops
+from .ranking import (
+    DEFAULT_CAMERA,
+    UNKNOWN_BELOW,
+    Answer,
+    Evidence,
+    Method,
+    PoseHypothesis,
+    RankedPlace,
+    rank,
+)
 
 __all__ = [
     "DEFAULT_CAMERA",
@@ -18,6 +24,7 @@ __all__ = [
     "UNKNOWN_BELOW",
     "Answer",
     "Camera",
+    "CandidatePlace",
     "Candidates",
     "Crop",
     "Evidence",
@@ -26,10 +33,10 @@ __all__ = [
     "Method",
     "PoseHypothesis",
     "RankedPlace",
-    "Spot",
+    "describe_value",
     "parse_json",
     "parse_question",
     "rank",
     "read_crops",
-    "shown",
+    "search_log",
 ]

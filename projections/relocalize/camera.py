@@ -1,8 +1,8 @@
-"""The camera behind the boxes: a pinhole that looks straight ahead of the robot.
+"""Camera model: a pinhole that looks straight ahead of the robot; bearings and sizes from boxes.
 
 A box's centre gives a bearing, its height a relative depth: the height in pixels times the depth in
 metres is the same for one thing from wherever it is seen (its *size*, in pixel metres). A box that
-touches the picture's edge is cut off there, so what it says is worth less.
+touches the picture's edge is cut off there, so its bearing and height count less.
 """
 
 import math
@@ -20,7 +20,7 @@ _MIN_HEIGHT_PX = 4.0
 _EDGE_PX = 1.0
 _UNKNOWN_HEIGHT_PX = 100.0
 _FARTHEST_PX = 1e6
-"""Coordinates beyond it are taken as it, so that the geometry's squares stay finite."""
+"""Coordinates are limited to it, so that the geometry's squares stay finite."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class Camera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Views:
-    """What n boxes say. ``slope`` is the tangent of the bearing, left positive; heights are pixels.
+    """Of n boxes the tangent of the bearing (``slope``, left positive) and the height in pixels.
 
     ``cut_x`` and ``cut_y`` tell which boxes touch the picture's edge at a side, at top or bottom.
     ``known`` is False where there is no box.

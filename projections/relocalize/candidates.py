@@ -1,13 +1,30 @@
-"""What a search brings back for each crop: the map's observations most like it, and their places.
+"""Candidates: for each crop the map's observations most similar to it, and their Places.
 
-This is the whole input of the ranking. The databases make it with one query, a folded state by
-exact search (`projections.relocalize.exact_search`); which of the two it was makes no difference.
+`Candidates` is the whole input of the ranking. The databases make it with one query
+(`projections.queries.relocalize`), a folded map by exact search (`ExactIndex`). Which of the two it
+was makes no difference to the ranking.
+
+Exact search: unit vectors are multiples of 2⁻²⁰ and multiplied in float64, so every sum is exact
+whatever BLAS does (see `projections.exact`). The same map and crops give the same candidates to the
+last bit.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
-from .question import Box
+import numpy as np
+
+from eventsrc.log import LogReader
+from eventsrc.log.seek import Note, resolve
+from eventsrc.text import counted
+from projections.errors import QuestionError
+from projections.exact import Q40, quantise
+from projections.model.fold import fold_log
+from projections.model.view import MapView
+from projections.settings import Settings
+
+from .question import Box, Crop
 
 NEIGHBOURS = 64
 """Observations fetched per crop. From 48 on, the measures in docs/relocalization.md stay the same;
@@ -38,8 +55,8 @@ class Match:
 
 
 @dataclass(frozen=True, slots=True)
-class Spot:
-    """A Place: id and centroid in metres."""
+class CandidatePlace:
+    """A Place that a match belongs to: id and centroid in metres."""
 
     place_id: str
     x: float
@@ -51,4 +68,84 @@ class Candidates:
     """``matches[i]`` are those of crop i, most similar first, ties by ordinal."""
 
     matches: tuple[tuple[Match, ...], ...]
-    places: Mapping[int, Spot]
+    places: Mapping[int, CandidatePlace]
+
+
+def search_log(
+    log: Path,
+    point: str,
+    settings: Settings,
+    crops: Sequence[Crop],
+    *,
+    note: Note | None = None,
+) -> Candidates:
+    """Candidates from the map as of ``point`` of a log: offset, ISO time, run:keyframe or end.
+
+    ``note`` is told what the user should know about ``point`` (`eventsrc.log.seek.resolve`).
+    """
+    with LogReader(log) as reader:
+        _, view = fold_log(reader, settings, resolve(reader, point, note=note))
+    return ExactIndex(view).search(crops)
+
+
+class ExactIndex:
+    """The observations of a view that have an embedding, as one matrix, for many searches."""
+
+    def __init__(self, view: MapView) -> None:
+        self._view = view
+        rows = [o.ordinal for o in view.observations if o.embedding is not None]
+        self._ordinals = np.array(rows, dtype=np.intp)
+        vectors = [view.observations[ordinal].embedding for ordinal in rows]
+        self._matrix = np.array(vectors, dtype=np.float64)
+        self.places = {
+            place.ordinal: CandidatePlace(place.place_id, place.centroid_x, place.centroid_y)
+            for place in view.places.values()
+        }
+        self.model = next(
+            (o.embedding_model for o in view.observations if o.embedding is not None), None
+        )
+
+    def search(self, crops: Sequence[Crop], neighbours: int = NEIGHBOURS) -> Candidates:
+        """The nearest observations of each crop. Raises QuestionError for another space."""
+        if not len(self._ordinals):
+            return Candidates(tuple(() for _ in crops), self.places)
+        for crop in crops:
+            check_space(crop, self._matrix.shape[1], self.model)
+        return Candidates(tuple(self._nearest(crop, neighbours) for crop in crops), self.places)
+
+    def _nearest(self, crop: Crop, neighbours: int) -> tuple[Match, ...]:
+        products = self._matrix @ quantise(crop.vector).astype(np.float64)
+        order = np.argsort(-products, kind="stable")[:neighbours]
+        return tuple(self._match(int(self._ordinals[i]), float(products[i]) / Q40) for i in order)
+
+    def _match(self, ordinal: int, similarity: float) -> Match:
+        observation = self._view.observations[ordinal]
+        keyframe = self._view.keyframes[observation.keyframe]
+        found = None if observation.object is None else self._view.objects[observation.object]
+        pose = keyframe.pose
+        return Match(
+            ordinal,
+            observation.det_id,
+            keyframe.run_id,
+            similarity,
+            None if pose is None else (pose.x_um / 1e6, pose.y_um / 1e6, pose.yaw_rad),
+            observation.bbox,
+            observation.class_name if found is None else found.class_name,
+            None if found is None else found.object_id,
+            None if found is None else found.place,
+            keyframe.place,
+        )
+
+
+def check_space(crop: Crop, dimension: int, model: str | None) -> None:
+    """Raise QuestionError when the crop is not of the map's embedding space."""
+    if len(crop.vector) != dimension:
+        raise QuestionError(
+            f"the question's embeddings have {counted(len(crop.vector), 'dimension')}, the"
+            f" map's {dimension}; ask with the model that made the map ({model})"
+        )
+    if crop.model is not None and model is not None and crop.model != model:
+        raise QuestionError(
+            f"the question's embeddings are of model {crop.model!r}, the map's of {model!r};"
+            " ask with the model that made the map"
+        )

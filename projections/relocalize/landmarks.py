@@ -1,167 +1,66 @@
-"""From matches to landmarks: where do the things stand that look like this crop?
+"""Landmarks: positions of things in the map that look like a crop, triangulated from its matches.
 
 Matches of one crop show one thing or look-alikes of it, so they share one size (pixel metres, see
 `camera`), and with a size every observation alone gives a point: bearing and depth from its pose.
 The right size is the one under which observations from different poses agree on points; it is
-searched on a grid. Points that agree within their errors are one landmark (`clusters`). Neither
-wrong fusions nor split Objects matter here, because only observations are looked at.
+searched on a grid (`_common_depth`). Points that agree within their errors are one landmark
+(`cluster_points`). Wrong fusions and split Objects do no harm, because only observations are used.
+
+A point's error is large along its ray, because the box's height is noisy, and small across it: a
+bearing is good to about a degree. So two chairs half a metre apart are told apart from the side,
+where a circle around every point would merge them into one landmark that fits neither. A landmark's
+position is the mean weighted by information (the inverse of those errors); three views along one
+ray leave the range open, two that cross do not. An error in the shared size moves all points
+outward together: by ``slide``, metres per unit of log size.
 
 Each landmark carries a table: how well its members' similarities fit, for a robot that looks at it
-from each direction (`_evidence`). From the side that was seen before a crop must be more similar
-than from behind; a look-alike fits a little worse from everywhere.
+from each direction (`_similarity_table`). From the side that was seen before a crop must be more
+similar than from behind; a look-alike fits a little worse from everywhere.
 
-No BLAS and no order but the candidates': the same candidates give the same landmarks.
-
-Points of one crop's matches grouped into things, and how sure the place of each thing is.
-
-A match's point is unsure along its ray, because the box's height is noisy, and hardly across it: a
-bearing is good to about a degree. So two chairs half a metre apart are told apart from the side,
-where one circle around every point would melt them into one thing that fits neither. A thing's
-place is the mean weighted by information (the inverse of those errors); three views along one ray
-leave the range open, two that cross do not.
-
-The crops of a thing share one size, so an error in it moves all points outward together: by
-``slide``, metres per unit of log size.
+No BLAS, and no order but the candidates': the same candidates give the same landmarks.
 """
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .camera import Flags, Floats, Views
+from .camera import Camera, Flags, Floats, Views, views
+from .candidates import Match
 from .model import Model
-from .sessions import Sessions, settled
+from .question import Crop
+from .sessions import (
+    RemainingShifts,
+    apply_remaining_shifts,
+    remaining_shifts,
+    session_shifts,
+    subtract_shifts,
+)
 
 Indices = NDArray[np.intp]
-
-_LEAST_REACH_M = 0.3
-_LEAST_PULL = 0.05
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Points:
-    """Points (n, 2) with the rays (n, 2) that lead to them from where they were seen, in metres.
-
-    ``along`` and ``across`` (n,) are their standard errors in and square to the ray's direction,
-    whose unit vectors ``ahead`` holds (2, n). ``moments`` (7, n) are what weighted sums are made
-    of: the inverse of a point's covariance (xx, xy, yy), that times the point, and that times the
-    ray.
-    """
-
-    at: Floats
-    ray: Floats
-    along: Floats
-    across: Floats
-    ahead: Floats
-    moments: Floats
-
-    def of(self, index: Indices) -> "Points":
-        """Those at ``index``."""
-        return Points(
-            self.at[index],
-            self.ray[index],
-            self.along[index],
-            self.across[index],
-            self.ahead[:, index],
-            self.moments[:, index],
-        )
-
-
-def points_of(origin: Floats, ray: Floats, cut: Flags, sigma_size: float, model: Model) -> Points:
-    """Points at the ends of the rays; ``cut`` marks boxes that are cut off or missing."""
-    length = np.sqrt(ray[:, 0] ** 2 + ray[:, 1] ** 2)
-    reach = np.maximum(length, _LEAST_REACH_M)
-    depth = np.where(cut, model.map_log_depth_cut, model.map_log_depth)
-    bearing = np.where(cut, model.map_bearing_cut, model.map_bearing)
-    along = np.sqrt(depth * depth + sigma_size**2) * reach + model.map_least
-    across = bearing * reach + model.map_least
-    safe = np.where(length > 0, length, 1.0)
-    ux, uy = np.where(length > 0, ray[:, 0] / safe, 1.0), ray[:, 1] / safe  # no length: along x
-    a, b = 1.0 / (along * along), 1.0 / (across * across)
-    at = origin + ray
-    xx, xy, yy = a * ux * ux + b * uy * uy, (a - b) * ux * uy, a * uy * uy + b * ux * ux
-    rows = [xx, xy, yy]
-    for x, y in (at.T, ray.T):
-        rows += [xx * x + xy * y, xy * x + yy * y]
-    return Points(at, ray, along, across, np.stack((ux, uy)), np.stack(rows))
-
-
-def clusters(points: Points, weight: Floats, most: int, model: Model) -> list[Indices]:
-    """Grouped around the densest point, then around the densest of the rest, and so on."""
-    chi = _misfit(points, points.at[:, None, :])
-    near = np.exp(-0.5 * chi)
-    free = np.ones(len(weight), dtype=bool)
-    found: list[Indices] = []
-    while free.any() and len(found) < most:
-        support = (near * (weight * free)).sum(1)
-        centre = int(np.argmax(np.where(free, support, -1.0)))
-        place = _mean(points, near[centre] * free)
-        mine = free & (_misfit(points, np.array(place)) < model.gate)
-        mine[centre] = True
-        found.append(np.flatnonzero(mine))
-        free &= ~mine
-    return found
-
-
-@dataclass(frozen=True, slots=True)
-class Settled:
-    """A thing's place in metres; ``spread`` is the covariance (xx, xy, yy) of it in m²."""
-
-    x: float
-    y: float
-    spread: tuple[float, float, float]
-    slide: tuple[float, float]
-
-
-def settle(points: Points, model: Model) -> Settled:
-    """The place of the thing that all ``points`` show, outliers counting little."""
-    centre = np.array(_mean(points, np.ones(len(points.at))))
-    pull = np.maximum(np.exp(-0.5 * _misfit(points, centre)), _LEAST_PULL)
-    sxx, sxy, syy, x, y, ray_x, ray_y = (points.moments * pull).sum(1).tolist()
-    det, least = sxx * syy - sxy * sxy, model.sigma_landmark**2
-    spread = (syy / det + least, -sxy / det, sxx / det + least)
-    at = _solve(sxx, sxy, syy, x, y)
-    return Settled(*at, spread, _solve(sxx, sxy, syy, ray_x, ray_y))
-
-
-def _misfit(points: Points, to: Floats) -> Floats:
-    """χ² of each point being at ``to``, of shape (2,) or (m, 1, 2)."""
-    ux, uy = points.ahead
-    dx, dy = to[..., 0] - points.at[:, 0], to[..., 1] - points.at[:, 1]
-    along, across = (dx * ux + dy * uy) / points.along, (dy * ux - dx * uy) / points.across
-    chi: Floats = along * along + across * across
-    return chi
-
-
-def _mean(points: Points, weight: Floats) -> tuple[float, float]:
-    """The mean place, weighted by information too."""
-    return _solve(*(points.moments[:5] * weight).sum(1).tolist())
-
-
-def _solve(xx: float, xy: float, yy: float, x: float, y: float) -> tuple[float, float]:
-    """The vector that the symmetric matrix takes to (x, y)."""
-    det = xx * yy - xy * xy
-    return (yy * x - xy * y) / det, (xx * y - xy * x) / det
-
 
 DIRECTIONS: Final = 36
 """Directions in a landmark's table, 10° apart."""
 MAX_LANDMARKS: Final = 8
+_NEAREST_M, _FARTHEST_M = 0.5, 6.0
 _DEPTHS: Final = np.exp(np.linspace(np.log(0.5), np.log(6.5), 20))
 _FOR_DEPTH: Final = 40
 """The most similar matches suffice to find the size; all pairs of them are compared."""
 _AGREE_M: Final = 0.3
 _CUT_WEIGHT: Final = 0.2
+_MIN_RANGE_M: Final = 0.3
+_MIN_WEIGHT: Final = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Landmark:
-    """A thing that may be the crop. ``members`` index the crop's posed matches.
+class LandmarkHypothesis:
+    """A thing in the map that may be the crop. ``members`` index the crop's posed matches.
 
-    ``spread`` (xx, xy, yy in m²) and ``slide`` (metres per unit of log size) say how unsure its
-    place is, see `clusters`.
+    ``spread`` (covariance xx, xy, yy in m²) and ``slide`` (metres per unit of log size) say how
+    unsure its position is. ``table`` (DIRECTIONS,) is a log-likelihood.
     """
 
     x: float
@@ -173,43 +72,98 @@ class Landmark:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Landmarks:
-    """The landmarks of one crop, best first, and the size (pixel metres) they share."""
+class CropEvidence:
+    """A crop and its landmarks, best first. Their members index ``poses`` of shape (n, 3).
 
-    items: tuple[Landmark, ...]
-    size: float
+    ``bearing`` (radians, left positive) is None without a box, and ``depth`` (metres ahead) then
+    means nothing. ``cut_x`` and ``cut_y`` say that the picture's edge cut the box,
+    ``sigma_log_size`` how unsure the size is that depth and landmarks share.
+    """
+
+    landmarks: tuple[LandmarkHypothesis, ...]
+    poses: Floats
+    bearing: float | None
+    depth: float
+    cut_x: bool
+    cut_y: bool
     sigma_log_size: float
 
+    @property
+    def in_robot_frame(self) -> tuple[float, float]:
+        """Metres ahead and left of the robot; only for a crop with a box."""
+        return self.depth, self.depth * math.tan(self.bearing or 0.0)
 
-def find_landmarks(
-    poses: Floats, views: Views, similarity: Floats, sessions: Sessions, model: Model
-) -> Landmarks:
-    """``poses`` of shape (n, 3) in metres and radians, ``similarity`` of shape (n,); n ≥ 1."""
+
+def crop_evidence(
+    crops: Sequence[Crop], matches: Sequence[Sequence[Match]], camera: Camera, model: Model
+) -> tuple[CropEvidence, ...]:
+    """Evidence of the crops that have a relevant match with a pose; maybe none."""
+    shifts, found = session_shifts(matches, model), []
+    for crop, row in zip(crops, matches, strict=True):
+        relevant = [
+            m
+            for m in subtract_shifts(row, shifts)
+            if m.pose is not None and m.similarity > model.relevant
+        ]
+        if relevant:
+            remaining = remaining_shifts(relevant, shifts, model)
+            found.append(_evidence_of(crop, relevant, remaining, camera, model))
+    return tuple(found)
+
+
+def _evidence_of(
+    crop: Crop, matches: Sequence[Match], remaining: RemainingShifts, camera: Camera, model: Model
+) -> CropEvidence:
+    poses = np.array([m.pose for m in matches], dtype=np.float64)
+    similarity = np.array([m.similarity for m in matches], dtype=np.float64)
+    boxes = views(camera, [m.bbox for m in matches])
+    landmarks, size, sigma = _find_landmarks(poses, boxes, similarity, remaining, model)
+    own = views(camera, [crop.bbox])
+    known = bool(own.known[0])
+    depth = size / float(own.height_px[0])
+    return CropEvidence(
+        landmarks,
+        poses,
+        math.atan(float(own.slope[0])) if known else None,
+        min(max(depth, _NEAREST_M), _FARTHEST_M),
+        bool(own.cut_x[0]),
+        bool(own.cut_y[0]),
+        sigma,
+    )
+
+
+def _find_landmarks(
+    poses: Floats, boxes: Views, similarity: Floats, remaining: RemainingShifts, model: Model
+) -> tuple[tuple[LandmarkHypothesis, ...], float, float]:
+    """Landmarks of one crop, best first, the size they share (pixel metres), its log's error.
+
+    ``poses`` of shape (n, 3) in metres and radians, ``similarity`` of shape (n,); n ≥ 1.
+    """
     weight = np.clip((similarity - model.relevant) / 0.05, 0.1, 1.0)
-    weight = np.where(views.cut_x | views.cut_y | ~views.known, _CUT_WEIGHT * weight, weight)
-    rays, median_px = _rays(poses, views)
+    cut = boxes.cut_x | boxes.cut_y | ~boxes.known
+    weight = np.where(cut, _CUT_WEIGHT * weight, weight)
+    rays, median_px = _rays(poses, boxes)
     most = np.arange(min(_FOR_DEPTH, len(poses)))
     depth, sigma = _common_depth(poses[most], rays[most], weight[most], model)
-    cut = views.cut_x | views.cut_y | ~views.known
     points = points_of(poses[:, :2], depth * rays, cut, sigma, model)
     found = []
-    for members in clusters(points, weight, 3 * MAX_LANDMARKS, model):
-        spot = settle(points.of(members), model)
-        of_runs = sessions.of(members)
-        table = _evidence(poses[members], spot.x, spot.y, similarity[members], of_runs, model)
-        found.append(Landmark(spot.x, spot.y, members, table, spot.spread, spot.slide))
+    for members in cluster_points(points, weight, 3 * MAX_LANDMARKS, model):
+        at = estimate_position(points.subset(members), model)
+        of_runs = remaining.subset(members)
+        table = _similarity_table(poses[members], at, similarity[members], of_runs, model)
+        found.append(LandmarkHypothesis(at.x, at.y, members, table, at.spread, at.slide))
     found.sort(key=lambda landmark: (-float(landmark.table.max()), int(landmark.members[0])))
-    return Landmarks(tuple(found[:MAX_LANDMARKS]), depth * median_px, sigma)
+    return tuple(found[:MAX_LANDMARKS]), depth * median_px, sigma
 
 
-def _rays(poses: Floats, views: Views) -> tuple[Floats, float]:
+def _rays(poses: Floats, boxes: Views) -> tuple[Floats, float]:
     """Per observation the vector to its thing, were the median height at a depth of 1 m."""
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    median_px = float(np.median(views.height_px))
-    relative = median_px / views.height_px
+    median_px = float(np.median(boxes.height_px))
+    relative = median_px / boxes.height_px
     ahead = np.stack((cos, sin), axis=1)
     left = np.stack((-sin, cos), axis=1)
-    return (ahead + views.slope[:, None] * left) * relative[:, None], median_px
+    return (ahead + boxes.slope[:, None] * left) * relative[:, None], median_px
 
 
 def _common_depth(poses: Floats, rays: Floats, weight: Floats, model: Model) -> tuple[float, float]:
@@ -250,23 +204,129 @@ def _width(score: Floats) -> float:
     return float(np.sqrt((share * off * off).sum()))
 
 
-def _evidence(
-    poses: Floats, x: float, y: float, similarity: Floats, sessions: Sessions, model: Model
+@dataclass(frozen=True, slots=True, eq=False)
+class Points:
+    """Points ``xy`` (n, 2) with the rays (n, 2) to them from where they were seen, in metres.
+
+    ``sigma_along`` and ``sigma_across`` (n,) are their standard errors in and square to the ray's
+    direction, whose unit vectors are ``direction`` (2, n). ``moments`` (7, n) are what weighted
+    sums are made of: the inverse of a point's covariance (xx, xy, yy), that times the point, and
+    that times the ray.
+    """
+
+    xy: Floats
+    ray: Floats
+    sigma_along: Floats
+    sigma_across: Floats
+    direction: Floats
+    moments: Floats
+
+    def subset(self, index: Indices) -> "Points":
+        """Those at ``index``."""
+        return Points(
+            self.xy[index],
+            self.ray[index],
+            self.sigma_along[index],
+            self.sigma_across[index],
+            self.direction[:, index],
+            self.moments[:, index],
+        )
+
+
+def points_of(origin: Floats, ray: Floats, cut: Flags, sigma_size: float, model: Model) -> Points:
+    """Points at the ends of the rays; ``cut`` marks boxes that are cut off or missing."""
+    length = np.sqrt(ray[:, 0] ** 2 + ray[:, 1] ** 2)
+    reach = np.maximum(length, _MIN_RANGE_M)
+    depth = np.where(cut, model.map_log_depth_cut, model.map_log_depth)
+    bearing = np.where(cut, model.map_bearing_cut, model.map_bearing)
+    along = np.sqrt(depth * depth + sigma_size**2) * reach + model.map_least
+    across = bearing * reach + model.map_least
+    safe = np.where(length > 0, length, 1.0)
+    ux, uy = np.where(length > 0, ray[:, 0] / safe, 1.0), ray[:, 1] / safe  # no length: along x
+    a, b = 1.0 / (along * along), 1.0 / (across * across)
+    xy = origin + ray
+    m_xx, m_xy, m_yy = a * ux * ux + b * uy * uy, (a - b) * ux * uy, a * uy * uy + b * ux * ux
+    rows = [m_xx, m_xy, m_yy]
+    for x, y in (xy.T, ray.T):
+        rows += [m_xx * x + m_xy * y, m_xy * x + m_yy * y]
+    return Points(xy, ray, along, across, np.stack((ux, uy)), np.stack(rows))
+
+
+def cluster_points(points: Points, weight: Floats, most: int, model: Model) -> list[Indices]:
+    """Grouped around the densest point, then around the densest of the rest, and so on."""
+    near = np.exp(-0.5 * _chi_squared(points, points.xy[:, None, :]))
+    free = np.ones(len(weight), dtype=bool)
+    found: list[Indices] = []
+    while free.any() and len(found) < most:
+        support = (near * (weight * free)).sum(1)
+        centre = int(np.argmax(np.where(free, support, -1.0)))
+        mean = _weighted_mean(points, near[centre] * free)
+        members = free & (_chi_squared(points, np.array(mean)) < model.gate)
+        members[centre] = True
+        found.append(np.flatnonzero(members))
+        free &= ~members
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Position:
+    """A landmark's position in metres, its covariance (xx, xy, yy) in m², and its slide."""
+
+    x: float
+    y: float
+    spread: tuple[float, float, float]
+    slide: tuple[float, float]
+
+
+def estimate_position(points: Points, model: Model) -> Position:
+    """The position of the thing that all ``points`` show, outliers counting little."""
+    centre = np.array(_weighted_mean(points, np.ones(len(points.xy))))
+    weight = np.maximum(np.exp(-0.5 * _chi_squared(points, centre)), _MIN_WEIGHT)
+    sxx, sxy, syy, x, y, ray_x, ray_y = (points.moments * weight).sum(1).tolist()
+    det, least = sxx * syy - sxy * sxy, model.sigma_landmark**2
+    spread = (syy / det + least, -sxy / det, sxx / det + least)
+    return Position(*_solve(sxx, sxy, syy, x, y), spread, slide=_solve(sxx, sxy, syy, ray_x, ray_y))
+
+
+def _chi_squared(points: Points, to: Floats) -> Floats:
+    """χ² of each point being at ``to``, of shape (2,) or (m, 1, 2)."""
+    ux, uy = points.direction
+    dx, dy = to[..., 0] - points.xy[:, 0], to[..., 1] - points.xy[:, 1]
+    along = (dx * ux + dy * uy) / points.sigma_along
+    across = (dy * ux - dx * uy) / points.sigma_across
+    chi: Floats = along * along + across * across
+    return chi
+
+
+def _weighted_mean(points: Points, weight: Floats) -> tuple[float, float]:
+    """The mean position, weighted by information too."""
+    return _solve(*(points.moments[:5] * weight).sum(1).tolist())
+
+
+def _solve(xx: float, xy: float, yy: float, x: float, y: float) -> tuple[float, float]:
+    """The vector that the symmetric matrix takes to (x, y)."""
+    det = xx * yy - xy * xy
+    return (yy * x - xy * y) / det, (xx * y - xy * x) / det
+
+
+def _similarity_table(
+    poses: Floats, at: Position, similarity: Floats, remaining: RemainingShifts, model: Model
 ) -> Floats:
     """Log-likelihood (up to a constant) per direction from which the robot looks at the thing."""
     directions = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS)
-    seen_from = np.arctan2(poses[:, 1] - y, poses[:, 0] - x)
+    seen_from = np.arctan2(poses[:, 1] - at.y, poses[:, 0] - at.x)
     apart = np.cos(directions[:, None] - seen_from[None])
     expected = model.floor + model.side * np.exp(model.kappa * (apart - 1.0))
-    error = np.minimum(similarity, model.usual_best)[None] - expected
-    error, paid = settled(error, sessions, model) if sessions.several else (error, 0.0)
+    error, price = np.minimum(similarity, model.usual_best)[None] - expected, np.zeros(DIRECTIONS)
+    if remaining.several_runs:
+        error, price = apply_remaining_shifts(error, remaining, model)
     mean = error.mean(1)
     count = min(float(len(similarity)), model.independent)
     scatter = ((error - mean[:, None]) ** 2).mean(1) * (count / model.sigma_observation**2)
     offset = mean * mean / (model.sigma_instance**2 + model.sigma_observation**2 / count)
     offset = np.where(mean > 0, np.minimum(offset, model.too_similar), offset)
     degrees = min(len(similarity) - 1.0, model.independent)
-    table: Floats = np.minimum(-0.5 * (scatter - 0.5 * degrees + offset) - paid, 1.5)
+    table: Floats = np.minimum(-0.5 * (scatter - 0.5 * degrees + offset) - price, 1.5)
     if float(similarity.max()) > model.usual_best + model.same_crop:
         table = table + model.same_crop_worth
     return table

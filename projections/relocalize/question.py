@@ -1,4 +1,4 @@
-"""A question: the object crops a lost robot sees, read from JSON.
+"""Questions: the object crops a lost robot sees, read from JSON and checked.
 
 A question is an envelope, a JSON list of detections, or ``{"crops": [...]}``. Each crop needs an
 ``embedding``, base64 of little-endian float32 as in an envelope, or a JSON list of numbers;
@@ -29,7 +29,7 @@ MAX_CROPS: Final = 32
 MAX_MARKS: Final = 20_000
 """More of ``[``, ``{`` and ``:`` than this are refused before the JSON is parsed. Empty lists and
 objects cost most per byte; a question of 32 crops holds about 300 of these characters."""
-_MAX_SHOWN: Final = 80
+_MAX_DESCRIBED: Final = 80
 
 Vector = NDArray[np.float32]
 Box = tuple[float, float, float, float]
@@ -49,8 +49,8 @@ class Crop:
     model: str | None = None
 
     @property
-    def order(self) -> tuple[bytes, Box, str]:
-        """A key that puts crops into one order whatever order they came in."""
+    def sort_key(self) -> tuple[bytes, Box, str]:
+        """Puts crops into one order, whatever order they came in."""
         return self.vector.tobytes(), self.bbox or (0.0, 0.0, 0.0, 0.0), self.det_id or ""
 
 
@@ -101,14 +101,6 @@ def parse_json(payload: bytes) -> Any:
         raise QuestionError(f"the question is not JSON: {error}") from None
 
 
-def shown(value: Any) -> str:
-    """A value of a question as a message may show it: escaped, and not long."""
-    if isinstance(value, list | dict):
-        return f"a {'list' if isinstance(value, list) else 'JSON object'}"
-    text = repr(value[:_MAX_SHOWN] if isinstance(value, str) else value)
-    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}…"
-
-
 def read_crops(document: Any) -> tuple[Crop, ...]:
     """The crops of a parsed question that have an embedding; at least one, of one dimension."""
     models = _validated(_crop_list(document))
@@ -118,7 +110,7 @@ def read_crops(document: Any) -> tuple[Crop, ...]:
     if not crops:
         count = counted(len(models), "crop")
         raise QuestionError(f"the question has {count} and no embedding; send at least one")
-    _same_space(crops)
+    _check_one_space(crops)
     return tuple(crops)
 
 
@@ -193,7 +185,7 @@ def _floats(index: int, model: _CropModel) -> Vector:
         return np.asarray(given, dtype=np.float64).astype(np.float32)
 
 
-def _same_space(crops: Sequence[Crop]) -> None:
+def _check_one_space(crops: Sequence[Crop]) -> None:
     dims = {len(crop.vector) for crop in crops}
     models = {crop.model for crop in crops} - {None}
     if len(dims) > 1 or len(models) > 1:
@@ -201,3 +193,11 @@ def _same_space(crops: Sequence[Crop]) -> None:
         raise QuestionError(
             f"the question mixes embedding spaces ({', '.join(what)}); send crops of one model"
         )
+
+
+def describe_value(value: Any) -> str:
+    """A value of a question for an error message: escaped, and at most 80 characters."""
+    if isinstance(value, list | dict):
+        return f"a {'list' if isinstance(value, list) else 'JSON object'}"
+    text = repr(value[:_MAX_DESCRIBED] if isinstance(value, str) else value)
+    return text if len(text) <= _MAX_DESCRIBED else f"{text[:_MAX_DESCRIBED]}…"

@@ -1,97 +1,93 @@
-"""The ranking: from crops and their candidates to an answer. Pure: no clock, no chance, no I/O.
+"""The ranking: from crops and their candidates to an answer. No clock, no chance, no I/O.
 
-The joint method weighs poses (`posterior`), and a Place's score is the share of their weight that
-lies in it: each hypothesis counts for the Place of the nearest keyframe among the candidates.
-Places that no hypothesis lies in come last, by the plain recipe's sums. Ties go to the Place
-founded first. Crops are put into one order at the start, so that theirs does not matter.
+The joint method weighs poses (`pose`), and a Place's score is the share of their weight that lies
+in it: each pose counts for the Place of the nearest keyframe among the candidates. Places that no
+pose lies in come last, by the plain method's sums. Ties go to the Place founded first. Crops are
+first put into one order, so that theirs does not matter.
 
-Places in their order, each with the observations that speak for it: the best one per crop.
-
-The plain recipe, kept as the baseline everything else is measured against.
-
-The ten nearest observations of each crop; each gives its similarity to the Place of its Object; the
-Place with the greatest sum wins; the pose is its centroid.
+The plain method is the baseline that everything else is measured against: each of the ten nearest
+observations of a crop gives its similarity to the Place of its Object; the Place with the greatest
+sum wins; the pose is its centroid.
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Final, Literal
+from dataclasses import asdict, dataclass
+from typing import Any, Final, Literal
 
 import numpy as np
 
-from .answer import Answer, Evidence, PoseHypothesis, RankedPlace
 from .camera import Camera
 from .candidates import Candidates, Match
 from .model import MODEL, Model
 from .pose import Posterior, confidence, locate
 from .question import Crop
-from .sighting import sightings
-
-
-def ranked_places(
-    candidates: Candidates, order: Sequence[int], scores: Mapping[int, float]
-) -> tuple[RankedPlace, ...]:
-    """The places of ``order`` (ordinals) with their scores and evidence."""
-    ranked = []
-    for place in order:
-        spot = candidates.places[place]
-        evidence = _evidence(candidates.matches, place)
-        ranked.append(RankedPlace(spot.place_id, scores[place], spot.x, spot.y, evidence))
-    return tuple(ranked)
-
-
-def _evidence(matches: Sequence[Sequence[Match]], place: int) -> tuple[Evidence, ...]:
-    best = [next((m for m in row if speaks_for(m, place)), None) for row in matches]
-    found = sorted((m for m in best if m is not None), key=lambda m: (-m.similarity, m.observation))
-    return tuple(Evidence(m.det_id, m.object_id, m.class_name, m.similarity) for m in found)
-
-
-def speaks_for(match: Match, place: int) -> bool:
-    """Whether the match's Object is located in the place, or was seen from it."""
-    return place in (match.object_place, match.keyframe_place)
-
-
-PLAIN_NEIGHBOURS = 10
-
-
-def plain_scores(matches: Sequence[Sequence[Match]]) -> dict[int, float]:
-    """Sum of similarities by Place; summed exactly, so that no order matters."""
-    given: dict[int, list[float]] = {}
-    for row in matches:
-        for match in row[:PLAIN_NEIGHBOURS]:
-            if match.object_place is not None:
-                given.setdefault(match.object_place, []).append(match.similarity)
-    return {place: math.fsum(values) for place, values in given.items()}
-
-
-def rank_plain(candidates: Candidates, top: int) -> Answer:
-    """The plain recipe's answer. Its confidence is the winner's share of all similarity."""
-    scores = plain_scores(candidates.matches)
-    if not scores:
-        return Answer((), None, 0.0)
-    order = sorted(scores, key=lambda place: (-scores[place], place))
-    winner = candidates.places[order[0]]
-    share = scores[order[0]] / math.fsum(scores.values())
-    places = ranked_places(candidates, order[:top], scores)
-    spread = _spread(candidates, order[0], winner.x, winner.y)
-    return Answer(
-        places, PoseHypothesis(winner.x, winner.y, None, spread), max(0.0, min(1.0, share))
-    )
-
-
-def _spread(candidates: Candidates, place: int, x: float, y: float) -> float:
-    """Root mean square distance of the poses that voted for the place from its centroid."""
-    squared = [
-        (m.pose[0] - x) ** 2 + (m.pose[1] - y) ** 2
-        for row in candidates.matches
-        for m in row[:PLAIN_NEIGHBOURS]
-        if m.object_place == place and m.pose is not None
-    ]
-    return math.sqrt(math.fsum(squared) / len(squared)) if squared else 0.0
-
 
 Method = Literal["joint", "plain"]
 DEFAULT_CAMERA: Final = Camera()
+PLAIN_NEIGHBOURS: Final = 10
+UNKNOWN_BELOW: Final = 0.3
+"""Below this confidence the answer is 'unknown'."""
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """An observation in the map that supports a Place. ``object_id`` is None if unfused."""
+
+    det_id: str
+    object_id: str | None
+    class_name: str
+    similarity: float
+
+
+@dataclass(frozen=True, slots=True)
+class RankedPlace:
+    """A Place and its score: the share of the poses' weight that lies in it.
+
+    With the plain method the score is the sum of similarities. The centroid is in metres.
+    """
+
+    place_id: str
+    score: float
+    centroid_x: float
+    centroid_y: float
+    evidence: tuple[Evidence, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class PoseHypothesis:
+    """Metres and radians in the map frame; ``yaw`` is None when the evidence leaves it open.
+
+    ``spread_m`` is the root mean square distance of all weighed poses from this one.
+    """
+
+    x: float
+    y: float
+    yaw: float | None
+    spread_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """``confidence`` is the calibrated probability that the pose is right within 1.5 m."""
+
+    places: tuple[RankedPlace, ...]
+    pose: PoseHypothesis | None
+    confidence: float
+
+    @property
+    def unknown(self) -> bool:
+        """Whether the confidence is too low to name a Place."""
+        return self.confidence < UNKNOWN_BELOW
+
+    def document(self) -> dict[str, Any]:
+        """The answer as JSON, in the shape of ``relocalize --json``."""
+        return {
+            "places": [asdict(place) for place in self.places],
+            "pose": None if self.pose is None else asdict(self.pose),
+            "confidence": self.confidence,
+            "unknown": self.unknown,
+        }
 
 
 def rank(
@@ -104,38 +100,30 @@ def rank(
     model: Model = MODEL,
 ) -> Answer:
     """The answer to a question; ``candidates.matches`` run parallel to ``crops``."""
-    order = sorted(range(len(crops)), key=lambda index: crops[index].order)
+    order = sorted(range(len(crops)), key=lambda index: crops[index].sort_key)
     crops = [crops[index] for index in order]
     candidates = Candidates(tuple(candidates.matches[i] for i in order), candidates.places)
     if method == "plain":
-        return rank_plain(candidates, top)
-    posterior = weigh(crops, candidates, camera, model)
+        return _rank_plain(candidates, top)
+    posterior = locate(crops, candidates.matches, camera, model)
     return _answer(candidates, posterior, len(crops), top)
 
 
-def weigh(
-    crops: Sequence[Crop], candidates: Candidates, camera: Camera, model: Model
-) -> Posterior | None:
-    """The posterior over poses; None when no candidate is relevant."""
-    seen = sightings(crops, candidates.matches, camera, model)
-    return locate(seen, model) if seen else None
-
-
 def _answer(candidates: Candidates, posterior: Posterior | None, crops: int, top: int) -> Answer:
-    plain = plain_scores(candidates.matches)
-    shares = {} if posterior is None else _shares(candidates, posterior)
-    known = sorted(shares.keys() | plain.keys())
-    order = sorted(known, key=lambda p: (-shares.get(p, 0.0), -plain.get(p, 0.0), p))
+    sums = _similarity_sums(candidates.matches)
+    shares = {} if posterior is None else _place_shares(candidates, posterior)
+    known = sorted(shares.keys() | sums.keys())
+    order = sorted(known, key=lambda p: (-shares.get(p, 0.0), -sums.get(p, 0.0), p))
     scores = {place: shares.get(place, 0.0) for place in known}
-    places = ranked_places(candidates, order[:top], scores)
+    places = _ranked_places(candidates, order[:top], scores)
     if posterior is None:
         return Answer(places, None, 0.0)
     pose = PoseHypothesis(posterior.x, posterior.y, posterior.yaw, posterior.spread_m)
     return Answer(places, pose, confidence(posterior, crops))
 
 
-def _shares(candidates: Candidates, posterior: Posterior) -> dict[int, float]:
-    """The weight of the hypotheses by the Place of the nearest placed candidate keyframe."""
+def _place_shares(candidates: Candidates, posterior: Posterior) -> dict[int, float]:
+    """The weight of the poses by the Place of the nearest placed candidate keyframe."""
     placed = sorted({spot for row in candidates.matches for m in row if (spot := _placed(m))})
     if not placed:
         return {}
@@ -150,7 +138,66 @@ def _shares(candidates: Candidates, posterior: Posterior) -> dict[int, float]:
 
 
 def _placed(match: Match) -> tuple[float, float, int] | None:
+    """A match's keyframe position and Place."""
     place = match.object_place if match.keyframe_place is None else match.keyframe_place
     if match.pose is None or place is None:
         return None
     return match.pose[0], match.pose[1], place
+
+
+def _ranked_places(
+    candidates: Candidates, order: Sequence[int], scores: Mapping[int, float]
+) -> tuple[RankedPlace, ...]:
+    """The places of ``order`` (ordinals) with their scores and evidence."""
+    ranked = []
+    for ordinal in order:
+        place = candidates.places[ordinal]
+        evidence = _evidence(candidates.matches, ordinal)
+        ranked.append(RankedPlace(place.place_id, scores[ordinal], place.x, place.y, evidence))
+    return tuple(ranked)
+
+
+def _evidence(matches: Sequence[Sequence[Match]], place: int) -> tuple[Evidence, ...]:
+    """The best match of each crop whose Object is located in the place, or was seen from it."""
+    best = [
+        next((m for m in row if place in (m.object_place, m.keyframe_place)), None)
+        for row in matches
+    ]
+    found = sorted((m for m in best if m is not None), key=lambda m: (-m.similarity, m.observation))
+    return tuple(Evidence(m.det_id, m.object_id, m.class_name, m.similarity) for m in found)
+
+
+def _rank_plain(candidates: Candidates, top: int) -> Answer:
+    """The plain method's answer. Its confidence is the winner's share of all similarity."""
+    sums = _similarity_sums(candidates.matches)
+    if not sums:
+        return Answer((), None, 0.0)
+    order = sorted(sums, key=lambda place: (-sums[place], place))
+    winner = candidates.places[order[0]]
+    share = sums[order[0]] / math.fsum(sums.values())
+    places = _ranked_places(candidates, order[:top], sums)
+    spread = _spread(candidates, order[0], winner.x, winner.y)
+    return Answer(
+        places, PoseHypothesis(winner.x, winner.y, None, spread), max(0.0, min(1.0, share))
+    )
+
+
+def _similarity_sums(matches: Sequence[Sequence[Match]]) -> dict[int, float]:
+    """Sum of similarities by Place; summed exactly, so that no order matters."""
+    given: dict[int, list[float]] = {}
+    for row in matches:
+        for match in row[:PLAIN_NEIGHBOURS]:
+            if match.object_place is not None:
+                given.setdefault(match.object_place, []).append(match.similarity)
+    return {place: math.fsum(values) for place, values in given.items()}
+
+
+def _spread(candidates: Candidates, place: int, x: float, y: float) -> float:
+    """Root mean square distance from (x, y) of the poses whose matches support the place."""
+    squared = [
+        (m.pose[0] - x) ** 2 + (m.pose[1] - y) ** 2
+        for row in candidates.matches
+        for m in row[:PLAIN_NEIGHBOURS]
+        if m.object_place == place and m.pose is not None
+    ]
+    return math.sqrt(math.fsum(squared) / len(squared)) if squared else 0.0

@@ -30,10 +30,10 @@ from projections.relocalize import (
     Camera,
     Crop,
     Method,
+    describe_value,
     parse_json,
     rank,
     read_crops,
-    shown,
 )
 
 from .pools import Pools
@@ -153,7 +153,9 @@ class Answerer:
         """``places`` or ``objects`` near a pose: x, y and radius in metres."""
         near = {"places": places_near, "objects": objects_near}.get(what)
         if near is None:
-            raise QuestionError(f"no state called {shown(what)}; there are places and objects")
+            raise QuestionError(
+                f"no state called {describe_value(what)}; there are places and objects"
+            )
         x, y = _number(options, "x"), _number(options, "y")
         radius = _number(options, "radius", DEFAULT_RADIUS_M)
         with self._telling():
@@ -200,14 +202,14 @@ def _top(value: Any) -> int:
     if isinstance(value, str) and value.isascii() and value.isdecimal() and len(value) <= 9:
         value = int(value)
     if type(value) is not int or not 1 <= value <= MAX_TOP:
-        raise QuestionError(f"top is {shown(value)}; give a number from 1 to {MAX_TOP}")
+        raise QuestionError(f"top is {describe_value(value)}; give a number from 1 to {MAX_TOP}")
     return value
 
 
 def _method(value: Any) -> Method:
     if isinstance(value, str) and value in get_args(Method):
         return cast("Method", value)
-    raise QuestionError(f"method is {shown(value)}; there are joint and plain")
+    raise QuestionError(f"method is {describe_value(value)}; there are joint and plain")
 
 
 def _number(options: Mapping[str, str], name: str, default: float | None = None) -> float:
@@ -216,5 +218,7 @@ def _number(options: Mapping[str, str], name: str, default: float | None = None)
     except (KeyError, ValueError):
         value = math.nan
     if not abs(value) <= MAX_METRES:  # nor NaN
-        raise QuestionError(f"{name} is {shown(options.get(name))}; give a number of metres")
+        raise QuestionError(
+            f"{name} is {describe_value(options.get(name))}; give a number of metres"
+        )
     return value

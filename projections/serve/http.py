@@ -16,7 +16,7 @@ from starlette.requests import ClientDisconnect
 
 from eventsrc.errors import MapfoldError
 from projections.errors import QuestionError
-from projections.relocalize import shown
+from projections.relocalize import describe_value
 
 from .answering import DEFAULT_RADIUS_M, MAX_TOP, Answerer, TooMuchError, encode, refusal
 from .connections import peer_of
@@ -102,14 +102,14 @@ def _refuse_in_our_words(app: FastAPI) -> None:
     @app.exception_handler(RequestValidationError)
     async def refuse_parameter(_: Request, error: RequestValidationError) -> JSONResponse:
         first = error.errors()[0]
-        found = "missing" if first["type"] == "missing" else shown(first["input"])
+        found = "missing" if first["type"] == "missing" else describe_value(first["input"])
         said = f"{first['loc'][-1]} is {found}; {first['msg'].lower()}"
         status, document = refusal(QuestionError(said))
         return JSONResponse(document, status)
 
     @app.exception_handler(HTTPException)
     async def refuse_path(request: Request, error: HTTPException) -> JSONResponse:
-        asked = f"{request.method} {shown(request.scope['path'])}"
+        asked = f"{request.method} {describe_value(request.scope['path'])}"
         said = f"{asked}: {error.detail}; /docs tells what there is"
         _, document = refusal(QuestionError(said))
         return JSONResponse(document, error.status_code, headers=error.headers)

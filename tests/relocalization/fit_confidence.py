@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from projections.evaluate.scores import auroc, expected_calibration_error
 from projections.relocalize import Camera, ExactIndex
 from projections.relocalize.model import MODEL
-from projections.relocalize.pose import WEIGHTS, features
-from projections.relocalize.ranking import weigh
+from projections.relocalize.pose import WEIGHTS, features, locate
 from tests.relocalization.buildings import Building, Keyframe
 from tests.relocalization.drives import drive
 from tests.relocalization.rooms import crops_of, fold
@@ -62,9 +61,9 @@ def ask(mapped: Sequence[Keyframe], asked: Sequence[Keyframe], step: int) -> lis
 
 def _row(index: ExactIndex, instances: set[str], keyframe: Keyframe, drawn: list[int]) -> Row:
     seen = crops_of(keyframe)
-    crops = sorted((seen[i] for i in drawn), key=lambda crop: crop.order)
+    crops = sorted((seen[i] for i in drawn), key=lambda crop: crop.sort_key)
     known = any(keyframe.instances[i] in instances for i in drawn)
-    posterior = weigh(crops, index.search(crops), Camera(), MODEL)
+    posterior = locate(crops, index.search(crops).matches, Camera(), MODEL)
     if posterior is None:
         return (0.0,) * (len(WEIGHTS) - 1), False, known, len(crops)
     envelope = keyframe.accepted.envelope

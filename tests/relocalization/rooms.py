@@ -6,7 +6,7 @@ from dataclasses import replace
 from projections.exact import quantise, to_float32
 from projections.model.view import MapView
 from projections.reducers.semantic_map import SemanticMap
-from projections.relocalize import Candidates, Crop, ExactIndex, Match, Spot
+from projections.relocalize import CandidatePlace, Candidates, Crop, ExactIndex, Match
 from projections.settings import Settings
 from tests.relocalization.buildings import Keyframe
 
@@ -47,13 +47,13 @@ class RoomMap:
         self.view = fold(run)
         self._index = ExactIndex(self.view)
         self.rooms = sorted({keyframe.room for keyframe in run})
-        self._spots = {i: Spot(room, float(i), 0.0) for i, room in enumerate(self.rooms)}
+        self._places = {i: CandidatePlace(room, float(i), 0.0) for i, room in enumerate(self.rooms)}
 
     def search(self, crops: Sequence[Crop]) -> Candidates:
         """As `ExactIndex.search`, each match in the room its keyframe is in."""
         found = self._index.search(crops)
         rows = tuple(tuple(self._in_room(m) for m in row) for row in found.matches)
-        return Candidates(rows, self._spots)
+        return Candidates(rows, self._places)
 
     def _in_room(self, match: Match) -> Match:
         keyframe = self.view.observations[match.observation].keyframe

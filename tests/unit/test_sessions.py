@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from projections.relocalize import Camera, Crop, Match
+from projections.relocalize.landmarks import crop_evidence
 from projections.relocalize.model import MODEL
 from projections.relocalize.sessions import (
-    Sessions,
+    RemainingShifts,
+    apply_remaining_shifts,
+    remaining_shifts,
     session_shifts,
-    sessions_of,
-    settled,
-    unshifted,
+    subtract_shifts,
 )
-from projections.relocalize.sighting import sightings
 
 
 def row(**runs: list[float]) -> list[Match]:
@@ -43,12 +43,12 @@ def test_a_run_with_too_few_matches_is_left_alone() -> None:
     rows = [row(own=[1.0, 0.95], other=[0.87, 0.86, 0.85])] * 2
     shifts = session_shifts(rows, MODEL)
     assert shifts == {"own": 0.0, "other": 0.0}
-    assert unshifted(rows[0], shifts) == rows[0]
+    assert subtract_shifts(rows[0], shifts) == rows[0]
 
 
 def test_only_the_own_runs_matches_move_and_the_order_follows() -> None:
     crop = row(own=[0.9375, 0.875], other=[0.9, 0.8125])
-    moved = unshifted(crop, {"own": 0.0625, "other": 0.0})
+    moved = subtract_shifts(crop, {"own": 0.0625, "other": 0.0})
     assert [(m.run_id, m.similarity) for m in moved] == [
         ("other", 0.9),
         ("own", 0.875),
@@ -60,17 +60,19 @@ def test_only_the_own_runs_matches_move_and_the_order_follows() -> None:
 
 def test_what_a_shift_lacks_of_a_whole_sessions() -> None:
     crop = row(own=[0.9], other=[0.8])
-    found = sessions_of(crop, {"own": 0.03, "other": 0.0, "else": 0.1}, MODEL)
-    assert found.several
-    assert not found.of(np.array([0])).several
-    assert found.lacks.tolist() == pytest.approx([MODEL.session - 0.03, MODEL.session])
+    found = remaining_shifts(crop, {"own": 0.03, "other": 0.0, "else": 0.1}, MODEL)
+    assert found.several_runs
+    assert not found.subset(np.array([0])).several_runs
+    assert found.shift.tolist() == pytest.approx([MODEL.session - 0.03, MODEL.session])
 
 
 def test_a_run_that_is_too_similar_from_behind_is_the_own_session() -> None:
     """Seen from the first direction run 1 is as much too similar as a session makes it."""
     run = np.array([1, 0, 1, 0, 1, 0])
     error = np.array([[MODEL.session * (r == 1) for r in run], [-0.02] * 6])
-    less, paid = settled(error, Sessions(run, np.full(6, MODEL.session)), MODEL)
+    less, paid = apply_remaining_shifts(
+        error, RemainingShifts(run, np.full(6, MODEL.session)), MODEL
+    )
     assert less[0].tolist() == pytest.approx([0.0] * 6)
     assert less[1].tolist() == error[1].tolist()
     assert paid.tolist() == [MODEL.session_price, 0.0]
@@ -78,7 +80,9 @@ def test_a_run_that_is_too_similar_from_behind_is_the_own_session() -> None:
 
 def test_a_run_whose_shift_is_told_whole_is_not_open() -> None:
     error = np.full((3, 4), 0.05)
-    less, paid = settled(error, Sessions(np.array([0, 0, 1, 1]), np.zeros(4)), MODEL)
+    less, paid = apply_remaining_shifts(
+        error, RemainingShifts(np.array([0, 0, 1, 1]), np.zeros(4)), MODEL
+    )
     assert less.tolist() == error.tolist()
     assert paid.tolist() == [0.0] * 3
 
@@ -103,7 +107,7 @@ def test_a_landmark_two_runs_have_seen_is_known_from_the_side_the_other_run_saw(
     for own in ("own", "other"):
         seen = [looks_at_the_origin(i, "other", 2.5, y, front) for i, y in enumerate(wide)]
         seen += [looks_at_the_origin(9 + i, own, -2.5, y, behind) for i, y in enumerate(wide)]
-        found = sightings([crop], [seen], Camera(), MODEL)[0].landmarks
+        found = crop_evidence([crop], [seen], Camera(), MODEL)[0].landmarks
         assert [len(landmark.members) for landmark in found] == [10]
         tables[own] = found[0].table
     assert tables["own"][0] > tables["other"][0] + 1.0
