@@ -1,7 +1,7 @@
-"""The ``mapfold`` command: one composition root for both packages' commands.
+"""The ``mapfold`` program: its commands and its entry point.
 
-Nothing is imported here but what every process has loaded: until `main` has begun, Ctrl-C would
-show where Python was just then.
+This module imports only what the interpreter has loaded already: before `main` runs, Ctrl-C would
+print a traceback.
 """
 
 import os
@@ -29,18 +29,18 @@ COMMANDS: "Mapping[str, str]" = {
     "query": "projections.cli.query",
     "serve": "projections.cli.serve",
     "draw": "projections.cli.draw",
-    "merges": "projections.cli.merges",
-    "why": "projections.cli.why",
-    "diff": "projections.cli.diff",
-    "bisect": "projections.cli.bisect",
-    "whatif": "projections.cli.whatif",
+    "merges": "projections.cli.time_travel",
+    "why": "projections.cli.time_travel",
+    "diff": "projections.cli.time_travel",
+    "bisect": "projections.cli.time_travel",
+    "whatif": "projections.cli.time_travel",
 }
-"""The module of each command, in the order ``--help`` lists them; its ``register`` adds it."""
+"""The module of each command, in the order of ``--help``; commands of one module are adjacent."""
 
 
 def command_line(names: "Iterable[str]" = tuple(COMMANDS)) -> "typer.Typer":
     """The program with these commands."""
-    from .start import compose  # here, so that `main` is there before typer is
+    from .program import compose  # here: it imports typer
 
     return compose(names, COMMANDS)
 
@@ -48,7 +48,7 @@ def command_line(names: "Iterable[str]" = tuple(COMMANDS)) -> "typer.Typer":
 def main() -> None:
     """Entry point of the ``mapfold`` program; it ends by SystemExit."""
     try:
-        from .start import start
+        from .program import start
     except KeyboardInterrupt:
         os.write(2, b"mapfold: interrupted\n")
         os._exit(130)

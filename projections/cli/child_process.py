@@ -1,7 +1,7 @@
-"""A mapfold command that ends when the process that started it does, however that ends.
+"""``python -m projections.cli.child_process``: a mapfold command that ends with its parent process.
 
-Its stdin is a pipe that nobody writes to: the end of it means that nobody holds the other end any
-more. Then the command gets SIGTERM, as if somebody had asked: a recorder drains and closes its log.
+Its stdin is a pipe that nobody writes to. At the end of the pipe the parent process has ended, in
+whatever way; the command gets SIGTERM then, so a recorder drains its queue and closes its log.
 """
 
 import os
@@ -14,11 +14,11 @@ from projections.cli import main
 
 def run() -> None:
     """Run the command that ``sys.argv`` names."""
-    threading.Thread(target=_end_with_stdin, name="watch-starter", daemon=True).start()
+    threading.Thread(target=_terminate_at_end_of_stdin, name="watch-parent", daemon=True).start()
     main()
 
 
-def _end_with_stdin() -> None:
+def _terminate_at_end_of_stdin() -> None:
     while os.read(sys.stdin.fileno(), 1024):
         pass
     os.kill(os.getpid(), signal.SIGTERM)

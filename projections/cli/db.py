@@ -14,8 +14,17 @@ from projections.database.embedded import EmbeddedServer
 from projections.database.grants import roles_sql
 from projections.database.retry import retry
 
-from .options import DbOption, SetOption, SettingsOption, VectorDbOption, databases, settings_from
-from .replay import JsonOption, LogArgument, OnlyOption, only_of
+from .options import (
+    DbOption,
+    JsonOption,
+    LogArgument,
+    SetOption,
+    SettingsOption,
+    VectorDbOption,
+    databases,
+    settings_from,
+)
+from .replay import OnlyOption, only_of
 from .terminal import display, emit, finish, say
 
 group = typer.Typer(

@@ -7,7 +7,8 @@ import typer
 
 from eventsrc.sim import DEFAULT_SEED
 
-from .options import DbOption, VectorDbOption, sigterm_unwinds
+from .options import DbOption, JsonOption, VectorDbOption
+from .signals import sigterm_unwinds
 from .terminal import emit, finish, say
 
 
@@ -21,7 +22,7 @@ def demo(
     ] = 30.0,
     db: DbOption = None,
     vector_db: VectorDbOption = None,
-    json_: Annotated[bool, typer.Option("--json", help="The numbers as JSON on stdout.")] = False,
+    json_: JsonOption = False,
 ) -> None:
     """The whole story on one machine, each part real.
 

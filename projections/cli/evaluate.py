@@ -15,8 +15,17 @@ from projections.evaluate.picture import draw_failures
 from projections.evaluate.questions import DEFAULT_SEED
 from projections.evaluate.run import scores_text
 
-from .options import SetOption, SettingsOption, W, check_picture, settings_from
-from .question_options import HfovOption, ImageOption, camera_from
+from .options import (
+    HfovOption,
+    ImageOption,
+    JsonOption,
+    SetOption,
+    SettingsOption,
+    W,
+    camera_from,
+    check_picture,
+    settings_from,
+)
 from .relocalize import method_from
 from .terminal import display, emit, say
 
@@ -51,7 +60,7 @@ def evaluate(
     ] = None,
     set_: SetOption = None,
     settings_file: SettingsOption = None,
-    json_: Annotated[bool, typer.Option("--json", help="The scores as JSON on stdout.")] = False,
+    json_: JsonOption = False,
 ) -> None:
     """How good places, objects and re-localisation are.
 

@@ -29,6 +29,7 @@ from eventsrc.log import LogWriter
 from eventsrc.text import counted, visible
 from eventsrc.transport.config import check_key
 
+from .options import JsonOption
 from .recorder_text import restart_as_json, say_restart
 from .signals import ctrl_c_between_steps
 from .terminal import emit, finish, people, say
@@ -48,7 +49,7 @@ def import_(
         ),
     ],
     key: Annotated[str, typer.Option(help="Key for messages whose file names none.")] = DEFAULT_KEY,
-    json_: Annotated[bool, typer.Option("--json", help="Counts as JSON on stdout.")] = False,
+    json_: JsonOption = False,
 ) -> None:
     """Append recorded envelopes to a log, in the order of the files.
 

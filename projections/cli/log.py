@@ -38,6 +38,7 @@ from eventsrc.log_info import LogInfo, SegmentInfo, log_info
 from eventsrc.system_events import is_system_key
 from eventsrc.text import counted, visible
 
+from .options import JsonOption, LogArgument
 from .terminal import display, emit, emit_lines, finish, say
 
 _SHORT = 100
@@ -149,9 +150,6 @@ class Watch:
                     names = ", ".join(map(visible, there)) or "none, as the log is empty"
                     yield f"{log}: no event has the key {key!r}; there are {names}"
 
-
-LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="The log's folder.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Data as JSON on stdout.")]
 
 log_app = typer.Typer(help="Look at a log: info, cat, verify, recover.", no_args_is_help=True)
 

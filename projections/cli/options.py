@@ -1,48 +1,48 @@
-"""Options that several commands share: which databases, which settings. Declared once.
+"""Options and arguments that several commands share, and what they are parsed to.
 
-A point of a log on the command line: W means the same, and warns the same, in every command.
-
-A picture's name, looked at before anything is folded for it.
-
-Questions to a past map: which settings its log is folded with.
+What only some commands need (databases, re-localisation, pictures) is imported in the
+function that uses it: the imports of all of them take longer than most commands.
 """
 
 import contextlib
 import json
-import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from types import FrameType
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 from eventsrc.log.seek import resolve
-from projections.database.connection import Targets, open_targets
-from projections.errors import SettingsError
+from eventsrc.transport.config import DEFAULT_ENDPOINT, ZenohOptions
+from projections.errors import QuestionError, SettingsError
 from projections.settings import Settings
 
+from .signals import sigterm_unwinds
 from .terminal import say
 
-DbOption = Annotated[
-    str | None,
-    typer.Option(
-        "--db",
-        metavar="URL",
-        help="PostgreSQL with Apache AGE for the graph [env MAPFOLD_DB; default: embedded server].",
-    ),
-]
-VectorDbOption = Annotated[
-    str | None,
-    typer.Option(
-        "--vector-db",
-        metavar="URL",
-        help="PostgreSQL with pgvector for the embeddings [env MAPFOLD_VECTOR_DB; default: --db].",
-    ),
-]
+if TYPE_CHECKING:
+    from projections.database.connection import Targets
+    from projections.relocalize import Camera, Crop
+
+JsonOption = Annotated[bool, typer.Option("--json", help="JSON on stdout.")]
+LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="The log's folder.")]
+
+# Points of a log
+
+W = "number of events, ISO time, RUN:KEYFRAME (inclusive) or end"
+"""What W may be, for help texts."""
+
+
+def point(reader: LogReader, text: str) -> int:
+    """The number of events that W means in this log; warns when times run backwards in it."""
+    return resolve(reader, text, note=say)
+
+
+# Settings of the fold
+
 SetOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -72,51 +72,8 @@ def _settings_of_file(file: Path) -> Settings:
         raise SettingsError(f"--settings {file}: not JSON: {error}") from None
 
 
-@contextlib.contextmanager
-def databases(db: str | None, vector_db: str | None) -> Iterator[Targets]:
-    """The databases a command uses. Also after SIGTERM no embedded server is left behind."""
-    with sigterm_unwinds(), open_targets(db, vector_db) as targets:
-        yield targets
-
-
-@contextlib.contextmanager
-def sigterm_unwinds() -> Iterator[None]:
-    """SIGTERM ends the command through its ``finally`` blocks, as Ctrl-C does."""
-
-    def leave(signum: int, _frame: FrameType | None) -> None:
-        sys.exit(128 + signum)
-
-    if signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:  # the command has its own way
-        yield
-        return
-    signal.signal(signal.SIGTERM, leave)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-
-
-W = "number of events, ISO time, RUN:KEYFRAME (inclusive) or end"
-"""What W may be, for help texts."""
-
-
-def point(reader: LogReader, text: str) -> int:
-    """The number of events that W means in this log; people are told when stamps run backwards."""
-    return resolve(reader, text, note=say)
-
-
-def check_picture(out: Path | None) -> None:
-    """Raises MisuseError when ``out`` is no picture's name; None is no picture."""
-    if out is None:
-        return
-    # Here and not above: matplotlib takes longer to import than most commands take to run.
-    from projections.drawing.canvas import check_name
-
-    check_name(out)
-
-
 def past_settings(log: Path | None, file: Path | None, assignments: list[str] | None) -> Settings:
-    """The settings to fold ``log`` with.
+    """The settings to fold ``log`` with, for a question to a past map.
 
     Raises MisuseError when there are settings but no log: the live map keeps its own.
     """
@@ -129,6 +86,140 @@ def past_settings(log: Path | None, file: Path | None, assignments: list[str] | 
 
 
 def say_defaults(settings: Settings) -> None:
-    """Once folded, tell people that the settings were not the live map's but the default ones."""
+    """Say, after a fold with default settings, that the live map may have others."""
     if settings == Settings():
         say("folded with the default settings; a live map made with others needs its --set here")
+
+
+# Databases
+
+DbOption = Annotated[
+    str | None,
+    typer.Option(
+        "--db",
+        metavar="URL",
+        help="PostgreSQL with Apache AGE for the graph [env MAPFOLD_DB; default: embedded server].",
+    ),
+]
+VectorDbOption = Annotated[
+    str | None,
+    typer.Option(
+        "--vector-db",
+        metavar="URL",
+        help="PostgreSQL with pgvector for the embeddings [env MAPFOLD_VECTOR_DB; default: --db].",
+    ),
+]
+
+
+@contextlib.contextmanager
+def databases(db: str | None, vector_db: str | None) -> "Iterator[Targets]":
+    """The databases a command uses; an embedded server it started is stopped, after SIGTERM too."""
+    from projections.database.connection import open_targets
+
+    with sigterm_unwinds(), open_targets(db, vector_db) as targets:
+        yield targets
+
+
+# Zenoh
+
+_ZENOH_PANEL = "Zenoh"
+
+ConnectOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--connect",
+        metavar="ENDPOINT",
+        help=f"Router or peer to connect to; may be repeated. [default: {DEFAULT_ENDPOINT}]",
+        rich_help_panel=_ZENOH_PANEL,
+    ),
+]
+ListenOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--listen",
+        metavar="ENDPOINT",
+        help="Let others connect to this process there; may be repeated. Port 0 takes a free one.",
+        rich_help_panel=_ZENOH_PANEL,
+    ),
+]
+ConfigOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--zenoh-config",
+        metavar="FILE",
+        help="Zenoh configuration (JSON5) for the rest: TLS, access control, scouting.",
+        rich_help_panel=_ZENOH_PANEL,
+    ),
+]
+
+
+def zenoh_options(
+    connect: list[str] | None, listen: list[str] | None, config: Path | None
+) -> ZenohOptions:
+    """What ``--connect``, ``--listen`` and ``--zenoh-config`` say."""
+    return ZenohOptions(tuple(connect or ()), tuple(listen or ()), config)
+
+
+# Questions to the map
+
+QuestionArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="QUERY",
+        help="JSON file with the crops: an envelope, a list of detections, or an object with"
+        " crops; - reads stdin.",
+    ),
+]
+HfovOption = Annotated[
+    float, typer.Option("--hfov", help="Horizontal field of view of the robot's camera, degrees.")
+]
+ImageOption = Annotated[
+    str, typer.Option("--image", metavar="WxH", help="Size of the camera's pictures in pixels.")
+]
+_MAX_QUESTION_BYTES = 16 * 1024 * 1024
+
+
+def question_from(query: str) -> "tuple[Crop, ...]":
+    """The crops of a file or of stdin. Raises QuestionError that names the file."""
+    from projections.relocalize import parse_question
+
+    try:
+        payload = _read_question(query)
+    except OSError as error:
+        raise QuestionError(f"{query}: {error.strerror}; give a JSON file, or -") from None
+    if len(payload) > _MAX_QUESTION_BYTES:
+        raise QuestionError(f"{query}: more than {_MAX_QUESTION_BYTES} bytes; send fewer crops")
+    try:
+        return parse_question(payload)
+    except QuestionError as error:
+        raise QuestionError(f"{query}: {error}") from None
+
+
+def _read_question(query: str) -> bytes:
+    if query == "-":
+        return sys.stdin.buffer.read(_MAX_QUESTION_BYTES + 1)
+    with Path(query).open("rb") as file:
+        return file.read(_MAX_QUESTION_BYTES + 1)
+
+
+def camera_from(hfov: float, image: str) -> "Camera":
+    """The camera that ``--hfov`` and ``--image`` describe. Raises QuestionError for a bad size."""
+    from projections.relocalize import Camera
+
+    width, _, height = image.lower().partition("x")
+    try:
+        return Camera(float(width), float(height), hfov)
+    except ValueError:
+        raise QuestionError(f"--image {image}: write it as 640x400, in pixels") from None
+
+
+# Pictures
+
+
+def check_picture(out: Path | None) -> None:
+    """Raises MisuseError when ``out`` is not the name of a picture; None is no picture."""
+    if out is None:
+        return
+    from projections.drawing.canvas import check_name
+
+    check_name(out)

@@ -1,28 +1,32 @@
-"""Running the commands as a program: what ends it early, and what it exits with.
+"""The ``mapfold`` program: starting it, its standard streams, and what it exits with.
 
-typer would answer Ctrl-C with an empty line and a closed pipe with exit 1, before anybody else
-hears of them; `Program` hands both through to `run_app` as what they are.
+Starting. Only the module of the command that was asked for is imported: all of them together take a
+third of a second, longer than most commands work. The cyclic garbage collector is off while modules
+are imported, and OpenBLAS gets one thread: the matrix products here are too small to be split.
+
+Streams. All three are open: where one was closed (``2>&-``), the next file to be opened, a log's
+for example, would get its number and everything that is written to that stream. A failed write to
+stdout is OutputLost, so that a full disk there is not taken for a fault of the log that is read; a
+reader that has left stays a BrokenPipeError. A failed write to stderr is ignored: a recorder goes
+on when the disk of its messages is full or its terminal is gone.
 
 Exit codes: 0 done · 1 failed · 2 misuse · 3 done, with loss or findings · 130 interrupted ·
-141 the reader of stdout left before everything was printed · 143 terminated.
-
-The three streams that a program is given, made fit to rely on.
-
-* All three are there. Where one was closed (``2>&-``), the next file that is opened would get its
-  number, a log's for example, and with it whatever anybody says to that stream.
-* What cannot be written to stdout is OutputLost, whoever writes it: a full disk there is no fault
-  of the log that is being read. A reader that has left stays a BrokenPipeError.
-* What cannot be written to stderr is nobody's loss but the reader's: a recorder goes on recording
-  when the file it tells its news to is on a full disk, or its terminal is gone.
+141 the reader of stdout left before everything was printed · 143 terminated. typer itself would
+answer Ctrl-C with an empty line and a closed pipe with exit 1; `Program` passes both on to
+`run_app` as exceptions of their own.
 """
 
 import contextlib
+import gc
+import importlib
 import io
 import os
 import re
+import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Final, NoReturn, TextIO
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn, TextIO
 
 import typer
 from typer.core import TyperGroup
@@ -34,12 +38,96 @@ from .terminal import EXIT_FAILED, say
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
-_ODD_CHARACTERS: Final = "backslashreplace"
-"""What the terminal's encoding has no letter for, and bytes of a path that are no text."""
+EXIT_INTERRUPTED: Final = 130
+EXIT_READER_GONE: Final = 141
+"""128 + SIGPIPE, as a shell shows a program that writes to a closed pipe."""
+
+# typer's own class or click's, depending on typer's version.
+_UsageError: Any = typer.BadParameter.__base__
+_DATABASE_OPTION: Final = re.compile(r"--(vector-)?db\b")
+_SECRET: Final = re.compile(r"://|password", re.IGNORECASE)
+
+
+def start(
+    command_line: Callable[[Mapping[str, str]], Callable[..., Any]], commands: Mapping[str, str]
+) -> None:
+    """Run the command that ``sys.argv`` names; ends by SystemExit.
+
+    ``commands`` is the table of all commands, ``command_line`` makes the program of some of them.
+    """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when numpy is imported
+    gc.disable()
+    name = sys.argv[1] if len(sys.argv) > 1 else ""
+    with _exit_on_ctrl_c():
+        program = command_line({name: commands[name]} if name in commands else commands)
+    gc.freeze()
+    gc.enable()
+    try:
+        run_app(program)
+    finally:
+        gc.freeze()  # else the interpreter would search all objects for cycles as it exits
+
+
+@contextlib.contextmanager
+def _exit_on_ctrl_c() -> Iterator[None]:
+    """Ctrl-C during the imports exits at once: an exception could be raised anywhere in them."""
+    usual = signal.getsignal(signal.SIGINT)
+    if usual is not signal.default_int_handler:  # ignored, or set by the caller of `main`
+        yield
+        return
+    signal.signal(signal.SIGINT, _exit_interrupted)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, usual)
+
+
+def _exit_interrupted(_number: int, _frame: FrameType | None) -> None:
+    os.write(2, b"mapfold: interrupted\n")
+    os._exit(EXIT_INTERRUPTED)
+
+
+def compose(names: Iterable[str], modules: Mapping[str, str]) -> typer.Typer:
+    """The program with these commands.
+
+    ``modules`` names the module of each; its ``register`` adds the commands of that module.
+    """
+    app = typer.Typer(
+        name="mapfold",
+        cls=Program,
+        help="A robot's semantic map as a deterministic fold over an append-only log.",
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+    )
+    app.callback()(_main_options)
+    for module in dict.fromkeys(modules[name] for name in names):
+        importlib.import_module(module).register(app)
+    return app
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version  # it takes as long to import as typer does
+
+        sys.stdout.write(f"mapfold {version('mapfold')}\n")
+        raise typer.Exit
+
+
+def _main_options(
+    _version: Annotated[
+        bool,
+        typer.Option(
+            "--version", help="Print the version and exit.", callback=_print_version, is_eager=True
+        ),
+    ] = False,
+) -> None:  # without a callback typer would drop the name of a single command
+    pass
 
 
 class OutputLost(Exception):
-    """Stdout takes no more; the text says why."""
+    """A write to stdout failed; the text says why."""
 
 
 class _Stdout(io.FileIO):
@@ -60,15 +148,15 @@ class _Stderr(io.FileIO):
 
 
 def secure_streams() -> None:
-    """Make stdin, stdout and stderr what is said above, for the life of the program."""
+    """Make stdin, stdout and stderr as described above, for the life of the program."""
     for number in range(3):
         _open_if_closed(number)
     sys.stdout = _secured(sys.stdout, _Stdout)
     sys.stderr = _secured(sys.stderr, _Stderr)
 
 
-def give_up_stdout() -> None:
-    """Point stdout elsewhere, so that the interpreter's own flush at exit does not fail again."""
+def discard_stdout() -> None:
+    """Redirect stdout to /dev/null, so that the interpreter's flush at exit does not fail too."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
@@ -83,25 +171,14 @@ def _secured(stream: TextIO | None, kind: type[io.FileIO]) -> io.TextIOWrapper:
     if stream is None:
         return open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123 - until the end
     stream.flush()
-    at_once = getattr(stream, "write_through", False)  # python -u
+    unbuffered = getattr(stream, "write_through", False)  # python -u
     raw = kind(stream.fileno(), "w", closefd=False)
     return io.TextIOWrapper(
         io.BufferedWriter(raw),
         encoding=stream.encoding,
-        errors=_ODD_CHARACTERS,
-        line_buffering=raw.isatty() or kind is _Stderr or at_once,
+        errors="backslashreplace",  # for letters outside the encoding, and bytes of a path
+        line_buffering=raw.isatty() or kind is _Stderr or unbuffered,
     )
-
-
-EXIT_INTERRUPTED: Final = 130
-EXIT_READER_GONE: Final = 141
-"""What a shell shows of a program that writes to a closed pipe: neither done nor failed."""
-
-
-# Of typer itself or of click, as typer's version has it.
-_UsageError: Any = typer.BadParameter.__base__
-_DATABASE: Final = re.compile(r"--(vector-)?db\b")
-_SECRET: Final = re.compile(r"://|password", re.IGNORECASE)
 
 
 class _Interrupted(Exception):
@@ -109,11 +186,11 @@ class _Interrupted(Exception):
 
 
 class _ReaderGone(Exception):
-    """`mapfold log cat L | head`: the reader has seen enough."""
+    """The reader of stdout has left: ``mapfold log cat L | head``."""
 
 
 @contextlib.contextmanager
-def _handed_through() -> Iterator[None]:
+def _exceptions_passed_on() -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
@@ -121,19 +198,19 @@ def _handed_through() -> Iterator[None]:
     except BrokenPipeError:
         raise _ReaderGone from None
     except _UsageError as error:
-        told = error.message.removeprefix("Value error, ")  # typer's inside showing
-        error.message = _without_secrets(told, sys.argv)
+        message = error.message.removeprefix("Value error, ")
+        error.message = _without_secrets(message, sys.argv)
         raise
 
 
 def _without_secrets(message: str, arguments: Sequence[str]) -> str:
-    """A usage error's message without words that may be a database's URL, or a part of one.
+    """A usage error's message without words that may be a database's URL or a part of one.
 
-    An URL without quotes falls apart at its spaces: ``--db host=h password=…`` leaves an argument
-    that no command takes.
+    A URL without quotes is split at its spaces: ``--db host=h password=…`` leaves an argument that
+    no command takes.
     """
-    apart = "extra argument" in message and any(_DATABASE.match(a) for a in arguments)
-    if not apart and not _SECRET.search(message):
+    split = "extra argument" in message and any(_DATABASE_OPTION.match(a) for a in arguments)
+    if not split and not _SECRET.search(message):
         return message
     head = re.split(r"[('\"]", message, maxsplit=1)[0].rstrip()
     return f"{head} (not shown, it may hold a password)".lstrip()
@@ -144,45 +221,45 @@ class Program(TyperGroup):
 
     def make_context(self, *args: Any, **kwargs: Any) -> Any:
         """As typer does it; ``--help`` prints from in here."""
-        with _handed_through():
+        with _exceptions_passed_on():
             return super().make_context(*args, **kwargs)
 
     def invoke(self, ctx: Any) -> Any:
         """As typer does it."""
-        with _handed_through():
+        with _exceptions_passed_on():
             return super().invoke(ctx)
 
 
 def run_app(app: Callable[..., Any]) -> NoReturn:
-    """Run a typer app made of `Program`, and exit: our errors are one line for people."""
+    """Run a typer app made of `Program` and exit; a MapfoldError is one line on stderr."""
     secure_streams()
     code = _exit_code(app)
     try:
         sys.stdout.flush()
     except BrokenPipeError:
-        give_up_stdout()
+        discard_stdout()
     except OutputLost as lost:
-        give_up_stdout()
+        discard_stdout()
         if code != EXIT_FAILED:
-            code = _say_lost(lost)
+            code = _report_lost_output(lost)
     sys.exit(code)
 
 
-def _say_lost(lost: OutputLost) -> int:
-    say(f"mapfold: stdout: {lost}; nobody has got all of the output")
+def _report_lost_output(lost: OutputLost) -> int:
+    say(f"mapfold: stdout: {lost}; the output is not complete")
     return EXIT_FAILED
 
 
 def _exit_code(app: Callable[..., Any]) -> int:
     try:
         app()
-    except SystemExit as ended:  # how typer ends, also when all is well
+    except SystemExit as ended:  # typer raises it after every command
         return ended.code if isinstance(ended.code, int) else 0
     except MapfoldError as error:
         say(f"mapfold: {error}")
         return error.exit_code
     except OutputLost as lost:
-        return _say_lost(lost)
+        return _report_lost_output(lost)
     except _ReaderGone:
         return EXIT_READER_GONE
     except (_Interrupted, KeyboardInterrupt):

@@ -26,6 +26,8 @@ from projections.settings import Settings
 
 from .options import (
     DbOption,
+    JsonOption,
+    QuestionArgument,
     SetOption,
     SettingsOption,
     VectorDbOption,
@@ -33,9 +35,9 @@ from .options import (
     databases,
     past_settings,
     point,
+    question_from,
     say_defaults,
 )
-from .question_options import QuestionArgument, question_from
 from .terminal import display, emit
 
 AtOption = Annotated[
@@ -46,7 +48,6 @@ LogOption = Annotated[
     Path | None,
     typer.Option("--log", metavar="LOG", help="Ask this log, folded, instead of the live map."),
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="The answer as JSON on stdout.")]
 PlaceArgument = Annotated[str, typer.Argument(metavar="PLACE", help="A place's id.")]
 
 

@@ -17,10 +17,10 @@ from eventsrc.recorder import DEFAULT_KEYS, DEFAULT_QUEUE_SIZE, Recorder
 from eventsrc.transport.config import parse_address
 from eventsrc.transport.session import check_keys, open_session
 
+from .options import ConfigOption, ConnectOption, JsonOption, ListenOption, zenoh_options
 from .recorder_text import EVERY_S, RecorderEnd, say_restart, watching
 from .signals import stop_on_signals
 from .terminal import say, say_metrics
-from .zenoh_options import ConfigOption, ConnectOption, ListenOption, zenoh_options
 
 _LARGEST_BYTES: Final = 128 * 1024 * 1024
 """What Zenoh puts together of one message, however small ``--max-payload``: it tells nobody of what
@@ -68,7 +68,7 @@ def record(
         str | None,
         typer.Option(metavar="PORT", help="Serve Prometheus metrics; PORT or HOST:PORT."),
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="The final numbers as JSON.")] = False,
+    json: JsonOption = False,
 ) -> None:
     """Record what robots publish over Zenoh, until Ctrl-C.
 

@@ -12,15 +12,20 @@ from projections.relocalize import UNKNOWN_BELOW, Answer, Method, RankedPlace, r
 
 from .options import (
     DbOption,
+    HfovOption,
+    ImageOption,
+    JsonOption,
+    QuestionArgument,
     SetOption,
     SettingsOption,
     VectorDbOption,
     W,
+    camera_from,
     databases,
     past_settings,
+    question_from,
     say_defaults,
 )
-from .question_options import HfovOption, ImageOption, QuestionArgument, camera_from, question_from
 from .terminal import display, emit, say
 
 
@@ -44,7 +49,7 @@ def relocalize(
     vector_db: VectorDbOption = None,
     set_: SetOption = None,
     settings_file: SettingsOption = None,
-    json_: Annotated[bool, typer.Option("--json", help="The answer as JSON on stdout.")] = False,
+    json_: JsonOption = False,
 ) -> None:
     """Where a robot is, from a few object crops.
 

@@ -21,6 +21,8 @@ from projections.settings import Settings
 
 from .options import (
     DbOption,
+    JsonOption,
+    LogArgument,
     SetOption,
     SettingsOption,
     VectorDbOption,
@@ -97,7 +99,6 @@ class Loaders(StrEnum):
     insert = "insert"
 
 
-LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="The log's directory.")]
 OnlyOption = Annotated[
     Sinks | None, typer.Option("--only", help="Write only the graph or only the vectors.")
 ]
@@ -105,7 +106,6 @@ LoaderOption = Annotated[
     Loaders,
     typer.Option("--loader", help="How rows are sent; insert where COPY is not allowed."),
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")]
 
 
 def register(app: typer.Typer) -> None:

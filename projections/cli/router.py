@@ -4,9 +4,9 @@ import typer
 
 from eventsrc.transport.session import Router
 
+from .options import ConfigOption, ConnectOption, ListenOption, zenoh_options
 from .signals import stop_on_signals
 from .terminal import say
-from .zenoh_options import ConfigOption, ConnectOption, ListenOption, zenoh_options
 
 
 def router(

@@ -22,11 +22,19 @@ from projections.database.connection import open_targets
 from projections.serve import Answerer, Pools, Room, ZenohService
 from projections.serve.answering import DEFAULT_MAX_BYTES
 
-from .options import DbOption, VectorDbOption
-from .question_options import HfovOption, ImageOption, camera_from
+from .options import (
+    ConfigOption,
+    ConnectOption,
+    DbOption,
+    HfovOption,
+    ImageOption,
+    ListenOption,
+    VectorDbOption,
+    camera_from,
+    zenoh_options,
+)
 from .signals import stop_on_signals
 from .terminal import say
-from .zenoh_options import ConfigOption, ConnectOption, ListenOption, zenoh_options
 
 if TYPE_CHECKING:  # what needs the extra [serve] is imported when it is asked for
     import socket

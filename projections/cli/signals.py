@@ -1,41 +1,42 @@
-"""Ending a long-running command: the first SIGINT, SIGTERM or SIGHUP asks, the second one insists;
-or Ctrl-C ends it, but between two steps."""
+"""Signals that end a command: after its work is closed, through its ``finally`` blocks, or between
+two steps of it."""
 
 import contextlib
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from types import FrameType, TracebackType
 from typing import Final, Self
 
 _STOPPING: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_POLL_S: Final = 0.25
 
 
-_LOOK_S: Final = 0.25
+class _PollingEvent(threading.Event):
+    """An event whose `wait` returns to the interpreter every `_POLL_S`.
 
-
-class _Stop(threading.Event):
-    """Waits in pieces. Python runs a signal's handler in the main thread, between two steps of it;
-    a signal that another thread gets, or that comes just before the wait, does not end the wait.
+    Python runs signal handlers between two bytecodes of the main thread; a signal that another
+    thread receives, or that comes just before the wait, does not interrupt a plain `wait`.
     """
 
     def wait(self, timeout: float | None = None) -> bool:
         if timeout is not None:
             return super().wait(timeout)
-        while not super().wait(_LOOK_S):
+        while not super().wait(_POLL_S):
             pass
         return True
 
 
 @contextlib.contextmanager
 def stop_on_signals() -> Iterator[threading.Event]:
-    """An event that SIGINT, SIGTERM and SIGHUP set, so that the command can finish its work. SIGHUP
-    comes when the terminal goes; where it is ignored (``nohup``) it stays so.
+    """An event that SIGINT, SIGTERM and SIGHUP set, so that the command can finish its work.
 
+    SIGHUP comes when the terminal is closed; where it is ignored (``nohup``) it stays ignored.
     After the first signal all have their usual effect again: a second Ctrl-C ends a command that
-    does not end. For the main thread only, as Python's signals are.
+    hangs. For the main thread only, as Python's signals are.
     """
-    stop = _Stop()
+    stop = _PollingEvent()
     usual = {number: signal.getsignal(number) for number in _STOPPING}
     if usual[signal.SIGHUP] == signal.SIG_IGN:
         del usual[signal.SIGHUP]
@@ -44,32 +45,49 @@ def stop_on_signals() -> Iterator[threading.Event]:
         for number, handler in usual.items():
             signal.signal(number, handler)
 
-    def ask(_number: int, _frame: FrameType | None) -> None:
+    def set_stop(_number: int, _frame: FrameType | None) -> None:
         restore()
-        # From another thread: the handler may have interrupted this thread inside `stop.wait`,
-        # holding the very lock that `stop.set` takes.
+        # In another thread: the handler may have interrupted this one inside `stop.wait`, while it
+        # holds the lock that `stop.set` takes.
         threading.Thread(target=stop.set, name="stop").start()
 
     for number in usual:
-        signal.signal(number, ask)
+        signal.signal(number, set_stop)
     try:
         yield stop
     finally:
         restore()
 
 
-class Steps:
-    """A context manager for each step of a work that Ctrl-C may end only between two steps.
+@contextlib.contextmanager
+def sigterm_unwinds() -> Iterator[None]:
+    """SIGTERM ends the command through its ``finally`` blocks, as Ctrl-C does."""
 
-    Inside it Ctrl-C is held back until the step is done. A second Ctrl-C does not wait.
+    def leave(signum: int, _frame: FrameType | None) -> None:
+        sys.exit(128 + signum)
+
+    if signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:  # the command handles it itself
+        yield
+        return
+    signal.signal(signal.SIGTERM, leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+class Steps:
+    """A context manager for one step of a command that Ctrl-C may end only between two steps.
+
+    Inside it, Ctrl-C takes effect when the step is done; a second Ctrl-C takes effect at once.
     """
 
     def __init__(self) -> None:
-        self._busy = False
-        self._asked = False
+        self._in_step = False
+        self._interrupted = False
 
     def __enter__(self) -> Self:
-        self._busy = True
+        self._in_step = True
         return self
 
     def __exit__(
@@ -78,23 +96,23 @@ class Steps:
         error: BaseException | None,
         at: TracebackType | None,
     ) -> None:
-        self._busy = False
-        if self._asked and error is None:
+        self._in_step = False
+        if self._interrupted and error is None:
             raise KeyboardInterrupt
 
     def interrupt(self, _number: int, _frame: FrameType | None) -> None:
         """The handler of SIGINT."""
-        if not self._busy or self._asked:
+        if not self._in_step or self._interrupted:
             raise KeyboardInterrupt
-        self._asked = True
+        self._interrupted = True
 
 
 @contextlib.contextmanager
 def ctrl_c_between_steps() -> Iterator[Steps]:
-    """Where Ctrl-C would raise KeyboardInterrupt anywhere, let it do so outside of steps only."""
+    """While inside, Ctrl-C raises KeyboardInterrupt only outside of `Steps`."""
     steps = Steps()
     usual = signal.getsignal(signal.SIGINT)
-    if usual is not signal.default_int_handler:  # ignored, or somebody else's
+    if usual is not signal.default_int_handler:  # ignored, or set by the caller
         yield steps
         return
     signal.signal(signal.SIGINT, steps.interrupt)

@@ -12,9 +12,9 @@ from eventsrc.text import counted
 from eventsrc.transport.config import check_key
 from eventsrc.transport.session import ZenohOptions, open_session
 
+from .options import ConfigOption, ConnectOption, JsonOption, ListenOption, zenoh_options
 from .signals import stop_on_signals
 from .terminal import emit, finish, say
-from .zenoh_options import ConfigOption, ConnectOption, ListenOption, zenoh_options
 
 _LONGEST_NAME: Final = 100
 
@@ -37,7 +37,7 @@ def simulate(
     wait: Annotated[
         float, typer.Option(metavar="SECONDS", help="How long to wait for a subscriber.", min=0.0)
     ] = 30.0,
-    json_: Annotated[bool, typer.Option("--json", help="Numbers as JSON on stdout.")] = False,
+    json_: JsonOption = False,
     connect: ConnectOption = None,
     listen: ListenOption = None,
     zenoh_config: ConfigOption = None,

@@ -11,7 +11,7 @@ from projections.model.digest import map_digest
 from projections.model.export import state_document, state_text
 from projections.model.fold import fold_log_cached
 
-from .options import SetOption, SettingsOption, W, point, settings_from
+from .options import JsonOption, SetOption, SettingsOption, W, point, settings_from
 from .terminal import display, emit, say
 
 
@@ -21,7 +21,7 @@ def state(
         str,
         typer.Option("--at", metavar="W", help=f"Fold to here: {W}."),
     ] = "end",
-    json_: Annotated[bool, typer.Option("--json", help="The whole map as JSON on stdout.")] = False,
+    json_: JsonOption = False,
     digest: Annotated[bool, typer.Option("--digest", help="Print only the digest.")] = False,
     set_: SetOption = None,
     settings_file: SettingsOption = None,

@@ -8,8 +8,16 @@ from eventsrc.log_info import LogInfo, log_info
 from eventsrc.text import counted, visible
 from projections.database.status import SinkStatus, Status, projection_status
 
-from .options import DbOption, SetOption, SettingsOption, VectorDbOption, databases, settings_from
-from .replay import JsonOption, LogArgument
+from .options import (
+    DbOption,
+    JsonOption,
+    LogArgument,
+    SetOption,
+    SettingsOption,
+    VectorDbOption,
+    databases,
+    settings_from,
+)
 from .terminal import display, emit, finish, say
 
 

@@ -16,8 +16,17 @@ from eventsrc.text import counted
 from eventsrc.transport.config import parse_address
 from projections.database import TailProgress, TailReport, tail
 
-from .options import DbOption, SetOption, SettingsOption, VectorDbOption, databases, settings_from
-from .replay import JsonOption, LoaderOption, Loaders, LogArgument, OnlyOption, loader_of, only_of
+from .options import (
+    DbOption,
+    JsonOption,
+    LogArgument,
+    SetOption,
+    SettingsOption,
+    VectorDbOption,
+    databases,
+    settings_from,
+)
+from .replay import LoaderOption, Loaders, OnlyOption, loader_of, only_of
 from .terminal import Bar, emit, finish, say, say_metrics
 
 

@@ -1,15 +1,12 @@
-"""What every command shares: data on stdout, people on stderr, findings as an exit code.
+"""What commands print: data on stdout, messages and a progress bar on stderr, and the exit code 3.
 
-Whatever is printed goes through here, and so through `eventsrc.text`: keys, names and reasons
-come from the network.
-
-How far a long command is, for people at a terminal.
+Everything printed goes through `eventsrc.text`, which escapes control characters: keys, names and
+reasons come from the network.
 """
 
 import json
 import sys
 from collections.abc import Iterable
-from types import TracebackType
 from typing import Any
 
 import typer
@@ -22,25 +19,24 @@ from eventsrc.transport.config import is_loopback
 EXIT_FAILED = 1
 EXIT_FINDINGS = 3
 
-
 people = Console(stderr=True, highlight=False, soft_wrap=True, markup=False)
-"""Plain text: ids and reasons may hold anything, so markup is off."""
+"""Stderr. Without markup, since ids and reasons may hold any text."""
 
 
 def say(message: str) -> None:
-    """One line for people, or lines that were laid out."""
+    """Print a message of one or several lines to stderr."""
     people.print(visible_lines(message))
 
 
 def display(text: str) -> None:
-    """Lines on stdout for people; an end is added to the last one if it has none."""
+    """Print text to stdout, with a newline at its end if it has none."""
     sys.stdout.write(visible_lines(text))
     if text and not text.endswith("\n"):
         sys.stdout.write("\n")
 
 
 def say_metrics(address: tuple[str, int], port: int) -> None:
-    """Where the numbers of ``--metrics`` are, and who can read them."""
+    """Say where the metrics of ``--metrics`` are served, and warn when others can read them."""
     say(f"metrics on http://{address[0]}:{port}/metrics")
     if not is_loopback(address[0]):
         say(
@@ -50,7 +46,7 @@ def say_metrics(address: tuple[str, int], port: int) -> None:
 
 
 def emit(document: Any) -> None:
-    """One JSON document on stdout."""
+    """Print one JSON document to stdout."""
     encoder = json.JSONEncoder(ensure_ascii=False, allow_nan=False, indent=2)
     for part in encoder.iterencode(document):
         sys.stdout.write(visible_json(part))
@@ -58,7 +54,7 @@ def emit(document: Any) -> None:
 
 
 def emit_lines(documents: Iterable[Any]) -> None:
-    """JSON lines on stdout, each as soon as it is there."""
+    """Print JSON lines to stdout, each as soon as it comes."""
     for document in documents:
         text = json.dumps(document, ensure_ascii=False, allow_nan=False)
         sys.stdout.write(visible_json(text) + "\n")
@@ -71,7 +67,7 @@ def finish(*, findings: bool) -> None:
 
 
 class Bar:
-    """A progress bar with rate and time left on a terminal, silence elsewhere."""
+    """A progress bar with rate and time left; prints nothing when stderr is not a terminal."""
 
     def __init__(self) -> None:
         self._progress = Progress(
@@ -90,20 +86,21 @@ class Bar:
         self._progress.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
     def show(self, stage: str, done: int, total: int) -> None:
-        """Show that ``done`` of ``total`` events are through, and what is going on."""
+        """Show the name of the current stage, and that ``done`` of ``total`` events are through."""
         speed = self._progress.tasks[0].speed
         rate = f"{speed:,.0f} events/s" if speed else ""
         self._progress.update(self._task, description=stage, completed=done, total=total, rate=rate)
 
+    def show_fold(self, done: int, total: int) -> None:
+        """Progress of a command that only folds: the bar is removed when all events are folded."""
+        self.show("folding", done, total)
+        if done >= total:
+            self.stop()
+
     def stop(self) -> None:
-        """Take the bar away. May be called twice."""
+        """Remove the bar. May be called twice."""
         self._progress.stop()

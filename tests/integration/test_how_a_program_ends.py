@@ -45,7 +45,7 @@ def mapfold(tmp_path: Path) -> Commands:
     ("module", "args"),
     [
         ("contextlib", ("log", "info", "log")),  # the first thing that is imported
-        ("projections.cli.start", ("log", "info", "log")),
+        ("projections.cli.program", ("log", "info", "log")),
         ("typer", ("state", "log")),
         ("projections.cli.state", ("state", "log")),
         ("numpy", ("state", "log")),
@@ -149,7 +149,7 @@ def test_output_that_finds_no_room_is_a_failure(
         )
     assert done.returncode == 1
     assert done.stderr == (
-        b"mapfold: stdout: No space left on device; nobody has got all of the output\n"
+        b"mapfold: stdout: No space left on device; the output is not complete\n"
     )
 
 
