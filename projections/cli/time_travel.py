@@ -26,7 +26,6 @@ from projections.history.rendering import (
 )
 from projections.history.whatif import Alternative, WhatIf, alternatives, assigned, what_if
 
-from .evaluate import warn_of_no_truth
 from .options import (
     JsonOption,
     LogArgument,
@@ -302,6 +301,8 @@ def whatif(
             truth=scored, processes=processes, progress=bar.show_fold,
             keep_views=picture is not None,
         )  # fmt: skip
+    from .evaluate import warn_of_no_truth  # here: it imports all of re-localisation
+
     warn_of_no_truth(log, found.base.outcome.scores)
     if picture is not None:
         _draw_maps(found, picture)
