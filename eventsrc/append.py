@@ -11,7 +11,7 @@ from typing import TypeAlias
 
 from eventsrc.transport.config import key_fault
 
-from .envelope import ENVELOPE_VERSION, Envelope
+from .envelope import ENVELOPE_VERSION, Envelope, Offset
 from .ingest import DEFAULT_MAX_PAYLOAD_BYTES, Rejected, quoted
 from .log import LogWriter, NewEvent
 from .system_events import REJECTED_KEY, RejectedPayload
@@ -53,7 +53,7 @@ def judge_payloads(
     """
     logged = writer.now_ns() if logged_ns is None else logged_ns
     arrivals = [
-        Arrival(offset, key, logged, payload, guess_version(payload))
+        Arrival(Offset(offset), key, logged, payload, guess_version(payload))
         for offset, (key, payload) in enumerate(messages, writer.next_offset)
     ]
     verdicts = _judge(arrivals, max_bytes)

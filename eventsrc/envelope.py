@@ -5,10 +5,8 @@ number. Unknown fields need only be JSON; they are ignored here and kept in the 
 the payload verbatim. Making one from bytes, with every refusal named, is the job of
 `eventsrc.ingest`.
 
-Names for the integers and strings that identify things.
-
-An ``Offset`` is the index of an event in its log: 0, 1, 2 … without holes. It is the only order and
-the only progress marker; times and keyframe ids are data.
+Here too are the types of what identifies things: `Offset`, `RunId`, `KeyframeId`, `DetId`. They are
+ints and strings at run time; mypy keeps them apart.
 """
 
 import math
@@ -27,6 +25,15 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails
 
+Offset = NewType("Offset", int)
+"""The index of an event in its log: 0, 1, 2 … without holes. The only order and progress marker;
+times and keyframe ids are data. As the end of a range it is excluded."""
+FIRST_OFFSET = Offset(0)
+RunId = NewType("RunId", str)
+KeyframeId = NewType("KeyframeId", int)
+"""The number a robot gives a keyframe within its run."""
+DetId = NewType("DetId", str)
+
 ENVELOPE_VERSION = 2
 """The version of the models below. Older ones climb a ladder to it, see `eventsrc.upcast`."""
 
@@ -42,9 +49,8 @@ MAX_DETECTIONS = 10_000
 """Bound of the detections in one envelope; with embeddings of 512 numbers, 16 MiB hold 6,000."""
 
 
-Text = Annotated[
-    str, StringConstraints(max_length=MAX_ID_LENGTH, pattern=r"^[^\x00-\x1f\x7f-\x9f]+$")
-]
+_TEXT = StringConstraints(max_length=MAX_ID_LENGTH, pattern=r"^[^\x00-\x1f\x7f-\x9f]+$")
+Text = Annotated[str, _TEXT]
 """An id or a name: 1 to 256 characters, none of them a control character (category Cc)."""
 
 
@@ -61,7 +67,8 @@ def fault(error: ErrorDetails) -> str:
     return f"has the control character U+{ord(char):04X} at index {at}"
 
 
-Int64 = Annotated[int, Field(ge=-(2**63), lt=2**63)]
+_INT64 = Field(ge=-(2**63), lt=2**63)
+Int64 = Annotated[int, _INT64]
 Position = Annotated[float, Field(ge=-MAX_POSITION_M, le=MAX_POSITION_M)]
 
 
@@ -110,7 +117,7 @@ class Detection(_Model):
     ``embedding_dim`` little-endian float32.
     """
 
-    det_id: Text | None = None
+    det_id: Annotated[DetId, _TEXT] | None = None
     class_name: Text = Field(alias="class")
     confidence: float
     bbox: tuple[float, float, float, float]
@@ -126,8 +133,8 @@ class Envelope(_Model):
     metres and ``map_yaw`` radians in the map frame; all three are None when the robot has no pose.
     """
 
-    run_id: Text
-    keyframe_id: Int64
+    run_id: Annotated[RunId, _TEXT]
+    keyframe_id: Annotated[KeyframeId, _INT64]
     timestamp: Annotated[float, Field(ge=0.0, le=MAX_TIMESTAMP_S)]
     map_x: Position | None = None
     map_y: Position | None = None
@@ -150,12 +157,6 @@ class Envelope(_Model):
         return int(Decimal(text).scaleb(9).to_integral_value())
 
 
-Offset = NewType("Offset", int)
-RunId = NewType("RunId", str)
-KeyframeId = NewType("KeyframeId", int)
-DetId = NewType("DetId", str)
-
-
-def default_det_id(run_id: str, keyframe_id: int, index: int) -> DetId:
+def default_det_id(run_id: RunId, keyframe_id: KeyframeId, index: int) -> DetId:
     """The id of the ``index``-th detection (from 0) of a keyframe that names none itself."""
     return DetId(f"{run_id}_kf{keyframe_id}_d{index}")

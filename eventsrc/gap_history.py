@@ -34,7 +34,7 @@ from eventsrc.log.format import LEDGER
 from eventsrc.log.log_identity import lineage, still_holds
 from eventsrc.log.reader import LogReader
 
-from .envelope import ENVELOPE_VERSION, Int64
+from .envelope import ENVELOPE_VERSION, FIRST_OFFSET, Int64, KeyframeId, Offset, RunId
 from .gaps import DEFAULT_SETTLE_NS, GapLedger, RunState, gap_of, sound
 from .system_events import LOSS_KEY, Loss, is_system_key
 
@@ -48,7 +48,7 @@ Note = Callable[[str], None]
 """Takes one line for people."""
 
 
-Run = tuple[str, Int64, Int64, Annotated[tuple[tuple[Int64, Int64, bool], ...], FailFast()]]
+Run = tuple[RunId, Int64, Int64, Annotated[tuple[tuple[Int64, Int64, bool], ...], FailFast()]]
 """A `RunState` as it is saved."""
 
 
@@ -59,11 +59,11 @@ class SavedLedger(BaseModel):
 
     format: Literal[3] = 3
     log_id: str
-    next_offset: Annotated[int, Field(ge=0, lt=2**63)]
+    next_offset: Annotated[Offset, Field(ge=0, lt=2**63)]
     segments: Annotated[tuple[str, ...], FailFast()]
     runs: Annotated[tuple[Run, ...], FailFast()]
 
-    def states(self) -> list[RunState]:
+    def states(self) -> list[RunState[RunId]]:
         """What `GapLedger.restore` takes."""
         return [RunState(*run) for run in self.runs]
 
@@ -128,7 +128,7 @@ def _check(saved: SavedLedger, reader: LogReader) -> None:
         raise _Doubt("segments that it was made from have changed or are gone")
 
 
-def save(path: Path, log_id: str, next_offset: int, ledger: GapLedger) -> None:
+def save(path: Path, log_id: str, next_offset: Offset, ledger: GapLedger[RunId]) -> None:
     """Replace the saved ledger. That it cannot be written is no error: it is a cache. Nor is it one
     if the log names keyframes that no envelope can have."""
     with contextlib.suppress(OSError, ValidationError):
@@ -172,8 +172,8 @@ class _Identity(BaseModel):
 
     model_config = ConfigDict(strict=True, frozen=True, extra="ignore")
 
-    run_id: str
-    keyframe_id: Int64
+    run_id: RunId
+    keyframe_id: Annotated[KeyframeId, Field(ge=-(2**63), lt=2**63)]
 
 
 def ledger_of(
@@ -182,7 +182,7 @@ def ledger_of(
     settle_ns: int = DEFAULT_SETTLE_NS,
     now_ns: int | None = None,
     note: Note | None = None,
-) -> GapLedger:
+) -> GapLedger[RunId]:
     """The ledger of a whole log, beginning where a saved one ends.
 
     Holes the log never reported count as open since ``now_ns`` (by default: now, monotonic clock).
@@ -193,7 +193,7 @@ def ledger_of(
     return fold_ledger(reader.read(start), ledger, now_ns)
 
 
-def keep_ledger(reader: LogReader, *, note: Note | None = None) -> GapLedger:
+def keep_ledger(reader: LogReader, *, note: Note | None = None) -> GapLedger[RunId]:
     """`ledger_of` for the log's writer, which saves it: on the way through a long log as well, so
     that one that is killed meanwhile reads no event twice but the last `SAVE_EVERY`."""
     now_ns = time.monotonic_ns()
@@ -202,7 +202,7 @@ def keep_ledger(reader: LogReader, *, note: Note | None = None) -> GapLedger:
     if note is not None and end - at >= _MANY:
         note(f"reading {reader.path} once, to know which keyframes it lacks …")
     while at < end:
-        upto = min(at + SAVE_EVERY, end)
+        upto = min(Offset(at + SAVE_EVERY), end)
         # Only a reading without an end looks for damage behind the last event.
         events = reader.read(at) if upto == end else reader.read(at, upto)
         fold_ledger(events, ledger, now_ns)
@@ -213,12 +213,12 @@ def keep_ledger(reader: LogReader, *, note: Note | None = None) -> GapLedger:
 
 def _resume(
     reader: LogReader, settle_ns: int, now_ns: int, note: Note | None
-) -> tuple[int, GapLedger]:
+) -> tuple[Offset, GapLedger[RunId]]:
     """The saved ledger and the offset behind what it knows; an empty one and 0 if there is none."""
-    ledger = GapLedger(settle_ns)
+    ledger: GapLedger[RunId] = GapLedger(settle_ns)
     saved = load(reader, note)
     if saved is None:
-        return 0, ledger
+        return FIRST_OFFSET, ledger
     ledger.restore(saved.states(), now_ns)
     return saved.next_offset, ledger
 
@@ -229,7 +229,7 @@ def unread_events(reader: LogReader) -> int:
     return reader.next_offset - (0 if saved is None else saved.next_offset)
 
 
-def save_ledger(path: Path, log_id: str, next_offset: int, ledger: GapLedger) -> None:
+def save_ledger(path: Path, log_id: str, next_offset: Offset, ledger: GapLedger[RunId]) -> None:
     """Save the ledger of the first ``next_offset`` events of the log at ``path``, as a cache.
 
     They must be durable, with everything the ledger reported among them.
@@ -243,7 +243,7 @@ def forget_ledger(path: Path) -> None:
         delete_durably(path / NAME)
 
 
-def fold_ledger(events: Iterable[Event], ledger: GapLedger, now_ns: int) -> GapLedger:
+def fold_ledger(events: Iterable[Event], ledger: GapLedger[RunId], now_ns: int) -> GapLedger[RunId]:
     """Take ``events`` into ``ledger``, which is also returned."""
     for event in events:
         if event.key == LOSS_KEY:
@@ -255,7 +255,7 @@ def fold_ledger(events: Iterable[Event], ledger: GapLedger, now_ns: int) -> GapL
     return ledger
 
 
-def _take_loss(ledger: GapLedger, payload: bytes, now_ns: int) -> None:
+def _take_loss(ledger: GapLedger[RunId], payload: bytes, now_ns: int) -> None:
     try:
         loss = Loss.model_validate_json(payload)
     except ValidationError:
@@ -265,7 +265,7 @@ def _take_loss(ledger: GapLedger, payload: bytes, now_ns: int) -> None:
         ledger.assume(gap, now_ns)
 
 
-def _identity(event: Event) -> tuple[str, int] | None:
+def _identity(event: Event) -> tuple[RunId, KeyframeId] | None:
     if event.version != ENVELOPE_VERSION:
         return None
     try:

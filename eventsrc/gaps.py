@@ -26,19 +26,23 @@ from bisect import bisect_right
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import Final, Generic, NamedTuple, TypeVar
 
+from .envelope import RunId
 from .system_events import Loss
+
+Source = TypeVar("Source", bound=str)
+"""Who counts: a `RunId` of its keyframes, or a Zenoh publisher of its messages."""
 
 DEFAULT_SETTLE_NS: Final = 5_000_000_000
 """Longer than a publisher waits before it sends again, so a resent keyframe is no reported gap."""
 
 
 @dataclass(frozen=True, slots=True)
-class Gap:
+class Gap(Generic[Source]):
     """The keyframes ``first`` to ``last`` of ``run_id``, both included, are missing."""
 
-    run_id: str
+    run_id: Source
     first: int
     last: int
 
@@ -52,16 +56,16 @@ class Gap:
         return self.last - self.first + 1
 
 
-def gap_of(loss: Loss) -> Gap | None:
+def gap_of(loss: Loss) -> Gap[RunId] | None:
     """The gap that a loss event reports; None for a loss of another kind."""
     if loss.cause != "keyframe_gap" or loss.first is None or loss.last is None:
         return None
-    return Gap(loss.publisher, loss.first, loss.last) if loss.first <= loss.last else None
+    return Gap(RunId(loss.publisher), loss.first, loss.last) if loss.first <= loss.last else None
 
 
 @dataclass(slots=True, eq=False)
-class _Hole:
-    run_id: str
+class _Hole(Generic[Source]):
+    run_id: Source
     first: int
     last: int
     since_ns: int
@@ -74,32 +78,32 @@ class _Hole:
 
 
 @dataclass(slots=True)
-class _Run:
+class _Run(Generic[Source]):
     """What is recorded of one run: ``first`` to ``last`` but for the holes, which are in order."""
 
-    run_id: str
+    run_id: Source
     first: int
     last: int
-    holes: list[_Hole] = field(default_factory=list)
+    holes: list[_Hole[Source]] = field(default_factory=list)
 
     def holes_before(self, keyframe_id: int) -> int:
         """How many holes begin at or before ``keyframe_id``."""
         return bisect_right(self.holes, keyframe_id, key=lambda hole: hole.first)
 
 
-class RunState(NamedTuple):
+class RunState(NamedTuple, Generic[Source]):
     """What a ledger knows of one run: ``holes`` are (first, last, whether reported), in order."""
 
-    run_id: str
+    run_id: Source
     first: int
     last: int
     holes: tuple[tuple[int, int, bool], ...]
 
 
-def sound(runs: Iterable[RunState], events: int) -> bool:
+def sound(runs: Iterable[RunState[Source]], events: int) -> bool:
     """Whether a ledger of that many events can be in this state. Between two holes there is a
     recorded keyframe, and each event is one keyframe, or a loss with one recorded on each side."""
-    seen: set[str] = set()
+    seen: set[Source] = set()
     recorded = 0
     for run_id, first, last, holes in runs:
         if run_id in seen or last < first:
@@ -115,23 +119,23 @@ def sound(runs: Iterable[RunState], events: int) -> bool:
     return recorded <= 2 * events
 
 
-class GapLedger:
+class GapLedger(Generic[Source]):
     """What is recorded and what is missing, run by run. Memory: a few words per run and hole."""
 
     def __init__(self, settle_ns: int = DEFAULT_SETTLE_NS) -> None:
         self._settle_ns = settle_ns
-        self._runs: dict[str, _Run] = {}
+        self._runs: dict[Source, _Run[Source]] = {}
         # Holes to report, oldest first: (since_ns, a number that makes it unique, hole).
-        self._young: list[tuple[int, int, _Hole]] = []
+        self._young: list[tuple[int, int, _Hole[Source]]] = []
         self._opened = 0
         # What publishers said, oldest first: (when, run, its last keyframe).
-        self._said: deque[tuple[int, str, int]] = deque()
+        self._said: deque[tuple[int, Source, int]] = deque()
         self.missing = 0
         """How many keyframes are missing now."""
         self.duplicates = 0
         """Keyframes recorded more than once."""
 
-    def record(self, run_id: str, keyframe_id: int, now_ns: int) -> None:
+    def record(self, run_id: Source, keyframe_id: int, now_ns: int) -> None:
         """Take in one recorded keyframe. ``now_ns`` is when a hole it opens began to be open."""
         run = self._runs.get(run_id)
         if run is None:
@@ -148,11 +152,11 @@ class GapLedger:
         else:
             self._fill(run, keyframe_id)
 
-    def expect(self, run_id: str, last: int, now_ns: int) -> None:
+    def expect(self, run_id: Source, last: int, now_ns: int) -> None:
         """The publisher of ``run_id`` says at ``now_ns`` that it has sent keyframe ``last``."""
         self._said.append((now_ns, run_id, last))
 
-    def mark_reported(self, gap: Gap) -> None:
+    def mark_reported(self, gap: Gap[Source]) -> None:
         """The log says that ``gap`` was reported: what is left of it will not be reported again."""
         run = self._runs.get(gap.run_id)
         if run is None:
@@ -167,7 +171,7 @@ class GapLedger:
                 run.holes[index].reported = True
             index += 1
 
-    def assume(self, gap: Gap, now_ns: int) -> None:
+    def assume(self, gap: Gap[Source], now_ns: int) -> None:
         """Take a loss event's word for it: the keyframe before ``gap`` was recorded or reported
         missing, ``gap`` is missing, and it will not be reported again."""
         before = gap.first - 1
@@ -177,7 +181,7 @@ class GapLedger:
         self._extend(gap.run_id, gap.last, now_ns)
         self.mark_reported(gap)
 
-    def due(self, now_ns: int) -> list[Gap]:
+    def due(self, now_ns: int) -> list[Gap[Source]]:
         """The gaps to report now: open for the settle time. Each is returned once."""
         settled_ns = now_ns - self._settle_ns
         while self._said and self._said[0][0] <= settled_ns:
@@ -185,24 +189,24 @@ class GapLedger:
             self._extend(run_id, last, said_ns)
         return self._report(settled_ns)
 
-    def flush(self) -> list[Gap]:
+    def flush(self) -> list[Gap[Source]]:
         """Every gap not yet reported, however young: the recorder ends."""
         self._said.clear()
         return self._report(None)
 
-    def highest(self, run_id: str) -> int | None:
+    def highest(self, run_id: Source) -> int | None:
         """The highest keyframe that is known of this run, recorded or missing."""
         run = self._runs.get(run_id)
         return None if run is None else run.last
 
-    def close(self, gap: Gap) -> None:
+    def close(self, gap: Gap[Source]) -> None:
         """Take what is missing of ``gap`` for recorded."""
         run = self._runs.get(gap.run_id)
         index = run.holes_before(gap.first - 1) if run is not None else 0
         while run is not None and index < len(run.holes) and run.holes[index].last <= gap.last:
             self._remove(run, index)
 
-    def forget(self, run_id: str) -> list[Gap]:
+    def forget(self, run_id: Source) -> list[Gap[Source]]:
         """Know nothing of this run any more; what is missing of it and was not yet reported."""
         run = self._runs.pop(run_id)
         gaps = [Gap(run_id, hole.first, hole.last) for hole in run.holes if not hole.reported]
@@ -210,13 +214,13 @@ class GapLedger:
             self._remove(run, 0)
         return gaps
 
-    def gaps(self) -> Iterator[Gap]:
+    def gaps(self) -> Iterator[Gap[Source]]:
         """Everything that is missing now, reported or not, in the order the runs began."""
         for run in self._runs.values():
             for hole in run.holes:
                 yield Gap(run.run_id, hole.first, hole.last)
 
-    def reported_gaps(self) -> Iterator[Gap]:
+    def reported_gaps(self) -> Iterator[Gap[Source]]:
         """What is missing now and has been reported, in the order the runs began."""
         for run in self._runs.values():
             for hole in run.holes:
@@ -227,7 +231,7 @@ class GapLedger:
         """How many of the missing keyframes have been reported."""
         return sum(gap.count for gap in self.reported_gaps())
 
-    def state(self) -> tuple[RunState, ...]:
+    def state(self) -> tuple[RunState[Source], ...]:
         """Everything `restore` needs to go on from here, but for how long holes have been open."""
         return tuple(
             RunState(
@@ -239,24 +243,24 @@ class GapLedger:
             for run in self._runs.values()
         )
 
-    def restore(self, runs: Iterable[RunState], now_ns: int) -> None:
+    def restore(self, runs: Iterable[RunState[Source]], now_ns: int) -> None:
         """Fill a new ledger; holes not yet reported count as open since ``now_ns``."""
         for saved in runs:
             run = self._runs[saved.run_id] = _Run(saved.run_id, saved.first, saved.last)
             for first, last, reported in saved.holes:
                 self._add(run, len(run.holes), _Hole(run.run_id, first, last, now_ns, reported))
 
-    def _open(self, run: _Run, index: int, first: int, last: int, now_ns: int) -> None:
+    def _open(self, run: _Run[Source], index: int, first: int, last: int, now_ns: int) -> None:
         self._add(run, index, _Hole(run.run_id, first, last, now_ns))
 
-    def _add(self, run: _Run, index: int, hole: _Hole) -> None:
+    def _add(self, run: _Run[Source], index: int, hole: _Hole[Source]) -> None:
         run.holes.insert(index, hole)
         self.missing += hole.count
         if not hole.reported:
             self._opened += 1
             heapq.heappush(self._young, (hole.since_ns, self._opened, hole))
 
-    def _fill(self, run: _Run, keyframe_id: int) -> None:
+    def _fill(self, run: _Run[Source], keyframe_id: int) -> None:
         index = run.holes_before(keyframe_id) - 1
         if index < 0 or keyframe_id > run.holes[index].last:
             self.duplicates += 1
@@ -264,14 +268,14 @@ class GapLedger:
         self._cut(run, index, keyframe_id, keyframe_id)
         self._remove(run, run.holes_before(keyframe_id) - 1)
 
-    def _extend(self, run_id: str, last: int, now_ns: int) -> None:
+    def _extend(self, run_id: Source, last: int, now_ns: int) -> None:
         """All up to ``last`` were sent; a hole is what is not recorded of them."""
         run = self._runs.get(run_id)
         if run is not None and last > run.last:
             self._open(run, len(run.holes), run.last + 1, last, now_ns)
             run.last = last
 
-    def _cut(self, run: _Run, index: int, first: int, last: int) -> None:
+    def _cut(self, run: _Run[Source], index: int, first: int, last: int) -> None:
         """Make the part from ``first`` to ``last`` of a hole a hole of its own."""
         hole = run.holes[index]
         if (hole.first, hole.last) == (first, last):
@@ -281,12 +285,12 @@ class GapLedger:
             if start <= end:
                 self._add(run, index, _Hole(run.run_id, start, end, hole.since_ns, hole.reported))
 
-    def _remove(self, run: _Run, index: int) -> None:
+    def _remove(self, run: _Run[Source], index: int) -> None:
         hole = run.holes.pop(index)
         hole.closed = True
         self.missing -= hole.count
 
-    def _report(self, open_since_ns: int | None) -> list[Gap]:
+    def _report(self, open_since_ns: int | None) -> list[Gap[Source]]:
         """In the order of run ids and keyframes, so that equal ledgers report equally."""
         reported = []
         while self._young and (open_since_ns is None or self._young[0][0] <= open_since_ns):

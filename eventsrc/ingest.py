@@ -9,7 +9,7 @@ import binascii
 import math
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain, islice
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import msgspec
 import numpy as np
@@ -218,7 +218,7 @@ def _det_ids(envelope: Envelope) -> tuple[DetId, ...]:
     ids = [
         default_det_id(envelope.run_id, envelope.keyframe_id, index)
         if d.det_id is None
-        else cast("DetId", d.det_id)
+        else d.det_id
         for index, d in enumerate(envelope.detections)
     ]
     if len(set(ids)) == len(ids):

@@ -22,6 +22,7 @@ from eventsrc.log.mcap_records import Channel
 from eventsrc.log.reader import OpenSegment
 from eventsrc.log.sealed_segment import SealedFile
 
+from .envelope import Offset
 from .errors import LogDamaged
 from .gap_history import ledger_of
 from .gaps import gap_of
@@ -34,7 +35,7 @@ class SegmentInfo:
     """One segment: ``events`` are the durable ones, ``size_bytes`` what the file takes."""
 
     name: str
-    base: int
+    base: Offset
     events: int
     size_bytes: int
     sealed: bool

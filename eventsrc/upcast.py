@@ -20,7 +20,14 @@ from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
-from .envelope import ENVELOPE_VERSION, MAX_DETECTIONS, Detection, Envelope, holds_not_finite
+from .envelope import (
+    ENVELOPE_VERSION,
+    MAX_DETECTIONS,
+    Detection,
+    Envelope,
+    Offset,
+    holds_not_finite,
+)
 from .ingest import (
     DEFAULT_MAX_PAYLOAD_BYTES,
     Accepted,
@@ -57,7 +64,7 @@ Step = Callable[[Any, Recorded], Any]
 class Arrival(NamedTuple):
     """A payload that is about to be recorded, as far as a step may know it."""
 
-    offset: int
+    offset: Offset
     key: str
     stamp_ns: int
     payload: bytes

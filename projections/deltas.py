@@ -28,6 +28,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from eventsrc.envelope import Offset, RunId
+
 UnitVector: TypeAlias = NDArray[np.int32]
 """A unit vector as multiples of 2⁻²⁰, int32 of shape (dim,); see `projections.exact`."""
 
@@ -56,19 +58,19 @@ class RunSeen(msgspec.Struct, frozen=True, gc=False):
     ``started_at`` is the earliest keyframe timestamp of the run so far, in seconds.
     """
 
-    offset: int
+    offset: Offset
     run: int
-    run_id: str
+    run_id: RunId
     started_at: float
 
 
 class KeyframeAdded(msgspec.Struct, frozen=True, gc=False):
     """A new keyframe; ``pose`` is None when the robot did not know where it was."""
 
-    offset: int
+    offset: Offset
     keyframe: int
     run: int
-    run_id: str
+    run_id: RunId
     keyframe_id: int
     timestamp: float
     pose: Pose | None
@@ -81,10 +83,10 @@ class ObservationAdded(msgspec.Struct, frozen=True, eq=False, gc=False):
     (then ``foreign_space`` is true).
     """
 
-    offset: int
+    offset: Offset
     observation: int
     keyframe: int
-    run_id: str
+    run_id: RunId
     keyframe_id: int
     det_id: str
     class_name: str
@@ -104,12 +106,12 @@ class EventSkipped(msgspec.Struct, frozen=True, gc=False):
     folded).
     """
 
-    offset: int
+    offset: Offset
     kind: str
-    run_id: str
+    run_id: RunId
     keyframe_id: int
     det_id: str | None = None
-    first_offset: int | None = None
+    first_offset: Offset | None = None
 
 
 class PlaceFormed(msgspec.Struct, frozen=True, gc=False):
@@ -118,7 +120,7 @@ class PlaceFormed(msgspec.Struct, frozen=True, gc=False):
     ``place_id`` is ``{run_id}_p{counter}`` with a counter from 0 per founding run.
     """
 
-    offset: int
+    offset: Offset
     place: int
     place_id: str
     founder: int
@@ -141,7 +143,7 @@ class PlacesMerged(msgspec.Struct, frozen=True, gc=False):
     the merge.
     """
 
-    offset: int
+    offset: Offset
     survivor: int
     absorbed: tuple[int, ...]
     bridge: int
@@ -153,7 +155,7 @@ class PlacesMerged(msgspec.Struct, frozen=True, gc=False):
 class KeyframePlaced(msgspec.Struct, frozen=True, gc=False):
     """A keyframe (new, or noise until now) belongs to a place."""
 
-    offset: int
+    offset: Offset
     keyframe: int
     place: int
 
@@ -164,7 +166,7 @@ class PlaceChanged(msgspec.Struct, frozen=True, gc=False):
     The centroid in metres is ``sum / (keyframe_count * 1_000_000)``, correctly rounded.
     """
 
-    offset: int
+    offset: Offset
     place: int
     keyframe_count: int
     sum_x_um: int
@@ -174,7 +176,7 @@ class PlaceChanged(msgspec.Struct, frozen=True, gc=False):
 class ObjectFound(msgspec.Struct, frozen=True, gc=False):
     """A new Object, founded by an observation; its position is that keyframe's pose."""
 
-    offset: int
+    offset: Offset
     object: int
     object_id: str
     class_name: str
@@ -189,7 +191,7 @@ class ObjectSeen(msgspec.Struct, frozen=True, gc=False):
     ``sum / (obs_count * 1_000_000)``. ``first_seen`` and ``last_seen`` are robot timestamps.
     """
 
-    offset: int
+    offset: Offset
     object: int
     observation: int
     similarity_q40: int
@@ -203,7 +205,7 @@ class ObjectSeen(msgspec.Struct, frozen=True, gc=False):
 class ObjectMoved(msgspec.Struct, frozen=True, gc=False):
     """An Object is located in another place than before, or in none (None)."""
 
-    offset: int
+    offset: Offset
     object: int
     place: int | None
 
@@ -214,7 +216,7 @@ class PlacesLinked(msgspec.Struct, frozen=True, gc=False):
     0 means the edge is gone (one of the two was absorbed, or relabelling moved the transitions).
     """
 
-    offset: int
+    offset: Offset
     a: int
     b: int
     shared_transitions: int

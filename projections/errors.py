@@ -15,6 +15,7 @@ MapfoldError
     └── CheckpointMoved         1  someone else moved the checkpoint under us
 """
 
+from eventsrc.envelope import Offset
 from eventsrc.errors import MapfoldError
 
 
@@ -39,7 +40,7 @@ class QuestionError(MapfoldError):
 class FoldError(MapfoldError):
     """An event cannot be folded."""
 
-    def __init__(self, offset: int, reason: str) -> None:
+    def __init__(self, offset: Offset, reason: str) -> None:
         super().__init__(f"event at offset {offset} cannot be folded: {reason}")
         self.offset = offset
         self.reason = reason

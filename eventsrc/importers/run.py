@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from eventsrc.append import append_payload
+from eventsrc.envelope import Offset
 from eventsrc.errors import MisuseError
 from eventsrc.ingest import Rejected
 from eventsrc.log import FsyncPolicy, LogWriter
@@ -41,8 +42,8 @@ class ImportReport:
     system: int
     """Rejects and losses of another mapfold log, taken over as they were."""
     skipped: int
-    first_offset: int
-    next_offset: int
+    first_offset: Offset
+    next_offset: Offset
 
 
 class ImportCut(KeyboardInterrupt):

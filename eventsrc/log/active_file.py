@@ -4,6 +4,8 @@ hopped over once (80 bytes each) and again only from where that ended."""
 import os
 from pathlib import Path
 
+from eventsrc.envelope import Offset
+
 from . import mcap_records as _mcap
 from .durable_files import FileBytes
 from .format import SEALED, mark_seed, segment_path
@@ -15,7 +17,7 @@ from .segment import ChunkRef, SegmentFile, Unreadable
 class ActiveFile(SegmentFile):
     """A growing or left-over segment, known as far as its commit marks go."""
 
-    def __init__(self, path: Path, base: int) -> None:
+    def __init__(self, path: Path, base: Offset) -> None:
         super().__init__(path, base)
         self.position = self.head_bytes
         self._seed = mark_seed(self.head)
@@ -25,7 +27,7 @@ class ActiveFile(SegmentFile):
             self.close()
             raise
 
-    def refresh(self) -> int:
+    def refresh(self) -> Offset:
         """Take in what was committed since; the next offset."""
         try:
             while self._take_commit():
@@ -70,10 +72,10 @@ class ActiveFile(SegmentFile):
             if self.refresh() == before:  # else a writer was at work between the two looks
                 if promised <= before:
                     return None
-                return Unreadable(before, promised - 1, f"damaged at byte {self.position}")
+                return Unreadable(before, Offset(promised - 1), f"damaged at byte {self.position}")
         return None
 
-    def _promised_in(self, rest: FileBytes) -> int:
+    def _promised_in(self, rest: FileBytes) -> Offset:
         """How far marks in ``rest``, which cannot be read, say that the segment was recorded."""
         stretch = Stretch(0, self.next_offset)
         at, promised = 0, self.next_offset

@@ -24,6 +24,7 @@ import secrets
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from eventsrc.envelope import Offset
 from eventsrc.errors import LogError
 
 from .durable_files import FsyncPolicy, replace_durably, sync_file, write_all
@@ -54,7 +55,7 @@ class ActiveSegment:
         self,
         log: Path,
         log_id: str,
-        base: int,
+        base: Offset,
         policy: FsyncPolicy,
         slack: int = 1,
         on_fault: Callable[[FileFault], None] = lambda _: None,
@@ -73,7 +74,7 @@ class ActiveSegment:
         self._failure: str | None = None
         self._fd = -1
 
-    def _name_file(self, base: int) -> None:
+    def _name_file(self, base: Offset) -> None:
         self.file_base = base
         self.path = segment_path(self._log, base, ACTIVE)
         self._mark_seed = secrets.randbits(32)
@@ -95,7 +96,7 @@ class ActiveSegment:
         self._head_size = self.size = len(head)
 
     @property
-    def next_offset(self) -> int:
+    def next_offset(self) -> Offset:
         """The offset the next event gets."""
         return self._group.next_offset
 
@@ -186,7 +187,7 @@ class ActiveSegment:
         elif size > self.size:
             os.ftruncate(self._fd, self.size)
 
-    def _begin_anew(self, first: int, found: Found) -> None:
+    def _begin_anew(self, first: Offset, found: Found) -> None:
         """Go on in a new file, whose first offset is ``first``. Raises LogError if that cannot be
         made."""
         fault = FileFault(self.path, self.file_base, first, found.text, not found.whole)

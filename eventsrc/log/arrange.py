@@ -19,6 +19,7 @@ from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 
+from eventsrc.envelope import Offset
 from eventsrc.errors import LogDamaged, NotALog
 
 from . import mcap_records as _mcap
@@ -85,7 +86,7 @@ class Arrangement:
         files = [_look_at(segment.path, segment) for segment in segment_files(self._log)]
         files += [_look_at(path, _as_named(path)) for path in half_renamed(self._log)]
         self.log_id = majority_of((f.path, f.log_id) for f in files if f.log_id is not None)
-        wanted: defaultdict[int, list[_File]] = defaultdict(list)
+        wanted: defaultdict[Offset, list[_File]] = defaultdict(list)
         for file in files:
             if file.log_id in (None, self.log_id):
                 wanted[file.wanted.base].append(file)
@@ -98,7 +99,7 @@ class Arrangement:
             self._choose(wanted[base], following)
         self._rename([files[0] for files in wanted.values()])
 
-    def _choose(self, files: list[_File], following: int | None) -> None:
+    def _choose(self, files: list[_File], following: Offset | None) -> None:
         """Leave the best of ``files`` as the only one; the others are set aside."""
         if len(files) == 1 or _still_being_sealed(files):
             files.sort(key=lambda file: not file.wanted.sealed)
@@ -129,7 +130,7 @@ class Arrangement:
 def _as_named(path: Path) -> SegmentPath:
     """The segment that a half-renamed file is to be."""
     name = path.name.partition(MISNAMED)[0]
-    return SegmentPath(path.with_name(name), int(name[:20]), name.endswith(SEALED))
+    return SegmentPath(path.with_name(name), Offset(int(name[:20])), name.endswith(SEALED))
 
 
 def _look_at(path: Path, named: SegmentPath) -> _File:
@@ -142,7 +143,7 @@ def _look_at(path: Path, named: SegmentPath) -> _File:
         if _is_mcap(path) and not _grew_here(damaged):
             raise LogDamaged(_not_ours(path)) from None
         return damaged
-    base, sealed = int(claims["base"]), PREVIOUS in claims
+    base, sealed = Offset(int(claims["base"])), PREVIOUS in claims
     where = segment_path(path.parent, base, SEALED if sealed else ACTIVE)
     return _File(path, SegmentPath(where, base, sealed), claims["log_id"])
 
@@ -184,7 +185,7 @@ def _still_being_sealed(files: list[_File]) -> bool:
     return scan.next_offset <= _scan(sealed).next_offset
 
 
-def _worth(file: _File, following: int | None) -> tuple[int, bool, bool]:
+def _worth(file: _File, following: Offset | None) -> tuple[int, bool, bool]:
     """The most good events before the next segment; then the right name; then sealed."""
     events = sum(
         chunk.following - chunk.first

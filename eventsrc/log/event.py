@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from eventsrc.envelope import ENVELOPE_VERSION
+from eventsrc.envelope import ENVELOPE_VERSION, Offset
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,7 +16,7 @@ class Event:
     envelope's ``version`` (see `eventsrc.upcast`).
     """
 
-    offset: int
+    offset: Offset
     key: str
     logged_ns: int
     stamp_ns: int

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+from eventsrc.envelope import Offset
+
 from .format import DAMAGED, free_name
 
 
@@ -36,8 +38,8 @@ class FileFault:
     whether they can no longer be relied on."""
 
     path: Path
-    base: int
-    following: int
+    base: Offset
+    following: Offset
     found: str
     lost: bool
 

@@ -25,7 +25,7 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
-from eventsrc.envelope import ENVELOPE_VERSION, Envelope
+from eventsrc.envelope import ENVELOPE_VERSION, Envelope, Offset
 from eventsrc.errors import LogDamaged, NotALog
 from eventsrc.system_events import LOSS_KEY, REJECTED_KEY, Loss, RejectedPayload, is_system_key
 
@@ -45,7 +45,7 @@ HEAD_BYTES = 4096
 """More than any head of ours takes."""
 
 
-def head_metadata(log_id: str, base: int, extra: dict[str, str] | None = None) -> Metadata:
+def head_metadata(log_id: str, base: Offset, extra: dict[str, str] | None = None) -> Metadata:
     """What stands at the head of every segment, active and sealed."""
     values = {"format": FORMAT, "log_id": log_id, "base": str(base), **(extra or {})}
     return _mcap.own_metadata(SEGMENT_METADATA, values)
@@ -66,7 +66,7 @@ class WrongPlace(LogDamaged):
     """A whole segment under the name of another one. Inside ``eventsrc.log`` only."""
 
 
-def head_of(path: Path, base: int) -> dict[str, str]:
+def head_of(path: Path, base: Offset) -> dict[str, str]:
     """Our metadata at the head of the segment at ``path``; see `read_head`."""
     with path.open("rb") as file:
         return read_head(path, file.read(HEAD_BYTES), base)[0]
@@ -78,7 +78,7 @@ def claims_of(path: Path) -> dict[str, str]:
         return _read_head(path, file.read(HEAD_BYTES))[0]
 
 
-def read_head(path: Path, data: bytes, base: int) -> tuple[dict[str, str], int]:
+def read_head(path: Path, data: bytes, base: Offset) -> tuple[dict[str, str], int]:
     """Our metadata at the head of a segment and the byte after it. Raises WrongPlace when it is not
     the segment at offset ``base``, LogDamaged when it cannot be read, NotALog when it is none."""
     values, end = _read_head(path, data)
@@ -198,11 +198,11 @@ class SegmentPath:
     """A segment on disk: its base offset and whether it is sealed."""
 
     path: Path
-    base: int
+    base: Offset
     sealed: bool
 
 
-def segment_path(log: Path, base: int, suffix: str) -> Path:
+def segment_path(log: Path, base: Offset, suffix: str) -> Path:
     """Where the segment that starts at offset ``base`` stands."""
     return log / f"{base:020d}{suffix}"
 
@@ -220,7 +220,11 @@ def segment_files(log: Path) -> list[SegmentPath]:
     """Every file of ``log`` that is named as a segment; two of one base while one is sealed."""
     matches = ((entry, _NAME.fullmatch(entry.name)) for entry in log.iterdir())
     return sorted(
-        (SegmentPath(entry, int(m[1]), m[2] == SEALED) for entry, m in matches if m is not None),
+        (
+            SegmentPath(entry, Offset(int(m[1])), m[2] == SEALED)
+            for entry, m in matches
+            if m is not None
+        ),
         key=lambda segment: segment.path.name,
     )
 

@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
 
+from eventsrc.envelope import Offset
+
 from . import mcap_records as _mcap
 from .durable_files import FsyncPolicy
 from .event import NewEvent
@@ -25,16 +27,16 @@ class Group:
     ``definitions`` hold the schemas that are new in it; ``schemas`` are all so far, for a file that
     does not have those before."""
 
-    base: int
-    first: int
-    following: int
+    base: Offset
+    first: Offset
+    following: Offset
     first_ns: int
     last_ns: int
     definitions: list[bytes]
     parts: list[bytes]
     schemas: list[bytes]
 
-    def pieces(self, base: int, mark_seed: int) -> tuple[bytes, bytes, bytes]:
+    def pieces(self, base: Offset, mark_seed: int) -> tuple[bytes, bytes, bytes]:
         """What to write into a file that begins at offset ``base`` and has that mark seed, in this
         order: the chunk's head, its messages, its commit mark. The first two are not joined, for
         the messages are megabytes."""
@@ -59,7 +61,7 @@ class GroupBuilder:
     a caller whose last group is still on its way to the disk.
     """
 
-    def __init__(self, base: int, policy: FsyncPolicy, slack: int = 1) -> None:
+    def __init__(self, base: Offset, policy: FsyncPolicy, slack: int = 1) -> None:
         self._base = base
         self.next_offset = base
         self._first = base
@@ -117,7 +119,7 @@ class GroupBuilder:
         self._parts += parts
         self._first_ns, self._last_ns = first_ns, last_ns
         self._bytes = size
-        self.next_offset = self._base + sequence
+        self.next_offset = Offset(self._base + sequence)
         return len(parts) // 2
 
     def _lead_with(self, key: str, version: int) -> int:

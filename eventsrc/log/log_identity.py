@@ -17,6 +17,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from eventsrc.envelope import Offset
 from eventsrc.errors import LogDamaged, NotALog
 
 from .format import SegmentPath, WrongPlace, head_of, list_growing
@@ -68,7 +69,7 @@ _FOOTER_BYTES = 12
 _SEALED = " sealed "
 
 
-def lineage(log: Path, next_offset: int) -> tuple[str, ...]:
+def lineage(log: Path, next_offset: Offset) -> tuple[str, ...]:
     """One text for each segment with events before ``next_offset``. Raises OSError."""
     return tuple(_of(segment) for segment in list_growing(log) if segment.base < next_offset)
 

@@ -41,6 +41,8 @@ from mcap.records import (
     SummaryOffset,
 )
 
+from eventsrc.envelope import Offset
+
 MAGIC = b"\x89MCAP0\r\n"
 PROFILE = "mapfold"
 LIBRARY = "mapfold"
@@ -231,13 +233,13 @@ def encode_message_index(channel: int, flat: list[int]) -> bytes:
     return FRAME.pack(Opcode.MESSAGE_INDEX, len(content)) + content
 
 
-def encode_mark(first: int, following: int, seed: int) -> bytes:
+def encode_mark(first: Offset, following: Offset, seed: int) -> bytes:
     """The commit mark of a chunk that holds offsets ``first`` … ``following`` - 1."""
     mark = _MARK.pack(MARK_OPCODE, MARK_BYTES - FRAME.size, first, following)
     return mark + _CRC.pack(zlib.crc32(mark) ^ seed)
 
 
-def decode_mark(data: bytes, seed: int) -> tuple[int, int]:
+def decode_mark(data: bytes, seed: int) -> tuple[Offset, Offset]:
     """First and next offset of a commit mark of a segment with that mark seed."""
     if len(data) < MARK_BYTES:
         raise BadRecord("cut short inside a commit mark")

@@ -12,6 +12,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Collection, Generator, Iterator
 from pathlib import Path
 
+from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.errors import LogDamaged, LogError, LogNotFound, NotALog
 
 from .active_file import ActiveFile
@@ -22,6 +23,7 @@ from .sealed_segment import SealedFile
 from .segment import Unreadable, chunk_events
 
 _OPEN_SEGMENTS = 8
+_NO_END = Offset(sys.maxsize)
 
 OpenSegment = SealedFile | ActiveFile
 OnGap = Callable[[Unreadable], None]
@@ -39,7 +41,7 @@ class LogReader:
         """As its last segment says; no other is read if it says otherwise."""
 
     @property
-    def next_offset(self) -> int:
+    def next_offset(self) -> Offset:
         """The number of durable events as of opening or the last `refresh`."""
         return self._last.next_offset
 
@@ -48,7 +50,7 @@ class LogReader:
         """The segments as of opening or the last `refresh`, in offset order."""
         return tuple(self._segments)
 
-    def refresh(self) -> int:
+    def refresh(self) -> Offset:
         """Take in what was committed since; the new `next_offset`."""
         while True:
             if isinstance(self._last, ActiveFile):
@@ -70,12 +72,14 @@ class LogReader:
         if not self.path.exists():
             raise LogNotFound(f"the log at {self.path} is gone; check the path")
         stop = _stop_at_gap(self.path)
-        self._look_for_rot(0, stop)
+        self._look_for_rot(FIRST_OFFSET, stop)
         segments = list_growing(self.path)
         known = self.refresh()  # after the look at the folder: a writer may be at work
         for newest in segments[-1:]:
             if newest.base > known:
-                stop(Unreadable(known, newest.base - 1, f"missing before {newest.path.name}"))
+                stop(
+                    Unreadable(known, Offset(newest.base - 1), f"missing before {newest.path.name}")
+                )
 
     def _reopen_last(self) -> None:
         """A restarted writer has sealed the segment, perhaps with events that had no commit mark
@@ -96,8 +100,8 @@ class LogReader:
 
     def read(
         self,
-        start: int = 0,
-        end: int | None = None,
+        start: Offset = FIRST_OFFSET,
+        end: Offset | None = None,
         *,
         keys: Collection[str] | None = None,
         on_gap: OnGap | None = None,
@@ -110,10 +114,10 @@ class LogReader:
         known = self.next_offset
         stop = known if end is None else min(end, known)
         report = on_gap or _stop_at_gap(self.path)
-        at = max(start, 0)
+        at = max(start, FIRST_OFFSET)
         for entry, following in self._entries_from(at):
             if at < min(entry.base, stop):  # the log's first segment is gone
-                last = min(entry.base, stop) - 1
+                last = Offset(min(entry.base, stop) - 1)
                 report(Unreadable(at, last, f"missing before {entry.path.name}"))
                 at = entry.base
             if at >= stop:
@@ -121,32 +125,37 @@ class LogReader:
             upto = min(stop, following)
             at = yield from self._read_segment(entry, at, upto, keys, report)
             if at < upto:
-                report(Unreadable(at, upto - 1, f"missing after {entry.path.name}"))
+                report(Unreadable(at, Offset(upto - 1), f"missing after {entry.path.name}"))
                 at = upto
         if end is None or end > known:
             self._look_for_rot(start, report)
 
-    def _look_for_rot(self, start: int, report: OnGap) -> None:
+    def _look_for_rot(self, start: Offset, report: OnGap) -> None:
         """Whether more was recorded than the growing segment still shows."""
         rot = self._last.rot() if isinstance(self._last, ActiveFile) else None
         if rot is not None and rot.last >= start:
             report(rot)
 
-    def _entries_from(self, start: int) -> Iterator[tuple[SegmentPath, int]]:
+    def _entries_from(self, start: Offset) -> Iterator[tuple[SegmentPath, Offset]]:
         """Each segment from the one that holds ``start`` on, and the base of the next one."""
         first = bisect_right(self._segments, start, key=lambda entry: entry.base) - 1
         for index in range(max(first, 0), len(self._segments)):
             is_last = index + 1 == len(self._segments)
-            yield self._segments[index], sys.maxsize if is_last else self._segments[index + 1].base
+            yield self._segments[index], _NO_END if is_last else self._segments[index + 1].base
 
     def _read_segment(
-        self, entry: SegmentPath, start: int, end: int, keys: Collection[str] | None, report: OnGap
-    ) -> Generator[Event, None, int]:
+        self,
+        entry: SegmentPath,
+        start: Offset,
+        end: Offset,
+        keys: Collection[str] | None,
+        report: OnGap,
+    ) -> Generator[Event, None, Offset]:
         """The events of one segment; returns the offset behind the last it can account for."""
         try:
             segment = self.open_segment(entry)
         except LogDamaged as error:
-            report(Unreadable(start, end - 1, str(error)))
+            report(Unreadable(start, Offset(end - 1), str(error)))
             return end
         wanted = _wanted_channels(segment, keys)
         at = start
@@ -159,7 +168,7 @@ class LogReader:
                 try:
                     yield from chunk_events(segment, chunk, at, end, keys)
                 except LogDamaged as error:
-                    last = min(chunk.following, end) - 1
+                    last = Offset(min(chunk.following, end) - 1)
                     report(Unreadable(max(chunk.first, at), last, str(error)))
             at = chunk.following
         return at

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from eventsrc.envelope import ENVELOPE_VERSION
+from eventsrc.envelope import ENVELOPE_VERSION, Offset
 from eventsrc.errors import LogDamaged, NotALog
 from eventsrc.system_events import LOSS_KEY, Loss
 
@@ -128,7 +128,7 @@ def _bodies(fd: int, scan: Scan, nearby: Moment) -> Iterator[bytes]:
                 prelude = b""
 
 
-def _losses(base: int, channel: int, first: int, following: int, when: Moment) -> bytes:
+def _losses(base: Offset, channel: int, first: int, following: int, when: Moment) -> bytes:
     parts: list[bytes] = []
     for offset in range(first, following):
         loss = Loss(publisher="log", first=offset, last=offset, count=1, cause="rot")
@@ -140,19 +140,21 @@ def _losses(base: int, channel: int, first: int, following: int, when: Moment) -
     return b"".join(parts)
 
 
-def trimmed(source: Path, scan: Scan, first: int, end: int) -> Scan:
+def trimmed(source: Path, scan: Scan, first: Offset, end: Offset) -> Scan:
     """What ``scan`` found in ``source`` from offset ``first`` to before ``end``, as a segment of
     its own; offsets that are missing at its end are left out of it."""
     rest = Scan(first, scan.log_id, next_offset=first, channels=scan.channels)
     for chunk in scan.chunks:
-        offsets = range(max(first, chunk.first), min(end, chunk.following))
-        if offsets:
-            body = partial(_cut_out, source, chunk, scan.base, offsets, first)
-            rest.take(ChunkRef(0, chunk.length, offsets.start, offsets.stop, body=body))
+        start, stop = max(first, chunk.first), min(end, chunk.following)
+        if start < stop:
+            body = partial(_cut_out, source, chunk, scan.base, range(start, stop), first)
+            rest.take(ChunkRef(0, chunk.length, start, stop, body=body))
     return rest
 
 
-def _cut_out(source: Path, chunk: ChunkRef, base: int, offsets: range, new_base: int) -> bytes:
+def _cut_out(
+    source: Path, chunk: ChunkRef, base: Offset, offsets: range, new_base: Offset
+) -> bytes:
     """The messages of a chunk that have these offsets, counted from another base."""
     fd = os.open(source, os.O_RDONLY)
     try:

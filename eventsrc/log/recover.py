@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from eventsrc.clock import Clock, system_clock
+from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.errors import LogDamaged, LogError, NotALog
 
 from .active_segment import ActiveSegment
@@ -63,7 +64,7 @@ class SegmentRecovery:
     lost_events: int
     lost_bytes: int
     torn_events: int
-    gaps: tuple[tuple[int, int], ...]
+    gaps: tuple[tuple[Offset, Offset], ...]
     kept_copy: str | None
 
 
@@ -110,7 +111,7 @@ class _Recovery:
         self._spare: list[SegmentPath] = []
         """Segments set aside because they overlap others, by base."""
         self._done: list[SegmentRecovery] = []
-        self._next = 0
+        self._next = FIRST_OFFSET
         self._previous: SegmentPath | None = None
 
     def run(self) -> RecoveryReport:
@@ -154,7 +155,7 @@ class _Recovery:
                 return
         else:
             scan = _scan(segment, reach)
-            if segment.base == 0 and scan.log_id and scan == Scan(0, scan.log_id):
+            if segment.base == 0 and scan.log_id and scan == Scan(FIRST_OFFSET, scan.log_id):
                 return  # an empty log, and whole
         self._rewrite(segment, scan, following)
 
@@ -227,7 +228,7 @@ class _Recovery:
         for that carries its id."""
         replaced = segment.sealed and scan.next_offset > scan.base
         if scan.next_offset == 0:
-            empty = ActiveSegment(self._log, self._log_id, 0, GROUP_COMMIT)
+            empty = ActiveSegment(self._log, self._log_id, FIRST_OFFSET, GROUP_COMMIT)
             empty.create()
             empty.close()
             replaced = not segment.sealed
@@ -235,7 +236,7 @@ class _Recovery:
             segment.path.unlink()
             sync_directory(self._log)
 
-    def _sealed(self, base: int) -> SegmentPath:
+    def _sealed(self, base: Offset) -> SegmentPath:
         return SegmentPath(segment_path(self._log, base, SEALED), base, True)
 
     def _keep_copy(self, segment: SegmentPath | None, scan: Scan) -> str | None:
@@ -254,7 +255,7 @@ class _Recovery:
                 return copy.name
 
 
-def _scan(segment: SegmentPath, reach: int | None) -> Scan:
+def _scan(segment: SegmentPath, reach: Offset | None) -> Scan:
     """Look at a segment, which ends at ``reach`` if that is known."""
     if segment.sealed:
         return scan_sealed(segment.path, segment.base, reach)

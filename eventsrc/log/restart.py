@@ -22,6 +22,7 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.errors import LogDamaged, NotALog
 
 from . import mcap_records as _mcap
@@ -51,13 +52,13 @@ class Restart:
     """
 
     log_id: str | None = None
-    next_offset: int = 0
+    next_offset: Offset = FIRST_OFFSET
     previous_sha256: str = NO_PREVIOUS
     recovered_segments: int = 0
     recovered_events: int = 0
     torn_bytes: int = 0
     torn_events: int = 0
-    unsealed: list[tuple[int, int]] = field(default_factory=list)
+    unsealed: list[tuple[Offset, Offset]] = field(default_factory=list)
     """Base and next offset of the left-over segments that are finished and still to be sealed, in
     order."""
 
@@ -135,7 +136,7 @@ def _look_at_leftovers(log: Path, segments: list[SegmentPath], state: Restart) -
     return found
 
 
-def _look_at(segment: SegmentPath, reach: int | None) -> _Leftover:
+def _look_at(segment: SegmentPath, reach: Offset | None) -> _Leftover:
     """``reach`` is the base of the next segment: this one was whole before that was begun."""
     finished = None if reach is None else _finished(segment, reach)
     if finished is not None:
@@ -157,7 +158,7 @@ def _look_at(segment: SegmentPath, reach: int | None) -> _Leftover:
     return _Leftover(segment, scan, marked, file.position)
 
 
-def _finished(segment: SegmentPath, reach: int) -> _Leftover | None:
+def _finished(segment: SegmentPath, reach: Offset) -> _Leftover | None:
     """A segment whose marks reach the next one, taken at their word; None for one to look into."""
     try:
         file = ActiveFile(segment.path, segment.base)

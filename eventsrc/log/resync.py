@@ -14,6 +14,8 @@ the lengths of the records:
 
 from typing import NamedTuple
 
+from eventsrc.envelope import Offset
+
 from . import mcap_records as _mcap
 from .durable_files import FileBytes
 from .mcap_records import BadRecord
@@ -24,14 +26,14 @@ class Resumption(NamedTuple):
     ``promised`` were recorded (what was expected there, if no mark does)."""
 
     at: int
-    promised: int
+    promised: Offset
 
 
 class Stretch(NamedTuple):
     """What cannot be read: from byte ``start`` on, where offset ``expected`` should stand."""
 
     start: int
-    expected: int
+    expected: Offset
 
 
 def resume(data: FileBytes, at: int, stretch: Stretch, seed: int | None) -> Resumption:
@@ -60,7 +62,7 @@ def _chunk_end(data: FileBytes, at: int) -> int | None:
     return at + head.length
 
 
-def _promised(data: FileBytes, at: int, stretch: Stretch, seed: int | None) -> int | None:
+def _promised(data: FileBytes, at: int, stretch: Stretch, seed: int | None) -> Offset | None:
     """The next offset of the mark at byte ``at``, if one stands there and can be true."""
     if seed is None:
         return None

@@ -13,6 +13,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from eventsrc.envelope import FIRST_OFFSET, Offset
+
 from . import mcap_records as _mcap
 from .foreign_mcap import ForeignDamage, ForeignRecord, foreign_records
 from .mcap_records import FRAME, BadRecord, Header, Opcode
@@ -44,7 +46,7 @@ def is_rewritten(data: bytes) -> bool:
         return False
 
 
-def take_messages(path: Path, scan: "Scan", following: int | None) -> None:
+def take_messages(path: Path, scan: "Scan", following: Offset | None) -> None:
     """Take into ``scan`` every message of the file that is in none of its chunks. Those from offset
     ``following`` on, where the next segment begins, are that one's."""
     taken = _Taken(scan, following)
@@ -65,14 +67,14 @@ def take_messages(path: Path, scan: "Scan", following: int | None) -> None:
 class _Taken:
     """The messages of a file by offset, and the schemas and channels that they need."""
 
-    def __init__(self, scan: "Scan", following: int | None) -> None:
+    def __init__(self, scan: "Scan", following: Offset | None) -> None:
         self._scan = scan
-        self._end = scan.base + _SEQUENCES if following is None else following
+        self._end = Offset(scan.base + _SEQUENCES) if following is None else following
         self._known = list(scan.chunks)
         self._starts = [chunk.first for chunk in self._known]
         self._channels: set[int] = set()
         self._definitions: dict[bytes, None] = {}
-        self._messages: dict[int, bytes] = {}
+        self._messages: dict[Offset, bytes] = {}
         self._definition_bytes = self._message_bytes = 0
 
     def take(self, record: ForeignRecord) -> bool:
@@ -84,7 +86,7 @@ class _Taken:
             _mcap.check_definitions(len(content))
             if opcode == Opcode.METADATA:
                 metadata = _mcap.decode_as(_mcap.Metadata, content)
-                self._scan.gap_up_to(self._scan.base + _sealed_count(metadata))
+                self._scan.gap_up_to(Offset(self._scan.base + _sealed_count(metadata)))
                 return True
             if opcode == Opcode.CHANNEL:
                 self._channels.add(_mcap.decode_as(_mcap.Channel, content).id)
@@ -105,7 +107,7 @@ class _Taken:
         if len(content) < _HEAD.size:
             return False
         channel, sequence, _, _ = _HEAD.unpack_from(content)
-        offset = self._scan.base + sequence
+        offset = Offset(self._scan.base + sequence)
         wanted = offset < self._end and offset not in self._messages and not self._has(offset)
         if wanted and channel in self._channels:
             self._message_bytes += len(content) + _OVERHEAD_BYTES
@@ -114,7 +116,7 @@ class _Taken:
             self._messages[offset] = _framed(Opcode.MESSAGE, content)
         return True
 
-    def _has(self, offset: int) -> bool:
+    def _has(self, offset: Offset) -> bool:
         index = bisect_right(self._starts, offset) - 1
         return index >= 0 and offset < self._known[index].following
 
@@ -126,7 +128,7 @@ class _Taken:
         for first, run in _runs(self._messages):
             size = len(definitions) + sum(map(len, run))
             body = partial(b"".join, [definitions, *run])
-            chunks.append(ChunkRef(0, size, first, first + len(run), body=body))
+            chunks.append(ChunkRef(0, size, first, Offset(first + len(run)), body=body))
         end = scan.next_offset
         scan.chunks, scan.gaps, scan.next_offset = [], [], scan.base
         for chunk in sorted(chunks, key=lambda chunk: chunk.first):
@@ -148,9 +150,9 @@ def _sealed_count(record: _mcap.Metadata) -> int:
     return 0
 
 
-def _runs(messages: dict[int, bytes]) -> Iterator[tuple[int, list[bytes]]]:
+def _runs(messages: dict[Offset, bytes]) -> Iterator[tuple[Offset, list[bytes]]]:
     """Messages of consecutive offsets, with the first of these; some mebibytes at once."""
-    first, size = 0, 0
+    first, size = FIRST_OFFSET, 0
     run: list[bytes] = []
     for offset in sorted(messages):
         if run and (offset != first + len(run) or size > _RUN_BYTES):

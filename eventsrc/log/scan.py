@@ -18,6 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.errors import LogDamaged, NotALog
 
 from . import mcap_records as _mcap
@@ -39,17 +40,17 @@ file may be of any size."""
 class Scan:
     """The good chunks of a segment and what is between and behind them."""
 
-    base: int
+    base: Offset
     log_id: str | None
     chunks: list[ChunkRef] = field(default_factory=list)
-    gaps: list[tuple[int, int]] = field(default_factory=list)
+    gaps: list[tuple[Offset, Offset]] = field(default_factory=list)
     """First and last offset of events that were recorded once and are gone."""
     index_fault: str | None = None
     """Why the index of a sealed segment cannot be used, if so."""
     lost_bytes: int = 0
     torn_events: int = 0
     """Events that had begun to be written in the torn end; none of them was synced."""
-    next_offset: int = 0
+    next_offset: Offset = FIRST_OFFSET
     rewritten: bool = False
     """Whether another program has written the file that it is in now."""
     channels: dict[int, Channel] = field(default_factory=dict)
@@ -61,14 +62,14 @@ class Scan:
         self.chunks.append(chunk)
         self.next_offset = chunk.following
 
-    def gap_up_to(self, offset: int) -> None:
+    def gap_up_to(self, offset: Offset) -> None:
         """Offsets before ``offset`` that no good chunk holds are gone."""
         if offset > self.next_offset:
-            self.gaps.append((self.next_offset, offset - 1))
+            self.gaps.append((self.next_offset, Offset(offset - 1)))
             self.next_offset = offset
 
 
-def chunk_extent(data: FileBytes, at: int, scan: Scan) -> tuple[int, int, int]:
+def chunk_extent(data: FileBytes, at: int, scan: Scan) -> tuple[int, Offset, Offset]:
     """Length, first and next offset of the chunk at ``at``; BadRecord unless all of it is good."""
     head = _mcap.decode_chunk_head(data[at : at + _mcap.ZSTD_CHUNK_HEAD])
     if at + head.length > len(data):
@@ -86,10 +87,10 @@ def chunk_extent(data: FileBytes, at: int, scan: Scan) -> tuple[int, int, int]:
         following += 1
     if first < 0:
         raise BadRecord("a chunk without any message")
-    return head.length, scan.base + first, scan.base + following
+    return head.length, Offset(scan.base + first), Offset(scan.base + following)
 
 
-def scan_active(path: Path, base: int, following: int | None = None) -> Scan:
+def scan_active(path: Path, base: Offset, following: Offset | None = None) -> Scan:
     """Look at every byte of an active segment; ``following`` is the base of the next one, if there
     is one. Raises WrongPlace for a segment of another base."""
     with FileBytes.of(path) as data:
@@ -109,7 +110,7 @@ class _Row(NamedTuple):
 
 
 class _Scanner:
-    def __init__(self, path: Path, base: int, data: FileBytes) -> None:
+    def __init__(self, path: Path, base: Offset, data: FileBytes) -> None:
         self._path = path
         self._data = data
         self._at = 0
@@ -179,7 +180,7 @@ class _Scanner:
             seed = found
             at += _mcap.MARK_BYTES
 
-    def _seed_of(self, at: int, first: int, following: int) -> int | None:
+    def _seed_of(self, at: int, first: Offset, following: Offset) -> int | None:
         """The seed of the mark at byte ``at``, if it is that of a chunk of these offsets."""
         mark = self._data[at : at + _mcap.MARK_BYTES]
         if len(mark) < _mcap.MARK_BYTES:
@@ -246,4 +247,4 @@ def raw_events(fd: int, scan: Scan, chunk: ChunkRef) -> Iterator[Event]:
     }
     for id_, sequence, log_ns, stamp_ns, at, stop in _mcap.walk(body):
         key, version = known[id_]
-        yield Event(scan.base + sequence, key, log_ns, stamp_ns, body[at:stop], version)
+        yield Event(Offset(scan.base + sequence), key, log_ns, stamp_ns, body[at:stop], version)

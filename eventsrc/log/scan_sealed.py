@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from itertools import pairwise
 from pathlib import Path
 
+from eventsrc.envelope import Offset
 from eventsrc.errors import LogDamaged, NotALog
 
 from . import mcap_records as _mcap
@@ -18,7 +19,7 @@ from .sealed_segment import SEAL_METADATA, SealedFile, sealed_edges
 from .segment import ChunkRef
 
 
-def scan_sealed(path: Path, base: int, following: int | None) -> Scan:
+def scan_sealed(path: Path, base: Offset, following: Offset | None) -> Scan:
     """Look at every chunk. ``following`` is the base of the next segment, if there is one: how far
     this one reached when its own index cannot say. Raises WrongPlace for a segment of another
     base."""
@@ -30,9 +31,9 @@ def scan_sealed(path: Path, base: int, following: int | None) -> Scan:
     return scan
 
 
-def _scan(path: Path, data: FileBytes, base: int, following: int | None) -> Scan:
+def _scan(path: Path, data: FileBytes, base: Offset, following: Offset | None) -> Scan:
     scan = Scan(base, _log_id(path, base, data), next_offset=base)
-    edges: set[tuple[int, int]] | None = None
+    edges: set[tuple[Offset, Offset]] | None = None
     try:
         index = SealedFile(path, base)
         promised = index.next_offset
@@ -60,7 +61,7 @@ def _scan(path: Path, data: FileBytes, base: int, following: int | None) -> Scan
     return scan
 
 
-def _log_id(path: Path, base: int, data: FileBytes) -> str | None:
+def _log_id(path: Path, base: Offset, data: FileBytes) -> str | None:
     try:
         return read_head(path, data[:HEAD_BYTES], base)[0]["log_id"]
     except WrongPlace:
@@ -84,7 +85,7 @@ def _chunk_places(data: FileBytes) -> Iterator[int]:
             at = start + head.length - 1
 
 
-def _sealed_edges(data: FileBytes, base: int, last_chunk: int) -> list[int]:
+def _sealed_edges(data: FileBytes, base: Offset, last_chunk: int) -> list[Offset]:
     """The offsets at which chunks begin and the last one ends, by the seal, if that can be found
     behind the last chunk; else the base alone."""
     name = SEAL_METADATA.encode()

@@ -29,6 +29,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
+from eventsrc.envelope import Offset
 from eventsrc.errors import LogDamaged
 
 from . import mcap_records as _mcap
@@ -171,9 +172,9 @@ class SegmentPlan:
 
     log: Path
     log_id: str
-    base: int
+    base: Offset
     previous_sha256: str
-    following: int
+    following: Offset
     notes: dict[str, str] = field(default_factory=dict)
 
 

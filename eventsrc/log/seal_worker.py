@@ -35,6 +35,7 @@ from collections import deque
 from pathlib import Path
 from typing import IO, Any, Final, NamedTuple, cast
 
+from eventsrc.envelope import Offset
 from eventsrc.errors import LogDamaged, LogError, MapfoldError
 
 from .active_file import ActiveFile
@@ -149,8 +150,8 @@ _LOOK_AGAIN_S: Final = 0.25
 class Finished(NamedTuple):
     """A segment that was written to its end: its offsets are ``base`` to before ``following``."""
 
-    base: int
-    following: int
+    base: Offset
+    following: Offset
 
 
 class Sealer:
@@ -179,7 +180,7 @@ class Sealer:
         """Segments submitted and not sealed."""
         return self._count - self._sealed
 
-    def submit(self, base: int, following: int, *, last: bool = False) -> None:
+    def submit(self, base: Offset, following: Offset, *, last: bool = False) -> None:
         """Seal the finished active segment of offsets ``base`` to before ``following`` when its
         turn comes."""
         self._finishing = last  # too late for a process that is not there yet

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
+from eventsrc.envelope import Offset
 from eventsrc.errors import LogDamaged
 
 from . import mcap_records as _mcap
@@ -38,7 +39,7 @@ _MAX_CHUNKS = 1 << 16
 class SealedFile(SegmentFile):
     """An immutable segment, known from its summary."""
 
-    def __init__(self, path: Path, base: int) -> None:
+    def __init__(self, path: Path, base: Offset) -> None:
         super().__init__(path, base)
         self.channels: dict[int, Channel] = {}
         try:
@@ -122,10 +123,10 @@ class SealedFile(SegmentFile):
         ]
 
 
-def sealed_edges(text: str, base: int) -> list[int]:
+def sealed_edges(text: str, base: Offset) -> list[Offset]:
     """The offsets at which the chunks of a segment begin and the last one ends, from its seal.
     Raises ValueError."""
-    edges = [base + int(number) for number in text.split(",")]
+    edges = [Offset(base + int(number)) for number in text.split(",")]
     if edges[0] != base or any(one >= other for one, other in pairwise(edges)):
         raise BadRecord("the seal names chunks in no order")
     return edges

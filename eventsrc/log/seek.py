@@ -23,6 +23,7 @@ from datetime import UTC, datetime
 
 from pydantic import BaseModel, ValidationError
 
+from eventsrc.envelope import KeyframeId, Offset, RunId
 from eventsrc.errors import MisuseError
 from eventsrc.system_events import is_system_key
 from eventsrc.text import counted
@@ -38,8 +39,8 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class _Identity(BaseModel):
-    run_id: str
-    keyframe_id: int
+    run_id: RunId
+    keyframe_id: KeyframeId
 
 
 Note = Callable[[str], None]
@@ -48,7 +49,7 @@ Note = Callable[[str], None]
 
 def resolve(
     reader: LogReader, text: str, *, on_gap: OnGap | None = None, note: Note | None = None
-) -> int:
+) -> Offset:
     """The number of events that ``text`` means; MisuseError when the log has no such point.
 
     ``note`` is told when events stamped later than a time are in the range up to it.
@@ -58,7 +59,7 @@ def resolve(
     if text == "end":
         return _at_end(reader, on_gap)
     if text.isascii() and text.isdecimal():
-        return _within(reader, int(text))
+        return _within(reader, Offset(int(text)))
     time_ns = time_of(text)
     if time_ns is not None:
         included, later = _at_time(reader, time_ns, on_gap)
@@ -70,7 +71,9 @@ def resolve(
             )
         return included
     keyframe = _KEYFRAME_OF_RUN.fullmatch(text)
-    found = keyframe and _at_keyframe(reader, keyframe[1], int(keyframe[2]), on_gap)
+    found = keyframe and _at_keyframe(
+        reader, RunId(keyframe[1]), KeyframeId(int(keyframe[2])), on_gap
+    )
     if found:
         return found
     raise MisuseError(_no_point(reader, text, named=keyframe is not None))
@@ -93,7 +96,7 @@ def _no_point(reader: LogReader, text: str, *, named: bool) -> str:
     )
 
 
-def resolve_start(reader: LogReader, text: str, *, on_gap: OnGap | None = None) -> int:
+def resolve_start(reader: LogReader, text: str, *, on_gap: OnGap | None = None) -> Offset:
     """The offset to start at so that what ``text`` names is included: an offset is itself, a
     keyframe its own event, a time the robots' first event stamped then or later.
 
@@ -105,10 +108,10 @@ def resolve_start(reader: LogReader, text: str, *, on_gap: OnGap | None = None) 
         later = (e.offset for e in events if e.stamp_ns >= time_ns)
         return next(later, reader.next_offset)
     count = resolve(reader, text, on_gap=on_gap)
-    return count if text == "end" or text.isdecimal() else count - 1
+    return count if text == "end" or text.isdecimal() else Offset(count - 1)
 
 
-def _within(reader: LogReader, offset: int) -> int:
+def _within(reader: LogReader, offset: Offset) -> Offset:
     if offset > reader.next_offset:
         raise MisuseError(
             f"{offset} is beyond the end of {reader.path}, which holds "
@@ -129,9 +132,10 @@ def time_of(text: str) -> int | None:
     return (since.days * 86_400 + since.seconds) * 1_000_000_000 + since.microseconds * 1000
 
 
-def _at_time(reader: LogReader, time_ns: int, on_gap: OnGap | None) -> tuple[int, int]:
+def _at_time(reader: LogReader, time_ns: int, on_gap: OnGap | None) -> tuple[Offset, int]:
     """How many events are included, and how many of them are the robots' of a later time."""
-    included = later = later_included = 0
+    included: int = 0
+    later = later_included = 0
     in_time = True
 
     def take_in(gap: Unreadable) -> None:
@@ -146,30 +150,32 @@ def _at_time(reader: LogReader, time_ns: int, on_gap: OnGap | None) -> tuple[int
         if in_time:
             included, later_included = event.offset + 1, later
     if included > reader.next_offset:
-        included = _at_end(reader, on_gap)
-    return included, later_included
+        return _at_end(reader, on_gap), later_included
+    return Offset(included), later_included
 
 
-def _at_end(reader: LogReader, on_gap: OnGap | None) -> int:
+def _at_end(reader: LogReader, on_gap: OnGap | None) -> Offset:
     """Where there are no more events, unless more was recorded than the growing segment shows."""
     list(reader.read(reader.next_offset, on_gap=on_gap))
     return reader.next_offset
 
 
 def _at_keyframe(
-    reader: LogReader, run_id: str, keyframe_id: int, on_gap: OnGap | None
-) -> int | None:
+    reader: LogReader, run_id: RunId, keyframe_id: KeyframeId, on_gap: OnGap | None
+) -> Offset | None:
     for event in _mentioning(reader, keyframe_id, on_gap):
         try:
             identity = _Identity.model_validate_json(event.payload)
         except ValidationError:
             continue
         if (identity.run_id, identity.keyframe_id) == (run_id, keyframe_id):
-            return event.offset + 1
+            return Offset(event.offset + 1)
     return None
 
 
-def _mentioning(reader: LogReader, keyframe_id: int, on_gap: OnGap | None) -> Iterator[Event]:
+def _mentioning(
+    reader: LogReader, keyframe_id: KeyframeId, on_gap: OnGap | None
+) -> Iterator[Event]:
     """Events whose text has that keyframe id somewhere: parsing all of them takes 20 times as
     long."""
     for event in reader.read(on_gap=on_gap):

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from eventsrc.envelope import Offset
 from eventsrc.errors import LogDamaged
 
 from . import mcap_records as _mcap
@@ -21,8 +22,8 @@ class ChunkRef:
 
     position: int
     length: int
-    first: int
-    following: int
+    first: Offset
+    following: Offset
     channels: frozenset[int] | None = None
     body: Callable[[], bytes] | None = None
 
@@ -31,15 +32,15 @@ class ChunkRef:
 class Unreadable:
     """Offsets ``first`` to ``last`` (included) that were recorded and cannot be read, and why."""
 
-    first: int
-    last: int
+    first: Offset
+    last: Offset
     reason: str
 
 
 class SegmentFile:
     """An open segment file and what its head says."""
 
-    def __init__(self, path: Path, base: int) -> None:
+    def __init__(self, path: Path, base: Offset) -> None:
         self._fd = -1  # for __del__, should opening fail
         self.path = path
         self.base = base
@@ -83,7 +84,7 @@ class SegmentFile:
 
 
 def chunk_events(
-    segment: SegmentFile, chunk: ChunkRef, start: int, end: int, keys: Collection[str] | None
+    segment: SegmentFile, chunk: ChunkRef, start: Offset, end: Offset, keys: Collection[str] | None
 ) -> Iterator[Event]:
     """The events of one chunk with offsets from ``start`` to before ``end``, in order. Raises
     LogDamaged for bytes that are not what was written, and for a chunk that contradicts itself."""
@@ -98,14 +99,15 @@ def _events(
     segment: SegmentFile,
     chunk: ChunkRef,
     body: bytes,
-    start: int,
-    end: int,
+    start: Offset,
+    end: Offset,
     keys: Collection[str] | None,
 ) -> Iterator[Event]:
     channels = segment.channels_of(body)
     names = {id_: channel.topic for id_, channel in channels.items()}
     versions = {id_: envelope_version(channel) for id_, channel in channels.items()}
-    base, expected = segment.base, chunk.first
+    base: int = segment.base
+    expected: int = chunk.first
     for channel_id, sequence, log_ns, publish_ns, at, stop in _mcap.walk(body):
         offset = base + sequence
         if offset != expected:
@@ -118,6 +120,7 @@ def _events(
         key = names[channel_id]
         if keys is None or key in keys:
             version = versions[channel_id]
-            yield Event(offset, key, log_ns, publish_ns, body[at:stop], version)
+            # No call of Offset for each event: reading would take 5 % longer.
+            yield Event(offset, key, log_ns, publish_ns, body[at:stop], version)  # type: ignore[arg-type]
     if expected != chunk.following:
         raise BadRecord(f"the chunk ends before offset {expected}")

@@ -12,6 +12,8 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+from eventsrc.envelope import Offset
+
 from .event import Event
 from .reader import LogReader
 
@@ -21,7 +23,7 @@ _LOOK_EVERY = 200
 
 
 def follow(
-    path: Path, start: int, *, stop: threading.Event, poll_s: float = POLL_S
+    path: Path, start: Offset, *, stop: threading.Event, poll_s: float = POLL_S
 ) -> Iterator[Event | None]:
     """Events from ``start`` on, for as long as ``stop`` is not set.
 

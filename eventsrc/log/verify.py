@@ -9,6 +9,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.errors import LogDamaged, LogError, NotALog
 from eventsrc.text import counted
 
@@ -58,7 +59,7 @@ class _Verifier:
         self._found: list[Finding] = []
         self._events = EventFindings()
         self._log_id = _usual_log_id(segments)
-        self._next = 0
+        self._next = FIRST_OFFSET
         self._count = 0
         self._known_as: set[str] = {NO_PREVIOUS}
         """Hashes by which a successor may know the segment before it."""
@@ -77,13 +78,13 @@ class _Verifier:
             (*self._found, *self._events.findings()),
         )
 
-    def _visit(self, segment: SegmentPath, reach: int | None) -> int:
+    def _visit(self, segment: SegmentPath, reach: Offset | None) -> int:
         """Look at one segment, which ends at ``reach`` if that is known; its size in bytes."""
         if not segment.sealed and not segment.path.exists():  # sealed since the folder was listed
             segment = SegmentPath(segment_path(self._log, segment.base, SEALED), segment.base, True)
         name = segment.path.name
         if segment.base != self._next:
-            last = max(segment.base - 1, self._next)
+            last = max(Offset(segment.base - 1), self._next)
             self._add("gap", "events before this segment are missing", name, self._next, last)
         head = self._check_head(segment)
         if head is None:
@@ -104,11 +105,11 @@ class _Verifier:
         self._next = scan.next_offset
         return segment.path.stat().st_size
 
-    def _pass_over(self, segment: SegmentPath, reach: int | None) -> None:
+    def _pass_over(self, segment: SegmentPath, reach: Offset | None) -> None:
         """A segment that does not belong here holds none of the offsets that it stands for."""
         if reach is not None:
             text = "the segment for these events is missing"
-            self._add("gap", text, segment.path.name, segment.base, reach - 1)
+            self._add("gap", text, segment.path.name, segment.base, Offset(reach - 1))
             self._next = reach
         self._known_as = set()
 
@@ -165,8 +166,8 @@ class _Verifier:
         kind: Kind,
         message: str,
         segment: str,
-        first: int | None = None,
-        last: int | None = None,
+        first: Offset | None = None,
+        last: Offset | None = None,
         *,
         count: int | None = None,
     ) -> None:

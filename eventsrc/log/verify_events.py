@@ -25,7 +25,7 @@ from typing import Literal, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from eventsrc.envelope import ENVELOPE_VERSION
+from eventsrc.envelope import ENVELOPE_VERSION, KeyframeId, Offset, RunId
 from eventsrc.gaps import Gap, GapLedger, gap_of
 from eventsrc.ingest import Accepted
 from eventsrc.system_events import LOSS_KEY, REJECTED_KEY, Loss, RejectedPayload, is_system_key
@@ -38,31 +38,31 @@ class OpenGaps(NamedTuple):
     """How many keyframes of a run were reported missing and never came, and the offsets of the
     first and the last event that reports any of them."""
 
-    run_id: str
+    run_id: RunId
     missing: int
-    first_offset: int
-    last_offset: int
+    first_offset: Offset
+    last_offset: Offset
 
 
 class ReportedGaps:
     """Takes keyframes and reported gaps in offset order."""
 
     def __init__(self) -> None:
-        self._ledger = GapLedger()
-        self._reports: defaultdict[str, list[tuple[int, Gap]]] = defaultdict(list)
+        self._ledger: GapLedger[RunId] = GapLedger()
+        self._reports: defaultdict[RunId, list[tuple[Offset, Gap[RunId]]]] = defaultdict(list)
 
-    def take_keyframe(self, run_id: str, keyframe_id: int) -> None:
+    def take_keyframe(self, run_id: RunId, keyframe_id: KeyframeId) -> None:
         """One that is recorded."""
         self._ledger.record(run_id, keyframe_id, 0)
 
-    def take_report(self, offset: int, gap: Gap) -> None:
+    def take_report(self, offset: Offset, gap: Gap[RunId]) -> None:
         """The loss event at ``offset`` reports ``gap``."""
         self._reports[gap.run_id].append((offset, gap))
         self._ledger.assume(gap, 0)
 
     def still_open(self) -> Iterator[OpenGaps]:
         """By run, what is still missing."""
-        missing: defaultdict[str, list[Gap]] = defaultdict(list)
+        missing: defaultdict[RunId, list[Gap[RunId]]] = defaultdict(list)
         for gap in self._ledger.reported_gaps():
             missing[gap.run_id].append(gap)
         for run_id, gaps in missing.items():
@@ -82,7 +82,7 @@ JUMP_NS = 24 * 3600 * 1_000_000_000
 class StampOddity(NamedTuple):
     """``offset`` of a keyframe and what is odd about its stamp."""
 
-    offset: int
+    offset: Offset
     message: str
 
 
@@ -97,9 +97,9 @@ class RunStamps:
     """Takes each keyframe once, in offset order; three numbers of memory for each."""
 
     def __init__(self) -> None:
-        self._runs: dict[str, _Run] = {}
+        self._runs: dict[RunId, _Run] = {}
 
-    def take(self, run_id: str, keyframe_id: int, stamp_ns: int, offset: int) -> None:
+    def take(self, run_id: RunId, keyframe_id: KeyframeId, stamp_ns: int, offset: Offset) -> None:
         """The next keyframe in the log."""
         run = self._runs.setdefault(run_id, _Run())
         run.keyframes.append(keyframe_id)
@@ -113,10 +113,12 @@ class RunStamps:
             for before, this in pairwise(order):
                 step_ns = run.stamps[this] - run.stamps[before]
                 if step_ns < 0:
-                    yield StampOddity(run.offsets[this], f"stamps of run {run_id} run backwards")
+                    yield StampOddity(
+                        Offset(run.offsets[this]), f"stamps of run {run_id} run backwards"
+                    )
                 elif step_ns > JUMP_NS:
                     yield StampOddity(
-                        run.offsets[this], f"stamps of run {run_id} jump by more than a day"
+                        Offset(run.offsets[this]), f"stamps of run {run_id} jump by more than a day"
                     )
 
 
@@ -144,8 +146,8 @@ class Finding:
     kind: Kind
     message: str
     segment: str | None = None
-    first_offset: int | None = None
-    last_offset: int | None = None
+    first_offset: Offset | None = None
+    last_offset: Offset | None = None
     count: int = 1
 
 
@@ -160,8 +162,8 @@ class _Group:
 
     kind: Kind
     message: str
-    first: int
-    last: int
+    first: Offset
+    last: Offset
     count: int = 0
 
 
@@ -170,7 +172,7 @@ class EventFindings:
 
     def __init__(self) -> None:
         self._groups: dict[tuple[Kind, str], _Group] = {}
-        self._seen: dict[str, set[int]] = {}
+        self._seen: dict[RunId, set[KeyframeId]] = {}
         self._stamps = RunStamps()
         self._gaps = ReportedGaps()
         self._logged_ns = 0
@@ -224,7 +226,7 @@ class EventFindings:
         if event.version == ENVELOPE_VERSION:  # older ones count no keyframes
             self._gaps.take_keyframe(run_id, keyframe_id)
 
-    def _add(self, kind: Kind, about: str, offset: int, message: str, count: int = 1) -> None:
+    def _add(self, kind: Kind, about: str, offset: Offset, message: str, count: int = 1) -> None:
         group = self._groups.setdefault((kind, about), _Group(kind, message, offset, offset))
         group.first = min(group.first, offset)
         group.last = max(group.last, offset)

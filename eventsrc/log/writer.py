@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import NamedTuple
 
 from eventsrc.clock import Clock, system_clock
-from eventsrc.envelope import ENVELOPE_VERSION
+from eventsrc.envelope import ENVELOPE_VERSION, Offset
 from eventsrc.errors import LogError, MapfoldError, NotALog
 
 from .active_segment import ActiveSegment
@@ -104,7 +104,7 @@ class LogWriter:
             self._lock.release()
             raise
 
-    def _next_segment(self, base: int) -> ActiveSegment:
+    def _next_segment(self, base: Offset) -> ActiveSegment:
         self._begun = time.monotonic_ns()
         slack = self._commits.slack
         return ActiveSegment(self.path, self.log_id, base, self._fsync, slack, self._take_fault)
@@ -115,12 +115,12 @@ class LogWriter:
         self._faults.append(fault)
 
     @property
-    def next_offset(self) -> int:
+    def next_offset(self) -> Offset:
         """The offset the next append gets."""
         return self._active.next_offset
 
     @property
-    def durable_offset(self) -> int:
+    def durable_offset(self) -> Offset:
         """Every event below it is synced, and visible to readers."""
         ending = self._ending.committed  # all of it is, when it has come to the next one's base
         return ending if ending < self._active.base else self._active.committed
@@ -163,7 +163,7 @@ class LogWriter:
         stamp = logged if stamp_ns is None else stamp_ns
         return self.append_all([NewEvent(key, payload, logged, stamp, version)])
 
-    def append_all(self, events: Sequence[NewEvent]) -> int:
+    def append_all(self, events: Sequence[NewEvent]) -> Offset:
         """Take several events in order; the offset of the first. Commits in between as the policy
         says, as `append` of each would. None is taken unless all times and sizes are in bounds."""
         for event in events:
@@ -191,7 +191,7 @@ class LogWriter:
             self._rotate()
         return begun
 
-    def sync(self) -> int:
+    def sync(self) -> Offset:
         """Commit everything appended; the durable offset, which is then `next_offset`."""
         self._commits.finish(self._active)
         return self.durable_offset

@@ -41,9 +41,9 @@ class Numbering:
     """`arrived` and `told` take in what comes, `due` and `flush` tell what did not."""
 
     def __init__(self, settle_ns: int = DEFAULT_SETTLE_NS) -> None:
-        self._ledger = GapLedger(settle_ns)
+        self._ledger: GapLedger[str] = GapLedger(settle_ns)
         self._sources: dict[str, None] = {}
-        self._forgotten: list[Gap] = []
+        self._forgotten: list[Gap[str]] = []
 
     def arrived(self, number: SequenceNumber, now_ns: int) -> None:
         """A message with this number has come."""
@@ -58,15 +58,15 @@ class Numbering:
         else:
             self.arrived(number, now_ns)
 
-    def due(self, now_ns: int) -> list[Gap]:
+    def due(self, now_ns: int) -> list[Gap[str]]:
         """The gaps that have settled: source, first and last number. Each is returned once."""
         return self._take(self._ledger.due(now_ns))
 
-    def flush(self) -> list[Gap]:
+    def flush(self) -> list[Gap[str]]:
         """Every gap, however young."""
         return self._take(self._ledger.flush())
 
-    def _take(self, gaps: list[Gap]) -> list[Gap]:
+    def _take(self, gaps: list[Gap[str]]) -> list[Gap[str]]:
         for gap in gaps:
             self._ledger.close(gap)
         forgotten, self._forgotten = self._forgotten, []
@@ -199,7 +199,7 @@ class Inbox:
             too_large, self._too_large = self._too_large, {}
             return too_large
 
-    def take_missed(self, now_ns: int | None) -> list[Gap]:
+    def take_missed(self, now_ns: int | None) -> list[Gap[str]]:
         """The numbers that never came, each once: those long enough missing at ``now_ns``, or all
         that are missing."""
         with self._lock:

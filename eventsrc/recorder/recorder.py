@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Final
 
+from eventsrc.envelope import RunId
 from eventsrc.errors import TransportError
 from eventsrc.gaps import GapLedger
 from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES
@@ -39,7 +40,7 @@ class Recorder:
         *,
         queue_size: int = DEFAULT_QUEUE_SIZE,
         max_events: int | None = None,
-        ledger: GapLedger | None = None,
+        ledger: GapLedger[RunId] | None = None,
         report_gaps: bool = True,
         max_payload_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES,
     ) -> None:

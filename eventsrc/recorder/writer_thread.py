@@ -31,10 +31,10 @@ from typing import Final, Literal, NamedTuple
 from pydantic import ValidationError
 
 from eventsrc.append import Judged, judge_payloads
-from eventsrc.envelope import ENVELOPE_VERSION
+from eventsrc.envelope import ENVELOPE_VERSION, KeyframeId, Offset, RunId
 from eventsrc.errors import LogError
 from eventsrc.gap_history import forget_ledger, save_ledger
-from eventsrc.gaps import Gap, GapLedger
+from eventsrc.gaps import Gap, GapLedger, Source
 from eventsrc.ingest import Rejected
 from eventsrc.log import LogWriter
 from eventsrc.robot.acks import (
@@ -59,22 +59,22 @@ class Unsynced(NamedTuple):
     keyframes: a rejected payload, or a form older than the envelope. ``refusal`` is what to say
     of a rejected payload, ``key`` what it came under, ``sha256`` names the bytes of an envelope."""
 
-    offset: int
+    offset: Offset
     key: str
     refusal: Refusal | None
-    run_id: str | None
-    keyframe_id: int
+    run_id: RunId | None
+    keyframe_id: KeyframeId | None
     sha256: str
 
 
-def unsynced(offset: int, message: Received, judged: Judged) -> Unsynced:
+def unsynced(offset: Offset, message: Received, judged: Judged) -> Unsynced:
     """What follows from ``message``, which gets into the log at ``offset``."""
     event, verdict = judged
     key = message.key
     if isinstance(verdict, Rejected):
-        return Unsynced(offset, key, Refusal.of(message.payload, verdict.reason), None, 0, "")
+        return Unsynced(offset, key, Refusal.of(message.payload, verdict.reason), None, None, "")
     if event.version != ENVELOPE_VERSION:
-        return Unsynced(offset, key, None, None, 0, "")
+        return Unsynced(offset, key, None, None, None, "")
     digest = payload_sha256(message.payload)
     return Unsynced(offset, key, None, verdict.run_id, verdict.keyframe_id, digest)
 
@@ -83,7 +83,7 @@ class Answers:
     """The answers to what one sync made durable: `note` each event, then send `messages`."""
 
     def __init__(self) -> None:
-        self._synced: defaultdict[tuple[str, str], list[str]] = defaultdict(list)
+        self._synced: defaultdict[tuple[RunId, str], list[str]] = defaultdict(list)
         self._refusals: defaultdict[str, list[Refusal]] = defaultdict(list)
 
     def note(self, event: Unsynced) -> None:
@@ -128,7 +128,7 @@ class RecorderReport:
     missing_before: int
     queue_depth: int
     queue_size: int
-    next_offset: int
+    next_offset: Offset
     too_large: int = 0
     unwritten: int = 0
     unsealed: int = 0
@@ -170,7 +170,7 @@ minute of it."""
 class _Told(NamedTuple):
     """What a robot said when the log's next offset was ``offset``."""
 
-    offset: int
+    offset: Offset
     sent: Sent
 
 
@@ -181,7 +181,7 @@ class Writing:
         self,
         inbox: Inbox,
         writer: LogWriter,
-        ledger: GapLedger | None,
+        ledger: GapLedger[RunId] | None,
         answer: Answer,
         *,
         max_events: int | None,
@@ -190,7 +190,7 @@ class Writing:
     ) -> None:
         self._inbox = inbox
         self._writer = writer
-        self._ledger = GapLedger() if ledger is None else ledger
+        self._ledger: GapLedger[RunId] = GapLedger() if ledger is None else ledger
         self._saves = ledger is not None  # one that does not know the whole log is not its ledger
         self._answer = answer
         self._room = max_events
@@ -282,7 +282,7 @@ class Writing:
         payloads = [(message.key, message.payload) for message in messages]
         judged = judge_payloads(self._writer, payloads, max_bytes=self._max_payload_bytes)
         # Noted first: should appending fail in the middle, what was synced by then still counts.
-        offsets = itertools.count(self._writer.next_offset)
+        offsets = map(Offset, itertools.count(self._writer.next_offset))
         self._unsynced.extend(map(unsynced, offsets, messages, judged))
         self._in_hand -= len(messages)
         self._writer.append_all([event for event, _ in judged])
@@ -307,14 +307,14 @@ class Writing:
             sent = self._told.popleft().sent
             self._ledger.expect(sent.run_id, sent.last, now_ns)
 
-    def _follow_events(self, durable: int, now_ns: int) -> None:
+    def _follow_events(self, durable: Offset, now_ns: int) -> None:
         waiting, answers, ledger = self._unsynced, Answers(), self._ledger
         rejected, before = 0, len(waiting)
         while waiting and waiting[0].offset < durable:
             event = waiting.popleft()
             rejected += event.refusal is not None
             run_id, keyframe_id = event.run_id, event.keyframe_id
-            if run_id is not None:
+            if run_id is not None and keyframe_id is not None:
                 ledger.record(run_id, keyframe_id, now_ns)
             answers.note(event)
         self._rejected += rejected
@@ -337,7 +337,7 @@ class Writing:
             self._saves = False
             forget_ledger(self._writer.path)
 
-    def _sync(self) -> int:
+    def _sync(self) -> Offset:
         """Make everything durable, so that the ledger is that of the whole log; its end."""
         next_offset = self._writer.sync()
         self._follow_up()
@@ -348,7 +348,7 @@ class Writing:
         if self._saves:
             save_ledger(self._writer.path, self._writer.log_id, next_offset, self._ledger)
 
-    def _write_losses(self, missing: list[Gap], missed: list[Gap]) -> None:
+    def _write_losses(self, missing: list[Gap[RunId]], missed: list[Gap[str]]) -> None:
         """``missing`` are keyframes, ``missed`` publishers' own numbers."""
         for gap in missing if self._report_gaps else ():
             self._append_loss(_loss("keyframe_gap", gap))
@@ -356,8 +356,8 @@ class Writing:
             self._append_loss(Loss(publisher=key, count=count, cause="queue_full"))
         for key, count in self._inbox.take_too_large().items():
             self._append_loss(Loss(publisher=key, count=count, cause="too_large"))
-        for gap in missed:
-            self._append_loss(_loss("transport_miss", gap))
+        for of_source in missed:
+            self._append_loss(_loss("transport_miss", of_source))
         self._missing = self._ledger.missing if self._report_gaps else 0
 
     def _append_loss(self, loss: Loss) -> None:
@@ -378,5 +378,5 @@ def _portions(messages: Sequence[Received]) -> Iterator[list[Received]]:
         yield portion
 
 
-def _loss(cause: Literal["keyframe_gap", "transport_miss"], gap: Gap) -> Loss:
+def _loss(cause: Literal["keyframe_gap", "transport_miss"], gap: Gap[Source]) -> Loss:
     return Loss(publisher=gap.run_id, first=gap.first, last=gap.last, count=gap.count, cause=cause)

@@ -21,6 +21,7 @@ from urllib.parse import quote
 
 from pydantic import BaseModel, ConfigDict, FailFast, Field
 
+from eventsrc.envelope import RunId
 from eventsrc.transport.config import MAX_KEY_BYTES
 
 ACK_PREFIX: Final = "mapfold/ack/"
@@ -37,7 +38,7 @@ def payload_sha256(payload: bytes) -> str:
     return hashlib.sha256(payload).hexdigest()
 
 
-def ack_key(run_id: str) -> str:
+def ack_key(run_id: RunId) -> str:
     """The key of the acks for ``run_id``; characters not allowed in a key are quoted."""
     return ACK_PREFIX + quote(run_id, safe="")
 
@@ -47,7 +48,7 @@ class Ack(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
-    run_id: str
+    run_id: RunId
     key: str
     log_id: str
     sha256: Annotated[tuple[str, ...], Field(min_length=1), FailFast()]
@@ -117,7 +118,7 @@ class Sent(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="ignore", strict=True)
 
-    run_id: str
+    run_id: RunId
     last: Annotated[int, Field(ge=-(2**63), lt=2**63)]
 
     def encode(self) -> bytes:

@@ -27,6 +27,7 @@ from typing import Final
 
 from pydantic import ValidationError
 
+from eventsrc.envelope import RunId
 from eventsrc.errors import MisuseError, SpoolError, TransportError
 from eventsrc.transport.session import Publisher, Received, Session, ZenohOptions, open_session
 
@@ -67,7 +68,9 @@ class Sender:
         self._changed = threading.Condition()
         self._answers: deque[Ack | Refusals] = deque()
         self._sent = 0  # the highest seq that was ever sent
-        self._unreported: dict[str, int] = {}  # by run: the highest keyframe sent, not reported yet
+        self._unreported: dict[
+            RunId, int
+        ] = {}  # by run: the highest keyframe sent, not reported yet
         self._progress_due_s = 0.0
         self._woken = self._stopping = False
         self._failure: TransportError | None = None

@@ -21,6 +21,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from eventsrc.envelope import KeyframeId, RunId
 from eventsrc.errors import SpoolError, SpoolFull
 
 from .acks import Ack, Refusals, payload_sha256
@@ -69,16 +70,16 @@ class Spooled(NamedTuple):
     """An envelope that waits for an ack; ``seq`` is never used twice in a file."""
 
     seq: int
-    run_id: str
-    keyframe_id: int
+    run_id: RunId
+    keyframe_id: KeyframeId
     payload: bytes
 
 
 class Refused(NamedTuple):
     """A quarantined envelope; the log ``log_id`` has its bytes and ``reason``."""
 
-    run_id: str
-    keyframe_id: int
+    run_id: RunId
+    keyframe_id: KeyframeId
     log_id: str
     reason: str
 
@@ -187,7 +188,7 @@ class Spool:
         row = self._db.execute("select count(*), coalesce(sum(length(payload)), 0) from spooled")
         self._count, self._bytes = row.fetchone()
 
-    def add(self, run_id: str, keyframe_id: int, payload: bytes) -> None:
+    def add(self, run_id: RunId, keyframe_id: KeyframeId, payload: bytes) -> None:
         """Keep one envelope until it is acknowledged. Raises SpoolFull if there is no room."""
         with self._spool_errors(), self._lock:
             if not self._make_room(len(payload)):

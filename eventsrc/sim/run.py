@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from eventsrc.envelope import default_det_id
+from eventsrc.envelope import KeyframeId, RunId, default_det_id
 from eventsrc.errors import MisuseError, TransportError
 from eventsrc.transport.session import Session
 
@@ -40,7 +40,7 @@ _YAW_NOISE_RAD = 0.008
 class SimulatedRun:
     """A whole run. ``envelopes``, ``truth`` and ``true_poses`` run parallel, one per keyframe."""
 
-    run_id: str
+    run_id: RunId
     house: House
     envelopes: tuple[dict[str, Any], ...]
     truth: tuple[dict[str, Any], ...]
@@ -59,7 +59,7 @@ def encode(document: dict[str, Any]) -> bytes:
 
 def simulate_run(seed: int = DEFAULT_SEED, run: str = EXPLORER) -> SimulatedRun:
     """Run ``run`` through house ``seed``. Run ``a`` explores; any other name is another session."""
-    house, run_id = build_house(seed), f"sim-{seed}-{run}"
+    house, run_id = build_house(seed), RunId(f"sim-{seed}-{run}")
     poses = tuple(keyframes(walk(house.grid, plan_tour(house, run))))
     start_s = FIRST_START_S + _DAY_S * _day(run)
     made = [
@@ -79,7 +79,7 @@ def _day(run: str) -> int:
 
 
 def _keyframe(
-    house: House, run_id: str, number: int, pose: TruePose, start_s: float
+    house: House, run_id: RunId, number: int, pose: TruePose, start_s: float
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     rng = stream("keyframe", run_id, number)
     detections = list(detect(sightings(house, pose), run_id, rng))
@@ -89,7 +89,7 @@ def _keyframe(
         "timestamp": round(start_s + pose.time_s, 3),
         **_localised(pose, rng),
         "detections": [
-            {"det_id": default_det_id(run_id, number, index), **detection.fields}
+            {"det_id": default_det_id(run_id, KeyframeId(number), index), **detection.fields}
             for index, detection in enumerate(detections)
         ],
     }

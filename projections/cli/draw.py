@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from eventsrc.envelope import FIRST_OFFSET
 from eventsrc.log import LogReader
 from eventsrc.text import counted
 from projections.model.fold import fold_events
@@ -50,7 +51,7 @@ def draw(
     settings = settings_from(settings_file, set_)
     view = MapView(settings, keep_embeddings=False)
     with LogReader(log) as reader:
-        events = reader.read(0, point(reader, at))
+        events = reader.read(FIRST_OFFSET, point(reader, at))
         merged = fold_with_merges(fold_events(events, SemanticMap(settings)), view)
     draw_map(
         view,

@@ -21,6 +21,7 @@ from typing import Annotated, Any
 
 import typer
 
+from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.errors import LogError, MisuseError
 from eventsrc.log import (
     Event,
@@ -246,7 +247,7 @@ def cat(
     finish(findings=bool(gaps))
 
 
-def _end(reader: LogReader, to: str, start: int, on_gap: OnGap | None) -> int | None:
+def _end(reader: LogReader, to: str, start: Offset, on_gap: OnGap | None) -> Offset | None:
     """Where a range from offset ``start`` on ends. None: at the end of the log, or at the damage on
     the way to ``to``, where reading will stop; what is before that is shown first."""
     if to == "end":
@@ -259,7 +260,7 @@ def _end(reader: LogReader, to: str, start: int, on_gap: OnGap | None) -> int | 
     except MisuseError:
         if not met:
             raise
-        end = 0  # it may be among what cannot be read
+        end = FIRST_OFFSET  # it may be among what cannot be read
     if met and met[0].last < start:
         return resolve(reader, to)  # which says so
     return None if met else end

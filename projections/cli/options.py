@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from eventsrc.envelope import Offset
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 from eventsrc.log.seek import resolve
@@ -36,7 +37,7 @@ W = "number of events, ISO time, RUN:KEYFRAME (inclusive) or end"
 """What W may be, for help texts."""
 
 
-def point(reader: LogReader, text: str) -> int:
+def point(reader: LogReader, text: str) -> Offset:
     """The number of events that W means in this log; warns when times run backwards in it."""
     return resolve(reader, text, note=say)
 

@@ -8,6 +8,7 @@ from typing import Annotated, Final
 
 import typer
 
+from eventsrc.envelope import RunId
 from eventsrc.errors import LogDamaged
 from eventsrc.gap_history import keep_ledger
 from eventsrc.gaps import GapLedger
@@ -107,7 +108,7 @@ def record(
     end.finish()
 
 
-def _ledger(log: Path) -> GapLedger | None:
+def _ledger(log: Path) -> GapLedger[RunId] | None:
     """What the log lacks so far. Damage in an old segment is no reason not to record."""
     try:
         with LogReader(log) as reader:

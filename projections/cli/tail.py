@@ -11,6 +11,7 @@ from typing import Annotated
 
 import typer
 
+from eventsrc.envelope import Offset
 from eventsrc.log import LogReader
 from eventsrc.text import counted
 from eventsrc.transport.config import parse_address
@@ -102,7 +103,7 @@ def _complain(what: str, progress: TailProgress) -> None:
 class _CatchingUp:
     """Shows how far the tail is until it has what was in the log at its start, and says so then."""
 
-    def __init__(self, log: Path, end: int, bar: Bar, once: bool) -> None:
+    def __init__(self, log: Path, end: Offset, bar: Bar, once: bool) -> None:
         self._log, self._end, self._bar = log, end, bar
         self._once, self._done = once, False
 

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from eventsrc.envelope import Offset
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 from eventsrc.text import counted
@@ -151,7 +152,9 @@ def why(
         display(story_text(story))
 
 
-def _story(timeline: Timeline, thing: str | None, same: tuple[str, str] | None, end: int) -> Story:
+def _story(
+    timeline: Timeline, thing: str | None, same: tuple[str, str] | None, end: Offset
+) -> Story:
     if same is not None:
         return timeline.why_same(*same, end)
     return timeline.why(thing or "", end)

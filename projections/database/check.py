@@ -22,6 +22,7 @@ from typing import Any, Final, Literal, TypeAlias
 import psycopg
 from psycopg import IsolationLevel, sql
 
+from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.log import Event, LogReader
 from projections.errors import ProjectionMissing
 from projections.settings import Settings
@@ -142,7 +143,7 @@ class CheckReport:
     """
 
     sink: SinkName
-    next_offset: int
+    next_offset: Offset
     rows: int
     differing: int
     differences: tuple[Difference, ...]
@@ -241,7 +242,7 @@ def _events(
 ) -> Iterator[tuple[Event, bool]]:
     """The events of the projection, and whether each was parked."""
     parked = {letter.offset for letter in checkpoints.parked(connection, sink)}
-    for event in reader.read(0, checkpoint.next_offset):
+    for event in reader.read(FIRST_OFFSET, checkpoint.next_offset):
         yield event, event.offset in parked
 
 

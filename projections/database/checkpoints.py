@@ -6,6 +6,7 @@ import time
 from dataclasses import dataclass
 from typing import Final
 
+from eventsrc.envelope import Offset, RunId
 from eventsrc.log import Event
 from projections.errors import CheckpointMoved, DatabaseError, ProjectionBusy
 from projections.settings import Settings
@@ -30,9 +31,9 @@ LOCK_POLL_S: Final = 0.02
 class DeadLetter:
     """An event that could not be folded and was left out. ``run_id`` when its payload tells one."""
 
-    offset: int
+    offset: Offset
     key: str
-    run_id: str | None
+    run_id: RunId | None
     reason: str
 
 
@@ -120,7 +121,7 @@ def create(connection: Connection, sink: SinkName, log_id: str, settings: Settin
 
 
 def advance(
-    connection: Connection, sink: SinkName, before: Checkpoint, next_offset: int, last_event: str
+    connection: Connection, sink: SinkName, before: Checkpoint, next_offset: Offset, last_event: str
 ) -> Checkpoint:
     """Move the checkpoint, in the transaction of the rows. Raises CheckpointMoved."""
     cursor = connection.execute(
@@ -201,10 +202,10 @@ def dead_letter(event: Event, reason: str) -> DeadLetter:
     return DeadLetter(event.offset, event.key, _run_id(event.payload), reason)
 
 
-def _run_id(payload: bytes) -> str | None:
+def _run_id(payload: bytes) -> RunId | None:
     try:
         document = json.loads(payload)
     except (ValueError, RecursionError):
         return None
     run_id = document.get("run_id") if isinstance(document, dict) else None
-    return run_id if isinstance(run_id, str) and "\0" not in run_id else None
+    return RunId(run_id) if isinstance(run_id, str) and "\0" not in run_id else None

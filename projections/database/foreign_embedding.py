@@ -3,6 +3,7 @@
 import sys
 from dataclasses import dataclass
 
+from eventsrc.envelope import Offset
 from eventsrc.ingest import Accepted
 from eventsrc.log import LogReader
 from eventsrc.upcast import read_envelope
@@ -17,7 +18,7 @@ class ForeignEmbedding:
     ``map_dim`` is None when the map has no embedding: none had the space that the settings ask for.
     """
 
-    offset: int
+    offset: Offset
     det_id: str
     model: str | None
     dim: int
@@ -31,7 +32,7 @@ def first_foreign_embedding(fold: LiveFold, reader: LogReader) -> ForeignEmbeddi
     if first is None:
         return None
     offset, space = fold.view.keyframes[first.keyframe].offset, fold.map.space
-    (event,) = reader.read(offset, offset + 1)
+    (event,) = reader.read(offset, Offset(offset + 1))
     parsed = read_envelope(event, max_bytes=sys.maxsize)
     assert isinstance(parsed, Accepted)  # noqa: S101 - it was folded
     vector = parsed.vectors[parsed.det_ids.index(first.det_id)]

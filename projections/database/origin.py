@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
+from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
 from projections.errors import ProjectionMismatch, ProjectionMissing
 from projections.settings import Settings
@@ -22,7 +23,7 @@ _NOT_AN_OPTION: Final = "neighbourhood"
 
 def command_line(name: str, log: Path, settings: Settings, *options: str) -> str:
     """``mapfold NAME LOG`` with ``options``, and ``--set`` for all that is not the default."""
-    " default."""
+    " default."
     default = Settings().model_dump()
     changed = [key for key, value in settings.model_dump().items() if value != default[key]]
     words = ["mapfold", name, shlex.quote(str(log)), *options, *_options(settings, changed)]
@@ -103,7 +104,7 @@ def refuse_mismatch(
             f"{where}: {found.next_offset:,} events are in the {sink} there, but {log} has only"
             f" {reader.next_offset:,}; {advice}"
         )
-    for event in reader.read(max(0, found.next_offset - 1), found.next_offset):
+    for event in reader.read(max(FIRST_OFFSET, Offset(found.next_offset - 1)), found.next_offset):
         if event_hash(event) != found.last_event:
             raise ProjectionMismatch(
                 f"{log}: the event at offset {event.offset:,} is not the one that is in the"

@@ -10,6 +10,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
 from eventsrc.metrics import Number, serving_numbers
 
@@ -20,7 +21,7 @@ from .checkpoints import DeadLetter
 class TailReport:
     """What a tail did so far: batches and events written, where it stands, what it parked."""
 
-    next_offset: int = 0
+    next_offset: Offset = FIRST_OFFSET
     events: int = 0
     batches: int = 0
     restarts: int = 0
@@ -55,7 +56,7 @@ class TailProgress:
         with self._moved:
             self.troubles += 1
 
-    def wait(self, next_offset: int, timeout_s: float) -> bool:
+    def wait(self, next_offset: Offset, timeout_s: float) -> bool:
         """True once ``next_offset`` events are committed; False when that takes too long."""
         with self._moved:
             return self._moved.wait_for(lambda: self.next_offset >= next_offset, timeout_s)

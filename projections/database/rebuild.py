@@ -31,6 +31,7 @@ from typing import Any, Final, NamedTuple, TypeAlias
 
 import psycopg
 
+from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.log import Event, LogReader
 from projections.errors import DatabaseError, FoldError
 from projections.model.digest import map_digest
@@ -175,7 +176,7 @@ def rebuild(
     targets: Targets,
     settings: Settings,
     *,
-    until: int | None = None,
+    until: Offset | None = None,
     only: Only = None,
     loader: LoaderName = "copy",
     hnsw: bool = True,
@@ -199,7 +200,7 @@ def rebuild(
         fold = LiveFold(settings)
         with _transactions(stores):
             with short_turns(), loadings_of(stores) as loadings:
-                events, advice = reader.read(0, total), partial(_advice, log, settings)
+                events, advice = reader.read(FIRST_OFFSET, total), partial(_advice, log, settings)
                 last = _fold_into(fold, events, loadings, total, tell, advice)
                 folded = time.monotonic()
                 tell(RebuildProgress("writing", total, total))
@@ -272,7 +273,7 @@ def _fold_into(
     return last
 
 
-def _advice(log: Path, settings: Settings, offset: int) -> str:
+def _advice(log: Path, settings: Settings, offset: Offset) -> str:
     """What to do about an event that cannot be folded."""
     before = command_line("replay", log, settings, "--until", str(offset))
     return (

@@ -9,6 +9,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from eventsrc.envelope import Offset
 from eventsrc.ingest import Rejected
 from eventsrc.log import LogReader
 from eventsrc.upcast import read_envelope
@@ -60,7 +61,7 @@ def _retry(
 def _still_failing(reader: LogReader, letters: list[DeadLetter]) -> list[DeadLetter]:
     failing = []
     for letter in letters:
-        (event,) = reader.read(letter.offset, letter.offset + 1)
+        (event,) = reader.read(letter.offset, Offset(letter.offset + 1))
         judged = read_envelope(event, max_bytes=sys.maxsize)
         if isinstance(judged, Rejected):
             failing.append(DeadLetter(letter.offset, letter.key, letter.run_id, judged.reason))

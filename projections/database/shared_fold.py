@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, TypeAlias
 
+from eventsrc.envelope import Offset
 from eventsrc.log import Event
 from projections.deltas import Delta
 from projections.errors import FoldError
@@ -48,10 +49,10 @@ class LiveFold:
                 self.skip(events[start].offset)
                 start += 1
 
-    def skip(self, offset: int) -> None:
+    def skip(self, offset: Offset) -> None:
         """Pass over an event that is left out."""
         self.map.skip(offset)
-        self.view.advance(offset + 1)
+        self.view.advance(Offset(offset + 1))
 
     def _apply(self, event: Event, deltas: list[Delta], sinks_of: SinksOf) -> None:
         for sink in sinks_of(event):

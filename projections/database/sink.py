@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol, TypeAlias, TypeVar
 
+from eventsrc.envelope import Offset
 from projections.deltas import Delta
 from projections.model.view import MapView
 
@@ -36,7 +37,7 @@ class Checkpoint:
     log_id: str
     fingerprint: str
     settings: str
-    next_offset: int
+    next_offset: Offset
     last_event: str
     digest: str | None = None
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
+from eventsrc.envelope import Offset
 from eventsrc.log import LogReader
 from projections.errors import DatabaseError, ProjectionMismatch
 from projections.settings import Settings
@@ -49,7 +50,7 @@ class SinkStatus:
     place: str
     condition: Condition
     note: str | None = None
-    next_offset: int | None = None
+    next_offset: Offset | None = None
     lag: int | None = None
     checkpoint_age_s: float | None = None
     heartbeat_age_s: float | None = None
@@ -65,7 +66,7 @@ class Status:
     """A log's end and the two sinks."""
 
     log_id: str
-    log_next_offset: int
+    log_next_offset: Offset
     sinks: tuple[SinkStatus, ...]
 
     @property
@@ -91,7 +92,7 @@ def projection_status(log: Path, targets: Targets, settings: Settings) -> Status
 
 
 def _status(
-    sink: SinkName, url: str, log: Path, log_id: str, end: int, settings: Settings
+    sink: SinkName, url: str, log: Path, log_id: str, end: Offset, settings: Settings
 ) -> SinkStatus:
     try:
         opened = connect(url, application="mapfold status", autocommit=True)
@@ -102,7 +103,7 @@ def _status(
 
 
 def _look(
-    connection: Connection, sink: SinkName, log: Path, log_id: str, end: int, settings: Settings
+    connection: Connection, sink: SinkName, log: Path, log_id: str, end: Offset, settings: Settings
 ) -> SinkStatus:
     where = describe_connection(connection)
     versions = _versions(connection)
@@ -142,7 +143,7 @@ def _condition(
     where: str,
     log: Path,
     log_id: str,
-    end: int,
+    end: Offset,
     settings: Settings,
     writer: str | None,
     beaten: float | None,

@@ -23,6 +23,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
+from eventsrc.envelope import Offset
 from eventsrc.log import Event, LogReader, follow
 from projections.errors import FoldError, ProjectionMismatch
 from projections.model.fold import WORTH_A_SNAPSHOT
@@ -72,7 +73,7 @@ class TailPass:
     stores: list[Store]
     report: TailReport
     checkpoints: dict[SinkName, Checkpoint] = field(default_factory=dict)
-    parked: dict[int, DeadLetter] = field(default_factory=dict)
+    parked: dict[Offset, DeadLetter] = field(default_factory=dict)
     letters: list[DeadLetter] = field(default_factory=list)
 
     def follow(self, reader: LogReader) -> None:
@@ -88,7 +89,7 @@ class TailPass:
             last = self._fold(fold, batch)
             if last is not None:
                 self._write(fold, writers, last)
-                plan.on_fold(last.offset + 1)
+                plan.on_fold(Offset(last.offset + 1))
             if time.monotonic() - beaten > HEARTBEAT_S:
                 beaten = time.monotonic()
                 for writer in writers:
@@ -98,7 +99,7 @@ class TailPass:
         if fold.map.next_offset - start >= WORTH_A_SNAPSHOT and not self.parked:
             cache.keep(fold.map, fold.view)
 
-    def _events(self, reader: LogReader, start: int) -> Iterable[Event | None]:
+    def _events(self, reader: LogReader, start: Offset) -> Iterable[Event | None]:
         if self.plan.once:
             return reader.read(start, reader.next_offset)
         return follow(self.plan.log, start, stop=self.plan.stop)
@@ -117,7 +118,7 @@ class TailPass:
             for store in self.stores
         ]
 
-    def _start_at_most(self) -> int:
+    def _start_at_most(self) -> Offset:
         """Up to which offset a snapshot is what this tail would fold: another command may have made
         one with events that are parked here."""
         return min([c.next_offset for c in self.checkpoints.values()] + list(self.parked))
@@ -125,7 +126,7 @@ class TailPass:
     def begin(self, reader: LogReader) -> None:
         """Make what is missing, read the checkpoints, refuse what does not fit."""
         plan = self.plan
-        parked: dict[int, DeadLetter] = {}
+        parked: dict[Offset, DeadLetter] = {}
         for store in self.stores:
             with database_errors(store.url), store.connection.transaction():
                 for sink in store.sinks:
@@ -185,7 +186,7 @@ class TailPass:
         self.report.parked.append(letter)
 
     def _write(self, fold: LiveFold, writers: list[Writer], last: Event) -> None:
-        next_offset = last.offset + 1
+        next_offset = Offset(last.offset + 1)
         written = 0
         for writer in writers:
             parts = [

@@ -22,6 +22,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Final, TypeAlias
 
+from eventsrc.envelope import Offset
 from projections.errors import (
     CheckpointMoved,
     DatabaseError,
@@ -87,7 +88,7 @@ class SinkBatch:
     changes: Any
     letters: tuple[DeadLetter, ...]
     before: Checkpoint
-    next_offset: int
+    next_offset: Offset
     last_event: str
 
 

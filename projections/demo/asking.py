@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from eventsrc.envelope import RunId
 from eventsrc.sim import SimulatedRun
 from projections.database.connection import Targets
 from projections.drawing import LostRobot, Spot
@@ -54,7 +55,7 @@ class Everywhere:
 class Lost:
     """Run B's first questions, where it truly was, and how it went from everywhere else."""
 
-    run_id: str
+    run_id: RunId
     keyframe_id: int
     room: str
     truth: Spot

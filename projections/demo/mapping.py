@@ -18,6 +18,7 @@ from typing import Final, Self
 
 from psycopg import sql
 
+from eventsrc.envelope import FIRST_OFFSET, Offset, RunId
 from eventsrc.errors import MapfoldError
 from eventsrc.log import LogReader
 from eventsrc.sim import SimulatedRun
@@ -50,8 +51,8 @@ class MergeMoment:
     ``bridge_room`` is where its keyframe was taken, ``places_before`` how many there were then.
     """
 
-    offset: int
-    run_id: str
+    offset: Offset
+    run_id: RunId
     keyframe_id: int
     bridge_room: str
     survivor: Part
@@ -94,7 +95,7 @@ def fold_with_rooms(folder: DemoFolder, settings: Settings, run: SimulatedRun) -
                     deltas.append(delta)
                     moments.append(_moment(view, delta, rooms))
                 view.apply(delta)
-            view.advance(event.offset + 1)
+            view.advance(Offset(event.offset + 1))
     return Folded(view, tuple(deltas), tuple(moments), map_digest(view), time.monotonic() - started)
 
 
@@ -156,12 +157,12 @@ class Follower:
     def __init__(self, log: Path, targets: Targets, settings: Settings) -> None:
         self._log, self._targets, self._settings = log, targets, settings
         self._stop = threading.Event()
-        self._commits: list[tuple[int, int]] = []
+        self._commits: list[tuple[Offset, int]] = []
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="tail")
         self._running: Future[TailReport] | None = None
 
     def __enter__(self) -> Self:
-        rebuild(self._log, self._targets, self._settings, until=0)
+        rebuild(self._log, self._targets, self._settings, until=FIRST_OFFSET)
         self._running = self._pool.submit(
             tail, self._log, self._targets, self._settings, stop=self._stop, on_batch=self._note
         )
@@ -171,7 +172,7 @@ class Follower:
         self._stop.set()
         self._pool.shutdown()
 
-    def caught_up(self, end: int) -> Followed:
+    def caught_up(self, end: Offset) -> Followed:
         """Wait until ``end`` events are in the databases; tells how they kept up."""
         assert self._running is not None  # noqa: S101 - inside the with block
         deadline, pause = time.monotonic() + _PATIENCE_S, threading.Event()
@@ -198,7 +199,7 @@ class Follower:
         commits = iter(self._commits)
         reached, committed_ns = 0, 0
         with LogReader(self._log) as reader:
-            for event in reader.read(0, self._commits[-1][0]):
+            for event in reader.read(FIRST_OFFSET, self._commits[-1][0]):
                 while reached <= event.offset:
                     reached, committed_ns = next(commits)
                 delays.append((committed_ns - event.logged_ns) / 1e9)

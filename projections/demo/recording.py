@@ -7,6 +7,7 @@ import time
 from dataclasses import dataclass
 from typing import Final
 
+from eventsrc.envelope import Offset, RunId
 from eventsrc.log import LogReader
 from eventsrc.log_info import log_info
 from eventsrc.sim import SimulatedRun
@@ -30,7 +31,7 @@ class Recorded:
     ``intact`` says that the log holds every payload, in order, byte for byte.
     """
 
-    run_id: str
+    run_id: RunId
     published: int
     recorded: int
     intact: bool
@@ -68,7 +69,7 @@ def record_run(
                 folder.said("simulate"),
             )
             children.wait(_PATIENCE_S + drive_s / speed)
-            followed = follower.caught_up(count)
+            followed = follower.caught_up(Offset(count))
     seconds = time.monotonic() - started
     info = log_info(folder.log)
     with LogReader(folder.log) as reader:

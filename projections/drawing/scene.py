@@ -7,6 +7,7 @@ import math
 from collections import Counter, defaultdict
 from dataclasses import dataclass
 
+from eventsrc.envelope import RunId
 from eventsrc.sim import House
 from projections.model.view import KeyframeRecord, MapView, ObjectRecord
 
@@ -125,7 +126,7 @@ def spot_of(keyframe: KeyframeRecord) -> tuple[float, float] | None:
     return keyframe.pose.x_um / 1e6, keyframe.pose.y_um / 1e6
 
 
-def drives(view: MapView) -> list[tuple[str, list[tuple[float, float]]]]:
+def drives(view: MapView) -> list[tuple[RunId, list[tuple[float, float]]]]:
     """Per run its id and its spots, in keyframe_id order."""
     by_run: dict[int, list[KeyframeRecord]] = defaultdict(list)
     for keyframe in view.keyframes:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from eventsrc.envelope import RunId
 from eventsrc.errors import MisuseError
 
 Key = tuple[str, int]
@@ -25,7 +26,7 @@ class TrueKeyframe(BaseModel):
 
     model_config = ConfigDict(frozen=True, strict=True)
 
-    run_id: str
+    run_id: RunId
     keyframe_id: int
     room: str | None
     instances: list[str | None]

@@ -18,6 +18,8 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from eventsrc.envelope import Offset
+
 from .condition_functions import Direction, Names, Value
 from .conditions import Expression
 from .history import NEVER, History
@@ -48,7 +50,7 @@ def _sorted(offsets: Iterable[int]) -> "array[int]":
 class HistoryFacts:
     """The map after the events below ``end``, which may be moved; answers `expression.Facts`."""
 
-    def __init__(self, history: History, tallies: Tallies, end: int) -> None:
+    def __init__(self, history: History, tallies: Tallies, end: Offset) -> None:
         self._history = history
         self._tallies = tallies
         self.end = end
@@ -168,8 +170,8 @@ class Search:
     """
 
     expression: Expression
-    start: int
-    end: int
+    start: Offset
+    end: Offset
     holds: tuple[bool, bool]
     found: Turn | None
     turns: tuple[Turn, ...]
@@ -194,14 +196,14 @@ class Searcher:
     """Asks one expression of one history at many offsets, and counts."""
 
     def __init__(
-        self, expression: Expression, facts: HistoryFacts, cause_at: Callable[[int], Cause]
+        self, expression: Expression, facts: HistoryFacts, cause_at: Callable[[Offset], Cause]
     ) -> None:
         self._expression = expression
         self._facts = facts
         self._cause_at = cause_at
         self._asked = 0
 
-    def search(self, start: int, end: int, *, scan: bool) -> Search:
+    def search(self, start: Offset, end: Offset, *, scan: bool) -> Search:
         """The first turn to true by an event in ``start`` … ``end`` − 1; with ``scan``, all."""
         holds = self._holds(start), self._holds(end)
         rising = self._expression.direction in (Direction.RISING, Direction.STEADY)
@@ -221,7 +223,7 @@ class Searcher:
             self._asked,
         )
 
-    def _holds(self, end: int) -> bool:
+    def _holds(self, end: Offset) -> bool:
         self._asked += 1
         self._facts.end = end
         return self._expression.holds(self._facts)
@@ -229,26 +231,26 @@ class Searcher:
     def _bisect(self, low: int, high: int) -> Turn:
         """False after ``low`` events, true after ``high``."""
         while high - low > 1:
-            middle = (low + high) // 2
+            middle = Offset((low + high) // 2)
             if self._holds(middle):
                 high = middle
             else:
                 low = middle
-        return self._turn(high - 1, becomes=True)
+        return self._turn(Offset(high - 1), becomes=True)
 
-    def _scan(self, start: int, end: int, now: bool, *, stop: bool) -> Iterator[Turn]:
-        for offset in range(start, end):
-            after = self._holds(offset + 1)
+    def _scan(self, start: Offset, end: Offset, now: bool, *, stop: bool) -> Iterator[Turn]:
+        for offset in map(Offset, range(start, end)):
+            after = self._holds(Offset(offset + 1))
             if after is not now:
                 yield self._turn(offset, becomes=after)
                 if after and stop:
                     return
             now = after
 
-    def _turn(self, offset: int, *, becomes: bool) -> Turn:
-        before, after = self._readings(offset), self._readings(offset + 1)
+    def _turn(self, offset: Offset, *, becomes: bool) -> Turn:
+        before, after = self._readings(offset), self._readings(Offset(offset + 1))
         return Turn(self._cause_at(offset), becomes, before, after)
 
-    def _readings(self, end: int) -> Readings:
+    def _readings(self, end: Offset) -> Readings:
         self._facts.end = end
         return self._expression.readings(self._facts)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeAlias, TypeVar
 
+from eventsrc.envelope import Offset, RunId
 from projections.model.view import MapView
 
 from .records import Cause
@@ -43,7 +44,7 @@ class ObjectRow:
 class KeyframeRow:
     """A keyframe and its place; the pose is metres and radians, None when there was none."""
 
-    run_id: str
+    run_id: RunId
     keyframe_id: int
     pose: tuple[float, float, float] | None
     place_id: str | None
@@ -174,8 +175,8 @@ class Difference:
     when time runs backwards (``end`` < ``start``).
     """
 
-    start: int
-    end: int
+    start: Offset
+    end: Offset
     digests: tuple[str, str]
     counts: tuple[dict[str, int], dict[str, int]]
     keyframes: Changes[tuple[str, int], KeyframeRow]
@@ -232,8 +233,8 @@ class Difference:
 
 
 def difference_of(
-    start: int,
-    end: int,
+    start: Offset,
+    end: Offset,
     rows: tuple[MapRows, MapRows],
     digests: tuple[str, str],
     counts: tuple[dict[str, int], dict[str, int]],

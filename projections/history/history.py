@@ -22,6 +22,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from eventsrc.envelope import FIRST_OFFSET, Offset
 from projections.deltas import (
     Delta,
     EventSkipped,
@@ -55,7 +56,7 @@ class Neighbours:
         self._row = {number: row for row, number in enumerate(self._numbers)}
         self._cells = _rows_by_cell(self._spots // self._radius)
 
-    def of(self, keyframe: int, end: int) -> list[int]:
+    def of(self, keyframe: int, end: Offset) -> list[int]:
         """Keyframes within ε of a posed ``keyframe``, itself too, after ``end`` events; ascending
         ordinals."""
         x, y = self._spots[self._row[keyframe]]
@@ -67,21 +68,21 @@ class Neighbours:
         near = ((self._spots[rows] - (x, y)) ** 2).sum(axis=1) <= self._radius**2
         return [self._numbers[row] for row in rows[near]]
 
-    def is_core(self, keyframe: int, end: int) -> bool:
+    def is_core(self, keyframe: int, end: Offset) -> bool:
         """Whether it is a core point after ``end`` events; false before it came."""
         row = self._row.get(keyframe)
         if row is None or self._offsets[row] >= end:
             return False
         return len(self.of(keyframe, end)) >= self._min_samples
 
-    def made_core(self, bridge: int, offset: int) -> list[int]:
+    def made_core(self, bridge: int, offset: Offset) -> list[int]:
         """The keyframes that the coming of ``bridge`` at ``offset`` made core points."""
         if bridge not in self._row:
             return []
         return [
             keyframe
-            for keyframe in self.of(bridge, offset + 1)
-            if self.is_core(keyframe, offset + 1) and not self.is_core(keyframe, offset)
+            for keyframe in self.of(bridge, Offset(offset + 1))
+            if self.is_core(keyframe, Offset(offset + 1)) and not self.is_core(keyframe, offset)
         ]
 
     def distance_um(self, a: int, b: int) -> int:
@@ -107,7 +108,7 @@ def _rows_by_cell(cells: NDArray[np.int64]) -> dict[tuple[int, int], NDArray[np.
     return dict(zip(keys, np.split(order, starts), strict=True))
 
 
-NEVER = 2**63 - 1
+NEVER = Offset(2**63 - 1)
 """The offset of what has not happened."""
 
 
@@ -126,7 +127,7 @@ class History:
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
-        self.next_offset = 0
+        self.next_offset = FIRST_OFFSET
         self.keyframes: list[KeyframeAdded] = []
         self.keyframe_offsets = array("q")
         self.placed_offsets = array("q")
@@ -142,9 +143,9 @@ class History:
         self.object_numbers: dict[str, int] = {}
         self._neighbours: tuple[int, Neighbours] | None = None
 
-    def apply(self, offset: int, deltas: Sequence[Delta]) -> None:
+    def apply(self, offset: Offset, deltas: Sequence[Delta]) -> None:
         """Remember what the event at ``offset`` did."""
-        self.next_offset = offset + 1
+        self.next_offset = Offset(offset + 1)
         if not deltas:
             return
         cause = cause_of(offset, deltas)
@@ -171,31 +172,31 @@ class History:
             self._neighbours = count, Neighbours(self.keyframes, self.settings)
         return self._neighbours[1]
 
-    def place_at(self, keyframe: int, end: int | None = None) -> int | None:
+    def place_at(self, keyframe: int, end: Offset | None = None) -> int | None:
         """The place a keyframe is in after the events below ``end`` (default: all so far)."""
         end = self.next_offset if end is None else end
         if self.placed_offsets[keyframe] >= end:
             return None
         return self.survivor_of(self.placed_in[keyframe], end)
 
-    def survivor_of(self, place: int, end: int | None = None) -> int:
+    def survivor_of(self, place: int, end: Offset | None = None) -> int:
         """Who stands for ``place`` after the events below ``end`` (default: all so far)."""
         end = self.next_offset if end is None else end
         while (merge := self.places[place].absorbed) is not None and merge.cause.offset < end:
             place = merge.survivor
         return place
 
-    def keyframe_count(self, end: int) -> int:
+    def keyframe_count(self, end: Offset) -> int:
         """Keyframes added by the events below ``end``."""
         return bisect_left(self.keyframe_offsets, end)
 
-    def cause_at(self, offset: int) -> Cause:
+    def cause_at(self, offset: Offset) -> Cause:
         """The cause of what the event at ``offset`` did."""
         number = bisect_left(self.keyframe_offsets, offset)
         added = self.keyframes[number : number + 1]
         return cause_of(offset, [k for k in added if k.offset == offset])
 
-    def transitions(self, a: int, b: int, end: int) -> int:
+    def transitions(self, a: int, b: int, end: Offset) -> int:
         """Shared transitions of two places after the events below ``end``."""
         pair = (min(a, b), max(a, b))
         linked = last_before(self.edges.get(pair, ()), end)

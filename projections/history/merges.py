@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
+from eventsrc.envelope import Offset
 from projections.deltas import Link
 
 from .history import History
@@ -67,7 +68,7 @@ def _doors(history: History, merge: Merge, keyframe: int) -> dict[int, int]:
     """By place the nearest old core point within ε of a new one."""
     offset, neighbours = merge.cause.offset, history.neighbours
     doors: dict[int, int] = {}
-    near = (k for k in neighbours.of(keyframe, offset + 1) if neighbours.is_core(k, offset))
+    near = (k for k in neighbours.of(keyframe, Offset(offset + 1)) if neighbours.is_core(k, offset))
     for old in sorted(near, key=lambda k: (neighbours.distance_um(keyframe, k), k)):
         place = history.place_at(old, offset)
         if place is not None:
@@ -101,7 +102,7 @@ def _shortest(
 def _next(
     history: History, merge: Merge, keyframe: int, doors: dict[int, dict[int, int]]
 ) -> Iterator[int]:
-    near = history.neighbours.of(keyframe, merge.cause.offset + 1)
+    near = history.neighbours.of(keyframe, Offset(merge.cause.offset + 1))
     return (k for k in near if k in doors)
 
 

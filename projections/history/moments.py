@@ -7,6 +7,7 @@ keyframe joined, objects) is made anew, so views never disturb each other.
 
 from bisect import bisect_left
 
+from eventsrc.envelope import Offset
 from projections.model.view import (
     KeyframeRecord,
     MapView,
@@ -21,7 +22,7 @@ from .history import History
 from .records import ObjectLife, count_before, last_before
 
 
-def view_at(history: History, latest: MapView, end: int, settings: Settings) -> MapView:
+def view_at(history: History, latest: MapView, end: Offset, settings: Settings) -> MapView:
     """The map after the events below ``end``; ``latest`` is a view of at least as many events."""
     view = MapView(settings, keep_embeddings=latest.keep_embeddings)
     view.all_places = _places(history, end)
@@ -37,7 +38,7 @@ def view_at(history: History, latest: MapView, end: int, settings: Settings) -> 
     return view
 
 
-def _places(history: History, end: int) -> list[PlaceRecord]:
+def _places(history: History, end: Offset) -> list[PlaceRecord]:
     lives = history.places[: bisect_left(history.places, end, key=lambda p: p.formed.offset)]
     records = []
     for life in lives:
@@ -54,7 +55,7 @@ def _places(history: History, end: int) -> list[PlaceRecord]:
     return records
 
 
-def _merge(history: History, records: list[PlaceRecord], end: int) -> None:
+def _merge(history: History, records: list[PlaceRecord], end: Offset) -> None:
     """Hand members on to survivors, in the order in which the merges happened."""
     for merge in history.merges:
         if merge.cause.offset >= end:
@@ -68,7 +69,7 @@ def _merge(history: History, records: list[PlaceRecord], end: int) -> None:
 
 
 def _keyframes(
-    history: History, latest: MapView, places: list[PlaceRecord], end: int
+    history: History, latest: MapView, places: list[PlaceRecord], end: Offset
 ) -> list[KeyframeRecord]:
     count = history.keyframe_count(end)
     return [
@@ -89,19 +90,19 @@ def _keyframes(
     ]
 
 
-def _observations(history: History, latest: MapView, end: int) -> list[ObservationRecord]:
+def _observations(history: History, latest: MapView, end: Offset) -> list[ObservationRecord]:
     keyframes = history.keyframe_count(end)
     return latest.observations[
         : bisect_left(latest.observations, keyframes, key=lambda o: o.keyframe)
     ]
 
 
-def _objects(history: History, end: int) -> list[ObjectRecord]:
+def _objects(history: History, end: Offset) -> list[ObjectRecord]:
     count = bisect_left(history.objects, end, key=lambda o: o.found.offset)
     return [_object(life, end) for life in history.objects[:count]]
 
 
-def _object(life: ObjectLife, end: int) -> ObjectRecord:
+def _object(life: ObjectLife, end: Offset) -> ObjectRecord:
     found, seen = life.found, life.seen[: count_before(life.seen, end)]
     record = ObjectRecord(found.object, found.object_id, found.class_name)
     record.observations = [delta.observation for delta in seen]
@@ -114,7 +115,7 @@ def _object(life: ObjectLife, end: int) -> ObjectRecord:
     return record
 
 
-def _runs(history: History, keyframes: list[KeyframeRecord], end: int) -> list[RunRecord]:
+def _runs(history: History, keyframes: list[KeyframeRecord], end: Offset) -> list[RunRecord]:
     records = []
     for seen in history.runs:
         last = last_before(seen, end)
@@ -125,7 +126,7 @@ def _runs(history: History, keyframes: list[KeyframeRecord], end: int) -> list[R
     return records
 
 
-def _adjacency(history: History, end: int) -> dict[tuple[int, int], int]:
+def _adjacency(history: History, end: Offset) -> dict[tuple[int, int], int]:
     found = ((pair, last_before(linked, end)) for pair, linked in history.edges.items())
     return {
         pair: last.shared_transitions

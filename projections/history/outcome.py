@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
+from eventsrc.envelope import Offset
 from projections.evaluate.scores import object_scores, place_scores
 from projections.evaluate.truth import Truth
 from projections.model.digest import map_digest
@@ -81,20 +82,20 @@ def _scores(view: MapView, truth: Truth) -> dict[str, dict[str, Any]]:
     return {"places": place_scores(view, truth), "objects": object_scores(view, truth)}
 
 
-def places_part(first: Outcome, second: Outcome) -> int | None:
+def places_part(first: Outcome, second: Outcome) -> Offset | None:
     """The first event after which two folds of one log have different places; None for never."""
     placings = zip(
         first.placed_offsets, first.placed_in, second.placed_offsets, second.placed_in, strict=True
     )
     parted = [min(o1, o2) for o1, p1, o2, p2 in placings if (o1, p1) != (o2, p2)]
     parted += [offset for offset, _, _ in set(first.merged) ^ set(second.merged)]
-    return min(parted, default=None)
+    return Offset(min(parted)) if parted else None
 
 
-def objects_part(first: Outcome, second: Outcome) -> int | None:
+def objects_part(first: Outcome, second: Outcome) -> Offset | None:
     """The first event after which two folds of one log have different objects."""
     pairs = zip(first.fused_into, second.fused_into, first.observation_offsets, strict=True)
-    return next((offset for a, b, offset in pairs if a != b), None)
+    return next((Offset(offset) for a, b, offset in pairs if a != b), None)
 
 
 def _numbers(places: Sequence[PlaceLife]) -> list[int]:

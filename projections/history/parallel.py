@@ -18,6 +18,7 @@ from itertools import islice
 from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 
+from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.errors import MapfoldError
 from eventsrc.log import Event, LogReader
 from projections.deltas import KeyframeAdded, KeyframePlaced, PlaceFormed, PlacesMerged
@@ -45,7 +46,7 @@ _done: "Synchronized[int] | None" = None
 def fold_all(
     log: Path,
     settings: Sequence[Settings],
-    end: int,
+    end: Offset,
     *,
     truth: Truth | None = None,
     processes: int | None = None,
@@ -68,7 +69,7 @@ def fold_all(
 def fold_several(
     log: Path,
     settings: Sequence[Settings],
-    end: int,
+    end: Offset,
     truth: Truth | None = None,
     progress: Progress | None = None,
     *,
@@ -77,7 +78,7 @@ def fold_several(
     """The same in this process: one pass over the log for all of ``settings``."""
     folds = [_Fold(each) for each in settings]
     with LogReader(log) as reader:
-        events = reader.read(0, end)
+        events = reader.read(FIRST_OFFSET, end)
         with no_cycle_search():
             while chunk := list(islice(events, AHEAD)):
                 _fold_chunk(chunk, folds)
@@ -119,7 +120,7 @@ def _fold_chunk(chunk: Sequence[Event], folds: Sequence[_Fold]) -> None:
 def _in_processes(
     log: Path,
     shares: list[list[Settings]],
-    end: int,
+    end: Offset,
     truth: Truth | None,
     progress: Progress | None,
     *,
@@ -163,7 +164,7 @@ def _start_worker(done: "Synchronized[int]") -> None:
 
 
 def _work(
-    log: Path, settings: list[Settings], end: int, truth: Truth | None, keep_views: bool
+    log: Path, settings: list[Settings], end: Offset, truth: Truth | None, keep_views: bool
 ) -> list[Outcome]:
     counted = 0
 

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
+from eventsrc.envelope import Offset
 from projections.drawing import canvas as palette
 from projections.drawing.canvas import HALO, Bounds, Canvas, check_name
 from projections.drawing.ground import draw_drives, draw_regions
@@ -40,7 +41,7 @@ def draw_merge(timeline: Timeline, merge: Merge, out: Path) -> None:
     On both: the bridging keyframe, its ε circle, the core points that met. Raises MisuseError when
     ``out`` is no picture's name or cannot be written.
     """
-    before, after = timeline.at(merge.cause.offset), timeline.at(merge.cause.offset + 1)
+    before, after = timeline.at(merge.cause.offset), timeline.at(Offset(merge.cause.offset + 1))
     bounds = _around(timeline, merge)
     figure, panels = _sheet(2, bounds, (2, _PANEL_IN), _HEAD_IN)
     for panel, view, when in zip(panels, (before, after), ("before", "after"), strict=True):
@@ -102,7 +103,7 @@ def _panel(panel: Canvas, view: MapView) -> None:
 
 def _draw_links(panel: Canvas, timeline: Timeline, merge: Merge) -> None:
     """The bridge with its ε circle and neighbours, and the core points that met."""
-    history, end = timeline.history, merge.cause.offset + 1
+    history, end = timeline.history, Offset(merge.cause.offset + 1)
     x, y = map(float, history.neighbours.spots([merge.bridge])[0])
     circle = Circle((x, y), timeline.settings.eps_m, fill=False, lw=1.2, ls="--", zorder=12)
     circle.set_edgecolor(palette.BRIDGE)

@@ -18,6 +18,7 @@ from datetime import UTC, datetime
 from operator import attrgetter
 from typing import Any, Literal, Protocol, TypeVar
 
+from eventsrc.envelope import Offset, RunId
 from projections.deltas import (
     Delta,
     KeyframeAdded,
@@ -41,10 +42,10 @@ class Cause:
     three are None for a cause that is not a keyframe. ``what`` is then its text.
     """
 
-    offset: int
+    offset: Offset
     kind: CauseKind
     time_s: float | None = None
-    run_id: str | None = None
+    run_id: RunId | None = None
     keyframe_id: int | None = None
     what: str | None = None
 
@@ -81,7 +82,7 @@ class Cause:
         }
 
 
-def cause_of(offset: int, deltas: Iterable[Delta]) -> Cause:
+def cause_of(offset: Offset, deltas: Iterable[Delta]) -> Cause:
     """The cause of the deltas of one event: the keyframe it added, if it added one."""
     for delta in deltas:
         if isinstance(delta, KeyframeAdded):
@@ -149,13 +150,13 @@ class PlaceLife:
     def place_id(self) -> str:
         return self.formed.place_id
 
-    def stands(self, end: int) -> bool:
+    def stands(self, end: Offset) -> bool:
         """Whether it is there, formed and not absorbed, after the events below ``end``."""
         return self.formed.offset < end and (
             self.absorbed is None or self.absorbed.cause.offset >= end
         )
 
-    def change(self, end: int) -> PlaceChanged | None:
+    def change(self, end: Offset) -> PlaceChanged | None:
         """Its size and sums after the events below ``end``."""
         return last_before(self.changes, end)
 
@@ -173,7 +174,7 @@ class ObjectLife:
     def object_id(self) -> str:
         return self.found.object_id
 
-    def place(self, end: int) -> int | None:
+    def place(self, end: Offset) -> int | None:
         """The place it joined last by the events below ``end``."""
         moved = last_before(self.located, end)
         return None if moved is None else moved.place
@@ -188,12 +189,12 @@ _T = TypeVar("_T", bound=_HasOffset)
 _offset = attrgetter("offset")
 
 
-def count_before(items: Sequence[_HasOffset], end: int) -> int:
+def count_before(items: Sequence[_HasOffset], end: Offset) -> int:
     """How many items, sorted by offset, were caused by events below ``end``."""
     return bisect_left(items, end, key=_offset)
 
 
-def last_before(items: Sequence[_T], end: int) -> _T | None:
+def last_before(items: Sequence[_T], end: Offset) -> _T | None:
     """The last item, sorted by offset, of the events below ``end``."""
     count = bisect_left(items, end, key=_offset)
     return items[count - 1] if count else None

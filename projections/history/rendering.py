@@ -14,6 +14,7 @@ A plain table: columns as wide as their widest cell, two spaces between, no line
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
+from eventsrc.envelope import Offset
 from eventsrc.text import counted
 from projections.model.partitions import Regrouping
 
@@ -190,7 +191,7 @@ def _edges(diff: Difference) -> tuple[str, str, list[list[str]]]:
 MOST = 12
 
 
-def merges_text(history: History, merges: Sequence[Merge], end: int) -> str:
+def merges_text(history: History, merges: Sequence[Merge], end: Offset) -> str:
     """The table of merges, or that there are none."""
     if not merges:
         formed = sum(life.formed.offset < end for life in history.places)
@@ -341,7 +342,7 @@ def _partings(each: Alternative) -> str:
     )
 
 
-def _parting(what: str, offset: int | None, *, same: bool) -> str:
+def _parting(what: str, offset: Offset | None, *, same: bool) -> str:
     if offset is None:
         return f"{what} are the same"
     return f"{what} part ways at offset {offset:,}" + (" and end the same" if same else "")

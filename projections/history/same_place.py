@@ -14,6 +14,7 @@ import difflib
 import re
 from collections.abc import Iterable
 
+from eventsrc.envelope import Offset
 from eventsrc.errors import MisuseError
 from eventsrc.text import counted
 
@@ -24,11 +25,11 @@ from .records import Merge, ObjectLife, PlaceLife
 from .story import Entry, Story, keyframe_name, place_name, spot
 
 
-def same_story(history: History, first: int, second: int, end: int) -> Story:
+def same_story(history: History, first: int, second: int, end: Offset) -> Story:
     """Why keyframes ``first`` and ``second`` are, or are not, in one place at ``end``."""
     since = together_since(history, first, second)
     together = since is not None and since < end
-    until = since + 1 if since is not None and together else end
+    until = Offset(since + 1) if since is not None and together else end
     entries = [_placing(history, k) for k in (first, second) if history.placed_offsets[k] < end]
     entries += [_merging(history, merge) for merge in _chain(history, (first, second), until)]
     return Story(
@@ -44,19 +45,20 @@ def same_story(history: History, first: int, second: int, end: int) -> Story:
     )
 
 
-def together_since(history: History, first: int, second: int) -> int | None:
+def together_since(history: History, first: int, second: int) -> Offset | None:
     """The offset of the event that first brought two keyframes into one place, ever."""
-    joined = max(history.placed_offsets[first], history.placed_offsets[second])
+    joined = Offset(max(history.placed_offsets[first], history.placed_offsets[second]))
     if joined == NEVER:
         return None
     chain = _chain(history, (first, second), NEVER)
     for offset in sorted({joined, *(m.cause.offset for m in chain if m.cause.offset > joined)}):
-        if history.place_at(first, offset + 1) == history.place_at(second, offset + 1):
+        after = Offset(offset + 1)
+        if history.place_at(first, after) == history.place_at(second, after):
             return offset
     return None
 
 
-def _chain(history: History, keyframes: tuple[int, int], end: int) -> list[Merge]:
+def _chain(history: History, keyframes: tuple[int, int], end: Offset) -> list[Merge]:
     """Merges below ``end`` that carried either keyframe from one place to another, in order."""
     merges: dict[int, Merge] = {}
     for keyframe in keyframes:
@@ -71,7 +73,8 @@ def _chain(history: History, keyframes: tuple[int, int], end: int) -> list[Merge
 
 def _placing(history: History, keyframe: int) -> Entry:
     place = place_name(history, history.placed_in[keyframe])
-    offset, own = history.placed_offsets[keyframe], history.keyframe_offsets[keyframe]
+    offset = Offset(history.placed_offsets[keyframe])
+    own = history.keyframe_offsets[keyframe]
     wait = counted(offset - own, "event")
     late = "" if offset == own else f", {wait} after it came: it was noise before"
     name = keyframe_name(history, keyframe)
@@ -93,7 +96,7 @@ def _merging(history: History, merge: Merge) -> Entry:
     )
 
 
-def _summary(history: History, first: int, second: int, since: int | None, end: int) -> str:
+def _summary(history: History, first: int, second: int, since: Offset | None, end: Offset) -> str:
     if since is not None:
         cause = history.cause_at(since)
         now = place_name(history, history.place_at(first, end))
@@ -101,7 +104,7 @@ def _summary(history: History, first: int, second: int, since: int | None, end: 
     return "not in one place: " + "; ".join(_where(history, k, end) for k in (first, second))
 
 
-def _where(history: History, keyframe: int, end: int) -> str:
+def _where(history: History, keyframe: int, end: Offset) -> str:
     name = keyframe_name(history, keyframe)
     if history.keyframe_offsets[keyframe] >= end:
         return f"{name} has not come yet"
@@ -111,7 +114,7 @@ def _where(history: History, keyframe: int, end: int) -> str:
     return f"{name} is noise" if place is None else f"{name} is in {place_name(history, place)}"
 
 
-def _place_id(history: History, keyframe: int, end: int) -> str | None:
+def _place_id(history: History, keyframe: int, end: Offset) -> str | None:
     place = history.place_at(keyframe, end)
     return None if place is None else place_name(history, place)
 

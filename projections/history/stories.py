@@ -6,6 +6,7 @@ Why an object is what it is: found by which detection, seen how often, located w
 from collections import Counter
 from collections.abc import Iterator
 
+from eventsrc.envelope import Offset
 from eventsrc.text import counted
 from projections.exact import Q40, mean_m
 
@@ -18,7 +19,7 @@ MOST_FOUNDERS = 6
 """Founding members named; a place is founded by few, but one event may pull in many."""
 
 
-def place_story(history: History, life: PlaceLife, end: int) -> Story:
+def place_story(history: History, life: PlaceLife, end: Offset) -> Story:
     """The chronicle of a place through the events below ``end``."""
     entries = sorted(
         (e for e in _place_entries(history, life) if e.cause.offset < end),
@@ -99,7 +100,7 @@ def _absorption(history: History, life: PlaceLife, merge: Merge) -> Entry:
     )
 
 
-def _ended(history: History, life: PlaceLife, end: int) -> str:
+def _ended(history: History, life: PlaceLife, end: Offset) -> str:
     merge = life.absorbed
     if merge is None or life.formed.offset >= end:
         return f"not founded yet; {life.cause.name} founds it at offset {life.formed.offset:,}"
@@ -109,14 +110,14 @@ def _ended(history: History, life: PlaceLife, end: int) -> str:
     return f"absorbed by {by} at offset {merge.cause.offset:,} ({merge.cause.when}){then}"
 
 
-def _absorber(history: History, life: PlaceLife, end: int) -> dict[str, object] | None:
+def _absorber(history: History, life: PlaceLife, end: Offset) -> dict[str, object] | None:
     merge = life.absorbed
     if merge is None or merge.cause.offset >= end:
         return None
     return {"place_id": place_name(history, merge.survivor), **merge.cause.document()}
 
 
-def _standing(history: History, life: PlaceLife, end: int) -> str:
+def _standing(history: History, life: PlaceLife, end: Offset) -> str:
     parts = [
         _objects(history, life.formed.place, end),
         _neighbours(history, life.formed.place, end),
@@ -127,7 +128,7 @@ def _standing(history: History, life: PlaceLife, end: int) -> str:
     return "; ".join(parts)
 
 
-def _objects(history: History, place: int, end: int) -> str:
+def _objects(history: History, place: int, end: Offset) -> str:
     classes = Counter(
         o.found.class_name
         for o in history.objects
@@ -142,7 +143,7 @@ def _objects(history: History, place: int, end: int) -> str:
     return f"{counted(classes.total(), 'object')}: {named}{more}"
 
 
-def _neighbours(history: History, place: int, end: int) -> str:
+def _neighbours(history: History, place: int, end: Offset) -> str:
     found = [
         (count, b if a == place else a)
         for a, b in history.edges
@@ -154,7 +155,7 @@ def _neighbours(history: History, place: int, end: int) -> str:
     return "next to " + ", ".join(f"{place_name(history, p)} ({n}×)" for n, p in found)
 
 
-def object_story(history: History, det_ids: list[str], life: ObjectLife, end: int) -> Story:
+def object_story(history: History, det_ids: list[str], life: ObjectLife, end: Offset) -> Story:
     """The chronicle of an object through the events below ``end``.
 
     ``det_ids`` are those of its sightings, parallel to ``life.seen``.
@@ -181,7 +182,7 @@ def _place_id(history: History, place: int | None) -> str | None:
     return None if place is None else place_name(history, place)
 
 
-def _summary(history: History, life: ObjectLife, end: int) -> str:
+def _summary(history: History, life: ObjectLife, end: Offset) -> str:
     last = last_before(life.seen, end)
     if last is None:
         return "not seen yet"
@@ -195,7 +196,7 @@ def _summary(history: History, life: ObjectLife, end: int) -> str:
 
 
 def _object_entries(history: History, det_ids: list[str], life: ObjectLife) -> Iterator[Entry]:
-    pose = history.keyframes[history.keyframe_count(life.found.offset + 1) - 1].pose
+    pose = history.keyframes[history.keyframe_count(Offset(life.found.offset + 1)) - 1].pose
     yield Entry(
         life.cause,
         "found",
@@ -224,7 +225,7 @@ def _moves(history: History, life: ObjectLife) -> Iterator[Entry]:
         before = moved.place
 
 
-def _move_text(history: History, before: int | None, after: int | None, offset: int) -> str:
+def _move_text(history: History, before: int | None, after: int | None, offset: Offset) -> str:
     to = place_name(history, after)
     if before is None:
         return f"located in {to}"

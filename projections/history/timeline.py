@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TypeAlias
 
+from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
 from eventsrc.text import counted
 from projections.errors import WhenceError
@@ -65,11 +66,11 @@ class Timeline:
         self.reader.close()
 
     @property
-    def end(self) -> int:
+    def end(self) -> Offset:
         """The number of events in the log as of opening or the last `refresh`."""
         return self.reader.next_offset
 
-    def refresh(self) -> int:
+    def refresh(self) -> Offset:
         """Take in what was recorded since; the new `end`."""
         return self.reader.refresh()
 
@@ -82,7 +83,7 @@ class Timeline:
                 self._fold_to(self.end)
         return self._history
 
-    def at(self, end: int | None = None) -> MapView:
+    def at(self, end: Offset | None = None) -> MapView:
         """The map after the first ``end`` events, all of them for None; yours to change.
 
         Its observations carry no embeddings, only their checksums. The first time it is taken from
@@ -98,7 +99,9 @@ class Timeline:
         with no_cycle_search():
             return view_at(history, self._latest, wanted, self.settings)
 
-    def deltas(self, start: int = 0, end: int | None = None) -> Iterator[FoldedEvent]:
+    def deltas(
+        self, start: Offset = FIRST_OFFSET, end: Offset | None = None
+    ) -> Iterator[FoldedEvent]:
         """What each event from ``start`` to before ``end`` changed, by a fold of its own that
         starts from the nearest snapshot."""
         found = self._snapshots().latest(self._end(start))
@@ -107,12 +110,12 @@ class Timeline:
         folded = fold_events(events, semantic_map, ahead=AHEAD)
         return (event for event in folded if event.offset >= start)
 
-    def merges(self, end: int | None = None) -> list[Merge]:
+    def merges(self, end: Offset | None = None) -> list[Merge]:
         """Every merge of places by the first ``end`` events, in order."""
         before = self._end(end)
         return [merge for merge in self.history.merges if merge.cause.offset < before]
 
-    def why(self, thing: str, end: int | None = None) -> Story:
+    def why(self, thing: str, end: Offset | None = None) -> Story:
         """The chronicle of a place or an object; raises NoSuchThing with the nearest names."""
         history = self.history
         if thing in history.object_numbers:
@@ -123,12 +126,12 @@ class Timeline:
             raise NoSuchThing("object", thing, history.object_numbers)
         return place_story(history, find_place(history, thing), self._end(end))
 
-    def why_same(self, first: str, second: str, end: int | None = None) -> Story:
+    def why_same(self, first: str, second: str, end: Offset | None = None) -> Story:
         """Since when, and by which merges, two keyframes (``run:keyframe``) are in one place."""
         a, b = (find_keyframe(self.history, text) for text in (first, second))
         return same_story(self.history, a, b, self._end(end))
 
-    def diff(self, start: int, end: int | None = None) -> Difference:
+    def diff(self, start: Offset, end: Offset | None = None) -> Difference:
         """What turns the map after ``start`` events into that after ``end``."""
         last = self._end(end)
         before, after = self.at(start), self.at(last)
@@ -141,7 +144,7 @@ class Timeline:
             self._absorbed(start, last),
         )
 
-    def facts(self, end: int | None = None) -> HistoryFacts:
+    def facts(self, end: Offset | None = None) -> HistoryFacts:
         """The map after ``end`` events as expressions ask it."""
         history = self.history
         if self._tallies is None:
@@ -151,8 +154,8 @@ class Timeline:
     def bisect(
         self,
         expression: Expression | str,
-        start: int = 0,
-        end: int | None = None,
+        start: Offset = FIRST_OFFSET,
+        end: Offset | None = None,
         *,
         scan: bool = False,
     ) -> Search:
@@ -167,7 +170,7 @@ class Timeline:
         self._check_names(asked, facts)
         return Searcher(asked, facts, self.history.cause_at).search(start, facts.end, scan=scan)
 
-    def _end(self, end: int | None) -> int:
+    def _end(self, end: Offset | None) -> Offset:
         if end is None:
             return self.end
         if not 0 <= end <= self.end:
@@ -177,7 +180,7 @@ class Timeline:
             )
         return end
 
-    def _fold_to(self, end: int) -> None:
+    def _fold_to(self, end: Offset) -> None:
         events = self.reader.read(self._history.next_offset, end)
         for folded in fold_events(events, self._map, ahead=AHEAD):
             self._latest.apply_event(folded.offset, folded.deltas)
@@ -187,7 +190,7 @@ class Timeline:
         if self._progress:
             self._progress(end, end)
 
-    def _from_snapshot(self, end: int) -> MapView | None:
+    def _from_snapshot(self, end: Offset) -> MapView | None:
         """The map at ``end`` from the nearest snapshot; None when there is none below."""
         if not any(offset <= end for offset in self._snapshots().offsets()):
             return None
@@ -204,7 +207,7 @@ class Timeline:
                 error = NoSuchThing(mention.kind.value, mention.text, names)
                 raise expression.error_at(mention.column, str(error))
 
-    def _absorbed(self, start: int, end: int) -> dict[str, tuple[str, Cause]]:
+    def _absorbed(self, start: Offset, end: Offset) -> dict[str, tuple[str, Cause]]:
         history = self.history
         return {
             place_name(history, place): (place_name(history, merge.survivor), merge.cause)

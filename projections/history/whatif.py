@@ -9,6 +9,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from eventsrc.envelope import Offset
 from projections.errors import SettingsError
 from projections.evaluate.truth import Truth
 from projections.model.partitions import PartitionComparison, Regrouping, compare_partitions
@@ -81,8 +82,8 @@ class Alternative:
     outcome: Outcome
     places: PartitionComparison
     objects: PartitionComparison
-    parted_places: int | None
-    parted_objects: int | None
+    parted_places: Offset | None
+    parted_objects: Offset | None
 
     @property
     def same(self) -> bool:
@@ -94,7 +95,7 @@ class Alternative:
 class WhatIf:
     """The base first, then its alternatives; all of the first ``end`` events of one log."""
 
-    end: int
+    end: Offset
     base: Alternative
     alternatives: tuple[Alternative, ...]
 
@@ -118,7 +119,7 @@ def what_if(
     log: Path,
     base: Settings,
     others: Sequence[Settings],
-    end: int,
+    end: Offset,
     *,
     truth: Truth | None = None,
     processes: int | None = None,

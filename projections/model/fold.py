@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from itertools import islice
 from typing import NamedTuple
 
+from eventsrc.envelope import Offset
 from eventsrc.ingest import Accepted, Rejected
 from eventsrc.log import Event, LogReader
 from eventsrc.system_events import is_system_key
@@ -31,7 +32,7 @@ WORTH_A_SNAPSHOT = 5_000
 class FoldedEvent(NamedTuple):
     """What the event at ``offset`` changed; mapfold's own events change nothing."""
 
-    offset: int
+    offset: Offset
     deltas: list[Delta]
 
 
@@ -41,7 +42,7 @@ class ReadEvent(NamedTuple):
     ``units`` runs parallel to the door's vectors; it is empty for what was refused.
     """
 
-    offset: int
+    offset: Offset
     door: Accepted | Rejected | None
     units: list[Units | None]
 
@@ -96,7 +97,7 @@ def fold_read(read: ReadEvent, semantic_map: SemanticMap) -> list[Delta]:
 def fold_log(
     reader: LogReader,
     settings: Settings,
-    until: int | None = None,
+    until: Offset | None = None,
     *,
     keep_embeddings: bool = True,
     neighbourhood: Neighbourhood | None = None,
@@ -111,7 +112,7 @@ def fold_log(
 def fold_log_cached(
     reader: LogReader,
     settings: Settings,
-    until: int | None = None,
+    until: Offset | None = None,
     *,
     note: Callable[[str], None] = lambda _: None,
     neighbourhood: Neighbourhood | None = None,
@@ -134,7 +135,7 @@ def fold_log_cached(
 
 
 def _fold_on(
-    reader: LogReader, semantic_map: SemanticMap, view: MapView, until: int | None
+    reader: LogReader, semantic_map: SemanticMap, view: MapView, until: Offset | None
 ) -> None:
     events = reader.read(semantic_map.next_offset, until)
     with no_cycle_search():

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+from eventsrc.envelope import Offset
 from eventsrc.log import lineage
 from projections.exact import Neighbourhood
 from projections.reducers.semantic_map import SemanticMap
@@ -44,16 +45,16 @@ class SnapshotCache:
         self._neighbourhood = neighbourhood
         self._unsound: set[Path] = set()
 
-    def offsets(self) -> list[int]:
+    def offsets(self) -> list[Offset]:
         """The offsets there are snapshots for, ascending."""
         try:
             names = [entry.name for entry in self.folder.iterdir()]
         except OSError:  # none yet, or not ours to read
             return []
         found = [m for name in names if (m := _NAME.fullmatch(name))]
-        return sorted(int(m[2]) for m in found if m[1] == self._settings.fingerprint())
+        return sorted(Offset(int(m[2])) for m in found if m[1] == self._settings.fingerprint())
 
-    def latest(self, until: int) -> tuple[SemanticMap, MapView] | None:
+    def latest(self, until: Offset) -> tuple[SemanticMap, MapView] | None:
         """The fold and view at the highest offset ≤ ``until`` whose snapshot is sound."""
         for offset in reversed([offset for offset in self.offsets() if offset <= until]):
             path = self._path(offset)
@@ -86,7 +87,7 @@ class SnapshotCache:
         except OSError as error:
             self._note(f"{path}: no snapshot was kept: {error.strerror}")
 
-    def _path(self, offset: int) -> Path:
+    def _path(self, offset: Offset) -> Path:
         return self.folder / f"{self._settings.fingerprint()}-{offset:020d}.map"
 
     def _thin_out(self) -> None:

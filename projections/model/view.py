@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+from eventsrc.envelope import FIRST_OFFSET, Offset, RunId
 from projections.deltas import (
     Delta,
     EventSkipped,
@@ -43,7 +44,7 @@ class RunRecord:
     """One run. ``started_at`` is the earliest keyframe timestamp of it so far."""
 
     ordinal: int
-    run_id: str
+    run_id: RunId
     started_at: float
     keyframe_count: int = 0
 
@@ -58,7 +59,7 @@ class PlaceRecord:
     ordinal: int
     place_id: str
     founder: int
-    founded_offset: int
+    founded_offset: Offset
     keyframe_count: int = 0
     sum_x_um: int = 0
     sum_y_um: int = 0
@@ -95,9 +96,9 @@ class KeyframeRecord:
     """One keyframe. ``offset`` is its event's; ``pose`` is None when the robot had none."""
 
     ordinal: int
-    offset: int
+    offset: Offset
     run: int
-    run_id: str
+    run_id: RunId
     keyframe_id: int
     timestamp: float
     pose: Pose | None
@@ -170,7 +171,7 @@ class MapView:
     def __init__(self, settings: Settings, *, keep_embeddings: bool = True) -> None:
         self.settings = settings
         self.keep_embeddings = keep_embeddings
-        self.next_offset = 0
+        self.next_offset = FIRST_OFFSET
         self.runs: list[RunRecord] = []
         self.keyframes: list[KeyframeRecord] = []
         self.observations: list[ObservationRecord] = []
@@ -184,14 +185,14 @@ class MapView:
         """Take in one delta."""
         self._APPLIERS[type(delta)](self, delta)
 
-    def apply_event(self, offset: int, deltas: Iterable[Delta]) -> None:
+    def apply_event(self, offset: Offset, deltas: Iterable[Delta]) -> None:
         """Take in all deltas of the event at ``offset`` and advance past it."""
         appliers = self._APPLIERS
         for delta in deltas:
             appliers[type(delta)](self, delta)
-        self.next_offset = offset + 1
+        self.next_offset = Offset(offset + 1)
 
-    def advance(self, next_offset: int) -> None:
+    def advance(self, next_offset: Offset) -> None:
         """Say that all events below ``next_offset`` are in the view."""
         self.next_offset = next_offset
 

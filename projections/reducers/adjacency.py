@@ -19,6 +19,7 @@ from bisect import bisect_right
 
 import numpy as np
 
+from eventsrc.envelope import Offset
 from projections.deltas import PlacesLinked
 from projections.reducers import State
 
@@ -137,7 +138,7 @@ class Adjacency:
         if after != place:
             self._add(place, after, 1)
 
-    def settle(self, offset: int) -> list[PlacesLinked]:
+    def settle(self, offset: Offset) -> list[PlacesLinked]:
         """The edges whose count is another than when last asked, ascending."""
         if not self._before:
             return []

@@ -13,6 +13,7 @@ from zlib import crc32
 
 import numpy as np
 
+from eventsrc.envelope import Offset, RunId
 from eventsrc.ingest import Accepted
 from projections.reducers import State
 
@@ -58,7 +59,7 @@ class Seen:
         self.digests = bytearray()
         self.det_ids: dict[str, int] = {}  # → ordinal of its keyframe, in order of arrival
 
-    def run(self, run_id: str, timestamp: float) -> tuple[int, bool]:
+    def run(self, run_id: RunId, timestamp: float) -> tuple[int, bool]:
         """The run's ordinal, and whether it is new or turns out to have started earlier."""
         run = self.runs.get(run_id)
         if run is None:
@@ -71,12 +72,12 @@ class Seen:
             return run, True
         return run, False
 
-    def find(self, run_id: str, keyframe_id: int) -> int | None:
+    def find(self, run_id: RunId, keyframe_id: int) -> int | None:
         """The ordinal of a keyframe that was folded, else None."""
         run = self.runs.get(run_id)
         return None if run is None else self.keyframes[run].get(keyframe_id)
 
-    def add(self, run: int, keyframe_id: int, offset: int, digest: bytes) -> int:
+    def add(self, run: int, keyframe_id: int, offset: Offset, digest: bytes) -> int:
         """Number a new keyframe."""
         keyframe = len(self.offsets)
         self.keyframes[run][keyframe_id] = keyframe

@@ -28,6 +28,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from eventsrc.envelope import Offset
 from projections.deltas import ObjectFound, ObjectSeen
 from projections.exact import MAX_IN_A_SUM, MAX_IN_ONE_DOT, Q40, long_dot, metres_to_um
 from projections.reducers import State
@@ -67,7 +68,7 @@ class Landmarks:
 
     def fold(
         self,
-        offset: int,
+        offset: Offset,
         observation: int,
         det_id: str,
         class_name: str,
@@ -144,7 +145,7 @@ class Landmarks:
             self._list(index, landmark)
 
     def _found(
-        self, offset: int, observation: int, det_id: str, landmark: Landmark
+        self, offset: Offset, observation: int, det_id: str, landmark: Landmark
     ) -> list[ObjectFound | ObjectSeen]:
         ordinal = len(self.objects)
         self.objects.append(landmark)
@@ -184,7 +185,7 @@ def _buckets(landmark: Landmark) -> list[Bucket]:
 
 
 def _seen(
-    offset: int, ordinal: int, observation: int, similarity_q40: int, landmark: Landmark
+    offset: Offset, ordinal: int, observation: int, similarity_q40: int, landmark: Landmark
 ) -> ObjectSeen:
     return ObjectSeen(
         offset,

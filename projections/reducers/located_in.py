@@ -5,6 +5,7 @@ votes once it is promoted. Ties go to the place founded first. An Object none of
 has a place is nowhere.
 """
 
+from eventsrc.envelope import Offset
 from projections.deltas import ObjectMoved
 from projections.reducers import State
 
@@ -45,7 +46,7 @@ class LocatedIn:
         else:
             self._vote(seen, place)
 
-    def settle(self, offset: int) -> list[ObjectMoved]:
+    def settle(self, offset: Offset) -> list[ObjectMoved]:
         """Decide again for every Object whose votes changed; those that moved, ascending."""
         if not self._touched:
             return []

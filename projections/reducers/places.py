@@ -26,6 +26,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from eventsrc.envelope import Offset, RunId
 from projections.deltas import Delta, KeyframePlaced, Link, PlaceChanged, PlaceFormed, PlacesMerged
 from projections.reducers import State, part, prefixed
 
@@ -51,7 +52,14 @@ class Places:
         self.sums_y_um: list[int] = []
 
     def fold(
-        self, offset: int, keyframe: int, run: int, run_id: str, x_um: int, y_um: int, yaw: float
+        self,
+        offset: Offset,
+        keyframe: int,
+        run: int,
+        run_id: RunId,
+        x_um: int,
+        y_um: int,
+        yaw: float,
     ) -> list[Delta]:
         """Take in a keyframe with a pose; what it changed, in the order of the delta contract."""
         point = len(self.joined)
@@ -121,7 +129,7 @@ class Places:
         self.crowd.load(part("crowd", state))
 
     def _grow(
-        self, offset: int, newcomer: int, fresh: list[int], deltas: list[Delta]
+        self, offset: Offset, newcomer: int, fresh: list[int], deltas: list[Delta]
     ) -> dict[int, int]:
         """Found, extend and merge around the fresh core points; who joins which place by it."""
         joining: dict[int, int] = {}
@@ -195,7 +203,7 @@ class Places:
                 best = place
         return best
 
-    def _found(self, offset: int, founder: int, deltas: list[Delta]) -> int:
+    def _found(self, offset: Offset, founder: int, deltas: list[Delta]) -> int:
         place, run = len(self.survivors), self.runs[founder]
         counter = self.founded.get(run, 0)
         self.founded[run] = counter + 1
@@ -208,7 +216,7 @@ class Places:
         return place
 
     def _merge(
-        self, offset: int, newcomer: int, survivor: int, touched: dict[int, tuple[int, int]]
+        self, offset: Offset, newcomer: int, survivor: int, touched: dict[int, tuple[int, int]]
     ) -> PlacesMerged:
         absorbed = tuple(sorted(place for place in touched if place != survivor))
         counts = self.member_counts
@@ -238,7 +246,7 @@ class Places:
         self.sums_x_um[place] += self.crowd.x[point]
         self.sums_y_um[place] += self.crowd.y[point]
 
-    def _changed(self, offset: int, place: int) -> PlaceChanged:
+    def _changed(self, offset: Offset, place: int) -> PlaceChanged:
         return PlaceChanged(
             offset,
             place,

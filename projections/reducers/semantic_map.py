@@ -26,6 +26,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from eventsrc.envelope import FIRST_OFFSET, Offset, RunId
 from eventsrc.ingest import Accepted
 from projections.deltas import (
     Delta,
@@ -93,7 +94,7 @@ class SemanticMap:
     def __init__(self, settings: Settings, neighbourhood: Neighbourhood | None = None) -> None:
         _check_named(settings, neighbourhood)
         self.settings = settings
-        self.next_offset = 0
+        self.next_offset = FIRST_OFFSET
         self.seen = Seen()
         self.space = Space(settings)
         self.places = Places(
@@ -106,24 +107,24 @@ class SemanticMap:
         self.adjacency = Adjacency()
         self.observation_count = 0
 
-    def skip(self, offset: int) -> None:
+    def skip(self, offset: Offset) -> None:
         """Pass over an event that says nothing about the map."""
-        self.next_offset = offset + 1
+        self.next_offset = Offset(offset + 1)
 
     def fold(
-        self, offset: int, accepted: Accepted, units: Sequence[Units | None] | None = None
+        self, offset: Offset, accepted: Accepted, units: Sequence[Units | None] | None = None
     ) -> list[Delta]:
         """Take in one envelope; what it changed, in the order `projections.deltas` states.
 
         ``units`` is ``unit_vectors(accepted.vectors)`` for a caller who made it beforehand.
         """
-        self.next_offset = offset + 1
+        self.next_offset = Offset(offset + 1)
         envelope, seen = accepted.envelope, self.seen
         digest = content_digest(accepted)
         earlier = seen.find(envelope.run_id, envelope.keyframe_id)
         if earlier is not None:
             kind = "duplicate" if seen.digest_of(earlier) == digest else "conflict"
-            first = seen.offsets[earlier]
+            first = Offset(seen.offsets[earlier])
             return [EventSkipped(offset, kind, envelope.run_id, envelope.keyframe_id, None, first)]
         deltas: list[Delta] = []
         run, is_news = seen.run(envelope.run_id, envelope.timestamp)
@@ -183,7 +184,7 @@ class SemanticMap:
 
     def _observe(
         self,
-        offset: int,
+        offset: Offset,
         keyframe: int,
         accepted: Accepted,
         units: Sequence[Units | None],
@@ -224,7 +225,7 @@ class SemanticMap:
             self.observation_count += 1
         return sightings
 
-    def _reused(self, offset: int, accepted: Accepted, det_id: str, first: int) -> EventSkipped:
+    def _reused(self, offset: Offset, accepted: Accepted, det_id: str, first: int) -> EventSkipped:
         envelope = accepted.envelope
         return EventSkipped(
             offset,
@@ -232,11 +233,17 @@ class SemanticMap:
             envelope.run_id,
             envelope.keyframe_id,
             det_id,
-            self.seen.offsets[first],
+            Offset(self.seen.offsets[first]),
         )
 
     def _place(
-        self, offset: int, keyframe: int, run: int, run_id: str, pose: Pose, deltas: list[Delta]
+        self,
+        offset: Offset,
+        keyframe: int,
+        run: int,
+        run_id: RunId,
+        pose: Pose,
+        deltas: list[Delta],
     ) -> int | None:
         """Run places and tell who depends on them; the keyframe's own place."""
         seen, place = self.seen, None
@@ -260,7 +267,7 @@ class SemanticMap:
 
     def _fuse(
         self,
-        offset: int,
+        offset: Offset,
         keyframe: int,
         place: int | None,
         pose: Pose,

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from eventsrc.envelope import RunId
 from eventsrc.log import LogReader
 from eventsrc.log.seek import Note, resolve
 from eventsrc.text import counted
@@ -44,7 +45,7 @@ class Match:
 
     observation: int
     det_id: str
-    run_id: str
+    run_id: RunId
     similarity: float
     pose: Pose | None
     bbox: Box | None
