@@ -1,7 +1,4 @@
-"""`mapfold evaluate`: how good are the places, the objects and the re-localisation.
-
-Scores against a truth that says nothing of the map look perfect; people are told so.
-"""
+"""`mapfold evaluate`: how good are the places, the objects and the re-localisation."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,7 +10,6 @@ from projections.evaluate import evaluate as score
 from projections.evaluate import read_truth
 from projections.evaluate.picture import draw_failures
 from projections.evaluate.questions import DEFAULT_SEED
-from projections.evaluate.run import scores_text
 
 from .options import (
     HfovOption,
@@ -29,12 +25,29 @@ from .options import (
 from .relocalize import method_from
 from .terminal import display, emit, say
 
-
-def warn_of_no_truth(log: Path, scores: Mapping[str, Any] | None) -> None:
-    """Say so when none of a map's keyframes and observations has truth; None is no scores."""
-    if scores is None or scores["places"]["rooms"] or scores["objects"]["instances"]:
-        return
-    say(f"no truth for any keyframe of {log}: its places and objects are not scored; see --truth")
+_ROWS = (
+    ("questions", "questions"),
+    ("known", "… of things in the map"),
+    ("top1_room", "first place is the room"),
+    ("top3_room", "… one of three is"),
+    ("top1_contains_room", "first place contains it"),
+    ("nearest_place", "first place is the nearest"),
+    ("room_at_pose", "pose lies in the room"),
+    ("pose_room", "nearest mapped pose does"),
+    ("room_ceiling", "… could: room was mapped"),
+    ("pose_error_m.p50", "pose error p50, m"),
+    ("pose_error_m.p90", "pose error p90, m"),
+    ("yaw_error_rad.p50", "yaw error p50, rad"),
+    ("centroid_error_m.p50", "place's centroid p50, m"),
+    ("centroid_error_m.p90", "place's centroid p90, m"),
+    ("within_1_5_m", "pose within 1.5 m"),
+    ("known_called_unknown", "known called unknown"),
+    ("unknown_called_unknown", "unknown called unknown"),
+    ("auroc", "AUROC known / unknown"),
+    ("ece", "calibration error"),
+    ("latency_ms.p50", "latency p50, ms"),
+    ("latency_ms.p99", "latency p99, ms"),
+)
 
 
 def evaluate(
@@ -85,6 +98,49 @@ def evaluate(
         display(scores_text(result.scores))
     if picture is not None:
         draw_failures(result.view, result.trials[3], picture)
+
+
+def warn_of_no_truth(log: Path, scores: Mapping[str, Any] | None) -> None:
+    """Say so when none of a map's keyframes and observations has truth; None is no scores.
+
+    Without the warning the scores of nothing look perfect.
+    """
+    if scores is None or scores["places"]["rooms"] or scores["objects"]["instances"]:
+        return
+    say(f"no truth for any keyframe of {log}: its places and objects are not scored; see --truth")
+
+
+def scores_text(scores: Mapping[str, Any]) -> str:
+    """The scores as a table: places, objects, then re-localisation by number of crops."""
+    lines = [_score_line("places", scores["places"]), _score_line("objects", scores["objects"]), ""]
+    by_crops = scores["relocalization"]
+    heads = [f"{n} crop{'s' if n != '1' else ''}" for n in by_crops]
+    lines.append(f"re-localisation ({scores['method']})".ljust(28) + _cells(heads))
+    for path, label in _ROWS:
+        values = [_cell(_value_at(column, path)) for column in by_crops.values()]
+        lines.append("  " + label.ljust(26) + _cells(values))
+    return "\n".join(lines) + "\n"
+
+
+def _score_line(title: str, scores: Mapping[str, Any]) -> str:
+    return f"{title}: " + ", ".join(f"{k} {_cell(v)}" for k, v in scores.items())
+
+
+def _cells(cells: list[str]) -> str:
+    return "".join(cell.rjust(10) for cell in cells)
+
+
+def _value_at(column: Mapping[str, Any], path: str) -> Any:
+    value: Any = column
+    for part in path.split("."):
+        value = value[part]
+    return value
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.3f}" if isinstance(value, float) else str(value)
 
 
 def register(app: typer.Typer) -> None:

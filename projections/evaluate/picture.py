@@ -1,4 +1,4 @@
-"""Where re-localisation fails: each question's true spot, and a line to where the answer was."""
+"""Picture of an evaluation: each question's true position, and a line to a wrong answer."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,7 +6,6 @@ from pathlib import Path
 from eventsrc.errors import MisuseError
 from projections.model.view import MapView
 
-from .run import right
 from .trials import Trial
 
 _GOOD, _BAD, _UNKNOWN, _DRIVE = "#2a7f62", "#c0392b", "#8e8e8e", "#d9d9d9"
@@ -26,7 +25,9 @@ def draw_failures(view: MapView, trials: Sequence[Trial], out: Path) -> None:
         if trial.known:
             _draw(axes, trial)
     known = [t for t in trials if t.known]
-    axes.set_title(f"{sum(right(t) for t in known)} of {len(known)} poses within 1.5 m", loc="left")
+    axes.set_title(
+        f"{sum(t.correct for t in known)} of {len(known)} poses within 1.5 m", loc="left"
+    )
     axes.set_xlabel(
         "green: within 1.5 m   red: not, with a line to the answer   grey: answered 'unknown'"
     )
@@ -39,8 +40,8 @@ def draw_failures(view: MapView, trials: Sequence[Trial], out: Path) -> None:
 
 def _draw(axes: object, trial: Trial) -> None:
     question, pose = trial.question, trial.answer.pose
-    colour = _GOOD if right(trial) else _UNKNOWN if trial.answer.unknown else _BAD
-    if pose is not None and not right(trial):
+    colour = _GOOD if trial.correct else _UNKNOWN if trial.answer.unknown else _BAD
+    if pose is not None and not trial.correct:
         axes.plot(  # type: ignore[attr-defined]
             [question.x, pose.x], [question.y, pose.y], color=colour, linewidth=0.7, alpha=0.6
         )

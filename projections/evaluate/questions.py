@@ -1,4 +1,4 @@
-"""Questions for the evaluation: from every query keyframe with enough crops, the same ones always.
+"""Questions for the evaluation, one from each query keyframe with enough crops; repeatable.
 
 Which crops of a keyframe are asked with is drawn by hashing ``seed`` and each det_id; the one-crop
 question's crop is among the two-crop question's, and so on. The truth only scores the answer.
@@ -61,7 +61,7 @@ def make_questions(
         key = (keyframe.envelope.run_id, keyframe.envelope.keyframe_id)
         usable = [i for i, vector in enumerate(keyframe.vectors) if vector is not None]
         if key in truth.keyframes and len(usable) >= crops:
-            drawn = sorted(usable, key=lambda i: _draw(seed, keyframe.det_ids[i]))[:crops]
+            drawn = sorted(usable, key=lambda i: _draw_key(seed, keyframe.det_ids[i]))[:crops]
             found.append(_question(keyframe, key, truth, drawn))
     return found
 
@@ -79,7 +79,7 @@ def check_truth(keyframes: Iterable[Accepted], truth: Truth) -> None:
     )
 
 
-def _draw(seed: int, det_id: str) -> bytes:
+def _draw_key(seed: int, det_id: str) -> bytes:
     return hashlib.sha256(f"{seed}:{det_id}".encode()).digest()
 
 

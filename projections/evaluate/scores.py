@@ -1,13 +1,9 @@
-"""How well two labellings agree: homogeneity, completeness, V, adjusted Rand.
+"""Scores: agreement of clusterings, places and objects against the truth, calibration, AUROC.
 
 Homogeneity is 1 when each cluster holds one class only, completeness when each class is in one
 cluster only, V is their harmonic mean (Rosenberg & Hirschberg 2007). The adjusted Rand index counts
 pairs and is 0 for chance (Hubert & Arabie 1985). Sums are exact (`math.fsum`) or of integers, so
 the order of things does not matter.
-
-Scores of the map itself: places against rooms, objects against instances.
-
-Is a confidence of 0.8 right four times in five, and does it tell known from unknown?
 """
 
 import math
@@ -20,6 +16,11 @@ from projections.model.partitions import adjusted_rand_of_pairs
 from projections.model.view import MapView
 
 from .truth import Key, Truth
+
+SPANS_FROM = 0.1
+"""A place spans two rooms when a second room has at least this share of its members."""
+BINS = 10
+"""Of the confidence, for calibration."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,10 +64,6 @@ def _adjusted_rand(
     )
     pairs = total * (total - 1) // 2
     return float(adjusted_rand_of_pairs(pairs, together, in_class, in_cluster))
-
-
-SPANS_FROM = 0.1
-"""A place spans two rooms when a second room has at least this share of its members."""
 
 
 def place_scores(view: MapView, truth: Truth) -> dict[str, Any]:
@@ -128,9 +125,6 @@ def instances_of(view: MapView, truth: Truth) -> Iterable[tuple[int, str | None]
         if key in truth.keyframes:
             for index, observation in enumerate(keyframe.observations):
                 yield observation, truth.instance(key, index)
-
-
-BINS = 10
 
 
 def expected_calibration_error(confidence: Sequence[float], right: Sequence[bool]) -> float:

@@ -1,11 +1,4 @@
-"""Asking: each question put to the map, and its answer held against the truth.
-
-In which room a position is, by every keyframe whose room is known: a floor plan of sorts.
-
-The map's own keyframes cannot name a room the map never entered, though a pose may well lie in it.
-So the whole of the map's log counts, also what comes after ``--at``, and the query runs that saw a
-thing the map's log saw too; another building's runs, in a frame of their own, do not.
-"""
+"""Trials: each question asked of the map, and its answer compared with the truth."""
 
 import math
 import time
@@ -23,25 +16,32 @@ from .questions import Question
 from .scores import instances_of
 from .truth import Key, Truth
 
+RIGHT_WITHIN_M = 1.5
 
-class FloorPlan:
-    """Nearest keyframe of known room, leaving out the one that asks."""
+
+class RoomIndex:
+    """The room at a position: that of the nearest keyframe whose room is known.
+
+    The map's own keyframes cannot name a room the map never entered, though a pose may lie in it.
+    So the whole of the map's log counts, also what comes after ``--at``, and the query runs that
+    saw an instance the map's log saw too; another building's runs, in another frame, do not.
+    """
 
     def __init__(
         self, mapped: Sequence[Accepted], asking: Sequence[Accepted], truth: Truth
     ) -> None:
-        at_home = _instances(mapped, truth)
-        runs = {_key(k)[0] for k in asking if at_home & _instances([k], truth)}
+        in_map = _instances(mapped, truth)
+        runs = {_key(k)[0] for k in asking if in_map & _instances([k], truth)}
         here = [*mapped, *(k for k in asking if _key(k)[0] in runs)]
         known = {key: k for k in here if truth.room(key := _key(k)) is not None}
         self._keys = list(known)
         self._rooms = [truth.room(key) for key in self._keys]
         poses = [(k.envelope.map_x or 0.0, k.envelope.map_y or 0.0) for k in known.values()]
-        self._at = np.array(poses, dtype=np.float64).reshape(-1, 2)
+        self._positions = np.array(poses, dtype=np.float64).reshape(-1, 2)
 
     def room(self, x: float, y: float, asking: Key) -> str | None:
-        """The room at a position in metres; None when no other keyframe's room is known."""
-        squared = ((self._at - (x, y)) ** 2).sum(1)
+        """The room at a position in metres, without the keyframe ``asking``; None if unknown."""
+        squared = ((self._positions - (x, y)) ** 2).sum(1)
         nearest = np.argsort(squared, kind="stable")[:2]
         return next((self._rooms[i] for i in nearest if self._keys[i] != asking), None)
 
@@ -57,13 +57,13 @@ def _instances(keyframes: Sequence[Accepted], truth: Truth) -> set[str]:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One question's outcome. Lengths in metres; None where the truth or the answer has nothing.
+    """One question's outcome. Lengths in metres; None where truth or answer lacks the value.
 
     ``known`` says that at least one of the crops' true instances is in the map. A place *is* a room
     when most of its keyframes are in it, and *contains* it when any is. ``room_has_place`` says
     that some place contains the true room: without one no place can be the right answer.
     ``room_of_pose`` is the room of the mapped keyframe nearest to the pose, ``room_at_pose`` the
-    room there by the `FloorPlan`, None without one.
+    room there by the `RoomIndex`, None without one.
     """
 
     question: Question
@@ -80,9 +80,14 @@ class Trial:
     nearest_place: bool | None
     seconds: float
 
+    @property
+    def correct(self) -> bool:
+        """Whether the question is known and its pose within 1.5 m of the truth."""
+        return self.known and self.pose_error_m is not None and self.pose_error_m <= RIGHT_WITHIN_M
 
-class Examiner:
-    """Puts questions to a folded map by exact search, and knows the map's own truth."""
+
+class TrialRunner:
+    """Asks questions of a folded map by exact search, and scores them with the map's own truth."""
 
     def __init__(
         self,
@@ -91,14 +96,14 @@ class Examiner:
         *,
         camera: Camera,
         method: Method,
-        plan: FloorPlan | None = None,
+        room_index: RoomIndex | None = None,
     ) -> None:
-        self._plan = plan
+        self._room_index = room_index
         self._index = ExactIndex(view)
         self._camera, self._method = camera, method
         self._instances = {i for _, i in instances_of(view, truth) if i is not None}
         self._rooms: dict[str, Counter[str]] = {p.place_id: Counter() for p in view.places.values()}
-        self._drive: list[tuple[float, float, str | None, str | None]] = []
+        self._keyframes: list[tuple[float, float, str | None, str | None]] = []
         for keyframe in view.keyframes:
             if keyframe.pose is None:
                 continue
@@ -106,53 +111,55 @@ class Examiner:
             place_id = view.place_id(keyframe.place)
             if room is not None and place_id is not None:
                 self._rooms[place_id][room] += 1
-            self._drive.append((keyframe.pose.x_um / 1e6, keyframe.pose.y_um / 1e6, room, place_id))
+            self._keyframes.append(
+                (keyframe.pose.x_um / 1e6, keyframe.pose.y_um / 1e6, room, place_id)
+            )
 
-        self._entered = {room for rooms in self._rooms.values() for room in rooms}
+        self._rooms_in_map = {room for rooms in self._rooms.values() for room in rooms}
 
-    def ask(self, questions: Iterable[Question]) -> list[Trial]:
+    def run(self, questions: Iterable[Question]) -> list[Trial]:
         """One trial for each question, three places asked for."""
-        return [self._ask(question) for question in questions]
+        return [self._run(question) for question in questions]
 
-    def _ask(self, question: Question) -> Trial:
+    def _run(self, question: Question) -> Trial:
         began = time.perf_counter()
         candidates = self._index.search(question.crops)
         answer = rank(question.crops, candidates, top=3, method=self._method, camera=self._camera)
         seconds = time.perf_counter() - began
         pose, places = answer.pose, answer.places
         known = any(i in self._instances for i in question.instances if i is not None)
-        here = self._nearest(question.x, question.y)
+        true_place = self._nearest(question.x, question.y)[3]
         return Trial(
             question,
             answer,
             known,
             None if pose is None else math.hypot(pose.x - question.x, pose.y - question.y),
-            None if pose is None or pose.yaw is None else _turn(pose.yaw - question.yaw),
+            None if pose is None or pose.yaw is None else _angle_size(pose.yaw - question.yaw),
             math.hypot(places[0].centroid_x - question.x, places[0].centroid_y - question.y)
             if places
             else None,
             None if pose is None else self._nearest(pose.x, pose.y)[2],
             None
-            if pose is None or self._plan is None
-            else self._plan.room(pose.x, pose.y, question.key),
-            question.room in self._entered,
+            if pose is None or self._room_index is None
+            else self._room_index.room(pose.x, pose.y, question.key),
+            question.room in self._rooms_in_map,
             tuple(self._room_of(place.place_id) for place in places),
             tuple((question.room or "") in self._rooms[place.place_id] for place in places),
-            None if here[3] is None or not places else places[0].place_id == here[3],
+            None if true_place is None or not places else places[0].place_id == true_place,
             seconds,
         )
 
     def _nearest(self, x: float, y: float) -> tuple[float, float, str | None, str | None]:
         """The map keyframe nearest to a position; ties go to the earlier one."""
-        if not self._drive:
+        if not self._keyframes:
             return x, y, None, None
-        return min(self._drive, key=lambda k: (k[0] - x) ** 2 + (k[1] - y) ** 2)
+        return min(self._keyframes, key=lambda k: (k[0] - x) ** 2 + (k[1] - y) ** 2)
 
     def _room_of(self, place_id: str) -> str | None:
         rooms = self._rooms[place_id]
         return max(sorted(rooms), key=rooms.__getitem__) if rooms else None
 
 
-def _turn(angle: float) -> float:
-    """The size of an angle difference, 0 … π."""
+def _angle_size(angle: float) -> float:
+    """The size of an angle, 0 … π."""
     return abs(math.remainder(angle, 2.0 * math.pi))

@@ -22,7 +22,7 @@ Key = tuple[str, int]
 
 
 class TrueKeyframe(BaseModel):
-    """What is true of one keyframe."""
+    """The truth of one keyframe, as in the file."""
 
     model_config = ConfigDict(frozen=True, strict=True)
 

@@ -1,6 +1,6 @@
-"""The room at a position: by other keyframes of this building, never by the one that asks."""
+"""The room at a position: by other keyframes of this building, never by the one asked from."""
 
-from projections.evaluate.trials import FloorPlan
+from projections.evaluate.trials import RoomIndex
 from projections.evaluate.truth import TrueKeyframe, Truth
 from tests.relocalization.buildings import Building
 from tests.relocalization.drives import drive
@@ -23,7 +23,7 @@ def truth() -> Truth:
     return Truth({(line.run_id, line.keyframe_id): line for line in lines})
 
 
-PLAN = FloorPlan([k.accepted for k in MAPPED], [k.accepted for k in (*ASKED, *FOREIGN)], truth())
+ROOMS = RoomIndex([k.accepted for k in MAPPED], [k.accepted for k in (*ASKED, *FOREIGN)], truth())
 
 
 def test_where_a_keyframe_was_is_its_room() -> None:
@@ -31,19 +31,19 @@ def test_where_a_keyframe_was_is_its_room() -> None:
         at = keyframe.accepted.envelope
         assert at.map_x is not None
         assert at.map_y is not None
-        assert PLAN.room(at.map_x, at.map_y, ("nobody", 0)) == keyframe.room
+        assert ROOMS.room(at.map_x, at.map_y, ("nobody", 0)) == keyframe.room
 
 
 def test_another_buildings_runs_name_no_room_here() -> None:
     for keyframe in FOREIGN:
         at = keyframe.accepted.envelope
-        room = PLAN.room(at.map_x or 0.0, at.map_y or 0.0, ("nobody", 0))
+        room = ROOMS.room(at.map_x or 0.0, at.map_y or 0.0, ("nobody", 0))
         assert room is not None
         assert not room.startswith("foreign")
 
 
 def test_a_keyframe_does_not_vouch_for_itself() -> None:
     only = [MAPPED[0].accepted]
-    plan = FloorPlan(only, [], truth())
-    assert plan.room(0.0, 0.0, ("nobody", 0)) == MAPPED[0].room
-    assert plan.room(0.0, 0.0, ("a", only[0].envelope.keyframe_id)) is None
+    rooms = RoomIndex(only, [], truth())
+    assert rooms.room(0.0, 0.0, ("nobody", 0)) == MAPPED[0].room
+    assert rooms.room(0.0, 0.0, ("a", only[0].envelope.keyframe_id)) is None
