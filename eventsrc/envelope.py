@@ -1,9 +1,9 @@
 """The envelope: one keyframe's message as it came over Zenoh (DESIGN section 3).
 
-The models say what a *valid* envelope is. They are strict: an int is not a string, NaN is not a
-number. Unknown fields need only be JSON; they are ignored here and kept in the log, which stores
-the payload verbatim. Making one from bytes, with every refusal named, is the job of
-`eventsrc.ingest`.
+The models define a *valid* envelope. They are strict: an int is not a string, NaN is not a number.
+Unknown fields need only be JSON; they are ignored here, and the log keeps them, since it stores the
+payload verbatim. `eventsrc.ingest` makes an envelope from bytes and gives the reason if it cannot.
+The docstrings of the models are part of the JSON schema in every segment: do not change them.
 
 Here too are the types of what identifies things: `Offset`, `RunId`, `KeyframeId`, `DetId`. They are
 ints and strings at run time; mypy keeps them apart.
@@ -35,7 +35,7 @@ KeyframeId = NewType("KeyframeId", int)
 DetId = NewType("DetId", str)
 
 ENVELOPE_VERSION = 2
-"""The version of the models below. Older ones climb a ladder to it, see `eventsrc.upcast`."""
+"""The version of the models below; `eventsrc.upcast` converts older ones to it."""
 
 MAX_ID_LENGTH = 256
 MAX_POSITION_M = 1e7
@@ -54,8 +54,8 @@ Text = Annotated[str, _TEXT]
 """An id or a name: 1 to 256 characters, none of them a control character (category Cc)."""
 
 
-def fault(error: ErrorDetails) -> str:
-    """What is wrong, in words: pydantic's, but for a `Text`."""
+def describe_error(error: ErrorDetails) -> str:
+    """What is wrong, in pydantic's words or, for a `Text`, in ours."""
     if error["type"] not in ("string_too_long", "string_pattern_mismatch"):
         return error["msg"].removeprefix("Value error, ")
     text: str = error["input"]
@@ -72,13 +72,15 @@ Int64 = Annotated[int, _INT64]
 Position = Annotated[float, Field(ge=-MAX_POSITION_M, le=MAX_POSITION_M)]
 
 
-class NotFinite(Exception):
-    """An unknown field holds NaN or infinity. No ValueError, so that pydantic stops at the first
-    instead of collecting one error for each of a million fields."""
+class NonFinite(Exception):
+    """An unknown field holds NaN or infinity.
+
+    No ValueError, so that pydantic stops at the first one instead of collecting a million errors.
+    """
 
 
-def holds_not_finite(value: object) -> bool:
-    """Whether NaN or infinity stands anywhere in a JSON value."""
+def contains_non_finite(value: object) -> bool:
+    """Whether NaN or infinity is anywhere in a JSON value."""
     rest = [value]
     while rest:
         item = rest.pop()
@@ -92,19 +94,19 @@ def holds_not_finite(value: object) -> bool:
     return False
 
 
-def _checked_and_forgotten(value: object) -> None:
-    """Refuse NaN and infinity anywhere in an unknown field: JSON has no word for them, and whoever
-    reads the log as JSON would stumble. The value is then forgotten here; the log has it."""
-    if isinstance(value, float | list | dict) and holds_not_finite(value):
-        raise NotFinite
+def _require_finite(value: object) -> None:
+    """Raise NonFinite for NaN or infinity in an unknown field: they are not JSON, and a reader of
+    the log that parses JSON would fail. Returns None: the model drops the value, the log has it."""
+    if isinstance(value, float | list | dict) and contains_non_finite(value):
+        raise NonFinite
 
 
-Unknown = Annotated[Any, AfterValidator(_checked_and_forgotten)]
+Unknown = Annotated[Any, AfterValidator(_require_finite)]
 
 
 class _Model(BaseModel):
     __pydantic_extra__: dict[str, Unknown]
-    # "allow" is what has unknown fields checked; it costs nothing where there are none.
+    # "allow" makes pydantic check unknown fields; it costs nothing without any.
     model_config = ConfigDict(
         strict=True, frozen=True, extra="allow", allow_inf_nan=False, populate_by_name=True
     )
@@ -142,7 +144,7 @@ class Envelope(_Model):
     detections: Annotated[tuple[Detection, ...], Field(max_length=MAX_DETECTIONS), FailFast()]
 
     @model_validator(mode="after")
-    def _pose_is_whole(self) -> "Envelope":
+    def _check_pose(self) -> "Envelope":
         if not (self.map_x is None) is (self.map_y is None) is (self.map_yaw is None):
             raise ValueError("map_x, map_y and map_yaw must all be numbers or all be absent")
         return self
@@ -153,10 +155,10 @@ class Envelope(_Model):
         text = repr(self.timestamp)
         whole, _, part = text.partition(".")
         if 0 < len(part) <= 9 and "e" not in part:
-            return int(whole + part.ljust(9, "0"))  # the quick way to the same
+            return int(whole + part.ljust(9, "0"))  # the same, faster
         return int(Decimal(text).scaleb(9).to_integral_value())
 
 
 def default_det_id(run_id: RunId, keyframe_id: KeyframeId, index: int) -> DetId:
-    """The id of the ``index``-th detection (from 0) of a keyframe that names none itself."""
+    """The id of a keyframe's detection ``index`` (from 0) that has none of its own."""
     return DetId(f"{run_id}_kf{keyframe_id}_d{index}")

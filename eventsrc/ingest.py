@@ -1,8 +1,8 @@
-"""From bytes to Accepted or Rejected: what is refused at the door, and why (DESIGN section 3).
+"""Validate the bytes of an envelope: `Accepted`, or `Rejected` with the reason (DESIGN section 3).
 
-No I/O. The same function guards the recorder, the importer and the fold, so a log holds nothing
-under a robot's key that the fold cannot read. A refusal keeps the bytes; its caller writes them to
-the ``mapfold/rejected`` channel.
+No I/O. The recorder, the importer and the fold all use it, so a log holds nothing under a robot's
+key that the fold cannot read. The caller writes a rejected payload, with its bytes, to the
+``mapfold/rejected`` channel. The reasons are part of those events.
 """
 
 import binascii
@@ -18,24 +18,32 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import from_json
 
-from .envelope import Detection, DetId, Envelope, NotFinite, default_det_id, fault, holds_not_finite
+from .envelope import (
+    Detection,
+    DetId,
+    Envelope,
+    NonFinite,
+    contains_non_finite,
+    default_det_id,
+    describe_error,
+)
 from .text import visible
 
 DEFAULT_MAX_PAYLOAD_BYTES = 16 * 1024 * 1024
 MAX_PAYLOAD_BYTES = 2 * DEFAULT_MAX_PAYLOAD_BYTES
-"""Of what may be asked for: a log keeps events of up to 96 MiB, and what is rejected as base64."""
-MAX_MARKS = 500_000
-"""Bound of the commas and opening brackets in one payload, as many as it has values: reading JSON
-costs some hundred bytes and a microsecond a value, however short the value."""
-_FEW_MARKS_BYTES: Final = 64 * 1024
-"""Payloads up to here are not counted: they cannot cost much."""
-_QUOTED: Final = 80
+"""Bound of ``max_bytes``: a log keeps events of up to 96 MiB, and rejected payloads as base64."""
+MAX_JSON_VALUES = 500_000
+"""Bound of the values in one payload, counted as commas and opening brackets: parsing JSON costs
+some hundred bytes and a microsecond a value, however short the value."""
+_UNCOUNTED_BYTES: Final = 64 * 1024
+"""In payloads up to this size values are not counted."""
+_MAX_SHOWN: Final = 80
 """How many characters of a value a reason shows."""
 
 Vector = NDArray[np.float32]
 _FLOAT32 = np.dtype("<f4")
 _validate_json: Callable[[bytes], Envelope] = TypeAdapter(Envelope).validator.validate_json
-"""``Envelope.model_validate_json`` without the layer of Python around it, a twentieth of it."""
+"""``Envelope.model_validate_json`` without its Python wrapper, a twentieth of the time."""
 
 
 class Accepted(msgspec.Struct, frozen=True, gc=False):
@@ -57,85 +65,85 @@ class Rejected(msgspec.Struct, frozen=True, gc=False):
     reason: str
 
 
-class _RefusalError(Exception):
-    """Inside this module only: carries a reason up to `ingest`."""
+class _RejectionError(Exception):
+    """Carries a reason up to `ingest`, within this module."""
 
 
 def ingest(payload: bytes, *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES) -> Accepted | Rejected:
-    """Read one envelope. Never raises for bad input; it says Rejected and why."""
+    """Validate one envelope and decode its vectors. Never raises for bad input."""
     return ingest_all((payload,), max_bytes=max_bytes)[0]
 
 
 def ingest_all(
     payloads: Sequence[bytes], *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES
 ) -> list[Accepted | Rejected]:
-    """`ingest` of each, none dependent on another. Decoding their vectors together saves time."""
+    """`ingest` of each, faster: their vectors are decoded together."""
     read = [_read(payload, max_bytes) for payload in payloads]
-    rows = _rows_of_one_kind(_detections(read))
+    rows = _decode_uniform(_detections(read))
     if rows is None:
-        return [_admit(said, None) for said in read]
-    coming = iter(list(rows))
-    return [_admit(said, coming) for said in read]
+        return [_accept(result, None) for result in read]
+    vectors = iter(list(rows))
+    return [_accept(result, vectors) for result in read]
 
 
 def check_all(
     payloads: Sequence[bytes], *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES
 ) -> list[Envelope | Rejected]:
-    """What `ingest_all` says to each, without its vectors and ids: for who only keeps the bytes."""
+    """Like `ingest_all`, without the vectors and ids: for callers that only keep the bytes."""
     read = [_read(payload, max_bytes) for payload in payloads]
-    if _rows_of_one_kind(_detections(read)) is not None:
-        return [_check_det_ids(said) for said in read]
-    admitted = [_admit(said, None) for said in read]
-    return [said if isinstance(said, Rejected) else said.envelope for said in admitted]
+    if _decode_uniform(_detections(read)) is not None:
+        return [_check_det_ids(result) for result in read]
+    accepted = [_accept(result, None) for result in read]
+    return [result if isinstance(result, Rejected) else result.envelope for result in accepted]
 
 
 def _detections(read: Sequence[Envelope | Rejected]) -> list[Detection]:
-    return [d for said in read if isinstance(said, Envelope) for d in said.detections]
+    return [d for result in read if isinstance(result, Envelope) for d in result.detections]
 
 
-def excess(payload: bytes, max_bytes: int) -> Rejected | None:
-    """The refusal of a payload that would cost too much to read, told before it is read."""
+def check_cost(payload: bytes, max_bytes: int) -> Rejected | None:
+    """The rejection of a payload that would cost too much to parse, found without parsing it."""
     if len(payload) > max_bytes:
         return Rejected(f"payload of {len(payload)} bytes is over the limit of {max_bytes}")
-    if len(payload) > _FEW_MARKS_BYTES:
-        marks = sum(map(payload.count, (b",", b"[", b"{")))
-        if marks > MAX_MARKS:
+    if len(payload) > _UNCOUNTED_BYTES:
+        values = sum(map(payload.count, (b",", b"[", b"{")))
+        if values > MAX_JSON_VALUES:
             return Rejected(
-                f"payload of {marks:,} commas and opening brackets, more than {MAX_MARKS:,}"
+                f"payload of {values:,} commas and opening brackets, more than {MAX_JSON_VALUES:,}"
             )
     return None
 
 
 def _read(payload: bytes, max_bytes: int) -> Envelope | Rejected:
-    refused = excess(payload, max_bytes)
-    if refused is not None:
-        return refused
+    rejected = check_cost(payload, max_bytes)
+    if rejected is not None:
+        return rejected
     try:
         return _validate_json(payload)
     except ValidationError as error:
-        return Rejected(_first_error(error, payload))
-    except NotFinite:
-        return Rejected(_not_finite(from_json(payload)))
-    except RecursionError:  # nesting deeper than the parser follows
+        return Rejected(_error_reason(error, payload))
+    except NonFinite:
+        return Rejected(_non_finite_reason(from_json(payload)))
+    except RecursionError:  # nested deeper than the parser's limit
         return Rejected("not JSON that can be read: nested too deeply")
 
 
-def _admit(said: Envelope | Rejected, vectors: Iterator[Vector] | None) -> Accepted | Rejected:
-    """The last steps, which look at several fields; ``vectors`` are those to come, if decoded."""
-    if isinstance(said, Rejected):
-        return said
-    own = None if vectors is None else tuple(islice(vectors, len(said.detections)))
+def _accept(result: Envelope | Rejected, vectors: Iterator[Vector] | None) -> Accepted | Rejected:
+    """Ids and vectors of a parsed envelope; ``vectors`` yields those of all, if decoded already."""
+    if isinstance(result, Rejected):
+        return result
+    own = None if vectors is None else tuple(islice(vectors, len(result.detections)))
     try:
-        return Accepted(said, _det_ids(said), _vectors(said) if own is None else own)
-    except _RefusalError as refusal:
-        return Rejected(str(refusal))
+        return Accepted(result, _det_ids(result), _decode_vectors(result) if own is None else own)
+    except _RejectionError as rejection:
+        return Rejected(str(rejection))
 
 
-def _first_error(error: ValidationError, payload: bytes) -> str:
-    """One line for the first thing that is wrong, and how many more pydantic met before it stopped.
+def _error_reason(error: ValidationError, payload: bytes) -> str:
+    """One line for the first error, and the number of further ones before pydantic stopped.
 
-    Pydantic would give the wrong value with each error, the whole envelope for every field that is
-    missing in it; so the one that is shown is looked up instead.
+    Pydantic would copy the wrong value into each error, the whole envelope for every missing field;
+    so the one value that is shown is looked up here instead.
     """
     details = error.errors(include_url=False, include_context=False, include_input=False)
     first = details[0]
@@ -144,21 +152,20 @@ def _first_error(error: ValidationError, payload: bytes) -> str:
     if first["type"] == "model_type" and not first["loc"]:
         return f"not a JSON object but {type(from_json(payload)).__name__}"
     more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
-    place = _place(*first["loc"])
+    path = _field_path(*first["loc"])
     if first["type"] == "missing":
-        return f"{place}: required field is missing{more}"
+        return f"{path}: required field is missing{more}"
     if not first["loc"]:
-        return f"{fault(first)}{more}"
+        return f"{describe_error(first)}{more}"
     value = from_json(payload)
     for part in first["loc"]:
         value = value[part]
     first["input"] = value
-    return f"{place}: {fault(first)} (got {quoted(value)}){more}"
+    return f"{path}: {describe_error(first)} (got {abbreviate(value)}){more}"
 
 
-def _not_finite(document: Any) -> str:
-    """The reason for an object with NaN or infinity in a field that an envelope does not know.
-    There may be more that is wrong with it."""
+def _non_finite_reason(document: Any) -> str:
+    """The reason for NaN or infinity in an unknown field; there may be further errors."""
     of_envelope = (((name,), value) for name, value in document.items() if name != "detections")
     detections = document.get("detections")
     of_detections = (
@@ -168,23 +175,23 @@ def _not_finite(document: Any) -> str:
         for name, value in detection.items()
     )
     fields: Iterator[tuple[tuple[str | int, ...], Any]] = chain(of_envelope, of_detections)
-    place, value = next(field for field in fields if holds_not_finite(field[1]))
-    return f"{_place(*place)}: holds NaN or infinity (got {quoted(value)})"
+    path, value = next(field for field in fields if contains_non_finite(field[1]))
+    return f"{_field_path(*path)}: holds NaN or infinity (got {abbreviate(value)})"
 
 
-def _place(*parts: str | int) -> str:
-    """``detections.3.bbox``, however long or odd a field's name is."""
-    return visible(".".join(str(part)[:_QUOTED] for part in parts))
+def _field_path(*parts: str | int) -> str:
+    """``detections.3.bbox``, bounded and printable whatever the field's name."""
+    return visible(".".join(str(part)[:_MAX_SHOWN] for part in parts))
 
 
-def quoted(value: Any) -> str:
-    """The beginning of a JSON value as Python writes it, at the cost of no more than that."""
-    text = _beginning(value, _QUOTED)
-    return text if len(text) <= _QUOTED else text[: _QUOTED - 3] + "..."
+def abbreviate(value: Any) -> str:
+    """The first characters of ``repr(value)``, without the cost of the whole."""
+    text = _repr_start(value, _MAX_SHOWN)
+    return text if len(text) <= _MAX_SHOWN else text[: _MAX_SHOWN - 3] + "..."
 
 
-def _beginning(value: Any, room: int) -> str:
-    """``repr(value)``, of which only the first ``room`` characters count."""
+def _repr_start(value: Any, room: int) -> str:
+    """``repr(value)``, or a text with the same first ``room`` characters."""
     if isinstance(value, str):
         return repr(value[: room + 1])
     if not isinstance(value, list | dict):
@@ -195,23 +202,23 @@ def _beginning(value: Any, room: int) -> str:
             break
         text += ", " if text else ""
         if isinstance(item, tuple):  # a member of an object
-            text += f"{_beginning(item[0], room)}: {_beginning(item[1], room - len(text))}"
+            text += f"{_repr_start(item[0], room)}: {_repr_start(item[1], room - len(text))}"
         else:
-            text += _beginning(item, room - len(text))
+            text += _repr_start(item, room - len(text))
     return f"{{{text}}}" if isinstance(value, dict) else f"[{text}]"
 
 
-def _check_det_ids(said: Envelope | Rejected) -> Envelope | Rejected:
-    if isinstance(said, Rejected):
-        return said
-    for detection in said.detections:
-        if detection.det_id is not None:  # the ids that mapfold gives differ from one another
+def _check_det_ids(result: Envelope | Rejected) -> Envelope | Rejected:
+    if isinstance(result, Rejected):
+        return result
+    for detection in result.detections:
+        if detection.det_id is not None:  # default ids are distinct
             try:
-                _det_ids(said)
-            except _RefusalError as refusal:
-                return Rejected(str(refusal))
+                _det_ids(result)
+            except _RejectionError as rejection:
+                return Rejected(str(rejection))
             break
-    return said
+    return result
 
 
 def _det_ids(envelope: Envelope) -> tuple[DetId, ...]:
@@ -226,26 +233,27 @@ def _det_ids(envelope: Envelope) -> tuple[DetId, ...]:
     seen: set[DetId] = set()
     for index, det_id in enumerate(ids):
         if det_id in seen:
-            raise _RefusalError(
+            raise _RejectionError(
                 f"detections.{index}.det_id: {det_id!r} stands twice in one envelope"
             )
         seen.add(det_id)
     return tuple(ids)
 
 
-def _vectors(envelope: Envelope) -> tuple[Vector | None, ...]:
+def _decode_vectors(envelope: Envelope) -> tuple[Vector | None, ...]:
     detections = envelope.detections
-    rows = _rows_of_one_kind(detections)
+    rows = _decode_uniform(detections)
     if rows is not None:
         return tuple(rows)
     return tuple(
-        None if d.embedding is None else _vector(index, d) for index, d in enumerate(detections)
+        None if d.embedding is None else _decode_vector(index, d)
+        for index, d in enumerate(detections)
     )
 
 
-def _rows_of_one_kind(detections: Sequence[Detection]) -> Vector | None:
-    """All vectors, shape (len(detections), dim), if there is nothing odd about them, as a rule;
-    None to look closer."""
+def _decode_uniform(detections: Sequence[Detection]) -> Vector | None:
+    """All vectors at once, shape (len(detections), dim), if they are valid and of one dimension, as
+    is usual; None if each must be looked at."""
     try:
         raws = [pybase64.b64decode(d.embedding, None, True) for d in detections]  # type: ignore[arg-type]
     except (TypeError, ValueError):
@@ -262,35 +270,35 @@ def _rows_of_one_kind(detections: Sequence[Detection]) -> Vector | None:
     return rows
 
 
-def _vector(index: int, detection: Detection) -> Vector:
+def _decode_vector(index: int, detection: Detection) -> Vector:
     place = f"detections.{index}.embedding"
-    raw = _base64(place, detection.embedding or "")
+    raw = _decode_base64(place, detection.embedding or "")
     dim = detection.embedding_dim
     if dim is None:
-        raise _RefusalError(f"detections.{index}.embedding_dim: required beside an embedding")
+        raise _RejectionError(f"detections.{index}.embedding_dim: required beside an embedding")
     if len(raw) != 4 * dim:
-        raise _RefusalError(
+        raise _RejectionError(
             f"{place}: {len(raw)} bytes do not match embedding_dim {dim}, which takes {4 * dim}"
         )
     vector = np.frombuffer(raw, dtype="<f4")
     largest = float(np.abs(vector).max())
     if not np.isfinite(largest):
-        raise _RefusalError(f"{place}: holds NaN or infinity")
+        raise _RejectionError(f"{place}: holds NaN or infinity")
     if largest == 0.0:
-        raise _RefusalError(f"{place}: is the zero vector, which has no direction")
+        raise _RejectionError(f"{place}: is the zero vector, which has no direction")
     return vector
 
 
-def _base64(place: str, text: str) -> bytes:
+def _decode_base64(place: str, text: str) -> bytes:
     try:
         return pybase64.b64decode(text, None, True)
     except ValueError:
-        raise _RefusalError(f"{place}: not base64: {_base64_fault(text)}") from None
+        raise _RejectionError(f"{place}: not base64: {_base64_error(text)}") from None
 
 
-def _base64_fault(text: str) -> str:
-    """What is wrong with it, in the words of the standard library, which not every version of it
-    says of too much padding; so it is never the judge."""
+def _base64_error(text: str) -> str:
+    """What is wrong with ``text``, as `binascii` says. Not used to decide: not every version of it
+    refuses excess padding."""
     try:
         binascii.a2b_base64(text, strict_mode=True)
     except ValueError as error:

@@ -1,13 +1,9 @@
-"""A recorder's numbers for Prometheus, over HTTP.
+"""Metrics for Prometheus over HTTP: the recorder's, and any other values (`--metrics`).
 
-The one door to prometheus_client. The numbers are read when somebody scrapes, so metrics cost the
-recording nothing.
-
-The HTTP server behind ``--metrics``: connections that are held open cost the recorder nothing.
-
-Each request has a thread, and a connection that waits would keep it, and its file descriptor, for
-ever. Here a silent one is closed after ``SILENT_S``, and beyond ``MAX_CONNECTIONS`` the oldest
-gives way.
+Only this module imports prometheus_client. Values are read when they are scraped, so metrics cost
+the recording nothing. Each request has a thread, which a silent connection would keep, with its
+file descriptor, for ever. So a silent connection is closed after ``SILENT_S``, and beyond
+``MAX_CONNECTIONS`` the oldest is closed.
 """
 
 import contextlib
@@ -66,7 +62,7 @@ class _Server(ThreadingMixIn, WSGIServer):
         super().shutdown_request(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        if not isinstance(sys.exception(), OSError):  # who asked is gone: nobody is left to tell
+        if not isinstance(sys.exception(), OSError):  # the client has gone
             super().handle_error(request, client_address)
 
 
@@ -75,8 +71,8 @@ class _Server6(_Server):
 
 
 @contextlib.contextmanager
-def serving_wsgi(host: str, port: int, application: Callable[..., Any]) -> Iterator[int]:
-    """Serve in a thread for the length of a ``with`` block; yields the port. Raises OSError."""
+def _serving_wsgi(host: str, port: int, application: Callable[..., Any]) -> Iterator[int]:
+    """Serve in a thread within a ``with`` block; yields the port. Raises OSError."""
     kind = _Server6 if ":" in host else _Server
     with make_server(host.strip("[]"), port, application, kind, _Handler) as server:
         thread = threading.Thread(target=server.serve_forever, name="metrics", daemon=True)
@@ -126,7 +122,7 @@ class _RecorderCollector(Collector):
 def serving_metrics(
     address: tuple[str, int], report: Callable[[], RecorderReport], log: Path
 ) -> Iterator[int]:
-    """Serve ``/metrics`` for the length of a ``with`` block; yields the port, also for port 0.
+    """Serve ``/metrics`` within a ``with`` block; yields the port, also for port 0.
 
     Raises TransportError when the address cannot be listened on.
     """
@@ -135,8 +131,8 @@ def serving_metrics(
 
 
 @dataclass(frozen=True, slots=True)
-class Number:
-    """One number to serve: a counter if it only grows, else a gauge; ``labels`` tell apart."""
+class MetricValue:
+    """One value to serve: a counter if it only grows, else a gauge. ``text`` is its help."""
 
     name: str
     text: str
@@ -145,24 +141,24 @@ class Number:
     labels: tuple[tuple[str, str], ...] = ()
 
 
-class _NumbersCollector(Collector):
-    def __init__(self, numbers: Callable[[], Iterable[Number]]) -> None:
-        self._numbers = numbers
+class _ValuesCollector(Collector):
+    def __init__(self, values: Callable[[], Iterable[MetricValue]]) -> None:
+        self._values = values
 
     def collect(self) -> Iterator[Metric]:
-        for number in self._numbers():
-            family = CounterMetricFamily if number.counter else GaugeMetricFamily
-            metric = family(number.name, number.text, labels=[name for name, _ in number.labels])
-            metric.add_metric([value for _, value in number.labels], number.value)
+        for value in self._values():
+            family = CounterMetricFamily if value.counter else GaugeMetricFamily
+            metric = family(value.name, value.text, labels=[name for name, _ in value.labels])
+            metric.add_metric([text for _, text in value.labels], value.value)
             yield metric
 
 
 @contextmanager
-def serving_numbers(
-    address: tuple[str, int], numbers: Callable[[], Iterable[Number]]
+def serving_values(
+    address: tuple[str, int], values: Callable[[], Iterable[MetricValue]]
 ) -> Iterator[int]:
-    """Serve any other numbers in the same way; ``numbers`` is called at each scrape."""
-    with _serving(address, _NumbersCollector(numbers)) as port:
+    """Serve other values in the same way; ``values`` is called at each scrape."""
+    with _serving(address, _ValuesCollector(values)) as port:
         yield port
 
 
@@ -173,7 +169,7 @@ def _serving(address: tuple[str, int], collector: Collector) -> Iterator[int]:
     host, port = address
     with ExitStack() as stack:
         try:
-            bound = stack.enter_context(serving_wsgi(host, port, make_wsgi_app(registry)))
+            bound = stack.enter_context(_serving_wsgi(host, port, make_wsgi_app(registry)))
         except OSError as error:
             raise TransportError(
                 f"cannot serve metrics on {host}:{port}: {error.strerror or error}; "

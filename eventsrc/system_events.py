@@ -1,8 +1,10 @@
-"""mapfold's own events: they stand in the same log and the same offset space as the envelopes.
+"""mapfold's own events, in the same log and offset space as the envelopes.
 
-``mapfold/rejected``  a payload refused at the door, with its bytes and the reason
-``mapfold/loss``      a gap that was noticed: who, first and last missing, why
-``mapfold/command``   what an operator said (kept for later; nothing writes it yet)
+``mapfold/rejected``  a payload that is no valid envelope, with its bytes and the reason
+``mapfold/loss``      a detected gap: publisher, first and last missing, cause
+``mapfold/command``   an operator's command (reserved; nothing writes it yet)
+
+The docstrings of the models are part of the JSON schema in every segment: do not change them.
 """
 
 import json
@@ -18,7 +20,7 @@ COMMAND_KEY = "mapfold/command"
 
 
 def is_system_key(key: str) -> bool:
-    """True for the keys of mapfold's own events; every other key carries envelopes."""
+    """Whether ``key`` is for mapfold's own events; every other key carries envelopes."""
     return key.startswith(RESERVED_PREFIX)
 
 
@@ -35,9 +37,10 @@ class RejectedPayload(_Model):
 
     @staticmethod
     def encode(key: str, reason: str, raw: bytes) -> bytes:
-        """The JSON that keeps ``raw``, which came under ``key`` and was refused for ``reason``.
+        """The event's JSON, for ``raw`` that came under ``key`` and was refused for ``reason``.
 
-        Written from bytes: ``raw`` may be large, and each step over text would be a copy of it."""
+        Built from bytes: ``raw`` may be large, and each conversion to text would copy it.
+        """
         head = json.dumps({"key": key, "reason": reason}, separators=(",", ":"))
         return b"".join((head[:-1].encode(), b',"payload":"', pybase64.b64encode(raw), b'"}'))
 

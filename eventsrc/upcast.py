@@ -1,18 +1,18 @@
-"""Reading yesterday's logs: old forms of the envelope climb a ladder to today's.
+"""Convert older forms of the envelope to the current one, step by step, when they are read.
 
-A log keeps payloads as they came, so what a form means must outlive the robots that sent it. Each
-channel of a log says the version of its envelopes; `read_envelope` takes an event up from its
-version, one step at a time, and through the same door as new ones.
+A log keeps payloads as they came, so it must stay readable when the form changes. Each channel of a
+log has the version of its envelopes; `read_envelope` converts an event from its version to the
+current one and validates it like a new one.
 
     1   the bare list of a detector, before there was an envelope: ``[{"class_name": "cup",
-        "confidence": 0.87, "bbox": [120.0, 80.0, 250.0, 310.0]}, …]``. It does not say who saw it,
-        when and where; the event around it says what can be said: the run is ``unnamed:<key>``,
-        the keyframe id is the event's offset, the time is the event's stamp, and there is no pose.
-        So it becomes observations without a place. ``class_name`` became ``class``.
+        "confidence": 0.87, "bbox": [120.0, 80.0, 250.0, 310.0]}, …]``. It has no run, time
+        or pose, so the event around it supplies them: the run is ``unnamed:<key>``, the keyframe id
+        is the event's offset, the time is the event's stamp, and there is no pose. So it becomes
+        observations without a place. ``class_name`` became ``class``.
     2   the envelope of DESIGN section 3.
 
-To change the envelope: raise ENVELOPE_VERSION, write the step from the version before, and add a
-log of that version to the tests. Never change a step that has been released.
+To change the envelope: raise ENVELOPE_VERSION, add the upcaster from the version before to
+``UPCASTERS``, and a log of that version to the tests. Never change a released upcaster.
 """
 
 import json
@@ -26,14 +26,14 @@ from .envelope import (
     Detection,
     Envelope,
     Offset,
-    holds_not_finite,
+    contains_non_finite,
 )
 from .ingest import (
     DEFAULT_MAX_PAYLOAD_BYTES,
     Accepted,
     Rejected,
     check_all,
-    excess,
+    check_cost,
     ingest,
     ingest_all,
 )
@@ -42,8 +42,8 @@ BARE_LIST_VERSION = 1
 _DETECTION_FIELDS = tuple(field.alias or name for name, field in Detection.model_fields.items())
 
 
-class Recorded(Protocol):
-    """What a step may know of the event around a payload; `eventsrc.log.Event` is one."""
+class VersionedEvent(Protocol):
+    """What an upcaster may know of the event around a payload; `eventsrc.log.Event` is one."""
 
     @property
     def offset(self) -> int: ...
@@ -57,12 +57,12 @@ class Recorded(Protocol):
     def version(self) -> int: ...
 
 
-Step = Callable[[Any, Recorded], Any]
-"""From the JSON value of one version to that of the next. Raises ValueError for what is none."""
+Upcaster = Callable[[Any, VersionedEvent], Any]
+"""From the JSON value of one version to that of the next. Raises ValueError if it is not valid."""
 
 
-class Arrival(NamedTuple):
-    """A payload that is about to be recorded, as far as a step may know it."""
+class PendingEvent(NamedTuple):
+    """A payload that is about to be appended, as a `VersionedEvent`."""
 
     offset: Offset
     key: str
@@ -72,20 +72,20 @@ class Arrival(NamedTuple):
 
 
 def read_envelope(
-    event: Recorded, *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES
+    event: VersionedEvent, *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES
 ) -> Accepted | Rejected:
-    """The envelope of an event of any version."""
+    """Validate an event of any version as an envelope of the current one."""
     if event.version == ENVELOPE_VERSION:
         return ingest(event.payload, max_bytes=max_bytes)
-    if event.version not in LADDER:
+    if event.version not in UPCASTERS:
         return Rejected(f"envelope version {event.version} is unknown here; upgrade mapfold")
-    refused = excess(event.payload, max_bytes)
-    if refused is not None:
-        return refused
+    rejected = check_cost(event.payload, max_bytes)
+    if rejected is not None:
+        return rejected
     try:
-        document = _finite(json.loads(event.payload))
+        document = _require_finite(json.loads(event.payload))
         for version in range(event.version, ENVELOPE_VERSION):
-            document = LADDER[version](document, event)
+            document = UPCASTERS[version](document, event)
         payload = json.dumps(document).encode()
     except (ValueError, RecursionError) as error:
         return Rejected(f"not an envelope of version {event.version}: {error}")
@@ -93,40 +93,40 @@ def read_envelope(
 
 
 def read_envelopes(
-    events: Sequence[Recorded], *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES
+    events: Sequence[VersionedEvent], *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES
 ) -> list[Accepted | Rejected]:
-    """`read_envelope` of each; quicker together if all are of today's version."""
+    """`read_envelope` of each; faster together if all are of the current version."""
     if any(event.version != ENVELOPE_VERSION for event in events):
         return [read_envelope(event, max_bytes=max_bytes) for event in events]
     return ingest_all([event.payload for event in events], max_bytes=max_bytes)
 
 
 def check_envelopes(
-    events: Sequence[Recorded], *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES
+    events: Sequence[VersionedEvent], *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES
 ) -> list[Envelope | Rejected]:
-    """What `read_envelopes` says to each, without its vectors and ids."""
+    """Like `read_envelopes`, without the vectors and ids."""
     if any(event.version != ENVELOPE_VERSION for event in events):
         read = [read_envelope(event, max_bytes=max_bytes) for event in events]
-        return [said if isinstance(said, Rejected) else said.envelope for said in read]
+        return [result if isinstance(result, Rejected) else result.envelope for result in read]
     return check_all([event.payload for event in events], max_bytes=max_bytes)
 
 
-def guess_version(payload: bytes) -> int:
-    """The version of a payload that does not say: a list with an object in it is a bare list."""
+def detect_version(payload: bytes) -> int:
+    """The version of a payload from its first bytes: a list of objects is a bare list."""
     if payload.startswith(b"{"):
         return ENVELOPE_VERSION
     start = payload[:64].split()
     return BARE_LIST_VERSION if b"".join(start).startswith(b"[{") else ENVELOPE_VERSION
 
 
-def _finite(document: Any) -> Any:
-    """The same, where unknown fields that a step leaves out hold no NaN or infinity either."""
-    if holds_not_finite(document):
+def _require_finite(document: Any) -> Any:
+    """``document``; ValueError for NaN or infinity anywhere, also in fields an upcaster drops."""
+    if contains_non_finite(document):
         raise ValueError("holds NaN or infinity")
     return document
 
 
-def _envelope_around_bare_list(document: Any, event: Recorded) -> dict[str, Any]:
+def _upcast_bare_list(document: Any, event: VersionedEvent) -> dict[str, Any]:
     if not isinstance(document, list) or not all(isinstance(d, dict) for d in document):
         raise ValueError("not a list of detections")
     if len(document) > MAX_DETECTIONS:
@@ -135,18 +135,17 @@ def _envelope_around_bare_list(document: Any, event: Recorded) -> dict[str, Any]
         "run_id": f"unnamed:{event.key}",
         "keyframe_id": event.offset,
         "timestamp": event.stamp_ns / 1e9,
-        "detections": [_class_for_class_name(detection) for detection in document],
+        "detections": [_upcast_detection(detection) for detection in document],
     }
 
 
-def _class_for_class_name(detection: dict[str, Any]) -> dict[str, Any]:
-    """The fields that an envelope knows; the others stay in the log. ``class`` is the only one that
-    was called otherwise."""
+def _upcast_detection(detection: dict[str, Any]) -> dict[str, Any]:
+    """The known fields, ``class_name`` as ``class``; the others stay in the log."""
     known = {name: detection[name] for name in _DETECTION_FIELDS if name in detection}
     if "class" not in detection and "class_name" in detection:
         known["class"] = detection["class_name"]
     return known
 
 
-LADDER: Mapping[int, Step] = MappingProxyType({1: _envelope_around_bare_list})
-"""The step up from each older version."""
+UPCASTERS: Mapping[int, Upcaster] = MappingProxyType({1: _upcast_bare_list})
+"""From each older version to the next."""

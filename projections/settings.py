@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
-from eventsrc.envelope import Text, fault
+from eventsrc.envelope import Text, describe_error
 
 from .errors import SettingsError
 
@@ -89,7 +89,7 @@ class Settings(BaseModel):
 
 def _rule(error: ErrorDetails) -> str:
     """The rule a value breaks, as the end of a sentence."""
-    said = fault(error)
+    said = describe_error(error)
     return said[:1].lower() + said[1:]
 
 

@@ -1,11 +1,18 @@
-"""Getting messages that others kept into a log."""
+"""Import messages from files into a log."""
 
-from .run import DEFAULT_KEY, LAZY_COMMIT, ImportCut, ImportReport, check_sources, import_files
+from .run import (
+    DEFAULT_KEY,
+    IMPORT_FSYNC,
+    ImportInterrupted,
+    ImportReport,
+    check_sources,
+    import_files,
+)
 
 __all__ = [
     "DEFAULT_KEY",
-    "LAZY_COMMIT",
-    "ImportCut",
+    "IMPORT_FSYNC",
+    "ImportInterrupted",
     "ImportReport",
     "check_sources",
     "import_files",

@@ -1,16 +1,12 @@
-"""JSON lines, plain or gzip, from a file or a stream.
+"""JSON lines, plain or gzip, from a file or a stream; also the records of Zenoh loggers.
 
-One message as some other tool kept it, on its way into a log.
+A Zenoh logger writes one object a line: ``{"ts": 1740000000.123, "iso": "2025-…Z",
+"key": "tb/detections", "payload": …}``. The payload is parsed JSON, or a string: the raw text if it
+was no JSON, in some loggers always, in some as base64. An older logger wrote
+``{"ts", "iso", "detections": [ … ]}`` with the bare list that its detector published.
 
-Taking a logger's record apart without re-writing what is inside.
-
-A plain Zenoh logger writes one object a line: ``{"ts": 1740000000.123, "iso": "2025-…Z",
-"key": "tb/detections", "payload": …}``. The payload stands there as parsed JSON, or as a string:
-the raw text when it was no JSON, in some loggers always, in some as base64. An older logger wrote
-``{"ts", "iso", "detections": [ … ]}`` with the bare list its detector published.
-
-A JSON payload is cut out of the line as it stands, so that numbers, spaces, escapes and even what
-no JSON parser would give back reach the log as they were.
+A JSON payload is cut out of the line as it stands, never parsed and written again, so that numbers,
+spaces and escapes reach the log unchanged.
 """
 
 import binascii
@@ -24,13 +20,13 @@ from json.decoder import JSONDecodeError
 from typing import BinaryIO, Protocol
 
 from eventsrc.errors import MapfoldError, MisuseError
-from eventsrc.ingest import excess
+from eventsrc.ingest import check_cost
 
 
 @dataclass(frozen=True, slots=True)
-class Imported:
-    """``key`` is None where the source names none. ``logged_ns`` is when the source received the
-    message and ``stamp_ns`` when it was published, None where it does not say."""
+class ImportedMessage:
+    """A message of a source, with what is None if the source does not say: its ``key``,
+    ``logged_ns`` (when the source received it) and ``stamp_ns`` (when it was published)."""
 
     payload: bytes
     key: str | None = None
@@ -39,22 +35,22 @@ class Imported:
 
 
 class Source(Protocol):
-    """Something to import from."""
+    """A file, stream or log to import from."""
 
     name: str
     unit: str
-    """What `at` counts: ``line``, ``message``, ``offset``."""
+    """What `at` counts: ``line``, ``message`` or ``offset``."""
     at: int | None
-    """Where the message that `records` gave last stands."""
+    """Number of the message that `messages` yielded last."""
     size_bytes: int | None
     skipped: int
-    """Messages passed over because they are no JSON by their own declaration."""
+    """Messages skipped because their channel is not declared as JSON."""
 
-    def records(self) -> Iterator[Imported]:
-        """The messages in their order."""
+    def messages(self) -> Iterator[ImportedMessage]:
+        """The messages in order."""
 
-    def position(self) -> int:
-        """Bytes consumed so far, of ``size_bytes``."""
+    def bytes_read(self) -> int:
+        """Bytes read so far, of ``size_bytes``."""
 
 
 _DECODER = json.JSONDecoder()
@@ -62,51 +58,51 @@ _SPACE = " \t\r\n"
 _PAYLOAD_FIELDS = ("payload", "detections")
 
 
-def read_line(line: bytes) -> Imported:
-    """The message in one line: a logger's record, or else the line itself."""
+def read_line(line: bytes) -> ImportedMessage:
+    """The message in one line: the payload of a logger's record, else the line itself."""
     if b'"ts"' not in line or not any(b'"%s"' % f.encode() in line for f in _PAYLOAD_FIELDS):
-        return Imported(line)
-    if excess(line, len(line)) is not None:  # too much to take apart; it will be refused as it is
-        return Imported(line)
+        return ImportedMessage(line)
+    if check_cost(line, len(line)) is not None:  # too costly to parse; validation will reject it
+        return ImportedMessage(line)
     try:
         fields = {name: (value, text) for name, value, text in _members(line.decode())}
     except (JSONDecodeError, UnicodeDecodeError, RecursionError):
-        return Imported(line)
+        return ImportedMessage(line)
     if "ts" not in fields or "run_id" in fields:
-        return Imported(line)
+        return ImportedMessage(line)
     for name in _PAYLOAD_FIELDS:
         if name in fields:
             key = fields.get("key", (None, ""))[0]
-            return Imported(
+            return ImportedMessage(
                 _payload(*fields[name]),
                 key=key if isinstance(key, str) and key else None,
                 logged_ns=_nanoseconds(fields["ts"][1]),
             )
-    return Imported(line)
+    return ImportedMessage(line)
 
 
 def _members(text: str) -> Iterator[tuple[str, object, str]]:
     """Name, value and source text of each member of a JSON object."""
-    at = _skip(text, 0)
+    at = _skip_spaces(text, 0)
     if text[at : at + 1] != "{":
         raise JSONDecodeError("no object", text, at)
-    at = _skip(text, at + 1)
+    at = _skip_spaces(text, at + 1)
     while text[at : at + 1] != "}":
         name, at = _DECODER.raw_decode(text, at)
-        at = _skip(text, at)
+        at = _skip_spaces(text, at)
         if not isinstance(name, str) or text[at : at + 1] != ":":
             raise JSONDecodeError("no member", text, at)
-        start = _skip(text, at + 1)
+        start = _skip_spaces(text, at + 1)
         value, at = _DECODER.raw_decode(text, start)
         yield name, value, text[start:at]
-        at = _skip(text, at)
+        at = _skip_spaces(text, at)
         if text[at : at + 1] == ",":
-            at = _skip(text, at + 1)
+            at = _skip_spaces(text, at + 1)
         elif text[at : at + 1] != "}":
             raise JSONDecodeError("no end of object", text, at)
 
 
-def _skip(text: str, at: int) -> int:
+def _skip_spaces(text: str, at: int) -> int:
     while at < len(text) and text[at] in _SPACE:
         at += 1
     return at
@@ -126,7 +122,7 @@ def _payload(value: object, text: str) -> bytes:
 
 
 def _nanoseconds(seconds: str) -> int | None:
-    """Exact to the decimal in the file; None where there is no time in bounds."""
+    """Exact for the decimal text; None if it is no time within int64."""
     try:
         value = int(Decimal(seconds).scaleb(9).to_integral_value())
     except (InvalidOperation, OverflowError, ValueError):
@@ -139,7 +135,7 @@ GZIP_MAGIC = b"\x1f\x8b"
 
 
 class JsonLines:
-    """One message a line; blank lines are nothing. Gzip is known by its first bytes."""
+    """One message a line; blank lines are skipped. Gzip is recognised by its first bytes."""
 
     def __init__(self, name: str, file: BinaryIO, size_bytes: int | None, start: bytes) -> None:
         self.name = name
@@ -151,11 +147,11 @@ class JsonLines:
         self._compressed = start.startswith(GZIP_MAGIC)
         self._read = 0
 
-    def position(self) -> int:
-        """Bytes of the file consumed."""
+    def bytes_read(self) -> int:
+        """Bytes of the file read."""
         return self._file.tell() if self._compressed and self.size_bytes else self._read
 
-    def records(self) -> Iterator[Imported]:
+    def messages(self) -> Iterator[ImportedMessage]:
         """The messages, line by line."""
         stream: BinaryIO = (
             gzip.GzipFile(fileobj=self._file) if self._compressed else self._file  # type: ignore[assignment]

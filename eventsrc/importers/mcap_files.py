@@ -1,4 +1,4 @@
-"""Messages out of MCAP files and other mapfold logs, in file order."""
+"""Messages of MCAP files and of other mapfold logs, in file order."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,14 +8,13 @@ from eventsrc.errors import MapfoldError
 from eventsrc.log import LogReader
 from eventsrc.log.foreign_mcap import ForeignDamage, foreign_messages
 
-from .json_lines import Imported
+from .json_lines import ImportedMessage
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 
 
 class McapFile:
-    """Any MCAP file. Channels that do not say ``json`` (images, ROS messages) are passed over and
-    counted."""
+    """Any MCAP file. Messages that are not ``json`` (images, ROS) are skipped and counted."""
 
     def __init__(self, name: str, file: BinaryIO, size_bytes: int | None) -> None:
         self.name = name
@@ -26,18 +25,18 @@ class McapFile:
         self._file = file
         self._read = 0
 
-    def position(self) -> int:
-        """Bytes of the file consumed."""
+    def bytes_read(self) -> int:
+        """Bytes of the file read."""
         return self._file.tell() if self.size_bytes else self._read
 
-    def records(self) -> Iterator[Imported]:
+    def messages(self) -> Iterator[ImportedMessage]:
         """The JSON messages."""
         try:
             for number, message in enumerate(foreign_messages(self._file), start=1):
                 self.at = number
                 self._read += len(message.payload)
                 if message.encoding == "json":
-                    yield Imported(
+                    yield ImportedMessage(
                         message.payload, message.key, message.logged_ns, message.published_ns
                     )
                 else:
@@ -49,7 +48,7 @@ class McapFile:
 
 
 class OtherLog:
-    """Another log, from its first event to its last durable one."""
+    """A mapfold log, from its first event to its last durable one."""
 
     def __init__(self, path: Path) -> None:
         self.name = str(path)
@@ -60,14 +59,14 @@ class OtherLog:
         self.skipped = 0
         self._read = 0
 
-    def position(self) -> int:
+    def bytes_read(self) -> int:
         """Bytes of payload read."""
         return self._read
 
-    def records(self) -> Iterator[Imported]:
-        """Its events, system events included."""
+    def messages(self) -> Iterator[ImportedMessage]:
+        """The log's events, system events included."""
         with self._reader as reader:
             for event in reader.read():
                 self.at = event.offset
                 self._read += len(event.payload)
-                yield Imported(event.payload, event.key, event.logged_ns, event.stamp_ns)
+                yield ImportedMessage(event.payload, event.key, event.logged_ns, event.stamp_ns)

@@ -1,7 +1,7 @@
-"""Importing: from files into a log, every message through the same door as the recorder's.
+"""Import files into a log, with the same validation as recording.
 
-Importing only appends. Import the same file twice and the log holds it twice; the fold takes a
-keyframe it has seen for a duplicate, so the map is the same.
+An import only appends. A file that is imported twice is in the log twice; the fold ignores
+duplicate keyframes, so the map is the same.
 """
 
 import sys
@@ -18,37 +18,37 @@ from eventsrc.ingest import Rejected
 from eventsrc.log import FsyncPolicy, LogWriter
 from eventsrc.system_events import LOSS_KEY, REJECTED_KEY
 
-from .json_lines import Imported, JsonLines, Source
+from .json_lines import ImportedMessage, JsonLines, Source
 from .mcap_files import MCAP_MAGIC, McapFile, OtherLog
 
 DEFAULT_KEY = "tb/detections"
 STDIN = "-"
-LAZY_COMMIT = FsyncPolicy(interval_ns=500_000_000, max_events=4096)
-"""The source can be read again, so nothing hangs on how soon an event is synced."""
+IMPORT_FSYNC = FsyncPolicy(interval_ns=500_000_000, max_events=4096)
+"""Larger commits than a recorder's: the source can be read again after a crash."""
 
 _PROGRESS_EVERY = 64
 
 Progress = Callable[[Source], None]
 OnReject = Callable[[str, str], None]
-"""Takes where a message stands (``run.jsonl: line 17``) and why it is no envelope."""
+"""Called with the place of a message (``run.jsonl: line 17``) and the reason of its rejection."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImportReport:
-    """What an import did. ``first_offset`` to before ``next_offset`` is what it appended."""
+    """Counts of an import; it appended ``first_offset`` to ``next_offset`` - 1."""
 
     accepted: int
     rejected: int
     system: int
-    """Rejects and losses of another mapfold log, taken over as they were."""
+    """Rejected payloads and losses of another mapfold log, copied unchanged."""
     skipped: int
     first_offset: Offset
     next_offset: Offset
 
 
-class ImportCut(KeyboardInterrupt):
-    """Ctrl-C. ``report`` says what is in the log, synced; ``place`` where its last message stands,
-    None when there is none."""
+class ImportInterrupted(KeyboardInterrupt):
+    """Ctrl-C. ``report`` counts what is in the log and synced; ``place`` is the place of its last
+    message (``line 17 of run.jsonl``), None without any."""
 
     def __init__(self, report: ImportReport, place: str | None) -> None:
         super().__init__()
@@ -65,28 +65,29 @@ def import_files(
     on_reject: OnReject | None = None,
     step: AbstractContextManager[object] | None = None,
 ) -> ImportReport:
-    """Append every message of ``names`` in order. Messages that name no key get ``key``.
+    """Append every message of ``names`` in order. Messages without a key get ``key``.
 
-    ``step`` is entered for each message: what holds Ctrl-C back in it makes `ImportCut` exact.
+    ``step`` is entered for each message; one that defers Ctrl-C makes `ImportInterrupted` exact.
+    Raises MisuseError and MapfoldError for files that cannot be read.
     """
     run = _Import(writer, key, on_reject or (lambda _place, _reason: None))
     try:
         with ExitStack() as files:
             for name in names:
                 source = open_source(name, files)
-                for number, record in enumerate(source.records()):
+                for number, message in enumerate(source.messages()):
                     with step or nullcontext():
-                        run.take(source, record)
+                        run.append(source, message)
                     if progress is not None and number % _PROGRESS_EVERY == 0:
                         progress(source)
                 run.skipped += source.skipped
     except KeyboardInterrupt:
-        raise ImportCut(run.report(), run.place) from None
+        raise ImportInterrupted(run.report(), run.place) from None
     return run.report()
 
 
 class _Import:
-    """What has been appended so far, and from where the last of it came."""
+    """Counts of what has been appended, and the place of the last message."""
 
     def __init__(self, writer: LogWriter, key: str, on_reject: OnReject) -> None:
         self._writer = writer
@@ -96,23 +97,23 @@ class _Import:
         self._last: tuple[Source, int | None] | None = None
         self.accepted = self.rejected = self.system = self.skipped = 0
 
-    def take(self, source: Source, record: Imported) -> None:
-        """Append one message."""
-        if record.key == REJECTED_KEY or record.key == LOSS_KEY:
-            self._take_over(record.key, record)
+    def append(self, source: Source, message: ImportedMessage) -> None:
+        """Append one message: a system event unchanged, anything else after validation."""
+        if message.key == REJECTED_KEY or message.key == LOSS_KEY:
+            self._append_system_event(message.key, message)
         else:
-            self._append(source, record)
+            self._append_envelope(source, message)
         self._last = source, source.at
 
-    def _take_over(self, key: str, record: Imported) -> None:
+    def _append_system_event(self, key: str, message: ImportedMessage) -> None:
         self._writer.append(
-            key, record.payload, logged_ns=record.logged_ns, stamp_ns=record.stamp_ns
+            key, message.payload, logged_ns=message.logged_ns, stamp_ns=message.stamp_ns
         )
         self.system += 1
 
-    def _append(self, source: Source, record: Imported) -> None:
+    def _append_envelope(self, source: Source, message: ImportedMessage) -> None:
         outcome = append_payload(
-            self._writer, record.key or self._key, record.payload, logged_ns=record.logged_ns
+            self._writer, message.key or self._key, message.payload, logged_ns=message.logged_ns
         )
         if isinstance(outcome, Rejected):
             self.rejected += 1
@@ -122,20 +123,20 @@ class _Import:
 
     @property
     def place(self) -> str | None:
-        """``line 17 of run.jsonl``."""
+        """The last message's place, such as ``line 17 of run.jsonl``."""
         if self._last is None:
             return None
         source, at = self._last
         return f"{source.unit} {at} of {source.name}"
 
     def report(self) -> ImportReport:
-        """All of it, synced."""
+        """Sync the log and count what was appended."""
         counts = (self.accepted, self.rejected, self.system, self.skipped)
         return ImportReport(*counts, self._first, self._writer.sync())
 
 
 def check_sources(names: Sequence[str]) -> None:
-    """MisuseError for the first that is out of reach, before a log is made for nothing."""
+    """Raise MisuseError for the first that cannot be reached; call it before a log is created."""
     for name in names:
         if name == STDIN:
             continue
@@ -148,7 +149,7 @@ def check_sources(names: Sequence[str]) -> None:
 
 
 def open_source(name: str, files: ExitStack) -> Source:
-    """A file by what is in it, a log by being a folder, ``-`` for standard input."""
+    """Open ``name``: a folder is a log, ``-`` standard input, a file JSON lines or MCAP."""
     if name != STDIN and Path(name).is_dir():
         return OtherLog(Path(name))
     try:

@@ -14,7 +14,7 @@
   counted: being written, taken, or still in the queue.
 * Losses are written about once a second, not one by one: a queue that overflows is busy enough.
 * Keys under ``mapfold/`` are our own. From the network they could forge a loss or a command, so
-  `judge_payloads` rejects such a message like any other that is no envelope.
+  `prepare_events` rejects such a message like any other that is no envelope.
 
 What robots are to hear of an event, once it is synced: an ack, a refusal, or nothing.
 
@@ -30,7 +30,7 @@ from typing import Final, Literal, NamedTuple
 
 from pydantic import ValidationError
 
-from eventsrc.append import Judged, judge_payloads
+from eventsrc.append import PreparedEvent, prepare_events
 from eventsrc.envelope import ENVELOPE_VERSION, KeyframeId, Offset, RunId
 from eventsrc.errors import LogError
 from eventsrc.gap_history import forget_ledger, save_ledger
@@ -67,7 +67,7 @@ class Unsynced(NamedTuple):
     sha256: str
 
 
-def unsynced(offset: Offset, message: Received, judged: Judged) -> Unsynced:
+def unsynced(offset: Offset, message: Received, judged: PreparedEvent) -> Unsynced:
     """What follows from ``message``, which gets into the log at ``offset``."""
     event, verdict = judged
     key = message.key
@@ -280,7 +280,7 @@ class Writing:
 
     def _record(self, messages: list[Received]) -> None:
         payloads = [(message.key, message.payload) for message in messages]
-        judged = judge_payloads(self._writer, payloads, max_bytes=self._max_payload_bytes)
+        judged = prepare_events(self._writer, payloads, max_bytes=self._max_payload_bytes)
         # Noted first: should appending fail in the middle, what was synced by then still counts.
         offsets = map(Offset, itertools.count(self._writer.next_offset))
         self._unsynced.extend(map(unsynced, offsets, messages, judged))

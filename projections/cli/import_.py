@@ -1,4 +1,4 @@
-"""`mapfold import`: messages that others kept, into a log."""
+"""`mapfold import`: messages from files into a log."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,8 +18,8 @@ from rich.progress import (
 
 from eventsrc.importers import (
     DEFAULT_KEY,
-    LAZY_COMMIT,
-    ImportCut,
+    IMPORT_FSYNC,
+    ImportInterrupted,
     ImportReport,
     check_sources,
     import_files,
@@ -39,7 +39,7 @@ _MOST_REJECTS: Final = 5
 
 def import_(
     log: Annotated[
-        Path, typer.Argument(metavar="LOG", help="The log to append to; made if there is none.")
+        Path, typer.Argument(metavar="LOG", help="The log to append to; created if there is none.")
     ],
     files: Annotated[
         list[str],
@@ -48,27 +48,28 @@ def import_(
             help="JSON lines (plain or gzip), logger records, MCAP files, other logs; - is stdin.",
         ),
     ],
-    key: Annotated[str, typer.Option(help="Key for messages whose file names none.")] = DEFAULT_KEY,
+    key: Annotated[str, typer.Option(help="Key for messages without one.")] = DEFAULT_KEY,
     json_: JsonOption = False,
 ) -> None:
     """Append recorded envelopes to a log, in the order of the files.
 
-    What is no envelope is kept with its bytes and the reason under mapfold/rejected, and makes the
-    command exit with 3. Ctrl-C keeps what is in the log by then and says how far that is.
+    A message that is no valid envelope is kept with its bytes and the reason under
+    mapfold/rejected, and the command exits with 3. Ctrl-C keeps what is in the log and says how far
+    it got.
     """
     check_sources(files)
     check_key(key, "--key")
-    rejects = _Rejects()
+    rejects = _RejectPrinter()
     try:
-        with LogWriter(log, fsync=LAZY_COMMIT) as writer, _progress() as show:
+        with LogWriter(log, fsync=IMPORT_FSYNC) as writer, _progress() as show:
             say_restart(log, writer)
             with ctrl_c_between_steps() as step:
                 report = import_files(
                     writer, files, key=key, progress=show, on_reject=rejects.say, step=step
                 )
-    except ImportCut as cut:
+    except ImportInterrupted as interrupted:
         rejects.say_rest()
-        say(_cut(log, cut))
+        say(_kept(log, interrupted))
         raise
     rejects.say_rest()
     if json_:
@@ -77,8 +78,8 @@ def import_(
     finish(findings=report.rejected > 0)
 
 
-class _Rejects:
-    """Says the first few rejects as they come, and how many more there were."""
+class _RejectPrinter:
+    """Prints the first few rejections as they come, and the number of the others."""
 
     def __init__(self) -> None:
         self._count = 0
@@ -93,14 +94,14 @@ class _Rejects:
             say(f"… and {self._count - _MOST_REJECTS:,} more rejected")
 
 
-def _cut(log: Path, cut: ImportCut) -> str:
-    report = cut.report
-    if cut.place is None:
+def _kept(log: Path, interrupted: ImportInterrupted) -> str:
+    report = interrupted.report
+    if interrupted.place is None:
         return f"{log}: nothing was imported"
     kept = counted(report.next_offset - report.first_offset, "event")
     return (
         f"{log}: kept {kept}, offsets {report.first_offset} to {report.next_offset - 1}, up to "
-        f"{cut.place}; import only what comes after that, or the log holds the rest twice"
+        f"{interrupted.place}; import only what comes after that, or the log holds the rest twice"
     )
 
 
@@ -118,8 +119,8 @@ def _summary(log: Path, report: ImportReport) -> str:
 
 
 @contextmanager
-def _progress() -> Iterator["_Show | None"]:
-    """A bar with rate and time left on a terminal, nothing elsewhere."""
+def _progress() -> Iterator["_ProgressBar | None"]:
+    """A progress bar on a terminal, nothing elsewhere."""
     if not people.is_terminal:
         yield None
         return
@@ -131,11 +132,11 @@ def _progress() -> Iterator["_Show | None"]:
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=people, transient=True) as progress:
-        yield _Show(progress)
+        yield _ProgressBar(progress)
 
 
-class _Show:
-    """One task for each file."""
+class _ProgressBar:
+    """A line of progress for each file."""
 
     def __init__(self, progress: Progress) -> None:
         self._progress = progress
@@ -146,7 +147,7 @@ class _Show:
         if task is None:
             task = self._progress.add_task(visible(source.name), total=source.size_bytes)
             self._tasks[id(source)] = task
-        self._progress.update(task, completed=source.position())  # type: ignore[arg-type]
+        self._progress.update(task, completed=source.bytes_read())  # type: ignore[arg-type]
 
 
 def register(app: typer.Typer) -> None:

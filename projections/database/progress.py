@@ -12,7 +12,7 @@ from pathlib import Path
 
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
-from eventsrc.metrics import Number, serving_numbers
+from eventsrc.metrics import MetricValue, serving_values
 
 from .checkpoints import DeadLetter
 
@@ -66,21 +66,25 @@ def serving_tail_metrics(
     address: tuple[str, int], progress: TailProgress, log: Path
 ) -> AbstractContextManager[int]:
     """Serve ``/metrics`` for the length of a ``with`` block; yields the port, also for port 0."""
-    return serving_numbers(address, lambda: tail_numbers(progress, log))
+    return serving_values(address, lambda: tail_numbers(progress, log))
 
 
-def tail_numbers(progress: TailProgress, log: Path) -> Iterator[Number]:
+def tail_numbers(progress: TailProgress, log: Path) -> Iterator[MetricValue]:
     """Read when somebody scrapes; the lag is against the log as it is then."""
     with LogReader(log) as reader:
         end = reader.next_offset
-    yield Number("mapfold_tail_events", "Events written.", progress.events, counter=True)
-    yield Number("mapfold_tail_batches", "Transactions committed.", progress.batches, counter=True)
-    yield Number("mapfold_tail_parked", "Events left out.", progress.parked, counter=True)
-    yield Number("mapfold_tail_restarts", "Folds begun anew.", progress.restarts, counter=True)
-    yield Number("mapfold_tail_troubles", "Failed attempts.", progress.troubles, counter=True)
-    yield Number("mapfold_tail_next_offset", "Events in the databases.", progress.next_offset)
-    yield Number("mapfold_tail_log_next_offset", "Events in the log.", end)
-    yield Number("mapfold_tail_lag", "Events not yet written.", max(0, end - progress.next_offset))
+    yield MetricValue("mapfold_tail_events", "Events written.", progress.events, counter=True)
+    yield MetricValue(
+        "mapfold_tail_batches", "Transactions committed.", progress.batches, counter=True
+    )
+    yield MetricValue("mapfold_tail_parked", "Events left out.", progress.parked, counter=True)
+    yield MetricValue("mapfold_tail_restarts", "Folds begun anew.", progress.restarts, counter=True)
+    yield MetricValue("mapfold_tail_troubles", "Failed attempts.", progress.troubles, counter=True)
+    yield MetricValue("mapfold_tail_next_offset", "Events in the databases.", progress.next_offset)
+    yield MetricValue("mapfold_tail_log_next_offset", "Events in the log.", end)
+    yield MetricValue(
+        "mapfold_tail_lag", "Events not yet written.", max(0, end - progress.next_offset)
+    )
     if progress.committed_at is not None:
         age = time.monotonic() - progress.committed_at
-        yield Number("mapfold_tail_commit_age_seconds", "Since the last commit.", age)
+        yield MetricValue("mapfold_tail_commit_age_seconds", "Since the last commit.", age)

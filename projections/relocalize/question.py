@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from eventsrc.envelope import MAX_DIMENSION, Text, fault
+from eventsrc.envelope import MAX_DIMENSION, Text, describe_error
 from eventsrc.text import counted
 from projections.errors import QuestionError
 from projections.exact import quantise, to_float32
@@ -140,7 +140,11 @@ def _validated(items: list[Any]) -> list[_CropModel]:
         # Of the two forms of an embedding the list is named last, and says more.
         first = next((e for e in errors if e["loc"][-1] != "str"), errors[0])
         place = ".".join(str(p) for p in first["loc"] if not str(p).startswith("list["))
-        what = "should be a JSON object" if first["type"] == "model_type" else fault(first).lower()
+        what = (
+            "should be a JSON object"
+            if first["type"] == "model_type"
+            else describe_error(first).lower()
+        )
         raise QuestionError(f"crops.{place}: {what}") from None
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.importers import ImportCut, ImportReport, import_files
+from eventsrc.importers import ImportInterrupted, ImportReport, import_files
 from eventsrc.log import LogWriter
 from projections.cli.signals import ctrl_c_between_steps
 from tests.commands import PROGRAM, TIMEOUT_S, Commands
@@ -76,7 +76,7 @@ def test_a_cut_is_exact_also_in_the_midst_of_a_message(tmp_path: Path) -> None:
         signal.raise_signal(signal.SIGINT)
 
     with LogWriter(tmp_path / "L") as writer:
-        with pytest.raises(ImportCut) as caught, ctrl_c_between_steps() as step:
+        with pytest.raises(ImportInterrupted) as caught, ctrl_c_between_steps() as step:
             import_files(writer, files, on_reject=interrupt, step=step)
         assert writer.durable_offset == 165
     assert caught.value.place == f"line 65 of {files[1]}"

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from eventsrc.envelope import MAX_DETECTIONS
-from eventsrc.ingest import MAX_MARKS, Accepted, Rejected, ingest
-from eventsrc.upcast import Arrival, read_envelope
+from eventsrc.ingest import MAX_JSON_VALUES, Accepted, Rejected, ingest
+from eventsrc.upcast import PendingEvent, read_envelope
 from tests.envelopes import detection, envelope, payload
 
 CPU_S = 60
@@ -23,7 +23,7 @@ import re, resource, sys
 from pathlib import Path
 from eventsrc.append import append_payload
 from eventsrc.log import LogWriter
-from eventsrc.ingest import MAX_MARKS
+from eventsrc.ingest import MAX_JSON_VALUES
 
 resource.setrlimit(resource.RLIMIT_CPU, (int(sys.argv[2]), int(sys.argv[2])))
 SIZE = 16 * 1024 * 1024
@@ -31,7 +31,7 @@ HEAD = b'{"run_id":"e","keyframe_id":1,"timestamp":1,"detections":'
 VALID = b'{"class":"a","confidence":1,"bbox":[0,0,0,0]}'
 
 def shapes():
-    for most in (SIZE, MAX_MARKS - 100):  # as many as fit, as many as are read
+    for most in (SIZE, MAX_JSON_VALUES - 100):  # as many as fit, as many as are read
 
         def many(start, unit, end):
             marks = 1 + sum(map(unit.count, (b",", b"[", b"{")))
@@ -129,7 +129,7 @@ def test_so_many_detections_and_no_more() -> None:
 
 
 def test_so_many_values_and_no_more() -> None:
-    image = [0] * (MAX_MARKS - 100)
+    image = [0] * (MAX_JSON_VALUES - 100)
     assert isinstance(ingest(payload(envelope(depth=image))), Accepted)
     assert reason(envelope(depth=[*image, *[0] * 101])).endswith(
         "commas and opening brackets, more than 500,000"
@@ -157,11 +157,11 @@ def test_a_reason_escapes_what_a_terminal_would_obey() -> None:
 
 def test_a_bare_list_is_bounded_too() -> None:
     def said(detections: list[dict[str, Any]]) -> str:
-        event = Arrival(0, "tb/detections", 0, json.dumps(detections).encode(), version=1)
+        event = PendingEvent(0, "tb/detections", 0, json.dumps(detections).encode(), version=1)
         outcome = read_envelope(event)
         assert isinstance(outcome, Rejected)
         return outcome.reason
 
     assert said([{}] * (MAX_DETECTIONS + 1)).endswith("10001 detections, more than 10000")
-    assert said([{"a": [0] * MAX_MARKS}]).endswith("opening brackets, more than 500,000")
+    assert said([{"a": [0] * MAX_JSON_VALUES}]).endswith("opening brackets, more than 500,000")
     assert said([{"a": float("nan")}]).endswith("holds NaN or infinity")

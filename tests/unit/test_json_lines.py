@@ -10,7 +10,7 @@ from eventsrc.importers.json_lines import JsonLines
 
 
 def payloads(data: bytes) -> list[bytes]:
-    return [r.payload for r in JsonLines("f", io.BytesIO(data), len(data), data[:8]).records()]
+    return [r.payload for r in JsonLines("f", io.BytesIO(data), len(data), data[:8]).messages()]
 
 
 def test_blank_lines_are_nothing_and_the_last_needs_no_end() -> None:

@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from eventsrc.importers.json_lines import Imported, read_line
+from eventsrc.importers.json_lines import ImportedMessage, read_line
 
 TS = 1740000000.123
 TS_NS = 1740000000123000000
@@ -17,13 +17,13 @@ def record(payload_text: bytes) -> bytes:
 
 
 def test_json_is_cut_out_as_it_stands() -> None:
-    assert read_line(record(ODD)) == Imported(ODD, "tb/d", TS_NS)
+    assert read_line(record(ODD)) == ImportedMessage(ODD, "tb/d", TS_NS)
 
 
 @pytest.mark.parametrize("tail", [b', "more": [1, {"payload": 2}]}', b"   }  ", b"}"])
 def test_members_may_stand_in_any_order(tail: bytes) -> None:
     line = b' { "payload" : %s , "key":"k","ts":1740000000.123' % ODD + tail
-    assert read_line(line) == Imported(ODD, "k", TS_NS)
+    assert read_line(line) == ImportedMessage(ODD, "k", TS_NS)
 
 
 def test_a_string_is_its_text() -> None:
@@ -40,7 +40,7 @@ def test_a_string_of_base64_is_decoded_when_json_is_in_it() -> None:
 
 def test_the_older_logger_kept_bare_lists() -> None:
     line = b'{"ts": 1740000000.123, "iso": "x", "detections": [{"class":  "cup"}]}'
-    assert read_line(line) == Imported(b'[{"class":  "cup"}]', None, TS_NS)
+    assert read_line(line) == ImportedMessage(b'[{"class":  "cup"}]', None, TS_NS)
 
 
 @pytest.mark.parametrize(
@@ -57,10 +57,10 @@ def test_the_older_logger_kept_bare_lists() -> None:
     ],
 )
 def test_anything_else_is_the_message_itself(line: bytes) -> None:
-    assert read_line(line) == Imported(line)
+    assert read_line(line) == ImportedMessage(line)
 
 
 @pytest.mark.parametrize("ts", [b'"soon"', b"null", b"-1", b"1e99", b"NaN", b"Infinity"])
 def test_a_time_that_is_none_is_left_out(ts: bytes) -> None:
     line = b'{"ts": %s, "key": "k", "payload": {}}' % ts
-    assert read_line(line) == Imported(b"{}", "k", None)
+    assert read_line(line) == ImportedMessage(b"{}", "k", None)

@@ -10,7 +10,7 @@ from eventsrc.envelope import ENVELOPE_VERSION, Envelope
 from eventsrc.ingest import Accepted, Rejected
 from eventsrc.log import Event, LogReader, LogWriter
 from eventsrc.log.format import ENVELOPE_VERSION_KEY, envelope_version, key_channel
-from eventsrc.upcast import LADDER, guess_version, read_envelope
+from eventsrc.upcast import UPCASTERS, detect_version, read_envelope
 from projections.model.fold import fold_log
 from projections.settings import Settings
 from tests.fixtures_log import KEY, envelope, read_log
@@ -52,7 +52,7 @@ def test_a_version_from_the_future_is_named() -> None:
 
 
 def test_the_ladder_has_every_rung() -> None:
-    assert sorted(LADDER) == list(range(1, ENVELOPE_VERSION))
+    assert sorted(UPCASTERS) == list(range(1, ENVELOPE_VERSION))
 
 
 @pytest.mark.parametrize(
@@ -60,7 +60,7 @@ def test_the_ladder_has_every_rung() -> None:
     [(BARE, 1), (b' \n[ {"class"', 1), (b"[1]", 2), (b"[]", 2), (b"{}", 2), (b"", 2)],
 )
 def test_guessing(payload: bytes, version: int) -> None:
-    assert guess_version(payload) == version
+    assert detect_version(payload) == version
 
 
 def test_a_log_of_both_forms_keeps_the_bytes_and_folds(log_path: Path) -> None:
