@@ -221,6 +221,6 @@ def check_picture(out: Path | None) -> None:
     """Raises MisuseError when ``out`` is not the name of a picture; None is no picture."""
     if out is None:
         return
-    from projections.drawing.canvas import check_name
+    from projections.drawing.canvas import check_suffix
 
-    check_name(out)
+    check_suffix(out)

@@ -1,6 +1,6 @@
-"""The sheet a map is drawn on: axes in metres, and the boxes that text already takes.
+"""The canvas a map is drawn on: a figure with axes in metres, occupied boxes, and the colours.
 
-Colours that stay apart: one for each place, the rest of the picture in greys.
+Each place has a colour of its own; the rest of the picture is grey.
 """
 
 import colorsys
@@ -35,21 +35,26 @@ Bounds = tuple[float, float, float, float]
 
 @dataclass
 class Canvas:
-    """``bounds`` are x0, y0, x1, y1 of the drawn area; ``unit`` is the metres in a point."""
+    """``bounds`` are x0, y0, x1, y1 of the drawn area; ``unit`` is the metres in a point.
+
+    ``occupied`` are the boxes that labels must not cover.
+    """
 
     figure: Figure
     axes: Axes
     bounds: Bounds
     unit: float
-    taken: list[Extent] = field(default_factory=list)
+    occupied: list[Extent] = field(default_factory=list)
 
-    def head(self, line: int, text: str, size: float, colour: str, weight: str = "normal") -> None:
+    def header(
+        self, line: int, text: str, size: float, colour: str, weight: str = "normal"
+    ) -> None:
         """A line of text above the map; lines are numbered from the top."""
         height = self.figure.get_figheight()
         y = 1 - (0.27 + 0.27 * line) / height
         self.figure.text(0.02, y, text, fontsize=size, color=colour, weight=weight, va="center")
 
-    def foot(self, line: int, text: str, colour: str) -> None:
+    def footer(self, line: int, text: str, colour: str) -> None:
         """A line of text below the map; lines are numbered from the top."""
         y = (_FOOT_IN - 0.12 - 0.2 * line) / self.figure.get_figheight()
         self.figure.text(0.02, y, text, fontsize=8.5, color=colour, va="center")
@@ -57,8 +62,8 @@ class Canvas:
     def save(self, out: Path) -> None:
         """Write the picture; the same picture gives the same bytes."""
         for text in self.figure.findobj(Text):
-            text.set_parse_math(False)  # a class may be called "$5 bill$", which is no formula
-        # What would differ from time to time: PDF's and SVG's date, SVG's ids salted by chance.
+            text.set_parse_math(False)  # a class may be called "$5 bill$"
+        # PDF and SVG carry a date, SVG also ids with a random salt: left out, or fixed.
         undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
         try:
             out.parent.mkdir(parents=True, exist_ok=True)
@@ -66,7 +71,9 @@ class Canvas:
                 rc_context({"svg.hashsalt": "mapfold", "svg.fonttype": "none"}),
                 warnings.catch_warnings(),
             ):
-                warnings.filterwarnings("ignore", message="Glyph .* missing from font")  # a box
+                warnings.filterwarnings(
+                    "ignore", message="Glyph .* missing from font"
+                )  # drawn as a box
                 self.figure.savefig(out, dpi=_DPI, metadata=undated.get(out.suffix.lower()))
         except OSError as error:
             raise MisuseError(
@@ -74,14 +81,14 @@ class Canvas:
             ) from None
 
 
-def check_name(out: Path) -> None:
-    """Raises MisuseError when ``out`` is no picture's name."""
+def check_suffix(out: Path) -> None:
+    """Raise MisuseError unless the suffix of ``out`` is .png, .svg or .pdf."""
     if out.suffix.lower() not in SUFFIXES:
         raise MisuseError(f"{out}: a picture is .png, .svg or .pdf; give such a name")
 
 
 def new_canvas(view: MapView, floor: Floor) -> Canvas:
-    """An empty sheet that fits every pose of ``view`` and every wall of ``floor``."""
+    """An empty canvas that fits every pose of ``view`` and every wall of ``floor``."""
     x0, y0, x1, y1 = bounds = _bounds(view, floor)
     height = _WIDTH_IN * (y1 - y0) / (x1 - x0) + _HEAD_IN + _FOOT_IN
     figure = Figure(figsize=(_WIDTH_IN, height), facecolor="white")
@@ -102,7 +109,7 @@ def _bounds(view: MapView, floor: Floor) -> Bounds:
         return (-2.0, -1.0, 2.0, 1.0)
     xs, ys = [x for x, _ in spots], [y for _, y in spots]
     x0, y0, x1, y1 = min(xs), min(ys), max(xs), max(ys)
-    # A drive along a line still gets a sheet, at least a third as high as wide and the reverse.
+    # A drive along a line still gets some area: wide ≥ high / 2, high ≥ wide / 3.
     wide, high = max(x1 - x0, (y1 - y0) / 2, 1.0), max(y1 - y0, (x1 - x0) / 3, 1.0)
     x, y = (x0 + x1) / 2, (y0 + y1) / 2
     dx, dy = wide / 2 + _MARGIN_M, high / 2 + _MARGIN_M

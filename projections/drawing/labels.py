@@ -1,8 +1,8 @@
-"""Where to put labels so that they do not cover each other. No drawing here.
+"""Label placement: positions at which labels do not cover each other. No drawing here.
 
-Greedy: the most important label first. Each tries spots on rings around its anchor, nearest ring
-first, and takes the first box that hits nothing taken before. A label that finds none within the
-rings is left out, and the caller says how many were.
+Greedy, the most important label first. Each tries positions on rings around its anchor, nearest
+ring first, and gets the first box that overlaps no occupied one. A label for which there is none
+within the rings is left out; the caller tells how many were.
 """
 
 import math
@@ -21,7 +21,7 @@ class Extent:
     half_width: float
     half_height: float
 
-    def hits(self, other: "Extent") -> bool:
+    def overlaps(self, other: "Extent") -> bool:
         """Whether the two boxes overlap."""
         return (
             abs(self.x - other.x) < self.half_width + other.half_width
@@ -40,8 +40,8 @@ class Extent:
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
-    """A label of this size that belongs to an anchor."""
+class LabelRequest:
+    """An anchor (x, y) and the size of the label that belongs to it."""
 
     x: float
     y: float
@@ -50,33 +50,33 @@ class Wanted:
 
 
 def place_labels(
-    wanted: Sequence[Wanted],
-    taken: Iterable[Extent],
+    requests: Sequence[LabelRequest],
+    occupied: Iterable[Extent],
     bounds: tuple[float, float, float, float],
     rings: Sequence[float],
 ) -> list[Extent | None]:
-    """For each wanted label its box, or None where there was no room; runs parallel to ``wanted``.
+    """For each requested label its box, or None where there was no room.
 
     ``rings`` are distances from the anchor to the box's nearest edge, ascending.
     """
-    boxes = list(taken)
+    boxes = list(occupied)
     placed: list[Extent | None] = []
-    for label in wanted:
-        found = next(
+    for label in requests:
+        free = next(
             (
                 box
                 for box in _candidates(label, rings)
-                if box.inside(bounds) and not any(box.hits(other) for other in boxes)
+                if box.inside(bounds) and not any(box.overlaps(other) for other in boxes)
             ),
             None,
         )
-        if found is not None:
-            boxes.append(found)
-        placed.append(found)
+        if free is not None:
+            boxes.append(free)
+        placed.append(free)
     return placed
 
 
-def _candidates(label: Wanted, rings: Sequence[float]) -> Iterable[Extent]:
+def _candidates(label: LabelRequest, rings: Sequence[float]) -> Iterable[Extent]:
     half_width, half_height = label.width / 2, label.height / 2
     for ring in rings:
         for step in range(_ANGLES):

@@ -1,9 +1,7 @@
-"""The picture: layers from the floor up, important text before text that can move aside.
+"""A map's picture: layers from the floor up, fixed text before labels that can be moved.
 
-Objects stand where the fold has them, which is where the *robot* was when it saw them (mean); their
-labels are moved aside to stay legible, a hairline leads back.
-
-Which keyframes made places one, gathered while a log is folded.
+Objects are drawn at the fold's position, which is where the *robot* was when it saw them (mean);
+their labels are moved to stay legible, and a thin line leads back.
 """
 
 from collections.abc import Iterable, Sequence
@@ -15,9 +13,9 @@ from projections.model.fold import FoldedEvent
 from projections.model.view import MapView
 
 from . import canvas as palette
-from .canvas import Canvas, check_name, new_canvas
-from .ground import draw_drives, draw_floor, draw_regions, draw_walls
-from .marks import (
+from .base_layers import draw_drives, draw_floor, draw_regions, draw_walls
+from .canvas import Canvas, check_suffix, new_canvas
+from .overlays import (
     draw_adjacency,
     draw_bridges,
     draw_lost,
@@ -48,7 +46,7 @@ def draw_map(
     Objects seen fewer than ``min_observations`` times are left out. Raises MisuseError when ``out``
     cannot be written or has another suffix.
     """
-    check_name(out)
+    check_suffix(out)
     compose(view, title, floor or Floor(), lost, bridges, min_observations).save(out)
 
 
@@ -60,7 +58,7 @@ def compose(
     bridges: Sequence[Bridge] = (),
     min_observations: int = 2,
 ) -> Canvas:
-    """The finished sheet, not yet written anywhere."""
+    """The finished canvas, not yet written to a file."""
     canvas = new_canvas(view, floor)
     draw_floor(canvas, floor)
     draw_regions(canvas, view)
@@ -73,10 +71,10 @@ def compose(
     draw_room_names(canvas, floor)
     draw_bridges(canvas, bridges)
     left_out = draw_objects(canvas, view, min_observations)
-    canvas.head(0, title, 14, palette.INK, "bold")
-    canvas.head(1, _numbers(view, min_observations), 9.5, palette.SMALL_PRINT)
+    canvas.header(0, title, 14, palette.INK, "bold")
+    canvas.header(1, _numbers(view, min_observations), 9.5, palette.SMALL_PRINT)
     for line, text in enumerate(_legend(lost, bridges, left_out)):
-        canvas.foot(line, text, palette.SMALL_PRINT)
+        canvas.footer(line, text, palette.SMALL_PRINT)
     return canvas
 
 
@@ -113,7 +111,7 @@ def fold_with_merges(events: Iterable[FoldedEvent], view: MapView) -> list[Place
 
 
 def bridges_of(view: MapView, merges: Iterable[PlacesMerged]) -> list[Bridge]:
-    """One mark for each merge, where its bridging keyframe was taken."""
+    """One mark for each merge, at the position of its bridging keyframe."""
     names = place_names(view)
     marks: list[Bridge] = []
     for merge in merges:

@@ -1,6 +1,6 @@
-"""What a picture shows besides the map itself. All lengths in metres, all angles in radians.
+"""What a picture shows: floor plan, lost robot, merges; and from the map groups, names, drives.
 
-The plan of a simulated house, for the background of a picture.
+Lengths in metres, angles in radians.
 """
 
 import math
@@ -40,7 +40,7 @@ class Spot:
 
 @dataclass(frozen=True, slots=True)
 class LostRobot:
-    """Where a lost robot is, and where the map thinks it is (None: it did not say)."""
+    """Where a lost robot is, and where re-localisation puts it (None: no pose)."""
 
     truth: Spot
     estimate: Spot | None
@@ -49,7 +49,7 @@ class LostRobot:
 
 @dataclass(frozen=True, slots=True)
 class Bridge:
-    """The keyframe whose arrival made places one, and a few words about it."""
+    """The keyframe that merged places, and a label for it."""
 
     x: float
     y: float
@@ -65,8 +65,8 @@ class ObjectGroup:
     members: tuple[ObjectRecord, ...]
 
     @property
-    def seen(self) -> int:
-        """Observations of all of them."""
+    def obs_count(self) -> int:
+        """Observations of all its members."""
         return sum(member.obs_count for member in self.members)
 
     @property
@@ -90,17 +90,17 @@ def object_groups(view: MapView, min_observations: int) -> list[ObjectGroup]:
     grouped: dict[tuple[int | None, str], list[list[ObjectRecord]]] = defaultdict(list)
     for found in view.objects:
         if found.obs_count >= min_observations:
-            _add(grouped[found.place, found.class_name], found)
+            _add_to_group(grouped[found.place, found.class_name], found)
     groups = [
         ObjectGroup(name, place, tuple(members))
         for (place, name), clumps in grouped.items()
         for members in clumps
     ]
-    return sorted(groups, key=lambda group: (-group.seen, group.members[0].ordinal))
+    return sorted(groups, key=lambda group: (-group.obs_count, group.members[0].ordinal))
 
 
-def _add(clumps: list[list[ObjectRecord]], found: ObjectRecord) -> None:
-    """Put an object to the first clump whose first member is near, else begin another."""
+def _add_to_group(clumps: list[list[ObjectRecord]], found: ObjectRecord) -> None:
+    """Add an object to the first clump whose first member is near, else begin another."""
     for clump in clumps:
         first = clump[0].mean_x, clump[0].mean_y
         if math.dist(first, (found.mean_x, found.mean_y)) <= _NEAR_M:
@@ -110,7 +110,7 @@ def _add(clumps: list[list[ObjectRecord]], found: ObjectRecord) -> None:
 
 
 def place_names(view: MapView) -> dict[int, str]:
-    """What to call each place, living or absorbed: p3, or run_p3 where two runs have a p3."""
+    """A short name of each place, also absorbed ones: p3, or run_p3 where two runs have a p3."""
     short = {p.ordinal: p.place_id.rpartition("_")[2] for p in view.all_places}
     used = Counter(short.values())
     return {
@@ -120,14 +120,14 @@ def place_names(view: MapView) -> dict[int, str]:
 
 
 def spot_of(keyframe: KeyframeRecord) -> tuple[float, float] | None:
-    """Where a keyframe was taken, None without a pose."""
+    """A keyframe's position, None without a pose."""
     if keyframe.pose is None:
         return None
     return keyframe.pose.x_um / 1e6, keyframe.pose.y_um / 1e6
 
 
 def drives(view: MapView) -> list[tuple[RunId, list[tuple[float, float]]]]:
-    """Per run its id and its spots, in keyframe_id order."""
+    """Per run its id and its positions, in keyframe_id order."""
     by_run: dict[int, list[KeyframeRecord]] = defaultdict(list)
     for keyframe in view.keyframes:
         by_run[keyframe.run].append(keyframe)
@@ -139,7 +139,7 @@ def drives(view: MapView) -> list[tuple[RunId, list[tuple[float, float]]]]:
 
 
 def place_spots(view: MapView) -> dict[int, list[tuple[float, float]]]:
-    """Per place the spots of its keyframes."""
+    """Per place the positions of its keyframes."""
     return {
         ordinal: [s for k in place.members if (s := spot_of(view.keyframes[k])) is not None]
         for ordinal, place in view.places.items()

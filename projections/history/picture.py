@@ -13,9 +13,9 @@ from matplotlib.patches import Circle
 
 from eventsrc.envelope import Offset
 from projections.drawing import canvas as palette
-from projections.drawing.canvas import HALO, Bounds, Canvas, check_name
-from projections.drawing.ground import draw_drives, draw_regions
-from projections.drawing.marks import draw_place_names
+from projections.drawing.base_layers import draw_drives, draw_regions
+from projections.drawing.canvas import HALO, Bounds, Canvas, check_suffix
+from projections.drawing.overlays import draw_place_names
 from projections.model.view import MapView
 
 from .merges import chains_of, reason
@@ -144,5 +144,5 @@ def _whole(views: Sequence[MapView]) -> Bounds:
 
 
 def _save(figure: Figure, out: Path) -> None:
-    check_name(out)
+    check_suffix(out)
     Canvas(figure, figure.axes[0], (0, 0, 1, 1), 1.0).save(out)

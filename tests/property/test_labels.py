@@ -5,14 +5,14 @@ import math
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.drawing.labels import Extent, Wanted, place_labels
+from projections.drawing.labels import Extent, LabelRequest, place_labels
 
 BOUNDS = (0.0, 0.0, 10.0, 8.0)
 RINGS = (0.1, 0.4, 1.2)
 
 coordinates = st.floats(0, 10)
 wanted = st.builds(
-    Wanted, coordinates, coordinates, width=st.floats(0.1, 4), height=st.floats(0.1, 1)
+    LabelRequest, coordinates, coordinates, width=st.floats(0.1, 4), height=st.floats(0.1, 1)
 )
 extents = st.builds(Extent, coordinates, coordinates, st.floats(0.05, 2), st.floats(0.05, 2))
 
@@ -33,7 +33,7 @@ def _slightly_smaller(box: Extent) -> Extent:
 
 @given(st.lists(wanted, max_size=12), st.lists(extents, max_size=4))
 def test_placed_labels_are_apart_inside_and_as_large_as_wanted(
-    labels: list[Wanted], taken: list[Extent]
+    labels: list[LabelRequest], taken: list[Extent]
 ) -> None:
     placed = place_labels(labels, taken, BOUNDS, RINGS)
     assert len(placed) == len(labels)
@@ -54,7 +54,7 @@ def test_placed_labels_are_apart_inside_and_as_large_as_wanted(
 
 
 @given(wanted)
-def test_a_lone_label_with_space_around_it_lies_on_the_first_ring(label: Wanted) -> None:
+def test_a_lone_label_with_space_around_it_lies_on_the_first_ring(label: LabelRequest) -> None:
     wide = (-100.0, -100.0, 100.0, 100.0)
     (box,) = place_labels([label], [], wide, RINGS)
     assert box is not None
@@ -64,6 +64,6 @@ def test_a_lone_label_with_space_around_it_lies_on_the_first_ring(label: Wanted)
 
 
 @given(wanted)
-def test_a_label_is_left_out_only_when_everything_is_taken(label: Wanted) -> None:
+def test_a_label_is_left_out_only_when_everything_is_taken(label: LabelRequest) -> None:
     assert place_labels([label], [Extent(5, 5, 50, 50)], BOUNDS, RINGS) == [None]
     assert place_labels([label], [], (4.0, 4.0, 4.05, 4.05), RINGS) == [None]

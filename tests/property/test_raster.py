@@ -1,11 +1,11 @@
-"""Distances on a picture's sheet against every point asked of every keyframe."""
+"""A raster's distances against the distance of every point to every keyframe."""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.drawing.ground import FAR_M, REACH_M, Raster
+from projections.drawing.base_layers import FAR_M, REACH_M, Raster
 
 BOUNDS = (-3.0, -2.0, 4.0, 3.0)
 COORDINATE = st.floats(-6.0, 6.0)

@@ -1,6 +1,6 @@
-"""The upper layers: adjacency, names, objects, merges, the lost robot.
+"""The upper layers of a picture: adjacency, names, objects, merges, the lost robot.
 
-Whatever carries text claims its box on the canvas, so that later and less important text keeps
+Each text adds its box to the canvas' occupied ones, so that later and less important labels keep
 clear of it.
 """
 
@@ -13,7 +13,7 @@ from projections.model.view import MapView
 
 from . import canvas as palette
 from .canvas import HALO, Canvas
-from .labels import Extent, Wanted, place_labels
+from .labels import Extent, LabelRequest, place_labels
 from .scene import Bridge, Floor, LostRobot, Spot, object_groups, place_names
 
 _LABEL_PT = 8.0
@@ -28,7 +28,7 @@ def draw_adjacency(canvas: Canvas, view: MapView) -> None:
         line = {"arrowstyle": "-", "color": palette.INK, "lw": 1.2, "ls": (0, (4, 3))}
         canvas.axes.annotate("", end, start, zorder=8, arrowprops=line)
         middle = (start[0] + end[0]) / 2, (start[1] + end[1]) / 2
-        _badge(
+        _draw_badge(
             canvas, middle, str(count), 7.5, ("white", palette.INK, palette.INK), "round,pad=0.2"
         )
 
@@ -39,23 +39,25 @@ def draw_place_names(canvas: Canvas, view: MapView) -> None:
     for ordinal, place in view.places.items():
         centroid = place.centroid_x, place.centroid_y
         colours = palette.place_colour(ordinal), "white", "white"
-        _badge(canvas, centroid, names[ordinal], 10, colours, "round,pad=0.3,rounding_size=0.9")
+        _draw_badge(
+            canvas, centroid, names[ordinal], 10, colours, "round,pad=0.3,rounding_size=0.9"
+        )
 
 
 def draw_room_names(canvas: Canvas, floor: Floor) -> None:
-    """In the first corner of the room that is free."""
+    """Each room's name, in the first of its corners that is free."""
     height = 12 * canvas.unit
     for name, (x0, y0, x1, y1) in floor.rooms:
         width = 5.6 * len(name) * canvas.unit
         dx, dy = width / 2 + 0.14, height / 2 + 0.1
         corners = ((x0 + dx, y1 - dy), (x1 - dx, y1 - dy), (x0 + dx, y0 + dy), (x1 - dx, y0 + dy))
         boxes = [Extent(x, y, width / 2, height / 2) for x, y in corners]
-        free = [box for box in boxes if not any(box.hits(taken) for taken in canvas.taken)]
-        _write(canvas, (free or boxes)[0], name, 9.5, palette.ROOM_NAME, style="italic")
+        free = [box for box in boxes if not any(box.overlaps(other) for other in canvas.occupied)]
+        _draw_text(canvas, (free or boxes)[0], name, 9.5, palette.ROOM_NAME, style="italic")
 
 
 def draw_objects(canvas: Canvas, view: MapView, min_observations: int) -> int:
-    """A dot for each object, a label for each group; returns how many labels found no room."""
+    """A dot for each object, a label for each group; returns how many labels did not fit."""
     groups = object_groups(view, min_observations)
     for group in groups:
         colour = palette.INK if group.place is None else palette.place_colour(group.place)
@@ -63,34 +65,34 @@ def draw_objects(canvas: Canvas, view: MapView, min_observations: int) -> int:
         canvas.axes.scatter(
             xs, ys, s=15, marker="D", facecolor=colour, edgecolor="white", lw=0.6, zorder=10
         )
-        canvas.taken += (Extent(x, y, 0.04, 0.04) for x, y in zip(xs, ys, strict=True))
-    wanted = [_wanted(canvas, group.label, group.spot) for group in groups]
-    boxes = place_labels(wanted, canvas.taken, canvas.bounds, _RINGS_M)
+        canvas.occupied += (Extent(x, y, 0.04, 0.04) for x, y in zip(xs, ys, strict=True))
+    requests = [_label_request(canvas, group.label, group.spot) for group in groups]
+    boxes = place_labels(requests, canvas.occupied, canvas.bounds, _RINGS_M)
     for group, box in zip(groups, boxes, strict=True):
         if box is not None:
-            _leader(canvas, group.spot, box)
-            _write(canvas, box, group.label, _LABEL_PT, palette.INK)
+            _draw_leader(canvas, group.spot, box)
+            _draw_text(canvas, box, group.label, _LABEL_PT, palette.INK)
     return sum(box is None for box in boxes)
 
 
 def draw_bridges(canvas: Canvas, bridges: Sequence[Bridge]) -> None:
-    """A ring around each keyframe that made places one, and what it did."""
+    """A ring around each keyframe that merged places, with its text."""
     for bridge in bridges:
         canvas.axes.scatter(
             [bridge.x], [bridge.y], s=110, marker="o", facecolor="none", edgecolor=palette.BRIDGE,
             lw=1.8, zorder=13,
         )  # fmt: skip
-        canvas.taken.append(Extent(bridge.x, bridge.y, 0.12, 0.12))
-    wanted = [_wanted(canvas, bridge.text, (bridge.x, bridge.y)) for bridge in bridges]
-    boxes = place_labels(wanted, canvas.taken, canvas.bounds, _RINGS_M)
+        canvas.occupied.append(Extent(bridge.x, bridge.y, 0.12, 0.12))
+    requests = [_label_request(canvas, bridge.text, (bridge.x, bridge.y)) for bridge in bridges]
+    boxes = place_labels(requests, canvas.occupied, canvas.bounds, _RINGS_M)
     for bridge, box in zip(bridges, boxes, strict=True):
         if box is not None:
-            _leader(canvas, (bridge.x, bridge.y), box)
-            _write(canvas, box, bridge.text, _LABEL_PT, palette.BRIDGE, weight="bold")
+            _draw_leader(canvas, (bridge.x, bridge.y), box)
+            _draw_text(canvas, box, bridge.text, _LABEL_PT, palette.BRIDGE, weight="bold")
 
 
 def draw_lost(canvas: Canvas, lost: LostRobot) -> None:
-    """The lost robot's true spot, the estimate with its spread, and the line between them."""
+    """The lost robot's true position, the estimate with its spread, and a line between them."""
     truth, estimate = lost.truth, lost.estimate
     if estimate is not None:
         if lost.spread_m:
@@ -101,11 +103,11 @@ def draw_lost(canvas: Canvas, lost: LostRobot) -> None:
             (truth.x, estimate.x), (truth.y, estimate.y), color=palette.ESTIMATE, lw=1.6, ls=":",
             zorder=13,
         )  # fmt: skip
-        _robot(canvas, estimate, palette.ESTIMATE, "o")
-    _robot(canvas, truth, palette.TRUTH, "X")
+        _draw_robot(canvas, estimate, palette.ESTIMATE, "o")
+    _draw_robot(canvas, truth, palette.TRUTH, "X")
 
 
-def _robot(canvas: Canvas, spot: Spot, colour: str, marker: str) -> None:
+def _draw_robot(canvas: Canvas, spot: Spot, colour: str, marker: str) -> None:
     canvas.axes.scatter(
         [spot.x], [spot.y], s=120, marker=marker, facecolor=colour, edgecolor="white", lw=1.2,
         zorder=16,
@@ -114,10 +116,10 @@ def _robot(canvas: Canvas, spot: Spot, colour: str, marker: str) -> None:
         tip = spot.x + 0.5 * math.cos(spot.yaw_rad), spot.y + 0.5 * math.sin(spot.yaw_rad)
         arrow = {"arrowstyle": "-|>", "color": colour, "lw": 1.8}
         canvas.axes.annotate("", tip, (spot.x, spot.y), zorder=15, arrowprops=arrow)
-    canvas.taken.append(Extent(spot.x, spot.y, 0.15, 0.15))
+    canvas.occupied.append(Extent(spot.x, spot.y, 0.15, 0.15))
 
 
-def _badge(
+def _draw_badge(
     canvas: Canvas,
     spot: tuple[float, float],
     text: str,
@@ -133,19 +135,19 @@ def _badge(
         zorder=14,
     )  # fmt: skip
     half_width = (0.36 * size * len(text) + 0.45 * size) * canvas.unit
-    canvas.taken.append(Extent(*spot, half_width, 0.9 * size * canvas.unit))
+    canvas.occupied.append(Extent(*spot, half_width, 0.9 * size * canvas.unit))
 
 
-def _wanted(canvas: Canvas, text: str, spot: tuple[float, float]) -> Wanted:
+def _label_request(canvas: Canvas, text: str, spot: tuple[float, float]) -> LabelRequest:
     width = (0.58 * len(text) * _LABEL_PT + 3) * canvas.unit
-    return Wanted(*spot, width, 1.3 * _LABEL_PT * canvas.unit)
+    return LabelRequest(*spot, width, 1.3 * _LABEL_PT * canvas.unit)
 
 
-def _leader(canvas: Canvas, anchor: tuple[float, float], box: Extent) -> None:
+def _draw_leader(canvas: Canvas, anchor: tuple[float, float], box: Extent) -> None:
     canvas.axes.plot((anchor[0], box.x), (anchor[1], box.y), color=palette.LEADER, lw=0.5, zorder=9)
 
 
-def _write(
+def _draw_text(
     canvas: Canvas,
     box: Extent,
     text: str,
@@ -155,7 +157,7 @@ def _write(
     style: str = "normal",
     weight: str = "normal",
 ) -> None:
-    canvas.taken.append(box)
+    canvas.occupied.append(box)
     canvas.axes.text(
         box.x, box.y, text, ha="center", va="center", size=size, color=colour, style=style,
         weight=weight, path_effects=HALO, zorder=11,

@@ -1,13 +1,10 @@
-"""The lower layers: floor, place regions, drives, walls.
+"""The lower layers of a picture: floor, place regions, drives, walls.
 
 A place's region is all that lies within ``REACH_M`` of one of its keyframes and nearer to it than
-to any other place's.
-
-How far each point of a sheet is from a place's keyframes, as far as that shows on a picture.
-
-Beyond ``REACH_M`` a point is in no region, so a keyframe matters to the few points around it alone,
-and its cost does not grow with the sheet. Two steps more are told exactly: the outline is drawn
-between points on both of its sides.
+to any other place's. It is drawn from a raster of distances to the place's keyframes. Beyond
+``REACH_M`` a point is in no region, so distances are computed only around each keyframe, and the
+cost of a keyframe does not grow with the canvas. They are exact up to two steps beyond, because the
+outline is drawn between points on both of its sides.
 """
 
 from collections.abc import Sequence
@@ -27,7 +24,7 @@ from .scene import Box, Floor, drives, place_spots
 REACH_M = 0.55
 """A place's region reaches this far around its keyframes."""
 FAR_M = 2 * REACH_M
-"""What is said of all points that are further away than shows."""
+"""The distance given for all points outside the regions."""
 _STEP_M = 0.05
 _MAX_STEPS = 400
 
@@ -35,8 +32,8 @@ Grid = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Patch:
-    """Metres to the nearest of some spots, for the rows and columns of the sheet around them."""
+class DistancePatch:
+    """Metres to the nearest of some spots, for the raster's rows and columns around them."""
 
     rows: slice
     columns: slice
@@ -44,7 +41,7 @@ class Patch:
 
 
 class Raster:
-    """Points ``xs`` by ``ys`` of the sheet ``bounds`` (x0, y0, x1, y1), in metres."""
+    """Points ``xs`` by ``ys`` of the canvas ``bounds`` (x0, y0, x1, y1), in metres."""
 
     def __init__(self, bounds: tuple[float, float, float, float]) -> None:
         x0, y0, x1, y1 = bounds
@@ -52,8 +49,8 @@ class Raster:
         self.xs: Grid = np.arange(x0, x1, self.step)
         self.ys: Grid = np.arange(y0, y1, self.step)
 
-    def distances(self, spots: Sequence[tuple[float, float]]) -> Patch:
-        """To the nearest of ``spots``, FAR_M where that is beyond what shows; empty for none."""
+    def distances(self, spots: Sequence[tuple[float, float]]) -> DistancePatch:
+        """Distances to the nearest of ``spots``, FAR_M outside the regions; empty for no spots."""
         near = [(*self.around(x, y), x, y) for x, y in spots]
         rows = _hull([each[0] for each in near])
         columns = _hull([each[1] for each in near])
@@ -62,10 +59,10 @@ class Raster:
             part = field[_within(own_rows, rows), _within(own_columns, columns)]
             to_x, to_y = self.xs[None, own_columns] - x, self.ys[own_rows, None] - y
             np.minimum(part, np.hypot(to_x, to_y), out=part)
-        return Patch(rows, columns, field)
+        return DistancePatch(rows, columns, field)
 
     def around(self, x: float, y: float) -> tuple[slice, slice]:
-        """Rows and columns of the points that a keyframe there matters to."""
+        """Rows and columns of the points near enough for a keyframe there to count."""
         return self._span(self.ys, y), self._span(self.xs, x)
 
     def _span(self, points: Grid, middle: float) -> slice:
@@ -92,18 +89,18 @@ def draw_floor(canvas: Canvas, floor: Floor) -> None:
 
 
 def draw_walls(canvas: Canvas, floor: Floor) -> None:
-    """Walls, on top of the regions that may reach a little through them."""
+    """Walls, on top of the regions, which may reach a little through them."""
     for x0, y0, x1, y1 in floor.walls:
         canvas.axes.plot(
             (x0, x1), (y0, y1), color=palette.WALL, lw=3.2, solid_capstyle="projecting", zorder=7
         )
-        if x0 == x1 or y0 == y1:  # text keeps off upright walls; a slanted one's box is too much
+        if x0 == x1 or y0 == y1:  # labels keep off upright walls; a slanted one's box is too large
             half_x, half_y = abs(x1 - x0) / 2 + 0.03, abs(y1 - y0) / 2 + 0.03
-            canvas.taken.append(Extent((x0 + x1) / 2, (y0 + y1) / 2, half_x, half_y))
+            canvas.occupied.append(Extent((x0 + x1) / 2, (y0 + y1) / 2, half_x, half_y))
 
 
 def draw_regions(canvas: Canvas, view: MapView) -> None:
-    """What each place covers, in its colour."""
+    """Each place's region, in its colour."""
     raster = Raster(canvas.bounds)
     patches = {p: raster.distances(spots) for p, spots in place_spots(view).items()}
     nearest = np.full((len(raster.ys), len(raster.xs)), np.inf)
@@ -114,14 +111,14 @@ def draw_regions(canvas: Canvas, view: MapView) -> None:
         if min(patch.field.shape) < 2:
             continue
         field = np.where(patch.field <= nearest[patch.rows, patch.columns], patch.field, FAR_M)
-        sheet = raster.xs[patch.columns], raster.ys[patch.rows], field
+        grid = raster.xs[patch.columns], raster.ys[patch.rows], field
         colours = [palette.place_colour(place)]
-        canvas.axes.contourf(*sheet, levels=[-1.0, REACH_M], colors=colours, alpha=0.28, zorder=2)
-        canvas.axes.contour(*sheet, levels=[REACH_M], colors=colours, linewidths=1.1, zorder=3)
+        canvas.axes.contourf(*grid, levels=[-1.0, REACH_M], colors=colours, alpha=0.28, zorder=2)
+        canvas.axes.contour(*grid, levels=[REACH_M], colors=colours, linewidths=1.1, zorder=3)
 
 
 def draw_drives(canvas: Canvas, view: MapView) -> None:
-    """Each run's way, where it started, and its keyframes in their places' colours."""
+    """Each run's path, where it started, and its keyframes in their places' colours."""
     for _, spots in drives(view):
         if spots:
             xs, ys = zip(*spots, strict=True)
