@@ -6,7 +6,8 @@ per thing is enough, and applying one twice does no harm. ``offset`` names the e
 the cause need not be a keyframe.
 
 Ordinals number the things of one kind 0, 1, 2 … in the order in which the fold met or founded them.
-They are never reused, and a database's ids are computed from them.
+They are never reused, and a database's ids are computed from them. They are ints at run time; mypy
+keeps those of one kind apart from the others.
 
 Positions are integer micrometres in the map frame (``_um``), so that sums and comparisons are
 exact; `projections.exact` says why and where the bounds are. Timestamps are the robot's, float
@@ -22,14 +23,20 @@ the time of a frozen dataclass to make. ``gc=False`` keeps them out of the garba
 would traverse a whole history of them; a delta is never part of a reference cycle.
 """
 
-from typing import TypeAlias
+from typing import Literal, NewType, TypeAlias
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from eventsrc.envelope import Offset, RunId
+from eventsrc.envelope import DetId, KeyframeId, Offset, RunId
 
+RunOrdinal = NewType("RunOrdinal", int)
+KeyframeOrdinal = NewType("KeyframeOrdinal", int)
+ObservationOrdinal = NewType("ObservationOrdinal", int)
+PlaceOrdinal = NewType("PlaceOrdinal", int)
+ObjectOrdinal = NewType("ObjectOrdinal", int)
+SkipKind: TypeAlias = Literal["duplicate", "conflict", "det_id_reused"]
 UnitVector: TypeAlias = NDArray[np.int32]
 """A unit vector as multiples of 2⁻²⁰, int32 of shape (dim,); see `projections.exact`."""
 
@@ -59,7 +66,7 @@ class RunSeen(msgspec.Struct, frozen=True, gc=False):
     """
 
     offset: Offset
-    run: int
+    run: RunOrdinal
     run_id: RunId
     started_at: float
 
@@ -68,10 +75,10 @@ class KeyframeAdded(msgspec.Struct, frozen=True, gc=False):
     """A new keyframe; ``pose`` is None when the robot did not know where it was."""
 
     offset: Offset
-    keyframe: int
-    run: int
+    keyframe: KeyframeOrdinal
+    run: RunOrdinal
     run_id: RunId
-    keyframe_id: int
+    keyframe_id: KeyframeId
     timestamp: float
     pose: Pose | None
 
@@ -84,11 +91,11 @@ class ObservationAdded(msgspec.Struct, frozen=True, eq=False, gc=False):
     """
 
     offset: Offset
-    observation: int
-    keyframe: int
+    observation: ObservationOrdinal
+    keyframe: KeyframeOrdinal
     run_id: RunId
-    keyframe_id: int
-    det_id: str
+    keyframe_id: KeyframeId
+    det_id: DetId
     class_name: str
     confidence: float
     bbox: tuple[float, float, float, float]
@@ -107,10 +114,10 @@ class EventSkipped(msgspec.Struct, frozen=True, gc=False):
     """
 
     offset: Offset
-    kind: str
+    kind: SkipKind
     run_id: RunId
-    keyframe_id: int
-    det_id: str | None = None
+    keyframe_id: KeyframeId
+    det_id: DetId | None = None
     first_offset: Offset | None = None
 
 
@@ -121,16 +128,16 @@ class PlaceFormed(msgspec.Struct, frozen=True, gc=False):
     """
 
     offset: Offset
-    place: int
+    place: PlaceOrdinal
     place_id: str
-    founder: int
+    founder: KeyframeOrdinal
 
 
 class Link(msgspec.Struct, frozen=True, gc=False):
     """Two core points within ε of each other that joined two places; keyframe ordinals, µm."""
 
-    core: int
-    neighbour: int
+    core: KeyframeOrdinal
+    neighbour: KeyframeOrdinal
     distance_um: int
 
 
@@ -144,9 +151,9 @@ class PlacesMerged(msgspec.Struct, frozen=True, gc=False):
     """
 
     offset: Offset
-    survivor: int
-    absorbed: tuple[int, ...]
-    bridge: int
+    survivor: PlaceOrdinal
+    absorbed: tuple[PlaceOrdinal, ...]
+    bridge: KeyframeOrdinal
     links: tuple[Link, ...]
     survivor_count: int
     absorbed_counts: tuple[int, ...]
@@ -156,8 +163,8 @@ class KeyframePlaced(msgspec.Struct, frozen=True, gc=False):
     """A keyframe (new, or noise until now) belongs to a place."""
 
     offset: Offset
-    keyframe: int
-    place: int
+    keyframe: KeyframeOrdinal
+    place: PlaceOrdinal
 
 
 class PlaceChanged(msgspec.Struct, frozen=True, gc=False):
@@ -167,7 +174,7 @@ class PlaceChanged(msgspec.Struct, frozen=True, gc=False):
     """
 
     offset: Offset
-    place: int
+    place: PlaceOrdinal
     keyframe_count: int
     sum_x_um: int
     sum_y_um: int
@@ -177,10 +184,10 @@ class ObjectFound(msgspec.Struct, frozen=True, gc=False):
     """A new Object, founded by an observation; its position is that keyframe's pose."""
 
     offset: Offset
-    object: int
+    object: ObjectOrdinal
     object_id: str
     class_name: str
-    observation: int
+    observation: ObservationOrdinal
 
 
 class ObjectSeen(msgspec.Struct, frozen=True, gc=False):
@@ -192,8 +199,8 @@ class ObjectSeen(msgspec.Struct, frozen=True, gc=False):
     """
 
     offset: Offset
-    object: int
-    observation: int
+    object: ObjectOrdinal
+    observation: ObservationOrdinal
     similarity_q40: int
     obs_count: int
     sum_x_um: int
@@ -206,8 +213,8 @@ class ObjectMoved(msgspec.Struct, frozen=True, gc=False):
     """An Object is located in another place than before, or in none (None)."""
 
     offset: Offset
-    object: int
-    place: int | None
+    object: ObjectOrdinal
+    place: PlaceOrdinal | None
 
 
 class PlacesLinked(msgspec.Struct, frozen=True, gc=False):
@@ -217,8 +224,8 @@ class PlacesLinked(msgspec.Struct, frozen=True, gc=False):
     """
 
     offset: Offset
-    a: int
-    b: int
+    a: PlaceOrdinal
+    b: PlaceOrdinal
     shared_transitions: int
 
 

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Iterator
 from json.encoder import encode_basestring
 from typing import Final
 
+from projections.deltas import PlaceOrdinal
 from projections.exact import Q40, UM_PER_M
 from projections.model.view import KeyframeRecord, MapView
 
@@ -188,7 +189,7 @@ def adjacent_to_rows(view: MapView, links: Iterable[tuple[int, int]]) -> Iterato
     """The edges of those pairs of places that still have one."""
     base = graphid_base("ADJACENT_TO")
     for a, b in links:
-        shared = view.adjacency.get((a, b))
+        shared = view.adjacency.get((PlaceOrdinal(a), PlaceOrdinal(b)))
         if shared is not None:
             properties = f'{{"shared_transitions": {shared}}}'
             edge = base + adjacency_number(a, b)

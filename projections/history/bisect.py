@@ -18,7 +18,8 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from eventsrc.envelope import Offset
+from eventsrc.envelope import KeyframeId, Offset, RunId
+from projections.deltas import KeyframeOrdinal
 
 from .condition_functions import Direction, Names, Value
 from .conditions import Expression
@@ -126,11 +127,11 @@ class HistoryFacts:
         return None if place is None else self._history.places[place].place_id
 
 
-def keyframe_number(history: History, text: str) -> int | None:
+def keyframe_number(history: History, text: str) -> KeyframeOrdinal | None:
     """The ordinal of the keyframe ``run_id:keyframe_id`` names; a run id may hold colons."""
     run_id, _, number = text.rpartition(":")
     try:
-        return history.keyframe_numbers.get((run_id, int(number)))
+        return history.keyframe_numbers.get((RunId(run_id), KeyframeId(int(number))))
     except ValueError:
         return None
 

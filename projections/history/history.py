@@ -15,29 +15,33 @@ when at least ``min_samples`` posed keyframes, itself included, are within ε of
 
 from array import array
 from bisect import bisect_left
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, MutableSequence, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from eventsrc.envelope import FIRST_OFFSET, Offset
+from eventsrc.envelope import FIRST_OFFSET, KeyframeId, Offset, RunId
 from projections.deltas import (
     Delta,
     EventSkipped,
     KeyframeAdded,
+    KeyframeOrdinal,
     KeyframePlaced,
     ObjectFound,
     ObjectMoved,
+    ObjectOrdinal,
     ObjectSeen,
     PlaceChanged,
     PlaceFormed,
+    PlaceOrdinal,
     PlacesLinked,
     PlacesMerged,
     RunSeen,
 )
 from projections.exact import distance_um, metres_to_um
+from projections.reducers import packed
 from projections.settings import Settings
 
 from .records import Cause, EdgeChange, Merge, ObjectLife, PlaceLife, cause_of, last_before
@@ -49,14 +53,14 @@ class Neighbours:
     def __init__(self, keyframes: Sequence[KeyframeAdded], settings: Settings) -> None:
         self._radius = metres_to_um(settings.eps_m)
         self._min_samples = settings.min_samples
-        posed = [(n, k.offset, k.pose) for n, k in enumerate(keyframes) if k.pose is not None]
+        posed = [(k.keyframe, k.offset, k.pose) for k in keyframes if k.pose is not None]
         self._numbers = [n for n, _, _ in posed]
         self._offsets = [offset for _, offset, _ in posed]
         self._spots = np.array([(p.x_um, p.y_um) for _, _, p in posed], np.int64).reshape(-1, 2)
         self._row = {number: row for row, number in enumerate(self._numbers)}
         self._cells = _rows_by_cell(self._spots // self._radius)
 
-    def of(self, keyframe: int, end: Offset) -> list[int]:
+    def of(self, keyframe: KeyframeOrdinal, end: Offset) -> list[KeyframeOrdinal]:
         """Keyframes within ε of a posed ``keyframe``, itself too, after ``end`` events; ascending
         ordinals."""
         x, y = self._spots[self._row[keyframe]]
@@ -68,14 +72,14 @@ class Neighbours:
         near = ((self._spots[rows] - (x, y)) ** 2).sum(axis=1) <= self._radius**2
         return [self._numbers[row] for row in rows[near]]
 
-    def is_core(self, keyframe: int, end: Offset) -> bool:
+    def is_core(self, keyframe: KeyframeOrdinal, end: Offset) -> bool:
         """Whether it is a core point after ``end`` events; false before it came."""
         row = self._row.get(keyframe)
         if row is None or self._offsets[row] >= end:
             return False
         return len(self.of(keyframe, end)) >= self._min_samples
 
-    def made_core(self, bridge: int, offset: Offset) -> list[int]:
+    def made_core(self, bridge: KeyframeOrdinal, offset: Offset) -> list[KeyframeOrdinal]:
         """The keyframes that the coming of ``bridge`` at ``offset`` made core points."""
         if bridge not in self._row:
             return []
@@ -85,12 +89,12 @@ class Neighbours:
             if self.is_core(keyframe, Offset(offset + 1)) and not self.is_core(keyframe, offset)
         ]
 
-    def distance_um(self, a: int, b: int) -> int:
+    def distance_um(self, a: KeyframeOrdinal, b: KeyframeOrdinal) -> int:
         """The distance of two posed keyframes, rounded down."""
         (ax, ay), (bx, by) = (map(int, self._spots[self._row[k]]) for k in (a, b))
         return distance_um(ax, ay, bx, by)
 
-    def spots(self, keyframes: Sequence[int]) -> NDArray[np.float64]:
+    def spots(self, keyframes: Sequence[KeyframeOrdinal]) -> NDArray[np.float64]:
         """Positions of posed keyframes in metres, shape (n, 2)."""
         metres: NDArray[np.float64] = self._spots[[self._row[k] for k in keyframes]] / 1e6
         return metres
@@ -110,12 +114,14 @@ def _rows_by_cell(cells: NDArray[np.int64]) -> dict[tuple[int, int], NDArray[np.
 
 NEVER = Offset(2**63 - 1)
 """The offset of what has not happened."""
+NO_PLACE = PlaceOrdinal(-1)
+"""What `History.placed_in` holds for a keyframe in no place."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Move:
-    object: int
-    before: int | None
+    object: ObjectOrdinal
+    before: PlaceOrdinal | None
 
 
 class History:
@@ -131,16 +137,16 @@ class History:
         self.keyframes: list[KeyframeAdded] = []
         self.keyframe_offsets = array("q")
         self.placed_offsets = array("q")
-        self.placed_in = array("q")
+        self.placed_in: MutableSequence[PlaceOrdinal] = packed("q")
         self.places: list[PlaceLife] = []
         self.objects: list[ObjectLife] = []
         self.merges: list[Merge] = []
         self.runs: list[list[RunSeen]] = []
         self.skipped: list[EventSkipped] = []
-        self.edges: dict[tuple[int, int], list[PlacesLinked]] = {}
-        self.keyframe_numbers: dict[tuple[str, int], int] = {}
-        self.place_numbers: dict[str, int] = {}
-        self.object_numbers: dict[str, int] = {}
+        self.edges: dict[tuple[PlaceOrdinal, PlaceOrdinal], list[PlacesLinked]] = {}
+        self.keyframe_numbers: dict[tuple[RunId, KeyframeId], KeyframeOrdinal] = {}
+        self.place_numbers: dict[str, PlaceOrdinal] = {}
+        self.object_numbers: dict[str, ObjectOrdinal] = {}
         self._neighbours: tuple[int, Neighbours] | None = None
 
     def apply(self, offset: Offset, deltas: Sequence[Delta]) -> None:
@@ -172,14 +178,14 @@ class History:
             self._neighbours = count, Neighbours(self.keyframes, self.settings)
         return self._neighbours[1]
 
-    def place_at(self, keyframe: int, end: Offset | None = None) -> int | None:
+    def place_at(self, keyframe: KeyframeOrdinal, end: Offset | None = None) -> PlaceOrdinal | None:
         """The place a keyframe is in after the events below ``end`` (default: all so far)."""
         end = self.next_offset if end is None else end
         if self.placed_offsets[keyframe] >= end:
             return None
         return self.survivor_of(self.placed_in[keyframe], end)
 
-    def survivor_of(self, place: int, end: Offset | None = None) -> int:
+    def survivor_of(self, place: PlaceOrdinal, end: Offset | None = None) -> PlaceOrdinal:
         """Who stands for ``place`` after the events below ``end`` (default: all so far)."""
         end = self.next_offset if end is None else end
         while (merge := self.places[place].absorbed) is not None and merge.cause.offset < end:
@@ -196,7 +202,7 @@ class History:
         added = self.keyframes[number : number + 1]
         return cause_of(offset, [k for k in added if k.offset == offset])
 
-    def transitions(self, a: int, b: int, end: Offset) -> int:
+    def transitions(self, a: PlaceOrdinal, b: PlaceOrdinal, end: Offset) -> int:
         """Shared transitions of two places after the events below ``end``."""
         pair = (min(a, b), max(a, b))
         linked = last_before(self.edges.get(pair, ()), end)
@@ -208,17 +214,17 @@ class History:
         self.runs[delta.run].append(delta)
 
     def _keyframe_added(self, delta: KeyframeAdded, _: Cause) -> None:
-        self.keyframe_numbers[delta.run_id, delta.keyframe_id] = len(self.keyframes)
+        self.keyframe_numbers[delta.run_id, delta.keyframe_id] = delta.keyframe
         self.keyframes.append(delta)
         self.keyframe_offsets.append(delta.offset)
         self.placed_offsets.append(NEVER)
-        self.placed_in.append(-1)
+        self.placed_in.append(NO_PLACE)
 
     def _event_skipped(self, delta: EventSkipped, _: Cause) -> None:
         self.skipped.append(delta)
 
     def _place_formed(self, delta: PlaceFormed, cause: Cause) -> None:
-        self.place_numbers[delta.place_id] = len(self.places)
+        self.place_numbers[delta.place_id] = delta.place
         self.places.append(PlaceLife(delta, cause))
 
     def _keyframe_placed(self, delta: KeyframePlaced, _: Cause) -> None:
@@ -230,7 +236,7 @@ class History:
         self.places[delta.place].changes.append(delta)
 
     def _object_found(self, delta: ObjectFound, cause: Cause) -> None:
-        self.object_numbers[delta.object_id] = len(self.objects)
+        self.object_numbers[delta.object_id] = delta.object
         self.objects.append(ObjectLife(delta, cause))
 
     def _object_seen(self, delta: ObjectSeen, _: Cause) -> None:

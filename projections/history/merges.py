@@ -20,7 +20,7 @@ from itertools import pairwise
 from typing import Any
 
 from eventsrc.envelope import Offset
-from projections.deltas import Link
+from projections.deltas import KeyframeOrdinal, Link, PlaceOrdinal
 
 from .history import History
 from .records import EdgeChange, Merge
@@ -35,13 +35,13 @@ class Chain:
     ``distances_um`` are the steps between them.
     """
 
-    joined: int
-    absorbed: int
-    points: tuple[int, ...]
+    joined: PlaceOrdinal
+    absorbed: PlaceOrdinal
+    points: tuple[KeyframeOrdinal, ...]
     distances_um: tuple[int, ...]
 
     @property
-    def made_core(self) -> tuple[int, ...]:
+    def made_core(self) -> tuple[KeyframeOrdinal, ...]:
         """The points that this event made core."""
         return self.points[1:-1]
 
@@ -64,10 +64,12 @@ def chains_of(history: History, merge: Merge) -> list[Chain]:
     return chains
 
 
-def _doors(history: History, merge: Merge, keyframe: int) -> dict[int, int]:
+def _doors(
+    history: History, merge: Merge, keyframe: KeyframeOrdinal
+) -> dict[PlaceOrdinal, KeyframeOrdinal]:
     """By place the nearest old core point within ε of a new one."""
     offset, neighbours = merge.cause.offset, history.neighbours
-    doors: dict[int, int] = {}
+    doors: dict[PlaceOrdinal, KeyframeOrdinal] = {}
     near = (k for k in neighbours.of(keyframe, Offset(offset + 1)) if neighbours.is_core(k, offset))
     for old in sorted(near, key=lambda k: (neighbours.distance_um(keyframe, k), k)):
         place = history.place_at(old, offset)
@@ -79,12 +81,12 @@ def _doors(history: History, merge: Merge, keyframe: int) -> dict[int, int]:
 def _shortest(
     history: History,
     merge: Merge,
-    doors: dict[int, dict[int, int]],
-    joined: set[int],
-    waiting: set[int],
+    doors: dict[KeyframeOrdinal, dict[PlaceOrdinal, KeyframeOrdinal]],
+    joined: set[PlaceOrdinal],
+    waiting: set[PlaceOrdinal],
 ) -> Chain | None:
     """Breadth first over the new core points, from joined places to one that waits."""
-    paths: deque[tuple[int, tuple[int, ...]]] = deque(
+    paths: deque[tuple[PlaceOrdinal, tuple[KeyframeOrdinal, ...]]] = deque(
         (place, (old, new)) for new in doors for place, old in doors[new].items() if place in joined
     )
     seen = {path[-1] for _, path in paths}
@@ -100,13 +102,21 @@ def _shortest(
 
 
 def _next(
-    history: History, merge: Merge, keyframe: int, doors: dict[int, dict[int, int]]
-) -> Iterator[int]:
+    history: History,
+    merge: Merge,
+    keyframe: KeyframeOrdinal,
+    doors: dict[KeyframeOrdinal, dict[PlaceOrdinal, KeyframeOrdinal]],
+) -> Iterator[KeyframeOrdinal]:
     near = history.neighbours.of(keyframe, Offset(merge.cause.offset + 1))
     return (k for k in near if k in doors)
 
 
-def _chain(history: History, joined: int, absorbed: int, points: tuple[int, ...]) -> Chain:
+def _chain(
+    history: History,
+    joined: PlaceOrdinal,
+    absorbed: PlaceOrdinal,
+    points: tuple[KeyframeOrdinal, ...],
+) -> Chain:
     distances = tuple(history.neighbours.distance_um(a, b) for a, b in pairwise(points))
     return Chain(joined, absorbed, points, distances)
 

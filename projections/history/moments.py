@@ -8,6 +8,7 @@ keyframe joined, objects) is made anew, so views never disturb each other.
 from bisect import bisect_left
 
 from eventsrc.envelope import Offset
+from projections.deltas import PlaceOrdinal
 from projections.model.view import (
     KeyframeRecord,
     MapView,
@@ -16,6 +17,7 @@ from projections.model.view import (
     PlaceRecord,
     RunRecord,
 )
+from projections.reducers.survivors import PlaceSurvivors
 from projections.settings import Settings
 
 from .history import History
@@ -26,8 +28,10 @@ def view_at(history: History, latest: MapView, end: Offset, settings: Settings) 
     """The map after the events below ``end``; ``latest`` is a view of at least as many events."""
     view = MapView(settings, keep_embeddings=latest.keep_embeddings)
     view.all_places = _places(history, end)
-    view.places = {p.ordinal: p for p in view.all_places if p.survivor is None}
-    view.keyframes = _keyframes(history, latest, view.all_places, end)
+    view.survivors = _survivors(history, end)
+    absorbed_by = view.survivors.absorbed_by
+    view.places = {p.ordinal: p for p in view.all_places if p.ordinal not in absorbed_by}
+    view.keyframes = _keyframes(history, latest, view.survivors, end)
     view.observations = _observations(history, latest, end)
     view.objects = _objects(history, end)
     view.runs = _runs(history, view.keyframes, end)
@@ -65,11 +69,18 @@ def _merge(history: History, records: list[PlaceRecord], end: Offset) -> None:
             absorbed = records[place]
             survivor.unordered_members += absorbed.unordered_members
             absorbed.unordered_members = []
-            absorbed.survivor = survivor
+
+
+def _survivors(history: History, end: Offset) -> PlaceSurvivors:
+    survivors = PlaceSurvivors()
+    for merge in history.merges:
+        if merge.cause.offset < end:
+            survivors.merge(merge.survivor, merge.absorbed)
+    return survivors
 
 
 def _keyframes(
-    history: History, latest: MapView, places: list[PlaceRecord], end: Offset
+    history: History, latest: MapView, survivors: PlaceSurvivors, end: Offset
 ) -> list[KeyframeRecord]:
     count = history.keyframe_count(end)
     return [
@@ -81,8 +92,9 @@ def _keyframes(
             k.keyframe_id,
             k.timestamp,
             k.pose,
+            survivors,
             k.observations,
-            places[place] if placed < end else None,
+            place if placed < end else None,
         )
         for k, placed, place in zip(
             latest.keyframes[:count], history.placed_offsets, history.placed_in, strict=False
@@ -126,7 +138,7 @@ def _runs(history: History, keyframes: list[KeyframeRecord], end: Offset) -> lis
     return records
 
 
-def _adjacency(history: History, end: Offset) -> dict[tuple[int, int], int]:
+def _adjacency(history: History, end: Offset) -> dict[tuple[PlaceOrdinal, PlaceOrdinal], int]:
     found = ((pair, last_before(linked, end)) for pair, linked in history.edges.items())
     return {
         pair: last.shared_transitions

@@ -22,13 +22,16 @@ from eventsrc.envelope import Offset, RunId
 from projections.deltas import (
     Delta,
     KeyframeAdded,
+    KeyframeOrdinal,
     KeyframePlaced,
     Link,
     ObjectFound,
     ObjectMoved,
+    ObjectOrdinal,
     ObjectSeen,
     PlaceChanged,
     PlaceFormed,
+    PlaceOrdinal,
 )
 
 CauseKind = Literal["keyframe", "command"]
@@ -100,8 +103,8 @@ def iso_time(time_s: float) -> str:
 class EdgeChange:
     """Shared transitions of two places before and after an event; 0 is no edge."""
 
-    a: int
-    b: int
+    a: PlaceOrdinal
+    b: PlaceOrdinal
     before: int
     after: int
 
@@ -117,17 +120,17 @@ class Merge:
 
     number: int
     cause: Cause
-    bridge: int
-    survivor: int
+    bridge: KeyframeOrdinal
+    survivor: PlaceOrdinal
     survivor_size: int
-    absorbed: tuple[int, ...]
+    absorbed: tuple[PlaceOrdinal, ...]
     absorbed_sizes: tuple[int, ...]
     links: tuple[Link, ...]
-    objects: tuple[int, ...]
+    objects: tuple[ObjectOrdinal, ...]
     edges: tuple[EdgeChange, ...]
 
     @property
-    def places(self) -> tuple[int, ...]:
+    def places(self) -> tuple[PlaceOrdinal, ...]:
         """The survivor and the absorbed ones."""
         return (self.survivor, *self.absorbed)
 
@@ -174,7 +177,7 @@ class ObjectLife:
     def object_id(self) -> str:
         return self.found.object_id
 
-    def place(self, end: Offset) -> int | None:
+    def place(self, end: Offset) -> PlaceOrdinal | None:
         """The place it joined last by the events below ``end``."""
         moved = last_before(self.located, end)
         return None if moved is None else moved.place

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 from eventsrc.envelope import Offset
 from eventsrc.text import counted
+from projections.deltas import PlaceOrdinal
 from projections.model.partitions import Regrouping
 
 from .bisect import Search, Turn
@@ -217,7 +218,7 @@ def merge_text(history: History, merge: Merge) -> str:
     return "".join(f"{line}\n" for line in lines)
 
 
-def _place(history: History, place: int, size: int) -> str:
+def _place(history: History, place: PlaceOrdinal, size: int) -> str:
     return f"{place_name(history, place)}, {counted(size, 'keyframe')}"
 
 

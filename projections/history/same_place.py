@@ -17,6 +17,7 @@ from collections.abc import Iterable
 from eventsrc.envelope import Offset
 from eventsrc.errors import MisuseError
 from eventsrc.text import counted
+from projections.deltas import KeyframeOrdinal
 
 from .bisect import keyframe_number
 from .history import NEVER, History
@@ -25,7 +26,9 @@ from .records import Merge, ObjectLife, PlaceLife
 from .story import Entry, Story, keyframe_name, place_name, spot
 
 
-def same_story(history: History, first: int, second: int, end: Offset) -> Story:
+def same_story(
+    history: History, first: KeyframeOrdinal, second: KeyframeOrdinal, end: Offset
+) -> Story:
     """Why keyframes ``first`` and ``second`` are, or are not, in one place at ``end``."""
     since = together_since(history, first, second)
     together = since is not None and since < end
@@ -45,7 +48,9 @@ def same_story(history: History, first: int, second: int, end: Offset) -> Story:
     )
 
 
-def together_since(history: History, first: int, second: int) -> Offset | None:
+def together_since(
+    history: History, first: KeyframeOrdinal, second: KeyframeOrdinal
+) -> Offset | None:
     """The offset of the event that first brought two keyframes into one place, ever."""
     joined = Offset(max(history.placed_offsets[first], history.placed_offsets[second]))
     if joined == NEVER:
@@ -58,7 +63,9 @@ def together_since(history: History, first: int, second: int) -> Offset | None:
     return None
 
 
-def _chain(history: History, keyframes: tuple[int, int], end: Offset) -> list[Merge]:
+def _chain(
+    history: History, keyframes: tuple[KeyframeOrdinal, KeyframeOrdinal], end: Offset
+) -> list[Merge]:
     """Merges below ``end`` that carried either keyframe from one place to another, in order."""
     merges: dict[int, Merge] = {}
     for keyframe in keyframes:
@@ -71,7 +78,7 @@ def _chain(history: History, keyframes: tuple[int, int], end: Offset) -> list[Me
     return [merges[number] for number in sorted(merges)]
 
 
-def _placing(history: History, keyframe: int) -> Entry:
+def _placing(history: History, keyframe: KeyframeOrdinal) -> Entry:
     place = place_name(history, history.placed_in[keyframe])
     offset = Offset(history.placed_offsets[keyframe])
     own = history.keyframe_offsets[keyframe]
@@ -96,7 +103,13 @@ def _merging(history: History, merge: Merge) -> Entry:
     )
 
 
-def _summary(history: History, first: int, second: int, since: Offset | None, end: Offset) -> str:
+def _summary(
+    history: History,
+    first: KeyframeOrdinal,
+    second: KeyframeOrdinal,
+    since: Offset | None,
+    end: Offset,
+) -> str:
     if since is not None:
         cause = history.cause_at(since)
         now = place_name(history, history.place_at(first, end))
@@ -104,7 +117,7 @@ def _summary(history: History, first: int, second: int, since: Offset | None, en
     return "not in one place: " + "; ".join(_where(history, k, end) for k in (first, second))
 
 
-def _where(history: History, keyframe: int, end: Offset) -> str:
+def _where(history: History, keyframe: KeyframeOrdinal, end: Offset) -> str:
     name = keyframe_name(history, keyframe)
     if history.keyframe_offsets[keyframe] >= end:
         return f"{name} has not come yet"
@@ -114,7 +127,7 @@ def _where(history: History, keyframe: int, end: Offset) -> str:
     return f"{name} is noise" if place is None else f"{name} is in {place_name(history, place)}"
 
 
-def _place_id(history: History, keyframe: int, end: Offset) -> str | None:
+def _place_id(history: History, keyframe: KeyframeOrdinal, end: Offset) -> str | None:
     place = history.place_at(keyframe, end)
     return None if place is None else place_name(history, place)
 
@@ -149,7 +162,7 @@ def find_object(history: History, text: str) -> ObjectLife:
     return history.objects[number]
 
 
-def find_keyframe(history: History, text: str) -> int:
+def find_keyframe(history: History, text: str) -> KeyframeOrdinal:
     """The ordinal of the keyframe written ``run_id:keyframe_id``."""
     number = keyframe_number(history, text)
     if number is None:

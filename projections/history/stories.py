@@ -4,10 +4,11 @@ Why an object is what it is: found by which detection, seen how often, located w
 """
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from eventsrc.envelope import Offset
 from eventsrc.text import counted
+from projections.deltas import PlaceOrdinal
 from projections.exact import Q40, mean_m
 
 from .history import History
@@ -128,7 +129,7 @@ def _standing(history: History, life: PlaceLife, end: Offset) -> str:
     return "; ".join(parts)
 
 
-def _objects(history: History, place: int, end: Offset) -> str:
+def _objects(history: History, place: PlaceOrdinal, end: Offset) -> str:
     classes = Counter(
         o.found.class_name
         for o in history.objects
@@ -143,7 +144,7 @@ def _objects(history: History, place: int, end: Offset) -> str:
     return f"{counted(classes.total(), 'object')}: {named}{more}"
 
 
-def _neighbours(history: History, place: int, end: Offset) -> str:
+def _neighbours(history: History, place: PlaceOrdinal, end: Offset) -> str:
     found = [
         (count, b if a == place else a)
         for a, b in history.edges
@@ -155,7 +156,7 @@ def _neighbours(history: History, place: int, end: Offset) -> str:
     return "next to " + ", ".join(f"{place_name(history, p)} ({n}×)" for n, p in found)
 
 
-def object_story(history: History, det_ids: list[str], life: ObjectLife, end: Offset) -> Story:
+def object_story(history: History, det_ids: Sequence[str], life: ObjectLife, end: Offset) -> Story:
     """The chronicle of an object through the events below ``end``.
 
     ``det_ids`` are those of its sightings, parallel to ``life.seen``.
@@ -178,7 +179,7 @@ def object_story(history: History, det_ids: list[str], life: ObjectLife, end: Of
     )
 
 
-def _place_id(history: History, place: int | None) -> str | None:
+def _place_id(history: History, place: PlaceOrdinal | None) -> str | None:
     return None if place is None else place_name(history, place)
 
 
@@ -195,7 +196,7 @@ def _summary(history: History, life: ObjectLife, end: Offset) -> str:
     )
 
 
-def _object_entries(history: History, det_ids: list[str], life: ObjectLife) -> Iterator[Entry]:
+def _object_entries(history: History, det_ids: Sequence[str], life: ObjectLife) -> Iterator[Entry]:
     pose = history.keyframes[history.keyframe_count(Offset(life.found.offset + 1)) - 1].pose
     yield Entry(
         life.cause,
@@ -217,7 +218,7 @@ def _sightings(history: History, life: ObjectLife) -> Iterator[Entry]:
 
 
 def _moves(history: History, life: ObjectLife) -> Iterator[Entry]:
-    before: int | None = None
+    before: PlaceOrdinal | None = None
     for moved in life.located:
         cause = history.cause_at(moved.offset)
         facts = {"from": _place_id(history, before), "to": _place_id(history, moved.place)}
@@ -225,7 +226,9 @@ def _moves(history: History, life: ObjectLife) -> Iterator[Entry]:
         before = moved.place
 
 
-def _move_text(history: History, before: int | None, after: int | None, offset: Offset) -> str:
+def _move_text(
+    history: History, before: PlaceOrdinal | None, after: PlaceOrdinal | None, offset: Offset
+) -> str:
     to = place_name(history, after)
     if before is None:
         return f"located in {to}"

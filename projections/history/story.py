@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from projections.deltas import Pose
+from projections.deltas import KeyframeOrdinal, PlaceOrdinal, Pose
 
 from .history import History
 from .records import Cause
@@ -44,13 +44,13 @@ class Story:
         }
 
 
-def keyframe_name(history: History, keyframe: int) -> str:
+def keyframe_name(history: History, keyframe: KeyframeOrdinal) -> str:
     """``run_id:keyframe_id``."""
     added = history.keyframes[keyframe]
     return f"{added.run_id}:{added.keyframe_id}"
 
 
-def place_name(history: History, place: int | None) -> str:
+def place_name(history: History, place: PlaceOrdinal | None) -> str:
     """The place's id, or words for none."""
     return "no place" if place is None else history.places[place].place_id
 

@@ -20,7 +20,14 @@ from typing import Any
 import numpy as np
 
 from eventsrc.log import still_holds
-from projections.deltas import Pose
+from projections.deltas import (
+    KeyframeOrdinal,
+    ObjectOrdinal,
+    ObservationOrdinal,
+    PlaceOrdinal,
+    Pose,
+    RunOrdinal,
+)
 from projections.exact import Neighbourhood
 from projections.reducers import part, prefixed
 from projections.reducers.semantic_map import SemanticMap
@@ -118,7 +125,7 @@ def dump_view(view: MapView) -> State:
                 p.keyframe_count,
                 p.sum_x_um,
                 p.sum_y_um,
-                p.current().ordinal,
+                view.survivors.find(p.ordinal),
             ]
             for p in view.all_places
         ],
@@ -129,7 +136,7 @@ def load_view(view: MapView, state: State) -> None:
     """Fill a new view with what `dump_view` gave."""
     view.next_offset = state["next_offset"]
     view.skipped = state["skipped"]
-    view.runs = [RunRecord(i, *row) for i, row in enumerate(state["runs"])]
+    view.runs = [RunRecord(RunOrdinal(i), *row) for i, row in enumerate(state["runs"])]
     view.adjacency = {(a, b): n for a, b, n in state["adjacency"]}
     _load_places(view, state["places"])
     _load_keyframes(view, state)
@@ -164,13 +171,14 @@ def _load_keyframes(view: MapView, state: State) -> None:
         )
     }
     rows = zip(state["keyframes"].tolist(), state["timestamps"].tolist(), strict=True)
-    for ordinal, ((offset, run, keyframe_id, place), timestamp) in enumerate(rows):
-        run_id = view.runs[run].run_id
-        pose = poses.get(ordinal)
-        record = KeyframeRecord(ordinal, offset, run, run_id, keyframe_id, timestamp, pose)
+    for i, ((offset, run, keyframe_id, place), timestamp) in enumerate(rows):
+        ordinal, run_id, pose = KeyframeOrdinal(i), view.runs[run].run_id, poses.get(i)
+        record = KeyframeRecord(
+            ordinal, offset, run, run_id, keyframe_id, timestamp, pose, view.survivors
+        )
         if place != _NONE:
-            record.joined = view.all_places[place]
-            record.joined.unordered_members.append(ordinal)
+            record.joined = place
+            view.all_places[place].unordered_members.append(ordinal)
         view.keyframes.append(record)
 
 
@@ -205,7 +213,8 @@ def _load_observations(view: MapView, state: State) -> None:
     rows = zip(
         state["det_ids"], state["observations"].tolist(), state["boxes"].tolist(), strict=True
     )
-    for ordinal, (det_id, row, (confidence, *box)) in enumerate(rows):
+    for i, (det_id, row, (confidence, *box)) in enumerate(rows):
+        ordinal = ObservationOrdinal(i)
         keyframe, name, model, crc, is_foreign, fused, q40 = row
         record = ObservationRecord(
             ordinal,
@@ -220,8 +229,8 @@ def _load_observations(view: MapView, state: State) -> None:
             bool(is_foreign),
         )
         view.observations.append(record)
-        seer = view.keyframes[keyframe]
-        seer.observations = [*seer.observations, ordinal]
+        observer = view.keyframes[keyframe]
+        observer.observations = [*observer.observations, ordinal]
         if fused != _NONE:
             record.object, record.similarity_q40 = fused, q40
             view.objects[fused].observations.append(ordinal)
@@ -229,19 +238,21 @@ def _load_observations(view: MapView, state: State) -> None:
 
 def _load_objects(view: MapView, state: State) -> None:
     rows = zip(state["objects"], state["object_times"].tolist(), strict=True)
-    for ordinal, ((object_id, name, count, x_um, y_um, place), (first, last)) in enumerate(rows):
+    for i, ((object_id, name, count, x_um, y_um, place), (first, last)) in enumerate(rows):
+        ordinal = ObjectOrdinal(i)
         view.objects.append(
             ObjectRecord(ordinal, object_id, name, count, x_um, y_um, first, last, place)
         )
 
 
 def _load_places(view: MapView, rows: list[list[Any]]) -> None:
-    view.all_places = [PlaceRecord(i, *row[:-1]) for i, row in enumerate(rows)]
-    for place, row in zip(view.all_places, rows, strict=True):
-        if row[-1] == place.ordinal:
+    for i, (*row, survivor) in enumerate(rows):
+        place = PlaceRecord(PlaceOrdinal(i), *row)
+        view.all_places.append(place)
+        if survivor == place.ordinal:
             view.places[place.ordinal] = place
         else:
-            place.survivor = view.all_places[row[-1]]
+            view.survivors.merge(survivor, (place.ordinal,))
 
 
 FOLD_VERSION = 2

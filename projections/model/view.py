@@ -1,15 +1,13 @@
-"""The map as anybody reads it, built from deltas alone.
+"""The map as data, built from deltas alone: `MapView` and its records.
 
-``MapView`` knows no reducer: the same deltas, from a live fold, from a log or from a test's hand,
-give the same view. Applying a delta twice does no harm. A merge moves the smaller member list into
-the larger one and leaves keyframes pointing at the place they joined; who asks a keyframe follows
-the (halved) path of survivors, so a merge costs little however many keyframes move.
+A view knows no reducer: the same deltas, from a live fold, from a log or from a test's hand, give
+the same view. Applying a delta twice does no harm. A merge moves the smaller member list into the
+larger one and leaves keyframes with the place they joined; `KeyframeRecord.place` looks its
+survivor up, so a merge costs little however many keyframes move.
 
-The rows of a `MapView`: what the map knows about each run, keyframe, observation, object, place.
-
-Read them, do not write them: only `MapView.apply` does. ``ordinal`` numbers the things of a kind in
-the order in which the fold met or founded them. Positions are integer micrometres (``_um``) and
-exact; ``_m`` and ``_x``/``_y`` values are metres, correctly rounded. Times are robot seconds.
+Records are written by `MapView.apply` only. ``ordinal`` numbers the things of a kind in the order
+in which the fold met or founded them. Positions are integer micrometres (``_um``) and exact; ``_m``
+and ``_x``/``_y`` values are metres, correctly rounded. Times are robot seconds.
 """
 
 import zlib
@@ -17,25 +15,32 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from eventsrc.envelope import FIRST_OFFSET, Offset, RunId
+from eventsrc.envelope import FIRST_OFFSET, DetId, KeyframeId, Offset, RunId
 from projections.deltas import (
     Delta,
     EventSkipped,
     KeyframeAdded,
+    KeyframeOrdinal,
     KeyframePlaced,
     ObjectFound,
     ObjectMoved,
+    ObjectOrdinal,
     ObjectSeen,
     ObservationAdded,
+    ObservationOrdinal,
     PlaceChanged,
     PlaceFormed,
+    PlaceOrdinal,
     PlacesLinked,
     PlacesMerged,
     Pose,
+    RunOrdinal,
     RunSeen,
+    SkipKind,
     UnitVector,
 )
 from projections.exact import mean_m
+from projections.reducers.survivors import PlaceSurvivors
 from projections.settings import Settings
 
 
@@ -43,7 +48,7 @@ from projections.settings import Settings
 class RunRecord:
     """One run. ``started_at`` is the earliest keyframe timestamp of it so far."""
 
-    ordinal: int
+    ordinal: RunOrdinal
     run_id: RunId
     started_at: float
     keyframe_count: int = 0
@@ -51,23 +56,22 @@ class RunRecord:
 
 @dataclass(slots=True, eq=False)
 class PlaceRecord:
-    """A region of the building. ``founder`` is the ordinal of its first core keyframe.
+    """A region of the building. ``founder`` is its first core keyframe.
 
-    ``survivor`` is the place that absorbed it; `MapView.places` lists only those without one.
+    `MapView.places` lists those that were not absorbed.
     """
 
-    ordinal: int
+    ordinal: PlaceOrdinal
     place_id: str
-    founder: int
+    founder: KeyframeOrdinal
     founded_offset: Offset
     keyframe_count: int = 0
     sum_x_um: int = 0
     sum_y_um: int = 0
-    survivor: "PlaceRecord | None" = None
-    unordered_members: list[int] = field(default_factory=list)
+    unordered_members: list[KeyframeOrdinal] = field(default_factory=list)
 
     @property
-    def members(self) -> list[int]:
+    def members(self) -> list[KeyframeOrdinal]:
         """Ordinals of its keyframes, ascending; a new list each time."""
         return sorted(self.unordered_members)
 
@@ -81,34 +85,29 @@ class PlaceRecord:
         """Metres; the mean of its members."""
         return mean_m(self.sum_y_um, self.keyframe_count)
 
-    def current(self) -> "PlaceRecord":
-        """The place that stands for this one now, itself unless it was absorbed."""
-        place = self
-        while place.survivor is not None:
-            if place.survivor.survivor is not None:  # halve the path for the next one who asks
-                place.survivor = place.survivor.survivor
-            place = place.survivor
-        return place
-
 
 @dataclass(slots=True, eq=False)
 class KeyframeRecord:
-    """One keyframe. ``offset`` is its event's; ``pose`` is None when the robot had none."""
+    """One keyframe. ``offset`` is its event's; ``pose`` is None when the robot had none.
 
-    ordinal: int
+    ``joined`` is the place it joined, as of then; ``survivors`` are the view's.
+    """
+
+    ordinal: KeyframeOrdinal
     offset: Offset
-    run: int
+    run: RunOrdinal
     run_id: RunId
-    keyframe_id: int
+    keyframe_id: KeyframeId
     timestamp: float
     pose: Pose | None
-    observations: list[int] | tuple[()] = ()
-    joined: PlaceRecord | None = None
+    survivors: PlaceSurvivors
+    observations: list[ObservationOrdinal] | tuple[()] = ()
+    joined: PlaceOrdinal | None = None
 
     @property
-    def place(self) -> int | None:
-        """Ordinal of the place it belongs to now; None for noise or without a pose."""
-        return None if self.joined is None else self.joined.current().ordinal
+    def place(self) -> PlaceOrdinal | None:
+        """The place it belongs to now; None for noise or without a pose."""
+        return None if self.joined is None else self.survivors.find(self.joined)
 
 
 @dataclass(slots=True, eq=False)
@@ -119,9 +118,9 @@ class ObservationRecord:
     made with ``keep_embeddings=False``; ``embedding_crc`` is there even then.
     """
 
-    ordinal: int
-    keyframe: int
-    det_id: str
+    ordinal: ObservationOrdinal
+    keyframe: KeyframeOrdinal
+    det_id: DetId
     class_name: str
     confidence: float
     bbox: tuple[float, float, float, float]
@@ -129,7 +128,7 @@ class ObservationRecord:
     embedding: UnitVector | None
     embedding_crc: int | None
     foreign_space: bool
-    object: int | None = None
+    object: ObjectOrdinal | None = None
     similarity_q40: int | None = None
 
 
@@ -137,7 +136,7 @@ class ObservationRecord:
 class ObjectRecord:
     """A landmark. ``observations`` are ordinals in the order in which they were fused."""
 
-    ordinal: int
+    ordinal: ObjectOrdinal
     object_id: str
     class_name: str
     obs_count: int = 0
@@ -145,17 +144,17 @@ class ObjectRecord:
     sum_y_um: int = 0
     first_seen: float = 0.0
     last_seen: float = 0.0
-    place: int | None = None
-    observations: list[int] = field(default_factory=list)
+    place: PlaceOrdinal | None = None
+    observations: list[ObservationOrdinal] = field(default_factory=list)
 
     @property
     def mean_x(self) -> float:
-        """Metres; the mean of the robot's positions that saw it."""
+        """Metres; the mean of the positions the robot observed it from."""
         return mean_m(self.sum_x_um, self.obs_count)
 
     @property
     def mean_y(self) -> float:
-        """Metres; the mean of the robot's positions that saw it."""
+        """Metres; the mean of the positions the robot observed it from."""
         return mean_m(self.sum_y_um, self.obs_count)
 
 
@@ -163,7 +162,8 @@ class MapView:
     """A whole map state. Read its attributes; change it by `apply` and `advance` only.
 
     ``runs``, ``keyframes``, ``observations`` and ``objects`` are lists indexed by ordinal.
-    ``places`` holds the living places by ordinal, ascending; ``all_places`` also the absorbed.
+    ``places`` are those not absorbed, by ordinal, ascending; ``all_places`` also the absorbed, and
+    ``survivors`` what these are part of now.
     ``adjacency`` maps (a, b), a founded before b, to shared transitions above 0; `edges` sorts it.
     ``next_offset`` is the number of events that went into the view.
     """
@@ -177,30 +177,31 @@ class MapView:
         self.observations: list[ObservationRecord] = []
         self.objects: list[ObjectRecord] = []
         self.all_places: list[PlaceRecord] = []
-        self.places: dict[int, PlaceRecord] = {}
-        self.adjacency: dict[tuple[int, int], int] = {}
-        self.skipped: dict[str, int] = {"duplicate": 0, "conflict": 0, "det_id_reused": 0}
+        self.places: dict[PlaceOrdinal, PlaceRecord] = {}
+        self.survivors = PlaceSurvivors()
+        self.adjacency: dict[tuple[PlaceOrdinal, PlaceOrdinal], int] = {}
+        self.skipped: dict[SkipKind, int] = {"duplicate": 0, "conflict": 0, "det_id_reused": 0}
 
     def apply(self, delta: Delta) -> None:
-        """Take in one delta."""
+        """Apply one delta."""
         self._APPLIERS[type(delta)](self, delta)
 
     def apply_event(self, offset: Offset, deltas: Iterable[Delta]) -> None:
-        """Take in all deltas of the event at ``offset`` and advance past it."""
+        """Apply all deltas of the event at ``offset`` and advance past it."""
         appliers = self._APPLIERS
         for delta in deltas:
             appliers[type(delta)](self, delta)
         self.next_offset = Offset(offset + 1)
 
     def advance(self, next_offset: Offset) -> None:
-        """Say that all events below ``next_offset`` are in the view."""
+        """Set ``next_offset``: all events below it are in the view."""
         self.next_offset = next_offset
 
-    def place_id(self, place: int | None) -> str | None:
-        """The id of a place's ordinal; None for None."""
+    def place_id(self, place: PlaceOrdinal | None) -> str | None:
+        """The id of a place, absorbed ones too; None for None."""
         return None if place is None else self.all_places[place].place_id
 
-    def edges(self) -> list[tuple[int, int, int]]:
+    def edges(self) -> list[tuple[PlaceOrdinal, PlaceOrdinal, int]]:
         """(a, b, shared_transitions), ascending."""
         return [(a, b, n) for (a, b), n in sorted(self.adjacency.items())]
 
@@ -223,6 +224,7 @@ class MapView:
                 delta.keyframe_id,
                 delta.timestamp,
                 delta.pose,
+                self.survivors,
             )
         )
 
@@ -272,13 +274,13 @@ class MapView:
             large.extend(small)
             survivor.unordered_members = large
             absorbed.unordered_members = []
-            absorbed.survivor = survivor
+            self.survivors.merge(delta.survivor, (ordinal,))
 
     def _keyframe_placed(self, delta: KeyframePlaced) -> None:
         keyframe = self.keyframes[delta.keyframe]
         if keyframe.joined is None:
-            keyframe.joined = self.all_places[delta.place]
-            keyframe.joined.unordered_members.append(delta.keyframe)
+            keyframe.joined = delta.place
+            self.all_places[delta.place].unordered_members.append(delta.keyframe)
 
     def _place_changed(self, delta: PlaceChanged) -> None:
         place = self.all_places[delta.place]
@@ -312,8 +314,8 @@ class MapView:
         else:
             self.adjacency.pop((delta.a, delta.b), None)
 
-    # Of the class, not bound to the view: a view that refers to itself would, when nobody wants it
-    # any more, keep a whole map in memory until Python looks for cycles.
+    # Functions of the class, not bound methods: a view that refers to itself would stay in memory,
+    # once it is no longer used, until Python looks for cycles.
     _APPLIERS: ClassVar[dict[type, Callable[["MapView", Any], None]]] = {
         RunSeen: _run_seen,
         KeyframeAdded: _keyframe_added,

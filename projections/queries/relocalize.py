@@ -29,6 +29,7 @@ from projections.database.connection import (
 )
 from projections.database.labels import LABEL_IDS
 from projections.database.statements import statements, tables
+from projections.deltas import ObservationOrdinal, PlaceOrdinal
 from projections.errors import (
     ExtensionMissing,
     ProjectionMismatch,
@@ -202,13 +203,13 @@ def _assemble(
     crops: int, near: Sequence[Sequence[Any]], along: Mapping[int, Sequence[Any]]
 ) -> Candidates:
     matches: list[list[Match]] = [[] for _ in range(crops)]
-    places: dict[int, CandidatePlace] = {}
+    places: dict[PlaceOrdinal, CandidatePlace] = {}
     for crop, det_pk, det_id, run_id, similarity, class_name, bbox, x, y, yaw, *_ in near:
         thing, its_id, its, there_id, there, _ = along.get(det_pk, (None,) * 6)
         found = None if thing is None else _properties(thing)
         matches[crop].append(
             Match(
-                det_pk - 1,
+                ObservationOrdinal(det_pk - 1),
                 det_id,
                 run_id,
                 similarity,
@@ -225,11 +226,11 @@ def _assemble(
 
 
 def _spot(
-    places: dict[int, CandidatePlace], graphid: str | None, properties: str | None
-) -> int | None:
+    places: dict[PlaceOrdinal, CandidatePlace], graphid: str | None, properties: str | None
+) -> PlaceOrdinal | None:
     if graphid is None or properties is None:
         return None
-    ordinal = (int(graphid) & _NUMBER) - 1
+    ordinal = PlaceOrdinal((int(graphid) & _NUMBER) - 1)
     if ordinal not in places:
         place = _properties(properties)
         places[ordinal] = CandidatePlace(

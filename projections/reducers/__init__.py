@@ -1,11 +1,17 @@
-"""What a reducer hands to a snapshot: named values, each a numpy array or JSON.
+"""The rules of the map: reducers, pure, without clock, chance, disk, network or database."""
 
-What a reducer hands to a snapshot: named values, each a numpy array or JSON.
-"""
-
-from typing import Any, TypeAlias
+from array import array
+from collections.abc import MutableSequence
+from typing import Any, Literal, TypeAlias
 
 State: TypeAlias = dict[str, Any]
+"""What a reducer hands to a snapshot: named values, each a numpy array or JSON."""
+
+
+def packed(typecode: Literal["i", "q"], content: bytes = b"") -> MutableSequence[Any]:
+    """An `array`, for an attribute that is declared as a sequence of ordinals: mypy's type for
+    arrays knows plain ints only."""
+    return array(typecode, content)
 
 
 def prefixed(name: str, state: State) -> State:

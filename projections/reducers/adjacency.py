@@ -7,40 +7,41 @@ A ≠ B, in either direction and by their *current* labels. So it always equals 
 * a keyframe that gets a place comes between its two neighbours in the run: their own transition
   goes, two new ones come;
 * when B is absorbed by A, A–B transitions are inside a place now and vanish; B–C become A–C.
-
-Sorted integers with a label each, cheap to add to in any order.
-
-Blocks of at most 2,048 keys: adding in order appends to the last one, adding out of order moves at
-most one block's worth of memory. No key is ever added twice or removed.
 """
 
 from array import array
 from bisect import bisect_right
+from collections.abc import MutableSequence
 
 import numpy as np
 
-from eventsrc.envelope import Offset
-from projections.deltas import PlacesLinked
-from projections.reducers import State
+from eventsrc.envelope import KeyframeId, Offset
+from projections.deltas import PlaceOrdinal, PlacesLinked, RunOrdinal
+from projections.reducers import State, packed
+
+from .survivors import PlaceSurvivors
 
 _BLOCK = 2048
 
 
 class SortedKeys:
-    """A sorted map from int64 keys to int32 labels that can be asked for the keys around one."""
+    """Places by int64 key, sorted; adding a key gives the labels around it.
+
+    Blocks of at most 2,048 keys: adding in order appends to the last one, adding out of order moves
+    at most one block's worth of memory. No key is ever added twice or removed.
+    """
 
     __slots__ = ("_firsts", "_keys", "_labels")
 
     def __init__(self) -> None:
         self._keys: list[array[int]] = []
-        self._labels: list[array[int]] = []
+        self._labels: list[MutableSequence[PlaceOrdinal]] = []
         self._firsts: list[int] = []
 
-    def add(self, key: int, label: int) -> tuple[int | None, int | None]:
+    def add(self, key: int, label: PlaceOrdinal) -> tuple[PlaceOrdinal | None, PlaceOrdinal | None]:
         """Add a new key; the labels of the keys just before and after it, None at the ends."""
         if not self._keys:
-            self._keys, self._labels = [array("q", [key])], [array("i", [label])]
-            self._firsts = [key]
+            self._open_block(key, label)
             return None, None
         if key > self._keys[-1][-1]:
             return self._append(key, label), None
@@ -55,29 +56,35 @@ class SortedKeys:
             self._split(block)
         return around
 
-    def _append(self, key: int, label: int) -> int:
+    def _append(self, key: int, label: PlaceOrdinal) -> PlaceOrdinal:
         """Add a key above all others; the label of the one before."""
         keys, labels = self._keys[-1], self._labels[-1]
         before = labels[-1]
         if len(keys) == _BLOCK:
-            self._keys.append(array("q", [key]))
-            self._labels.append(array("i", [label]))
-            self._firsts.append(key)
+            self._open_block(key, label)
         else:
             keys.append(key)
             labels.append(label)
         return before
 
-    def columns(self) -> tuple["array[int]", "array[int]"]:
+    def _open_block(self, key: int, label: PlaceOrdinal) -> None:
+        """Begin a new last block with a key above all others."""
+        labels: MutableSequence[PlaceOrdinal] = packed("i")
+        labels.append(label)
+        self._keys.append(array("q", [key]))
+        self._labels.append(labels)
+        self._firsts.append(key)
+
+    def columns(self) -> tuple["array[int]", MutableSequence[PlaceOrdinal]]:
         """All keys, ascending, and their labels."""
-        keys, labels = array("q"), array("i")
+        keys, labels = array("q"), packed("i")
         for block, others in zip(self._keys, self._labels, strict=True):
             keys += block
             labels += others
         return keys, labels
 
     @classmethod
-    def of(cls, keys: "array[int]", labels: "array[int]") -> "SortedKeys":
+    def of(cls, keys: "array[int]", labels: MutableSequence[PlaceOrdinal]) -> "SortedKeys":
         """From ascending keys and their labels."""
         made = cls()
         for start in range(0, len(keys), _BLOCK):
@@ -86,51 +93,57 @@ class SortedKeys:
             made._firsts.append(keys[start])
         return made
 
-    def _before(self, block: int, index: int) -> int | None:
+    def _before(self, block: int, index: int) -> PlaceOrdinal | None:
         if index > 0:
             return self._labels[block][index - 1]
         return self._labels[block - 1][-1] if block > 0 else None
 
-    def _after(self, block: int, index: int) -> int | None:
+    def _after(self, block: int, index: int) -> PlaceOrdinal | None:
         if index < len(self._labels[block]):
             return self._labels[block][index]
         return self._labels[block + 1][0] if block + 1 < len(self._labels) else None
 
     def _split(self, block: int) -> None:
         at = _BLOCK // 2
-        for columns in (self._keys, self._labels):
-            columns.insert(block + 1, columns[block][at:])
-            del columns[block][at:]
+        keys, labels = self._keys[block], self._labels[block]
+        self._keys.insert(block + 1, keys[at:])
+        self._labels.insert(block + 1, labels[at:])
+        del keys[at:], labels[at:]
         self._firsts.insert(block + 1, self._keys[block + 1][0])
 
 
 class Adjacency:
-    """The reducer. Tell it what happened, in order; then ask which edges changed."""
+    """The reducer. Tell it of merges and placings in order; then `collect_changes`."""
 
     def __init__(self) -> None:
-        self.placed: dict[int, SortedKeys] = {}  # per run: keyframe_id → place it joined
-        self.survivors: dict[int, int] = {}  # absorbed place → who absorbed it
-        self.edges: dict[int, dict[int, int]] = {}  # place → place → transitions, both ways round
-        self._before: dict[tuple[int, int], int] = {}  # changed edges, as they were
+        self.placed: dict[RunOrdinal, SortedKeys] = {}  # keyframe_id → place it joined
+        self.survivors = PlaceSurvivors()
+        # place → place → transitions, both ways round
+        self.edges: dict[PlaceOrdinal, dict[PlaceOrdinal, int]] = {}
+        # changed edges, as they were
+        self._before: dict[tuple[PlaceOrdinal, PlaceOrdinal], int] = {}
 
-    def places_merged(self, survivor: int, absorbed: tuple[int, ...]) -> None:
+    def places_merged(self, survivor: PlaceOrdinal, absorbed: tuple[PlaceOrdinal, ...]) -> None:
         """The absorbed places' transitions are the survivor's now."""
+        self.survivors.merge(survivor, absorbed)
         for place in absorbed:
-            self.survivors[place] = survivor
             for other, count in sorted(self.edges.get(place, {}).items()):
                 self._add(place, other, -count)
                 if other != survivor:
                     self._add(survivor, other, count)
             self.edges.pop(place, None)
 
-    def keyframe_placed(self, run: int, keyframe_id: int, place: int) -> None:
+    def keyframe_placed(
+        self, run: RunOrdinal, keyframe_id: KeyframeId, place: PlaceOrdinal
+    ) -> None:
         """A keyframe that had no place, perhaps because it is new, has one."""
         placed = self.placed.get(run)
         if placed is None:
             placed = self.placed[run] = SortedKeys()
         joined_before, joined_after = placed.add(keyframe_id, place)
-        before = place if joined_before is None else self._find(joined_before)
-        after = place if joined_after is None else self._find(joined_after)
+        find = self.survivors.find
+        before = place if joined_before is None else find(joined_before)
+        after = place if joined_after is None else find(joined_after)
         if joined_before is not None and joined_after is not None and before != after:
             self._add(before, after, -1)
         if before != place:
@@ -138,8 +151,8 @@ class Adjacency:
         if after != place:
             self._add(place, after, 1)
 
-    def settle(self, offset: Offset) -> list[PlacesLinked]:
-        """The edges whose count is another than when last asked, ascending."""
+    def collect_changes(self, offset: Offset) -> list[PlacesLinked]:
+        """The edges whose count differs from that at the last call, ascending."""
         if not self._before:
             return []
         linked = []
@@ -158,7 +171,7 @@ class Adjacency:
             "placed": [[run, len(keys)] for run, (keys, _) in columns.items()],
             "keys": np.array([k for keys, _ in columns.values() for k in keys], np.int64),
             "labels": np.array([p for _, labels in columns.values() for p in labels], np.int32),
-            "survivors": sorted(map(list, self.survivors.items())),
+            "survivors": sorted(map(list, self.survivors.absorbed_by.items())),
             "edges": sorted(edges),
         }
 
@@ -167,24 +180,15 @@ class Adjacency:
         start = 0
         for run, count in state["placed"]:
             keys = array("q", state["keys"][start : start + count].tobytes())
-            labels = array("i", state["labels"][start : start + count].tobytes())
+            labels = packed("i", state["labels"][start : start + count].tobytes())
             self.placed[run] = SortedKeys.of(keys, labels)
             start += count
-        self.survivors = dict(state["survivors"])
+        self.survivors.absorbed_by = dict(state["survivors"])
         for a, b, transitions in state["edges"]:
             self.edges.setdefault(a, {})[b] = transitions
             self.edges.setdefault(b, {})[a] = transitions
 
-    def _find(self, place: int) -> int:
-        survivors = self.survivors
-        while place in survivors:
-            above = survivors[place]
-            if above in survivors:
-                survivors[place] = survivors[above]
-            place = above
-        return place
-
-    def _add(self, a: int, b: int, change: int) -> None:
+    def _add(self, a: PlaceOrdinal, b: PlaceOrdinal, change: int) -> None:
         count = self.edges.get(a, {}).get(b, 0)
         self._before.setdefault((a, b) if a < b else (b, a), count)
         for one, other in ((a, b), (b, a)):

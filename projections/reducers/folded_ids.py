@@ -1,4 +1,4 @@
-"""What has been folded already: keyframes by run, det_ids, and a fingerprint of each content.
+"""Ids folded so far: runs, keyframes with a digest of their content, det_ids.
 
 A ``(run_id, keyframe_id)`` met again is a *duplicate* if its content is the same and a *conflict*
 if not. Content is what an envelope says, not how: key order, white space and unknown fields do not
@@ -7,18 +7,19 @@ matter, an id written out and the same id by default are the same.
 
 import hashlib
 import marshal
-from array import array
+from collections.abc import MutableSequence
 from operator import attrgetter
 from zlib import crc32
 
 import numpy as np
 
-from eventsrc.envelope import Offset, RunId
+from eventsrc.envelope import DetId, KeyframeId, Offset, RunId
 from eventsrc.ingest import Accepted
-from projections.reducers import State
+from projections.deltas import KeyframeOrdinal, RunOrdinal
+from projections.reducers import State, packed
 
 _DIGEST_BYTES = 16
-_said_of_it = attrgetter("class_name", "confidence", "bbox", "embedding_model")
+_detection_content = attrgetter("class_name", "confidence", "bbox", "embedding_model")
 
 
 def content_digest(accepted: Accepted) -> bytes:
@@ -35,35 +36,36 @@ def content_digest(accepted: Accepted) -> bytes:
         else:
             checksum = crc32(vector.data, checksum)
             lengths.append(len(vector))
-    said = (
+    content = (
         (envelope.timestamp, envelope.map_x, envelope.map_y, envelope.map_yaw),
         accepted.det_ids,
-        [*map(_said_of_it, envelope.detections)],
+        [*map(_detection_content, envelope.detections)],
         lengths,
         checksum,
     )
-    # Version 2 writes values and nothing of how this process holds them.
-    return hashlib.blake2b(marshal.dumps(said, 2), digest_size=_DIGEST_BYTES).digest()
+    # Format version 2 has no references, so equal values give equal bytes.
+    return hashlib.blake2b(marshal.dumps(content, 2), digest_size=_DIGEST_BYTES).digest()
 
 
-class Seen:
-    """Keyframes and det_ids folded so far. A run's and a keyframe's ordinal count from 0."""
+class FoldedIds:
+    """Runs, keyframes and det_ids folded so far, and the ordinals of the first two."""
 
     def __init__(self) -> None:
-        self.runs: dict[str, int] = {}
-        self.started: list[float] = []
-        self.keyframes: list[dict[int, int]] = []  # per run: keyframe_id → ordinal
-        self.keyframe_ids = array("q")
-        self.run_of = array("i")
-        self.offsets = array("q")
+        self.runs: dict[RunId, RunOrdinal] = {}
+        self.started: list[float] = []  # per run
+        self.keyframes: list[dict[KeyframeId, KeyframeOrdinal]] = []  # per run
+        # Per keyframe:
+        self.keyframe_ids: MutableSequence[KeyframeId] = packed("q")
+        self.run_of: MutableSequence[RunOrdinal] = packed("i")
+        self.offsets: MutableSequence[Offset] = packed("q")
         self.digests = bytearray()
-        self.det_ids: dict[str, int] = {}  # → ordinal of its keyframe, in order of arrival
+        self.det_ids: dict[DetId, KeyframeOrdinal] = {}  # det_id → keyframe, in order of arrival
 
-    def run(self, run_id: RunId, timestamp: float) -> tuple[int, bool]:
+    def add_run(self, run_id: RunId, timestamp: float) -> tuple[RunOrdinal, bool]:
         """The run's ordinal, and whether it is new or turns out to have started earlier."""
         run = self.runs.get(run_id)
         if run is None:
-            run = self.runs[run_id] = len(self.runs)
+            run = self.runs[run_id] = RunOrdinal(len(self.runs))
             self.started.append(timestamp)
             self.keyframes.append({})
             return run, True
@@ -72,14 +74,16 @@ class Seen:
             return run, True
         return run, False
 
-    def find(self, run_id: RunId, keyframe_id: int) -> int | None:
+    def find(self, run_id: RunId, keyframe_id: KeyframeId) -> KeyframeOrdinal | None:
         """The ordinal of a keyframe that was folded, else None."""
         run = self.runs.get(run_id)
         return None if run is None else self.keyframes[run].get(keyframe_id)
 
-    def add(self, run: int, keyframe_id: int, offset: Offset, digest: bytes) -> int:
+    def add_keyframe(
+        self, run: RunOrdinal, keyframe_id: KeyframeId, offset: Offset, digest: bytes
+    ) -> KeyframeOrdinal:
         """Number a new keyframe."""
-        keyframe = len(self.offsets)
+        keyframe = KeyframeOrdinal(len(self.offsets))
         self.keyframes[run][keyframe_id] = keyframe
         self.keyframe_ids.append(keyframe_id)
         self.run_of.append(run)
@@ -87,7 +91,7 @@ class Seen:
         self.digests += digest
         return keyframe
 
-    def digest_of(self, keyframe: int) -> bytes:
+    def digest_of(self, keyframe: KeyframeOrdinal) -> bytes:
         """The content digest of a folded keyframe."""
         start = keyframe * _DIGEST_BYTES
         return bytes(self.digests[start : start + _DIGEST_BYTES])
@@ -107,15 +111,15 @@ class Seen:
 
     def load(self, state: State) -> None:
         """Take over what `dump` gave."""
-        self.runs = {run_id: run for run, run_id in enumerate(state["runs"])}
+        self.runs = {run_id: RunOrdinal(run) for run, run_id in enumerate(state["runs"])}
         self.started = state["started"]
-        self.keyframe_ids = array("q", state["keyframe_ids"].tobytes())
-        self.run_of = array("i", state["run_of"].tobytes())
-        self.offsets = array("q", state["offsets"].tobytes())
+        self.keyframe_ids = packed("q", state["keyframe_ids"].tobytes())
+        self.run_of = packed("i", state["run_of"].tobytes())
+        self.offsets = packed("q", state["offsets"].tobytes())
         self.digests = bytearray(state["digests"].tobytes())
         self.det_ids = dict(zip(state["det_ids"], state["det_keyframes"].tolist(), strict=True))
         self.keyframes = [{} for _ in self.runs]
         for keyframe, (run, keyframe_id) in enumerate(
             zip(self.run_of, self.keyframe_ids, strict=True)
         ):
-            self.keyframes[run][keyframe_id] = keyframe
+            self.keyframes[run][keyframe_id] = KeyframeOrdinal(keyframe)

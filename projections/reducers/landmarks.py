@@ -1,4 +1,4 @@
-"""Landmarks: repeated sightings fused into Objects.
+"""Landmarks: repeated observations fused into Objects.
 
 The rules (DESIGN section 5), for an observation of class C made from the pose (x, y):
 
@@ -28,17 +28,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from eventsrc.envelope import Offset
-from projections.deltas import ObjectFound, ObjectSeen
+from eventsrc.envelope import DetId, Offset
+from projections.deltas import ObjectFound, ObjectOrdinal, ObjectSeen, ObservationOrdinal
 from projections.exact import MAX_IN_A_SUM, MAX_IN_ONE_DOT, Q40, long_dot, metres_to_um
 from projections.reducers import State
 
 Bucket = tuple[str, int, int]
+"""Class name, column and row of a grid cell."""
 
 
 @dataclass(slots=True, eq=False)
-class Landmark:
-    """An Object: sums of positions, µm, and of unit vectors, integers in float64, shape (dim,)."""
+class ObjectSums:
+    """An Object's sums over its observations: of positions, µm, and of unit vectors, integers in
+    float64, shape (dim,). ``column`` and ``row`` are the grid cell of its mean position."""
 
     class_name: str
     vector_sum: NDArray[np.float64]
@@ -52,7 +54,7 @@ class Landmark:
     row: int
 
 
-def object_id(det_id: str) -> str:
+def object_id(det_id: DetId) -> str:
     """The id of the Object that the observation ``det_id`` founds."""
     return "obj-" + hashlib.sha256(det_id.encode()).hexdigest()[:16]
 
@@ -63,14 +65,14 @@ class Landmarks:
     def __init__(self, fusion_radius_m: float, fusion_similarity: float) -> None:
         self._radius_um = max(metres_to_um(fusion_radius_m), 1)
         self._least_q40 = fusion_similarity * Q40
-        self.objects: list[Landmark] = []
-        self._near: dict[Bucket, list[int]] = {}
+        self.objects: list[ObjectSums] = []  # by ordinal
+        self._near: dict[Bucket, list[ObjectOrdinal]] = {}
 
     def fold(
         self,
         offset: Offset,
-        observation: int,
-        det_id: str,
+        observation: ObservationOrdinal,
+        det_id: DetId,
         class_name: str,
         vector: NDArray[np.float64],
         norm2: int,
@@ -81,37 +83,38 @@ class Landmarks:
         """Fuse one observation. ``vector`` and ``norm2`` are of its unit vector, `exact.Units`."""
         radius_um, objects = self._radius_um, self.objects
         column, row = x_um // radius_um, y_um // radius_um
-        winner, best_q40, best_dot = -1, -math.inf, 0
+        winner: ObjectOrdinal | None = None
+        best_q40, best_dot = -math.inf, 0
         for candidate in self._near.get((class_name, column, row), ()):
-            landmark = objects[candidate]
-            count = landmark.count
-            dx = landmark.sum_x_um - x_um * count
-            dy = landmark.sum_y_um - y_um * count
+            sums = objects[candidate]
+            count = sums.count
+            dx = sums.sum_x_um - x_um * count
+            dy = sums.sum_y_um - y_um * count
             if dx * dx + dy * dy > (radius_um * count) ** 2:
                 continue
             if count <= MAX_IN_ONE_DOT:
-                dot = int(landmark.vector_sum.dot(vector))
+                dot = int(sums.vector_sum.dot(vector))
             else:
-                dot = long_dot(landmark.vector_sum, vector)
+                dot = long_dot(sums.vector_sum, vector)
             # Both conversions, √ and ÷ are correctly rounded.
-            q40 = round(dot / math.sqrt(landmark.norm2 * norm2 or 1) * Q40)
-            if q40 > best_q40 or (q40 == best_q40 and candidate < winner):
+            q40 = round(dot / math.sqrt(sums.norm2 * norm2 or 1) * Q40)
+            if q40 > best_q40 or (q40 == best_q40 and winner is not None and candidate < winner):
                 winner, best_q40, best_dot = candidate, q40, dot
-        if winner < 0 or best_q40 < self._least_q40:
-            founded = Landmark(
+        if winner is None or best_q40 < self._least_q40:
+            sums = ObjectSums(
                 class_name, vector.copy(), norm2, 1, x_um, y_um, timestamp, timestamp, column, row
             )
-            return self._found(offset, observation, det_id, founded)
-        landmark = objects[winner]
-        if landmark.count >= MAX_IN_A_SUM:
+            return self._add_object(offset, observation, det_id, sums)
+        sums = objects[winner]
+        if sums.count >= MAX_IN_A_SUM:
             raise OverflowError(
                 f"object {winner} of class {class_name!r} has {MAX_IN_A_SUM} observations, "
                 "the bound of its exact arithmetic"
             )
-        landmark.vector_sum += vector
-        landmark.norm2 += 2 * best_dot + norm2
-        self._update(winner, landmark, timestamp, x_um, y_um)
-        return [_seen(offset, winner, observation, int(best_q40), landmark)]
+        sums.vector_sum += vector
+        sums.norm2 += 2 * best_dot + norm2
+        self._update(winner, sums, timestamp, x_um, y_um)
+        return [_object_seen(offset, winner, observation, int(best_q40), sums)]
 
     def dump(self) -> State:
         """Everything, for a snapshot. The vectors' sums are one matrix, a row for each Object."""
@@ -130,7 +133,7 @@ class Landmarks:
     def load(self, state: State) -> None:
         """Take over what `dump` gave."""
         for index, (first, last) in enumerate(state["seen"].tolist()):
-            landmark = Landmark(
+            sums = ObjectSums(
                 state["classes"][index],
                 state["vectors"][index].copy(),
                 state["norms2"][index],
@@ -141,60 +144,63 @@ class Landmarks:
                 last,
                 *state["cells"][index],
             )
-            self.objects.append(landmark)
-            self._list(index, landmark)
+            self.objects.append(sums)
+            self._list(ObjectOrdinal(index), sums)
 
-    def _found(
-        self, offset: Offset, observation: int, det_id: str, landmark: Landmark
+    def _add_object(
+        self, offset: Offset, observation: ObservationOrdinal, det_id: DetId, sums: ObjectSums
     ) -> list[ObjectFound | ObjectSeen]:
-        ordinal = len(self.objects)
-        self.objects.append(landmark)
-        self._list(ordinal, landmark)
-        found = ObjectFound(offset, ordinal, object_id(det_id), landmark.class_name, observation)
-        return [found, _seen(offset, ordinal, observation, Q40, landmark)]
+        ordinal = ObjectOrdinal(len(self.objects))
+        self.objects.append(sums)
+        self._list(ordinal, sums)
+        found = ObjectFound(offset, ordinal, object_id(det_id), sums.class_name, observation)
+        return [found, _object_seen(offset, ordinal, observation, Q40, sums)]
 
     def _update(
-        self, ordinal: int, landmark: Landmark, timestamp: float, x_um: int, y_um: int
+        self, ordinal: ObjectOrdinal, sums: ObjectSums, timestamp: float, x_um: int, y_um: int
     ) -> None:
-        landmark.count += 1
-        landmark.sum_x_um += x_um
-        landmark.sum_y_um += y_um
-        if timestamp > landmark.last_seen:
-            landmark.last_seen = timestamp
-        elif timestamp < landmark.first_seen:
-            landmark.first_seen = timestamp
-        side = self._radius_um * landmark.count
-        column, row = landmark.sum_x_um // side, landmark.sum_y_um // side
-        if (column, row) != (landmark.column, landmark.row):
-            for bucket in _buckets(landmark):
+        sums.count += 1
+        sums.sum_x_um += x_um
+        sums.sum_y_um += y_um
+        if timestamp > sums.last_seen:
+            sums.last_seen = timestamp
+        elif timestamp < sums.first_seen:
+            sums.first_seen = timestamp
+        side = self._radius_um * sums.count
+        column, row = sums.sum_x_um // side, sums.sum_y_um // side
+        if (column, row) != (sums.column, sums.row):
+            for bucket in _buckets(sums):
                 self._near[bucket].remove(ordinal)
-            landmark.column, landmark.row = column, row
-            self._list(ordinal, landmark)
+            sums.column, sums.row = column, row
+            self._list(ordinal, sums)
 
-    def _list(self, ordinal: int, landmark: Landmark) -> None:
-        for bucket in _buckets(landmark):
+    def _list(self, ordinal: ObjectOrdinal, sums: ObjectSums) -> None:
+        """Enter it in the nine cells around its mean position."""
+        for bucket in _buckets(sums):
             self._near.setdefault(bucket, []).append(ordinal)
 
 
-def _buckets(landmark: Landmark) -> list[Bucket]:
+def _buckets(sums: ObjectSums) -> list[Bucket]:
     return [
-        (landmark.class_name, landmark.column + dx, landmark.row + dy)
-        for dx in (-1, 0, 1)
-        for dy in (-1, 0, 1)
+        (sums.class_name, sums.column + dx, sums.row + dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)
     ]
 
 
-def _seen(
-    offset: Offset, ordinal: int, observation: int, similarity_q40: int, landmark: Landmark
+def _object_seen(
+    offset: Offset,
+    ordinal: ObjectOrdinal,
+    observation: ObservationOrdinal,
+    similarity_q40: int,
+    sums: ObjectSums,
 ) -> ObjectSeen:
     return ObjectSeen(
         offset,
         ordinal,
         observation,
         similarity_q40,
-        landmark.count,
-        landmark.sum_x_um,
-        landmark.sum_y_um,
-        landmark.first_seen,
-        landmark.last_seen,
+        sums.count,
+        sums.sum_x_um,
+        sums.sum_y_um,
+        sums.first_seen,
+        sums.last_seen,
     )

@@ -6,56 +6,60 @@ has a place is nowhere.
 """
 
 from eventsrc.envelope import Offset
-from projections.deltas import ObjectMoved
+from projections.deltas import KeyframeOrdinal, ObjectMoved, ObjectOrdinal, PlaceOrdinal
 from projections.reducers import State
 
 
 class LocatedIn:
-    """The reducer. Tell it what happened, in order; then ask what moved."""
+    """The reducer. Tell it of merges, placings and sightings in order; then `collect_moves`."""
 
     def __init__(self) -> None:
-        self.votes: list[dict[int, int]] = []  # per Object: place → observations there
-        self.located: list[int | None] = []
-        self.voters: dict[int, dict[int, None]] = {}  # place → Objects with votes there
-        self.waiting: dict[int, list[int]] = {}  # keyframe without a place → Objects it saw
-        self._touched: dict[int, None] = {}
+        self.votes: list[dict[PlaceOrdinal, int]] = []  # per Object: place → observations there
+        self.located: list[PlaceOrdinal | None] = []  # per Object
+        # place → Objects with votes there
+        self.voters: dict[PlaceOrdinal, dict[ObjectOrdinal, None]] = {}
+        # keyframe without a place → Objects it saw
+        self.waiting: dict[KeyframeOrdinal, list[ObjectOrdinal]] = {}
+        self._touched: dict[ObjectOrdinal, None] = {}
 
-    def places_merged(self, survivor: int, absorbed: tuple[int, ...]) -> None:
+    def places_merged(self, survivor: PlaceOrdinal, absorbed: tuple[PlaceOrdinal, ...]) -> None:
         """The votes for the absorbed places are votes for the survivor now."""
         for place in absorbed:
             voters = self.voters.pop(place, {})
-            for seen in voters:
-                votes = self.votes[seen]
+            for ordinal in voters:
+                votes = self.votes[ordinal]
                 votes[survivor] = votes.get(survivor, 0) + votes.pop(place)
             self._touched.update(voters)
             if voters:
                 self.voters.setdefault(survivor, {}).update(voters)
 
-    def keyframe_placed(self, keyframe: int, place: int) -> None:
+    def keyframe_placed(self, keyframe: KeyframeOrdinal, place: PlaceOrdinal) -> None:
         """A keyframe that had no place has one: what it saw can vote."""
-        for seen in self.waiting.pop(keyframe, ()):
-            self._vote(seen, place)
+        for ordinal in self.waiting.pop(keyframe, ()):
+            self._vote(ordinal, place)
 
-    def object_seen(self, seen: int, keyframe: int, place: int | None) -> None:
+    def object_seen(
+        self, ordinal: ObjectOrdinal, keyframe: KeyframeOrdinal, place: PlaceOrdinal | None
+    ) -> None:
         """The Object was observed from a keyframe, which is in ``place`` or, so far, in none."""
-        if seen == len(self.votes):
+        if ordinal == len(self.votes):
             self.votes.append({})
             self.located.append(None)
         if place is None:
-            self.waiting.setdefault(keyframe, []).append(seen)
+            self.waiting.setdefault(keyframe, []).append(ordinal)
         else:
-            self._vote(seen, place)
+            self._vote(ordinal, place)
 
-    def settle(self, offset: Offset) -> list[ObjectMoved]:
-        """Decide again for every Object whose votes changed; those that moved, ascending."""
+    def collect_moves(self, offset: Offset) -> list[ObjectMoved]:
+        """Recount the Objects whose votes changed; those that moved, ascending."""
         if not self._touched:
             return []
         moved = []
-        for seen in sorted(self._touched):
-            place = _winner(self.votes[seen])
-            if place != self.located[seen]:
-                self.located[seen] = place
-                moved.append(ObjectMoved(offset, seen, place))
+        for ordinal in sorted(self._touched):
+            place = _winner(self.votes[ordinal])
+            if place != self.located[ordinal]:
+                self.located[ordinal] = place
+                moved.append(ObjectMoved(offset, ordinal, place))
         self._touched.clear()
         return moved
 
@@ -64,7 +68,7 @@ class LocatedIn:
         return {
             "votes": [list(map(list, votes.items())) for votes in self.votes],
             "located": self.located,
-            "waiting": [[keyframe, seen] for keyframe, seen in self.waiting.items()],
+            "waiting": [[keyframe, ordinal] for keyframe, ordinal in self.waiting.items()],
         }
 
     def load(self, state: State) -> None:
@@ -72,20 +76,20 @@ class LocatedIn:
         self.votes = [dict(votes) for votes in state["votes"]]
         self.located = state["located"]
         self.waiting = dict(state["waiting"])
-        for seen, votes in enumerate(self.votes):
+        for ordinal, votes in enumerate(self.votes):
             for place in votes:
-                self.voters.setdefault(place, {})[seen] = None
+                self.voters.setdefault(place, {})[ObjectOrdinal(ordinal)] = None
 
-    def _vote(self, seen: int, place: int) -> None:
-        votes = self.votes[seen]
+    def _vote(self, ordinal: ObjectOrdinal, place: PlaceOrdinal) -> None:
+        votes = self.votes[ordinal]
         votes[place] = votes.get(place, 0) + 1
-        if self.located[seen] == place and seen not in self._touched:
+        if self.located[ordinal] == place and ordinal not in self._touched:
             return  # it is there already, and one more vote for it cannot change that
-        self.voters.setdefault(place, {})[seen] = None
-        self._touched[seen] = None
+        self.voters.setdefault(place, {})[ordinal] = None
+        self._touched[ordinal] = None
 
 
-def _winner(votes: dict[int, int]) -> int | None:
+def _winner(votes: dict[PlaceOrdinal, int]) -> PlaceOrdinal | None:
     if len(votes) == 1:
         return next(iter(votes))
     return min(votes, key=lambda place: (-votes[place], place), default=None)

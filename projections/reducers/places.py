@@ -6,8 +6,8 @@ The rules (Ester et al. 1996, 1998; DESIGN section 5):
     ``min_samples`` neighbours is *core*. Core points that are neighbours are of one place.
 2.  Points are only ever added, so a core point stays core and places only grow or merge.
 3.  A newcomer can make itself core, and any of its neighbours. Everything that changes, changes
-    around these *fresh* core points. Fresh ones that are neighbours act together: as one group when
-    the newcomer is core (it is everybody's neighbour), else in groups that may be apart.
+    around these *fresh* core points. Fresh ones that are connected act as one group; there is one
+    group when the newcomer is core (it is a neighbour of all), else there may be several.
 4.  A group that touches no older core point founds a place; its founder is its earliest keyframe.
     The place is named by the founder's run and a counter, and numbered in founding order.
 5.  A group that touches one place extends it. One that touches several merges them: the one founded
@@ -21,32 +21,46 @@ Rule 6 is the only freedom DBSCAN leaves; core points and their partition are un
 """
 
 import math
-from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, MutableSequence
 
 import numpy as np
 
 from eventsrc.envelope import Offset, RunId
-from projections.deltas import Delta, KeyframePlaced, Link, PlaceChanged, PlaceFormed, PlacesMerged
-from projections.reducers import State, part, prefixed
+from projections.deltas import (
+    Delta,
+    KeyframeOrdinal,
+    KeyframePlaced,
+    Link,
+    PlaceChanged,
+    PlaceFormed,
+    PlaceOrdinal,
+    PlacesMerged,
+    RunOrdinal,
+)
+from projections.reducers import State, packed, part, prefixed
 
-from .core_index import Crowd
-from .rule_index import RuledCrowd
+from .core_index import CoreIndex
+from .rule_index import RuleCoreIndex
+from .survivors import PlaceSurvivors
 
-NOISE = -1
+_NOISE = PlaceOrdinal(-1)
+"""What the packed array of places holds for a point in none."""
 
 
 class Places:
     """The reducer. Points are numbered by arrival among the keyframes that have a pose."""
 
-    def __init__(self, crowd: Crowd | RuledCrowd) -> None:
-        self.crowd = crowd
-        self.joined = array("i")  # the place each point joined, as of then; NOISE for none
-        self.keyframes = array("i")  # the ordinal of each point's keyframe
-        self.runs = array("i")
-        self.run_ids: dict[int, str] = {}
-        self.founded: dict[int, int] = {}  # places founded so far, per run
-        self.survivors: list[int] = []  # union-find over places by founding order
+    def __init__(self, core_index: CoreIndex | RuleCoreIndex) -> None:
+        self.core_index = core_index
+        # Per point: the place it joined, as of then; its keyframe; its run.
+        self.joined: MutableSequence[PlaceOrdinal] = packed("i")
+        self.keyframes: MutableSequence[KeyframeOrdinal] = packed("i")
+        self.runs: MutableSequence[RunOrdinal] = packed("i")
+        # Per run: its id, and how many places it has founded.
+        self.run_ids: dict[RunOrdinal, RunId] = {}
+        self.founded: dict[RunOrdinal, int] = {}
+        self.survivors = PlaceSurvivors()
+        # Per place, of its current members:
         self.member_counts: list[int] = []
         self.sums_x_um: list[int] = []
         self.sums_y_um: list[int] = []
@@ -54,106 +68,105 @@ class Places:
     def fold(
         self,
         offset: Offset,
-        keyframe: int,
-        run: int,
+        keyframe: KeyframeOrdinal,
+        run: RunOrdinal,
         run_id: RunId,
         x_um: int,
         y_um: int,
         yaw: float,
     ) -> list[Delta]:
-        """Take in a keyframe with a pose; what it changed, in the order of the delta contract."""
+        """Add a keyframe with a pose; what it changed, in the order of the delta contract."""
         point = len(self.joined)
-        self.joined.append(NOISE)
+        self.joined.append(_NOISE)
         self.keyframes.append(keyframe)
         self.runs.append(run)
         self.run_ids[run] = run_id
         deltas: list[Delta] = []
-        fresh = self.crowd.insert(x_um, y_um, yaw)
-        if fresh == [point] and (settled := self.crowd.settled(point)) is not None:
-            place = self.find(self.joined[settled])
+        fresh = self.core_index.insert(x_um, y_um, yaw)
+        if fresh == [point] and (older := self.core_index.enclosing_core(point)) is not None:
+            place = self.survivors.find(self.joined[older])
             self._join(point, place)
-            return [KeyframePlaced(offset, keyframe, place), self._changed(offset, place)]
-        joining = self._grow(offset, point, fresh, deltas) if fresh else {}
+            return [KeyframePlaced(offset, keyframe, place), self._place_changed(offset, place)]
+        joining = self._cluster(offset, point, fresh, deltas) if fresh else {}
         if point not in joining:
-            place = self._earliest_in_reach(point)
-            if place != NOISE:
-                joining[point] = place
+            earliest = self._earliest_in_reach(point)
+            if earliest is not None:
+                joining[point] = earliest
+        find = self.survivors.find
         changed = [d.survivor for d in deltas if type(d) is PlacesMerged]
         for joiner in sorted(joining):
-            place = self.find(joining[joiner])
+            place = find(joining[joiner])
             self._join(joiner, place)
             changed.append(place)
             deltas.append(KeyframePlaced(offset, self.keyframes[joiner], place))
-        deltas += [self._changed(offset, place) for place in sorted({*map(self.find, changed)})]
+        deltas += [self._place_changed(offset, place) for place in sorted({*map(find, changed)})]
         return deltas
 
-    def find(self, place: int) -> int:
-        """The place that stands for ``place`` now."""
-        survivors = self.survivors
-        while survivors[place] != place:
-            survivors[place] = survivors[survivors[place]]
-            place = survivors[place]
-        return place
-
-    def label(self, point: int) -> int:
-        """The point's current place, or NOISE."""
+    def label(self, point: int) -> PlaceOrdinal | None:
+        """The point's current place; None for noise."""
         joined = self.joined[point]
-        return joined if joined == NOISE else self.find(joined)
+        return None if joined == _NOISE else self.survivors.find(joined)
 
     def dump(self) -> State:
         """Everything, for a snapshot."""
+        absorbed_by, places = self.survivors.absorbed_by, range(len(self.member_counts))
         own = {
             "joined": np.array(self.joined, np.int32),
             "keyframes": np.array(self.keyframes, np.int32),
             "runs": np.array(self.runs, np.int32),
             "run_ids": [[run, run_id] for run, run_id in self.run_ids.items()],
             "founded": [[run, count] for run, count in self.founded.items()],
-            "survivors": self.survivors,
+            "survivors": [absorbed_by.get(PlaceOrdinal(p), p) for p in places],
             "member_counts": self.member_counts,
             "sums_x_um": self.sums_x_um,
             "sums_y_um": self.sums_y_um,
         }
-        return own | prefixed("crowd", self.crowd.dump())
+        return own | prefixed("crowd", self.core_index.dump())
 
     def load(self, state: State) -> None:
         """Take over what `dump` gave."""
-        self.joined = array("i", state["joined"].tobytes())
-        self.keyframes = array("i", state["keyframes"].tobytes())
-        self.runs = array("i", state["runs"].tobytes())
+        self.joined = packed("i", state["joined"].tobytes())
+        self.keyframes = packed("i", state["keyframes"].tobytes())
+        self.runs = packed("i", state["runs"].tobytes())
         self.run_ids = dict(state["run_ids"])
         self.founded = dict(state["founded"])
-        self.survivors = state["survivors"]
+        parents = enumerate(state["survivors"])
+        self.survivors.absorbed_by = {PlaceOrdinal(p): s for p, s in parents if p != s}
         self.member_counts = state["member_counts"]
         self.sums_x_um = state["sums_x_um"]
         self.sums_y_um = state["sums_y_um"]
-        self.crowd.load(part("crowd", state))
+        self.core_index.load(part("crowd", state))
 
-    def _grow(
+    def _cluster(
         self, offset: Offset, newcomer: int, fresh: list[int], deltas: list[Delta]
-    ) -> dict[int, int]:
-        """Found, extend and merge around the fresh core points; who joins which place by it."""
-        joining: dict[int, int] = {}
-        for group in self._groups(newcomer, fresh):
-            touched = self._touched(group, fresh)
+    ) -> dict[int, PlaceOrdinal]:
+        """Found, extend and merge places around the fresh core points (rules 3 to 5).
+
+        Appends the deltas; returns, by point, the place that it joins.
+        """
+        joining: dict[int, PlaceOrdinal] = {}
+        for group in self._connected_groups(newcomer, fresh):
+            touched = self._places_touched(group, fresh)
             if not touched:
-                place = self._found(offset, group[0], deltas)
+                place = self._form_place(offset, group[0], deltas)
             else:
                 place = min(touched)
                 if len(touched) > 1:
                     deltas.append(self._merge(offset, newcomer, place, touched))
             for core in group:
-                if self.joined[core] == NOISE:
+                if self.joined[core] == _NOISE:
                     joining[core] = place
-                for loose in self.crowd.loose_around(core):
-                    if self.joined[loose] == NOISE and loose != newcomer:
-                        joining[loose] = min(place, self.find(joining.get(loose, place)))
-        for core in fresh:  # so that the newcomer, if it is not core, sees them
-            if self.joined[core] == NOISE:
+                for other in self.core_index.non_core_around(core):
+                    if self.joined[other] == _NOISE and other != newcomer:
+                        earlier = self.survivors.find(joining.get(other, place))
+                        joining[other] = min(place, earlier)
+        for core in fresh:  # for `_earliest_in_reach`, should the newcomer not be core
+            if self.joined[core] == _NOISE:
                 self.joined[core] = joining[core]
         return joining
 
-    def _groups(self, newcomer: int, fresh: list[int]) -> Iterator[list[int]]:
-        """The fresh core points in connected groups, each ascending, by their earliest."""
+    def _connected_groups(self, newcomer: int, fresh: list[int]) -> Iterator[list[int]]:
+        """The fresh core points in connected groups, each ascending, ordered by their earliest."""
         if fresh[-1] == newcomer or len(fresh) == 1:
             yield fresh
             return
@@ -163,51 +176,53 @@ class Places:
             rest = rest[1:]
             while frontier:
                 core = frontier.pop()
-                near = [other for other in rest if self.crowd.are_neighbours(core, other)]
+                near = [other for other in rest if self.core_index.are_neighbours(core, other)]
                 rest = [other for other in rest if other not in near]
                 group += near
                 frontier += near
             yield sorted(group)
 
-    def _touched(self, group: list[int], fresh: list[int]) -> dict[int, tuple[int, int]]:
-        """The places with an older core point near the group, each with one such pair."""
-        touched: dict[int, tuple[int, int]] = {}
-        crowd, joined = self.crowd, self.joined
+    def _places_touched(
+        self, group: list[int], fresh: list[int]
+    ) -> dict[PlaceOrdinal, tuple[int, int]]:
+        """The places with an older core point in reach of the group, each with one pair of core
+        points: (a fresh one, one of the place)."""
+        touched: dict[PlaceOrdinal, tuple[int, int]] = {}
+        index, joined, find = self.core_index, self.joined, self.survivors.find
         for core in group:
-            own = NOISE
-            for first, cell in crowd.cores_around(core):
+            own = _NOISE
+            for first, cell in index.cores_around(core):
                 place = joined[first]
-                if place == NOISE or first in fresh:
+                if place == _NOISE or first in fresh:
                     continue
-                place = self.find(place)
+                place = find(place)
                 if cell is None:
                     own = place
                     touched.setdefault(place, (core, first))
                 elif place == own:
-                    crowd.unite(core, cell)  # type: ignore[arg-type]
+                    index.mark_one_cluster(core, cell)  # type: ignore[arg-type]
                 elif place not in touched:
-                    neighbour = crowd.reach(cell, core)  # type: ignore[arg-type]
+                    neighbour = index.core_in_reach(cell, core)  # type: ignore[arg-type]
                     if neighbour is not None:  # a fresh one has the older ``first`` beside it
                         pair = (neighbour, first) if neighbour in fresh else (core, neighbour)
                         touched[place] = pair
         return touched
 
-    def _earliest_in_reach(self, point: int) -> int:
-        """Rule 6 for a newcomer that is not core."""
-        best = NOISE
-        for first, cell in self.crowd.cores_around(point):
-            place = self.find(self.joined[first])
-            if best not in (NOISE, place) and best < place:
+    def _earliest_in_reach(self, point: int) -> PlaceOrdinal | None:
+        """The place a newcomer that is not core joins (rule 6); None for noise."""
+        index, earliest = self.core_index, None
+        for first, cell in index.cores_around(point):
+            place = self.survivors.find(self.joined[first])
+            if earliest is not None and earliest < place:
                 continue
-            if cell is None or self.crowd.reach(cell, point) is not None:  # type: ignore[arg-type]
-                best = place
-        return best
+            if cell is None or index.core_in_reach(cell, point) is not None:  # type: ignore[arg-type]
+                earliest = place
+        return earliest
 
-    def _found(self, offset: Offset, founder: int, deltas: list[Delta]) -> int:
-        place, run = len(self.survivors), self.runs[founder]
+    def _form_place(self, offset: Offset, founder: int, deltas: list[Delta]) -> PlaceOrdinal:
+        place, run = PlaceOrdinal(len(self.member_counts)), self.runs[founder]
         counter = self.founded.get(run, 0)
         self.founded[run] = counter + 1
-        self.survivors.append(place)
         self.member_counts.append(0)
         self.sums_x_um.append(0)
         self.sums_y_um.append(0)
@@ -216,7 +231,11 @@ class Places:
         return place
 
     def _merge(
-        self, offset: Offset, newcomer: int, survivor: int, touched: dict[int, tuple[int, int]]
+        self,
+        offset: Offset,
+        newcomer: int,
+        survivor: PlaceOrdinal,
+        touched: dict[PlaceOrdinal, tuple[int, int]],
     ) -> PlacesMerged:
         absorbed = tuple(sorted(place for place in touched if place != survivor))
         counts = self.member_counts
@@ -229,24 +248,24 @@ class Places:
             survivor_count=counts[survivor],
             absorbed_counts=tuple(counts[place] for place in absorbed),
         )
+        self.survivors.merge(survivor, absorbed)
         for place in absorbed:
-            self.survivors[place] = survivor
             counts[survivor] += counts[place]
             self.sums_x_um[survivor] += self.sums_x_um[place]
             self.sums_y_um[survivor] += self.sums_y_um[place]
         return delta
 
     def _link(self, core: int, neighbour: int) -> Link:
-        distance_um = math.isqrt(self.crowd.distance2(core, neighbour))
+        distance_um = math.isqrt(self.core_index.squared_distance(core, neighbour))
         return Link(self.keyframes[core], self.keyframes[neighbour], distance_um)
 
-    def _join(self, point: int, place: int) -> None:
+    def _join(self, point: int, place: PlaceOrdinal) -> None:
         self.joined[point] = place
         self.member_counts[place] += 1
-        self.sums_x_um[place] += self.crowd.x[point]
-        self.sums_y_um[place] += self.crowd.y[point]
+        self.sums_x_um[place] += self.core_index.x[point]
+        self.sums_y_um[place] += self.core_index.y[point]
 
-    def _changed(self, offset: Offset, place: int) -> PlaceChanged:
+    def _place_changed(self, offset: Offset, place: PlaceOrdinal) -> PlaceChanged:
         return PlaceChanged(
             offset,
             place,

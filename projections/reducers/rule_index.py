@@ -1,9 +1,9 @@
-"""Who is core, when neighbourhood is another rule than plain distance.
+"""Core-point index when neighbourhood is another rule than plain distance.
 
 Any symmetric predicate on two poses defines density-connected sets (GDBSCAN: Sander, Ester, Kriegel
-and Xu 1998). Without the triangle's help a cell says nothing about who is core, so neighbours are
-found by asking the predicate for everybody within its reach: the cost of a keyframe grows with how
-many poses lie around it, though not with the length of the log. Same interface as `_crowd.Crowd`.
+and Xu 1998). Without the triangle inequality a cell says nothing about which points are core, so
+the predicate is evaluated for every pose within its reach: the cost of a keyframe grows with how
+many poses lie around it, though not with the length of the log. Same interface as `CoreIndex`.
 """
 
 from array import array
@@ -16,7 +16,7 @@ from projections.exact import Neighbourhood
 from projections.reducers import State
 
 
-class RuledCrowd:
+class RuleCoreIndex:
     """Points and which of them are core, by a `Neighbourhood`."""
 
     def __init__(self, rule: Neighbourhood, min_samples: int) -> None:
@@ -50,11 +50,11 @@ class RuledCrowd:
         """True when the point has at least ``min_samples`` neighbours."""
         return self._counts[point] >= self._min_samples
 
-    def settled(self, point: int) -> None:  # noqa: ARG002
-        """Never known here; see `_crowd.Crowd.settled`."""
+    def enclosing_core(self, point: int) -> None:  # noqa: ARG002
+        """Never known under a rule; see `CoreIndex.enclosing_core`."""
         return
 
-    def distance2(self, a: int, b: int) -> int:
+    def squared_distance(self, a: int, b: int) -> int:
         """The squared distance of two points, in µm²."""
         return (self.x[a] - self.x[b]) ** 2 + (self.y[a] - self.y[b]) ** 2
 
@@ -68,17 +68,17 @@ class RuledCrowd:
         )
 
     def cores_around(self, point: int) -> Iterator[tuple[int, None]]:
-        """Each core point among the point's neighbours; see `_crowd.Crowd.cores_around`."""
+        """Each core point among the point's neighbours; see `CoreIndex.cores_around`."""
         return ((other, None) for other in self._neighbours(point) if self.is_core(other))
 
-    def reach(self, cell: None, point: int) -> int | None:
-        """Never needed here: `cores_around` gives neighbours only."""
+    def core_in_reach(self, cell: None, point: int) -> int | None:
+        """Never called: `cores_around` gives neighbours only."""
         raise NotImplementedError
 
-    def unite(self, point: int, cell: None) -> None:
-        """Nothing to remember here."""
+    def mark_one_cluster(self, point: int, cell: None) -> None:
+        """Does nothing: under a rule, a cell is no cluster."""
 
-    def loose_around(self, point: int) -> Iterator[int]:
+    def non_core_around(self, point: int) -> Iterator[int]:
         """The point's neighbours that are not core."""
         return (other for other in self._neighbours(point) if not self.is_core(other))
 

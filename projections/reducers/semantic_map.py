@@ -1,21 +1,17 @@
-"""The whole fold: one envelope in, what it changed out. The only one who knows all reducers.
+"""The fold: one envelope in, its deltas out. Runs the reducers and passes deltas between them.
 
 Per keyframe, in this order (DESIGN section 5):
 
-1.  Seen before? Then it changes nothing: a duplicate, or a conflict, where the first one wins.
-2.  The run, the keyframe and its observations are new things of the map. A det_id that an earlier
-    keyframe has is left out, and said so.
-3.  With a pose, the keyframe goes to places; what it saw in the map's embedding space goes to
-    landmarks. Without one, it is kept and no more.
-4.  Located-in and adjacency hear what places and landmarks said, in its order, and settle.
+1.  A keyframe folded before changes nothing: it is a duplicate, or a conflict if its content
+    differs; the first one stands.
+2.  The run, the keyframe and its observations are added. An observation whose det_id an earlier
+    keyframe has is left out and reported.
+3.  With a pose, the keyframe goes to places, and its observations in the map's embedding space go
+    to landmarks. A keyframe without a pose is only kept.
+4.  Located-in and adjacency are told what places and landmarks changed, in order, and give the
+    deltas that follow from it.
 
 The fold has no clock, chance, disk, network or database. The same events give the same deltas.
-
-One map has one embedding space: a model and a dimension.
-
-What the settings leave open, the first embedded detection that agrees with them decides. A vector
-of another space is *foreign*: it is counted, but neither fused nor searched. A detection that names
-no model is of the unnamed model, which is a model like any other.
 """
 
 from collections.abc import Sequence
@@ -26,17 +22,22 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from eventsrc.envelope import FIRST_OFFSET, Offset, RunId
+from eventsrc.envelope import FIRST_OFFSET, DetId, Offset, RunId
 from eventsrc.ingest import Accepted
 from projections.deltas import (
     Delta,
     EventSkipped,
     KeyframeAdded,
+    KeyframeOrdinal,
     KeyframePlaced,
     ObservationAdded,
+    ObservationOrdinal,
+    PlaceOrdinal,
     PlacesMerged,
     Pose,
+    RunOrdinal,
     RunSeen,
+    SkipKind,
 )
 from projections.errors import SettingsError
 from projections.exact import Neighbourhood, Units, metres_to_um, unit_vectors
@@ -44,16 +45,21 @@ from projections.reducers import State, part, prefixed
 from projections.settings import Settings
 
 from .adjacency import Adjacency
-from .core_index import Crowd
-from .folded_ids import Seen, content_digest
+from .core_index import CoreIndex
+from .folded_ids import FoldedIds, content_digest
 from .landmarks import Landmarks
 from .located_in import LocatedIn
 from .places import Places
-from .rule_index import RuledCrowd
+from .rule_index import RuleCoreIndex
 
 
 class Space:
-    """The map's embedding space; open until it is decided."""
+    """The map's embedding space, a model and a dimension; open until it is decided.
+
+    What the settings leave open is decided by the first embedded detection that agrees with them. A
+    vector of another space is *foreign*: it is counted, but neither fused nor searched. A detection
+    that names no model is of the unnamed model, which is a model like any other.
+    """
 
     def __init__(self, settings: Settings) -> None:
         self._wanted_model = settings.embedding_model
@@ -78,9 +84,9 @@ class Space:
         return False
 
 
-Sighting: TypeAlias = tuple[int, str, str, NDArray[np.float64], int]
-"""An observation that can be fused: ordinal, det_id, class name, unit vector, squared norm."""
-Reducer: TypeAlias = Seen | Places | Landmarks | LocatedIn | Adjacency
+FusibleObservation: TypeAlias = tuple[ObservationOrdinal, DetId, str, NDArray[np.float64], int]
+"""Ordinal, det_id, class name, unit vector of the map's space, its squared norm."""
+Reducer: TypeAlias = FoldedIds | Places | Landmarks | LocatedIn | Adjacency
 
 
 class SemanticMap:
@@ -95,12 +101,12 @@ class SemanticMap:
         _check_named(settings, neighbourhood)
         self.settings = settings
         self.next_offset = FIRST_OFFSET
-        self.seen = Seen()
+        self.folded_ids = FoldedIds()
         self.space = Space(settings)
         self.places = Places(
-            Crowd(metres_to_um(settings.eps_m), settings.min_samples)
+            CoreIndex(metres_to_um(settings.eps_m), settings.min_samples)
             if neighbourhood is None
-            else RuledCrowd(neighbourhood, settings.min_samples)
+            else RuleCoreIndex(neighbourhood, settings.min_samples)
         )
         self.landmarks = Landmarks(settings.fusion_radius_m, settings.fusion_similarity)
         self.located_in = LocatedIn()
@@ -108,29 +114,30 @@ class SemanticMap:
         self.observation_count = 0
 
     def skip(self, offset: Offset) -> None:
-        """Pass over an event that says nothing about the map."""
+        """Pass over an event that does not change the map."""
         self.next_offset = Offset(offset + 1)
 
     def fold(
         self, offset: Offset, accepted: Accepted, units: Sequence[Units | None] | None = None
     ) -> list[Delta]:
-        """Take in one envelope; what it changed, in the order `projections.deltas` states.
+        """Fold one envelope; what it changed, in the order `projections.deltas` states.
 
         ``units`` is ``unit_vectors(accepted.vectors)`` for a caller who made it beforehand.
         """
         self.next_offset = Offset(offset + 1)
-        envelope, seen = accepted.envelope, self.seen
+        envelope, folded_ids = accepted.envelope, self.folded_ids
         digest = content_digest(accepted)
-        earlier = seen.find(envelope.run_id, envelope.keyframe_id)
+        earlier = folded_ids.find(envelope.run_id, envelope.keyframe_id)
         if earlier is not None:
-            kind = "duplicate" if seen.digest_of(earlier) == digest else "conflict"
-            first = Offset(seen.offsets[earlier])
+            is_same = folded_ids.digest_of(earlier) == digest
+            kind: SkipKind = "duplicate" if is_same else "conflict"
+            first = folded_ids.offsets[earlier]
             return [EventSkipped(offset, kind, envelope.run_id, envelope.keyframe_id, None, first)]
         deltas: list[Delta] = []
-        run, is_news = seen.run(envelope.run_id, envelope.timestamp)
+        run, is_news = folded_ids.add_run(envelope.run_id, envelope.timestamp)
         if is_news:
             deltas.append(RunSeen(offset, run, envelope.run_id, envelope.timestamp))
-        keyframe = seen.add(run, envelope.keyframe_id, offset, digest)
+        keyframe = folded_ids.add_keyframe(run, envelope.keyframe_id, offset, digest)
         pose = _pose(accepted)
         deltas.append(
             KeyframeAdded(
@@ -145,12 +152,12 @@ class SemanticMap:
         )
         if units is None:
             units = unit_vectors(accepted.vectors)
-        sightings = self._observe(offset, keyframe, accepted, units, deltas)
+        fusible = self._observe(offset, keyframe, accepted, units, deltas)
         if pose is not None:
             place = self._place(offset, keyframe, run, envelope.run_id, pose, deltas)
-            self._fuse(offset, keyframe, place, pose, sightings, envelope.timestamp, deltas)
-            deltas += self.located_in.settle(offset)
-            deltas += self.adjacency.settle(offset)
+            self._fuse(offset, keyframe, place, pose, fusible, envelope.timestamp, deltas)
+            deltas += self.located_in.collect_moves(offset)
+            deltas += self.adjacency.collect_changes(offset)
         return deltas
 
     def dump(self) -> State:
@@ -175,7 +182,7 @@ class SemanticMap:
 
     def _parts(self) -> tuple[tuple[str, Reducer], ...]:
         return (
-            ("seen", self.seen),
+            ("seen", self.folded_ids),
             ("places", self.places),
             ("landmarks", self.landmarks),
             ("located_in", self.located_in),
@@ -185,15 +192,15 @@ class SemanticMap:
     def _observe(
         self,
         offset: Offset,
-        keyframe: int,
+        keyframe: KeyframeOrdinal,
         accepted: Accepted,
         units: Sequence[Units | None],
         deltas: list[Delta],
-    ) -> list[Sighting]:
+    ) -> list[FusibleObservation]:
         """Add the observations; those with a vector in the map's space."""
-        envelope, det_ids = accepted.envelope, self.seen.det_ids
+        envelope, det_ids = accepted.envelope, self.folded_ids.det_ids
         run_id, keyframe_id = envelope.run_id, envelope.keyframe_id
-        sightings: list[Sighting] = []
+        fusible: list[FusibleObservation] = []
         for detection, det_id, unit in zip(
             envelope.detections, accepted.det_ids, units, strict=True
         ):
@@ -201,13 +208,14 @@ class SemanticMap:
             is_member = unit is not None and self.space.has(model, len(unit[0]))
             first = det_ids.setdefault(det_id, keyframe)
             if first != keyframe:
-                deltas.append(self._reused(offset, accepted, det_id, first))
+                deltas.append(self._det_id_reused(offset, accepted, det_id, first))
                 continue
             class_name = detection.class_name
+            observation = ObservationOrdinal(self.observation_count)
             deltas.append(
                 ObservationAdded(
                     offset,
-                    self.observation_count,
+                    observation,
                     keyframe,
                     run_id,
                     keyframe_id,
@@ -221,11 +229,13 @@ class SemanticMap:
                 )
             )
             if unit is not None and is_member:
-                sightings.append((self.observation_count, det_id, class_name, unit[0], unit[2]))
+                fusible.append((observation, det_id, class_name, unit[0], unit[2]))
             self.observation_count += 1
-        return sightings
+        return fusible
 
-    def _reused(self, offset: Offset, accepted: Accepted, det_id: str, first: int) -> EventSkipped:
+    def _det_id_reused(
+        self, offset: Offset, accepted: Accepted, det_id: DetId, first: KeyframeOrdinal
+    ) -> EventSkipped:
         envelope = accepted.envelope
         return EventSkipped(
             offset,
@@ -233,20 +243,20 @@ class SemanticMap:
             envelope.run_id,
             envelope.keyframe_id,
             det_id,
-            Offset(self.seen.offsets[first]),
+            self.folded_ids.offsets[first],
         )
 
     def _place(
         self,
         offset: Offset,
-        keyframe: int,
-        run: int,
+        keyframe: KeyframeOrdinal,
+        run: RunOrdinal,
         run_id: RunId,
         pose: Pose,
         deltas: list[Delta],
-    ) -> int | None:
-        """Run places and tell who depends on them; the keyframe's own place."""
-        seen, place = self.seen, None
+    ) -> PlaceOrdinal | None:
+        """Run places and tell located-in and adjacency; the keyframe's own place."""
+        folded_ids, place = self.folded_ids, None
         for delta in self.places.fold(
             offset, keyframe, run, run_id, pose.x_um, pose.y_um, pose.yaw_rad
         ):
@@ -258,7 +268,7 @@ class SemanticMap:
                 else:
                     self.located_in.keyframe_placed(placed, delta.place)
                 self.adjacency.keyframe_placed(
-                    seen.run_of[placed], seen.keyframe_ids[placed], delta.place
+                    folded_ids.run_of[placed], folded_ids.keyframe_ids[placed], delta.place
                 )
             elif type(delta) is PlacesMerged:
                 self.located_in.places_merged(delta.survivor, delta.absorbed)
@@ -268,15 +278,16 @@ class SemanticMap:
     def _fuse(
         self,
         offset: Offset,
-        keyframe: int,
-        place: int | None,
+        keyframe: KeyframeOrdinal,
+        place: PlaceOrdinal | None,
         pose: Pose,
-        sightings: list[Sighting],
+        fusible: list[FusibleObservation],
         timestamp: float,
         deltas: list[Delta],
     ) -> None:
+        """Run landmarks and tell located-in."""
         x_um, y_um = pose.x_um, pose.y_um
-        for observation, det_id, class_name, vector, norm2 in sightings:
+        for observation, det_id, class_name, vector, norm2 in fusible:
             fused = self.landmarks.fold(
                 offset, observation, det_id, class_name, vector, norm2, timestamp, x_um, y_um
             )

@@ -19,6 +19,7 @@ from eventsrc.envelope import RunId
 from eventsrc.log import LogReader
 from eventsrc.log.seek import Note, resolve
 from eventsrc.text import counted
+from projections.deltas import ObservationOrdinal, PlaceOrdinal
 from projections.errors import QuestionError
 from projections.exact import Q40, quantise
 from projections.model.fold import fold_log
@@ -43,7 +44,7 @@ class Match:
     ordinals of Places, None for noise. ``class_name`` is the Object's if there is one.
     """
 
-    observation: int
+    observation: ObservationOrdinal
     det_id: str
     run_id: RunId
     similarity: float
@@ -51,8 +52,8 @@ class Match:
     bbox: Box | None
     class_name: str
     object_id: str | None = None
-    object_place: int | None = None
-    keyframe_place: int | None = None
+    object_place: PlaceOrdinal | None = None
+    keyframe_place: PlaceOrdinal | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +70,7 @@ class Candidates:
     """``matches[i]`` are those of crop i, most similar first, ties by ordinal."""
 
     matches: tuple[tuple[Match, ...], ...]
-    places: Mapping[int, CandidatePlace]
+    places: Mapping[PlaceOrdinal, CandidatePlace]
 
 
 def search_log(
@@ -117,9 +118,12 @@ class ExactIndex:
     def _nearest(self, crop: Crop, neighbours: int) -> tuple[Match, ...]:
         products = self._matrix @ quantise(crop.vector).astype(np.float64)
         order = np.argsort(-products, kind="stable")[:neighbours]
-        return tuple(self._match(int(self._ordinals[i]), float(products[i]) / Q40) for i in order)
+        return tuple(
+            self._match(ObservationOrdinal(int(self._ordinals[i])), float(products[i]) / Q40)
+            for i in order
+        )
 
-    def _match(self, ordinal: int, similarity: float) -> Match:
+    def _match(self, ordinal: ObservationOrdinal, similarity: float) -> Match:
         observation = self._view.observations[ordinal]
         keyframe = self._view.keyframes[observation.keyframe]
         found = None if observation.object is None else self._view.objects[observation.object]

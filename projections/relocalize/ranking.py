@@ -17,6 +17,8 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
+from projections.deltas import PlaceOrdinal
+
 from .camera import Camera
 from .candidates import Candidates, Match
 from .model import MODEL, Model
@@ -122,7 +124,7 @@ def _answer(candidates: Candidates, posterior: Posterior | None, crops: int, top
     return Answer(places, pose, confidence(posterior, crops))
 
 
-def _place_shares(candidates: Candidates, posterior: Posterior) -> dict[int, float]:
+def _place_shares(candidates: Candidates, posterior: Posterior) -> dict[PlaceOrdinal, float]:
     """The weight of the poses by the Place of the nearest placed candidate keyframe."""
     placed = sorted({spot for row in candidates.matches for m in row if (spot := _placed(m))})
     if not placed:
@@ -133,11 +135,12 @@ def _place_shares(candidates: Candidates, posterior: Posterior) -> dict[int, flo
     nearest = np.argmin(dx * dx + dy * dy, axis=1)
     owners = np.array([spot[2] for spot in placed])[nearest]
     return {
-        int(place): float(posterior.weights[owners == place].sum()) for place in np.unique(owners)
+        PlaceOrdinal(int(place)): float(posterior.weights[owners == place].sum())
+        for place in np.unique(owners)
     }
 
 
-def _placed(match: Match) -> tuple[float, float, int] | None:
+def _placed(match: Match) -> tuple[float, float, PlaceOrdinal] | None:
     """A match's keyframe position and Place."""
     place = match.object_place if match.keyframe_place is None else match.keyframe_place
     if match.pose is None or place is None:
@@ -146,7 +149,7 @@ def _placed(match: Match) -> tuple[float, float, int] | None:
 
 
 def _ranked_places(
-    candidates: Candidates, order: Sequence[int], scores: Mapping[int, float]
+    candidates: Candidates, order: Sequence[PlaceOrdinal], scores: Mapping[PlaceOrdinal, float]
 ) -> tuple[RankedPlace, ...]:
     """The places of ``order`` (ordinals) with their scores and evidence."""
     ranked = []
@@ -157,7 +160,7 @@ def _ranked_places(
     return tuple(ranked)
 
 
-def _evidence(matches: Sequence[Sequence[Match]], place: int) -> tuple[Evidence, ...]:
+def _evidence(matches: Sequence[Sequence[Match]], place: PlaceOrdinal) -> tuple[Evidence, ...]:
     """The best match of each crop whose Object is located in the place, or was seen from it."""
     best = [
         next((m for m in row if place in (m.object_place, m.keyframe_place)), None)
@@ -182,9 +185,9 @@ def _rank_plain(candidates: Candidates, top: int) -> Answer:
     )
 
 
-def _similarity_sums(matches: Sequence[Sequence[Match]]) -> dict[int, float]:
+def _similarity_sums(matches: Sequence[Sequence[Match]]) -> dict[PlaceOrdinal, float]:
     """Sum of similarities by Place; summed exactly, so that no order matters."""
-    given: dict[int, list[float]] = {}
+    given: dict[PlaceOrdinal, list[float]] = {}
     for row in matches:
         for match in row[:PLAIN_NEIGHBOURS]:
             if match.object_place is not None:
@@ -192,7 +195,7 @@ def _similarity_sums(matches: Sequence[Sequence[Match]]) -> dict[int, float]:
     return {place: math.fsum(values) for place, values in given.items()}
 
 
-def _spread(candidates: Candidates, place: int, x: float, y: float) -> float:
+def _spread(candidates: Candidates, place: PlaceOrdinal, x: float, y: float) -> float:
     """Root mean square distance from (x, y) of the poses whose matches support the place."""
     squared = [
         (m.pose[0] - x) ** 2 + (m.pose[1] - y) ** 2

@@ -20,8 +20,8 @@ from eventsrc.log import LogReader, LogWriter
 from projections.exact import unit_vectors
 from projections.model.fold import AHEAD, fold_events, fold_log, no_cycle_search
 from projections.model.view import MapView
-from projections.reducers.core_index import Crowd
-from projections.reducers.places import NOISE, Places
+from projections.reducers.core_index import CoreIndex
+from projections.reducers.places import Places
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 
@@ -35,16 +35,16 @@ def report(name: str, value: float, limit: float, unit: str = "") -> None:
     print(f"{name:<66} {value:>9.2f}{unit}  (at most {limit:g}{unit})  {verdict}", flush=True)
 
 
-def fold_places(points: list[tuple[int, int]]) -> tuple[float, list[int]]:
-    places = Places(Crowd(EPS_UM, LEAST))
+def fold_places(points: list[tuple[int, int]]) -> tuple[float, list[int | None]]:
+    places = Places(CoreIndex(EPS_UM, LEAST))
     start = clock()
     for n, (x, y) in enumerate(points):
         places.fold(n, n, 0, "r", x, y, 0.0)
     return clock() - start, [places.label(n) for n in range(len(points))]
 
 
-def same_noise(ours: list[int], theirs: list[int]) -> bool:
-    return [label == NOISE for label in ours] == [label < 0 for label in theirs]
+def same_noise(ours: list[int | None], theirs: list[int]) -> bool:
+    return [label is None for label in ours] == [label < 0 for label in theirs]
 
 
 def plain() -> None:
@@ -79,7 +79,7 @@ def peer() -> None:
 
 def lifelong() -> None:
     count = 100_000 if QUICK else 1_000_000
-    places = Places(Crowd(EPS_UM, LEAST))
+    places = Places(CoreIndex(EPS_UM, LEAST))
     before, number = _resident(), 0
 
     def fold_one(at: tuple[float, float]) -> None:

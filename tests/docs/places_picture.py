@@ -6,8 +6,8 @@ python -m tests.docs.places_picture        draws it anew
 from pathlib import Path
 
 from projections.deltas import PlacesMerged
-from projections.reducers.core_index import Crowd, cell_side_um
-from projections.reducers.places import NOISE, Places
+from projections.reducers.core_index import CoreIndex, cell_side_um
+from projections.reducers.places import Places
 
 PICTURE = Path(__file__).parents[2] / "docs" / "images" / "place-merge.svg"
 EPS_UM, LEAST = 1_500_000, 3
@@ -29,12 +29,12 @@ BRIDGE = (0.2, 0.4)
 
 PX_PER_M = 46
 LOW, HIGH = (-3.9, -2.4), (5.0, 2.3)
-COLOURS = {NOISE: "#888888", 0: "#1f6fb2", 1: "#d1662b"}
+COLOURS = {None: "#888888", 0: "#1f6fb2", 1: "#d1662b"}
 
 
 def drawn() -> str:
     """The SVG."""
-    places = Places(Crowd(EPS_UM, LEAST))
+    places = Places(CoreIndex(EPS_UM, LEAST))
     for x, y in [*LEFT, *RIGHT, *LONE]:
         _fold(places, x, y)
     before = _panel(places, f"before: {_legend(places)}", None)
@@ -65,13 +65,13 @@ def _fold(places: Places, x: float, y: float) -> list[object]:
 
 def _legend(places: Places) -> str:
     labels = [places.label(n) for n in range(len(places.joined))]
-    parts = [f"p{p} with {labels.count(p)} keyframes" for p in sorted({*labels} - {NOISE})]
-    return ", ".join([*parts, f"{labels.count(NOISE)} noise"])
+    parts = [f"p{p} with {labels.count(p)} keyframes" for p in sorted({*labels} - {None})]
+    return ", ".join([*parts, f"{labels.count(None)} noise"])
 
 
 def _panel(places: Places, title: str, merge: PlacesMerged | None) -> list[str]:
     lines = [f'<text x="8" y="17">{title}</text>', *_grid(places)]
-    cores = [n for n in range(len(places.joined)) if places.crowd.is_core(n)]
+    cores = [n for n in range(len(places.joined)) if places.core_index.is_core(n)]
     lines += [_circle(places, n, EPS_UM, COLOURS[places.label(n)], 0.05) for n in cores]
     if merge is not None:
         lines.append(_circle(places, merge.bridge, EPS_UM, "#000000", 0.0, dashed=True))
@@ -86,9 +86,9 @@ def _panel(places: Places, title: str, merge: PlacesMerged | None) -> list[str]:
 
 def _grid(places: Places) -> list[str]:
     """The cells that hold points; dense ones shaded."""
-    side_um, crowd = cell_side_um(EPS_UM), places.crowd
+    side_um, index = cell_side_um(EPS_UM), places.core_index
     cells: dict[tuple[int, int], int] = {}
-    for x_um, y_um in zip(crowd.x, crowd.y, strict=True):
+    for x_um, y_um in zip(index.x, index.y, strict=True):
         key = x_um // side_um, y_um // side_um
         cells[key] = cells.get(key, 0) + 1
     lines = []
@@ -107,8 +107,8 @@ def _point(places: Places, n: int) -> str:
     """Core points are filled, border points hollow, noise is a small ring."""
     x, y = _at(places, n)
     colour = COLOURS[places.label(n)]
-    fill = colour if places.crowd.is_core(n) else "white"
-    radius = 3.0 if places.label(n) == NOISE else 4.5
+    fill = colour if places.core_index.is_core(n) else "white"
+    radius = 3.0 if places.label(n) is None else 4.5
     return (
         f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius}" fill="{fill}" '
         f'stroke="{colour}" stroke-width="1.6"/>'
@@ -127,7 +127,7 @@ def _circle(
 
 
 def _at(places: Places, n: int) -> tuple[float, float]:
-    return _pixels(places.crowd.x[n], places.crowd.y[n])
+    return _pixels(places.core_index.x[n], places.core_index.y[n])
 
 
 def _pixels(x_um: int, y_um: int) -> tuple[float, float]:

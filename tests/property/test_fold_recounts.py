@@ -77,8 +77,7 @@ def test_the_view_from_deltas_is_the_reducers_own_state(documents: list[dict[str
     folded = fold(documents, **SETTINGS)
     view, places = folded.view, folded.map.places
     for point, keyframe in enumerate(places.keyframes):
-        label = view.keyframes[keyframe].place
-        assert places.label(point) == (-1 if label is None else label)
+        assert places.label(point) == view.keyframes[keyframe].place
     own = [
         (o.count, o.sum_x_um, o.sum_y_um, o.first_seen, o.last_seen)
         for o in folded.map.landmarks.objects

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from projections.deltas import PlacesMerged, Pose
 from projections.exact import Neighbourhood
-from projections.reducers.core_index import Crowd
-from projections.reducers.places import NOISE, Places
-from projections.reducers.rule_index import RuledCrowd
+from projections.reducers.core_index import CoreIndex
+from projections.reducers.places import Places
+from projections.reducers.rule_index import RuleCoreIndex
 from tests.folds import NaivePlaces, batch_dbscan, near_matrix
 
 Point = tuple[int, int, float]
@@ -58,13 +58,13 @@ def check_every_prefix(places: Places, points: list[Point], matrix: np.ndarray, 
         are_near = matrix[:n, :n]
         labels, cores = batch_dbscan(are_near, least)
         ours = [places.label(i) for i in range(n)]
-        assert {i for i in range(n) if places.crowd.is_core(i)} == cores
-        assert {i for i in range(n) if ours[i] == NOISE} == set(np.flatnonzero(labels == -1))
+        assert {i for i in range(n) if places.core_index.is_core(i)} == cores
+        assert {i for i in range(n) if ours[i] is None} == set(np.flatnonzero(labels == -1))
         assert len({(ours[i], labels[i]) for i in cores}) == len({ours[i] for i in cores})
         assert len({ours[i] for i in cores}) == len({labels[i] for i in cores})
         naive.add(are_near)
-        assert ours == [NOISE if label is None else label for label in naive.labels]
-        members = [label for label in ours if label != NOISE]
+        assert ours == naive.labels
+        members = [label for label in ours if label is not None]
         assert all(places.member_counts[label] == members.count(label) for label in set(members))
 
 
@@ -74,7 +74,7 @@ def test_plain_distance_equals_batch_dbscan(points: list[Point], least: int) -> 
         (ax, ay, _), (bx, by, _) = points[i], points[j]
         return (ax - bx) ** 2 + (ay - by) ** 2 <= EPS_UM**2
 
-    places = Places(Crowd(EPS_UM, least))
+    places = Places(CoreIndex(EPS_UM, least))
     check_every_prefix(places, points, near_matrix(len(points), is_near), least)
 
 
@@ -85,7 +85,7 @@ def test_the_smallest_epsilons_too(points: list[Point], least: int, eps: int) ->
     def is_near(i: int, j: int) -> bool:
         return (small[i][0] - small[j][0]) ** 2 + (small[i][1] - small[j][1]) ** 2 <= eps**2
 
-    places = Places(Crowd(eps, least))
+    places = Places(CoreIndex(eps, least))
     check_every_prefix(places, small, near_matrix(len(small), is_near), least)
 
 
@@ -105,7 +105,7 @@ def _wall(a: Pose, b: Pose) -> bool:
 def test_any_symmetric_predicate_equals_batch_dbscan(points, least, rule) -> None:
     poses = [Pose(*point) for point in points]
     matrix = near_matrix(len(points), lambda i, j: rule(poses[i], poses[j]))
-    places = Places(RuledCrowd(Neighbourhood("test", EPS_UM, rule), least))
+    places = Places(RuleCoreIndex(Neighbourhood("test", EPS_UM, rule), least))
     check_every_prefix(places, points, matrix, least)
 
 
@@ -126,27 +126,27 @@ def test_any_relation_at_all_equals_batch_dbscan(data: st.DataObject, count: int
         is_in_reach = max(abs(ax - bx), abs(ay - by)) <= EPS_UM
         return is_in_reach and tuple(sorted((i, j))) in related
 
-    places = Places(RuledCrowd(Neighbourhood("drawn", EPS_UM, holds), least))
+    places = Places(RuleCoreIndex(Neighbourhood("drawn", EPS_UM, holds), least))
     check_every_prefix(places, points, near_matrix(count, is_near), least)
 
 
 @given(points=POINTS, least=st.integers(1, 6))
-def test_both_crowds_tell_the_same_story(points: list[Point], least: int) -> None:
+def test_both_core_indexes_give_the_same_deltas(points: list[Point], least: int) -> None:
     """Plain distance as a predicate gives the same deltas, but for which pair a merge names."""
 
     def holds(a: Pose, b: Pose) -> bool:
         return (a.x_um - b.x_um) ** 2 + (a.y_um - b.y_um) ** 2 <= EPS_UM**2
 
-    plain = Places(Crowd(EPS_UM, least))
-    ruled = Places(RuledCrowd(Neighbourhood("test", EPS_UM, holds), least))
+    plain = Places(CoreIndex(EPS_UM, least))
+    ruled = Places(RuleCoreIndex(Neighbourhood("test", EPS_UM, holds), least))
     for n, (x, y, yaw) in enumerate(points):
         one = plain.fold(n, n, 0, "r", x, y, yaw)
         other = ruled.fold(n, n, 0, "r", x, y, yaw)
         assert [_without_links(d) for d in one] == [_without_links(d) for d in other]
         for delta in one:
             for link in getattr(delta, "links", ()):
-                assert plain.crowd.is_core(link.core)
-                assert plain.crowd.is_core(link.neighbour)
+                assert plain.core_index.is_core(link.core)
+                assert plain.core_index.is_core(link.neighbour)
                 assert link.distance_um <= EPS_UM
 
 
@@ -155,19 +155,19 @@ def test_a_link_is_of_a_fresh_core_point_and_an_older_one_of_the_absorbed_place(
     points: list[Point], least: int, is_ruled: bool
 ) -> None:
     rule = Neighbourhood("test", EPS_UM, _alike)
-    places = Places(RuledCrowd(rule, least) if is_ruled else Crowd(EPS_UM, least))
+    places = Places(RuleCoreIndex(rule, least) if is_ruled else CoreIndex(EPS_UM, least))
     for n, (x, y, yaw) in enumerate(points):
-        cores = {i for i in range(n) if places.crowd.is_core(i)}
+        cores = {i for i in range(n) if places.core_index.is_core(i)}
         labels = [places.label(i) for i in range(n)]
         for merge in places.fold(n, n, 0, "r", x, y, yaw):
             if type(merge) is not PlacesMerged:
                 continue
             for absorbed, link in zip(merge.absorbed, merge.links, strict=True):
                 assert link.core not in cores
-                assert places.crowd.is_core(link.core)
+                assert places.core_index.is_core(link.core)
                 assert link.neighbour in cores
                 assert labels[link.neighbour] == absorbed
-                assert places.crowd.are_neighbours(link.core, link.neighbour)
+                assert places.core_index.are_neighbours(link.core, link.neighbour)
 
 
 def _without_links(delta):

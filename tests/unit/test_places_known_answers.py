@@ -1,7 +1,6 @@
 """Small worlds whose places anyone can work out on paper."""
 
 import random
-from array import array
 
 import pytest
 
@@ -13,8 +12,8 @@ from projections.deltas import (
     PlacesLinked,
     PlacesMerged,
 )
-from projections.reducers.core_index import Crowd
-from projections.reducers.places import NOISE, Places
+from projections.reducers.core_index import CoreIndex
+from projections.reducers.places import Places
 from tests.envelopes import envelope
 from tests.folds import fold
 
@@ -81,7 +80,7 @@ def test_a_newcomer_that_is_not_core_can_still_merge_two_places() -> None:
     (merge,) = folded.all(PlacesMerged)
     assert (merge.survivor, merge.absorbed, merge.bridge) == (0, (1,), 12)
     assert merge.links == (Link(core=10, neighbour=5, distance_um=1_300_000),)
-    assert not folded.map.places.crowd.is_core(12)
+    assert not folded.map.places.core_index.is_core(12)
     assert folded.view.places[0].keyframe_count == 13
 
 
@@ -175,31 +174,30 @@ def test_absorbing_a_place_takes_its_edges_along() -> None:
 
 
 def test_a_year_in_one_room_leaves_nothing_to_count() -> None:
-    """No counts, no loose points, nothing apart, and a fence of a handful of posts."""
-    places, rng = Places(Crowd(1_500_000, 3)), random.Random(1)
+    """No counts, no points that are not core, no unlinked cells."""
+    places, rng = Places(CoreIndex(1_500_000, 3)), random.Random(1)
     for n in range(20_000):
         places.fold(n, n, 0, "r", rng.randrange(4_000_000), rng.randrange(3_000_000), 0.0)
     state = places.dump()
     assert state["crowd.loose"].tolist() == []
     assert state["crowd.sparse_cores"].tolist() == []
-    assert all(not cell.apart for cell in places.crowd._cells.values())
+    assert all(not cell.unlinked for cell in places.core_index._cells.values())
 
 
-def test_two_rooms_with_a_wall_between_are_asked_through_short_fences() -> None:
-    """Cells 1.6 m apart stay apart for ever: every keyframe asks, none may ask everybody."""
-    crowd, rng = Crowd(1_500_000, 3), random.Random(2)
-    places = Places(crowd)
+def test_the_envelopes_of_two_rooms_with_a_wall_between_stay_short() -> None:
+    """Cells 1.6 m apart stay unlinked for ever, so every keyframe queries their reach indexes."""
+    core_index, rng = CoreIndex(1_500_000, 3), random.Random(2)
+    places = Places(core_index)
     for n in range(20_000):
         x = rng.randrange(500_000) + (n % 2) * 2_100_000
         places.fold(n, n, 0, "r", x, rng.randrange(3_000_000), 0.0)
     assert {places.label(n) for n in range(20_000)} == {0, 1}
-    fences = [f for cell in crowd._cells.values() for f in cell.fences or () if f is not None]
-    assert fences
-    assert max(len(fence._posts) for fence in fences) < 60
+    sides = [s for cell in core_index._cells.values() for s in cell.sides or () if s is not None]
+    assert sides
+    assert max(len(side._centres) for side in sides) < 60
 
 
-def test_noise_is_a_value_of_its_own() -> None:
-    places = Places(Crowd(1_500_000, 3))
+def test_noise_is_labelled_none() -> None:
+    places = Places(CoreIndex(1_500_000, 3))
     assert places.fold(0, 0, 0, "r", 0, 0, 0.0) == []
-    assert places.label(0) == NOISE
-    assert places.joined == array("i", [NOISE])
+    assert places.label(0) is None

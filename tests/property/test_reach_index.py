@@ -1,4 +1,4 @@
-"""A fence answers as asking every point would, also for the least ε and for points on the edge."""
+"""A reach index answers as a scan of all points does, also for the least ε and points on edges."""
 
 from decimal import Decimal, localcontext
 
@@ -6,36 +6,36 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from projections.reducers.core_index import NEIGHBOUR_CELLS, cell_side_um
-from projections.reducers.reach_index import Fence, turned
+from projections.reducers.reach_index import ReachIndex, from_side
 
 EPS_UM = 1_500_000
 EPS = st.sampled_from([0, 1, 2, 3, 5, 7, 13, 50, 1000, 1_500_000, 10**9])
 
 
 @st.composite
-def questions(draw: st.DrawFn) -> tuple[int, list[tuple[int, int]], list[tuple[int, int, int]]]:
-    """ε, the points of the cell (0, 0), and askers (side, x, y) in cells around it."""
+def queries(draw: st.DrawFn) -> tuple[int, list[tuple[int, int]], list[tuple[int, int, int]]]:
+    """ε, the points of the cell (0, 0), and outside (side, x, y) in cells around it."""
     eps = draw(EPS)
     last = cell_side_um(eps) - 1
     inside = st.one_of(st.integers(0, last), st.sampled_from([0, last, last // 2]))
     points = draw(st.lists(st.tuples(inside, inside), min_size=1, max_size=30))
-    askers = []
+    outside = []
     for column, row in draw(st.lists(st.sampled_from(NEIGHBOUR_CELLS), min_size=1, max_size=8)):
         sides = [s for s, yes in enumerate((column < 0, column > 0, row < 0, row > 0)) if yes]
         x, y = draw(inside) + column * (last + 1), draw(inside) + row * (last + 1)
-        askers += [(side, x, y) for side in sides]
-    return eps, points, askers
+        outside += [(side, x, y) for side in sides]
+    return eps, points, outside
 
 
 @settings(max_examples=400)
-@given(questions())
-def test_a_fence_answers_as_all_points_would(question) -> None:
-    eps, points, askers = question
-    for side, x, y in askers:
-        fence = Fence(eps)
+@given(queries())
+def test_a_reach_index_answers_as_a_scan_of_all_points(query) -> None:
+    eps, points, outside = query
+    for side, x, y in outside:
+        reach_index = ReachIndex(eps)
         for index, point in enumerate(points):
-            fence.add(index, turned(side, *point))
-            found = fence.reach(turned(side, x, y))
+            reach_index.add(index, from_side(side, *point))
+            found = reach_index.point_in_reach(from_side(side, x, y))
             within = {
                 i
                 for i, (px, py) in enumerate(points[: index + 1])
@@ -59,7 +59,7 @@ def _meeting(a: tuple[int, int], c: tuple[int, int], eps: int) -> Decimal:
 
 @settings(max_examples=1000)
 @given(st.data(), st.sampled_from([3, 5, 7, 13, 50, 1000, 1_500_000]))
-def test_a_post_is_hidden_when_its_neighbours_meet_before_it_begins(data, eps: int) -> None:
+def test_a_centre_is_hidden_when_its_neighbours_meet_before_it_begins(data, eps: int) -> None:
     last = cell_side_um(eps) - 1
     inside = st.one_of(st.integers(0, last), st.sampled_from([0, last]))
     a, b, c = sorted(data.draw(st.tuples(inside, inside)) for _ in range(3))
@@ -67,7 +67,7 @@ def test_a_post_is_hidden_when_its_neighbours_meet_before_it_begins(data, eps: i
     with localcontext(prec=80):
         begins, ends = _meeting(a, b, eps), _meeting(b, c, eps)
     assume(abs(begins - ends) > Decimal("1e-40"))
-    assert Fence(eps)._is_hidden(a, b, c) == (begins > ends)
+    assert ReachIndex(eps)._is_hidden(a, b, c) == (begins > ends)
 
 
 def test_the_edge_of_a_region_can_be_where_it_ends() -> None:
@@ -77,4 +77,4 @@ def test_the_edge_of_a_region_can_be_where_it_ends() -> None:
     for low, middle, high in ((a, b, c), mirrored):
         with localcontext(prec=80):
             is_hidden = _meeting(low, middle, EPS_UM) > _meeting(middle, high, EPS_UM)
-        assert Fence(EPS_UM)._is_hidden(low, middle, high) == is_hidden
+        assert ReachIndex(EPS_UM)._is_hidden(low, middle, high) == is_hidden
