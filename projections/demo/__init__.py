@@ -1,4 +1,4 @@
-"""`mapfold demo`: the whole story on one machine, each part real, every number measured."""
+"""`mapfold demo`: record, replay, map and re-localise on one machine, each part real."""
 
 from .play import DemoOptions, run_demo
 

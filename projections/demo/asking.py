@@ -1,9 +1,9 @@
-"""Run B is lost: it looks around, sends a few crops without a pose, and gets Places.
+"""Run B re-localised: questions of a few crops without a pose, and how far the answers are off.
 
-The question is not chosen for its answer. The robot looks around where it starts and takes the
-first picture with the most detections, counting at most three; it asks with the surest of them,
-then with the two surest, then three. Afterwards it asks once from every keyframe of its whole run
-that shows anything, to tell what a single question is worth.
+The question is not chosen for its answer: it is the picture from around the start with the most
+detections, counting at most three; of several the first. It is asked with the most confident of
+them, then with two, then three. Afterwards every keyframe of the run that shows anything is asked
+once, to measure single questions.
 """
 
 import json
@@ -31,7 +31,7 @@ NEAR_M: Final = 1.5
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class AskedQuestion:
     """One question and its answer; ``error_m`` is None when no pose came back."""
 
     classes: tuple[str, ...]
@@ -41,7 +41,7 @@ class Asked:
 
 
 @dataclass(frozen=True, slots=True)
-class Everywhere:
+class RunSummary:
     """One question from each of ``asked`` keyframes. Answers of "unknown" count as not near."""
 
     asked: int
@@ -52,18 +52,18 @@ class Everywhere:
 
 
 @dataclass(frozen=True, slots=True)
-class Lost:
-    """Run B's first questions, where it truly was, and how it went from everywhere else."""
+class LostRun:
+    """Run B's first questions, its true pose there, and a summary of its whole run."""
 
     run_id: RunId
     keyframe_id: int
     room: str
     truth: Spot
-    questions: tuple[Asked, ...]
-    everywhere: Everywhere
+    questions: tuple[AskedQuestion, ...]
+    everywhere: RunSummary
 
     @property
-    def drawn(self) -> LostRobot:
+    def drawing(self) -> LostRobot:
         """For the picture: the last question's estimate."""
         pose = self.questions[-1].answer.pose if self.questions else None
         if pose is None:
@@ -71,17 +71,17 @@ class Lost:
         return LostRobot(self.truth, Spot(pose.x, pose.y, pose.yaw), pose.spread_m)
 
 
-def ask_lost(targets: Targets, run: SimulatedRun, folder: DemoFolder) -> Lost:
+def ask_lost(targets: Targets, run: SimulatedRun, folder: DemoFolder) -> LostRun:
     """Ask the databases where run B is."""
     index = _first_question(run)
     pose, truth = run.true_poses[index], run.truth[index]
-    best = _surest(run.envelopes[index]["detections"])
+    best = _most_confident(run.envelopes[index]["detections"])
     with Reader(targets) as reader:
         questions = tuple(
             _ask(reader, run, index, best[:count], folder) for count in range(1, len(best) + 1)
         )
-        everywhere = _everywhere(reader, run)
-    return Lost(
+        everywhere = _ask_whole_run(reader, run)
+    return LostRun(
         run.run_id,
         truth["keyframe_id"],
         truth["room"],
@@ -91,7 +91,7 @@ def ask_lost(targets: Targets, run: SimulatedRun, folder: DemoFolder) -> Lost:
     )
 
 
-def rooms_of(view: MapView, run: SimulatedRun) -> dict[str, str]:
+def place_rooms(view: MapView, run: SimulatedRun) -> dict[str, str]:
     """For each place the room most of its keyframes were truly taken in."""
     rooms = {line["keyframe_id"]: str(line["room"]) for line in run.truth}
     named: dict[str, str] = {}
@@ -102,9 +102,9 @@ def rooms_of(view: MapView, run: SimulatedRun) -> dict[str, str]:
 
 
 def _first_question(run: SimulatedRun) -> int:
-    """Among the keyframes at the start, the first that shows the most things, at most three.
+    """Of the keyframes at the start the first with the most detections, counting at most three.
 
-    Should the start show nothing at all, the first keyframe of the run that shows anything.
+    If those have none, the first keyframe of the run that has any.
     """
     start = run.true_poses[0]
     here = [
@@ -117,7 +117,7 @@ def _first_question(run: SimulatedRun) -> int:
     return best if shown[best] else next(i for i, count in enumerate(shown) if count)
 
 
-def _surest(detections: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def _most_confident(detections: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return sorted(detections, key=lambda d: (-d["confidence"], d["det_id"]))[:MOST_CROPS]
 
 
@@ -127,7 +127,7 @@ def _ask(
     index: int,
     detections: Sequence[dict[str, Any]],
     folder: DemoFolder | None = None,
-) -> Asked:
+) -> AskedQuestion:
     question = {"crops": detections}
     if folder is not None:
         folder.question(len(detections)).write_text(json.dumps(question) + "\n", "utf-8")
@@ -137,18 +137,18 @@ def _ask(
     seconds = time.monotonic() - started
     true, pose = run.true_poses[index], answer.pose
     error = None if pose is None else math.dist((pose.x, pose.y), (true.x, true.y))
-    return Asked(tuple(d["class"] for d in detections), answer, error, seconds)
+    return AskedQuestion(tuple(d["class"] for d in detections), answer, error, seconds)
 
 
-def _everywhere(reader: Reader, run: SimulatedRun) -> Everywhere:
+def _ask_whole_run(reader: Reader, run: SimulatedRun) -> RunSummary:
     started = time.monotonic()
     asked = [
-        _ask(reader, run, index, _surest(envelope["detections"]))
+        _ask(reader, run, index, _most_confident(envelope["detections"]))
         for index, envelope in enumerate(run.envelopes)
         if envelope["detections"]
     ]
     known = [a.error_m for a in asked if a.error_m is not None and not a.answer.unknown]
-    return Everywhere(
+    return RunSummary(
         asked=len(asked),
         unknown=len(asked) - len(known),
         near=sum(error <= NEAR_M for error in known),

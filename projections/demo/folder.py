@@ -1,9 +1,9 @@
-"""The demo's folder: made afresh each time, but never over something that is not the demo's.
+"""The demo's output folder: emptied at the start of each demo, if a demo made it.
 
 A file named ``MARKER`` says that the demo made a folder. Its log, questions and picture are removed
 before the next demo; the database server's files in it are kept, because making them takes longest
-and a replay replaces what is in them. A demo at work holds a lock on ``MARKER``: a second one in
-the same folder would take the log from under it.
+and a replay replaces what is in them. A running demo holds a lock on ``MARKER``: a second one in
+the same folder would remove its log.
 """
 
 import contextlib
@@ -17,12 +17,12 @@ from typing import Final
 from eventsrc.errors import MisuseError
 
 MARKER: Final = ".mapfold-demo"
-_MADE: Final = ("map.png", "settings.json", "question-*.json", "record.txt", "simulate.txt")
+_GENERATED: Final = ("map.png", "settings.json", "question-*.json", "record.txt", "simulate.txt")
 
 
 @dataclass(frozen=True, slots=True)
 class DemoFolder:
-    """Where everything of one demo lies."""
+    """Paths of one demo's files."""
 
     path: Path
 
@@ -45,28 +45,28 @@ class DemoFolder:
         """The question with this many crops, as the lost robot asked it."""
         return self.path / f"question-{crops}.json"
 
-    def said(self, child: str) -> Path:
-        """What a child process said on stderr."""
+    def stderr_of(self, child: str) -> Path:
+        """Where a child process' stderr goes."""
         return self.path / f"{child}.txt"
 
 
 @contextlib.contextmanager
 def fresh_folder(path: Path) -> Iterator[DemoFolder]:
-    """An empty demo folder at ``path``, this demo's alone until the end.
+    """An empty demo folder at ``path``, locked until the end.
 
     Raises MisuseError when something else is there, or another demo is at work in it.
     """
     with contextlib.ExitStack() as held:
         try:
-            _claim(path, held)
+            _lock(path, held)
             folder = DemoFolder(path)
-            _empty(folder)
+            _remove_old(folder)
         except OSError as error:
             raise MisuseError(f"{path}: {error.strerror}; choose another --out") from None
         yield folder
 
 
-def _claim(path: Path, held: contextlib.ExitStack) -> None:
+def _lock(path: Path, held: contextlib.ExitStack) -> None:
     """Mark the folder, and lock the mark for as long as ``held`` is; see `fresh_folder`."""
     if path.exists() and not (path / MARKER).exists() and any(path.iterdir()):
         raise MisuseError(
@@ -85,9 +85,9 @@ def _claim(path: Path, held: contextlib.ExitStack) -> None:
     mark.flush()
 
 
-def _empty(folder: DemoFolder) -> None:
+def _remove_old(folder: DemoFolder) -> None:
     if folder.log.exists():
         shutil.rmtree(folder.log)
-    for pattern in _MADE:
+    for pattern in _GENERATED:
         for old in folder.path.glob(pattern):
             old.unlink()

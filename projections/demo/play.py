@@ -1,10 +1,6 @@
-"""The stages in order: record, replay, map, ask, draw. Each tells what it did when it is done.
+"""The demo's stages in order: record, replay, map, ask, draw; then commands to go on with.
 
 House and runs are made before the clock starts: they stand for the world, not for mapfold.
-
-What a user can do next with what the demo leaves, as commands to copy.
-
-They are run by a test. Values are quoted for a POSIX shell.
 """
 
 import contextlib
@@ -26,54 +22,21 @@ from projections.drawing import draw_map, floor_of
 from projections.drawing.picture import bridges_of
 from projections.settings import Settings
 
-from . import story
-from .asking import ask_lost, rooms_of
+from . import report
+from .asking import ask_lost, place_rooms
 from .folder import DemoFolder, fresh_folder
-from .mapping import MergeMoment, fingerprint, fold_with_rooms, most_telling, places_with
+from .mapping import RoomMerge, fold_with_rooms, hash_tables, most_telling, places_with
 from .recording import record_run
-from .story import Played, document
-
-MAPFOLD = "mapfold"
-
-
-def commands(
-    folder: DemoFolder, merge: MergeMoment | None, db: str | None, vector_db: str | None
-) -> Iterator[str]:
-    """Lines to paste; comments say what for."""
-    if shutil.which(MAPFOLD) is None:
-        activate = Path(sys.prefix) / "bin" / "activate"
-        yield f"   . {_quoted(_near(activate))}    # puts mapfold on the path"
-    if db is None:
-        yield f"   export MAPFOLD_HOME={_quoted(folder.path)}    # where the databases are"
-    if db is not None or vector_db is not None:  # a URL may hold a password: not said here
-        yield "   # and MAPFOLD_DB, MAPFOLD_VECTOR_DB set to what --db and --vector-db were given"
-    log, settings = _quoted(folder.log), f"--settings {_quoted(folder.settings)}"
-    yield f"   mapfold state {log} {settings}"
-    if merge is not None:
-        yield f"   mapfold diff {log} {merge.offset} {merge.offset + 1} {settings}    # that merge"
-        yield f"   mapfold merges {log} {settings}"
-    yield f"   mapfold relocalize {_quoted(folder.question(1))}"
-    yield f"   mapfold status {log} {settings}"
-
-
-def _near(path: Path) -> Path:
-    """Relative to the current folder where it is inside it: shorter, and easier to read."""
-    here = Path.cwd()
-    return path.relative_to(here) if path.is_relative_to(here) else path
-
-
-def _quoted(path: Path) -> str:
-    return shlex.quote(os.fspath(path))
-
+from .report import DemoResult, result_document
 
 SETTINGS: Final = Settings(eps_m=0.75, min_samples=8)
-"""A look around puts 22 keyframes on one spot and a drive through a door three or four within
-0.75 m: these settings call the first a place and not the second. The default chains the house."""
+"""A look around leaves 22 keyframes in one spot, a drive through a door three or four within
+0.75 m: here the first is a place and the second not. The default chains the whole house."""
 
 
 @dataclass(frozen=True, slots=True)
 class DemoOptions:
-    """Where to leave everything, which house, how fast to play it, which databases if not ours."""
+    """Output folder, house, speed of the robot, and databases if not the demo's own."""
 
     out: Path
     seed: int = DEFAULT_SEED
@@ -86,7 +49,7 @@ Tell = Callable[[str], None]
 
 
 def run_demo(options: DemoOptions, tell: Tell) -> dict[str, Any]:
-    """Play the demo, telling it line by line; returns its numbers as a JSON document."""
+    """Run the demo, with each line of its report to ``tell``; returns its numbers for JSON."""
     with fresh_folder(options.out) as folder:
         return _play(options, folder, tell)
 
@@ -102,34 +65,34 @@ def _play(options: DemoOptions, folder: DemoFolder, tell: Tell) -> dict[str, Any
         with clock.stage("Run A explores the house and is recorded"):
             targets = stack.enter_context(_databases(folder, options))
             recorded, followed = record_run(explorer, options.speed, folder, targets, SETTINGS)
-            clock.tell(story.tell_recording(recorded, followed, detections, rooms, options.speed))
+            clock.tell(report.tell_recording(recorded, followed, detections, rooms, options.speed))
         with clock.stage("The databases are thrown away and the log is replayed"):
-            before = fingerprint(targets)
+            before = hash_tables(targets)
             replayed = rebuild(folder.log, targets, SETTINGS)
-            same_rows = fingerprint(targets) == before
+            same_rows = hash_tables(targets) == before
             folded = fold_with_rooms(folder, SETTINGS, explorer)
-            clock.tell(story.tell_replay(replayed, folded, same_rows))
+            clock.tell(report.tell_replay(replayed, folded, same_rows))
         with clock.stage("The map"):
             default_places = places_with(folder, Settings())
-            clock.tell(story.tell_map(folded, Settings(), default_places))
-            clock.tell(story.tell_merges(folded.merges))
+            clock.tell(report.tell_map(folded, Settings(), default_places))
+            clock.tell(report.tell_merges(folded.merges))
         with clock.stage("Run B is lost and asks"):
             lost = ask_lost(targets, lost_run, folder)
-            clock.tell(story.tell_lost(lost, rooms_of(folded.view, explorer)))
+            clock.tell(report.tell_lost(lost, place_rooms(folded.view, explorer)))
     with clock.stage("The map is drawn"):
         draw_map(
             folded.view,
             folder.map,
             title=f"House {house.seed}: explored by {explorer.run_id}, {lost.run_id} lost in it",
             floor=floor_of(house),
-            lost=lost.drawn,
+            lost=lost.drawing,
             bridges=bridges_of(folded.view, folded.deltas),
         )
         clock.tell([f"   {folder.map}"])
     tell(f"{clock.total:.1f} s in all. Go on with it:")
-    clock.tell(commands(folder, most_telling(folded.merges), options.db, options.vector_db))
-    return document(
-        Played(options.seed, SETTINGS, recorded, followed, replayed, same_rows, folded, lost),
+    clock.tell(_next_commands(folder, most_telling(folded.merges), options.db, options.vector_db))
+    return result_document(
+        DemoResult(options.seed, SETTINGS, recorded, followed, replayed, same_rows, folded, lost),
         clock.seconds,
         folder,
     )
@@ -169,3 +132,33 @@ def _databases(folder: DemoFolder, options: DemoOptions) -> Iterator[Targets]:
         return
     with EmbeddedServer(folder.path) as server:
         yield Targets(server.url, options.vector_db or server.url, server)
+
+
+def _next_commands(
+    folder: DemoFolder, merge: RoomMerge | None, db: str | None, vector_db: str | None
+) -> Iterator[str]:
+    """Commands to paste into a POSIX shell, with comments. A test runs them."""
+    if shutil.which("mapfold") is None:
+        activate = Path(sys.prefix) / "bin" / "activate"
+        yield f"   . {_quoted(_relative(activate))}    # puts mapfold on the path"
+    if db is None:
+        yield f"   export MAPFOLD_HOME={_quoted(folder.path)}    # where the databases are"
+    if db is not None or vector_db is not None:  # a URL may hold a password: not printed
+        yield "   # and MAPFOLD_DB, MAPFOLD_VECTOR_DB set to what --db and --vector-db were given"
+    log, settings = _quoted(folder.log), f"--settings {_quoted(folder.settings)}"
+    yield f"   mapfold state {log} {settings}"
+    if merge is not None:
+        yield f"   mapfold diff {log} {merge.offset} {merge.offset + 1} {settings}    # that merge"
+        yield f"   mapfold merges {log} {settings}"
+    yield f"   mapfold relocalize {_quoted(folder.question(1))}"
+    yield f"   mapfold status {log} {settings}"
+
+
+def _relative(path: Path) -> Path:
+    """Relative to the current folder if inside it."""
+    here = Path.cwd()
+    return path.relative_to(here) if path.is_relative_to(here) else path
+
+
+def _quoted(path: Path) -> str:
+    return shlex.quote(os.fspath(path))

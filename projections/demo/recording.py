@@ -1,32 +1,39 @@
-"""Run A explores the house: one process drives, another records, a router between them.
+"""Run A recorded: one process publishes it, another records, over a router in this process.
 
-Meanwhile a tail in this process writes what is recorded into the databases.
+Meanwhile a tail in a thread of this process writes the log into the databases.
 """
 
+import statistics
+import threading
 import time
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Final
+from pathlib import Path
+from typing import Final, Self
 
-from eventsrc.envelope import Offset, RunId
+from eventsrc.envelope import FIRST_OFFSET, Offset, RunId
+from eventsrc.errors import MapfoldError
 from eventsrc.log import LogReader
 from eventsrc.log_info import log_info
 from eventsrc.sim import SimulatedRun
 from eventsrc.system_events import is_system_key
 from eventsrc.transport.session import Router, ZenohOptions
+from projections.database import TailReport, rebuild, tail
 from projections.database.connection import Targets
 from projections.settings import Settings
 
 from .children import Children
 from .folder import DemoFolder
-from .mapping import Followed, Follower
 
 _ANY_PORT: Final = ZenohOptions(listen=("tcp/127.0.0.1:0",))
-_PATIENCE_S: Final = 40.0
+_TIMEOUT_S: Final = 40.0
+_TAIL_TIMEOUT_S: Final = 30.0
+_POLL_S: Final = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """What the recorder got of what was driven.
+    """What the recorder received of what was published.
 
     ``intact`` says that the log holds every payload, in order, byte for byte.
     """
@@ -42,6 +49,16 @@ class Recorded:
     seconds: float
 
 
+@dataclass(frozen=True, slots=True)
+class Followed:
+    """The tail's delays, from the recording of an event to its commit in the databases."""
+
+    events: int
+    batches: int
+    median_delay_s: float
+    worst_delay_s: float
+
+
 def record_run(
     run: SimulatedRun,
     speed: float,
@@ -49,7 +66,7 @@ def record_run(
     targets: Targets,
     settings: Settings,
 ) -> tuple[Recorded, Followed]:
-    """Have run A published, recorded into the folder's log, and followed into the databases."""
+    """Have run A published, recorded into the folder's log, and tailed into the databases."""
     started = time.monotonic()
     count = len(run.envelopes)
     drive_s = run.true_poses[-1].time_s
@@ -58,18 +75,18 @@ def record_run(
         children.start(
             "record",
             ("record", str(folder.log), *connect, "--max-events", str(count)),
-            folder.said("record"),
+            folder.stderr_of("record"),
         )
-        children.wait_said("record", "recording", _PATIENCE_S)
-        with Follower(folder.log, targets, settings) as follower:
+        children.wait_for_output("record", "recording", _TIMEOUT_S)
+        with BackgroundTail(folder.log, targets, settings) as background_tail:
             seed = str(run.house.seed)
             children.start(
                 "simulate",
                 ("simulate", "--seed", seed, "--run", "a", "--speed", str(speed), *connect),
-                folder.said("simulate"),
+                folder.stderr_of("simulate"),
             )
-            children.wait(_PATIENCE_S + drive_s / speed)
-            followed = follower.caught_up(Offset(count))
+            children.wait(_TIMEOUT_S + drive_s / speed)
+            followed = background_tail.wait_for(Offset(count))
     seconds = time.monotonic() - started
     info = log_info(folder.log)
     with LogReader(folder.log) as reader:
@@ -86,3 +103,61 @@ def record_run(
         seconds=seconds,
     )
     return recorded, followed
+
+
+class BackgroundTail:
+    """A tail beside the recorder, in a thread of this process, for the length of a ``with`` block.
+
+    It begins from an empty projection of this log, whatever the databases held before.
+    """
+
+    def __init__(self, log: Path, targets: Targets, settings: Settings) -> None:
+        self._log, self._targets, self._settings = log, targets, settings
+        self._stop = threading.Event()
+        self._commits: list[tuple[Offset, int]] = []
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="tail")
+        self._running: Future[TailReport] | None = None
+
+    def __enter__(self) -> Self:
+        rebuild(self._log, self._targets, self._settings, until=FIRST_OFFSET)
+        self._running = self._pool.submit(
+            tail, self._log, self._targets, self._settings, stop=self._stop, on_batch=self._on_batch
+        )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._pool.shutdown()
+
+    def wait_for(self, end: Offset) -> Followed:
+        """Wait until ``end`` events are in the databases; returns the delays."""
+        assert self._running is not None  # noqa: S101 - inside the with block
+        deadline, pause = time.monotonic() + _TAIL_TIMEOUT_S, threading.Event()
+        while not self._commits or self._commits[-1][0] < end:
+            if self._running.done():
+                self._running.result()  # raises the tail's error
+            if time.monotonic() > deadline:
+                raise MapfoldError(
+                    f"{self._log}: the databases did not reach event {end} within "
+                    f"{_TAIL_TIMEOUT_S:g} s; run mapfold status {self._log}"
+                )
+            pause.wait(_POLL_S)
+        self._stop.set()
+        report = self._running.result(_TAIL_TIMEOUT_S)
+        delays = self._delays()
+        return Followed(report.events, report.batches, statistics.median(delays), max(delays))
+
+    def _on_batch(self, report: TailReport) -> None:
+        self._commits.append((report.next_offset, time.time_ns()))
+
+    def _delays(self) -> list[float]:
+        """Seconds for every event, from the log's time stamp to the commit that covers it."""
+        delays: list[float] = []
+        commits = iter(self._commits)
+        reached, committed_ns = 0, 0
+        with LogReader(self._log) as reader:
+            for event in reader.read(FIRST_OFFSET, self._commits[-1][0]):
+                while reached <= event.offset:
+                    reached, committed_ns = next(commits)
+                delays.append((committed_ns - event.logged_ns) / 1e9)
+        return delays

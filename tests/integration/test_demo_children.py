@@ -19,7 +19,7 @@ from projections.demo.children import Children
 log, endpoint, said = sys.argv[1:]
 with Children() as children:
     children.start("record", ("record", log, "--connect", endpoint), Path(said))
-    children.wait_said("record", "recording", 60)
+    children.wait_for_output("record", "recording", 60)
     print("ready", flush=True)
     sys.stdin.read()
 """
@@ -62,6 +62,6 @@ def test_leaving_the_block_ends_them_too(tmp_path: Path) -> None:
     said = tmp_path / "said"
     with Children() as children:
         children.start("router", ("router", "--listen", "tcp/127.0.0.1:0"), said)
-        children.wait_said("router", "tcp/127.0.0.1", 60)
+        children.wait_for_output("router", "tcp/127.0.0.1", 60)
         (process,) = children._running.values()
     assert process.returncode == 0

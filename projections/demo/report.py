@@ -1,6 +1,6 @@
-"""The demo's story for people: a few short lines a stage, every number from what has happened.
+"""The demo's report: a few lines for each stage, and all its numbers as one JSON document.
 
-The demo's numbers as one JSON document. Lengths in metres, times in seconds.
+Lengths in metres, times in seconds.
 """
 
 from collections.abc import Iterator
@@ -13,16 +13,16 @@ from projections.database.labels import EDGE_LABELS, TABLE, VERTEX_LABELS
 from projections.relocalize import UNKNOWN_BELOW
 from projections.settings import Settings
 
-from .asking import NEAR_M, Asked, Lost
+from .asking import NEAR_M, AskedQuestion, LostRun
 from .folder import DemoFolder
-from .mapping import Folded, Followed, MergeMoment, Part, most_telling
-from .recording import Recorded
+from .mapping import Folded, Part, RoomMerge, most_telling
+from .recording import Followed, Recorded
 
 
 def tell_recording(
     recorded: Recorded, followed: Followed, detections: int, rooms: int, speed: float
 ) -> Iterator[str]:
-    """How run A got into the log, and from there into the databases."""
+    """How run A was recorded, and tailed into the databases."""
     kept = "byte for byte" if recorded.intact else "NOT byte for byte"
     yield (
         f"   {recorded.run_id} drove {recorded.drive_seconds:.0f} s through "
@@ -48,7 +48,7 @@ def tell_recording(
 
 
 def tell_replay(replayed: RebuildReport, folded: Folded, same_rows: bool) -> Iterator[str]:
-    """That the databases are disposable."""
+    """Whether a replay gives the same rows and digest."""
     nodes = sum(replayed.rows[label] for label in VERTEX_LABELS)
     edges = sum(replayed.rows[label] for label in EDGE_LABELS)
     rows = "the same rows as" if same_rows else "OTHER rows than"
@@ -62,7 +62,7 @@ def tell_replay(replayed: RebuildReport, folded: Folded, same_rows: bool) -> Ite
 
 
 def tell_map(folded: Folded, other_settings: Settings, other_places: int) -> Iterator[str]:
-    """What the log became, and honestly with which settings."""
+    """The map's numbers, with which settings, and with the default settings."""
     counts, settings = folded.view.counts(), folded.view.settings
     transitions = sum(count for _, _, count in folded.view.edges())
     yield (
@@ -81,8 +81,8 @@ def tell_map(folded: Folded, other_settings: Settings, other_places: int) -> Ite
     )
 
 
-def tell_merges(merges: tuple[MergeMoment, ...]) -> Iterator[str]:
-    """The moment two places became one, told for the most telling of them."""
+def tell_merges(merges: tuple[RoomMerge, ...]) -> Iterator[str]:
+    """The most telling merge of places."""
     merge = most_telling(merges)
     if merge is None:
         yield "   no two places became one on this drive"
@@ -101,8 +101,8 @@ def tell_merges(merges: tuple[MergeMoment, ...]) -> Iterator[str]:
     )
 
 
-def tell_lost(lost: Lost, rooms: dict[str, str]) -> Iterator[str]:
-    """Run B's questions and what came back."""
+def tell_lost(lost: LostRun, rooms: dict[str, str]) -> Iterator[str]:
+    """Run B's questions and the answers."""
     yield (
         f"   {lost.run_id}, another day, looks around and does not know where it is (in the "
         f"{lost.room}, in truth)"
@@ -123,7 +123,7 @@ def tell_lost(lost: Lost, rooms: dict[str, str]) -> Iterator[str]:
     )
 
 
-def _places(asked: Asked, rooms: dict[str, str]) -> str:
+def _places(asked: AskedQuestion, rooms: dict[str, str]) -> str:
     return ", ".join(
         f"{_short(place.place_id)} {place.score:.2f} ({rooms.get(place.place_id, '?')})"
         for place in asked.answer.places
@@ -131,7 +131,7 @@ def _places(asked: Asked, rooms: dict[str, str]) -> str:
     )
 
 
-def _pose(asked: Asked) -> str:
+def _pose(asked: AskedQuestion) -> str:
     answer = asked.answer
     off = "no pose" if asked.error_m is None else f"{asked.error_m:.2f} m off"
     sure = f"confidence {answer.confidence:.2f}"
@@ -149,8 +149,8 @@ def _short(place_id: str) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Played:
-    """What the stages brought. ``same_rows``: the replay wrote the rows that the tail had."""
+class DemoResult:
+    """The results of the stages. ``same_rows``: the replay wrote the rows that the tail had."""
 
     seed: int
     settings: Settings
@@ -159,29 +159,31 @@ class Played:
     replayed: RebuildReport
     same_rows: bool
     folded: Folded
-    lost: Lost
+    lost: LostRun
 
     @property
     def sound(self) -> bool:
-        """Whether all that must be equal is: log and run, tail and replay, databases and fold."""
+        """Whether log and run, tail and replay, databases and fold agree."""
         recorded = self.recorded
         whole = recorded.intact and not recorded.rejected and not recorded.lost
         return whole and self.same_rows and self.replayed.digest == self.folded.digest
 
 
-def document(played: Played, seconds: dict[str, float], folder: DemoFolder) -> dict[str, Any]:
+def result_document(
+    result: DemoResult, seconds: dict[str, float], folder: DemoFolder
+) -> dict[str, Any]:
     """What ``mapfold demo --json`` prints; ``seconds`` by stage."""
-    view, replayed = played.folded.view, played.replayed
+    view, replayed = result.folded.view, result.replayed
     counts = view.counts()
     return {
-        "sound": played.sound,
-        "seed": played.seed,
-        "settings": played.settings.model_dump(),
-        "record": asdict(played.recorded),
-        "tail": asdict(played.followed),
+        "sound": result.sound,
+        "seed": result.seed,
+        "settings": result.settings.model_dump(),
+        "record": asdict(result.recorded),
+        "tail": asdict(result.followed),
         "replay": {
             "rows": replayed.rows,
-            "same_rows_as_tail": played.same_rows,
+            "same_rows_as_tail": result.same_rows,
             "digest": replayed.digest,
             "seconds": replayed.total_s,
         },
@@ -191,11 +193,11 @@ def document(played: Played, seconds: dict[str, float], folder: DemoFolder) -> d
             "objects": counts["objects"],
             "adjacent_pairs": counts["adjacency"],
             "transitions": sum(count for _, _, count in view.edges()),
-            "digest": played.folded.digest,
-            "fold_seconds": played.folded.seconds,
+            "digest": result.folded.digest,
+            "fold_seconds": result.folded.seconds,
         },
-        "merges": [asdict(merge) for merge in played.folded.merges],
-        "relocalize": _lost(played.lost),
+        "merges": [asdict(merge) for merge in result.folded.merges],
+        "relocalize": _lost_document(result.lost),
         "seconds": {**seconds, "total": sum(seconds.values())},
         "files": {
             "folder": str(folder.path),
@@ -206,18 +208,18 @@ def document(played: Played, seconds: dict[str, float], folder: DemoFolder) -> d
     }
 
 
-def _lost(lost: Lost) -> dict[str, Any]:
+def _lost_document(lost: LostRun) -> dict[str, Any]:
     return {
         "run_id": lost.run_id,
         "keyframe_id": lost.keyframe_id,
         "room": lost.room,
         "truth": asdict(lost.truth),
-        "questions": [_asked(asked) for asked in lost.questions],
+        "questions": [_asked_document(asked) for asked in lost.questions],
         "everywhere": asdict(lost.everywhere),
     }
 
 
-def _asked(asked: Asked) -> dict[str, Any]:
+def _asked_document(asked: AskedQuestion) -> dict[str, Any]:
     return {
         "classes": list(asked.classes),
         "error_m": asked.error_m,

@@ -1,4 +1,4 @@
-"""The demo's story tells what happened, also when it went wrong."""
+"""The demo's report: the numbers of each stage, and what did not agree."""
 
 from dataclasses import replace
 
@@ -6,10 +6,10 @@ import pytest
 
 from projections.database import RebuildReport
 from projections.database.labels import LABELS, TABLE
-from projections.demo import story
-from projections.demo.mapping import Folded, Followed, MergeMoment, Part, most_telling
-from projections.demo.recording import Recorded
-from projections.demo.story import Played
+from projections.demo import report
+from projections.demo.mapping import Folded, Part, RoomMerge, most_telling
+from projections.demo.recording import Followed, Recorded
+from projections.demo.report import DemoResult
 from projections.model.view import MapView
 from projections.settings import Settings
 
@@ -37,13 +37,13 @@ REPLAYED = RebuildReport(
 )
 
 
-def _merge(offset: int, one: str, other: str, smaller: int) -> MergeMoment:
+def _merge(offset: int, one: str, other: str, smaller: int) -> RoomMerge:
     parts = Part("sim-1-a_p0", 30, one), (Part("sim-1-a_p1", smaller, other),)
-    return MergeMoment(offset, "sim-1-a", offset + 1, "hall", *parts, places_before=5)
+    return RoomMerge(offset, "sim-1-a", offset + 1, "hall", *parts, places_before=5)
 
 
-def _played() -> Played:
-    return Played(1, Settings(), RECORDED, FOLLOWED, REPLAYED, True, FOLDED, lost=None)  # type: ignore[arg-type]
+def _result() -> DemoResult:
+    return DemoResult(1, Settings(), RECORDED, FOLLOWED, REPLAYED, True, FOLDED, lost=None)  # type: ignore[arg-type]
 
 
 def test_a_merge_across_rooms_is_told_before_a_larger_one_within_a_room() -> None:
@@ -54,58 +54,58 @@ def test_a_merge_across_rooms_is_told_before_a_larger_one_within_a_room() -> Non
 
 
 def test_no_merge_is_said_to_be_none() -> None:
-    assert list(story.tell_merges(())) == ["   no two places became one on this drive"]
+    assert list(report.tell_merges(())) == ["   no two places became one on this drive"]
 
 
 def test_a_merge_is_told_with_its_numbers() -> None:
-    told = "\n".join(story.tell_merges((_merge(7, "hall", "study", 12),)))
+    told = "\n".join(report.tell_merges((_merge(7, "hall", "study", 12),)))
     for wanted in ("p0 (30 keyframes, hall)", "p1 (12 keyframes, study)", "event 7", "5 places"):
         assert wanted in told
     assert "such moments" not in told
 
 
 def test_what_is_not_whole_is_said_loudly() -> None:
-    good = "\n".join(story.tell_recording(RECORDED, FOLLOWED, 5, 8, 30.0))
+    good = "\n".join(report.tell_recording(RECORDED, FOLLOWED, 5, 8, 30.0))
     assert "byte for byte" in good
     assert "NOT" not in good
     torn = replace(RECORDED, recorded=9, intact=False, lost=1)
-    told = "\n".join(story.tell_recording(torn, FOLLOWED, 5, 8, 30.0))
+    told = "\n".join(report.tell_recording(torn, FOLLOWED, 5, 8, 30.0))
     assert "9 of 10" in told
     assert "NOT byte for byte; 0 rejected, 1 lost" in told
 
 
 @pytest.mark.parametrize(("same", "says"), [(True, "the same rows as"), (False, "OTHER rows than")])
 def test_a_replay_with_other_rows_is_said_loudly(same: bool, says: str) -> None:
-    assert says in "\n".join(story.tell_replay(REPLAYED, FOLDED, same))
+    assert says in "\n".join(report.tell_replay(REPLAYED, FOLDED, same))
 
 
 def test_a_replay_with_another_digest_is_said_loudly() -> None:
-    told = "\n".join(story.tell_replay(replace(REPLAYED, digest="0" * 64), FOLDED, True))
+    told = "\n".join(report.tell_replay(replace(REPLAYED, digest="0" * 64), FOLDED, True))
     assert "ANOTHER digest" in told
 
 
 def test_a_demo_is_sound_only_if_everything_agrees() -> None:
-    assert _played().sound
-    assert not replace(_played(), same_rows=False).sound
-    assert not replace(_played(), recorded=replace(RECORDED, intact=False)).sound
-    assert not replace(_played(), recorded=replace(RECORDED, lost=1)).sound
-    assert not replace(_played(), replayed=replace(REPLAYED, digest="0" * 64)).sound
+    assert _result().sound
+    assert not replace(_result(), same_rows=False).sound
+    assert not replace(_result(), recorded=replace(RECORDED, intact=False)).sound
+    assert not replace(_result(), recorded=replace(RECORDED, lost=1)).sound
+    assert not replace(_result(), replayed=replace(REPLAYED, digest="0" * 64)).sound
 
 
 def test_lines_fit_a_terminal() -> None:
     merges = (_merge(1234, "living room", "dining room", 120), _merge(7, "hall", "hall", 3))
     lines = [
-        *story.tell_recording(RECORDED, FOLLOWED, 12_345, 8, 30.0),
-        *story.tell_replay(REPLAYED, FOLDED, True),
-        *story.tell_map(FOLDED, Settings(), 1),
-        *story.tell_merges(merges),
+        *report.tell_recording(RECORDED, FOLLOWED, 12_345, 8, 30.0),
+        *report.tell_replay(REPLAYED, FOLDED, True),
+        *report.tell_map(FOLDED, Settings(), 1),
+        *report.tell_merges(merges),
     ]
     assert max(map(len, lines)) <= 100
 
 
 def test_one_is_singular() -> None:
     at_once = replace(FOLLOWED, batches=1)
-    told = "\n".join(story.tell_recording(RECORDED, at_once, 1, 1, 30.0))
+    told = "\n".join(report.tell_recording(RECORDED, at_once, 1, 1, 30.0))
     assert "through 1 room, " in told
     assert "with 1 detection are in the log" in told
     assert "in 1 transaction:" in told
