@@ -1,8 +1,8 @@
-"""What stands in which room: classes, models and sizes.
+"""The furniture of each room: classes, models and sizes.
 
-A model is what makes look-alikes: the six dining chairs are one model, the office chair another.
+Objects of one model look alike: the six dining chairs are one model, the office chair another.
 Sizes are width along the wall, depth from it, and height, in metres; ``base_m`` is the height of
-the lower edge above the floor. A piece with ``stands`` takes floor space, any other hangs on the
+the lower edge above the floor. A model with ``stands`` takes floor space; any other hangs on the
 wall or stands on something.
 """
 
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """One product: everything of the same model looks nearly the same."""
+    """One product; objects of the same model look nearly the same."""
 
     name: str
     class_name: str
@@ -86,7 +86,7 @@ FURNITURE: dict[str, tuple[str, ...]] = {
     ),
     "hall": ("rack-coats", "bench-hall", "plant-cactus", "mirror-plain", "picture-print"),
 }
-"""Model names by room, big pieces first: they are placed in this order."""
+"""Model names by room, in the order of placing: large ones first."""
 
 DINING_SET = ("table-dining", "chair-dining", "chair-dining", "chair-dining", "chair-dining")
-"""Stands together in the dining room: the table and a chair on each of four places around it."""
+"""Placed together in the dining room: the table and four chairs around it."""

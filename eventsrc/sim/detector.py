@@ -1,24 +1,21 @@
-"""From sightings to detections, with a detector's faults.
+"""The robot's camera and detector: visible objects, detections with faults, embeddings.
 
-It misses some, gets boxes wrong by a few pixels, is less sure of far things, names 4 % wrongly (a
-class of about the same size), and sees something that is not there in 2 % of the keyframes.
+Camera: a pinhole looking straight ahead, 640 × 400 pixels, 69.4° wide. An object is visible when it
+is in range, most of its box is in the picture, the box is not tiny, and no wall stands between the
+camera and its middle or one of its sides. Furniture hides phantom.
 
-What the robot sees: a pinhole camera looking straight ahead, 640 × 400 pixels, 69.4° wide.
+Detector: it misses some objects, gets boxes wrong by a few pixels, is less confident of distant
+objects, gives 4 % a wrong class (of about the same size), and detects something that is not there
+in 2 % of the keyframes.
 
-A thing is seen when it is in range, most of its box is in the picture, the box is not tiny, and no
-wall stands between the camera and its middle or one of its sides. Furniture hides nothing.
-
-Embeddings that behave like CLIP's on object crops, made of named random directions.
-
-One crop's embedding is the normalised sum of weighted unit vectors: what all crops share, the
-class, the model (the same in every house), the instance, the side that shows, the session's light,
-and noise. The weights are roots of the shares below and were set so that cosines come out as
-measured on real crops (5th to 95th percentile): same instance 0.82-0.92, same class but another
-instance 0.66-0.82, another class 0.48-0.58. Class directions lie in a space of few dimensions,
-which is what makes some classes closer to each other than others.
-
-The result is rounded to half precision, as a model run in fp16 gives it; rounding also hides the
-last bits in which C libraries differ.
+Embeddings, like CLIP's on object crops: the normalised sum of weighted unit vectors for what all
+crops share, the class, the model (the same in every house), the instance, the side in view, the
+session's light, and noise, each a named random direction. The weights are roots of the shares below
+and were set so that cosines come out as measured on real crops (5th to 95th percentile): same
+instance 0.82-0.92, same class but another instance 0.66-0.82, another class 0.48-0.58. Class
+directions lie in a space of few dimensions, which makes some classes closer to each other than
+others. The result is rounded to half precision, as a model run in fp16 gives it; rounding also
+hides the last bits in which C libraries differ.
 """
 
 import base64
@@ -33,7 +30,7 @@ from numpy.typing import NDArray
 
 from .catalogue import MODELS
 from .house import House, Thing
-from .random_streams import Vector, direction, happens, normal, normals, stream, uniform, unit
+from .random_streams import Vector, bernoulli, direction, normal, normals, stream, uniform, unit
 from .shapes import wrap
 from .tour import TruePose
 
@@ -50,10 +47,10 @@ Box = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Sighting:
+class VisibleObject:
     """A thing in view: its exact box in pixels, its distance, and which side of it shows.
 
-    ``side_rad`` is the direction from the thing to the camera, from the thing's own front.
+    ``side_rad`` is the direction from the thing to the camera, relative to the thing's front.
     """
 
     thing: Thing
@@ -62,17 +59,17 @@ class Sighting:
     side_rad: float
 
 
-def sightings(house: House, pose: TruePose) -> Iterator[Sighting]:
-    """Everything the camera sees from ``pose``, in the house's order of things."""
+def visible_objects(house: House, pose: TruePose) -> Iterator[VisibleObject]:
+    """Everything the camera sees from ``pose``, in the order of ``house.things``."""
     for thing in house.things:
         x, y = thing.centre
         distance = math.hypot(x - pose.x, y - pose.y)
         if not RANGE_M[0] <= distance <= RANGE_M[1]:
             continue
-        box = _shown(_project(thing, pose))
-        if box is not None and _in_sight(house, thing, pose):
+        box = _clipped(_project(thing, pose))
+        if box is not None and _unoccluded(house, thing, pose):
             side = wrap(math.atan2(pose.y - y, pose.x - x) - thing.facing_rad)
-            yield Sighting(thing, box, distance, side)
+            yield VisibleObject(thing, box, distance, side)
 
 
 def _project(thing: Thing, pose: TruePose) -> Box | None:
@@ -92,8 +89,8 @@ def _project(thing: Thing, pose: TruePose) -> Box | None:
     return min(us), min(vs), max(us), max(vs)
 
 
-def _shown(box: Box | None) -> Box | None:
-    """The part of ``box`` in the picture, None when that is too little of it."""
+def _clipped(box: Box | None) -> Box | None:
+    """The part of ``box`` in the picture; None when it is too small or too small a share."""
     if box is None:
         return None
     x0, y0, x1, y1 = box
@@ -104,7 +101,7 @@ def _shown(box: Box | None) -> Box | None:
     return cut if wide * high >= _MIN_SHOWN * (x1 - x0) * (y1 - y0) else None
 
 
-def _in_sight(house: House, thing: Thing, pose: TruePose) -> bool:
+def _unoccluded(house: House, thing: Thing, pose: TruePose) -> bool:
     x, y = thing.centre
     away = math.hypot(x - pose.x, y - pose.y)
     half = 0.4 * min(thing.model.width_m, thing.model.depth_m)
@@ -139,21 +136,21 @@ def embed(
     rng: np.random.Generator,
 ) -> NDArray[np.float32]:
     """The embedding of one crop, a unit vector (to half precision), float32 of shape (512,)."""
-    front, flank = _named("side-front", model), _named("side-flank", model)
+    front, flank = _named_direction("side-front", model), _named_direction("side-flank", model)
     total = (
-        _WEIGHTS["common"] * _named("common")
+        _WEIGHTS["common"] * _named_direction("common")
         + _WEIGHTS["class"] * _class_direction(class_name)
-        + _WEIGHTS["model"] * _named("model", model)
-        + _WEIGHTS["instance"] * _named("instance", instance)
+        + _WEIGHTS["model"] * _named_direction("model", model)
+        + _WEIGHTS["instance"] * _named_direction("instance", instance)
         + _WEIGHTS["side"] * (math.cos(side_rad) * front + math.sin(side_rad) * flank)
-        + _WEIGHTS["session"] * _named("session", session)
+        + _WEIGHTS["session"] * _named_direction("session", session)
         + _WEIGHTS["noise"] * unit(normals(rng, DIM))
     )
     return unit(total).astype(np.float16).astype(np.float32)
 
 
 @cache
-def _named(*words: str) -> Vector:
+def _named_direction(*words: str) -> Vector:
     return direction(stream("embedding", *words), DIM)
 
 
@@ -163,7 +160,7 @@ def _class_direction(class_name: str) -> Vector:
     mix = normals(stream("embedding", "class", class_name), _CLASS_SPACE)
     total = np.zeros(DIM)
     for index, weight in enumerate(mix.tolist()):
-        total = total + weight * _named("class axis", str(index))
+        total = total + weight * _named_direction("class axis", str(index))
     return unit(total)
 
 
@@ -177,42 +174,48 @@ CLASSES = tuple(sorted({model.class_name for model in MODELS.values()}))
 
 @dataclass(frozen=True, slots=True)
 class Detection:
-    """One detection as the envelope has it, but for its id, and the true instance behind it."""
+    """The fields of a detection in the envelope, without its id; the true instance or None."""
 
     fields: dict[str, Any]
     instance: str | None
 
 
-def detect(seen: Iterator[Sighting], session: str, rng: np.random.Generator) -> Iterator[Detection]:
-    """What the detector says about one keyframe's sightings."""
-    for sighting in seen:
-        if not happens(rng, MISS_RATE):
-            yield _detection(sighting, session, rng)
-    if happens(rng, FALSE_POSITIVE_RATE):
+def detect(
+    objects: Iterator[VisibleObject], session: str, rng: np.random.Generator
+) -> Iterator[Detection]:
+    """The detections of one keyframe."""
+    for visible in objects:
+        if not bernoulli(rng, MISS_RATE):
+            yield _detection(visible, session, rng)
+    if bernoulli(rng, FALSE_POSITIVE_RATE):
         yield _phantom(session, rng)
 
 
-def _detection(sighting: Sighting, session: str, rng: np.random.Generator) -> Detection:
-    model, instance = sighting.thing.model, sighting.thing.instance
-    vector = embed(model.class_name, model.name, instance, sighting.side_rad, session, rng)
-    label = _mistaken(model.class_name, rng) if happens(rng, WRONG_LABEL_RATE) else model.class_name
-    sure = 0.93 - 0.22 * sighting.distance_m / RANGE_M[1] + 0.06 * normal(rng)
+def _detection(visible: VisibleObject, session: str, rng: np.random.Generator) -> Detection:
+    model, instance = visible.thing.model, visible.thing.instance
+    vector = embed(model.class_name, model.name, instance, visible.side_rad, session, rng)
+    label = (
+        _wrong_class(model.class_name, rng)
+        if bernoulli(rng, WRONG_LABEL_RATE)
+        else model.class_name
+    )
+    confidence = 0.93 - 0.22 * visible.distance_m / RANGE_M[1] + 0.06 * normal(rng)
     if label != model.class_name:
-        sure -= 0.25
-    return Detection(_fields(label, sure, _shaken(sighting.box, rng), vector), instance)
+        confidence -= 0.25
+    return Detection(_fields(label, confidence, _noisy_box(visible.box, rng), vector), instance)
 
 
 def _phantom(session: str, rng: np.random.Generator) -> Detection:
     label = CLASSES[int(rng.integers(0, len(CLASSES)))]
-    nothing = f"phantom-{int(rng.integers(0, 2**62))}"
+    phantom = f"phantom-{int(rng.integers(0, 2**62))}"
     x, y = uniform(rng, 0, WIDTH_PX - 120), uniform(rng, 0, HEIGHT_PX - 120)
     box = (x, y, x + uniform(rng, 30, 120), y + uniform(rng, 30, 120))
-    vector = embed(label, nothing, nothing, 0.0, session, rng)
+    vector = embed(label, phantom, phantom, 0.0, session, rng)
     return Detection(_fields(label, uniform(rng, 0.3, 0.55), box, vector), None)
 
 
-def _mistaken(class_name: str, rng: np.random.Generator) -> str:
-    """One of the three classes nearest in size, as detectors confuse things of a kind."""
+def _wrong_class(class_name: str, rng: np.random.Generator) -> str:
+    """One of the three classes nearest in size."""
     size = _size(class_name)
     others = sorted(
         (c for c in CLASSES if c != class_name), key=lambda c: (abs(_size(c) - size), c)
@@ -224,15 +227,15 @@ def _size(class_name: str) -> float:
     return max(m.width_m * m.height_m for m in MODELS.values() if m.class_name == class_name)
 
 
-def _shaken(box: Box, rng: np.random.Generator) -> Box:
+def _noisy_box(box: Box, rng: np.random.Generator) -> Box:
     x0, y0, x1, y1 = (edge + _BOX_NOISE_PX * normal(rng) for edge in box)
     return max(x0, 0.0), max(y0, 0.0), min(x1, float(WIDTH_PX)), min(y1, float(HEIGHT_PX))
 
 
-def _fields(label: str, sure: float, box: Box, vector: NDArray[np.float32]) -> dict[str, Any]:
+def _fields(label: str, confidence: float, box: Box, vector: NDArray[np.float32]) -> dict[str, Any]:
     return {
         "class": label,
-        "confidence": round(max(0.3, min(0.99, sure)), 3),
+        "confidence": round(max(0.3, min(0.99, confidence)), 3),
         "bbox": [round(edge, 1) for edge in box],
         "embedding": base64.b64encode(vector.astype("<f4").tobytes()).decode("ascii"),
         "embedding_dim": DIM,

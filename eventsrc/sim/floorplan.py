@@ -1,8 +1,8 @@
 """A floor plan from a seed: day rooms on one side of a hall, night rooms on the other.
 
 +---------+-----+-------+--------+
-| bedroom |bath | study | guest  |     the order, widths and door positions are the seed's;
-+---- ----+- ---+-- ----+--- ----+     so is the side on which the day rooms lie
+| bedroom |bath | study | guest  |     the order, widths, door positions and the side of the
++---- ----+- ---+-- ----+--- ----+     day rooms depend on the seed
 |              hall              |
 +-------- ---+--------+--- ------+
 |   living     dining   kitchen  |     living and dining room share a wide opening
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .random_streams import happens, stream, uniform
+from .random_streams import bernoulli, stream, uniform
 from .shapes import Point, Rect, Segment
 
 DOOR_M = 1.0
@@ -77,7 +77,7 @@ def build_floor_plan(seed: int) -> FloorPlan:
     length = round(sum(widths[name] for name in DAY_ROOMS), 1)
     day_depth, hall_depth = round(uniform(rng, 4.2, 4.8), 1), round(uniform(rng, 1.6, 1.9), 1)
     night_depth = round(uniform(rng, 3.8, 4.4), 1)
-    day_first = happens(rng, 0.5)
+    day_first = bernoulli(rng, 0.5)
     depths = (
         (day_depth, hall_depth, night_depth) if day_first else (night_depth, hall_depth, day_depth)
     )
@@ -101,7 +101,7 @@ def _band(levels: tuple[float, ...], first: bool) -> tuple[float, float]:
 def _order(rng: np.random.Generator, names: tuple[str, ...], *, shuffle: bool) -> list[str]:
     if shuffle:
         return [names[index] for index in rng.permutation(len(names)).tolist()]
-    return list(names) if happens(rng, 0.5) else list(reversed(names))
+    return list(names) if bernoulli(rng, 0.5) else list(reversed(names))
 
 
 def _row(

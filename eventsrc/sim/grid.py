@@ -1,7 +1,7 @@
-"""Where the robot can drive, and the way from here to there: A* on a grid, then pulled straight.
+"""Free floor and routes: A* on a grid, then shortened to straight lines.
 
-Cells are 0.1 m. A cell is free when its centre keeps ``CLEARANCE_M`` from walls and furniture; that
-is more than the robot's radius, because a driven path cuts the planned path's corners a little.
+Cells are 0.1 m. A cell is free when its centre is at least ``CLEARANCE_M`` from walls and
+furniture; that is more than the robot's radius, because the driven path cuts corners a little.
 Costs are integers (10 straight, 14 diagonal, more near obstacles), so ties break the same way
 everywhere.
 """
@@ -49,13 +49,13 @@ class DriveGrid:
         return float(self._clearance[j, i])
 
     def free(self, x: float, y: float) -> bool:
-        """Whether the robot's centre may be planned at (x, y)."""
+        """Whether a route may lead through (x, y)."""
         return self.clearance_at(x, y) >= CLEARANCE_M
 
-    def roomiest(self, around: Point, within: Rect, radius_m: float) -> Point:
-        """The free spot in ``within`` with the most space, at most ``radius_m`` from ``around``.
+    def clearest(self, around: Point, within: Rect, radius_m: float) -> Point:
+        """The free spot in ``within`` with most clearance, at most ``radius_m`` from ``around``.
 
-        Nearer spots win ties. Raises MapfoldError when nothing there is free.
+        Nearer spots win ties. Raises MapfoldError when no spot there is free.
         """
         best: tuple[float, float, Cell] | None = None
         for cell in self._cells_of(within):
@@ -70,10 +70,10 @@ class DriveGrid:
             raise MapfoldError(f"no free floor within {radius_m} m of {around}; try another --seed")
         return self._centre(best[2])
 
-    def joins(self, spots: Sequence[Point]) -> bool:
-        """Whether one can drive between all of ``spots`` (each moved to free floor nearby)."""
+    def connects(self, spots: Sequence[Point]) -> bool:
+        """Whether there are routes between all of ``spots``, each moved to free floor nearby."""
         try:
-            near = [self.roomiest(spot, Rect.around(*spot, 3.0, 3.0), 1.5) for spot in spots]
+            near = [self.clearest(spot, Rect.around(*spot, 3.0, 3.0), 1.5) for spot in spots]
             for spot in near[1:]:
                 self.route(near[0], spot)
         except MapfoldError:
@@ -81,20 +81,20 @@ class DriveGrid:
         return True
 
     def route(self, start: Point, goal: Point) -> list[Point]:
-        """Way points from ``start`` to ``goal``, both included, joined by free straight lines."""
-        cells = self._search(self._cell(start), self._cell(goal))
+        """Waypoints from ``start`` to ``goal``, both included, joined by clear straight lines."""
+        cells = self._a_star(self._cell(start), self._cell(goal))
         points = [start, *(self._centre(cell) for cell in cells[1:-1]), goal]
-        pulled = [points[0]]
+        shortened = [points[0]]
         index = 0
         while index < len(points) - 1:
             ahead = min(len(points) - 1, index + 60)
-            while ahead > index + 1 and not self._straight(points[index], points[ahead]):
+            while ahead > index + 1 and not self._is_clear(points[index], points[ahead]):
                 ahead -= 1
-            pulled.append(points[ahead])
+            shortened.append(points[ahead])
             index = ahead
-        return pulled
+        return shortened
 
-    def _straight(self, a: Point, b: Point) -> bool:
+    def _is_clear(self, a: Point, b: Point) -> bool:
         count = max(2, math.ceil(math.hypot(b[0] - a[0], b[1] - a[1]) / 0.05))
         return all(
             self.clearance_at(a[0] + (b[0] - a[0]) * k / count, a[1] + (b[1] - a[1]) * k / count)
@@ -102,22 +102,22 @@ class DriveGrid:
             for k in range(count + 1)
         )
 
-    def _search(self, start: Cell, goal: Cell) -> list[Cell]:
-        frontier = [(self._guess(start, goal), 0, start)]
+    def _a_star(self, start: Cell, goal: Cell) -> list[Cell]:
+        frontier = [(self._estimate(start, goal), 0, start)]
         cost = {start: 0}
-        came: dict[Cell, Cell] = {}
+        previous: dict[Cell, Cell] = {}
         while frontier:
             _, spent, cell = heapq.heappop(frontier)
             if cell == goal:
-                return _trace(came, cell)
+                return _path_to(previous, cell)
             if spent > cost[cell]:
                 continue
             for neighbour, step in self._neighbours(cell, goal):
                 total = spent + step
                 if total < cost.get(neighbour, total + 1):
-                    cost[neighbour], came[neighbour] = total, cell
+                    cost[neighbour], previous[neighbour] = total, cell
                     heapq.heappush(
-                        frontier, (total + self._guess(neighbour, goal), total, neighbour)
+                        frontier, (total + self._estimate(neighbour, goal), total, neighbour)
                     )
         raise MapfoldError(f"no way from cell {start} to cell {goal}; try another --seed")
 
@@ -131,7 +131,7 @@ class DriveGrid:
                 yield (i, j), step if space >= _COMFORT_M else 2 * step
 
     @staticmethod
-    def _guess(a: Cell, b: Cell) -> int:
+    def _estimate(a: Cell, b: Cell) -> int:
         dx, dy = abs(a[0] - b[0]), abs(a[1] - b[1])
         return 10 * max(dx, dy) + 4 * min(dx, dy)
 
@@ -154,9 +154,9 @@ class DriveGrid:
                 yield i, j
 
 
-def _trace(came: dict[Cell, Cell], cell: Cell) -> list[Cell]:
+def _path_to(previous: dict[Cell, Cell], cell: Cell) -> list[Cell]:
     path = [cell]
-    while cell in came:
-        cell = came[cell]
+    while cell in previous:
+        cell = previous[cell]
         path.append(cell)
     return path[::-1]

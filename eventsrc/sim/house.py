@@ -1,8 +1,8 @@
 """A furnished house: the floor plan and the objects in it, all from one seed.
 
-Pieces that stand are put with their back to a wall, clear of doors and of each other; the dining
-set stands free. A furnishing is taken only if the robot can still drive from every room to every
-other; otherwise the next attempt is drawn. Nothing is random but the seed.
+Furniture stands with its back to a wall, clear of doors and of each other; the dining set stands
+free. A furnishing is accepted only if the robot can drive from every room to every other; otherwise
+the next attempt is drawn.
 """
 
 from collections.abc import Iterator
@@ -27,7 +27,7 @@ _CHAIR_OFFSETS = ((-0.35, -0.7), (0.35, -0.7), (-0.35, 0.7), (0.35, 0.7))
 
 @dataclass(frozen=True, slots=True)
 class Thing:
-    """One object. ``instance`` is its true identity; ``facing_rad`` is where its front looks."""
+    """One object. ``instance`` is its true identity, ``facing_rad`` the direction of its front."""
 
     instance: str
     model: Model
@@ -37,7 +37,7 @@ class Thing:
 
     @property
     def centre(self) -> Point:
-        """Where it is on the floor plan."""
+        """The middle of its footprint."""
         return self.footprint.centre
 
 
@@ -51,24 +51,24 @@ class House:
 
     @cached_property
     def walls(self) -> Walls:
-        """The walls, ready to be asked for lines of sight."""
+        """The walls, for lines of sight."""
         return Walls(self.plan.walls)
 
     @cached_property
     def grid(self) -> DriveGrid:
-        """Where the robot can drive."""
+        """The floor where the robot can drive."""
         return _grid(self.plan, self.things)
 
 
 def build_house(seed: int) -> House:
-    """The house of this seed. Raises MapfoldError if no attempt leaves it passable."""
+    """The house of this seed. Raises MapfoldError if every attempt blocks a room."""
     plan = build_floor_plan(seed)
     for attempt in range(_ATTEMPTS):
         things = _furnish(plan, stream("furniture", seed, attempt))
-        if things is not None and _grid(plan, things).joins(
+        if things is not None and _grid(plan, things).connects(
             [room.rect.centre for room in plan.rooms]
         ):
-            return House(seed, plan, _numbered(seed, things))
+            return House(seed, plan, _with_instances(seed, things))
     raise MapfoldError(
         f"house {seed}: no furnishing leaves every room reachable; try another --seed"
     )
@@ -80,7 +80,7 @@ def _grid(plan: FloorPlan, things: tuple[Thing, ...]) -> DriveGrid:
     )
 
 
-def _numbered(seed: int, things: tuple[Thing, ...]) -> tuple[Thing, ...]:
+def _with_instances(seed: int, things: tuple[Thing, ...]) -> tuple[Thing, ...]:
     """Name instances of one model house7-model-1, house7-model-2 … in the order they were placed.
 
     Two houses may have the same model of chair, never the same chair.
@@ -94,7 +94,7 @@ def _numbered(seed: int, things: tuple[Thing, ...]) -> tuple[Thing, ...]:
 
 
 def _furnish(plan: FloorPlan, rng: np.random.Generator) -> tuple[Thing, ...] | None:
-    """Everything in FURNITURE and the dining set, or None when something finds no room."""
+    """Everything in FURNITURE and the dining set; None when something does not fit."""
     placed: list[Thing] = []
     dining = _dining_set(plan, rng)
     if dining is None:
@@ -111,7 +111,7 @@ def _furnish(plan: FloorPlan, rng: np.random.Generator) -> tuple[Thing, ...] | N
 
 def _dining_set(plan: FloorPlan, rng: np.random.Generator) -> list[Thing] | None:
     room = plan.room("dining room")
-    keep_clear = list(_thresholds(plan, room))
+    keep_clear = list(_door_areas(plan, room))
     for _ in range(_TRIES):
         x = round(uniform(rng, room.rect.x0 + 1.1, room.rect.x1 - 1.1), 2)
         y = round(uniform(rng, room.rect.y0 + 1.1, room.rect.y1 - 1.1), 2)
@@ -130,7 +130,7 @@ def _against_a_wall(
     plan: FloorPlan, room: Room, model: Model, placed: list[Thing], rng: np.random.Generator
 ) -> Thing | None:
     taken = [t.footprint for t in placed if t.room == room.name and t.model.stands == model.stands]
-    taken += _thresholds(plan, room)
+    taken += _door_areas(plan, room)
     for _ in range(_TRIES):
         side = int(rng.integers(0, 4))
         spot = _spot(room.rect, model, side, uniform(rng, 0.0, 1.0))
@@ -154,18 +154,18 @@ def _spot(rect: Rect, model: Model, side: int, along: float) -> Rect:
 
 
 def _thing(model: Model, room: Room, spot: Rect, side: int) -> Thing:
-    """``side`` is the one its back is to; its front looks the other way."""
+    """``side`` is the wall at its back; its front faces the other way."""
     quarter_turns = {0: 0.0, 1: 0.5, 2: 1.0, 3: -0.5}
     return Thing("", model, room.name, spot, quarter_turns[side] * np.pi)
 
 
-def _thresholds(plan: FloorPlan, room: Room) -> Iterator[Rect]:
-    """The floor in front of the room's doors, to be kept free."""
+def _door_areas(plan: FloorPlan, room: Room) -> Iterator[Rect]:
+    """The floor around the room's doors, which stays free."""
     for door in plan.doors:
         if room.name in door.rooms:
-            yield _threshold(door)
+            yield _door_area(door)
 
 
-def _threshold(door: Door) -> Rect:
+def _door_area(door: Door) -> Rect:
     deep, wide = 2 * _DOOR_CLEAR_M, door.width_m
     return Rect.around(*door.centre, *((wide, deep) if door.flat else (deep, wide)))

@@ -1,4 +1,4 @@
-"""Chance with names: every decision draws from its own stream, so that one never shifts another.
+"""Named random streams: every decision draws from its own, so that none shifts another.
 
 A stream is PCG64 seeded with the SHA-256 of its name's words. Directions and noise are sums of
 integers (Irwin-Hall, close enough to normal): unlike numpy's normal variates they use no
@@ -42,8 +42,8 @@ def uniform(rng: np.random.Generator, low: float, high: float) -> float:
     return low + (high - low) * (int(rng.integers(0, 2**32)) / 2**32)
 
 
-def happens(rng: np.random.Generator, probability: float) -> bool:
-    """True with this probability."""
+def bernoulli(rng: np.random.Generator, probability: float) -> bool:
+    """True with probability ``probability``."""
     return uniform(rng, 0.0, 1.0) < probability
 
 

@@ -1,10 +1,8 @@
-"""One run through a simulated house: its envelopes, and beside them the truth.
+"""Simulate a run through a house, and publish it over Zenoh or write it to a file.
 
-The robot's poses in the envelopes are its localisation's, a centimetre or two off the true ones.
-The truth says which room a keyframe is in and which instance each detection shows; it never goes
-into an envelope or a log.
-
-Where a simulated run goes: over Zenoh in scaled real time, or into a file, the truth beside.
+The poses in the envelopes are those of a localisation, a centimetre or two off the true ones. The
+truth has the room of each keyframe and the instance of each detection; it goes to a file of its
+own, never into an envelope or a log.
 """
 
 import gzip
@@ -22,11 +20,11 @@ from eventsrc.envelope import KeyframeId, RunId, default_det_id
 from eventsrc.errors import MisuseError, TransportError
 from eventsrc.transport.session import Session
 
-from .detector import detect, sightings
+from .detector import detect, visible_objects
 from .house import House, build_house
 from .random_streams import normal, stream
 from .shapes import wrap
-from .tour import EXPLORER, TruePose, keyframes, plan_tour, walk
+from .tour import EXPLORER, TruePose, drive, keyframes, plan_tour
 
 DEFAULT_SEED = 7
 FIRST_START_S = 1_777_885_200.0
@@ -58,9 +56,9 @@ def encode(document: dict[str, Any]) -> bytes:
 
 
 def simulate_run(seed: int = DEFAULT_SEED, run: str = EXPLORER) -> SimulatedRun:
-    """Run ``run`` through house ``seed``. Run ``a`` explores; any other name is another session."""
+    """Simulate ``run`` through house ``seed``. Run ``a`` explores; each other name is a session."""
     house, run_id = build_house(seed), RunId(f"sim-{seed}-{run}")
-    poses = tuple(keyframes(walk(house.grid, plan_tour(house, run))))
+    poses = tuple(keyframes(drive(house.grid, plan_tour(house, run))))
     start_s = FIRST_START_S + _DAY_S * _day(run)
     made = [
         _keyframe(house, run_id, number, pose, start_s)
@@ -72,7 +70,7 @@ def simulate_run(seed: int = DEFAULT_SEED, run: str = EXPLORER) -> SimulatedRun:
 
 
 def _day(run: str) -> int:
-    """Runs a, b, c … are on successive days; any longer name has a day of its own from its text."""
+    """Runs a, b, c … are on successive days; the day of a longer name is drawn from its text."""
     if len(run) == 1 and "a" <= run <= "z":
         return ord(run) - ord("a")
     return 26 + int(stream("day", run).integers(0, 1000))
@@ -82,12 +80,12 @@ def _keyframe(
     house: House, run_id: RunId, number: int, pose: TruePose, start_s: float
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     rng = stream("keyframe", run_id, number)
-    detections = list(detect(sightings(house, pose), run_id, rng))
+    detections = list(detect(visible_objects(house, pose), run_id, rng))
     envelope = {
         "run_id": run_id,
         "keyframe_id": number,
         "timestamp": round(start_s + pose.time_s, 3),
-        **_localised(pose, rng),
+        **_noisy_pose(pose, rng),
         "detections": [
             {"det_id": default_det_id(run_id, KeyframeId(number), index), **detection.fields}
             for index, detection in enumerate(detections)
@@ -102,7 +100,7 @@ def _keyframe(
     return envelope, truth
 
 
-def _localised(pose: TruePose, rng: np.random.Generator) -> dict[str, float]:
+def _noisy_pose(pose: TruePose, rng: np.random.Generator) -> dict[str, float]:
     return {
         "map_x": round(pose.x + _POSITION_NOISE_M * normal(rng), 4),
         "map_y": round(pose.y + _POSITION_NOISE_M * normal(rng), 4),
@@ -121,8 +119,8 @@ def publish_run(
 ) -> int:
     """Publish ``run`` under ``key``, ``speed`` times as fast as the robot drove; 0 is unpaced.
 
-    Waits up to ``wait_s`` seconds for a subscriber, because a message without one is gone. Returns
-    how many keyframes were sent; fewer than the run has when ``stop`` was set.
+    Waits up to ``wait_s`` seconds for a subscriber, without which messages are lost; TransportError
+    if there is none. Returns how many keyframes were sent: not all when ``stop`` was set.
     """
     publisher = session.publisher(key)
     if not publisher.wait_for_subscriber(wait_s):
@@ -144,7 +142,10 @@ def publish_run(
 
 
 def write_run(run: SimulatedRun, out: Path) -> Path:
-    """Write ``run`` as JSON lines to ``out`` (gzip if it ends in .gz); returns the truth's path."""
+    """Write ``run`` as JSON lines to ``out`` (gzip if it ends in .gz); returns the truth's path.
+
+    Raises MisuseError if a file cannot be written.
+    """
     truth = truth_path(out)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -158,13 +159,13 @@ def write_run(run: SimulatedRun, out: Path) -> Path:
 
 
 def truth_path(out: Path) -> Path:
-    """Where the truth of ``out`` goes: run.jsonl.gz has run.truth.jsonl.gz beside it."""
+    """The path of the truth of ``out``: run.truth.jsonl.gz for run.jsonl.gz."""
     stem = out.name.removesuffix(".gz").removesuffix(".jsonl")
     return out.with_name(f"{stem}.truth{out.name.removeprefix(stem)}")
 
 
 def _write_lines(path: Path, documents: Iterable[dict[str, Any]]) -> None:
     text = b"".join(encode(document) + b"\n" for document in documents)
-    if path.suffix == ".gz":  # no name and no time inside: the same run gives the same file
+    if path.suffix == ".gz":  # without name and time, so that a run always gives the same file
         text = gzip.compress(text, mtime=0)
     path.write_bytes(text)

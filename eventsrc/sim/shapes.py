@@ -1,4 +1,4 @@
-"""The plane geometry the simulator needs: rectangles, wall segments, lines of sight. Metres."""
+"""Plane geometry in metres: rectangles, wall segments, lines of sight."""
 
 import math
 from collections.abc import Sequence
@@ -69,7 +69,7 @@ class Segment:
 
 
 class Walls:
-    """Wall segments as arrays, to ask many of them at once."""
+    """Wall segments as arrays, for vectorised queries."""
 
     def __init__(self, segments: Sequence[Segment]) -> None:
         ends = np.array([(s.x0, s.y0, s.x1, s.y1) for s in segments], dtype=np.float64)

@@ -1,19 +1,17 @@
-"""Where a run goes: stops in rooms, with or without a look around.
+"""A robot's drive: the stops of a run, the poses along it, and its keyframes.
 
-Run ``a`` explores: every viewpoint of every room and of the hall with a look around, and at the
-end one more in the wide opening between living and dining room. Any other run starts somewhere in
-the house with a look around, as a robot does that was carried there, and then visits all rooms in
-its own order, looking around in about half of them.
+Stops: run ``a`` explores; it looks around at every viewpoint of every room and of the hall, and at
+the end in the wide opening between living and dining room. Any other run looks around at its first
+stop, anywhere in the house, and visits all rooms in its own order, looking around in about half of
+them.
 
-From stops to keyframes: the robot turns, drives, looks around.
+Drive: pure pursuit at a point ``_LOOKAHEAD_M`` ahead on the path. The robot turns on the spot while
+that point is far off its heading, otherwise it turns while it drives. Time runs in ticks of 50 ms.
+A keyframe is due after 0.5 m or 15° since the last one.
 
-The robot drives after a carrot on its path (pure pursuit): it steers at a point ``_CARROT_M``
-ahead, stands still while it looks too far away from it, and turns while it drives otherwise. Time
-runs in ticks of 50 ms. A keyframe is due after 0.5 m or 15° since the last one.
-
-Twenty ticks of straight driving are 0.5 m but for the last bits of a sine, and those depend on the
-C library. So every threshold here is a micrometre or a microradian generous (``_SLACK``): what is
-equal in mathematics is equal everywhere.
+Twenty ticks of straight driving are 0.5 m but for the last bits of a sine, which depend on the C
+library. So every threshold has a slack of a micrometre or a microradian (``_SLACK``): values that
+are equal in exact arithmetic are treated alike on every machine.
 """
 
 import itertools
@@ -26,25 +24,25 @@ import numpy as np
 from .floorplan import HALL, OPENING_M, Room
 from .grid import DriveGrid
 from .house import House
-from .random_streams import happens, stream, uniform
+from .random_streams import bernoulli, stream, uniform
 from .shapes import Point, wrap
 
 EXPLORER = "a"
 _TWO_VIEWS_FROM_M = 5.0
 _SEARCH_M = 1.2
-_WANDER_M = 0.6
+_MOVE_M = 0.6
 
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """A spot to drive to; ``look_around`` turns once around there."""
+    """A spot to drive to, and whether to turn around once there."""
 
     spot: Point
     look_around: bool
 
 
 def plan_tour(house: House, run: str) -> tuple[Stop, ...]:
-    """The stops of this run; the first one is where it starts."""
+    """The stops of ``run``; it starts at the first."""
     return _explore(house) if run == EXPLORER else _revisit(house, run)
 
 
@@ -54,8 +52,8 @@ def _explore(house: House) -> tuple[Stop, ...]:
     here = hall[0]
     stops = [Stop(here, look_around=True)]
     left = [view for view in views if view != here]
-    while left:  # the nearest unseen viewpoint next, by the length of the way there
-        here = min(left, key=lambda view: (_way_m(house, here, view), view))
+    while left:  # next the nearest unseen viewpoint, by the length of the route
+        here = min(left, key=lambda view: (_route_m(house, here, view), view))
         left.remove(here)
         stops.append(Stop(here, look_around=True))
     return (*stops, Stop(_opening(house), look_around=True))
@@ -65,7 +63,7 @@ def _revisit(house: House, run: str) -> tuple[Stop, ...]:
     rng = stream("tour", house.seed, run)
     rooms = [house.plan.rooms[index] for index in rng.permutation(len(house.plan.rooms)).tolist()]
     stops = [
-        Stop(_wandered(house, room, spot, rng), happens(rng, 0.5))
+        Stop(_moved_spot(house, room, spot, rng), bernoulli(rng, 0.5))
         for room in rooms
         for spot in _viewpoints(house, room)
     ]
@@ -73,21 +71,21 @@ def _revisit(house: House, run: str) -> tuple[Stop, ...]:
 
 
 def _viewpoints(house: House, room: Room) -> list[Point]:
-    """One spot with space around it near the middle; two in a long room."""
+    """One spot with clearance near the middle; two in a long room."""
     rect = room.rect
     x, y = rect.centre
     wanted = [(x, y)]
     if max(rect.width, rect.height) >= _TWO_VIEWS_FROM_M:
         quarter = rect.width / 4
         wanted = [(rect.x0 + quarter, y), (rect.x1 - quarter, y)]
-    return [house.grid.roomiest(spot, rect, _SEARCH_M) for spot in wanted]
+    return [house.grid.clearest(spot, rect, _SEARCH_M) for spot in wanted]
 
 
-def _wandered(house: House, room: Room, spot: Point, rng: np.random.Generator) -> Point:
-    """A free spot up to ``_WANDER_M`` from ``spot``: nobody stops twice at the same place."""
+def _moved_spot(house: House, room: Room, spot: Point, rng: np.random.Generator) -> Point:
+    """A random free spot up to ``_MOVE_M`` from ``spot`` in x and y; ``spot`` if none is found."""
     for _ in range(50):
-        x = round(spot[0] + uniform(rng, -_WANDER_M, _WANDER_M), 2)
-        y = round(spot[1] + uniform(rng, -_WANDER_M, _WANDER_M), 2)
+        x = round(spot[0] + uniform(rng, -_MOVE_M, _MOVE_M), 2)
+        y = round(spot[1] + uniform(rng, -_MOVE_M, _MOVE_M), 2)
         if room.rect.contains(x, y) and house.grid.free(x, y):
             return x, y
     return spot
@@ -95,10 +93,10 @@ def _wandered(house: House, room: Room, spot: Point, rng: np.random.Generator) -
 
 def _opening(house: House) -> Point:
     door = next(door for door in house.plan.doors if door.width_m == OPENING_M)
-    return house.grid.roomiest(door.centre, house.plan.outline, 0.5)
+    return house.grid.clearest(door.centre, house.plan.outline, 0.5)
 
 
-def _way_m(house: House, start: Point, goal: Point) -> float:
+def _route_m(house: House, start: Point, goal: Point) -> float:
     points = house.grid.route(start, goal)
     return sum(math.dist(a, b) for a, b in itertools.pairwise(points))
 
@@ -109,8 +107,8 @@ KEYFRAME_RAD = math.radians(15.0)
 _TICK_S = 0.05
 _STEP_M = 0.5 * _TICK_S
 _TURN_RAD = math.radians(40.0) * _TICK_S
-_CARROT_M = 0.3
-_STAND_RAD = math.radians(35.0)
+_LOOKAHEAD_M = 0.3
+_TURN_ONLY_RAD = math.radians(35.0)
 _PAUSE_S = 0.5
 _SLACK = 1e-6
 
@@ -125,8 +123,8 @@ class TruePose:
     yaw_rad: float
 
 
-def walk(grid: DriveGrid, stops: Sequence[Stop]) -> Iterator[TruePose]:
-    """Every tick of the drive along ``stops``."""
+def drive(grid: DriveGrid, stops: Sequence[Stop]) -> Iterator[TruePose]:
+    """The pose at every tick of the drive along ``stops``."""
     robot = _Robot(*stops[0].spot)
     yield robot.pose
     for index, stop in enumerate(stops):
@@ -164,17 +162,18 @@ class _Robot:
         return TruePose(self._ticks * _TICK_S, self._x, self._y, self._yaw)
 
     def follow(self, path: Sequence[Point]) -> Iterator[TruePose]:
-        track = list(_densified(path))
-        carrot = 0
+        track = list(_resampled(path))
+        target = 0
         while True:
             while (
-                carrot < len(track) - 1 and math.dist(self.spot, track[carrot]) < _CARROT_M + _SLACK
+                target < len(track) - 1
+                and math.dist(self.spot, track[target]) < _LOOKAHEAD_M + _SLACK
             ):
-                carrot += 1
-            left = math.dist(self.spot, track[carrot])
+                target += 1
+            left = math.dist(self.spot, track[target])
             if left < 1e-6:
                 return
-            self._steer(track[carrot], left)
+            self._steer(track[target], left)
             yield self._tick()
 
     def look_around(self) -> Iterator[TruePose]:
@@ -189,7 +188,7 @@ class _Robot:
             self._x, self._y = target  # the last step: arrive
             return
         self._yaw = wrap(self._yaw + max(-_TURN_RAD, min(_TURN_RAD, error)))
-        if abs(error) < _STAND_RAD + _SLACK:
+        if abs(error) < _TURN_ONLY_RAD + _SLACK:
             step = min(_STEP_M, left) * math.cos(error)
             self._x += step * math.cos(self._yaw)
             self._y += step * math.sin(self._yaw)
@@ -199,7 +198,7 @@ class _Robot:
         return self.pose
 
 
-def _densified(path: Sequence[Point]) -> Iterator[Point]:
+def _resampled(path: Sequence[Point]) -> Iterator[Point]:
     for a, b in itertools.pairwise(path):
         count = max(1, math.ceil(math.dist(a, b) / 0.05))
         for k in range(1, count + 1):

@@ -1,4 +1,4 @@
-"""`mapfold router`: a Zenoh router, until a signal ends it."""
+"""`mapfold router`: a Zenoh router in the foreground."""
 
 import typer
 

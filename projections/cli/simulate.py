@@ -1,4 +1,4 @@
-"""`mapfold simulate`: a run through a simulated house, published or written down."""
+"""`mapfold simulate`: a run through a simulated house, published or written to a file."""
 
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -16,7 +16,7 @@ from .options import ConfigOption, ConnectOption, JsonOption, ListenOption, zeno
 from .signals import stop_on_signals
 from .terminal import emit, finish, say
 
-_LONGEST_NAME: Final = 100
+_MAX_NAME: Final = 100
 
 
 def simulate(
@@ -42,15 +42,14 @@ def simulate(
     listen: ListenOption = None,
     zenoh_config: ConfigOption = None,
 ) -> None:
-    """A seeded house run, over Zenoh or into a file.
+    """Simulate a run through a house, over Zenoh or into a file.
 
-    A robot drives through a simulated house and publishes what it sees, or writes it down. The
-    ground truth (room and instance) goes to a file beside --out, never into the messages.
+    A robot drives through a house generated from a seed; its keyframes are published or written to
+    a file. The ground truth (room and instance) goes to a file beside --out, never into the
+    messages.
     """
-    if not run.isprintable() or not 1 <= len(run) <= _LONGEST_NAME:
-        raise MisuseError(
-            f"--run {run!r}: give a name of 1 to {_LONGEST_NAME} printable characters"
-        )
+    if not run.isprintable() or not 1 <= len(run) <= _MAX_NAME:
+        raise MisuseError(f"--run {run!r}: give a name of 1 to {_MAX_NAME} printable characters")
     check_key(key, "--key")
     simulated = simulate_run(seed, run)
     document = _numbers(simulated)

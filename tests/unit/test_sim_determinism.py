@@ -7,10 +7,7 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from eventsrc.sim import detector as camera
-from eventsrc.sim import detector as embedding
-from eventsrc.sim import simulate_run
-from eventsrc.sim import tour as walk
+from eventsrc.sim import detector, simulate_run, tour
 
 Function = Callable[..., float]
 
@@ -39,14 +36,14 @@ def test_last_bits_of_a_sine_change_no_byte(
 ) -> None:
     here = list(simulate_run(seed, run).payloads)
     elsewhere = _another_library(seed)
-    modules: tuple[ModuleType, ...] = (walk, camera, embedding)
+    modules: tuple[ModuleType, ...] = (tour, detector)
     for module in modules:
         monkeypatch.setattr(module, "math", elsewhere)
     assert list(simulate_run(seed, run).payloads) == here
 
 
-def test_without_slack_at_the_thresholds_they_would(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(walk, "_SLACK", 0.0)
+def test_without_slack_at_the_thresholds_they_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tour, "_SLACK", 0.0)
     here = list(simulate_run(2, "a").payloads)
-    monkeypatch.setattr(walk, "math", _another_library(0))
+    monkeypatch.setattr(tour, "math", _another_library(0))
     assert list(simulate_run(2, "a").payloads) != here

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from eventsrc.sim.catalogue import MODELS
-from eventsrc.sim.detector import FOCAL_PX, HEIGHT_PX, WIDTH_PX, Sighting, sightings
+from eventsrc.sim.detector import FOCAL_PX, HEIGHT_PX, WIDTH_PX, VisibleObject, visible_objects
 from eventsrc.sim.floorplan import FloorPlan
 from eventsrc.sim.house import House, Thing, build_house
 from eventsrc.sim.shapes import Rect, Segment
@@ -24,8 +24,8 @@ def _lamp(x: float, y: float) -> Thing:
     return Thing("lamp-floor-1", model, "", Rect.around(x, y, 0.35, 0.35), math.pi)
 
 
-def _seen(house: House, yaw: float = 0.0) -> list[Sighting]:
-    return list(sightings(house, TruePose(0.0, 0.0, 0.0, yaw)))
+def _seen(house: House, yaw: float = 0.0) -> list[VisibleObject]:
+    return list(visible_objects(house, TruePose(0.0, 0.0, 0.0, yaw)))
 
 
 def test_a_thing_straight_ahead_is_centred_and_as_large_as_a_pinhole_makes_it() -> None:
@@ -71,10 +71,10 @@ def test_a_wall_hides_and_a_gap_in_it_does_not() -> None:
 def test_boxes_stay_in_the_picture_and_nothing_shows_through_a_real_house_wall() -> None:
     house = build_house(7)
     room = house.plan.room("bathroom")
-    x, y = house.grid.roomiest(room.rect.centre, room.rect, 1.2)
+    x, y = house.grid.clearest(room.rect.centre, room.rect, 1.2)
     seen_here: set[str] = set()
     for step in range(24):
-        for seen in sightings(house, TruePose(0.0, x, y, step * math.tau / 24)):
+        for seen in visible_objects(house, TruePose(0.0, x, y, step * math.tau / 24)):
             x0, y0, x1, y1 = seen.box
             assert 0 <= x0 < x1 <= WIDTH_PX
             assert 0 <= y0 < y1 <= HEIGHT_PX

@@ -8,21 +8,21 @@ import pytest
 from eventsrc.sim.grid import ROBOT_RADIUS_M
 from eventsrc.sim.house import House, build_house
 from eventsrc.sim.shapes import Segment, wrap
-from eventsrc.sim.tour import KEYFRAME_M, KEYFRAME_RAD, TruePose, keyframes, plan_tour, walk
+from eventsrc.sim.tour import KEYFRAME_M, KEYFRAME_RAD, TruePose, drive, keyframes, plan_tour
 
 SEEDS_AND_RUNS = [(7, "a"), (7, "b"), (3, "a"), (12, "c")]
 Drive = tuple[House, str, list[TruePose]]
 
 
 @pytest.fixture(params=SEEDS_AND_RUNS, ids=str, scope="module")
-def drive(request: pytest.FixtureRequest) -> Drive:
+def driven(request: pytest.FixtureRequest) -> Drive:
     seed, run = request.param
     house = build_house(seed)
-    return house, run, list(walk(house.grid, plan_tour(house, run)))
+    return house, run, list(drive(house.grid, plan_tour(house, run)))
 
 
-def test_keeps_its_radius_from_walls_and_furniture(drive: Drive) -> None:
-    house, _, poses = drive
+def test_keeps_its_radius_from_walls_and_furniture(driven: Drive) -> None:
+    house, _, poses = driven
     standing = [thing.footprint for thing in house.things if thing.model.stands]
     for pose in poses[::4]:  # every 0.2 s, at most 10 cm apart
         nearest = min(_distance(wall, pose.x, pose.y) for wall in house.plan.walls)
@@ -32,28 +32,28 @@ def test_keeps_its_radius_from_walls_and_furniture(drive: Drive) -> None:
         )
 
 
-def test_crosses_no_wall_between_two_ticks(drive: Drive) -> None:
-    house, _, poses = drive
+def test_crosses_no_wall_between_two_ticks(driven: Drive) -> None:
+    house, _, poses = driven
     moved = [(a, b) for a, b in itertools.pairwise(poses) if (a.x, a.y) != (b.x, b.y)]
     assert not any(house.walls.block((a.x, a.y), (b.x, b.y)) for a, b in moved)
 
 
-def test_visits_every_room(drive: Drive) -> None:
-    house, _, poses = drive
+def test_visits_every_room(driven: Drive) -> None:
+    house, _, poses = driven
     visited = {house.plan.room_at(pose.x, pose.y) for pose in poses}
     assert visited == {room.name for room in house.plan.rooms}
 
 
-def test_moves_like_a_robot(drive: Drive) -> None:
-    _, _, poses = drive
+def test_moves_like_a_robot(driven: Drive) -> None:
+    _, _, poses = driven
     for a, b in itertools.pairwise(poses):
         assert b.time_s > a.time_s
         assert math.hypot(b.x - a.x, b.y - a.y) <= 0.5 * 0.05 + 1e-6
         assert abs(wrap(b.yaw_rad - a.yaw_rad)) <= math.radians(2.0) + 1e-9
 
 
-def test_a_keyframe_comes_when_due_and_not_before(drive: Drive) -> None:
-    _, _, poses = drive
+def test_a_keyframe_comes_when_due_and_not_before(driven: Drive) -> None:
+    _, _, poses = driven
     chosen = list(keyframes(iter(poses)))
     assert chosen[0] == poses[0]
     index = {pose: number for number, pose in enumerate(poses)}
@@ -66,7 +66,7 @@ def test_a_look_around_sees_every_direction() -> None:
     house = build_house(7)
     first = plan_tour(house, "b")[0]
     assert first.look_around
-    turned = list(keyframes(walk(house.grid, [first])))
+    turned = list(keyframes(drive(house.grid, [first])))
     yaws = sorted(pose.yaw_rad % (2 * math.pi) for pose in turned)
     gaps = [b - a for a, b in itertools.pairwise([*yaws, yaws[0] + 2 * math.pi])]
     assert max(gaps) < math.radians(20)
