@@ -39,12 +39,11 @@ from .connection import (
 from .cypher import PARENTS
 from .graph_render import Row, expected_rows
 from .labels import GRAPH, LABELS, TABLE, VERTEX_LABELS
+from .live_fold import LiveFold, batches
 from .origin import command_line, refuse_mismatch, rows_dropped
-from .shared_fold import LiveFold, batches
-from .sink import Checkpoint, Sink, SinkName
+from .sink import Checkpoint, SinkName
 from .statements import statements
-from .vector_rows import VectorRow
-from .vector_sink import VectorSink
+from .vector_rows import VectorRow, new_rows
 
 _KINDS: Final = {"v": "VIEW", "m": "MATERIALIZED VIEW", "f": "FOREIGN TABLE"}
 
@@ -254,8 +253,8 @@ def _compare_graph(
     tally: _Tally,
 ) -> None:
     fold = LiveFold(settings)
-    for _ in _folded(fold, _events(connection, reader, checkpoint, "graph"), []):
-        pass
+    for _ in _folded(fold, _events(connection, reader, checkpoint, "graph")):
+        fold.recorder.drain()
     for label in LABELS:
         columns = ["id"] if label in VERTEX_LABELS else ["id", "start_id", "end_id"]
         ids = sql.SQL(", ").join(sql.SQL("{}::text").format(sql.Identifier(c)) for c in columns)
@@ -275,10 +274,12 @@ def _compare_vectors(
     settings: Settings,
     tally: _Tally,
 ) -> None:
-    fold, sink = LiveFold(settings), VectorSink()
+    fold = LiveFold(settings)
     events = _events(connection, reader, checkpoint, "vectors")
     expected = (
-        _vector_row(row) for _ in _folded(fold, events, [sink]) for row in sink.take(fold.view)
+        _vector_row(row)
+        for _ in _folded(fold, events)
+        for row in new_rows(fold.recorder.drain(), fold.view)
     )
     # Binary, so that a float32 arrives as the float32 it is.
     with connection.cursor(name="check", binary=True) as cursor:
@@ -287,19 +288,17 @@ def _compare_vectors(
         tally.merge(TABLE, expected, ((row[0], row[1:]) for row in cursor))
 
 
-def _folded(
-    fold: LiveFold, events: Iterable[tuple[Event, bool]], sinks: list[Sink[Any]]
-) -> Iterator[None]:
+def _folded(fold: LiveFold, events: Iterable[tuple[Event, bool]]) -> Iterator[None]:
     for parked, group in groupby(events, key=itemgetter(1)):
         for batch in batches((event for event, _ in group), BATCH_EVENTS):
             if parked:
                 for event in batch:
                     fold.skip(event.offset)
                 continue
-            for failed in fold.feed(batch, lambda _: sinks):
+            for failed in fold.feed(batch):
                 if failed is not None:
                     raise failed
-                yield
+            yield
 
 
 def _graph_row(row: Row | tuple[Any, ...]) -> Keyed:

@@ -8,7 +8,7 @@ from eventsrc.ingest import Accepted
 from eventsrc.log import LogReader
 from eventsrc.upcast import read_envelope
 
-from .shared_fold import LiveFold
+from .live_fold import LiveFold
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ AGE keeps a graph as a schema, so a graph is *ours* when the schema carries our 
 Anything else under our names is somebody's and is refused, never touched.
 
 The old graph is renamed by the swap, and dropped later, when every transaction that may still have
-its name has ended (see `_leaving`).
+its name has ended (see `swap`).
 """
 
 from collections.abc import Collection
@@ -132,7 +132,7 @@ def drop(connection: Connection, graph: str) -> None:
             cursor.execute(statements("graph")["drop_graph"], {"graph": graph})
 
 
-def leave_dropping(connection: Connection, graph: str) -> None:
+def drop_in_background(connection: Connection, graph: str) -> None:
     """Have the server drop a graph of ours, if it is there; closes the connection then."""
     if exists(connection, graph):
         connection.execute("SET search_path = ag_catalog, public")

@@ -21,7 +21,7 @@ SWITCH_S: Final = 0.0005
 COPY asks for its turn with every 128 kB."""
 
 
-class Loading:
+class LoadingThread:
     """Use as a context manager; leaving it ends the thread.
 
     Left by an error, it drops what was not begun and has ``cancel`` break off what was.

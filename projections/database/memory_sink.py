@@ -1,48 +1,112 @@
-"""The sink that keeps the rows in memory: the fake beside the port, published for tests.
+"""The sink that keeps rows in memory: the same rows as the databases, in plain dictionaries.
 
-It holds exactly what the databases hold, in plain dictionaries, and takes the same changes. What it
-has after a series of batches is what the real sinks must have.
+Tests compare the databases with it; it also serves whoever wants the rows without a database.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
-from eventsrc.log import Event
-from projections.deltas import Delta
+from projections.model.changes import BatchChanges
 from projections.model.view import MapView
 
-from .graph_rows import GraphChanges, GraphRows
-from .labels import LABELS, Label
-from .vector_rows import VectorRow, VectorRows
+from .graph_rows import GraphRows, changed_rows, changing_rows, fixed_rows
+from .labels import LABELS, TABLE, Label
+from .sink import PreparedWrite
+from .vector_rows import VectorRow, new_rows
+
+
+@dataclass(slots=True)
+class MemoryTables:
+    """``graph[label][graphid]`` and ``vectors[det_pk]``; ``next_offset`` is their checkpoint."""
+
+    next_offset: int = 0
+    graph: dict[Label, dict[int, Any]] = field(
+        default_factory=lambda: {name: {} for name in LABELS}
+    )
+    vectors: dict[int, VectorRow] = field(default_factory=dict)
+
+    def add(self, rows_of: Mapping[Label, list[Any]]) -> None:
+        """Insert or replace rows of the graph."""
+        for label, rows in rows_of.items():
+            self.graph[label].update((row[0], row) for row in rows)
+
+    def add_vectors(self, rows: list[VectorRow]) -> None:
+        """Insert or replace rows of ``detection_embeddings``."""
+        self.vectors.update((row.det_pk, row) for row in rows)
 
 
 class MemorySink:
-    """Rows by id: ``graph[label][graphid]`` and ``vectors[det_pk]``; ``next_offset`` goes along."""
+    """Implements `LiveSink` and `RebuildSink` for both graph and vectors."""
+
+    def ensure(self, transaction: MemoryTables) -> bool:  # noqa: ARG002 - the port
+        """Nothing to do: `MemoryTables` begins with its tables."""
+        return False
+
+    def prepare(self, changes: BatchChanges, view: MapView) -> PreparedWrite[MemoryTables]:
+        """Rows that a batch changed."""
+        graph, vectors = changed_rows(changes, view), new_rows(changes, view)
+
+        def send(tables: MemoryTables) -> None:
+            _write_graph(tables, graph)
+            tables.add_vectors(vectors)
+
+        return PreparedWrite(send, is_small=True)
+
+    def drop_leftovers(self, transaction: MemoryTables) -> None:
+        """Nothing to do: an unfinished shadow is in no table."""
+
+    def shadow(self) -> "MemoryShadow":
+        """A shadow, not created yet."""
+        return MemoryShadow()
+
+    def drop_replaced(self, transaction: MemoryTables) -> None:
+        """Nothing to do: `MemoryShadow.swap_in` has let go of it."""
+
+
+class MemoryShadow:
+    """Tables beside those that readers see."""
 
     def __init__(self) -> None:
-        self.next_offset = 0
-        self.graph: dict[Label, dict[int, Any]] = {label: {} for label in LABELS}
-        self.vectors: dict[int, VectorRow] = {}
-        self._graph_rows = GraphRows()
-        self._vector_rows = VectorRows()
+        self._new = MemoryTables()
 
-    def note(self, deltas: Sequence[Delta], logged_ns: int, view: MapView) -> None:
-        """Remember what ``deltas`` change."""
-        self._graph_rows.note(deltas, view)
-        self._vector_rows.note(deltas, logged_ns)
+    def create(self, transaction: MemoryTables) -> None:  # noqa: ARG002 - the port
+        """Create it, empty."""
+        self._new = MemoryTables()
 
-    def take(self, view: MapView) -> tuple[GraphChanges, list[VectorRow]]:
-        """What changed since the last take."""
-        return self._graph_rows.take(view), self._vector_rows.take(view)
+    def load(self, changes: BatchChanges, view: MapView) -> Callable[[MemoryTables], None]:
+        """Rows of new keyframes and observations that never change again."""
+        graph = fixed_rows(view, changes.keyframes, changes.observations)
+        vectors = new_rows(changes, view)
 
-    def write(self, changes: tuple[GraphChanges, list[VectorRow]], last: Event) -> None:
-        """Take the changes in, up to and with event ``last``."""
-        graph, vectors = changes
-        for rows_of in (graph.inserted, graph.upserted):
-            for label, rows in rows_of.items():
-                self.graph[label].update((row[0], row) for row in rows)
-        for label, ids in graph.deleted.items():
-            for i in ids:
-                self.graph[label].pop(i, None)
-        self.vectors.update((row.det_pk, row) for row in vectors)
-        self.next_offset = last.offset + 1
+        def load(_: MemoryTables) -> None:
+            self._new.add(graph)
+            self._new.add_vectors(vectors)
+
+        return load
+
+    def finish(self, view: MapView) -> Callable[[MemoryTables], Mapping[str, int]]:
+        """All other rows."""
+        graph = changing_rows(view)
+
+        def finish(_: MemoryTables) -> Mapping[str, int]:
+            self._new.add(graph)
+            rows: dict[str, int] = {label: len(rows) for label, rows in self._new.graph.items()}
+            return {**rows, TABLE: len(self._new.vectors)}
+
+        return finish
+
+    def lock_readers(self, transaction: MemoryTables) -> None:
+        """Nothing to do: nobody reads in the middle of `swap_in`."""
+
+    def swap_in(self, transaction: MemoryTables) -> None:
+        """Replace the tables' rows."""
+        transaction.graph, transaction.vectors = self._new.graph, self._new.vectors
+
+
+def _write_graph(tables: MemoryTables, rows: GraphRows) -> None:
+    tables.add(rows.inserted)
+    tables.add(rows.upserted)
+    for label, ids in rows.deleted.items():
+        for i in ids:
+            tables.graph[label].pop(i, None)

@@ -1,13 +1,11 @@
-"""Rebuild: the whole log into a shadow, and the shadow into the readers' view, or nothing at all.
+"""Rebuild: fold the whole log into shadows, and swap them in for what readers see.
 
 Everything up to the swap happens in *one* transaction per database: creating the shadow, COPY,
 indexes, the counts, the checkpoint, the swap. So an interruption at any moment, of any kind, leaves
 the old map served and nothing to clean up. What comes after the commit only helps: dropping what
-was replaced, statistics, the HNSW index of a large table.
+was replaced and the HNSW index of a large table.
 
-Filling the shadows of a rebuild: a thread for each database, and what it is given to do.
-
-Keeping readers out for the moment of the swap, without ever making one fail.
+One thread a database writes while the fold goes on (`loading_thread`).
 
 Readers name the graph and AGE resolves each label's table by that name, so a reader in the middle
 of a statement must not find half of its tables before the swap and half after. Therefore everything
@@ -23,68 +21,90 @@ between them, and the readers of one are not to wait until those of the other ha
 
 import contextlib
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Final, TypeAlias
 
 import psycopg
 
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.log import Event, LogReader
 from projections.errors import DatabaseError, FoldError
+from projections.model.changes import BatchChanges
 from projections.model.digest import map_digest
 from projections.model.fold import no_cycle_search
+from projections.model.view import MapView
 from projections.settings import Settings
 
 from . import checkpoints
 from .connection import Connection, Targets, database_errors
 from .foreign_embedding import ForeignEmbedding, first_foreign_embedding
+from .live_fold import LiveFold, batches
 from .loader import LoaderName
-from .loading_thread import Loading, short_turns
+from .loading_thread import LoadingThread, short_turns
 from .origin import command_line
-from .shared_fold import LiveFold, batches
-from .sink import Checkpoint, Sink
+from .sink import Checkpoint, Shadow
 from .stores import Only, Store, open_stores
-from .vector_sink import HnswReport, build_hnsw
+from .vector_table import HnswReport, build_hnsw
 
 
-class SinkLoading(NamedTuple):
-    """A sink, where it lives, and the thread that writes there."""
+@dataclass(frozen=True, slots=True)
+class StoreRebuild:
+    """A store, the shadows of its sinks in their order, and the thread that fills them.
 
-    loading: Loading
-    sink: Sink[Any]
+    ``rows`` is the number of rows by label or table, once a shadow is finished.
+    """
+
     store: Store
+    shadows: list[Shadow[Connection]]
+    thread: LoadingThread
+    rows: dict[str, int] = field(default_factory=dict)
 
-    def put(self, job: Callable[[Connection], None]) -> None:
-        """Have ``job`` done with the store's connection, its errors told as the store's."""
-        self.loading.put(partial(self.store.do, job))
+    def load(self, changes: BatchChanges, view: MapView) -> None:
+        """Have the thread write the rows of new keyframes and observations."""
+        for shadow in self.shadows:
+            self._put(shadow.load(changes, view))
+
+    def finish(self, view: MapView) -> None:
+        """Have the thread write all other rows, index them and compare their numbers."""
+        for shadow in self.shadows:
+            self._put(partial(self._finish, shadow.finish(view)))
+
+    def _finish(
+        self, finish: Callable[[Connection], Mapping[str, int]], connection: Connection
+    ) -> None:
+        self.rows.update(finish(connection))
+
+    def _put(self, job: Callable[[Connection], None]) -> None:
+        self.thread.put(partial(self.store.do, job))
 
 
 @contextlib.contextmanager
-def loadings_of(stores: list[Store]) -> Iterator[list[SinkLoading]]:
-    """A thread for each store, which begins its shadows, and which sink writes through which."""
+def _store_rebuilds(stores: list[Store]) -> Iterator[list[StoreRebuild]]:
+    """A thread for each store, which begins with creating the shadows."""
     with contextlib.ExitStack() as threads:
-        loadings = []
+        rebuilds = []
         for store in stores:
-            loading = threads.enter_context(Loading(partial(_break_off, store.connection)))
-            loading.put(partial(_begin, store))
-            loadings += [SinkLoading(loading, sink, store) for sink in store.sinks]
-        yield loadings
+            thread = threads.enter_context(LoadingThread(partial(_cancel, store.connection)))
+            shadows = [sink.shadow() for sink in store.sinks]
+            thread.put(partial(_create, store, shadows))
+            rebuilds.append(StoreRebuild(store, shadows, thread))
+        yield rebuilds
 
 
-def _break_off(connection: Connection) -> None:
+def _cancel(connection: Connection) -> None:
     with contextlib.suppress(psycopg.Error):  # the server is gone, and what it was at with it
         connection.cancel_safe()
 
 
-def _begin(store: Store) -> None:
-    with store.aside() as connection:
+def _create(store: Store, shadows: Sequence[Shadow[Connection]]) -> None:
+    with store.throwaway_connection() as connection:
         for sink in store.sinks:
-            sink.clear(connection)
-    for sink in store.sinks:
-        store.do(sink.begin)
+            sink.drop_leftovers(connection)
+    for shadow in shadows:
+        store.do(shadow.create)
 
 
 ATTEMPT: Final = "SET LOCAL lock_timeout = '200ms'; SET LOCAL statement_timeout = '400ms'"
@@ -95,51 +115,55 @@ PAUSE_S: Final = 0.02
 PATIENCE_S: Final = 120.0
 
 
-def lock_readers_out(stores: Sequence[Store]) -> None:
-    """Lock what the stores' sinks will swap. Raises DatabaseError when readers never let go."""
+def lock_readers(rebuilds: Sequence[StoreRebuild]) -> None:
+    """Lock what the shadows will replace. Raises DatabaseError when readers never let go."""
     deadline = time.monotonic() + PATIENCE_S
-    while (read := _still_read(stores)) is not None:
+    while (store := _store_with_readers(rebuilds)) is not None:
         if time.monotonic() > deadline:
             raise DatabaseError(
-                f"{read.place}: readers kept the map locked for {PATIENCE_S:.0f} s; end their"
+                f"{store.place}: readers kept the map locked for {PATIENCE_S:.0f} s; end their"
                 " transactions, then run the rebuild again"
             )
         time.sleep(PAUSE_S)
-    for store in stores:
-        store.connection.execute(DONE)
+    for each in rebuilds:
+        each.store.connection.execute(DONE)
 
 
-class _StillRead(Exception):
+class _HasReaders(Exception):
     """A reader has one of the tables."""
 
     def __init__(self, store: Store) -> None:
         self.store = store
 
 
-def _still_read(stores: Sequence[Store]) -> Store | None:
-    """Try once: None when all is locked, else whose readers are in the way; then nothing is."""
+def _store_with_readers(rebuilds: Sequence[StoreRebuild]) -> Store | None:
+    """Try once: None when all is locked, else a store whose readers hold locks; then nothing is."""
     try:
-        with contextlib.ExitStack() as savepoints:  # going back to them lets go of the locks
-            for store in stores:
-                with database_errors(store.url):
-                    savepoints.enter_context(store.connection.transaction())
-                    _lock(store)
-    except _StillRead as reader:
-        return reader.store
+        with contextlib.ExitStack() as savepoints:  # rolling back to them releases the locks
+            for each in rebuilds:
+                with database_errors(each.store.url):
+                    savepoints.enter_context(each.store.connection.transaction())
+                    _lock(each)
+    except _HasReaders as found:
+        return found.store
     return None
 
 
-def _lock(store: Store) -> None:
+def _lock(rebuild: StoreRebuild) -> None:
+    connection = rebuild.store.connection
     try:
-        store.connection.execute(ATTEMPT)
-        for sink in store.sinks:
-            sink.lock(store.connection)
+        connection.execute(ATTEMPT)
+        for shadow in rebuild.shadows:
+            shadow.lock_readers(connection)
     except (psycopg.errors.LockNotAvailable, psycopg.errors.QueryCanceled):
-        raise _StillRead(store) from None
+        raise _HasReaders(rebuild.store) from None
 
 
 TICK_EVENTS: Final = 256
-"""Events between two looks at whether rows wait to be written and somebody wants to hear of it."""
+"""Events between two reports of progress and checks of whether enough rows wait to be written."""
+STREAM_ROWS: Final = 2_000
+"""Keyframes and observations that wait before they are written: enough to make COPY's round trips
+vanish, few enough that the server has something to do from early on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,17 +223,18 @@ def rebuild(
         total = reader.next_offset if until is None else min(until, reader.next_offset)
         fold = LiveFold(settings)
         with _transactions(stores):
-            with short_turns(), loadings_of(stores) as loadings:
+            with short_turns(), _store_rebuilds(stores) as rebuilds:
                 events, advice = reader.read(FIRST_OFFSET, total), partial(_advice, log, settings)
-                last = _fold_into(fold, events, loadings, total, tell, advice)
+                last = _fold_into(fold, events, rebuilds, total, tell, advice)
                 folded = time.monotonic()
                 tell(RebuildProgress("writing", total, total))
-                for loading in loadings:
-                    loading.put(loading.sink.load(loading.sink.take_rest(fold.view)))
-                    loading.put(loading.sink.index)
+                changes = fold.recorder.drain()
+                for each in rebuilds:
+                    each.load(changes, fold.view)
+                    each.finish(fold.view)
                 digest = map_digest(fold.view)
-                for loading in loadings:
-                    loading.loading.flush()
+                for each in rebuilds:
+                    each.thread.flush()
             checkpoint = Checkpoint(
                 reader.log_id,
                 settings.fingerprint(),
@@ -218,12 +243,13 @@ def rebuild(
                 checkpoints.event_hash(last),
                 digest,
             )
-            rows = _check(stores, fold, checkpoint)
+            for each in rebuilds:
+                each.store.do(partial(_replace_checkpoints, each.store, checkpoint))
             tell(RebuildProgress("swapping", total, total))
-            lock_readers_out(stores)
-            for store in stores:
-                for sink in store.sinks:
-                    store.do(sink.swap)
+            lock_readers(rebuilds)
+            for each in rebuilds:
+                for shadow in each.shadows:
+                    each.store.do(shadow.swap_in)
         tell(RebuildProgress("tidying", total, total))
         with _swapped():
             index = _after(stores, tell, total, hnsw=hnsw)
@@ -232,7 +258,7 @@ def rebuild(
             total,
             digest,
             fold.view.counts(),
-            rows,
+            {label: rows for each in rebuilds for label, rows in each.rows.items()},
             folded - started,
             ended - started,
             index,
@@ -253,23 +279,22 @@ def _transactions(stores: list[Store]) -> Iterator[None]:
 def _fold_into(
     fold: LiveFold,
     events: Iterable[Event],
-    loadings: list[SinkLoading],
+    rebuilds: list[StoreRebuild],
     total: int,
     tell: OnProgress,
     advice: Callable[[int], str],
 ) -> Event | None:
-    told_of = [each.sink for each in loadings if not each.sink.rebuilds_from_view]
     last: Event | None = None
     for batch in batches(events, TICK_EVENTS):
-        for failed in fold.feed(batch, lambda _: told_of):
+        for failed in fold.feed(batch):
             if failed is not None:
                 raise FoldError(failed.offset, f"{failed.reason}; {advice(failed.offset)}")
         last = batch[-1]
         tell(RebuildProgress("folding", last.offset + 1, total))
-        for loading in loadings:
-            rows = loading.sink.take_final(fold.view)
-            if rows is not None:
-                loading.put(loading.sink.load(rows))
+        if fold.recorder.added >= STREAM_ROWS:
+            changes = fold.recorder.drain()
+            for each in rebuilds:
+                each.load(changes, fold.view)
     return last
 
 
@@ -282,15 +307,9 @@ def _advice(log: Path, settings: Settings, offset: Offset) -> str:
     )
 
 
-def _check(stores: list[Store], fold: LiveFold, checkpoint: Checkpoint) -> dict[str, int]:
-    """Compare, and put the checkpoints down; how many rows there are, by label and table."""
-    rows: dict[str, int] = {}
-    for store in stores:
-        for sink in store.sinks:
-            with database_errors(store.url):
-                rows.update(sink.check(store.connection, fold.view))
-                checkpoints.replace(store.connection, sink.name, checkpoint)
-    return rows
+def _replace_checkpoints(store: Store, checkpoint: Checkpoint, connection: Connection) -> None:
+    for sink in store.sinks:
+        checkpoints.replace(connection, sink.name, checkpoint)
 
 
 @contextlib.contextmanager
@@ -306,10 +325,10 @@ def _after(stores: list[Store], tell: OnProgress, total: int, *, hnsw: bool) -> 
     index: HnswReport | None = None
     for store in stores:
         for sink in store.sinks:
-            with store.aside() as connection:
-                sink.tidy(connection)
+            with store.throwaway_connection() as connection:
+                sink.drop_replaced(connection)
         if hnsw and any(sink.name == "vectors" for sink in store.sinks):
             tell(RebuildProgress("indexing", total, total))
-            with store.aside() as connection:
+            with store.throwaway_connection() as connection:
                 index = build_hnsw(connection)
     return index

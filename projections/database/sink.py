@@ -1,28 +1,41 @@
-"""The port between the fold and whatever its deltas are written to.
+"""The port between the fold and what the map is written to.
 
-A sink first only *notes* deltas; nothing is written until the runner *takes* what has changed and
-*writes* it inside a transaction that also moves the sink's checkpoint. What was taken is a value of
-its own, so a write that failed can be repeated with it, and writing it again does no harm.
+A sink that follows a log implements `LiveSink`. For each batch of events the runner (`tail`) calls
+`prepare` with what the batch changed and the view, opens a transaction, calls what `prepare`
+returned, moves the sink's checkpoint and commits: rows and checkpoint are written together or not
+at all. After a lost connection it calls `ensure` and, if the batch was not committed, the same
+prepared write again.
 
-A rebuild goes another way to the same rows: `begin` a shadow; while the fold runs `take_final` the
-rows that can never change again and `load` them; then `take_rest` and `load` the rest, `index`,
-`check` and `swap` the shadow in, all in one transaction; then `tidy` away what it replaced. Until
-then nobody sees anything of it. What needs the view and what needs the connection are apart, so
-that a thread can send while the fold goes on.
+A sink that can also be rebuilt from the start of a log implements `RebuildSink`; a sink of the
+databases (`stores.DatabaseSink`) does both. The runner (`rebuild`) calls, in this order:
+
+1. `RebuildSink.drop_leftovers`, outside a transaction; then it opens the one transaction of 2 to 5
+2. `Shadow.create`
+3. while the log is folded: `Shadow.load`, several times; at its end: `Shadow.finish`
+4. `Shadow.lock_readers`, for all shadows before any is swapped in, and again until all got theirs
+5. `Shadow.swap_in`; it replaces the checkpoint and commits. Readers see the old map until then
+6. `RebuildSink.drop_replaced`, outside a transaction
+
+``Tx`` is what an open transaction of the sink's store is: a psycopg connection for the databases,
+`memory_sink.MemoryTables` for memory. Methods that take the view take no transaction, so that the
+fold can go on while a thread sends what they returned.
+
+The runner writes only what the view has, and each event's changes once. Ordinals are ascending in
+`BatchChanges` and the same in every fold of a log: made into ids they give the same rows by tail
+and by rebuild, and no write has to look anything up.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal, Protocol, TypeAlias, TypeVar
+from typing import Generic, Literal, Protocol, TypeAlias, TypeVar
 
 from eventsrc.envelope import Offset
-from projections.deltas import Delta
+from projections.model.changes import BatchChanges
 from projections.model.view import MapView
 
-from .connection import Connection
-
 SinkName: TypeAlias = Literal["graph", "vectors"]
-Changes = TypeVar("Changes")
+"""Under which checkpoints and locks in the databases know a sink."""
+Tx = TypeVar("Tx", contravariant=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,59 +55,64 @@ class Checkpoint:
     digest: str | None = None
 
 
-class Sink(Protocol[Changes]):
-    """A place the map is written to. ``connection`` is inside a transaction of the runner's."""
+@dataclass(frozen=True, slots=True)
+class PreparedWrite(Generic[Tx]):
+    """The rows of a batch. ``send`` writes them, again if the first transaction failed.
 
-    @property
-    def name(self) -> SinkName:
-        """Under which the checkpoint and the locks know it."""
+    ``is_small`` says that ``send`` executes plain statements only, no COPY: a database can then
+    take them in one round trip (a pipeline).
+    """
 
-    @property
-    def rebuilds_from_view(self) -> bool:
-        """True when a rebuild need not `note`: all that it will write is in the view."""
+    send: Callable[[Tx], None]
+    is_small: bool
 
-    def note(self, deltas: Sequence[Delta], logged_ns: int, view: MapView) -> None:
-        """Remember what an event's deltas change; ``view`` has not applied them yet."""
 
-    def take(self, view: MapView) -> Changes:
-        """What changed since the last take, as ``view`` has it now."""
+class LiveSink(Protocol[Tx]):
+    """Rows that follow the log."""
 
-    def ensure(self, connection: Connection) -> bool:
-        """Create what `write` needs, if it is missing: True then. Refuses what is not ours."""
+    def ensure(self, transaction: Tx) -> bool:
+        """Create what is written to if it is missing; True then.
 
-    def few(self, changes: Changes) -> bool:
-        """True when `write` will send plain statements only, so that they may be pipelined."""
+        Raises DatabaseError when something has its name that mapfold did not make.
+        """
 
-    def write(self, connection: Connection, changes: Changes) -> None:
-        """Write what was taken."""
+    def prepare(self, changes: BatchChanges, view: MapView) -> PreparedWrite[Tx]:
+        """Rows to insert, update and delete after ``changes``, as ``view`` has them now."""
 
-    def clear(self, connection: Connection) -> None:
-        """Before a rebuild's transaction (autocommit): remove what an earlier one left behind."""
 
-    def begin(self, connection: Connection) -> None:
-        """Create an empty shadow."""
+class Shadow(Protocol[Tx]):
+    """New rows beside those that readers see. It is made for one rebuild, which may fail."""
 
-    def take_final(self, view: MapView) -> Changes | None:
-        """Rows that can never change again, taken out if enough of them wait; else None."""
+    def create(self, transaction: Tx) -> None:
+        """Create it, empty."""
 
-    def take_rest(self, view: MapView) -> Changes:
-        """All rows that `take_final` has not given out yet; the fold is over."""
+    def load(self, changes: BatchChanges, view: MapView) -> Callable[[Tx], None]:
+        """What adds the rows of new keyframes and observations that never change again."""
 
-    def load(self, changes: Changes) -> Callable[[Connection], None]:
-        """What writes what was taken to the shadow, and has only to send it."""
+    def finish(self, view: MapView) -> Callable[[Tx], Mapping[str, int]]:
+        """What adds all other rows, builds indexes and returns how many rows each table has.
 
-    def index(self, connection: Connection) -> None:
-        """Index the shadow, which is complete now, and gather its statistics."""
+        That raises DatabaseError when the view has other numbers.
+        """
 
-    def check(self, connection: Connection, view: MapView) -> Mapping[str, int]:
-        """Rows of the shadow, by label or table. Raises DatabaseError if the view has others."""
+    def lock_readers(self, transaction: Tx) -> None:
+        """Lock what `swap_in` replaces against readers, until the transaction ends."""
 
-    def lock(self, connection: Connection) -> None:
-        """Keep readers away from what `swap` replaces, until the transaction ends."""
-
-    def swap(self, connection: Connection) -> None:
+    def swap_in(self, transaction: Tx) -> None:
         """Put the shadow in the place of what readers see."""
 
-    def tidy(self, connection: Connection) -> None:
-        """After the commit (autocommit): have what was replaced removed. Nobody need wait for it;
-        ``connection`` may be closed and its session be at work for a while."""
+
+class RebuildSink(Protocol[Tx]):
+    """Rows that can be made anew while readers use the old ones."""
+
+    def drop_leftovers(self, transaction: Tx) -> None:
+        """Drop what an earlier rebuild replaced or left. Raises DatabaseError like `ensure`."""
+
+    def shadow(self) -> Shadow[Tx]:
+        """A shadow, not created yet."""
+
+    def drop_replaced(self, transaction: Tx) -> None:
+        """Have what was replaced dropped, now or once its last reader is gone.
+
+        It may close the connection and leave the server at work.
+        """

@@ -3,7 +3,7 @@
 import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Protocol, TypeAlias
 
 import psycopg
 
@@ -21,10 +21,19 @@ from .connection import (
 )
 from .graph_sink import GraphSink
 from .loader import LoaderName
-from .sink import Sink, SinkName
+from .sink import LiveSink, RebuildSink, SinkName
 from .vector_sink import VectorSink
 
 Only: TypeAlias = SinkName | None
+"""The one sink to write, None for all."""
+
+
+class DatabaseSink(LiveSink[Connection], RebuildSink[Connection], Protocol):
+    """A sink of a database; connections are in autocommit where the port says no transaction."""
+
+    @property
+    def name(self) -> SinkName:
+        """Under which the checkpoint and the locks know it."""
 
 
 @dataclass(slots=True)
@@ -33,7 +42,7 @@ class Store:
 
     url: str
     application: str
-    sinks: tuple[Sink[Any], ...]
+    sinks: tuple[DatabaseSink, ...]
     connection: Connection
 
     @property
@@ -47,11 +56,11 @@ class Store:
         self.connection = _open(self.url, self.application, self.sinks)
 
     @contextlib.contextmanager
-    def aside(self) -> Iterator[Connection]:
-        """A second connection, for dropping graphs.
+    def throwaway_connection(self) -> Iterator[Connection]:
+        """A second connection, closed afterwards, for dropping graphs.
 
         AGE 1.5 keeps labels of a dropped graph in the session's cache and may end the session over
-        them later; so that had better be a session without a future.
+        them later.
         """
         opened = connect(self.url, application=self.application, autocommit=True)
         with opened as connection, database_errors(self.url):
@@ -91,7 +100,7 @@ def open_stores(
 
 def _layout(
     targets: Targets, settings: Settings, only: Only, loader: LoaderName
-) -> list[tuple[str, tuple[Sink[Any], ...]]]:
+) -> list[tuple[str, tuple[DatabaseSink, ...]]]:
     graph = GraphSink(loader)
     vectors = VectorSink(loader, dimension=settings.embedding_dim)
     if only == "graph":
@@ -103,7 +112,7 @@ def _layout(
     return [(targets.graph_url, (graph,)), (targets.vector_url, (vectors,))]
 
 
-def _open(url: str, application: str, sinks: tuple[Sink[Any], ...]) -> Connection:
+def _open(url: str, application: str, sinks: tuple[DatabaseSink, ...]) -> Connection:
     connection = connect(url, application=application, autocommit=True)
     try:
         _refuse_encoding(connection, url)

@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, Final, TypeAlias
+from typing import Final, TypeAlias
 
 from eventsrc.envelope import Offset
 from eventsrc.log import Event, LogReader, follow
@@ -33,11 +33,11 @@ from projections.settings import Settings
 from . import checkpoints
 from .checkpoints import DeadLetter, dead_letter, event_hash
 from .connection import Targets, database_errors, describe_target
+from .live_fold import LiveFold, batches
 from .loader import LoaderName
 from .origin import refuse_mismatch, replay_advice, rows_dropped
 from .progress import TailProgress, TailReport
-from .shared_fold import LiveFold, batches
-from .sink import Checkpoint, Sink, SinkName
+from .sink import Checkpoint, SinkName
 from .stores import Only, Store, open_stores
 from .writing import AWAY, Backoff, LostCommits, OnTrouble, SinkBatch, Writer
 
@@ -85,7 +85,7 @@ class TailPass:
         writers = self._writers()
         beaten = time.monotonic()
         plan.on_fold(start)
-        for batch in batches(self._events(reader, start), plan.batch_events):
+        for batch in batches(self._events(reader, start), plan.batch_events, self._starts()):
             last = self._fold(fold, batch)
             if last is not None:
                 self._write(fold, writers, last)
@@ -117,6 +117,11 @@ class TailPass:
             )
             for store in self.stores
         ]
+
+    def _starts(self) -> set[Offset]:
+        """Where the sinks begin to listen. A batch does not go beyond such an offset, so each batch
+        is for a sink as a whole or not at all."""
+        return {checkpoint.next_offset for checkpoint in self.checkpoints.values()}
 
     def _start_at_most(self) -> Offset:
         """Up to which offset a snapshot is what this tail would fold: another command may have made
@@ -154,7 +159,7 @@ class TailPass:
         rest = batch
         while rest:
             stretch = list(takewhile(lambda event: event.offset not in self.parked, rest))
-            for event, error in zip(stretch, fold.feed(stretch, self._due), strict=True):
+            for event, error in zip(stretch, fold.feed(stretch), strict=True):
                 if error is not None:
                     self._park(event, error)
             rest = rest[len(stretch) :]
@@ -164,15 +169,6 @@ class TailPass:
                 fold.skip(rest[0].offset)
                 rest = rest[1:]
         return batch[-1] if batch else None
-
-    def _due(self, event: Event) -> list[Sink[Any]]:
-        """The sinks that do not have an event yet."""
-        return [
-            sink
-            for store in self.stores
-            for sink in store.sinks
-            if event.offset >= self.checkpoints[sink.name].next_offset
-        ]
 
     def _park(self, event: Event, error: FoldError) -> None:
         if any(event.offset < c.next_offset for c in self.checkpoints.values()):
@@ -186,14 +182,16 @@ class TailPass:
         self.report.parked.append(letter)
 
     def _write(self, fold: LiveFold, writers: list[Writer], last: Event) -> None:
+        """Write a batch to the sinks that do not have it yet."""
         next_offset = Offset(last.offset + 1)
+        changes = fold.recorder.drain()
         written = 0
         for writer in writers:
             parts = [
                 SinkBatch(
                     sink,
-                    sink.take(fold.view),
-                    tuple(d for d in self.letters if d.offset >= at.next_offset),
+                    sink.prepare(changes, fold.view),
+                    tuple(self.letters),
                     at,
                     next_offset,
                     event_hash(last),

@@ -1,4 +1,4 @@
-"""From deltas to rows of ``detection_embeddings``: one row for each searchable detection.
+"""Rows of ``detection_embeddings``: one for each searchable detection.
 
 Searchable means: it has an embedding of the map's own space. Rows are written once and never
 change. ``det_pk`` is the observation's ordinal + 1 and ``ingested_at`` is when the event was
@@ -7,7 +7,6 @@ change. ``det_pk`` is the observation's ordinal + 1 and ``ingested_at`` is when 
 
 import math
 import struct
-from collections.abc import Iterable
 from datetime import UTC, datetime, timedelta
 from typing import Final
 
@@ -15,8 +14,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from projections.deltas import Delta, ObservationAdded, Pose, UnitVector
+from projections.deltas import ObservationAdded, Pose, UnitVector
 from projections.exact import UM_PER_M, to_float32
+from projections.model.changes import BatchChanges
 from projections.model.view import MapView
 
 _REAL: Final = struct.Struct("f")
@@ -57,7 +57,7 @@ class VectorRow(msgspec.Struct, frozen=True, eq=False, gc=False):
     @property
     def unit(self) -> UnitVector:
         """The embedding as the fold has it. Only what has one is a row."""
-        assert self.added.embedding is not None  # noqa: S101 - see `VectorRows.note`
+        assert self.added.embedding is not None  # noqa: S101 - see `BatchChanges.embedded`
         return self.added.embedding
 
     @property
@@ -76,28 +76,10 @@ class VectorRow(msgspec.Struct, frozen=True, eq=False, gc=False):
         return _EPOCH + timedelta(microseconds=self.ingested_us)
 
 
-class VectorRows:
-    """Collects the rows a stream of deltas adds."""
-
-    def __init__(self) -> None:
-        self._waiting: list[tuple[ObservationAdded, int]] = []
-
-    def note(self, deltas: Iterable[Delta], logged_ns: int) -> None:
-        """Remember those of ``deltas`` that add a row; their event was logged at ``logged_ns``."""
-        for delta in deltas:
-            if type(delta) is ObservationAdded and delta.embedding is not None:
-                self._waiting.append((delta, logged_ns))
-
-    @property
-    def waiting(self) -> int:
-        """How many rows `take` would give."""
-        return len(self._waiting)
-
-    def take(self, view: MapView) -> list[VectorRow]:
-        """The rows added since the last take."""
-        waiting, self._waiting = self._waiting, []
-        keyframes = view.keyframes
-        return [VectorRow(added, keyframes[added.keyframe].pose, ns) for added, ns in waiting]
+def new_rows(changes: BatchChanges, view: MapView) -> list[VectorRow]:
+    """The rows that a batch adds, in the order of their observations."""
+    keyframes = view.keyframes
+    return [VectorRow(added, keyframes[added.keyframe].pose, ns) for added, ns in changes.embedded]
 
 
 def _real(value: float) -> float:

@@ -20,7 +20,7 @@ import contextlib
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Final, TypeAlias
+from typing import Final, TypeAlias
 
 from eventsrc.envelope import Offset
 from projections.errors import (
@@ -32,9 +32,9 @@ from projections.errors import (
 
 from . import checkpoints
 from .checkpoints import DeadLetter
-from .connection import database_errors
-from .sink import Checkpoint, Sink, SinkName
-from .stores import Store
+from .connection import Connection, database_errors
+from .sink import Checkpoint, PreparedWrite, SinkName
+from .stores import DatabaseSink, Store
 
 AWAY: Final = (DatabaseUnavailable, EmbeddedServerError)
 """What another attempt may mend: a server killed once more while it starts does not start."""
@@ -84,8 +84,8 @@ class LostCommits(Exception):
 class SinkBatch:
     """What one sink gets in one transaction, and the checkpoints before and after it."""
 
-    sink: Sink[Any]
-    changes: Any
+    sink: DatabaseSink
+    write: PreparedWrite[Connection]
     letters: tuple[DeadLetter, ...]
     before: Checkpoint
     next_offset: Offset
@@ -140,10 +140,10 @@ class Writer:
         connection = self.store.connection
         # Few rows: all statements go out at once, two round trips in all instead of twenty, which
         # is what the delay of a live tail is made of. COPY cannot be part of a pipeline.
-        few = all(part.sink.few(part.changes) for part in batch)
+        few = all(part.write.is_small for part in batch)
         with connection.pipeline() if few else contextlib.nullcontext(), connection.transaction():
             for part in batch:
-                part.sink.write(connection, part.changes)
+                part.write.send(connection)
                 for letter in part.letters:
                     checkpoints.park(connection, part.sink.name, letter)
             return [

@@ -19,7 +19,7 @@ from projections.database import RebuildProgress, rebuild
 from projections.database.connection import Targets, connect, describe_target
 from projections.database.embedded import EmbeddedServer
 from projections.database.loader import CopyLoader, Load, TypeName
-from projections.database.vector_sink import VectorSink
+from projections.database.vector_sink import VectorShadow
 from projections.errors import DatabaseError, DatabaseUnavailable
 from projections.settings import Settings
 from tests.logs import bridge, walk, write_log
@@ -45,9 +45,8 @@ def log(tmp_path: Path) -> Path:
 
 def in_small_streams(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the thread write while the fold goes on, also for a small log."""
-    monkeypatch.setattr("projections.database.graph_sink.STREAM_ROWS", 20)
-    monkeypatch.setattr("projections.database.vector_sink.STREAM_ROWS", 10)
     # The package's name for it is the function.
+    monkeypatch.setattr(sys.modules["projections.database.rebuild"], "STREAM_ROWS", 20)
     monkeypatch.setattr(sys.modules["projections.database.rebuild"], "TICK_EVENTS", 8)
 
 
@@ -187,12 +186,12 @@ def test_who_interrupts_a_rebuild_whose_server_has_gone_is_told_of_the_interrupt
         raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patched:
-        last = VectorSink.begin
+        last = VectorShadow.create
 
-        def and_say_so(self: VectorSink, connection: psycopg.Connection) -> None:
+        def and_say_so(self: VectorShadow, connection: psycopg.Connection) -> None:
             last(self, connection)
             begun.set()
 
-        patched.setattr(VectorSink, "begin", and_say_so)
+        patched.setattr(VectorShadow, "create", and_say_so)
         with pytest.raises(KeyboardInterrupt):
             rebuild(log, targets, SETTINGS, progress=interrupt)

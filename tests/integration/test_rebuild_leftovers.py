@@ -12,7 +12,7 @@ from projections.database import RebuildProgress, rebuild
 from projections.database.check import check
 from projections.database.connection import Connection, Targets, connect
 from projections.database.swap import try_drop_lock
-from projections.database.vector_sink import build_hnsw
+from projections.database.vector_table import build_hnsw
 from projections.errors import DatabaseError
 from projections.settings import Settings
 from tests.drops import wait_for_drops

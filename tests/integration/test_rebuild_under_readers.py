@@ -11,7 +11,7 @@ import pytest
 from projections.database import RebuildProgress, rebuild, tail
 from projections.database.connection import Targets
 from projections.database.cypher import connect_for_cypher
-from projections.database.vector_sink import VectorSink
+from projections.database.vector_sink import VectorShadow
 from projections.errors import DatabaseError, ProjectionBusy
 from projections.settings import Settings
 from tests.drops import wait_for_drops
@@ -203,7 +203,7 @@ def test_between_swap_and_commit_a_reader_waits_at_its_first_table(
     rebuild(log, one_database, SETTINGS, until=30)
     waited: list[str] = []
 
-    def swap_then_read(self: VectorSink, connection: psycopg.Connection) -> None:
+    def swap_then_read(self: VectorShadow, connection: psycopg.Connection) -> None:
         swap(self, connection)
         with connect_for_cypher(one_database.graph_url) as reader:
             reader.execute("SET lock_timeout = '50ms'")
@@ -211,8 +211,8 @@ def test_between_swap_and_commit_a_reader_waits_at_its_first_table(
                 reader.execute(query)  # type: ignore[arg-type]
             waited.append(query)
 
-    swap = VectorSink.swap
-    monkeypatch.setattr(VectorSink, "swap", swap_then_read)
+    swap = VectorShadow.swap_in
+    monkeypatch.setattr(VectorShadow, "swap_in", swap_then_read)
     rebuild(log, one_database, SETTINGS)
     assert waited == [query]
 

@@ -1,7 +1,7 @@
 """A tail begins at the nearest snapshot that is surely of its own fold, and leaves one."""
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import pytest
 from eventsrc.log import Event, LogReader
 from projections.database import rebuild, tail
 from projections.database.connection import Targets
-from projections.database.shared_fold import LiveFold
+from projections.database.live_fold import LiveFold
 from projections.model.fold import fold_log
 from projections.model.snapshot_cache import SnapshotCache
 from projections.settings import Settings
@@ -31,9 +31,9 @@ def folded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     offsets: list[int] = []
     feed = LiveFold.feed
 
-    def spy(self: LiveFold, events: Sequence[Event], sinks_of: Callable[..., Any]) -> Iterator[Any]:
+    def spy(self: LiveFold, events: Sequence[Event]) -> Iterator[Any]:
         offsets.extend(event.offset for event in events)
-        return feed(self, events, sinks_of)
+        return feed(self, events)
 
     monkeypatch.setattr(LiveFold, "feed", spy)
     return offsets

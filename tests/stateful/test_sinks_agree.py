@@ -29,9 +29,9 @@ from hypothesis.stateful import (
 from eventsrc.log import LogReader
 from projections.database import rebuild, tail
 from projections.database.connection import Targets, connect
+from projections.database.live_fold import LiveFold
 from projections.database.loader import LoaderName
-from projections.database.memory_sink import MemorySink
-from projections.database.shared_fold import LiveFold
+from projections.database.memory_sink import MemorySink, MemoryTables
 from projections.errors import FoldError
 from projections.settings import Settings
 from tests.drops import wait_for_drops
@@ -76,7 +76,7 @@ class SinksAgree(RuleBasedStateMachine):
         self.log = write_log(self.folder / "log", walk(3, seed=99, run_id="first"))
         self.keyframes = {"run-a": 0, "run-b": 0}
         self.unreadable = False
-        self.fold, self.memory = LiveFold(SETTINGS), MemorySink()
+        self.fold, self.memory = LiveFold(SETTINGS), MemoryTables()
         for name in self.targets:
             self._empty(self.targets[name])
 
@@ -182,13 +182,11 @@ class SinksAgree(RuleBasedStateMachine):
 
     def _memory_catches_up(self) -> None:
         with LogReader(self.log) as reader:
-            last = None
             for event in reader.read(self.memory.next_offset):
-                for _ in self.fold.feed([event], lambda _: [self.memory]):  # type: ignore[list-item]
+                for _ in self.fold.feed([event]):
                     pass
-                last = event
-        if last is not None:
-            self.memory.write(self.memory.take(self.fold.view), last)
+        MemorySink().prepare(self.fold.recorder.drain(), self.fold.view).send(self.memory)
+        self.memory.next_offset = self.fold.map.next_offset
 
 
 def _values(row: tuple[Any, ...]) -> tuple[Any, ...]:

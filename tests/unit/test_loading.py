@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from projections.database.loading_thread import WAITING_JOBS, Loading, short_turns
+from projections.database.loading_thread import WAITING_JOBS, LoadingThread, short_turns
 
 
 def test_jobs_are_done_in_order_and_elsewhere() -> None:
@@ -20,7 +20,7 @@ def test_jobs_are_done_in_order_and_elsewhere() -> None:
 
         return work
 
-    with Loading() as loading:
+    with LoadingThread() as loading:
         for number in range(20):
             loading.put(job(number))
         loading.flush()
@@ -32,12 +32,12 @@ def test_jobs_are_done_in_order_and_elsewhere() -> None:
 def test_whoever_brings_more_than_may_wait_waits() -> None:
     gate, brought = threading.Event(), threading.Semaphore(0)
 
-    def bring(loading: Loading) -> None:
+    def bring(loading: LoadingThread) -> None:
         for _ in range(WAITING_JOBS + 3):
             loading.put(lambda: gate.wait(60) and None)
             brought.release()
 
-    with Loading() as loading:
+    with LoadingThread() as loading:
         bringing = threading.Thread(target=bring, args=(loading,))
         bringing.start()
         for _ in range(WAITING_JOBS + 1):  # one in work, the others wait
@@ -55,7 +55,7 @@ def _fail() -> None:
 
 def test_a_failure_is_raised_where_one_waits_and_ends_the_work() -> None:
     done: list[int] = []
-    with Loading() as loading:
+    with LoadingThread() as loading:
         loading.put(_fail)
         loading.put(lambda: done.append(1))
         with pytest.raises(LookupError, match="went away"):
@@ -73,7 +73,7 @@ def test_leaving_by_an_error_breaks_off_what_runs_and_drops_the_rest() -> None:
         done.append(1 if cancelled.wait(60) else 0)
 
     def leave() -> None:
-        with Loading(cancelled.set) as loading:
+        with LoadingThread(cancelled.set) as loading:
             loading.put(first)
             loading.put(lambda: done.append(2))
             assert begun.wait(60)
@@ -86,7 +86,7 @@ def test_leaving_by_an_error_breaks_off_what_runs_and_drops_the_rest() -> None:
 
 def test_the_thread_ends_also_when_nothing_can_be_broken_off() -> None:
     def leave() -> None:
-        with Loading(_fail):
+        with LoadingThread(_fail):
             raise KeyboardInterrupt
 
     before = threading.active_count()

@@ -13,7 +13,7 @@ import pytest
 
 from eventsrc.log import LogReader
 from projections.database.graph_sink import GraphSink
-from projections.database.shared_fold import LiveFold
+from projections.database.live_fold import LiveFold
 from projections.database.vector_sink import VectorSink
 from projections.history.history import History
 from projections.model.fold import fold_log
@@ -47,11 +47,11 @@ def folding() -> object:
         folding,
         lambda: LiveFold(Settings()).view,
         GraphSink,
-        lambda: GraphSink()._rows,
+        lambda: LiveFold(Settings()).recorder,
         VectorSink,
         lambda: History(Settings()),
     ],
-    ids=["view", "map", "live view", "graph sink", "graph rows", "vector sink", "history"],
+    ids=["view", "map", "live view", "graph sink", "recorder", "vector sink", "history"],
 )
 def test_nobody_holds_on_to_it(make: Callable[[], object]) -> None:
     thing = make()

@@ -1,25 +1,19 @@
-"""One fold that several sinks listen to, each from its own offset on."""
+"""A fold of a log that may still grow, its view, and what each batch of events changed."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any, TypeAlias
+from collections.abc import Collection, Iterable, Iterator, Sequence
 
 from eventsrc.envelope import Offset
 from eventsrc.log import Event
-from projections.deltas import Delta
 from projections.errors import FoldError
+from projections.model.changes import ChangeRecorder
 from projections.model.fold import AHEAD, fold_events
 from projections.model.view import MapView
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 
-from .sink import Sink
-
-SinksOf: TypeAlias = Callable[[Event], Sequence[Sink[Any]]]
-"""Which sinks an event is for: those that do not have it yet."""
-
 
 class LiveFold:
-    """The fold's state and its view. Embeddings are not kept: sinks get them with the delta."""
+    """The fold's state, its view without embeddings, and the recorder of the view's changes."""
 
     def __init__(
         self, settings: Settings, start: tuple[SemanticMap, MapView] | None = None
@@ -29,9 +23,10 @@ class LiveFold:
             SemanticMap(settings),
             MapView(settings, keep_embeddings=False),
         )
+        self.recorder = ChangeRecorder(self.view)
 
-    def feed(self, events: Sequence[Event], sinks_of: SinksOf) -> Iterator[FoldError | None]:
-        """Fold events in order, telling each one's sinks; a step for each: None, or why it failed.
+    def feed(self, events: Sequence[Event]) -> Iterator[FoldError | None]:
+        """Fold events in order, a step for each: None, or why it failed.
 
         After a failed event the map is as it was before it; the event is passed over when the next
         step is asked for. Events are read a stretch ahead, which is faster than one by one.
@@ -41,7 +36,8 @@ class LiveFold:
             waiting = iter(events[start:])
             try:
                 for folded in fold_events(events[start:], self.map, ahead=AHEAD):
-                    self._apply(next(waiting), folded.deltas, sinks_of)
+                    event = next(waiting)
+                    self.recorder.apply_event(event.offset, folded.deltas, event.logged_ns)
                     start += 1
                     yield None
             except FoldError as error:
@@ -54,20 +50,20 @@ class LiveFold:
         self.map.skip(offset)
         self.view.advance(Offset(offset + 1))
 
-    def _apply(self, event: Event, deltas: list[Delta], sinks_of: SinksOf) -> None:
-        for sink in sinks_of(event):
-            sink.note(deltas, event.logged_ns, self.view)
-        self.view.apply_event(event.offset, deltas)
 
+def batches(
+    events: Iterable[Event | None], size: int, cuts: Collection[int] = ()
+) -> Iterator[list[Event]]:
+    """Group events: a batch ends at ``size``, before an offset in ``cuts``, and at a None.
 
-def batches(events: Iterable[Event | None], size: int) -> Iterator[list[Event]]:
-    """Group events: a batch ends at ``size`` or where the stream pauses (None).
-
-    An empty batch says that nothing came for a while.
+    None says that nothing came for a while; the batch is empty then if nothing came before it.
     """
     batch: list[Event] = []
     for event in events:
         if event is not None:
+            if batch and event.offset in cuts:
+                yield batch
+                batch = []
             batch.append(event)
         if event is None or len(batch) == size:
             yield batch

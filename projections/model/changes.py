@@ -1,0 +1,125 @@
+"""Which rows of a `MapView` a batch of events added or changed.
+
+`ChangeRecorder` applies events to a view and records the ordinals they touch; a sink looks up what
+those say now in the view. So a thousand changes of one Object in a batch are one ordinal.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, TypeAlias
+
+from eventsrc.envelope import Offset
+from projections.deltas import (
+    Delta,
+    KeyframePlaced,
+    ObjectFound,
+    ObjectMoved,
+    ObjectSeen,
+    ObservationAdded,
+    PlaceChanged,
+    PlaceFormed,
+    PlacesLinked,
+    PlacesMerged,
+    RunSeen,
+)
+
+from .view import MapView
+
+Embedded: TypeAlias = tuple[ObservationAdded, int]
+"""An observation that has an embedding of the map's space, and when its event was logged, in ns. A
+view that keeps no embeddings has neither."""
+
+
+@dataclass(frozen=True, slots=True)
+class BatchChanges:
+    """What a batch added or changed, as ordinals in ascending order; `MapView` has the values.
+
+    ``keyframes`` and ``observations`` are new. They never change later, except for the place of a
+    keyframe: ``placed`` are the keyframes that joined a place or whose place was absorbed.
+    ``runs``, ``objects`` and ``places`` are new or changed; a place that is not in
+    `MapView.places` any more was absorbed. ``located`` are objects that moved to another place or
+    out of one. ``links`` are pairs of places whose shared transitions changed; one that is not in
+    `MapView.adjacency` any more is gone. ``embedded`` is in the order of the observations.
+    """
+
+    keyframes: range
+    observations: range
+    embedded: list[Embedded]
+    runs: list[int]
+    objects: list[int]
+    places: list[int]
+    located: list[int]
+    placed: list[int]
+    links: list[tuple[int, int]]
+
+
+class ChangeRecorder:
+    """Applies events to ``view`` and records what they change."""
+
+    def __init__(self, view: MapView) -> None:
+        self.view = view
+        self._start()
+
+    def apply_event(self, offset: Offset, deltas: Sequence[Delta], logged_ns: int) -> None:
+        """Apply the deltas of the event at ``offset``, which was logged at ``logged_ns``."""
+        recorders = self._RECORDERS
+        for delta in deltas:
+            if type(delta) is ObservationAdded:
+                if delta.embedding is not None:
+                    self._embedded.append((delta, logged_ns))
+            elif (record := recorders.get(type(delta))) is not None:
+                record(self, delta)
+        self.view.apply_event(offset, deltas)
+
+    @property
+    def added(self) -> int:
+        """How many keyframes and observations are new since the last `drain`."""
+        view = self.view
+        return len(view.keyframes) - self._keyframes + len(view.observations) - self._observations
+
+    def drain(self) -> BatchChanges:
+        """All changes since the last drain."""
+        changes = BatchChanges(
+            range(self._keyframes, len(self.view.keyframes)),
+            range(self._observations, len(self.view.observations)),
+            self._embedded,
+            sorted(self._runs),
+            sorted(self._objects),
+            sorted(self._places),
+            sorted(self._located),
+            sorted(self._placed),
+            sorted(self._links),
+        )
+        self._start()
+        return changes
+
+    def _start(self) -> None:
+        self._keyframes = len(self.view.keyframes)
+        self._observations = len(self.view.observations)
+        self._embedded: list[Embedded] = []
+        self._runs: set[int] = set()
+        self._objects: set[int] = set()
+        self._places: set[int] = set()
+        self._located: set[int] = set()
+        self._placed: set[int] = set()
+        self._links: set[tuple[int, int]] = set()
+
+    def _places_merged(self, delta: PlacesMerged) -> None:
+        self._places.add(delta.survivor)
+        self._places.update(delta.absorbed)
+        for place in delta.absorbed:
+            # Before the view applies it: afterwards they are members of the survivor.
+            self._placed.update(self.view.all_places[place].unordered_members)
+
+    # Of the class, not bound to the recorder; `MapView` says why.
+    _RECORDERS: ClassVar[dict[type, Callable[["ChangeRecorder", Any], None]]] = {
+        RunSeen: lambda self, d: self._runs.add(d.run),
+        ObjectFound: lambda self, d: self._objects.add(d.object),
+        ObjectSeen: lambda self, d: self._objects.add(d.object),
+        ObjectMoved: lambda self, d: self._located.add(d.object),
+        PlaceFormed: lambda self, d: self._places.add(d.place),
+        PlaceChanged: lambda self, d: self._places.add(d.place),
+        KeyframePlaced: lambda self, d: self._placed.add(d.keyframe),
+        PlacesMerged: _places_merged,
+        PlacesLinked: lambda self, d: self._links.add((d.a, d.b)),
+    }
