@@ -1,8 +1,7 @@
-"""Is the file under a growing segment's name still the one that its writer has open, and as long as
-what was written to it?
+"""Check that a growing segment's file was not deleted, renamed, replaced, cut short or lengthened.
 
-Somebody may delete, rename, replace, cut short or lengthen it. What is overwritten in place, at the
-same length, cannot be seen so; the checksums find that when it is read.
+The file under its name must be the one that the writer has open, and as long as what was written to
+it. Bytes overwritten in place are not noticed here; the checksums find them on reading.
 """
 
 import os
@@ -17,15 +16,15 @@ from .format import DAMAGED, free_name
 
 
 class Identity(NamedTuple):
-    """What tells one file or folder from another."""
+    """Identifies a file or folder."""
 
     device: int
     inode: int
 
 
-class Found(NamedTuple):
-    """What is wrong with a file; ``whole`` when all that was written is still there in its place
-    and something stands behind it."""
+class Problem(NamedTuple):
+    """What is wrong with a file; ``whole`` if everything written to it is still in its place and
+    other bytes follow."""
 
     text: str
     whole: bool = False
@@ -33,9 +32,11 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class FileFault:
-    """The file at ``path`` was given up by its writer, who goes on in the file of offset
-    ``following``. Offsets ``base`` to before ``following`` had been recorded in it; ``lost`` says
-    whether they can no longer be relied on."""
+    """The file at ``path``, which its writer gave up to go on in a new one.
+
+    Offsets ``base`` to before ``following`` had been recorded in it; the new file begins at
+    ``following``. ``lost`` if they can no longer be relied on.
+    """
 
     path: Path
     base: Offset
@@ -45,7 +46,7 @@ class FileFault:
 
     @property
     def lost_events(self) -> int:
-        """How many recorded events are lost, at most: some may still be read."""
+        """How many recorded events are lost at most; some may still be readable."""
         return self.following - self.base if self.lost else 0
 
     def __str__(self) -> str:
@@ -58,39 +59,39 @@ class FileFault:
 
 
 def identity_of(path: Path) -> Identity:
-    """That of a file or folder. Raises OSError."""
+    """Device and inode of a file or folder. Raises OSError."""
     status = path.stat()
     return Identity(status.st_dev, status.st_ino)
 
 
-def fault_of(fd: int, path: Path, size: int) -> Found | None:
-    """What is wrong with the open file ``fd``, which should stand at ``path`` and be ``size`` bytes
-    long. Raises OSError."""
+def find_problem(fd: int, path: Path, size: int) -> Problem | None:
+    """What is wrong with the open file ``fd``, which should be at ``path`` and ``size`` bytes long.
+    Raises OSError."""
     ours = os.fstat(fd)
     try:
         named = identity_of(path)
     except FileNotFoundError:
         if ours.st_nlink == 0:
-            return Found("was deleted")
-        return Found("was renamed or moved away (put it back when the recording has ended)")
+            return Problem("was deleted")
+        return Problem("was renamed or moved away (put it back when the recording has ended)")
     if named != Identity(ours.st_dev, ours.st_ino):
-        return Found("was replaced by another file")
+        return Problem("was replaced by another file")
     if ours.st_size < size:
-        return Found(f"was cut short to {ours.st_size:,} of {size:,} bytes")
+        return Problem(f"was cut short to {ours.st_size:,} of {size:,} bytes")
     if ours.st_size > size:
         more = ours.st_size - size
-        return Found(f"has {more:,} bytes at its end that another program wrote", whole=True)
+        return Problem(f"has {more:,} bytes at its end that another program wrote", whole=True)
     return None
 
 
-def set_aside(path: Path) -> None:
-    """Rename what stands at ``path``, if anything does, as recovery names what it replaces."""
+def quarantine(path: Path) -> None:
+    """Rename the file at ``path``, if there is one, to ``….damaged``, as recovery does."""
     if path.exists():
         path.rename(free_name(path, DAMAGED))
 
 
 def is_readable_segment(path: Path, head_size: int) -> bool:
-    """Whether a file stands at ``path`` in which some events might still be read."""
+    """Whether the file at ``path`` is long enough to hold readable events."""
     try:
         status = path.stat()
     except FileNotFoundError:

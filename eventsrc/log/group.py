@@ -1,8 +1,6 @@
-"""The next commit while it is still in memory: events in, one group out.
+"""Commit groups: the events of the next commit, collected in memory.
 
-A *group* is what one commit brings to the disk: an uncompressed chunk and its commit mark. Taking
-events costs no more than laying out their heads; joining the bytes and their CRC are left to
-`Group.pieces`, which may run in another thread.
+A *group* is what one commit brings to the disk: an uncompressed chunk and its commit mark.
 """
 
 import time
@@ -22,10 +20,12 @@ from .mcap_records import MESSAGE_HEAD, Channel, Schema, encode_message_head
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Offsets ``first`` to before ``following``, and the records that hold them. ``parts`` are the
-    head and the payload of each message by turns; the heads count from offset ``base``.
-    ``definitions`` hold the schemas that are new in it; ``schemas`` are all so far, for a file that
-    does not have those before."""
+    """The records of offsets ``first`` to before ``following``.
+
+    ``parts`` are the head and the payload of each message by turns; sequence numbers in the heads
+    count from offset ``base``. ``definitions`` are the records of the group's channels and of the
+    schemas that are new in it, ``schemas`` those of all schemas of the segment so far.
+    """
 
     base: Offset
     first: Offset
@@ -36,10 +36,9 @@ class Group:
     parts: list[bytes]
     schemas: list[bytes]
 
-    def pieces(self, base: Offset, mark_seed: int) -> tuple[bytes, bytes, bytes]:
-        """What to write into a file that begins at offset ``base`` and has that mark seed, in this
-        order: the chunk's head, its messages, its commit mark. The first two are not joined, for
-        the messages are megabytes."""
+    def encode(self, base: Offset, mark_seed: int) -> tuple[bytes, bytes, bytes]:
+        """Chunk head, messages and commit mark for a file that begins at offset ``base`` and has
+        that mark seed. Head and messages are not joined, which would copy megabytes."""
         parts, definitions = self.parts, self.definitions
         if base != self.base:
             if base == self.first:
@@ -55,27 +54,22 @@ class Group:
 
 
 class GroupBuilder:
-    """Takes events of one segment and cuts them into groups as the policy says.
+    """Collects the events of one segment into groups of the size and age that the policy sets."""
 
-    With a ``slack`` above 1 a group may grow to that many times the policy's events and bytes, for
-    a caller whose last group is still on its way to the disk.
-    """
-
-    def __init__(self, base: Offset, policy: FsyncPolicy, slack: int = 1) -> None:
+    def __init__(self, base: Offset, policy: FsyncPolicy) -> None:
         self._base = base
         self.next_offset = base
         self._first = base
-        self._policy = policy
-        self._most_events = min(policy.max_events * slack, _mcap.MAX_MESSAGES)
-        self._most_bytes = min(policy.max_bytes * slack, _mcap.MAX_GROUP_BYTES)
+        self._interval_ns = policy.interval_ns
+        self._max_events = min(policy.max_events, _mcap.MAX_MESSAGES)
+        self._max_bytes = min(policy.max_bytes, _mcap.MAX_GROUP_BYTES)
         self._channels: dict[tuple[str, int], Channel] = {}
         self._schemas: dict[str, int] = {}
         self._schema_records: list[bytes] = []
         self._begin()
 
     def _begin(self) -> None:
-        self._ids: dict[tuple[str, int], int] = {}
-        """Of the channels whose records lead this group."""
+        self._ids: dict[tuple[str, int], int] = {}  # of the channels that lead this group
         self._definitions: list[bytes] = []
         self._parts: list[bytes] = []
         self._bytes = 0
@@ -84,26 +78,26 @@ class GroupBuilder:
 
     @property
     def waiting(self) -> int:
-        """Events taken and not cut."""
+        """Events in the group so far."""
         return self.next_offset - self._first
 
     @property
     def channels(self) -> int:
-        """Keys, each of one version, that were taken so far."""
+        """Channels of the segment so far: one for each key and version."""
         return len(self._channels)
 
-    def take(self, events: Sequence[NewEvent], start: int) -> int:
-        """Take events from index ``start`` on until the group is full; how many were taken."""
+    def add(self, events: Sequence[NewEvent], start: int) -> int:
+        """Add events from index ``start`` on until the group is full; returns how many."""
         if not self._parts:
             self._since_ns = time.monotonic_ns()
             self._first_ns = self._last_ns = events[start].logged_ns
-        room = self._most_events - self.waiting
+        room = self._max_events - self.waiting
         sequence = self.next_offset - self._base
         ids, size = self._ids, self._bytes
         first_ns, last_ns = self._first_ns, self._last_ns
         parts: list[bytes] = []
         for key, payload, logged_ns, stamp_ns, version in islice(events, start, start + room):
-            channel = ids.get((key, version)) or self._lead_with(key, version)
+            channel = ids.get((key, version)) or self._add_channel(key, version)
             length = len(payload)
             parts.append(encode_message_head(channel, sequence, logged_ns, stamp_ns, length))
             parts.append(payload)
@@ -113,18 +107,21 @@ class GroupBuilder:
             elif logged_ns > last_ns:
                 last_ns = logged_ns
             size += MESSAGE_HEAD + length
-            if size >= self._most_bytes:
+            if size >= self._max_bytes:
                 break
-        # All at the end: an interrupt in the loop leaves everything as it was.
+        # Stored at the end only: an interrupt in the loop leaves the group unchanged.
         self._parts += parts
         self._first_ns, self._last_ns = first_ns, last_ns
         self._bytes = size
         self.next_offset = Offset(self._base + sequence)
         return len(parts) // 2
 
-    def _lead_with(self, key: str, version: int) -> int:
-        """The channel's id. Its record leads every chunk that uses it, so that no rot in one chunk
-        can take the names from another's events; the schema, which the key tells, stands once."""
+    def _add_channel(self, key: str, version: int) -> int:
+        """Id of the key's channel, whose record is put before the group's messages.
+
+        Every chunk holds the records of its channels, so that it can be read without any other.
+        A schema, which follows from the key, is written once a segment.
+        """
         known = self._channels.get((key, version))
         if known is None:
             known = self._channels[key, version] = self._define(key, version)
@@ -143,21 +140,15 @@ class GroupBuilder:
         return key_channel(len(self._channels) + 1, schema, key, version)
 
     def due(self) -> bool:
-        """True when the policy wants a commit now."""
-        policy = self._policy
+        """Whether the policy wants a commit now."""
         return self.waiting > 0 and (
-            self.full()
-            or self.waiting >= policy.max_events
-            or self._bytes >= policy.max_bytes
-            or time.monotonic_ns() - self._since_ns >= policy.interval_ns
+            self.waiting >= self._max_events
+            or self._bytes >= self._max_bytes
+            or time.monotonic_ns() - self._since_ns >= self._interval_ns
         )
 
-    def full(self) -> bool:
-        """True when there is no room for another event."""
-        return self.waiting >= self._most_events or self._bytes >= self._most_bytes
-
-    def cut(self) -> Group:
-        """What was taken since the last cut, as one group."""
+    def finish(self) -> Group:
+        """The group so far; the next event begins another."""
         group = Group(
             self._base,
             self._first,

@@ -179,17 +179,11 @@ class SegmentPlan:
 
 
 def seal(plan: SegmentPlan, bodies: Iterable[bytes]) -> str:
-    """Write the sealed segment from chunk bodies in offset order and put it in its place; its
-    SHA-256. Raises OSError when the disk refuses; nothing is left behind then."""
+    """Write the sealed segment of chunk bodies in offset order; returns its SHA-256.
+
+    Raises OSError, and LogDamaged for bodies that a writer does not make; leaves nothing then.
+    """
     temporary = segment_path(plan.log, plan.base, SEALING)
-    sha256 = write_sealed(plan, bodies, temporary)
-    replace_durably(temporary, segment_path(plan.log, plan.base, SEALED))
-    return sha256
-
-
-def write_sealed(plan: SegmentPlan, bodies: Iterable[bytes], temporary: Path) -> str:
-    """Write it beside, synced but not yet in its place; see `seal`. Raises OSError, and LogDamaged
-    for bodies that are not what a writer makes."""
     fd = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
     try:
         builder = _Builder(fd, plan)
@@ -206,6 +200,7 @@ def write_sealed(plan: SegmentPlan, bodies: Iterable[bytes], temporary: Path) ->
         raise
     finally:
         os.close(fd)
+    replace_durably(temporary, segment_path(plan.log, plan.base, SEALED))
     return builder.sha256.hexdigest()
 
 

@@ -1,8 +1,9 @@
-"""Appending to a log: one writer, dense offsets, group commit, rotation.
+"""Append events to a log: one writer, dense offsets, group commit, rotation.
 
 An event has an offset when `append` returns and is *recorded* when `durable_offset` has passed it.
-A writer belongs to one thread. Every error is final for it: what is synced stays, what waits was
-never called recorded, and the next writer goes on behind the last good event.
+At most one commit group is not synced at any time. A writer belongs to one thread. After an error
+it accepts nothing more: what is synced stays, what was waiting never counted as recorded, and the
+next writer goes on behind the last good event.
 """
 
 import contextlib
@@ -19,7 +20,6 @@ from eventsrc.envelope import ENVELOPE_VERSION, Offset
 from eventsrc.errors import LogError, MapfoldError, NotALog
 
 from .active_segment import ActiveSegment
-from .commit_thread import Commits, OverlappedCommits
 from .durable_files import GROUP_COMMIT, FsyncPolicy, make_directory_durably, unlink_quietly
 from .event import NewEvent
 from .file_fault import FileFault
@@ -33,31 +33,26 @@ ROTATE_BYTES = 64 * 1024 * 1024
 ROTATE_EVENTS = 1_000_000
 ROTATE_SECONDS = 3600.0
 ROTATE_CHANNELS = 4_096
-"""A segment keeps the names of its channels in memory and writes them once more when it is sealed,
-and MCAP counts no more than 65,535 of them. Whoever invents keys gets more segments."""
+"""A segment keeps its channels in memory and writes them again when it is sealed, and MCAP allows
+65,535 of them. A publisher that invents keys causes more segments."""
 _MAX_NS = 2**63
 
 
 class Sealing(NamedTuple):
-    """``waiting`` segments are finished and not sealed yet. ``error`` says why the first of them is
-    not, if it was tried; that costs disk and loses nothing."""
+    """How many finished segments are ``waiting`` to be sealed, and the ``error`` of the first if it
+    was tried. Unsealed segments take more disk; nothing is lost."""
 
     waiting: int
     error: LogError | None
 
 
 class LogWriter:
-    """A context manager; creates the log if there is none, takes its lock, recovers what a
-    predecessor left. Raises LogBusy, NotALog, LogDamaged or LogError.
+    """A context manager: creates the log if there is none, takes its lock, recovers what a killed
+    writer left. Raises LogBusy, NotALog, LogDamaged or LogError.
 
-    A segment file that somebody deletes, moves or cuts short under the writer is given up, and
-    writing goes on in a new one behind the last recorded offset; `faults` tells at once, and
-    `close` raises LogError.
-
-    ``overlap`` is for much at once. A thread beside the caller's then writes and syncs one group
-    while the next is taken, so `durable_offset` moves by itself and an error shows with one of the
-    next calls (but not under ``always``, which syncs before `append` returns); and segments are
-    sealed in a process of their own.
+    A segment file that somebody deletes, moves or cuts short while it is written is given up, and
+    writing goes on in a new one behind the last recorded offset: see `faults`; `close` then raises
+    LogError. Full segments are sealed in a thread of their own.
     """
 
     def __init__(
@@ -69,7 +64,6 @@ class LogWriter:
         rotate_bytes: int = ROTATE_BYTES,
         rotate_events: int = ROTATE_EVENTS,
         rotate_seconds: float = ROTATE_SECONDS,
-        overlap: bool = False,
     ) -> None:
         self.path = path
         self._fsync = fsync
@@ -79,13 +73,11 @@ class LogWriter:
         self._rotate_ns = int(rotate_seconds * 1e9)
         self._closed = False
         self._faults: list[FileFault] = []
-        self._overlap = overlap
-        self._commits = OverlappedCommits() if overlap and fsync.max_events > 1 else Commits()
         try:
             self._open()
         except OSError as error:
             place, reason = error.filename or path, error.strerror or error
-            raise LogError(f"{place}: {reason}; {_way_out(error)}") from error
+            raise LogError(f"{place}: {reason}; {_advice(error)}") from error
 
     def _open(self) -> None:
         _make_log_directory(self.path)
@@ -93,10 +85,8 @@ class LogWriter:
         try:
             self.restart: Restart = restart(self.path)
             self.log_id = self.restart.log_id or uuid.uuid4().hex
-            self._sealer = Sealer(
-                self.path, self.log_id, self.restart.previous_sha256, aside=self._overlap
-            )
-            self._active = self._ending = self._next_segment(self.restart.next_offset)
+            self._sealer = Sealer(self.path, self.log_id, self.restart.previous_sha256)
+            self._active = self._new_segment(self.restart.next_offset)
             self._active.create()
             for base, following in self.restart.unsealed:
                 self._sealer.submit(base, following)
@@ -104,12 +94,11 @@ class LogWriter:
             self._lock.release()
             raise
 
-    def _next_segment(self, base: Offset) -> ActiveSegment:
+    def _new_segment(self, base: Offset) -> ActiveSegment:
         self._begun = time.monotonic_ns()
-        slack = self._commits.slack
-        return ActiveSegment(self.path, self.log_id, base, self._fsync, slack, self._take_fault)
+        return ActiveSegment(self.path, self.log_id, base, self._fsync, self._note_fault)
 
-    def _take_fault(self, fault: FileFault) -> None:
+    def _note_fault(self, fault: FileFault) -> None:
         if not fault.lost and fault.following > fault.base:
             self._sealer.submit(fault.base, fault.following)
         self._faults.append(fault)
@@ -122,24 +111,18 @@ class LogWriter:
     @property
     def durable_offset(self) -> Offset:
         """Every event below it is synced, and visible to readers."""
-        ending = self._ending.committed  # all of it is, when it has come to the next one's base
-        return ending if ending < self._active.base else self._active.committed
+        return self._active.committed
 
     @property
     def faults(self) -> Sequence[FileFault]:
-        """The files that had to be given up so far. A file is among them before `durable_offset`
-        passes the first event written behind it."""
+        """The files given up so far. A file is in the list before `durable_offset` passes the first
+        event written behind it."""
         return self._faults
 
     @property
     def sealing(self) -> Sealing:
-        """How far the sealing of finished segments is behind."""
+        """How far sealing is behind."""
         return Sealing(self._sealer.waiting, self._sealer.error)
-
-    def hurry(self, on: bool) -> None:
-        """Say whether more comes than can be taken. Sealing then waits, within bounds, for it takes
-        a processor and a disk that recording needs."""
-        self._sealer.hurry(on)
 
     def now_ns(self) -> int:
         """The writer's clock."""
@@ -154,18 +137,18 @@ class LogWriter:
         logged_ns: int | None = None,
         version: int = ENVELOPE_VERSION,
     ) -> int:
-        """Take one event; its offset. Commits when the fsync policy says so.
+        """Append one event; returns its offset. Commits when the fsync policy says so.
 
-        ``logged_ns`` is now by the writer's clock unless given; ``stamp_ns`` is the same unless
-        given; both are int nanoseconds from 0 to 2^63 - 1.
+        ``logged_ns`` defaults to now by the writer's clock, ``stamp_ns`` to ``logged_ns``; both are
+        int nanoseconds from 0 to 2^63 - 1.
         """
         logged = self._clock() if logged_ns is None else logged_ns
         stamp = logged if stamp_ns is None else stamp_ns
         return self.append_all([NewEvent(key, payload, logged, stamp, version)])
 
     def append_all(self, events: Sequence[NewEvent]) -> Offset:
-        """Take several events in order; the offset of the first. Commits in between as the policy
-        says, as `append` of each would. None is taken unless all times and sizes are in bounds."""
+        """Append several events in order; returns the offset of the first. Commits in between as
+        `append` of each would. Appends none unless all times and sizes are in bounds."""
         for event in events:
             if len(event.payload) > MAX_EVENT_BYTES:
                 raise LogError(
@@ -178,27 +161,29 @@ class LogWriter:
                     "from 0 to 2^63 - 1"
                 )
         first = self.next_offset
-        taken = 0
-        while taken < len(events):
-            taken += self._active.take(events, taken)
+        added = 0
+        while added < len(events):
+            added += self._active.add(events, added)
             self.commit_if_due()
         return first
 
     def commit_if_due(self) -> bool:
-        """Group commit and rotation by time; True when a commit was made or begun."""
-        begun = self._active.due() and self._commits.begin(self._active)
+        """Group commit and rotation by time; True when a commit was made."""
+        due = self._active.due()
+        if due:
+            self._active.commit()
         if self._full():
             self._rotate()
-        return begun
+        return due
 
     def sync(self) -> Offset:
-        """Commit everything appended; the durable offset, which is then `next_offset`."""
-        self._commits.finish(self._active)
+        """Commit everything appended; returns the durable offset, which is then `next_offset`."""
+        self._active.commit()
         return self.durable_offset
 
     def _full(self) -> bool:
         active = self._active
-        events = active.committed - active.file_base
+        events = active.committed - active.base
         return events > 0 and (
             active.size >= self._rotate_bytes
             or active.channels >= ROTATE_CHANNELS
@@ -207,36 +192,44 @@ class LogWriter:
         )
 
     def _rotate(self) -> None:
-        ending, following = self._active, self._next_segment(self._active.next_offset)
-        self._ending, self._active = ending, following  # first: if this fails, both refuse
-        self._commits.rotate(ending, following, lambda: self._submit(ending))
+        """Begin the next segment. Raises LogError; the writer then refuses further work."""
+        finished = self._active
+        following = self._new_segment(finished.next_offset)
+        try:
+            finished.finish()
+            following.create()
+        except OSError as error:
+            raise finished.refuse(
+                f"{self.path}: no new segment at offset {following.base}: "
+                f"{error.strerror or error}; every event before it is safe. "
+                "Free space or fix the disk, then start again"
+            ) from error
+        self._active = following
+        self._submit(finished)
 
-    def _submit(self, finished: ActiveSegment, *, last: bool = False) -> None:
-        self._sealer.submit(finished.file_base, finished.committed, last=last)
+    def _submit(self, finished: ActiveSegment) -> None:
+        self._sealer.submit(finished.base, finished.committed)
 
     def close(self) -> None:
-        """Commit, seal, let the next writer in. Raises LogError when the last events or the seal
-        could not be written, or a file had to be given up; the log is released either way."""
+        """Commit, seal, release the lock. Raises LogError when the last events or a sealed segment
+        could not be written, or a file was given up; the lock is released either way."""
         if self._closed:
             return
         self._closed = True
         try:
-            self._commits.settle()
             if self._active.waiting:
-                self._commits.finish(self._active)
+                self._active.commit()
             self._finish_active()
         finally:
-            self._commits.close()
-            self._ending.close()
             self._active.close()
             self._sealer.finish()
             self._lock.release()
         if self._faults:
-            raise LogError(self._told_of_faults())
+            raise LogError(self._describe_faults())
         if self._sealer.error is not None:
             raise self._sealer.error
 
-    def _told_of_faults(self) -> str:
+    def _describe_faults(self) -> str:
         more = f" (and {len(self._faults) - 1} more such files)" if len(self._faults) > 1 else ""
         return (
             f"{self._faults[0]}{more}; what was written from offset {self._faults[-1].following} "
@@ -246,10 +239,11 @@ class LogWriter:
         )
 
     def _finish_active(self) -> None:
-        """An empty segment stays only where it is all there is: it carries the log's id."""
-        if self._active.committed > self._active.file_base:
-            self._submit(self._active, last=True)
-        elif self._active.file_base > 0:
+        """Submit the last segment. An empty one is deleted unless it is the log's only one, which
+        carries the log's id."""
+        if self._active.committed > self._active.base:
+            self._submit(self._active)
+        elif self._active.base > 0:
             unlink_quietly(self._active.path)
 
     def __enter__(self) -> "LogWriter":
@@ -264,11 +258,11 @@ class LogWriter:
         if error is None:
             self.close()
             return
-        with contextlib.suppress(MapfoldError):  # the first error is the one to tell
+        with contextlib.suppress(MapfoldError):  # the first error is the one to report
             self.close()
 
 
-def _way_out(error: OSError) -> str:
+def _advice(error: OSError) -> str:
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return "free space on its disk and start again"
     return "check its rights, those of its folder, and its disk"

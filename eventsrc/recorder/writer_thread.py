@@ -256,7 +256,6 @@ class Writing:
         limit = _BATCH if self._room is None else min(_BATCH, self._room)
         closed = self._inbox.closed  # before taking: what came before the closing is still taken
         waiting = self._writer.durable_offset < self._writer.next_offset
-        self._writer.hurry(2 * self._inbox.depth() >= self._inbox.size)
         taken = self._inbox.take(limit, _UNSYNCED_S if waiting else _IDLE_S)
         batch = [message for message in taken if not message.key.endswith(SENT_SUFFIX)]
         self._in_hand = len(batch)

@@ -87,7 +87,7 @@ def record(
         RecorderEnd(log, json=json) as end,
         stop_on_signals() as stop,
         open_session(options, mode=options.mode) as session,
-        LogWriter(log, fsync=policy, overlap=True) as writer,
+        LogWriter(log, fsync=policy) as writer,
     ):
         say_restart(log, writer)
         recorder = Recorder(

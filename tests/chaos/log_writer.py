@@ -24,9 +24,7 @@ def payload_at(offset: int) -> bytes:
 
 def main(log: Path, fsync: str) -> None:
     """Write until killed."""
-    with LogWriter(
-        log, fsync=parse_fsync(fsync), rotate_events=ROTATE_EVENTS, overlap=True
-    ) as writer:
+    with LogWriter(log, fsync=parse_fsync(fsync), rotate_events=ROTATE_EVENTS) as writer:
         print("next", writer.next_offset, flush=True)
         said = writer.durable_offset
         while True:

@@ -2,23 +2,17 @@
 been called recorded is read back, none is made up, and the log is written on."""
 
 import shutil
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from eventsrc.errors import LogError
 from eventsrc.log import LogReader, LogWriter, recover_log
-from eventsrc.log import seal_worker as _sealer
 from eventsrc.log.durable_files import ALWAYS, FsyncPolicy
-from eventsrc.log.seal import SegmentPlan
-from eventsrc.log.seal_worker import SealingProcess, answer
 from tests.fixtures_log import BY_HAND, KEY, read_log
 from tests.power_loss import Call, Tracer, power_cuts
 
-TIMEOUT_S = 30
 THREE = FsyncPolicy(interval_ns=10**18, max_events=3)
 
 
@@ -49,39 +43,6 @@ def one_life(tracer: Tracer, policy: FsyncPolicy) -> None:
     tracer.promise = 10
 
 
-class TracedProcess(SealingProcess):
-    """The sealing process's work, done where it can be traced."""
-
-    done = threading.Event()
-
-    def __init__(self) -> None:
-        """No process."""
-
-    def seal(self, plan: SegmentPlan) -> str:
-        sha256 = super().seal(plan)
-        self.done.set()
-        return sha256
-
-    def _ask(self, question: dict[str, Any]) -> dict[str, Any]:
-        return answer(question, Path(question["log"]) / f"{question['base']:020d}.7.mcap.sealing")
-
-    def close(self) -> None:
-        """Nothing to close."""
-
-
-def overlapped_life(tracer: Tracer) -> None:
-    """Commits in another thread and seals as in another process."""
-    TracedProcess.done.clear()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_sealer, "SealingProcess", TracedProcess)
-        with LogWriter(tracer.folder, fsync=THREE, overlap=True, rotate_events=6) as writer:
-            append(tracer, writer, 7)
-            tracer.promise = writer.sync()
-            append(tracer, writer, 1)
-            assert TracedProcess.done.wait(TIMEOUT_S)
-    tracer.promise = 8
-
-
 def killed_and_restarted(tracer: Tracer) -> None:
     """A process dies without a word; the next one seals what it left."""
     writer = LogWriter(tracer.folder, fsync=BY_HAND)
@@ -105,7 +66,6 @@ def killed_and_recovered(tracer: Tracer) -> None:
 LIVES: dict[str, Callable[[Tracer], None]] = {
     "always": lambda tracer: one_life(tracer, ALWAYS),
     "groups": lambda tracer: one_life(tracer, THREE),
-    "groups overlapped": overlapped_life,
     "killed and restarted": killed_and_restarted,
     "killed and recovered": killed_and_recovered,
 }

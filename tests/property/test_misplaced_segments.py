@@ -47,7 +47,7 @@ def leave_active(path: Path, base: int) -> Path:
     active = ActiveSegment(path, log_id, base, ALWAYS)
     active.create()
     for number, payload in enumerate(events, start=base):
-        active.take([NewEvent(KEY, payload, 1000 + number, number, 2)], 0)
+        active.add([NewEvent(KEY, payload, 1000 + number, number, 2)], 0)
         active.commit()
     active.close()
     return segment_path(path, base, ACTIVE)

@@ -4,14 +4,10 @@ A crash is a copy of the folder as another process would find it: the writer's u
 are gone, and the growing file may be cut anywhere behind its last synced byte, with or without its
 last commit mark.
 
-A writer that overlaps commits in a thread of its own, so what is durable moves by itself: what it
-was before a crash must be there after it, and what is shown may be ahead of it by a group.
-
 Every step waits for the sealing it began: Hypothesis replays what it finds, and a step whose end
 depends on how far another thread has come does not replay. What readers see while a segment is
 being sealed is asked where the moment can be chosen (tests/unit/test_log_commit.py) and under load
-(tests/integration/test_log_tail.py). Sealing in a process is left out, for starting one takes
-longer than all else here; tests/integration/test_log_aside.py has it.
+(tests/integration/test_log_tail.py).
 """
 
 import contextlib
@@ -20,26 +16,19 @@ import tempfile
 import threading
 from pathlib import Path
 
-import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from eventsrc.errors import LogError
 from eventsrc.log import Event, FsyncPolicy, LogReader, LogWriter, follow, recover_log, verify_log
-from eventsrc.log import seal_worker as _sealer
 from eventsrc.log.mcap_records import MARK_BYTES
-from eventsrc.log.seal_worker import ProcessGone
 from eventsrc.log_info import log_info
 from tests.fixtures_log import BY_HAND, MEMORY_DISK
 
 KEYS = ["tb/detections", "other/key", "mapfold/loss"]
 PAYLOADS = st.binary(max_size=40)
 IN_THREES = FsyncPolicy(interval_ns=10**18, max_events=3)
-
-
-def _no_process() -> None:
-    raise ProcessGone("not here")
 
 
 class LogMachine(RuleBasedStateMachine):
@@ -54,13 +43,13 @@ class LogMachine(RuleBasedStateMachine):
         self.written: list[Event] = []
         self.durable = 0
         self.stop = threading.Event()
-        self.patch = pytest.MonkeyPatch()
-        self.patch.setattr(_sealer, "SealingProcess", _no_process)
 
-    @initialize(rotate_events=st.sampled_from([1, 5, 1000]), overlap=st.booleans())
-    def begin(self, rotate_events: int, overlap: bool) -> None:
+    @initialize(
+        rotate_events=st.sampled_from([1, 5, 1000]), policy=st.sampled_from([BY_HAND, IN_THREES])
+    )
+    def begin(self, rotate_events: int, policy: FsyncPolicy) -> None:
         self.rotate_events = rotate_events
-        self.overlap = overlap
+        self.policy = policy
         self.writer: LogWriter | None = None
         self.open_writer()
         self.tail = follow(self.path, 0, stop=self.stop)
@@ -69,9 +58,8 @@ class LogMachine(RuleBasedStateMachine):
     def open_writer(self) -> None:
         self.writer = LogWriter(
             self.path,
-            fsync=IN_THREES if self.overlap else BY_HAND,
+            fsync=self.policy,
             rotate_events=self.rotate_events,
-            overlap=self.overlap,
         )
         self.base = self.writer._active.base
         self.writer._sealer.finish()  # of what its predecessor left
@@ -81,11 +69,10 @@ class LogMachine(RuleBasedStateMachine):
         assert self.durable == len(self.written)
 
     def let_seal(self) -> None:
-        """Wait for the rotation that was begun, if one was, and for the sealing behind it."""
+        """Wait for the sealing that a rotation began, if there was one."""
         assert self.writer is not None
         if self.writer._active.base > self.base:
             self.base = self.writer._active.base
-            self.writer._commits.settle()
             self.writer._sealer.finish()
 
     def note_durable(self) -> None:
@@ -182,8 +169,7 @@ class LogMachine(RuleBasedStateMachine):
         with LogReader(self.path) as reader:
             shown = self.written[: reader.next_offset]
             if self.writer is not None:
-                ahead = len(self.written) if self.overlap else self.durable
-                assert self.durable <= reader.next_offset <= ahead
+                assert reader.next_offset == self.durable
             expected = [e for e in shown[start:end] if keys is None or e.key in keys]
             assert list(reader.read(start, end, keys=keys)) == expected
 
@@ -195,8 +181,7 @@ class LogMachine(RuleBasedStateMachine):
             assert event == self.written[self.tailed]
             self.tailed += 1
         if self.writer is not None:
-            assert self.tailed >= self.durable
-            assert self.tailed == self.durable or self.overlap
+            assert self.tailed == self.durable
 
     @precondition(lambda self: self.writer is None)
     @rule()
@@ -208,16 +193,13 @@ class LogMachine(RuleBasedStateMachine):
     @invariant()
     def nothing_durable_is_gone(self) -> None:
         if self.writer is not None:
-            before = self.durable
-            self.note_durable()
-            assert self.durable == before or self.overlap
+            assert self.writer.durable_offset == self.durable
 
     def teardown(self) -> None:
         self.stop.set()
         self.tail.close()
         if self.writer is not None:
             self.writer.close()
-        self.patch.undo()
         shutil.rmtree(self.folder)
 
 

@@ -1,5 +1,7 @@
-"""When events are committed, when segments rotate, and what sealing may not hold up."""
+"""Group commit, rotation, appending in batches, failing disks, and reading beside sealing."""
 
+import contextlib
+import errno
 import os
 import threading
 import tracemalloc
@@ -8,17 +10,35 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from eventsrc.errors import LogError, MisuseError
-from eventsrc.log import ALWAYS, GROUP_COMMIT, NEVER, LogReader, LogWriter, parse_fsync, verify_log
+from eventsrc.log import (
+    ALWAYS,
+    GROUP_COMMIT,
+    NEVER,
+    LogReader,
+    LogWriter,
+    NewEvent,
+    parse_fsync,
+    verify_log,
+)
 from eventsrc.log import active_segment as _active
 from eventsrc.log import seal_worker as _sealer
+from eventsrc.log.active_segment import ActiveSegment
 from eventsrc.log.durable_files import FsyncPolicy
 from eventsrc.log.seal import SegmentPlan, seal
 from eventsrc.log_info import log_info
 from tests.fixtures_log import BY_HAND, KEY, read_log
 
 TIMEOUT_S = 30
+FOUR = FsyncPolicy(interval_ns=10**18, max_events=4)
+
+
+def new(*payloads: bytes) -> list[NewEvent]:
+    """Events to append."""
+    return [NewEvent(KEY, payload, 10 + n, n) for n, payload in enumerate(payloads)]
 
 
 def test_fsync_as_people_write_it() -> None:
@@ -225,6 +245,85 @@ def test_times_out_of_bounds_are_refused(log_path: Path) -> None:
             with pytest.raises(LogError, match="nanoseconds"):
                 writer.append(KEY, b"x", **times)
         assert writer.next_offset == 0
+
+
+def test_times_out_of_bounds_refuse_the_whole_batch(log_path: Path) -> None:
+    with LogWriter(log_path) as writer:
+        with pytest.raises(LogError, match="nanoseconds"):
+            writer.append_all([*new(b"good"), NewEvent(KEY, b"bad", -1, 0)])
+        assert writer.next_offset == 0
+
+
+def test_with_fsync_always_each_append_is_synced_and_visible(log_path: Path) -> None:
+    with LogWriter(log_path, fsync=ALWAYS) as writer:
+        for number in range(1, 4):
+            writer.append(KEY, b"x")
+            assert writer.durable_offset == number
+            with LogReader(log_path) as reader:
+                assert reader.next_offset == number
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    batches=st.lists(st.lists(st.binary(max_size=20), max_size=30), max_size=8),
+    policy=st.sampled_from([ALWAYS, FOUR, GROUP_COMMIT, BY_HAND]),
+    rotate_events=st.sampled_from([1, 7, 1000]),
+)
+def test_batches_and_single_appends_make_the_same_log_with_at_most_one_group_unsynced(
+    batches: list[list[bytes]],
+    policy: FsyncPolicy,
+    rotate_events: int,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    folder = tmp_path_factory.mktemp("logs")
+    with LogWriter(
+        folder / "batches", fsync=policy, rotate_events=rotate_events, clock=lambda: 7
+    ) as writer:
+        for batch in batches:
+            first = writer.next_offset
+            assert writer.append_all(new(*batch)) == first
+            assert writer.next_offset == first + len(batch)
+            assert writer.next_offset - writer.durable_offset < policy.max_events
+    with LogWriter(folder / "single", fsync=policy, clock=lambda: 7) as writer:
+        for batch in batches:
+            for event in new(*batch):
+                writer.append(
+                    KEY, event.payload, stamp_ns=event.stamp_ns, logged_ns=event.logged_ns
+                )
+    events = read_log(folder / "batches")
+    assert events == read_log(folder / "single")
+    assert [e.payload for e in events] == [payload for batch in batches for payload in batch]
+
+
+def test_a_next_segment_that_cannot_be_made_ends_the_writer(
+    log_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = LogWriter(log_path, fsync=FOUR, rotate_events=4)
+    writer.append_all(new(b"s", b"a", b"f"))
+    with monkeypatch.context() as patch:
+        patch.setattr(ActiveSegment, "create", refuse)
+        with pytest.raises(LogError, match=r"no new segment at offset \d+: No space left"):
+            append_for_ever(writer)
+        with pytest.raises(LogError, match="no new segment"):
+            writer.append(KEY, b"never")
+        kept = writer.durable_offset
+        assert kept >= 4
+        with contextlib.suppress(LogError):
+            writer.close()
+    assert len(read_log(log_path)) == kept
+    with LogWriter(log_path) as again:
+        assert again.next_offset == kept
+
+
+def refuse(_: ActiveSegment) -> None:
+    """A disk that is full."""
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def append_for_ever(writer: LogWriter) -> None:
+    """Until the writer refuses."""
+    while True:
+        writer.append_all(new(b"unsure"))
 
 
 def test_the_end_of_a_long_log_is_read_without_the_rest(

@@ -66,12 +66,11 @@ def write(writer: LogWriter, numbers: range) -> None:
         writer.sync()
 
 
-@pytest.mark.parametrize("overlap", [False, True])
 @pytest.mark.parametrize("tamper", TAKEN)
 def test_what_comes_after_is_recorded_behind_it_in_a_new_file(
-    log_path: Path, tamper: Tamper, overlap: bool
+    log_path: Path, tamper: Tamper
 ) -> None:
-    writer = LogWriter(log_path, fsync=BY_HAND, overlap=overlap)
+    writer = LogWriter(log_path, fsync=BY_HAND)
     write(writer, range(BEFORE))
     old = growing(log_path)
     tamper(old)

@@ -19,10 +19,10 @@ def _payload(number: int) -> bytes:
     return envelope(number, note=f"{number:08d}" * (SIZE // 8))
 
 
-@pytest.fixture(params=[True, False], ids=["overlap", "in turn"])
-def log(request: pytest.FixtureRequest, log_path: Path) -> Path:
+@pytest.fixture
+def log(log_path: Path) -> Path:
     """Small events around large ones, in two sealed segments."""
-    with LogWriter(log_path, overlap=request.param, rotate_bytes=20_000_000) as writer:
+    with LogWriter(log_path, rotate_bytes=20_000_000) as writer:
         for number in range(COUNT):
             writer.append(KEY, envelope(100 + number), stamp_ns=100 + number)
             writer.append(KEY, _payload(number), stamp_ns=number)

@@ -2,8 +2,6 @@
 
 import errno
 import os
-import shutil
-import threading
 import zlib
 from pathlib import Path
 
@@ -16,8 +14,6 @@ from eventsrc.log import seal_worker as _sealer
 from eventsrc.log.format import ACTIVE, HEAD_BYTES, SEALED, read_head, segment_path
 from eventsrc.log.seal_worker import Sealer
 from tests.fixtures_log import KEY, flip, read_log
-
-TIMEOUT_S = 30
 
 
 class Disk:
@@ -102,11 +98,10 @@ def test_a_folder_that_cannot_be_synced_is_tried_again(
     assert {f.kind for f in verify_log(log_path).findings} == {"schema"}
 
 
-@pytest.mark.parametrize("aside", [False, True])
-def test_a_segment_that_contradicts_itself_is_told_and_kept(log_path: Path, aside: bool) -> None:
+def test_a_segment_that_contradicts_itself_is_told_and_kept(log_path: Path) -> None:
     """Its CRC holds, so only who takes it apart can tell."""
     sealer = segments(log_path, 2)
-    sealer = Sealer(log_path, LogReader(log_path).log_id, "", aside=aside)
+    sealer = Sealer(log_path, LogReader(log_path).log_id, "")
     active = segment_path(log_path, 0, ACTIVE)
     active.write_bytes(with_a_cut_message(active.read_bytes()))
     sealer.submit(0, 1)
@@ -122,10 +117,7 @@ def test_a_segment_that_contradicts_itself_is_told_and_kept(log_path: Path, asid
 
 
 @pytest.mark.parametrize("at", [3, -10], ids=["chunk head", "commit mark"])
-@pytest.mark.parametrize("aside", [False, True])
-def test_what_hides_behind_a_rotten_frame_is_not_sealed_away(
-    log_path: Path, at: int, aside: bool
-) -> None:
+def test_what_hides_behind_a_rotten_frame_is_not_sealed_away(log_path: Path, at: int) -> None:
     """Readers see nothing behind it, so a sealed segment of what they see would be all there is."""
     writer = LogWriter(log_path, fsync=ALWAYS)
     writer._sealer.submit = lambda *_, **__: None  # type: ignore[method-assign]
@@ -136,7 +128,7 @@ def test_what_hides_behind_a_rotten_frame_is_not_sealed_away(
         ends.append(active.stat().st_size)
     writer.close()
     flip(active, ends[0] + at if at > 0 else ends[1] + at)
-    sealer = Sealer(log_path, writer.log_id, "", aside=aside)
+    sealer = Sealer(log_path, writer.log_id, "")
     sealer.submit(0, 4)
     sealer.finish()
     with pytest.raises(LogError, match=r"offsets 1 to 3 were recorded .* log recover"):
@@ -172,52 +164,3 @@ def test_a_full_disk_is_no_question_of_rights(
     monkeypatch.setattr("eventsrc.log.active_segment.sync_file", refuse)
     with pytest.raises(LogError, match="No space left on device; free space on its disk"):
         LogWriter(log_path)
-
-
-def test_a_recording_in_a_hurry_is_not_disturbed_until_too_much_waits(
-    log_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(_sealer, "_MOST_WAITING", 3)
-    monkeypatch.setattr(_sealer, "_LOOK_AGAIN_S", 0.001)
-    real, sealed = _sealer.seal, threading.Semaphore(0)
-
-    def seal(*args: object) -> str:
-        sha256 = real(*args)  # type: ignore[arg-type]
-        sealed.release()
-        return sha256
-
-    monkeypatch.setattr(_sealer, "seal", seal)
-    with LogWriter(log_path, fsync=ALWAYS, rotate_events=1) as writer:
-        writer.hurry(True)
-        writer.append(KEY, b"0")
-        writer.append(KEY, b"1")
-        assert not sealed.acquire(timeout=0.05)
-        writer.append(KEY, b"2")
-        assert sealed.acquire(timeout=TIMEOUT_S)  # three waited
-        assert not sealed.acquire(timeout=0.05)
-        writer.hurry(False)
-        assert sealed.acquire(timeout=TIMEOUT_S)
-        writer.hurry(True)
-        writer.append(KEY, b"3")
-    assert writer.sealing == (0, None)  # closing waits for all
-
-
-def test_a_disk_that_gets_full_is_a_reason_to_seal(
-    log_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    usage = shutil.disk_usage(log_path.parent)
-    sealed = threading.Event()
-    real = _sealer.seal
-
-    def seal(*args: object) -> str:
-        sealed.set()
-        return real(*args)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(_sealer, "seal", seal)
-    monkeypatch.setattr(_sealer, "_LOOK_AGAIN_S", 0.001)
-    with LogWriter(log_path, fsync=ALWAYS, rotate_events=1) as writer:
-        writer.hurry(True)
-        writer.append(KEY, b"0")
-        assert not sealed.wait(0.05)
-        monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1000))
-        assert sealed.wait(TIMEOUT_S)

@@ -1,1 +1,1 @@
-"""How fast the log is, as ratios to something bare measured in the same run."""
+"""Benchmark of the log, beside bare loops measured in the same run."""

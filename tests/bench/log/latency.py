@@ -1,4 +1,4 @@
-"""From `publish` in one process to the event in the hands of a tail in another."""
+"""Latency from `publish` in one process to the delivery by a tail in another."""
 
 import json
 import statistics
@@ -65,7 +65,7 @@ def latency(log: Path, fsync: FsyncPolicy, seconds: float) -> Latency:
     with program(ROUTER) as router:
         endpoint = said(router)
         with (
-            LogWriter(log, fsync=fsync, overlap=True) as writer,
+            LogWriter(log, fsync=fsync) as writer,
             open_session(ZenohOptions(connect=(endpoint,)), mode="client") as session,
         ):
             recorder = Recorder(session, writer, [KEY], max_events=count)

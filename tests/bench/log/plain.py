@@ -1,4 +1,4 @@
-"""The bare loops that the log is compared with: no format, no checks, no offsets."""
+"""The floor: bare loops without format, checks or offsets."""
 
 import os
 import time
@@ -14,7 +14,7 @@ from .payloads import Payloads
 
 
 class PlainFile:
-    """Bytes to one file, synced as group commit would."""
+    """A file that is synced as often as group commit does."""
 
     def __init__(self, path: Path) -> None:
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
@@ -23,7 +23,7 @@ class PlainFile:
         self.count = 0
 
     def append(self, data: bytes) -> None:
-        """Write, and sync when it is time."""
+        """Write, and sync when due."""
         os.write(self._fd, data)
         self.count += 1
         self._waiting += 1
@@ -49,9 +49,8 @@ class PlainFile:
         os.close(self._fd)
 
 
-def append_plain(path: Path, payloads: Payloads, seconds: float, most: int) -> float:
-    """A bare loop that syncs every ``most`` events, or sooner as group commit does: events a
-    second."""
+def append_plain(path: Path, payloads: Payloads, seconds: float) -> float:
+    """A bare loop that syncs as often as group commit does: events a second."""
     fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     start = synced = time.perf_counter()
     count = waiting = 0
@@ -59,7 +58,7 @@ def append_plain(path: Path, payloads: Payloads, seconds: float, most: int) -> f
         os.write(fd, payloads[count])
         count += 1
         waiting += 1
-        if waiting == most or now - synced > GROUP_COMMIT.interval_ns / 1e9:
+        if waiting == GROUP_COMMIT.max_events or now - synced > GROUP_COMMIT.interval_ns / 1e9:
             sync_file(fd)
             synced, waiting = time.perf_counter(), 0
     sync_file(fd)

@@ -1,4 +1,4 @@
-"""Recording through a loopback router: three processes, as in life."""
+"""Recording through a loopback router: publisher, router and recorder in processes of their own."""
 
 import subprocess
 import sys
@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from eventsrc.log import LogWriter
-from eventsrc.log import active_segment as _active
 from eventsrc.log.durable_files import FsyncPolicy
 from eventsrc.log_info import log_info
 from eventsrc.recorder import Recorder
@@ -49,14 +48,14 @@ with open_session(ZenohOptions(connect=(endpoint,)), mode="client") as session:
     sys.stdin.read()
 """
 UNPACED = float("inf")
-"""As fast as the network takes it: a reliable publisher that blocks is slowed down, and loses
-nothing, when who receives cannot keep up."""
+"""As fast as the recorder takes it: a reliable, blocking publisher is slowed down and loses nothing
+when the receiver cannot keep up."""
 ROOT = Path(__file__).parents[3]
 
 
 @contextmanager
 def program(code: str, *args: str) -> Iterator["subprocess.Popen[str]"]:
-    """Python code in a process of its own, which ends when its standard input does."""
+    """Python code in a process of its own, which ends when its standard input is closed."""
     command = [sys.executable, "-c", code, *args]
     with subprocess.Popen(
         command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -74,25 +73,24 @@ def said(process: "subprocess.Popen[str]") -> str:
 
 @dataclass(frozen=True)
 class Recording:
-    """``lost`` are messages published and not recorded; the rate is events a second, from the first
-    one's logging to the last one's. ``syncs`` are those of events; ``unsealed`` segments were left
-    when that was done, and sealing them took ``sealing_s`` more."""
+    """``per_s`` is events a second from the logging of the first to that of the last. ``unsealed``
+    segments were left at the end, and sealing them took ``sealing_s`` seconds more."""
 
     published: int
     recorded: int
     per_s: float
-    syncs: int
     unsealed: int
     sealing_s: float
 
     @property
     def lost(self) -> int:
-        """What did not get there."""
+        """Messages published and not recorded."""
         return self.published - self.recorded
 
 
 class _Until:
-    """Sets ``stop`` when all that a publisher says it published has come, or after a while."""
+    """Sets ``stop`` when everything that a publisher says it published has come, or when it takes
+    too long."""
 
     def __init__(self, publisher: "subprocess.Popen[str]", seconds: float) -> None:
         self.stop = threading.Event()
@@ -105,13 +103,13 @@ class _Until:
     def _listen(self, publisher: "subprocess.Popen[str]") -> None:
         self.published = int(said(publisher))
 
-    def look(self, arrived: int) -> None:
-        """Called now and then with what has come so far."""
+    def check(self, arrived: int) -> None:
+        """To be called from time to time with the number of messages so far."""
         if self.published and arrived >= self.published:
             self.stop.set()
 
     def end(self) -> None:
-        """Nobody waits any more."""
+        """End the timer and the thread."""
         self._give_up.cancel()
         self._listener.join()
 
@@ -121,44 +119,26 @@ def record(log: Path, fsync: FsyncPolicy, rate: float, seconds: float) -> Record
     with program(ROUTER) as router:
         endpoint = said(router)
         with (
-            counted_syncs() as syncs,
-            LogWriter(log, fsync=fsync, overlap=True) as writer,
+            LogWriter(log, fsync=fsync) as writer,
             open_session(ZenohOptions(connect=(endpoint,)), mode="client") as session,
         ):
             recorder = Recorder(session, writer, [KEY])
             with program(PUBLISHER, endpoint, str(rate), str(seconds)) as publisher:
                 until = _Until(publisher, seconds)
                 report = recorder.run(
-                    until.stop, every_s=0.05, watch=lambda now: until.look(now.recorded)
+                    until.stop, every_s=0.05, watch=lambda now: until.check(now.recorded)
                 )
                 until.end()
             unsealed = len(list(log.glob("*.active"))) - 1
             begun = time.perf_counter()
     sealing_s = time.perf_counter() - begun
     per_s = _logged_per_s(log)
-    return Recording(until.published, report.recorded, per_s, len(syncs), unsealed, sealing_s)
-
-
-@contextmanager
-def counted_syncs() -> Iterator[list[int]]:
-    """Grows by one with each sync of a growing segment in this process; few are not of events."""
-    syncs: list[int] = []
-    real = _active.sync_file
-
-    def sync_file(fd: int) -> None:
-        real(fd)
-        syncs.append(fd)
-
-    _active.sync_file = sync_file  # type: ignore[attr-defined]
-    try:
-        yield syncs
-    finally:
-        _active.sync_file = real  # type: ignore[attr-defined]
+    return Recording(until.published, report.recorded, per_s, unsealed, sealing_s)
 
 
 def subscribe_plain(path: Path, seconds: float) -> float:
-    """What Zenoh itself takes: the same bytes through such a router to a plain file, with the same
-    syncs and nothing else; events a second."""
+    """The floor with Zenoh: the same bytes through a router to a plain file, with the same syncs
+    and nothing else; events a second."""
     with program(ROUTER) as router, PlainFile(path) as file:
         endpoint = said(router)
         with open_session(ZenohOptions(connect=(endpoint,)), mode="client") as session:
@@ -167,7 +147,7 @@ def subscribe_plain(path: Path, seconds: float) -> float:
             with program(PUBLISHER, endpoint, str(UNPACED), str(seconds)) as publisher:
                 until = _Until(publisher, seconds)
                 while not until.stop.wait(0.05):
-                    until.look(file.count)
+                    until.check(file.count)
                 until.end()
             return file.per_s
 
