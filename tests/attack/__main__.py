@@ -1,4 +1,4 @@
-"""Attacks the real commands and says what held: see `tests.attack`."""
+"""Attack the real commands and report what held: see `tests.attack`."""
 
 import argparse
 import random
@@ -34,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return stack.enter_context(server_to_kill()).url
 
         for number, name in _schedule(names, args.seconds, args.round):
-            _fight(name, number, args.seed, tallies[name], database)
+            _play_round(name, number, args.seed, tallies[name], database)
     print(table([*tallies.values()]))
     repeat = f"scripts/attack --seed {args.seed}"
     for tally in tallies.values():
@@ -68,12 +68,14 @@ def _schedule(
             yield number, name
 
 
-def _fight(name: str, number: int, seed: int, tally: Tally, database: Callable[[], str]) -> None:
+def _play_round(
+    name: str, number: int, seed: int, tally: Tally, database: Callable[[], str]
+) -> None:
     begun = time.monotonic()
-    chance = random.Random(f"{seed} {name} {number}")
+    rng = random.Random(f"{seed} {name} {number}")
     with (
         tempfile.TemporaryDirectory(prefix="mapfold-attack-") as folder,
-        Arena(Path(folder), number, chance, tally, database) as arena,
+        Arena(Path(folder), number, rng, tally, database) as arena,
     ):
         arena.attempt("it", lambda: ATTACKS[name](arena))
     tally.rounds += 1

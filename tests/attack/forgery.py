@@ -1,4 +1,4 @@
-"""Commit marks that no log wrote, laid out by hand (docs/log-format.md)."""
+"""Forged commit marks (docs/log-format.md)."""
 
 import re
 import struct
@@ -16,7 +16,7 @@ def mark(first: int, following: int, seed: int = 0) -> bytes:
 
 
 def seed_of(segment: bytes) -> int:
-    """What the marks of a growing segment are made with, which who can read the file knows."""
+    """The seed of the marks of a growing segment, read from the file; 0 if it has none."""
     found = _SEED.search(segment)
     return int(found[1], 16) if found else 0
 

@@ -1,4 +1,4 @@
-"""What was sent and what was acknowledged, kept outside of the processes that are attacked."""
+"""Sent and acknowledged payloads, kept outside of the attacked processes."""
 
 import hashlib
 import threading
@@ -12,7 +12,7 @@ from eventsrc.system_events import is_system_key
 
 
 def digest(payload: bytes) -> bytes:
-    """The name of a payload."""
+    """The SHA-256 that names a payload."""
     return hashlib.sha256(payload).digest()
 
 
@@ -35,28 +35,28 @@ class Oracle:
         self._acknowledged: set[bytes] = set()
         self._at: dict[int, bytes] = {}
         self.destroyed: set[bytes] = set()
-        """What the attacker took from the disk after it was acknowledged: no recorder's fault."""
+        """Acknowledged payloads that the attack itself removed from the disk."""
 
     def sent(self, payload: bytes) -> None:
-        """Somebody sends this."""
+        """Note a payload that is about to be sent."""
         with self._lock:
             self._sent.add(digest(payload))
 
     def acknowledged(self, digests: Iterable[bytes]) -> None:
-        """A recorder said that it has these on disk."""
+        """Note payloads that a recorder has acknowledged."""
         with self._lock:
             self._acknowledged.update(digests)
 
     def wrote(self, offset: int, payload: bytes) -> None:
-        """This is synced at ``offset``."""
+        """Note a payload that is synced at ``offset``."""
         with self._lock:
             self._sent.add(digest(payload))
             self._acknowledged.add(digest(payload))
             self._at[offset] = digest(payload)
 
     def forget_promises(self) -> None:
-        """The attacker destroyed what he could not tell: events may be missing, but none made up
-        and none at another offset."""
+        """The attack destroyed unknown events: any may be missing from now on, but none may be
+        invented or change its offset."""
         with self._lock:
             self.destroyed |= self._acknowledged
 

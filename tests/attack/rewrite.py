@@ -1,4 +1,4 @@
-"""An MCAP file as another tool writes it anew: by the mcap package, in order of log time."""
+"""Rewrite an MCAP file with the mcap package, in order of log time, as other tools do."""
 
 from io import BytesIO
 from pathlib import Path

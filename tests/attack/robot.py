@@ -1,4 +1,4 @@
-"""An honest robot: publishes through its spool, and knows what a recorder acknowledged."""
+"""An honest robot that publishes through its spool and notes what was acknowledged."""
 
 import json
 import threading

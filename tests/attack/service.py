@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from tests.attack.arena import Arena
-from tests.attack.victim import Victim
+from tests.attack.attacked_command import AttackedCommand
 from tests.logs import walk, write_log
 
 
@@ -11,7 +11,7 @@ from tests.logs import walk, write_log
 class Service:
     """The server, and where it answers over HTTP."""
 
-    server: Victim
+    server: AttackedCommand
     url: str
 
 

@@ -1,4 +1,4 @@
-"""What an attack has come to, and the table that says it of all of them."""
+"""The results of an attack, and a table of all of them."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -29,20 +29,20 @@ class Tally:
     slowest_s: float = 0.0
     complaints: list[str] = field(default_factory=list)
 
-    def weigh(self, role: str, peak_mb: float, command: str) -> None:
-        """A command has ended that took so much memory."""
+    def note_memory(self, role: str, peak_mb: float, command: str) -> None:
+        """Note the peak memory of a command that has ended."""
         self.peak_mb[role] = max(self.peak_mb[role], peak_mb)
         if role in _ROLES and peak_mb > MEMORY_LIMIT_MB:
             self.complaints.append(f"{command} took {peak_mb:,.0f} MB")
 
     def answered(self, after_s: float) -> None:
-        """An honest question was answered."""
+        """Note the time of an answer to an honest question."""
         self.answers += 1
         self.slowest_s = max(self.slowest_s, after_s)
 
     @property
     def held(self) -> bool:
-        """Whether everything was as it must be."""
+        """Whether no rule was violated."""
         bad = self.lost or self.invented or self.tracebacks or self.complaints
         return not bad and self.slowest_s <= ANSWER_LIMIT_S
 

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.attack.attacked_command import _MAPFOLD, AttackedCommand
 from tests.attack.oracle import Judgement, Oracle, digest
 from tests.attack.tally import ANSWER_LIMIT_S, MEMORY_LIMIT_MB, Tally, table
-from tests.attack.victim import _MAPFOLD, Victim
 from tests.fixtures_log import envelope, write_log
 
 PAYLOADS = [envelope(k) for k in range(4)]
@@ -53,7 +53,7 @@ def _harmed() -> Iterator[Tally]:
         setattr(tally, change, 1)
         yield tally
     large, slow, told = Tally("large"), Tally("slow"), Tally("told")
-    large.weigh("reader", MEMORY_LIMIT_MB + 1, "mapfold log info")
+    large.note_memory("reader", MEMORY_LIMIT_MB + 1, "mapfold log info")
     slow.answered(ANSWER_LIMIT_S + 0.1)
     told.complaints.append("something")
     yield from (large, slow, told)
@@ -67,7 +67,7 @@ def test_each_kind_of_harm_is_a_violation(tally: Tally) -> None:
 
 def test_a_tally_without_harm_holds() -> None:
     tally = Tally("calm", rounds=2, acknowledged=1_000)
-    tally.weigh("recorder", MEMORY_LIMIT_MB - 1, "mapfold record")
+    tally.note_memory("recorder", MEMORY_LIMIT_MB - 1, "mapfold record")
     tally.answered(ANSWER_LIMIT_S - 0.1)
     assert tally.held
     assert table([tally]).endswith("yes")
@@ -77,22 +77,22 @@ def test_a_traceback_and_the_memory_of_a_command_are_seen(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     failing = _MAPFOLD.replace("main()", "bytearray(100_000_000); 1 / 0")
-    monkeypatch.setattr("tests.attack.victim._MAPFOLD", failing)
-    victim = Victim("reader", [], env={}, cwd=tmp_path)
+    monkeypatch.setattr("tests.attack.attacked_command._MAPFOLD", failing)
+    attacked = AttackedCommand("reader", [], env={}, cwd=tmp_path)
     try:
-        assert victim.wait() == 1
-        assert victim.faults() == ["Traceback (most recent call last):"]
-        assert 100 < victim.peak_mb() < 1_000
+        assert attacked.wait() == 1
+        assert attacked.faults() == ["Traceback (most recent call last):"]
+        assert 100 < attacked.peak_mb() < 1_000
     finally:
-        victim.close()
+        attacked.close()
 
 
 def test_a_command_leaves_its_numbers_behind(tmp_path: Path) -> None:
-    victim = Victim("reader", ["--help"], env={"PATH": ""}, cwd=tmp_path)
+    attacked = AttackedCommand("reader", ["--help"], env={"PATH": ""}, cwd=tmp_path)
     try:
-        assert victim.wait() == 0, victim.lines
-        assert "record" in victim.output()
-        assert victim.peak_mb() > 10
-        assert victim.faults() == []
+        assert attacked.wait() == 0, attacked.lines
+        assert "record" in attacked.output()
+        assert attacked.peak_mb() > 10
+        assert attacked.faults() == []
     finally:
-        victim.close()
+        attacked.close()

@@ -1,4 +1,4 @@
-"""One target under atheris, which sees what an input reaches and keeps those that reach more.
+"""Run one target under atheris, guided by coverage.
 
 python -m tests.fuzz.guided TARGET CORPUS [libFuzzer options]
 """
@@ -17,10 +17,10 @@ def main() -> None:
     target = TARGETS[sys.argv.pop(1)]
 
     def mutate(data: bytes, max_size: int, seed: int) -> bytes:
-        chance = random.Random(seed)
-        if chance.random() < 0.2:
+        rng = random.Random(seed)
+        if rng.random() < 0.2:
             return bytes(atheris.Mutate(data, max_size))
-        return target.maul(data, chance)[:max_size]
+        return target.mutate(data, rng)[:max_size]
 
     atheris.Setup(sys.argv, target.check, custom_mutator=mutate)
     atheris.Fuzz()

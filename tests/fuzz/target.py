@@ -21,18 +21,18 @@ class Target(ABC):
         """Valid inputs."""
 
     @abstractmethod
-    def maul(self, data: bytes, chance: random.Random) -> bytes:
+    def mutate(self, data: bytes, rng: random.Random) -> bytes:
         """``data``, which need not be valid, with something about it changed."""
 
     @abstractmethod
     def check(self, data: bytes) -> None:
         """Read ``data``. Raises whatever is no documented error; AssertionError: it is misread."""
 
-    def mauled_seed(self, chance: random.Random) -> bytes:
+    def mutated_seed(self, rng: random.Random) -> bytes:
         """A valid input that was damaged once or a few times."""
-        data = chance.choice(self._seeds())
-        for _ in range(chance.choice((1, 1, 2, 4))):
-            data = self.maul(data, chance)
+        data = rng.choice(self._seeds())
+        for _ in range(rng.choice((1, 1, 2, 4))):
+            data = self.mutate(data, rng)
         return data
 
     @cache  # noqa: B019  # one target of each kind, as long as the process lives

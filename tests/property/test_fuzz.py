@@ -27,6 +27,6 @@ def test_only_documented_errors(target: Target) -> None:
     @given(number=st.integers(0, 2**32))
     @example(number=0)
     def check(number: int) -> None:
-        target.check(target.mauled_seed(random.Random(number)))
+        target.check(target.mutated_seed(random.Random(number)))
 
     check()

@@ -14,7 +14,7 @@ import pytest
 from eventsrc.errors import LogError
 from eventsrc.log import ALWAYS, LogWriter, recover_log, verify_log
 from eventsrc.system_events import LOSS_KEY
-from tests.attack.maul import maul
+from tests.attack.corruption import corrupt_log
 from tests.fixtures_log import BY_HAND, KEY, envelope, read_log, read_with_gaps
 
 EVENTS = 25
@@ -59,7 +59,7 @@ def test_nothing_is_made_up_and_nothing_that_can_be_read_is_lost(
 ) -> None:
     log = quick_path / "log"
     shutil.copytree(whole, log)
-    maul(log, random.Random(seed))
+    corrupt_log(log, random.Random(seed))
     before = readable(log).items()
     verify_log(log)
     with contextlib.suppress(LogError), LogWriter(log, fsync=ALWAYS) as writer:

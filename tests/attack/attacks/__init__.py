@@ -6,7 +6,7 @@ from . import (
     bombs,
     connections,
     damage,
-    doors,
+    exposure,
     files,
     junk,
     kills,
@@ -25,6 +25,6 @@ ATTACKS: dict[str, Attack] = {
     "questions": questions.attack,
     "connections": connections.attack,
     "projections": projections.attack,
-    "doors": doors.attack,
+    "exposure": exposure.attack,
 }
 """In the order in which they are played."""

@@ -1,5 +1,5 @@
-"""Small files that unfold into large ones, and files that only say that they are large. Each is
-refused or read, in bounded memory and time, by every command that meets it."""
+"""Decompression bombs, and files that claim to be large: each command refuses or reads them in
+bounded memory and time."""
 
 import hashlib
 import zlib
@@ -11,7 +11,7 @@ from eventsrc.log import LogWriter
 from projections.model.snapshot import MAGIC as SNAPSHOT_MAGIC
 from projections.settings import Settings
 from tests.attack.arena import Arena
-from tests.attack.explosives import gzip_line, mcap_with, mcap_with_large_message, zstd_chunk
+from tests.attack.bomb_files import gzip_line, mcap_with, mcap_with_large_message, zstd_chunk
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import BY_HAND, KEY
 
@@ -27,8 +27,8 @@ def zstd_import(arena: Arena) -> None:
     _import(arena, bomb)
 
 
-def zstd_import_that_lies(arena: Arena) -> None:
-    """… and the head of the chunk says that they are 100 bytes."""
+def zstd_import_with_false_size(arena: Arena) -> None:
+    """Like `zstd_import`, but the head of the chunk says 100 bytes."""
     bomb = arena.folder / "liar.mcap"
     mcap_with(bomb, zstd_chunk(UNFOLDED, said=100))
     _import(arena, bomb)
@@ -69,8 +69,8 @@ def zstd_in_segment(arena: Arena) -> None:
 def snapshot(arena: Arena) -> None:
     """A snapshot beside a log unfolds into 2 GB; its checksum is right."""
     log = _log(arena, "log")
-    squeeze = zlib.compressobj(1)
-    body = b"".join(squeeze.compress(bytes(GB // 50)) for _ in range(100)) + squeeze.flush()
+    compressor = zlib.compressobj(1)
+    body = b"".join(compressor.compress(bytes(GB // 50)) for _ in range(100)) + compressor.flush()
     folder = log.with_name(f"{log.name}.snapshots")
     folder.mkdir()
     name = f"{Settings().fingerprint()}-{5:020d}.map"
@@ -80,14 +80,14 @@ def snapshot(arena: Arena) -> None:
 
 
 CASES: tuple[Callable[[Arena], None], ...] = (
-    *(zstd_import, zstd_import_that_lies, large_message, gzip_import),
+    *(zstd_import, zstd_import_with_false_size, large_message, gzip_import),
     *(sparse_segment, zstd_in_segment, snapshot),
 )
 
 
 def attack(arena: Arena) -> None:
-    """Round 0: all of them; later one by chance."""
-    for bomb in CASES if arena.round == 0 else [arena.chance.choice(CASES)]:
+    """Round 0: all of them; later one at random."""
+    for bomb in CASES if arena.round == 0 else [arena.rng.choice(CASES)]:
         arena.attempt(bomb.__name__, partial(bomb, arena))
 
 

@@ -1,5 +1,4 @@
-"""Connections to the service that say little, slowly, or nothing, and very many of them, beside
-honest questions."""
+"""Very many, slow, silent or malformed connections to the service, beside honest questions."""
 
 import random
 import socket
@@ -8,7 +7,7 @@ from contextlib import ExitStack, suppress
 from urllib.parse import urlsplit
 
 from tests.attack.arena import Arena
-from tests.attack.questioner import Questioner, ask, question
+from tests.attack.honest_client import HonestClient, ask, question
 from tests.attack.service import serve
 
 MANY = 1_100
@@ -42,26 +41,26 @@ def attack(arena: Arena) -> None:
     service = serve(arena)
     netloc = urlsplit(service.url)
     address = (netloc.hostname or "", netloc.port or 0)
-    with Questioner(service.url, arena.tally):
+    with HonestClient(service.url, arena.tally):
         for source, begin in CASES if arena.round == 0 else [(ELSEWHERE, None)]:
-            _crowd(arena, address, source, begin)
+            _hold_many(arena, address, source, begin)
     ask(f"{service.url}/relocalize", question())  # and afterwards it is as it was
     arena.finish(service.server, codes=(0,))
 
 
-def _crowd(arena: Arena, address: tuple[str, int], source: str, begin: bytes | None) -> None:
+def _hold_many(arena: Arena, address: tuple[str, int], source: str, begin: bytes | None) -> None:
     """Open many connections, hold them for a while with a drop now and then, and let go."""
     with ExitStack() as open_ones:
         held = []
         for number in range(MANY):
-            said = begin or arena.chance.choice(BEGINNINGS)
+            said = begin or arena.rng.choice(BEGINNINGS)
             connection = _open(address, source, said)
             if connection is None:
                 arena.complain(f"connection {number} was not taken in time")
                 break
             open_ones.enter_context(connection)
             held.append(connection)
-        _drip(held, arena.chance)
+        _drip(held, arena.rng)
 
 
 def _open(address: tuple[str, int], source: str, begin: bytes) -> socket.socket | None:
@@ -78,11 +77,11 @@ def _open(address: tuple[str, int], source: str, begin: bytes) -> socket.socket 
     return connection
 
 
-def _drip(connections: list[socket.socket], chance: random.Random) -> None:
+def _drip(connections: list[socket.socket], rng: random.Random) -> None:
     pause = threading.Event()
     for _ in range(int(HELD_S / DRIP_S)):
         pause.wait(DRIP_S)
-        for connection in chance.sample(connections, min(100, len(connections))):
+        for connection in rng.sample(connections, min(100, len(connections))):
             try:
                 connection.send(b"a")
             except OSError:  # the service has let go of it, as it should

@@ -1,5 +1,5 @@
-"""Logs that somebody or something has been at: mended by `mapfold log recover`, they hold nothing
-under another offset than before, nothing of another log, and all that can still be read."""
+"""Damaged and forged logs: after `mapfold log recover` no event has another offset or comes from
+another log, and everything that could be read is there."""
 
 import json
 import shutil
@@ -9,8 +9,8 @@ from pathlib import Path
 
 from eventsrc.log import LogReader, LogWriter
 from tests.attack.arena import Arena
+from tests.attack.corruption import corrupt_log
 from tests.attack.forgery import mark, mark_as_text, seed_of
-from tests.attack.maul import maul
 from tests.attack.oracle import Oracle
 from tests.attack.rewrite import rewrite
 from tests.envelopes import envelope
@@ -57,7 +57,7 @@ def forged_mark_in_key(arena: Arena, log: Path, oracle: Oracle) -> int:
     _write(log, "forged", oracle, key=f"tb/{mark_as_text(10**6)}")
     (active,) = log.glob("*.active")
     with active.open("r+b") as file:
-        file.truncate(active.stat().st_size - arena.chance.randrange(30, 200))
+        file.truncate(active.stat().st_size - arena.rng.randrange(30, 200))
     return EVENTS
 
 
@@ -76,14 +76,14 @@ def one_digit_of_ledger(arena: Arena, log: Path, _: Oracle) -> int:
     if ledger.exists():
         text = ledger.read_text()
         digits = [at for at, char in enumerate(text) if char.isdigit()]
-        at = arena.chance.choice(digits)
+        at = arena.rng.choice(digits)
         ledger.write_text(text[:at] + str((int(text[at]) + 1) % 10) + text[at + 1 :])
     return EVENTS
 
 
 def by_chance(arena: Arena, log: Path, _: Oracle) -> int:
     """Bits, zeros, cuts, repeats: one to three of them."""
-    maul(log, arena.chance)
+    corrupt_log(log, arena.rng)
     return 0
 
 
@@ -98,8 +98,8 @@ CASES: tuple[Damage, ...] = (
 
 
 def attack(arena: Arena) -> None:
-    """Round 0: the cases; later one of them, and damage by chance."""
-    chosen = CASES if arena.round == 0 else (arena.chance.choice(CASES), by_chance)
+    """Round 0: the cases; later one of them, and random damage."""
+    chosen = CASES if arena.round == 0 else (arena.rng.choice(CASES), by_chance)
     for damage in chosen:
         arena.attempt(damage.__name__, partial(_one, arena, damage))
 

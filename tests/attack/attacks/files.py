@@ -1,7 +1,7 @@
-"""The file a recorder writes is cut to nothing, renamed, replaced or deleted under its hands.
+"""The active segment is truncated, renamed, replaced or deleted while a recorder writes it.
 
-What stood in it is gone; but what is acknowledged from then on must be in the log, whether the
-recorder goes on in a new segment or stops.
+Its events are gone; but what is acknowledged from then on must be in the log, whether the recorder
+goes on in a new segment or stops.
 """
 
 import shutil
@@ -26,7 +26,7 @@ def cut(active: Path, _: Arena) -> None:
 def cut_somewhere(active: Path, arena: Arena) -> None:
     """Leave a part of it."""
     with active.open("r+b") as file:
-        file.truncate(arena.chance.randrange(1, active.stat().st_size))
+        file.truncate(arena.rng.randrange(1, active.stat().st_size))
 
 
 def rename(active: Path, _: Arena) -> None:
@@ -50,8 +50,8 @@ WAYS: tuple[Callable[[Path, Arena], None], ...] = (cut, rename, replace, delete,
 
 
 def attack(arena: Arena) -> None:
-    """Round 0: the two ways that once made it promise what it did not have; later one by chance."""
-    for way in WAYS[:2] if arena.round == 0 else [arena.chance.choice(WAYS)]:
+    """Round 0: the two ways that once made it promise what it did not have; later one at random."""
+    for way in WAYS[:2] if arena.round == 0 else [arena.rng.choice(WAYS)]:
         arena.attempt(way.__name__, partial(_one, arena, way))
 
 

@@ -1,4 +1,4 @@
-"""Messages and keys that are made to hurt, sent beside an honest robot."""
+"""Costly and malformed messages and keys, sent beside an honest robot."""
 
 import json
 import threading
@@ -80,9 +80,9 @@ def same_ids(_: Random, size: int) -> bytes:
     return head + many + b"]}"
 
 
-def noise(chance: Random, size: int) -> bytes:
+def noise(rng: Random, size: int) -> bytes:
     """Random bytes."""
-    return chance.randbytes(size)
+    return rng.randbytes(size)
 
 
 KINDS: tuple[Junk, ...] = (
@@ -91,7 +91,7 @@ KINDS: tuple[Junk, ...] = (
 )
 
 
-def keys(chance: Random) -> Iterator[str]:
+def keys(rng: Random) -> Iterator[str]:
     """Keys that a recorder of everything must bear."""
     yield "tb/" + "k" * 22_000
     yield "tb/" + "/".join(["k"] * 10_000)
@@ -99,13 +99,13 @@ def keys(chance: Random) -> Iterator[str]:
     yield "mapfold/ack/" + "k" * 22_000
     yield f"tb/{mark_as_text(10**6)}"
     yield "tb/\x1b[2J\x07\u202e"
-    yield "tb/" + "".join(chr(chance.randrange(0x100, 0xD800)) for _ in range(60))
+    yield "tb/" + "".join(chr(rng.randrange(0x100, 0xD800)) for _ in range(60))
 
 
 def attack(arena: Arena) -> None:
-    """Round 0: the cases; later ten messages and a key by chance. The honest robot's envelopes
+    """Round 0: the cases; later ten messages and a key at random. The honest robot's envelopes
     are all acknowledged, and in the log, and the recorder ends when it is told to."""
-    chance = arena.chance
+    rng = arena.rng
     log, oracle, endpoint = arena.folder / "log", Oracle(), arena.router()
     recorder = arena.recorder(log, endpoint, "--key", "**")
     options = ZenohOptions(connect=(endpoint,))
@@ -121,7 +121,7 @@ def attack(arena: Arena) -> None:
         session.confirm()
         if not robot.finish(FLUSH_S):
             arena.complain(f"{robot.publisher.unacknowledged} honest envelopes not acknowledged")
-        if chance.random() < 0.5:
+        if rng.random() < 0.5:
             recorder.kill()
             arena.run("reader", "log", "recover", log, codes=(0, 3))
         else:
@@ -132,21 +132,21 @@ def attack(arena: Arena) -> None:
 
 
 def _messages(arena: Arena) -> Iterator[tuple[bytes, str]]:
-    chance = arena.chance
+    rng = arena.rng
     if arena.round == 0:
         for junk in KINDS:
-            yield junk(chance, 2 * MB), "tb/detections"
-        yield empty_detections(chance, SIXTEEN_MIB), "tb/detections"
-        for key in keys(chance):
+            yield junk(rng, 2 * MB), "tb/detections"
+        yield empty_detections(rng, SIXTEEN_MIB), "tb/detections"
+        for key in keys(rng):
             yield b"{}", key
         return
     for _ in range(10):
-        size = chance.choice((100, 10_000, 10_000, MB, 2 * MB, SIXTEEN_MIB))
-        yield chance.choice(KINDS)(chance, size), "tb/detections"
-    yield noise(chance, 100), chance.choice([*keys(chance)])
+        size = rng.choice((100, 10_000, 10_000, MB, 2 * MB, SIXTEEN_MIB))
+        yield rng.choice(KINDS)(rng, size), "tb/detections"
+    yield noise(rng, 100), rng.choice([*keys(rng)])
 
 
 def _send(session: Session, key: str, payload: bytes, oracle: Oracle) -> None:
-    """Past our own side of the door, which would refuse such a key."""
+    """Send without `Session`'s own checks, which would refuse such a key."""
     oracle.sent(payload)
     session.raw.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)

@@ -24,17 +24,17 @@ def attack(arena: Arena) -> None:
         robot.start()
     for _ in range(3):
         recorder = arena.start("recorder", "record", log, "--connect", endpoint)
-        if arena.chance.random() < 0.8:
+        if arena.rng.random() < 0.8:
             recorder.wait_for("recording ")
         try:
-            code = recorder.wait(arena.chance.uniform(0.0, LONGEST_LIFE_S))
+            code = recorder.wait(arena.rng.uniform(0.0, LONGEST_LIFE_S))
             arena.complain(f"a recorder ended by itself with {code}: {recorder.lines[-1:]}")
         except subprocess.TimeoutExpired:  # the wait has killed it
             assert recorder.process.returncode == -signal.SIGKILL
         for robot in robots:
             robot.note_acknowledged()
         if any(log.glob("*.mcap*")):
-            if arena.chance.random() < 0.5:
+            if arena.rng.random() < 0.5:
                 arena.run("reader", "log", "recover", log, codes=(0, 3))
             arena.judge(oracle, log)
     last = arena.recorder(log, endpoint)

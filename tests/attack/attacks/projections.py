@@ -1,5 +1,5 @@
-"""A tail and its database are killed, rows are changed by hand, keys hold control characters; and
-in the end the database equals the log, or somebody says where it does not."""
+"""Tails are killed, rows changed by hand, names hold control characters: in the end the databases
+equal the log, or `db check` reports where they do not."""
 
 import json
 import signal
@@ -29,21 +29,21 @@ WRITES = (
 
 
 def attack(arena: Arena) -> None:
-    """Kill a tail three times, let one finish, and check; then play reader and vandal."""
+    """Kill a tail three times, let one finish, and check; then change rows by hand."""
     url = arena.database()
-    log = write_log(arena.folder / "log", walk(40, seed=arena.chance.randrange(1000)))
+    log = write_log(arena.folder / "log", walk(40, seed=arena.rng.randrange(1000)))
     arena.run("reader", "replay", log, "--until", "10", "--db", url, codes=(0,))
     for _ in range(3):
         tail = arena.start("reader", "tail", log, "--db", url)
         try:
-            tail.wait(arena.chance.uniform(0.3, LONGEST_LIFE_S))
+            tail.wait(arena.rng.uniform(0.3, LONGEST_LIFE_S))
         except subprocess.TimeoutExpired:  # the wait has killed it
             assert tail.process.returncode == -signal.SIGKILL
     arena.run("reader", "tail", log, "--once", "--db", url, codes=(0,))
     arena.run("reader", "db", "check", log, "--db", url, codes=(0,))
     if arena.round == 0:
         arena.attempt("reader", partial(_read_only, arena, url))
-        arena.attempt("vandal", partial(_vandal, arena, log, url))
+        arena.attempt("changed rows", partial(_change_rows, arena, log, url))
         arena.attempt("characters", partial(_control_characters, arena))
 
 
@@ -74,7 +74,7 @@ def _places(url: str) -> list[tuple[str]]:
         ).fetchall()
 
 
-def _vandal(arena: Arena, log: Path, url: str) -> None:
+def _change_rows(arena: Arena, log: Path, url: str) -> None:
     """A label that is none of ours is put into the graph, and one of our rows is changed."""
     with connect_for_cypher(url) as owner:
         owner.execute(
@@ -108,12 +108,12 @@ def _control_characters(arena: Arena) -> None:
         ("state", log),
     )
     for command in commands:
-        victim = arena.run("reader", *command)
-        said = victim.output() + "\n".join(victim.lines)
+        attacked = arena.run("reader", *command)
+        said = attacked.output() + "\n".join(attacked.lines)
         if found := {char for char in said if _moves(char)}:
-            arena.complain(f"{victim.command} shows {sorted(found)!r} as they are")
+            arena.complain(f"{attacked.command} shows {sorted(found)!r} as they are")
 
 
 def _moves(char: str) -> bool:
-    """Whether a terminal would do something else than to show it."""
+    """Whether a terminal would obey ``char`` instead of showing it."""
     return char != "\n" and (ord(char) < 0x20 or 0x7F <= ord(char) < 0xA0 or char == "\u202e")

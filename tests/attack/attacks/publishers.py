@@ -1,6 +1,6 @@
-"""Several plain publishers, reliable and blocking, on one router: nothing is lost, and nothing else
-is said. Each counts its own keyframes; their sessions stamp their messages or leave it to the
-router, so stamps come out of order."""
+"""Several plain publishers, reliable and blocking, on one router: every message is recorded once.
+
+Their sessions stamp their messages or leave it to the router, so timestamps come out of order."""
 
 import json
 
@@ -38,9 +38,9 @@ for thread in threads: thread.join()
 
 
 def attack(arena: Arena) -> None:
-    """Round 0: all cases, one after the other through one router; later one by chance."""
+    """Round 0: all cases, one after the other through one router; later one at random."""
     endpoint = arena.router()
-    for publishers, per_second in CASES if arena.round == 0 else [arena.chance.choice(CASES)]:
+    for publishers, per_second in CASES if arena.round == 0 else [arena.rng.choice(CASES)]:
         _one(arena, endpoint, publishers, per_second)
 
 

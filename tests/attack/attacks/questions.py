@@ -12,8 +12,8 @@ from urllib.parse import urlsplit
 
 from eventsrc.transport.session import ZenohOptions, open_session
 from tests.attack.arena import Arena
-from tests.attack.json_maul import maul_json
-from tests.attack.questioner import Questioner, question
+from tests.attack.corruption import corrupt_json
+from tests.attack.honest_client import HonestClient, question
 from tests.attack.service import serve
 
 MOST = 1_000_000
@@ -62,13 +62,13 @@ STRANGERS = ({"Host": "evil.example"}, {"Origin": "http://evil.example"})
 
 
 def attack(arena: Arena) -> None:
-    """Round 0: the cases; later questions that were damaged by chance."""
+    """Round 0: the cases; later questions that were damaged at random."""
     endpoint = arena.router()
     service = serve(arena, endpoint)
     options = ZenohOptions(connect=(endpoint,))
-    payloads = [*cases()] if arena.round == 0 else [*_mauled(arena.chance)]
+    payloads = [*cases()] if arena.round == 0 else [*_corrupted(arena.rng)]
     with (
-        Questioner(service.url, arena.tally),
+        HonestClient(service.url, arena.tally),
         open_session(options, mode="client") as session,
         ThreadPoolExecutor(ASKERS) as askers,
     ):
@@ -138,6 +138,6 @@ def _question_with(field: bytes) -> bytes:
     return json.dumps({"crops": document["detections"]}).encode()[:-1] + b"," + field + b"}"
 
 
-def _mauled(chance: random.Random) -> Iterator[bytes]:
+def _corrupted(rng: random.Random) -> Iterator[bytes]:
     for _ in range(60):
-        yield maul_json(question(), chance)[:MOST]
+        yield corrupt_json(question(), rng)[:MOST]

@@ -4,7 +4,7 @@ import random
 from collections.abc import Sequence
 
 from eventsrc.ingest import Accepted, Rejected, check_all, ingest
-from tests.attack.json_maul import maul_json
+from tests.attack.corruption import corrupt_json
 from tests.envelopes import detection, envelope, payload
 from tests.fuzz.target import Target
 from tests.logs import walk
@@ -21,12 +21,12 @@ class EnvelopeTarget(Target):
         documents = [*walk(5, seed=1), envelope(1, None), envelope(2, detections=[odd])]
         return [payload(document) for document in documents]
 
-    def maul(self, data: bytes, chance: random.Random) -> bytes:
+    def mutate(self, data: bytes, rng: random.Random) -> bytes:
         """One value becomes another."""
-        return maul_json(data, chance)
+        return corrupt_json(data, rng)
 
     def check(self, data: bytes) -> None:
-        """Both doors say the same, shortly."""
+        """`ingest` and `check_all` agree; a reason is short."""
         said = ingest(data)
         (kept,) = check_all((data,))
         assert isinstance(said, Rejected) == isinstance(kept, Rejected)

@@ -9,7 +9,7 @@ from pathlib import Path
 from eventsrc.gap_history import ledger_of, save_ledger
 from eventsrc.gaps import GapLedger
 from eventsrc.log import NEVER, LogReader, LogWriter
-from tests.attack.json_maul import maul_json
+from tests.attack.corruption import corrupt_json
 from tests.fixtures_log import KEY, envelope
 from tests.fuzz.scratch import scratch
 from tests.fuzz.target import Target
@@ -28,9 +28,9 @@ class LedgerTarget(Target):
             save_ledger(log, reader.log_id, reader.next_offset, _recount(log))
         return [(log / NAME).read_bytes()]
 
-    def maul(self, data: bytes, chance: random.Random) -> bytes:
+    def mutate(self, data: bytes, rng: random.Random) -> bytes:
         """One value becomes another."""
-        return maul_json(data, chance)
+        return corrupt_json(data, rng)
 
     def check(self, data: bytes) -> None:
         """Whatever the file says, the ledger is that of the log."""

@@ -11,7 +11,7 @@ from eventsrc.errors import MapfoldError
 from eventsrc.importers import import_files
 from eventsrc.log import NEVER, LogReader, LogWriter
 from tests.envelopes import envelope, payload
-from tests.fuzz.mcap_maul import maul_mcap
+from tests.fuzz.mcap_mutation import mutate_mcap
 from tests.fuzz.scratch import scratch
 from tests.fuzz.target import Target, check_message
 
@@ -26,9 +26,9 @@ class McapTarget(Target):
             *(_file(compression=kind) for kind in CompressionType),
         ]
 
-    def maul(self, data: bytes, chance: random.Random) -> bytes:
+    def mutate(self, data: bytes, rng: random.Random) -> bytes:
         """One record, below the checksums."""
-        return maul_mcap(data, chance)
+        return mutate_mcap(data, rng)
 
     def check(self, data: bytes) -> None:
         """What was imported can be read, and is as much as was said."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from projections.errors import QuestionError
 from projections.relocalize import parse_question
-from tests.attack.json_maul import maul_json
+from tests.attack.corruption import corrupt_json
 from tests.envelopes import detection, envelope, payload
 from tests.fuzz.target import Target, check_message
 
@@ -22,9 +22,9 @@ class QuestionTarget(Target):
         document = {"crops": [crop, plain], "top": 3, "method": "joint"}
         return [payload(d) for d in (document, [crop], [plain], envelope(1, detections=[crop]))]
 
-    def maul(self, data: bytes, chance: random.Random) -> bytes:
+    def mutate(self, data: bytes, rng: random.Random) -> bytes:
         """One value becomes another."""
-        return maul_json(data, chance)
+        return corrupt_json(data, rng)
 
     def check(self, data: bytes) -> None:
         """Unit vectors of one dimension, or a short refusal."""

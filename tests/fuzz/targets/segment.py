@@ -9,7 +9,7 @@ from eventsrc.errors import LogError
 from eventsrc.log import LogReader, LogWriter, recover_log, verify_log
 from eventsrc.log.segment import Unreadable
 from tests.fixtures_log import BY_HAND, KEY, envelope
-from tests.fuzz.mcap_maul import maul_mcap
+from tests.fuzz.mcap_mutation import mutate_mcap
 from tests.fuzz.scratch import scratch
 from tests.fuzz.target import Target
 
@@ -35,9 +35,9 @@ class SegmentTarget(Target):
         shutil.rmtree(log)
         return [growing, sealed]
 
-    def maul(self, data: bytes, chance: random.Random) -> bytes:
+    def mutate(self, data: bytes, rng: random.Random) -> bytes:
         """One record, below the checksums."""
-        return maul_mcap(data, chance)
+        return mutate_mcap(data, rng)
 
     def check(self, data: bytes) -> None:
         """Under either name: what is read is in order, what is recovered is whole."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from projections.cli.options import settings_from
 from projections.errors import SettingsError
 from projections.settings import Settings
-from tests.attack.json_maul import maul_json
+from tests.attack.corruption import corrupt_json
 from tests.fuzz.scratch import scratch
 from tests.fuzz.target import Target, check_message
 
@@ -25,9 +25,9 @@ class SettingsTarget(Target):
         )
         return [json.dumps(document).encode() for document in documents]
 
-    def maul(self, data: bytes, chance: random.Random) -> bytes:
+    def mutate(self, data: bytes, rng: random.Random) -> bytes:
         """One value becomes another."""
-        return maul_json(data, chance)
+        return corrupt_json(data, rng)
 
     def check(self, data: bytes) -> None:
         """What is accepted has a fingerprint, and that is stable."""

@@ -8,7 +8,7 @@ from contextlib import suppress
 
 from projections.model.snapshot import MAGIC, SnapshotRefused, restore, snapshot
 from projections.settings import Settings
-from tests.attack.json_maul import maul_bytes, maul_json
+from tests.attack.corruption import corrupt_bytes, corrupt_json
 from tests.folds import fold
 from tests.fuzz.target import Target
 from tests.logs import walk
@@ -25,20 +25,20 @@ class SnapshotTarget(Target):
         folded = [fold(walk(count, seed=2)) for count in (0, 12)]
         return [snapshot(one.map, one.view, "log") for one in folded]
 
-    def maul(self, data: bytes, chance: random.Random) -> bytes:
+    def mutate(self, data: bytes, rng: random.Random) -> bytes:
         """The file itself, its index or its arrays, with lengths and checksum made right."""
-        if chance.random() < 0.1:
-            return maul_bytes(data, chance)
+        if rng.random() < 0.1:
+            return corrupt_bytes(data, rng)
         try:
             content = zlib.decompress(data[_HEAD:])
         except zlib.error:
-            return maul_bytes(data, chance)
+            return corrupt_bytes(data, rng)
         start = _LENGTH_BYTES + int.from_bytes(content[:_LENGTH_BYTES], "little")
         index, arrays = content[_LENGTH_BYTES:start], content[start:]
-        if chance.random() < 0.6:
-            index = maul_json(index, chance)
+        if rng.random() < 0.6:
+            index = corrupt_json(index, rng)
         else:
-            arrays = maul_bytes(arrays, chance)
+            arrays = corrupt_bytes(arrays, rng)
         body = zlib.compress(len(index).to_bytes(_LENGTH_BYTES, "little") + index + arrays, 1)
         return MAGIC + hashlib.sha256(body).digest() + body
 

@@ -27,7 +27,7 @@ main()
 """`mapfold`, which leaves its memory's numbers behind: a parent is told none, only its own."""
 
 
-class Victim(Program):
+class AttackedCommand(Program):
     """`mapfold ARGUMENTS`, in the ``role`` of recorder, reader, server or router. Linux only."""
 
     def __init__(
@@ -36,11 +36,11 @@ class Victim(Program):
         self.role = role
         self.command = f"mapfold {' '.join(arguments)}"
         self._peak_mb = 0.0
-        self._folder = tempfile.TemporaryDirectory(prefix="mapfold-victim-")
-        self._left = Path(self._folder.name) / "status"
+        self._folder = tempfile.TemporaryDirectory(prefix="mapfold-attacked-")
+        self._status = Path(self._folder.name) / "status"
         self._stdout = (Path(self._folder.name) / "stdout").open("w+")
         super().__init__(
-            _MAPFOLD, [str(self._left), *arguments], stdout=self._stdout, env=env, cwd=cwd
+            _MAPFOLD, [str(self._status), *arguments], stdout=self._stdout, env=env, cwd=cwd
         )
         # The attacker's own limit is higher: it holds one end of each of very many connections.
         most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
@@ -53,7 +53,7 @@ class Victim(Program):
 
     def peak_mb(self) -> float:
         """The most memory it has taken by now, in MB. Ask before it is killed."""
-        for status in (Path(f"/proc/{self.process.pid}/status"), self._left):
+        for status in (Path(f"/proc/{self.process.pid}/status"), self._status):
             if status.exists():
                 self._peak_mb = max(self._peak_mb, _high_water_mb(status))
         return self._peak_mb

@@ -26,7 +26,7 @@ def ask(url: str, payload: bytes | None) -> Any:
         return json.loads(answer.read())
 
 
-class Questioner:
+class HonestClient:
     """Asks from a thread while the block runs; every answer must be that of the first question."""
 
     def __init__(self, url: str, tally: Tally) -> None:

@@ -1,4 +1,4 @@
-"""Files that take far more memory than they take room, written in pieces."""
+"""Write decompression bombs and other files that unfold to far more than their size."""
 
 import gzip
 import json
@@ -18,9 +18,9 @@ _PIECE = bytes(16 * 1024 * 1024)
 
 def zstd_chunk(size: int, said: int | None = None) -> bytes:
     """A chunk record of ``size`` zeros, compressed; its head may say another size."""
-    squeeze = zstandard.ZstdCompressor(level=1).compressobj(size=size)
-    parts = [squeeze.compress(_PIECE[: min(size - at, len(_PIECE))]) for at in _pieces(size)]
-    data = b"".join([*parts, squeeze.flush()])
+    compressor = zstandard.ZstdCompressor(level=1).compressobj(size=size)
+    parts = [compressor.compress(_PIECE[: min(size - at, len(_PIECE))]) for at in _pieces(size)]
+    data = b"".join([*parts, compressor.flush()])
     length = _CHUNK.size - FRAME.size + 4 + 8 + len(data)
     head = _CHUNK.pack(Opcode.CHUNK, length, 0, 0, size if said is None else said, 0, 4)
     return head + b"zstd" + struct.pack("<Q", len(data)) + data

@@ -1,5 +1,5 @@
-"""What a command opens, trusts and says when it is told little, or something malformed: addresses,
-passwords, and folders that somebody else may have made."""
+"""What a command listens on, trusts and prints without or with malformed configuration: addresses,
+passwords, and folders that another user may have made."""
 
 import os
 import shutil
@@ -32,13 +32,13 @@ NOBODY = 65534
 
 
 def attack(arena: Arena) -> None:
-    """Every round the same: there is little chance in it, and it is quick."""
+    """Every round the same: it has little randomness, and it is quick."""
     arena.attempt("router", partial(_router_listens_on_loopback, arena))
     arena.attempt("token", partial(_serve_demands_a_token, arena))
-    for url in MALFORMED if arena.round == 0 else [arena.chance.choice(MALFORMED)]:
-        arena.attempt("password", partial(_password_is_not_told, arena, url))
+    for url in MALFORMED if arena.round == 0 else [arena.rng.choice(MALFORMED)]:
+        arena.attempt("password", partial(_password_is_not_printed, arena, url))
     arena.attempt("link", partial(_link_is_not_followed, arena))
-    arena.attempt("strange server", partial(_strange_server_is_not_asked, arena))
+    arena.attempt("foreign server", partial(_foreign_server_is_not_used, arena))
 
 
 def _router_listens_on_loopback(arena: Arena) -> None:
@@ -59,11 +59,11 @@ def _serve_demands_a_token(arena: Arena) -> None:
     arena.run("server", "serve", *arguments, codes=(2,), patience_s=PATIENCE_S)
 
 
-def _password_is_not_told(arena: Arena, url: str) -> None:
-    victim = arena.run("reader", "query", "MATCH (n) RETURN n", "--db", url, codes=(1, 2))
-    said = victim.output() + "\n".join(victim.lines)
+def _password_is_not_printed(arena: Arena, url: str) -> None:
+    attacked = arena.run("reader", "query", "MATCH (n) RETURN n", "--db", url, codes=(1, 2))
+    said = attacked.output() + "\n".join(attacked.lines)
     if SECRET in said:
-        arena.complain(f"a password is told: {said[:300]}")
+        arena.complain(f"a password is printed: {said[:300]}")
 
 
 def _link_is_not_followed(arena: Arena) -> None:
@@ -79,7 +79,7 @@ def _link_is_not_followed(arena: Arena) -> None:
             arena.complain(f"a link at {place} was followed")
 
 
-def _strange_server_is_not_asked(arena: Arena) -> None:
+def _foreign_server_is_not_used(arena: Arena) -> None:
     """Somebody else's server answers where ours would."""
     home = arena.folder / LONG / "strange"
     with _taken(arena, home) as place, socket.socket(socket.AF_UNIX) as listener:
