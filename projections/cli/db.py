@@ -1,4 +1,4 @@
-"""``mapfold db``: the embedded server, and whether the databases still agree with the log."""
+"""``mapfold db``: the embedded server, check and repair of the databases, roles, retry."""
 
 import sys
 from dataclasses import asdict
@@ -61,7 +61,7 @@ def start(as_json: JsonOption = False) -> None:
         emit({"url": address, "data": str(server.data), "running": True, "kept": True})
         return
     display(address)
-    sys.stdout.flush()  # so that it comes before the line on stderr also where both are one pipe
+    sys.stdout.flush()  # before the line on stderr, also where both are one pipe
     say(f"running, with its data in {server.data}; stop it with: mapfold db stop")
 
 
@@ -70,10 +70,10 @@ def stop(as_json: JsonOption = False) -> None:
     """Stop the embedded server, unless another command is using it right now."""
     server = EmbeddedServer()
     ran = server.running
-    still = server.stop(discard_keep=True)
+    running = server.stop(discard_keep=True)
     if as_json:
-        emit({"data": str(server.data), "running": still, "kept": False})
-    elif still:
+        emit({"data": str(server.data), "running": running, "kept": False})
+    elif running:
         say("another command is using the server; it stops when that command ends")
     else:
         say("stopped" if ran else "it was not running")
@@ -97,19 +97,19 @@ def check(
     with databases(db, vector_db) as targets:
         reports = check_projections(log, targets, settings, only=only_of(only))
         wrong = [report for report in reports if report.differing]
-        # A rebuild would drop what somebody else has put into the graph.
-        mended = [report for report in wrong if repair and not report.foreign]
-        for report in mended:
+        # A rebuild would drop the foreign tables in the graph.
+        repaired = [report for report in wrong if repair and not report.foreign]
+        for report in repaired:
             rebuild(log, targets, settings, until=report.next_offset, only=report.sink)
     if as_json:
-        emit({"sinks": [asdict(r) for r in reports], "repaired": bool(mended)})
+        emit({"sinks": [asdict(r) for r in reports], "repaired": bool(repaired)})
     else:
-        _tell(reports)
-        for report in mended:
+        _print_check(reports)
+        for report in repaired:
             say(f"{report.sink}: rebuilt")
         if wrong and not repair:
             say(f"to mend it run: mapfold db check --repair {log}")
-        elif len(mended) < len(wrong):
+        elif len(repaired) < len(wrong):
             say("graph: not rebuilt, as that would drop what is not ours; remove it first")
     finish(findings=not all(report.sound for report in reports))
 
@@ -143,7 +143,7 @@ def retry_command(
     finish(findings=any(report.still for report in reports))
 
 
-def _tell(reports: list[CheckReport]) -> None:
+def _print_check(reports: list[CheckReport]) -> None:
     for report in reports:
         display(
             f"{report.sink}: {counted(report.rows, 'row')} at offset {report.next_offset:,},"

@@ -1,4 +1,4 @@
-"""`mapfold query …`: what stands where, what is near, how to get there."""
+"""``mapfold query``: similar objects, where an object is, what a place holds, paths."""
 
 import contextlib
 from collections.abc import Iterator
@@ -11,17 +11,17 @@ from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 from projections.database.connection import connect
 from projections.model.fold import fold_log
-from projections.queries.ask import (
-    Asker,
-    LiveAsker,
-    ViewAsker,
+from projections.queries.map_queries import (
+    FoldedMap,
+    LiveMap,
+    MapSource,
     objects_of,
     path_between,
     places_holding,
     similar_objects,
     where_is,
 )
-from projections.queries.relocalize import Reader, prepare_graph
+from projections.queries.relocalize import CandidateReader, prepare_graph
 from projections.settings import Settings
 
 from .options import (
@@ -60,9 +60,9 @@ def similar(
 ) -> None:
     """Objects that look most like the crops of QUERY."""
     crops = question_from(query)
-    with databases(db, vector_db) as targets, Reader(targets) as reader:
+    with databases(db, vector_db) as targets, CandidateReader(targets) as reader:
         found = similar_objects(crops, reader.candidates(crops), top)
-    _tell(found, json_)
+    _print(found, json_)
 
 
 def where(
@@ -75,8 +75,8 @@ def where(
     json_: JsonOption = False,
 ) -> None:
     """Where an object is, or was at a point of the log."""
-    with _asker(db, log, at, past_settings(log, settings_file, set_)) as asker:
-        _tell(where_is(asker, object_id), json_)
+    with _map_source(db, log, at, past_settings(log, settings_file, set_)) as source:
+        _print(where_is(source, object_id), json_)
 
 
 def contents(
@@ -89,8 +89,8 @@ def contents(
     json_: JsonOption = False,
 ) -> None:
     """The objects located in a place."""
-    with _asker(db, log, at, past_settings(log, settings_file, set_)) as asker:
-        _tell(objects_of(asker, place_id), json_)
+    with _map_source(db, log, at, past_settings(log, settings_file, set_)) as source:
+        _print(objects_of(source, place_id), json_)
 
 
 def holding(
@@ -108,8 +108,8 @@ def holding(
 
     Near is at most --hops steps away, each from a place to one next to it.
     """
-    with _asker(db, log, at, past_settings(log, settings_file, set_)) as asker:
-        _tell(places_holding(asker, class_name, start, hops), json_)
+    with _map_source(db, log, at, past_settings(log, settings_file, set_)) as source:
+        _print(places_holding(source, class_name, start, hops), json_)
 
 
 def path(
@@ -123,18 +123,20 @@ def path(
     json_: JsonOption = False,
 ) -> None:
     """The places on the way from one place to another."""
-    with _asker(db, log, at, past_settings(log, settings_file, set_)) as asker:
-        _tell(path_between(asker, start, goal), json_)
+    with _map_source(db, log, at, past_settings(log, settings_file, set_)) as source:
+        _print(path_between(source, start, goal), json_)
 
 
 @contextlib.contextmanager
-def _asker(db: str | None, log: Path | None, at: str | None, settings: Settings) -> Iterator[Asker]:
+def _map_source(
+    db: str | None, log: Path | None, at: str | None, settings: Settings
+) -> Iterator[MapSource]:
     """The live graph, or the log folded to a point with ``settings``."""
     if log is not None:
         with LogReader(log) as reader:
             _, view = fold_log(reader, settings, point(reader, at or "end"))
         say_defaults(settings)
-        yield ViewAsker(view)
+        yield FoldedMap(view)
         return
     if at is not None:
         raise MisuseError("--at asks a past map, which only the log knows; give --log LOG too")
@@ -143,18 +145,18 @@ def _asker(db: str | None, log: Path | None, at: str | None, settings: Settings)
         connect(targets.graph_url, application="mapfold query", autocommit=True) as connection,
     ):
         prepare_graph(connection)
-        yield LiveAsker(connection)
+        yield LiveMap(connection)
 
 
-def _tell(found: Any, as_json: bool) -> None:
+def _print(found: Any, as_json: bool) -> None:
     if as_json:
         emit(found)
         return
     rows = found if isinstance(found, list) else [found]
-    display("".join(f"{_line(row)}\n" for row in rows) or "nothing")
+    display("".join(f"{_format(row)}\n" for row in rows) or "nothing")
 
 
-def _line(row: dict[str, Any]) -> str:
+def _format(row: dict[str, Any]) -> str:
     return "  ".join(
         f"{name} {value:.3f}" if isinstance(value, float) else f"{name} {value}"
         for name, value in row.items()

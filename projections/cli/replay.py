@@ -1,7 +1,4 @@
-"""``mapfold replay``: rebuild the databases from a log.
-
-What a replay left out of the map: how much, why, and what to do about it.
-"""
+"""``mapfold replay``: rebuild the databases from a log, and print what was left out and why."""
 
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -35,12 +32,12 @@ from .terminal import Bar, emit, say
 
 
 def left_out(log: Path, settings: Settings, report: RebuildReport) -> str | None:
-    """One line, None when everything is in."""
-    told = "; ".join(_told(log, settings, report))
+    """What a replay left out of the map and what to do about it, in one line; None for nothing."""
+    told = "; ".join(_left_out_parts(log, settings, report))
     return f"left out: {told}" if told else None
 
 
-def _told(log: Path, settings: Settings, report: RebuildReport) -> Iterator[str]:
+def _left_out_parts(log: Path, settings: Settings, report: RebuildReport) -> Iterator[str]:
     counts = report.counts
     if counts["duplicates"]:
         yield f"{counted(counts['duplicates'], 'keyframe')} that came twice"
@@ -55,30 +52,32 @@ def _told(log: Path, settings: Settings, report: RebuildReport) -> Iterator[str]
             " keyframe (leave det_id away, or make it unique)"
         )
     if report.foreign is not None:
-        yield _foreign(log, settings, report, report.foreign)
+        yield _foreign_text(log, settings, report, report.foreign)
 
 
-def _foreign(log: Path, settings: Settings, report: RebuildReport, first: ForeignEmbedding) -> str:
+def _foreign_text(
+    log: Path, settings: Settings, report: RebuildReport, first: ForeignEmbedding
+) -> str:
     many = counted(report.counts["foreign_embeddings"], "embedding")
     chosen = settings.embedding_model is not None or settings.embedding_dim is not None
     why = "as the settings say" if chosen else "as the log's first one is"
     if first.map_dim is None:
-        wanted = _space(settings.embedding_model or "any model", settings.embedding_dim)
+        wanted = _space_text(settings.embedding_model or "any model", settings.embedding_dim)
     else:
-        wanted = _space(first.map_model or "an unnamed model", first.map_dim)
-    came = _space(first.model or "an unnamed model", first.dim)
-    instead = command_line("replay", log, _of_space(settings, first))
+        wanted = _space_text(first.map_model or "an unnamed model", first.map_dim)
+    came = _space_text(first.model or "an unnamed model", first.dim)
+    instead = command_line("replay", log, _settings_for(settings, first))
     return (
         f"{many} of another space: the map's are of {wanted}, {why}, but that of {first.det_id} at"
         f" offset {first.offset:,} is of {came}; to map that space instead run: {instead}"
     )
 
 
-def _space(model: str, dim: int | None) -> str:
+def _space_text(model: str, dim: int | None) -> str:
     return model if dim is None else f"{model} with {counted(dim, 'dimension')}"
 
 
-def _of_space(settings: Settings, first: ForeignEmbedding) -> Settings:
+def _settings_for(settings: Settings, first: ForeignEmbedding) -> Settings:
     update: dict[str, str | int | None] = {"embedding_dim": first.dim}
     if first.model != first.map_model or first.map_dim is None:
         update["embedding_model"] = first.model
@@ -155,10 +154,10 @@ def replay(
     if as_json:
         emit(asdict(report))
     else:
-        _tell(log, settings, report)
+        _print(log, settings, report)
 
 
-def _tell(log: Path, settings: Settings, report: RebuildReport) -> None:
+def _print(log: Path, settings: Settings, report: RebuildReport) -> None:
     rows = sum(report.rows.values())
     rate = report.events / report.total_s if report.total_s else 0.0
     say(

@@ -1,9 +1,7 @@
-"""`mapfold serve`: answer lost robots over Zenoh and HTTP until a signal ends it.
+"""``mapfold serve``: answer questions over Zenoh and HTTP until a signal.
 
-Where `mapfold serve` listens for HTTP, and who may ask there.
-
-An address that others can reach demands a token; everything is checked before a database is
-opened.
+HTTP on an address that others can reach requires a token. All options are checked before a database
+is opened.
 """
 
 import dataclasses
@@ -19,7 +17,7 @@ import typer
 from eventsrc.errors import MisuseError
 from eventsrc.transport.session import open_session
 from projections.database.connection import open_targets
-from projections.serve import Answerer, Pools, Room, ZenohService
+from projections.serve import Answerer, FairQueue, Pools, ZenohService
 from projections.serve.answering import DEFAULT_MAX_BYTES
 
 from .options import (
@@ -36,11 +34,9 @@ from .options import (
 from .signals import stop_on_signals
 from .terminal import say
 
-if TYPE_CHECKING:  # what needs the extra [serve] is imported when it is asked for
+if TYPE_CHECKING:  # modules that need the extra [serve] are imported when they are used
     import socket
     import ssl
-
-    from projections.serve import Answerer, Room
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +49,7 @@ class HttpOptions:
     hosts: tuple[str, ...]
 
     def refuse_without_http(self) -> None:
-        """Raise MisuseError when one of them is given, as they mean nothing without ``--http``."""
+        """Raise MisuseError when one of them is given."""
         for name, value in (
             ("--token-file", self.token_file),
             ("--tls-cert", self.tls_cert),
@@ -65,8 +61,8 @@ class HttpOptions:
 
 
 @dataclass(frozen=True, slots=True)
-class HttpDoor:
-    """A bound address, and who may ask there."""
+class HttpEndpoint:
+    """A bound address and its access control."""
 
     host: str
     listener: "socket.socket"
@@ -76,8 +72,8 @@ class HttpDoor:
 
     @classmethod
     @contextmanager
-    def opened(cls, http: str, options: HttpOptions) -> Iterator[Self]:
-        """Bind ``http``, which is HOST:PORT. Raises MisuseError when it must not be served so."""
+    def bound(cls, http: str, options: HttpOptions) -> Iterator[Self]:
+        """Bind ``http``, a HOST:PORT. Raises MisuseError when the options do not allow it."""
         host, colon, port = http.rpartition(":")
         if not colon or not port.isdecimal() or int(port) > 65_535:
             raise MisuseError(f"--http {http}: write it as HOST:PORT, such as 127.0.0.1:8080")
@@ -110,21 +106,20 @@ class HttpDoor:
             yield cls(host, listener, token, tls, options.hosts)
 
     @contextmanager
-    def serving(self, answerer: "Answerer", room: "Room") -> Iterator[str]:
-        """Answer until the end of the block; yields the URL."""
+    def serving(self, answerer: Answerer, queue: FairQueue) -> Iterator[str]:
+        """Serve until the end of the block; yields the URL."""
         from projections.serve.guard import Guard
         from projections.serve.http import create_app
         from projections.serve.listening import serving
 
-        guarded = Guard(create_app(answerer, room), self.token, (self.host, *self.hosts))
+        guarded = Guard(create_app(answerer, queue), self.token, (self.host, *self.hosts))
         with serving(guarded, self.listener, self.tls, say) as port:
             shown = f"[{self.host}]" if ":" in self.host else self.host
             yield f"{'http' if self.tls is None else 'https'}://{shown}:{port}"
 
 
 _LARGEST_BYTES: Final = 16 * 1024 * 1024
-"""What Zenoh puts together of one question. A longer one gets no answer; a shorter one that is over
-``--max-bytes`` is told so."""
+"""Zenoh drops longer questions without an answer; a shorter one over ``--max-bytes`` is refused."""
 
 
 def serve(
@@ -177,8 +172,8 @@ def serve(
 ) -> None:
     """Answer questions from the live databases until Ctrl-C.
 
-    Over Zenoh at mapfold/relocalize and mapfold/state/**, over HTTP as /docs there tells. Errors
-    come back as replies. On SIGINT or SIGTERM open questions are answered first.
+    Over Zenoh at mapfold/relocalize and mapfold/state/**, over HTTP as described at /docs there.
+    Errors are replies too. On SIGINT or SIGTERM open questions are answered first.
     """
     if http is None and not zenoh:
         raise MisuseError("neither --zenoh nor --http: there is nothing to serve on")
@@ -189,7 +184,7 @@ def serve(
     )
     given = HttpOptions(token_file, tls_cert, tls_key, tuple(allow_host or ()))
     with ExitStack() as stack:
-        door = None if http is None else stack.enter_context(HttpDoor.opened(http, given))
+        endpoint = None if http is None else stack.enter_context(HttpEndpoint.bound(http, given))
         if http is None:
             given.refuse_without_http()
         stop = stack.enter_context(stop_on_signals())
@@ -199,12 +194,13 @@ def serve(
         session = None
         if zenoh:
             session = stack.enter_context(open_session(options, mode=options.mode))
-        room = stack.enter_context(Room(workers))  # its last answers go over the session
+        # Closed before the session, which sends its last answers.
+        queue = stack.enter_context(FairQueue(workers))
         if session is not None:
-            stack.enter_context(ZenohService(session, answerer, room))
+            stack.enter_context(ZenohService(session, answerer, queue))
             say("answering mapfold/relocalize and mapfold/state/** over Zenoh")
-        if door is not None:
-            url = stack.enter_context(door.serving(answerer, room))
+        if endpoint is not None:
+            url = stack.enter_context(endpoint.serving(answerer, queue))
             say(f"answering {url}, described at /docs")
         say("Ctrl-C ends it")
         stop.wait()

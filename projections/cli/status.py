@@ -1,4 +1,4 @@
-"""``mapfold status``: where the log and the databases stand."""
+"""``mapfold status``: state of the log and the databases."""
 
 from dataclasses import asdict
 
@@ -52,27 +52,27 @@ def status(
             }
         )
     else:
-        _tell(info, found)
+        _print(info, found)
     finish(findings=not found.healthy or bool(info.rejected) or bool(info.lost))
 
 
-def _tell(info: LogInfo, found: Status) -> None:
+def _print(info: LogInfo, found: Status) -> None:
     display(
         f"log      {info.log_id}: {counted(info.events, 'event')}, {info.rejected:,} rejected,"
         f" {info.lost:,} lost"
     )
     for sink in found.sinks:
-        display(f"{sink.sink:<8} {_line(sink)}")
+        display(f"{sink.sink:<8} {_sink_line(sink)}")
         if sink.note:
             say(f"         {sink.note}")
         if sink.unwanted_writers:
-            display(f"         {_open_to(sink.unwanted_writers)}")
+            display(f"         {_unwanted_writers(sink.unwanted_writers)}")
         for letter in sink.dead_letters:
             run = f" (run {letter.run_id})" if letter.run_id else ""
             display(f"         parked: offset {letter.offset:,}{run}: {letter.reason}")
 
 
-def _open_to(roles: tuple[str, ...]) -> str:
+def _unwanted_writers(roles: tuple[str, ...]) -> str:
     them = ", ".join(map(visible, roles))
     return (
         f"not read-only: {them} may only read the graph, but Apache AGE lets them change it through"
@@ -81,7 +81,7 @@ def _open_to(roles: tuple[str, ...]) -> str:
     )
 
 
-def _line(sink: SinkStatus) -> str:
+def _sink_line(sink: SinkStatus) -> str:
     versions = ", ".join(f"{name} {number}" for name, number in (sink.versions or {}).items())
     if sink.next_offset is None:
         return f"{sink.condition} · {sink.place}" + (f" · {versions}" if versions else "")

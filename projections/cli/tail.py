@@ -72,14 +72,14 @@ def tail_command(
             loader=loader_of(loader),
             stop=stop,
             progress=progress,
-            on_fold=_CatchingUp(log, end, bar, once).show,
-            on_trouble=lambda what: _complain(what, progress),
+            on_fold=_CatchUpBar(log, end, bar, once).show,
+            on_trouble=lambda what: _report_failure(what, progress),
             note=say,
         )
     if as_json:
         emit(asdict(report))
     else:
-        _tell(report)
+        _print(report)
     finish(findings=bool(report.parked))
 
 
@@ -88,27 +88,28 @@ def _metrics(address: tuple[str, int] | None, progress: TailProgress, log: Path)
     if address is None:
         yield
         return
-    from projections.database.progress import serving_tail_metrics  # costs nothing unless asked for
+    # Imported only when used.
+    from projections.database.tail_progress import serving_tail_metrics
 
     with serving_tail_metrics(address, progress, log) as port:
         say_metrics(address, port)
         yield
 
 
-def _complain(what: str, progress: TailProgress) -> None:
-    progress.trouble(what)
+def _report_failure(what: str, progress: TailProgress) -> None:
+    progress.count_failure()
     say(f"mapfold: {what}; trying again")
 
 
-class _CatchingUp:
-    """Shows how far the tail is until it has what was in the log at its start, and says so then."""
+class _CatchUpBar:
+    """A bar until the tail has the events that were in the log at its start, then one line."""
 
     def __init__(self, log: Path, end: Offset, bar: Bar, once: bool) -> None:
         self._log, self._end, self._bar = log, end, bar
         self._once, self._done = once, False
 
     def show(self, folded: int) -> None:
-        """``folded`` events are through."""
+        """Update the bar: ``folded`` events are written."""
         if self._done:
             return
         self._bar.show("catching up", folded, self._end)
@@ -119,7 +120,7 @@ class _CatchingUp:
                 say(f"following {self._log} from offset {folded:,} on; Ctrl-C ends it")
 
 
-def _tell(report: TailReport) -> None:
+def _print(report: TailReport) -> None:
     say(
         f"{counted(report.events, 'event')} written in {report.batches:,}"
         f" {'batch' if report.batches == 1 else 'batches'}; the databases are at offset"
@@ -131,7 +132,7 @@ def _tell(report: TailReport) -> None:
 
 @contextlib.contextmanager
 def _stopped_by_signals() -> Iterator[threading.Event]:
-    """SIGTERM and Ctrl-C end the tail after the batch it is at; a second Ctrl-C at once."""
+    """SIGTERM and Ctrl-C end the tail after the current batch; a second Ctrl-C at once."""
     stop = threading.Event()
 
     def drain(_signum: int, _frame: FrameType | None) -> None:

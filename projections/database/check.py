@@ -1,14 +1,13 @@
-"""Prove that the databases hold exactly what the log says, row by row.
+"""Compare the databases with the fold of the log, row by row; find foreign tables in the graph.
 
 Each sink is compared at its own checkpoint, in one read-only snapshot, so that a tail may go on
-writing. Both sides stream in the order of their ids and are merged: nothing is held in memory but
-the map itself. Properties are compared as values with their types, not as text: the server orders
-keys and writes floats in its own way.
+writing. Both sides stream in the order of their ids and are merged: only the map itself is held in
+memory. Properties are compared as values with their types, not as text: the server orders keys
+and writes floats in its own way.
 
-Find what somebody else keeps in the schema of our graph: labels, tables, rows without a label.
-
-``CREATE (n:Door)`` makes a label, which is a table; rows without a label stand in the tables that
-all labels inherit from. A rebuild replaces the graph and so drops both.
+Foreign tables are labels, tables and rows without a label that somebody else has made in the
+graph's schema: ``CREATE (n:Door)`` makes a label, which is a table; rows without a label are in the
+tables that all labels inherit from. A rebuild replaces the graph and so drops them.
 """
 
 import json
@@ -45,15 +44,15 @@ from .sink import Checkpoint, SinkName
 from .statements import statements
 from .vector_rows import VectorRow, new_rows
 
-_KINDS: Final = {"v": "VIEW", "m": "MATERIALIZED VIEW", "f": "FOREIGN TABLE"}
+_RELATION_KINDS: Final = {"v": "VIEW", "m": "MATERIALIZED VIEW", "f": "FOREIGN TABLE"}
 
 
 @dataclass(frozen=True, slots=True)
 class ForeignTable:
     """A table in the graph's schema with rows that are not ours.
 
-    ``rows`` is None when they are not for us to read. ``keep`` is SQL that copies them elsewhere,
-    ``remove`` is SQL that drops them.
+    ``rows`` is their number, None when this role may not read them. ``keep`` is SQL that copies
+    them to the schema ``public``, ``remove`` is SQL that drops them.
     """
 
     table: str
@@ -64,26 +63,26 @@ class ForeignTable:
 
 
 def foreign_tables(connection: Connection) -> tuple[ForeignTable, ...]:
-    """All of them, by name."""
+    """The foreign tables of the graph's schema, by name."""
     values = {"graph": GRAPH, "ours": list(LABELS)}
     found = []
     for name, kind, label, readable in connection.execute(
         statements("foreign_tables")["tables"], values
     ).fetchall():
-        rows = _count(connection, name) if readable else None
+        rows = _count_rows(connection, name) if readable else None
         if name in PARENTS and not rows:
             continue
-        found.append(_described(connection, name, kind, label, rows))
+        found.append(_foreign_table(connection, name, kind, label, rows))
     return tuple(found)
 
 
-def _count(connection: Connection, name: str) -> int:
+def _count_rows(connection: Connection, name: str) -> int:
     query = sql.SQL("SELECT count(*) FROM ONLY {}").format(sql.Identifier(GRAPH, name))
     row = connection.execute(query).fetchone()
     return 0 if row is None else int(row[0])
 
 
-def _described(
+def _foreign_table(
     connection: Connection, name: str, kind: str, label: str | None, rows: int | None
 ) -> ForeignTable:
     table, copy = sql.Identifier(GRAPH, name), sql.Identifier("public", name)
@@ -95,21 +94,21 @@ def _described(
         call = sql.SQL("SELECT ag_catalog.drop_label({}, {})")
         remove = call.format(sql.Literal(GRAPH), sql.Literal(name))
     else:
-        what = _KINDS.get(kind, "TABLE").lower()
-        remove = sql.SQL("DROP {} {}").format(sql.SQL(_KINDS.get(kind, "TABLE")), table)
-    # A table of its own leaves the schema whole; a label would stay a part of the graph.
+        what = _RELATION_KINDS.get(kind, "TABLE").lower()
+        remove = sql.SQL("DROP {} {}").format(sql.SQL(_RELATION_KINDS.get(kind, "TABLE")), table)
+    # Not ALTER TABLE … SET SCHEMA: a label would stay a part of the graph.
     keep = sql.SQL("CREATE TABLE {} AS SELECT * FROM ONLY {}").format(copy, table)
     return ForeignTable(name, what, rows, keep.as_string(connection), remove.as_string(connection))
 
 
 Kind: TypeAlias = Literal["missing", "extra", "different"]
 Keyed: TypeAlias = tuple[int, Any]
-"""A row's id and the rest of it, in a form that compares."""
+"""A row's id, and its other values in a form that can be compared."""
 NAMED: Final = 100
-"""This many differences are named; all are counted."""
+"""The number of differences that are named; all are counted."""
 STREAM_ROWS: Final = 2_000
 BATCH_EVENTS: Final = 256
-_NONE: Final[dict[SinkName, str]] = {"graph": "no graph has", "vectors": "no vectors have"}
+_NO_ROWS_TEXT: Final[dict[SinkName, str]] = {"graph": "no graph has", "vectors": "no vectors have"}
 
 _TABLES: Final[dict[SinkName, list[sql.Identifier]]] = {
     "graph": [sql.Identifier(GRAPH, label) for label in LABELS],
@@ -136,9 +135,9 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class CheckReport:
-    """One sink at its checkpoint. ``differences`` names the first of ``differing``.
+    """One sink at its checkpoint. ``differences`` are the first of ``differing``.
 
-    ``foreign`` is what somebody else keeps in the graph's schema; a rebuild would drop it.
+    ``foreign`` are the tables in the graph's schema that a rebuild would drop.
     """
 
     sink: SinkName
@@ -150,51 +149,57 @@ class CheckReport:
 
     @property
     def sound(self) -> bool:
-        """True when the sink holds what the log says and nothing else."""
+        """True when the sink has exactly the rows of the fold, and no foreign table."""
         return not self.differing and not self.foreign
 
 
 def check(
     log: Path, targets: Targets, settings: Settings, *, only: SinkName | None = None
 ) -> list[CheckReport]:
-    """Compare what is there with the fold. Raises ProjectionMissing and ProjectionMismatch."""
+    """Compare the sinks with the fold. Raises ProjectionMissing and ProjectionMismatch."""
     sinks: tuple[tuple[SinkName, str], ...] = (
         ("graph", targets.graph_url),
         ("vectors", targets.vector_url),
     )
-    return [_check(log, sink, url, settings) for sink, url in sinks if only in (None, sink)]
+    return [_check_sink(log, sink, url, settings) for sink, url in sinks if only in (None, sink)]
 
 
-def _check(log: Path, sink: SinkName, url: str, settings: Settings) -> CheckReport:
-    tally = _Tally()
+def _check_sink(log: Path, sink: SinkName, url: str, settings: Settings) -> CheckReport:
+    comparison = _Comparison()
     with LogReader(log) as reader, connect(url, application="mapfold check") as connection:
         connection.isolation_level = IsolationLevel.REPEATABLE_READ
         connection.read_only = True
         with database_errors(url):
             pin_session_settings(connection)
             connection.commit()
-            held = _hold(connection, sink)
+            locked = _lock_tables(connection, sink)
             checkpoint = checkpoints.load(connection, sink)
             if checkpoint is None:
                 raise ProjectionMissing(
-                    f"{describe_target(url)}: {_NONE[sink]} been projected there;"
+                    f"{describe_target(url)}: {_NO_ROWS_TEXT[sink]} been projected there;"
                     f" run: {command_line('replay', log, settings)}"
                 )
-            if not held:
+            if not locked:
                 raise rows_dropped(checkpoint, sink, describe_target(url), log, settings)
             refuse_mismatch(checkpoint, sink, describe_target(url), log, reader, settings)
             compare = _compare_graph if sink == "graph" else _compare_vectors
-            compare(connection, reader, checkpoint, settings, tally)
+            compare(connection, reader, checkpoint, settings, comparison)
             foreign = foreign_tables(connection) if sink == "graph" else ()
     return CheckReport(
-        sink, checkpoint.next_offset, tally.rows, tally.differing, tuple(tally.differences), foreign
+        sink,
+        checkpoint.next_offset,
+        comparison.rows,
+        comparison.differing,
+        tuple(comparison.differences),
+        foreign,
     )
 
 
-def _hold(connection: Connection, sink: SinkName) -> bool:
-    """Keep rebuilds from swapping until the transaction ends; False when there is nothing to swap.
+def _lock_tables(connection: Connection, sink: SinkName) -> bool:
+    """Lock a sink's tables against swaps until the transaction ends; False when there are none.
 
-    Before its first look at anything: to a snapshot from before a swap the new tables are empty.
+    It must be the transaction's first statement: a snapshot from before a swap sees the new tables
+    as empty.
     """
     tables = sql.SQL(", ").join(_TABLES[sink])
     try:
@@ -205,8 +210,8 @@ def _hold(connection: Connection, sink: SinkName) -> bool:
     return True
 
 
-class _Tally:
-    """Merges two streams ordered by id and keeps what differs."""
+class _Comparison:
+    """Merges pairs of streams ordered by id; counts rows and keeps differences."""
 
     def __init__(self) -> None:
         self.rows = 0
@@ -218,28 +223,30 @@ class _Tally:
         while want is not None or have is not None:
             self.rows += 1
             if have is None or (want is not None and want[0] < have[0]):
-                self._differs(table, "missing", want, None)
+                self._add_difference(table, "missing", want, None)
                 want = next(expected, None)
             elif want is None or have[0] < want[0]:
-                self._differs(table, "extra", None, have)
+                self._add_difference(table, "extra", None, have)
                 have = next(found, None)
             else:
                 if want[1] != have[1]:
-                    self._differs(table, "different", want, have)
+                    self._add_difference(table, "different", want, have)
                 want, have = next(expected, None), next(found, None)
 
-    def _differs(self, table: str, kind: Kind, want: Keyed | None, have: Keyed | None) -> None:
+    def _add_difference(
+        self, table: str, kind: Kind, want: Keyed | None, have: Keyed | None
+    ) -> None:
         self.differing += 1
         row = want or have
         if row is not None and len(self.differences) < NAMED:
-            said = [None if side is None else _shortened(side[1]) for side in (want, have)]
-            self.differences.append(Difference(table, row[0], kind, said[0], said[1]))
+            expected, found = (None if r is None else _shortened(r[1]) for r in (want, have))
+            self.differences.append(Difference(table, row[0], kind, expected, found))
 
 
 def _events(
     connection: Connection, reader: LogReader, checkpoint: Checkpoint, sink: SinkName
 ) -> Iterator[tuple[Event, bool]]:
-    """The events of the projection, and whether each was parked."""
+    """The events up to the checkpoint, and whether each was parked."""
     parked = {letter.offset for letter in checkpoints.parked(connection, sink)}
     for event in reader.read(FIRST_OFFSET, checkpoint.next_offset):
         yield event, event.offset in parked
@@ -250,7 +257,7 @@ def _compare_graph(
     reader: LogReader,
     checkpoint: Checkpoint,
     settings: Settings,
-    tally: _Tally,
+    comparison: _Comparison,
 ) -> None:
     fold = LiveFold(settings)
     for _ in _folded(fold, _events(connection, reader, checkpoint, "graph")):
@@ -264,7 +271,7 @@ def _compare_graph(
             cursor.itersize = STREAM_ROWS
             cursor.execute(query.format(ids, table, sql.Identifier(label)))
             expected = (_graph_row(row) for row in expected_rows(fold.view, label))
-            tally.merge(label, expected, (_graph_row(row) for row in cursor))
+            comparison.merge(label, expected, (_graph_row(row) for row in cursor))
 
 
 def _compare_vectors(
@@ -272,7 +279,7 @@ def _compare_vectors(
     reader: LogReader,
     checkpoint: Checkpoint,
     settings: Settings,
-    tally: _Tally,
+    comparison: _Comparison,
 ) -> None:
     fold = LiveFold(settings)
     events = _events(connection, reader, checkpoint, "vectors")
@@ -285,7 +292,7 @@ def _compare_vectors(
     with connection.cursor(name="check", binary=True) as cursor:
         cursor.itersize = STREAM_ROWS
         cursor.execute(_VECTORS)
-        tally.merge(TABLE, expected, ((row[0], row[1:]) for row in cursor))
+        comparison.merge(TABLE, expected, ((row[0], row[1:]) for row in cursor))
 
 
 def _folded(fold: LiveFold, events: Iterable[tuple[Event, bool]]) -> Iterator[None]:

@@ -17,19 +17,19 @@ from .sink import Checkpoint, SinkName
 from .statements import statements
 
 _LOCK_NUMBERS: Final[dict[SinkName, int]] = {"graph": 1, "vectors": 2}
-_ONE_OF: Final[dict[SinkName, str]] = {
+_FIRST_TABLES: Final[dict[SinkName, str]] = {
     "graph": f'{GRAPH}."{LABELS[0]}"',
     "vectors": f"public.{TABLE}",
 }
-_MARK: Final = "mapfold"
+_COMMENT_PREFIX: Final = "mapfold"
 LOCK_GRACE_S: Final = 1.0
-"""A server notices only after a moment that the last writer's connection has ended."""
+"""It takes a server a moment to notice that the last writer's connection has ended."""
 LOCK_POLL_S: Final = 0.02
 
 
 @dataclass(frozen=True, slots=True)
 class DeadLetter:
-    """An event that could not be folded and was left out. ``run_id`` when its payload tells one."""
+    """An event that could not be folded and was left out. ``run_id`` is None when unreadable."""
 
     offset: Offset
     key: str
@@ -38,7 +38,7 @@ class DeadLetter:
 
 
 def event_hash(event: Event | None) -> str:
-    """Identifies an event by all it holds; "" for none."""
+    """SHA-256 over all fields of an event, in hex; "" for none."""
     if event is None:
         return ""
     head = json.dumps([event.offset, event.key, event.logged_ns, event.stamp_ns]).encode()
@@ -46,7 +46,7 @@ def event_hash(event: Event | None) -> str:
 
 
 def lock_writer(connection: Connection, sink: SinkName) -> None:
-    """Be the only writer of a sink until the connection ends. Raises ProjectionBusy."""
+    """Lock a sink for writing until the connection ends. Raises ProjectionBusy."""
     number = {"number": _LOCK_NUMBERS[sink]}
     deadline = time.monotonic() + LOCK_GRACE_S
     while True:
@@ -57,7 +57,7 @@ def lock_writer(connection: Connection, sink: SinkName) -> None:
             break
         time.sleep(LOCK_POLL_S)
     holder = connection.execute(statements("checkpoint")["lock_holder"], number).fetchone()
-    # The writer itself may run on any machine; what the database knows is its session.
+    # The writer may run on any machine; the database only knows its session.
     who = f" ({holder[1]}; PostgreSQL serves it in process {holder[0]})" if holder else ""
     raise ProjectionBusy(
         f"{describe_connection(connection)}: another rebuild or tail{who} is writing the {sink}"
@@ -66,18 +66,18 @@ def lock_writer(connection: Connection, sink: SinkName) -> None:
 
 
 def writer(connection: Connection, sink: SinkName) -> str | None:
-    """The application that holds the sink's lock, None when nobody does."""
+    """Name of the application that holds the sink's lock; None when it is free."""
     number = {"number": _LOCK_NUMBERS[sink]}
     row = connection.execute(statements("checkpoint")["lock_holder"], number).fetchone()
     return None if row is None else str(row[1])
 
 
 def has_schema(connection: Connection) -> bool:
-    """Whether the schema ``mapfold`` is there. Raises when somebody else's is."""
+    """Whether the schema ``mapfold`` exists. Raises DatabaseError when it is not ours."""
     row = connection.execute(statements("checkpoint")["schema_owner"]).fetchone()
     if row is None:
         return False
-    if not str(row[0]).startswith(_MARK):
+    if not str(row[0]).startswith(_COMMENT_PREFIX):
         raise DatabaseError(
             f"{describe_connection(connection)}: has a schema mapfold that mapfold did not make;"
             " use another database"
@@ -100,15 +100,15 @@ def load(connection: Connection, sink: SinkName) -> Checkpoint | None:
 
 
 def rows_exist(connection: Connection, sink: SinkName) -> bool:
-    """Whether the sink's rows have somewhere to be: somebody may have dropped it."""
+    """Whether the sink's graph or table still exists."""
     row = connection.execute(
-        statements("checkpoint")["rows_exist"], {"table": _ONE_OF[sink]}
+        statements("checkpoint")["rows_exist"], {"table": _FIRST_TABLES[sink]}
     ).fetchone()
     return row is not None and bool(row[0])
 
 
 def create(connection: Connection, sink: SinkName, log_id: str, settings: Settings) -> None:
-    """Make a checkpoint at offset 0, if there is none."""
+    """Insert a checkpoint at offset 0, if there is none."""
     connection.execute(
         statements("checkpoint")["create_first"],
         {
@@ -148,7 +148,7 @@ def advance(
 
 
 def replace(connection: Connection, sink: SinkName, checkpoint: Checkpoint) -> None:
-    """Put down a rebuild's checkpoint and forget the dead letters of the past."""
+    """Write a rebuild's checkpoint and delete the dead letters."""
     connection.execute(
         statements("checkpoint")["replace"],
         {
@@ -165,7 +165,7 @@ def replace(connection: Connection, sink: SinkName, checkpoint: Checkpoint) -> N
 
 
 def park(connection: Connection, sink: SinkName, letter: DeadLetter) -> None:
-    """Keep word of an event that was left out, in the transaction that moves past it."""
+    """Record an event that was left out, in the transaction that moves past it."""
     connection.execute(
         statements("checkpoint")["park"],
         {
@@ -179,7 +179,7 @@ def park(connection: Connection, sink: SinkName, letter: DeadLetter) -> None:
 
 
 def parked(connection: Connection, sink: SinkName) -> list[DeadLetter]:
-    """The events left out, by offset."""
+    """The dead letters, by offset."""
     if not has_schema(connection):
         return []
     rows = connection.execute(statements("checkpoint")["parked"], {"sink": sink}).fetchall()
@@ -187,18 +187,18 @@ def parked(connection: Connection, sink: SinkName) -> list[DeadLetter]:
 
 
 def write_heartbeat(connection: Connection, sink: SinkName) -> None:
-    """Say that the sink's tail lives."""
+    """Record that the sink's tail is alive."""
     connection.execute(statements("checkpoint")["write_heartbeat"], {"sink": sink})
 
 
 def ages(connection: Connection, sink: SinkName) -> tuple[float, float | None]:
-    """Seconds since the checkpoint moved, and since its tail last said that it lives."""
+    """Seconds since the checkpoint moved, and since its tail's last heartbeat (None: never)."""
     row = connection.execute(statements("checkpoint")["ages"], {"sink": sink}).fetchone()
     return (0.0, None) if row is None else (row[0], row[1])
 
 
 def dead_letter(event: Event, reason: str) -> DeadLetter:
-    """Where it stands in the log, why it was left out, and its run if the payload still tells."""
+    """The dead letter of an event."""
     return DeadLetter(event.offset, event.key, _run_id(event.payload), reason)
 
 

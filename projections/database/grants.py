@@ -1,7 +1,4 @@
-"""A rebuild makes new tables; whoever might read or write the old ones may do so with the new.
-
-Least privilege: the SQL for a role that only reads and one that only tails.
-"""
+"""Privileges: carried over to the tables of a rebuild; SQL of the roles for readers and writers."""
 
 from collections.abc import Collection
 from typing import Final
@@ -19,7 +16,7 @@ _PRIVILEGES: Final = {
     "DELETE": sql.SQL("DELETE"),
     "USAGE": sql.SQL("USAGE"),
 }
-"""Those worth carrying over: what readers and writers of rows need."""
+"""The privileges that are carried over: those that readers and writers of rows need."""
 _SCHEMA_GRANTS: Final = """
 SELECT coalesce(r.rolname, ''), a.privilege_type
 FROM pg_namespace n CROSS JOIN aclexplode(n.nspacl) a LEFT JOIN pg_roles r ON r.oid = a.grantee
@@ -49,7 +46,7 @@ def copy_privileges(
 
 def _grant(connection: Connection, privilege: str, what: sql.Composable, role: str) -> None:
     if privilege in _PRIVILEGES:
-        # The catalogue has no name for everybody.
+        # The catalogue has no name for PUBLIC.
         who = sql.Identifier(role) if role else sql.SQL("PUBLIC")
         connection.execute(
             sql.SQL("GRANT {} ON {} TO {}").format(_PRIVILEGES[privilege], what, who)
@@ -57,7 +54,7 @@ def _grant(connection: Connection, privilege: str, what: sql.Composable, role: s
 
 
 def roles_sql(sinks: Collection[str] = ("graph", "vectors")) -> str:
-    """The statements for a database that holds ``sinks``, ready for psql."""
+    """SQL for psql that makes the roles of a database that holds ``sinks``."""
     parts = statements("roles")
     wanted = ["reader", "writer", *(name for name in ("graph", "vectors") if name in sinks)]
     first = sql.Literal(list(FIRST_ENFORCING_VERSION))

@@ -117,6 +117,6 @@ def rows_dropped(
 ) -> ProjectionMissing:
     """The error for a checkpoint whose graph or table was dropped."""
     return ProjectionMissing(
-        f"{where}: {found.next_offset:,} events are in the {sink} by its checkpoint, but somebody"
-        f" has dropped what they were in; {replay_advice(log, settings)}"
+        f"{where}: the checkpoint of the {sink} has {found.next_offset:,} events, but their"
+        f" tables were dropped; {replay_advice(log, settings)}"
     )

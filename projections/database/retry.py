@@ -1,8 +1,8 @@
-"""Trying parked events again.
+"""Retry parked events: rebuild a sink once all of its parked events can be folded.
 
-An event that was parked changes, once it can be folded, everything that came after it; so there is
-no writing it in later. If all parked events of a sink can be read now (by a newer mapfold), the
-sink is rebuilt to where it was. If one still cannot, nothing is changed.
+A parked event, once folded, changes everything after it, so it cannot be added later. If all parked
+events of a sink can be read now (by a newer mapfold), the sink is rebuilt up to its checkpoint. If
+one still cannot, nothing is changed.
 """
 
 import sys
@@ -25,7 +25,7 @@ from .sink import SinkName
 
 @dataclass(frozen=True, slots=True)
 class RetryReport:
-    """A sink's parked events: how many there were, those that still fail, and what was done."""
+    """A sink's parked events: how many, which still fail, whether it was rebuilt."""
 
     sink: SinkName
     parked: int
@@ -34,7 +34,7 @@ class RetryReport:
 
 
 def retry(log: Path, targets: Targets, settings: Settings) -> list[RetryReport]:
-    """Try the dead letters of both sinks. Raises ProjectionMismatch for another log or settings."""
+    """Retry the parked events of both sinks. Raises ProjectionMismatch."""
     sinks: tuple[tuple[SinkName, str], ...] = (
         ("graph", targets.graph_url),
         ("vectors", targets.vector_url),
@@ -52,17 +52,17 @@ def _retry(
         if checkpoint is None or not letters:
             return RetryReport(sink, 0, (), rebuilt=False)
         refuse_mismatch(checkpoint, sink, describe_target(url), log, reader, settings)
-        still = tuple(_still_failing(reader, letters))
+        still = tuple(_still_rejected(reader, letters))
     if not still:
         rebuild(log, targets, settings, until=checkpoint.next_offset, only=sink)
     return RetryReport(sink, len(letters), still, rebuilt=not still)
 
 
-def _still_failing(reader: LogReader, letters: list[DeadLetter]) -> list[DeadLetter]:
+def _still_rejected(reader: LogReader, letters: list[DeadLetter]) -> list[DeadLetter]:
     failing = []
     for letter in letters:
         (event,) = reader.read(letter.offset, Offset(letter.offset + 1))
-        judged = read_envelope(event, max_bytes=sys.maxsize)
-        if isinstance(judged, Rejected):
-            failing.append(DeadLetter(letter.offset, letter.key, letter.run_id, judged.reason))
+        parsed = read_envelope(event, max_bytes=sys.maxsize)
+        if isinstance(parsed, Rejected):
+            failing.append(DeadLetter(letter.offset, letter.key, letter.run_id, parsed.reason))
     return failing

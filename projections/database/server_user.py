@@ -1,16 +1,14 @@
-"""As whom the embedded server runs when we are root: PostgreSQL refuses to be root.
+"""The system user of the embedded server, and the folder for its socket when paths are too long.
 
-Then it is the system user ``pgserver``, made on first use. That user must be able to *enter* the
-folders above the data and the programs: those that forbid it get ``o+x``, which lets nobody list or
-read them.
+PostgreSQL does not run as root. For root it runs as the system user ``pgserver``, made on first
+use. That user must be able to *enter* the folders above the data and the programs: those that
+forbid it get ``o+x``, which lets nobody list or read them.
 
-A folder for the server's socket, when the path of the data folder is too long for one.
-
-It stands in the temporary directory, where everybody may make folders, so no name is trusted:
+The socket folder is in ``/tmp``, where everybody may make folders, so no name is trusted:
 
 * It is made under a random name, 0700, so nobody can have made it before.
-* Its name is kept beside the data folder, in ``pg.socket``, for later commands to find, together
-  with the data folder's inode: the copy of a home is another server.
+* Its name is in the file ``pg.socket`` beside the data folder, with the data folder's inode: the
+  copy of a home is another server.
 * It is used only while it is a folder, no link, that the server's user owns and nobody else can
   enter. Else the server gets a new one.
 """
@@ -31,7 +29,7 @@ SYSTEM_USER: Final = "pgserver"
 
 
 def server_identity() -> dict[str, Any]:
-    """What `subprocess.run` needs to run a program as the server's user; nothing unless root."""
+    """Arguments for `subprocess.run` to run a program as the server's user; none unless root."""
     if os.geteuid() != 0:
         return {}
     _ensure_system_user()
@@ -53,7 +51,7 @@ def _ensure_system_user() -> None:
 
 
 def server_uid() -> int | None:
-    """The user id that the server runs under; None when root has not made its user yet."""
+    """The user id that the server runs as; None when root has not made that user yet."""
     if os.geteuid() != 0:
         return os.geteuid()
     with contextlib.suppress(KeyError):
@@ -62,7 +60,7 @@ def server_uid() -> int | None:
 
 
 def server_user() -> str:
-    """The name of that user."""
+    """The name of the user that the server runs as."""
     if os.geteuid() == 0:
         return SYSTEM_USER
     try:
@@ -76,7 +74,7 @@ def server_user() -> str:
 
 @contextlib.contextmanager
 def open_folder(name: Path | str, within: int | None = None) -> Iterator[int]:
-    """A descriptor of a folder. Raises OSError when it is a link or no folder."""
+    """A descriptor of a folder, relative to ``within``. Raises OSError for a link or no folder."""
     flags = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
     descriptor = os.open(name, flags, dir_fd=within)
     try:
@@ -86,7 +84,7 @@ def open_folder(name: Path | str, within: int | None = None) -> Iterator[int]:
 
 
 def give_to_server_user(folder: Path) -> None:
-    """Make the server's user the owner of ``folder``, which we have made."""
+    """Make the server's user the owner of ``folder``, which this process has made."""
     if os.geteuid() != 0:
         return
     _ensure_system_user()
@@ -98,13 +96,13 @@ def give_to_server_user(folder: Path) -> None:
 
 
 def let_server_user_enter(*paths: Path) -> None:
-    """Let the server's user pass through every folder above ``paths``."""
+    """Set ``o+x`` on the folders above ``paths`` that the server's user cannot enter."""
     if os.geteuid() != 0:
         return
     for path in paths:
         with contextlib.ExitStack() as opened:
             above = opened.enter_context(open_folder("/"))
-            # One by one, so that none can become a link meanwhile.
+            # One by one through descriptors, so that none can be replaced by a link meanwhile.
             for name in path.resolve().parts[1:-1]:
                 above = opened.enter_context(open_folder(name, above))
                 mode = stat.S_IMODE(os.fstat(above).st_mode)
@@ -117,19 +115,22 @@ _PARENT: Final = Path("/tmp")  # noqa: S108 - random names, made 0700, and check
 _PREFIX: Final = "mapfold-"
 
 
-def find(data: Path) -> Path | None:
-    """The folder of the server of ``data``; None if there is none that can be trusted."""
-    folder = _recorded(data)
+def find_socket_folder(data: Path) -> Path | None:
+    """The socket folder of ``data``; None if there is none that can be trusted."""
+    folder = _read_record(data)
     return folder if folder is not None and _is_private(folder) else None
 
 
-def find_or_make(data: Path) -> Path:
-    """The same, making one if need be; under its last name, if that is free, as URLs hold it."""
-    folder = find(data)
+def find_or_make_socket_folder(data: Path) -> Path:
+    """The socket folder of ``data``, made if need be: under its last name if that is free, as URLs
+    hold it."""
+    folder = find_socket_folder(data)
     if folder is None:
-        folder = _made_again(_recorded(data)) or Path(tempfile.mkdtemp(prefix=_PREFIX, dir=_PARENT))
+        folder = _make_again(_read_record(data)) or Path(
+            tempfile.mkdtemp(prefix=_PREFIX, dir=_PARENT)
+        )
         give_to_server_user(folder)
-        _record(data, folder)
+        _write_record(data, folder)
     return folder
 
 
@@ -142,7 +143,7 @@ def _is_private(folder: Path) -> bool:
     return status.st_uid == server_uid() and not status.st_mode & 0o077
 
 
-def _made_again(folder: Path | None) -> Path | None:
+def _make_again(folder: Path | None) -> Path | None:
     if folder is None:
         return None
     try:
@@ -152,22 +153,22 @@ def _made_again(folder: Path | None) -> Path | None:
     return folder
 
 
-def _recorded(data: Path) -> Path | None:
+def _read_record(data: Path) -> Path | None:
     with contextlib.suppress(OSError, ValueError):
-        inode, name = _record_of(data).read_text("utf-8").split("\n")[:2]
+        inode, name = _record_file(data).read_text("utf-8").split("\n")[:2]
         if int(inode) == data.stat().st_ino and name.startswith(_PREFIX) and "/" not in name:
             return _PARENT / name
     return None
 
 
-def _record(data: Path, folder: Path) -> None:
-    record = _record_of(data)
-    written = record.with_name(f"{record.name}.new")
-    written.unlink(missing_ok=True)
-    with written.open("x", encoding="utf-8") as file:
+def _write_record(data: Path, folder: Path) -> None:
+    record = _record_file(data)
+    new = record.with_name(f"{record.name}.new")
+    new.unlink(missing_ok=True)
+    with new.open("x", encoding="utf-8") as file:
         file.write(f"{data.stat().st_ino}\n{folder.name}\n")
-    written.replace(record)
+    new.replace(record)
 
 
-def _record_of(data: Path) -> Path:
+def _record_file(data: Path) -> Path:
     return data.with_name(f"{data.name}.socket")

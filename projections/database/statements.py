@@ -1,7 +1,7 @@
-"""Statements kept in ``sql/*.sql``, one file for each subject.
+"""SQL statements, loaded from ``sql/*.sql``.
 
-A file may hold several statements, each under a line ``-- name: …``. ``{braces}`` are identifiers
-put in by `psycopg.sql`, ``%(name)s`` are bind parameters; there is no third way for a value.
+A file holds several statements, each under a line ``-- name: …``. ``{braces}`` are identifiers that
+`psycopg.sql` quotes, ``%(name)s`` are bind parameters; no value gets in otherwise.
 """
 
 import re
@@ -21,7 +21,7 @@ def statements(file: str) -> dict[str, sql.SQL]:
     """The statements of ``sql/<file>.sql`` by name."""
     text = files("projections.database").joinpath("sql", f"{file}.sql").read_text("utf-8")
     parts = _NAME.split(text)[1:]
-    # Part of the program, not of its input: as literal as a string in this file.
+    # The files are part of the program, so their text is as literal as a string here.
     bodies = {
         name: cast("LiteralString", body.strip())
         for name, body in zip(parts[::2], parts[1::2], strict=True)
@@ -31,5 +31,5 @@ def statements(file: str) -> dict[str, sql.SQL]:
 
 @cache
 def tables() -> dict[str, sql.Identifier]:
-    """The graph's label tables under their names in lower case, for the ``{braces}``."""
+    """Identifiers of the label tables by label in lower case, for the ``{braces}``."""
     return {label.lower(): sql.Identifier(GRAPH, label) for label in LABELS}

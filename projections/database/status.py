@@ -1,9 +1,9 @@
-"""Where the databases stand beside a log: lag, liveness, dead letters, versions.
+"""State of the databases compared with a log: lag, writer, dead letters, versions.
 
-A sink is *following* when a tail that lives holds it, whether it has every event or not yet,
-*stalled* when the tail that holds it has not been heard of for a while, *rebuilding* when a replay
-is at work on it; with nobody on it, it is *idle* when it has every event and *behind* when not. It
-is *other* when it was made from another log or with other settings.
+A sink is *following* while a live tail writes it, with every event or still catching up; *stalled*
+when its tail has had no heartbeat for ``STALLED_S``; *rebuilding* while a replay writes it. Without
+a writer it is *idle* when it has every event and *behind* when not. It is *other* when it was made
+from another log or with other settings.
 """
 
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ from .origin import command_line, refuse_other_origin, replay_advice
 from .sink import Checkpoint, SinkName
 
 STALLED_S: Final = 20.0
-"""A living tail says so every 5 s."""
+"""A live tail's heartbeat comes every 5 s."""
 
 Condition = Literal[
     "missing", "other", "idle", "following", "rebuilding", "stalled", "behind", "unreachable"
@@ -42,8 +42,8 @@ Condition = Literal[
 class SinkStatus:
     """One sink. Ages are seconds; ``note`` explains ``other`` and ``unreachable``.
 
-    ``lag`` is None when it was made from another log, or a longer one: there is nothing to count.
-    ``unwanted_writers`` are roles without the privilege that Apache AGE lets write all the same.
+    ``lag`` is None when it was made from another log, or a longer one. ``unwanted_writers`` are
+    roles without the privilege to write that Apache AGE lets write nevertheless.
     """
 
     sink: SinkName
@@ -71,7 +71,7 @@ class Status:
 
     @property
     def healthy(self) -> bool:
-        """True when nothing is missing, stalled, of another origin, parked, or open to readers."""
+        """True unless a sink is not up to date, has parked events or can be written by readers."""
         good = ("idle", "following", "rebuilding")
         return all(
             s.condition in good and not s.dead_letters and not s.unwanted_writers
@@ -80,29 +80,29 @@ class Status:
 
 
 def projection_status(log: Path, targets: Targets, settings: Settings) -> Status:
-    """Look at both sinks. A database that cannot be reached is a finding, not a failure."""
+    """State of both sinks. A database that cannot be reached is a finding, not an error."""
     with LogReader(log) as reader:
         log_id, end = reader.log_id, reader.next_offset
     sinks: tuple[tuple[SinkName, str], ...] = (
         ("graph", targets.graph_url),
         ("vectors", targets.vector_url),
     )
-    found = tuple(_status(sink, url, log, log_id, end, settings) for sink, url in sinks)
+    found = tuple(_reachable_status(sink, url, log, log_id, end, settings) for sink, url in sinks)
     return Status(log_id, end, found)
 
 
-def _status(
+def _reachable_status(
     sink: SinkName, url: str, log: Path, log_id: str, end: Offset, settings: Settings
 ) -> SinkStatus:
     try:
         opened = connect(url, application="mapfold status", autocommit=True)
         with opened as connection, database_errors(url):
-            return _look(connection, sink, log, log_id, end, settings)
+            return _sink_status(connection, sink, log, log_id, end, settings)
     except DatabaseError as error:
         return SinkStatus(sink, describe_target(url), "unreachable", note=str(error))
 
 
-def _look(
+def _sink_status(
     connection: Connection, sink: SinkName, log: Path, log_id: str, end: Offset, settings: Settings
 ) -> SinkStatus:
     where = describe_connection(connection)
@@ -110,16 +110,16 @@ def _look(
     found = checkpoints.load(connection, sink)
     writer = checkpoints.writer(connection, sink)
     if found is None and writer is not None:
-        return SinkStatus(sink, where, _at_work(writer), writer=writer, versions=versions)
+        return SinkStatus(sink, where, _working(writer), writer=writer, versions=versions)
     if found is None:
         advice = f"nothing has been projected there; run: {command_line('replay', log, settings)}"
         return SinkStatus(sink, where, "missing", note=advice, versions=versions)
     if not checkpoints.rows_exist(connection, sink):
-        told = f"somebody has dropped what its {found.next_offset:,} events were in"
-        advice = f"{told}; {replay_advice(log, settings)}"
+        dropped = f"the tables of its {found.next_offset:,} events were dropped"
+        advice = f"{dropped}; {replay_advice(log, settings)}"
         return SinkStatus(sink, where, "missing", note=advice, versions=versions)
-    moved, beaten = checkpoints.ages(connection, sink)
-    condition, note = _condition(found, sink, where, log, log_id, end, settings, writer, beaten)
+    moved, heartbeat = checkpoints.ages(connection, sink)
+    condition, note = _condition(found, sink, where, log, log_id, end, settings, writer, heartbeat)
     return SinkStatus(
         sink,
         where,
@@ -128,7 +128,7 @@ def _look(
         found.next_offset,
         end - found.next_offset if found.log_id == log_id and found.next_offset <= end else None,
         round(moved, 3),
-        None if beaten is None else round(beaten, 3),
+        None if heartbeat is None else round(heartbeat, 3),
         writer,
         found.digest,
         tuple(checkpoints.parked(connection, sink)),
@@ -146,7 +146,7 @@ def _condition(
     end: Offset,
     settings: Settings,
     writer: str | None,
-    beaten: float | None,
+    heartbeat: float | None,
 ) -> tuple[Condition, str | None]:
     advice = replay_advice(log, settings)
     try:
@@ -155,16 +155,16 @@ def _condition(
         return "other", str(error)
     if found.next_offset > end:
         return "other", f"the log has only {end:,} events; {advice}"
-    if writer == "mapfold tail" and (beaten is None or beaten > STALLED_S):
-        return "stalled", "a tail holds it but has not been heard of; look at that process"
+    if writer == "mapfold tail" and (heartbeat is None or heartbeat > STALLED_S):
+        return "stalled", "a tail holds it but sends no heartbeat; look at that process"
     if writer is not None:
-        return _at_work(writer), None
+        return _working(writer), None
     if found.next_offset == end:
         return "idle", None
     return "behind", f"nobody writes it; run: {command_line('tail', log, settings)}"
 
 
-def _at_work(writer: str) -> Literal["following", "rebuilding"]:
+def _working(writer: str) -> Literal["following", "rebuilding"]:
     return "following" if writer == "mapfold tail" else "rebuilding"
 
 

@@ -36,9 +36,9 @@ from .connection import Targets, database_errors, describe_target
 from .live_fold import LiveFold, batches
 from .loader import LoaderName
 from .origin import refuse_mismatch, replay_advice, rows_dropped
-from .progress import TailProgress, TailReport
 from .sink import Checkpoint, SinkName
 from .stores import Only, Store, open_stores
+from .tail_progress import TailProgress, TailReport
 from .writing import AWAY, Backoff, LostCommits, OnTrouble, SinkBatch, Writer
 
 HEARTBEAT_S: Final = 5.0
@@ -110,7 +110,7 @@ class TailPass:
             Writer(
                 store,
                 self.checkpoints,
-                plan.targets.revive,
+                plan.targets.restart_embedded,
                 plan.stop,
                 plan.on_trouble,
                 plan.patience_s,
@@ -278,7 +278,7 @@ def _pass(
     try:
         if outage is not None:
             outage.wait()
-            plan.targets.revive()
+            plan.targets.restart_embedded()
         opened = open_stores(
             plan.targets, plan.settings, only=only, application="mapfold tail", loader=loader
         )

@@ -20,7 +20,7 @@ from eventsrc.sim import SimulatedRun
 from projections.database.connection import Targets
 from projections.drawing import LostRobot, Spot
 from projections.model.view import MapView
-from projections.queries.relocalize import Reader
+from projections.queries.relocalize import CandidateReader
 from projections.relocalize import Answer, rank, read_crops
 
 from .folder import DemoFolder
@@ -76,7 +76,7 @@ def ask_lost(targets: Targets, run: SimulatedRun, folder: DemoFolder) -> LostRun
     index = _first_question(run)
     pose, truth = run.true_poses[index], run.truth[index]
     best = _most_confident(run.envelopes[index]["detections"])
-    with Reader(targets) as reader:
+    with CandidateReader(targets) as reader:
         questions = tuple(
             _ask(reader, run, index, best[:count], folder) for count in range(1, len(best) + 1)
         )
@@ -122,7 +122,7 @@ def _most_confident(detections: Sequence[dict[str, Any]]) -> list[dict[str, Any]
 
 
 def _ask(
-    reader: Reader,
+    reader: CandidateReader,
     run: SimulatedRun,
     index: int,
     detections: Sequence[dict[str, Any]],
@@ -140,7 +140,7 @@ def _ask(
     return AskedQuestion(tuple(d["class"] for d in detections), answer, error, seconds)
 
 
-def _ask_whole_run(reader: Reader, run: SimulatedRun) -> RunSummary:
+def _ask_whole_run(reader: CandidateReader, run: SimulatedRun) -> RunSummary:
     started = time.monotonic()
     asked = [
         _ask(reader, run, index, _most_confident(envelope["detections"]))

@@ -1,8 +1,6 @@
-"""Reading Places and Objects from the graph's tables; every function is one round trip or two.
+"""Reads of Places and Objects from the graph's tables, in one or two round trips each.
 
-Ids and class names are bind parameters, encoded as agtype strings; they may hold anything.
-
-Places and Objects near a position, nearest first.
+Ids and class names are bind parameters, encoded as agtype strings; they may hold any characters.
 """
 
 import json
@@ -18,7 +16,7 @@ from projections.errors import ProjectionMissing
 
 from .place_graph import PlaceGraph, PlaceNode
 
-_NUMBER = (1 << 48) - 1
+_NUMBER_MASK = (1 << 48) - 1
 
 
 def read_place_graph(connection: Connection) -> PlaceGraph:
@@ -45,33 +43,35 @@ def read_place_graph(connection: Connection) -> PlaceGraph:
 def read_object(connection: Connection, object_id: str) -> dict[str, Any] | None:
     """An Object with its ``place_id`` (None for none); None if there is no such Object."""
     rows = _rows(connection, "object", id=text(object_id))
-    return _thing(rows[0]) if rows else None
+    return _object_document(rows[0]) if rows else None
 
 
 def read_objects_of_place(connection: Connection, place_id: str) -> list[dict[str, Any]]:
     """The Objects located in a Place, in founding order."""
-    return [_thing(row) for row in _rows(connection, "objects_of_place", id=text(place_id))]
+    return [
+        _object_document(row) for row in _rows(connection, "objects_of_place", id=text(place_id))
+    ]
 
 
-def read_holders(connection: Connection, class_name: str) -> dict[int, int]:
-    """How many Objects of a class each Place holds, by the Place's ordinal."""
-    rows = _rows(connection, "holders", id=text(class_name))
+def read_object_counts(connection: Connection, class_name: str) -> dict[int, int]:
+    """Number of Objects of a class, by Place ordinal; only Places that have one."""
+    rows = _rows(connection, "object_counts", id=text(class_name))
     return {_ordinal(graphid): count for graphid, count in rows}
 
 
-def read_near(connection: Connection, kind: str, x: float, y: float, r: float) -> list[Any]:
+def _read_square(connection: Connection, kind: str, x: float, y: float, r: float) -> list[Any]:
     """Properties of the ``places`` or ``objects`` in a square of half-width ``r`` metres."""
     box = {"x0": x - r, "x1": x + r, "y0": y - r, "y1": y + r}
     return [json.loads(row[0]) for row in _rows(connection, f"near_{kind}", **box)]
 
 
-def _thing(row: tuple[str, str | None]) -> dict[str, Any]:
+def _object_document(row: tuple[str, str | None]) -> dict[str, Any]:
     place_id = None if row[1] is None else json.loads(row[1])["place_id"]
     return {**json.loads(row[0]), "place_id": place_id}
 
 
 def _ordinal(graphid: str) -> int:
-    return (int(graphid) & _NUMBER) - 1
+    return (int(graphid) & _NUMBER_MASK) - 1
 
 
 def _rows(connection: Connection, name: str, **values: Any) -> list[Any]:
@@ -87,14 +87,14 @@ def _rows(connection: Connection, name: str, **values: Any) -> list[Any]:
 
 
 def places_near(connection: Connection, x: float, y: float, radius: float) -> list[dict[str, Any]]:
-    """Places whose centroid is within ``radius`` metres, with ``distance_m``."""
-    found = read_near(connection, "places", x, y, radius)
+    """Places with a centroid within ``radius`` metres, nearest first, with ``distance_m``."""
+    found = _read_square(connection, "places", x, y, radius)
     return _nearest(found, "centroid_x", "centroid_y", "place_id", x, y, radius)
 
 
 def objects_near(connection: Connection, x: float, y: float, radius: float) -> list[dict[str, Any]]:
-    """Objects seen from within ``radius`` metres on average, with ``distance_m``."""
-    found = read_near(connection, "objects", x, y, radius)
+    """Objects with a mean position within ``radius`` metres, nearest first, with ``distance_m``."""
+    found = _read_square(connection, "objects", x, y, radius)
     return _nearest(found, "mean_x", "mean_y", "object_id", x, y, radius)
 
 

@@ -1,8 +1,7 @@
-"""Places and which are next to each other, small enough to hold: paths and neighbourhoods.
+"""The graph of adjacent Places, in memory: shortest paths and neighbourhoods. Pure.
 
-A building has hundreds of Places, not millions, so the whole adjacency comes in one look and is
-searched here; a variable-length pattern in Cypher would load the whole graph per session instead.
-Pure: the databases and a folded map both fill it.
+A building has hundreds of Places, not millions, so all of them are read at once and searched here;
+a variable-length pattern in Cypher would load the whole graph per session instead.
 """
 
 from collections import deque
@@ -61,14 +60,15 @@ class PlaceGraph:
         return hops
 
     def path(self, start: int, goal: int) -> list[int] | None:
-        """The way with the fewest steps; of those the one driven most; of those the earliest.
+        """The path with the fewest steps, as ordinals; None if there is none.
 
-        "Driven most" counts the transitions on the least driven step. None if there is no way.
+        Of several, the one whose least driven step has the most transitions; then the one with the
+        lowest ordinals.
         """
         steps = self.hops_from(goal, len(self.places))
         if start not in steps:
             return None
-        # From the goal outwards: the best (least driven step, way) of each place.
+        # From the goal outwards, of each place: transitions of the least driven step, and path.
         best: dict[int, tuple[int, list[int]]] = {goal: (1 << 62, [goal])}
         for here in sorted(steps, key=lambda place: (steps[place], place)):
             if here == goal:

@@ -1,13 +1,11 @@
-"""Re-localisation against the live databases: one round trip, or two when they are apart.
+"""Re-localisation with the live databases, one round trip to each of them.
 
-A `Reader` holds the connections and fetches candidates; `relocalize` is the whole question from
-databases to answer. What the ranking does with the candidates is `projections.relocalize`.
+`relocalize` answers a whole question; a `CandidateReader` keeps the connections for several. The
+candidates are ranked in `projections.relocalize`.
 
-Graph and vectors are one map only if the same log and the same settings made both.
-
-Each carries a checkpoint of its own, and ``replay --only`` or ``tail --only`` may have made one of
-them from something else. Numbers of observations then name other things on the other side, and an
-answer made of both would be wrong without anybody noticing.
+Graph and vectors are one map only if the same log and settings made both. Each has a checkpoint of
+its own, and ``replay --only`` or ``tail --only`` may have made one of them from something else. The
+numbers of observations then differ, and an answer made of both would be wrong; it is refused.
 """
 
 import contextlib
@@ -59,22 +57,22 @@ def refuse_mixed(
         return
     log, _, _ = vectors.rpartition(" ")
     graph_log, _, _ = graph.rpartition(" ")
-    told = (
+    reason = (
         f"made with other settings than the graph, both from log {log}"
         if log == graph_log
         else f"made from log {log}, the graph from log {graph_log}"
     )
     where = "" if vectors_place == graph_place else f" (the graph is in {graph_place})"
     raise ProjectionMismatch(
-        f"{vectors_place}: the vectors there were {told}{where}; run mapfold replay LOG without"
+        f"{vectors_place}: the vectors there were {reason}{where}; run mapfold replay LOG without"
         " --only, so that one log and one set of settings make both"
     )
 
 
-_LABELS = {"observation": LABEL_IDS["Observation"]}
-_NUMBER = (1 << 48) - 1
-_NEAR = 12
-"""Columns of the statement ``near``; the last two: the embedding's model, and the origin."""
+_LABEL_IDS = {"observation": LABEL_IDS["Observation"]}
+_NUMBER_MASK = (1 << 48) - 1
+_NEAR_COLUMNS = 12
+"""Number of columns of the statement ``near``; the last two are embedding model and origin."""
 _EF_SEARCH = max(100, NEIGHBOURS)
 
 
@@ -87,14 +85,14 @@ def relocalize(
     camera: Camera = DEFAULT_CAMERA,
 ) -> Answer:
     """Where a robot is that sees ``crops``, from the databases as they are now."""
-    with Reader(targets) as reader:
+    with CandidateReader(targets) as reader:
         return rank(crops, reader.candidates(crops), top=top, method=method, camera=camera)
 
 
 def prepare_graph(connection: Connection) -> None:
-    """Set up a session for walking along the graph's tables; AGE's operators are found last.
+    """Set up a session for joins of the graph's tables by id; ag_catalog comes last in the path.
 
-    A question follows a few hundred ids. Left alone the planner reads whole tables into hashes for
+    A question joins a few hundred ids. By default the planner reads whole tables into hashes for
     that: 300 ms instead of 10 at 300,000 observations.
     """
     connection.execute('SET search_path = "$user", public, ag_catalog')
@@ -103,7 +101,7 @@ def prepare_graph(connection: Connection) -> None:
 
 
 def prepare_vectors(connection: Connection) -> None:
-    """Set up a session for searching: vectors in binary, enough breadth.
+    """Set up a session for vector search: vectors in binary, a wider HNSW search.
 
     Without a wider ``ef_search`` an HNSW index silently returns fewer rows than asked for.
     """
@@ -118,8 +116,8 @@ def prepare_vectors(connection: Connection) -> None:
     connection.execute(sql.SQL("SET hnsw.ef_search = {}").format(sql.Literal(_EF_SEARCH)))
 
 
-class Reader:
-    """Connections to the databases of one projection, for questions one after the other."""
+class CandidateReader:
+    """Connections to the databases of one projection, for one question after the other."""
 
     def __init__(self, targets: Targets) -> None:
         self._targets = targets
@@ -138,11 +136,11 @@ class Reader:
             raise
 
     def candidates(self, crops: Sequence[Crop], neighbours: int = NEIGHBOURS) -> Candidates:
-        """The observations most like each crop, with their places."""
+        """The ``neighbours`` observations most similar to each crop, with their Places."""
         return fetch(self._vectors, self._graph, crops, neighbours)
 
-    def exactly(self) -> None:
-        """From now on search without the index: slow, and never wrong."""
+    def disable_index(self) -> None:
+        """From now on search exactly, without the HNSW index: slow."""
         self._vectors.execute("SET enable_indexscan = off")
 
     def close(self) -> None:
@@ -160,28 +158,30 @@ class Reader:
 def fetch(
     vectors: Connection, graph: Connection, crops: Sequence[Crop], neighbours: int = NEIGHBOURS
 ) -> Candidates:
-    """Candidates over open connections; the same one twice means one round trip."""
+    """Candidates over open connections; with the same one twice in one round trip."""
     one = vectors is graph
-    with _clear_errors(vectors):
+    with _query_errors(vectors):
         rows = vectors.execute(
-            _statement("near_and_along" if one else "near", len(crops)),
-            {**_LABELS, "neighbours": neighbours, **_bound(crops)},
+            _statement("near_and_graph" if one else "near", len(crops)),
+            {**_LABEL_IDS, "neighbours": neighbours, **_crop_values(crops)},
         ).fetchall()
     _check_spaces(crops, rows)
-    near = [(*row[:_NEAR],) for row in rows]
-    along = {row[1]: row[_NEAR:] for row in rows} if one else _along(graph, near)
+    near = [(*row[:_NEAR_COLUMNS],) for row in rows]
+    graph_rows = (
+        {row[1]: row[_NEAR_COLUMNS:] for row in rows} if one else _follow_graph(graph, near)
+    )
     if near:
-        first = along.get(near[0][1], (None,))
+        first = graph_rows.get(near[0][1], (None,))
         refuse_mixed(
             near[0][-1], first[-1], describe_connection(vectors), describe_connection(graph)
         )
-    return _assemble(len(crops), near, along)
+    return _assemble(len(crops), near, graph_rows)
 
 
-def _along(graph: Connection, near: Sequence[Sequence[Any]]) -> dict[int, tuple[Any, ...]]:
+def _follow_graph(graph: Connection, near: Sequence[Sequence[Any]]) -> dict[int, tuple[Any, ...]]:
     det_pks = sorted({row[1] for row in near})
-    with _clear_errors(graph):
-        rows = graph.execute(_statement("along", 0), {**_LABELS, "det_pks": det_pks}).fetchall()
+    with _query_errors(graph):
+        rows = graph.execute(_statement("graph", 0), {**_LABEL_IDS, "det_pks": det_pks}).fetchall()
     return {row[0]: row[1:] for row in rows}
 
 
@@ -195,17 +195,19 @@ def _statement(name: str, crops: int) -> sql.Composed:
     return statements("relocalize")[name].format(questions=questions, **tables())
 
 
-def _bound(crops: Sequence[Crop]) -> dict[str, Any]:
+def _crop_values(crops: Sequence[Crop]) -> dict[str, Any]:
     return {f"crop_{i}": crop.vector for i, crop in enumerate(crops)}
 
 
 def _assemble(
-    crops: int, near: Sequence[Sequence[Any]], along: Mapping[int, Sequence[Any]]
+    crops: int, near: Sequence[Sequence[Any]], graph_rows: Mapping[int, Sequence[Any]]
 ) -> Candidates:
     matches: list[list[Match]] = [[] for _ in range(crops)]
     places: dict[PlaceOrdinal, CandidatePlace] = {}
     for crop, det_pk, det_id, run_id, similarity, class_name, bbox, x, y, yaw, *_ in near:
-        thing, its_id, its, there_id, there, _ = along.get(det_pk, (None,) * 6)
+        thing, object_place_id, object_place, place_id, place, _ = graph_rows.get(
+            det_pk, (None,) * 6
+        )
         found = None if thing is None else _properties(thing)
         matches[crop].append(
             Match(
@@ -217,8 +219,8 @@ def _assemble(
                 (bbox[0], bbox[1], bbox[2], bbox[3]),
                 class_name if found is None else found["class_name"],
                 None if found is None else found["object_id"],
-                _spot(places, its_id, its),
-                _spot(places, there_id, there),
+                _spot(places, object_place_id, object_place),
+                _spot(places, place_id, place),
             )
         )
     ordered = (tuple(sorted(row, key=lambda m: (-m.similarity, m.observation))) for row in matches)
@@ -230,7 +232,7 @@ def _spot(
 ) -> PlaceOrdinal | None:
     if graphid is None or properties is None:
         return None
-    ordinal = PlaceOrdinal((int(graphid) & _NUMBER) - 1)
+    ordinal = PlaceOrdinal((int(graphid) & _NUMBER_MASK) - 1)
     if ordinal not in places:
         place = _properties(properties)
         places[ordinal] = CandidatePlace(
@@ -246,14 +248,14 @@ def _properties(agtype: str) -> dict[str, Any]:
 
 
 def _check_spaces(crops: Sequence[Crop], rows: Sequence[Sequence[Any]]) -> None:
-    model = next((row[_NEAR - 2] for row in rows), None)
+    model = next((row[_NEAR_COLUMNS - 2] for row in rows), None)
     for crop in crops:
         check_space(crop, len(crop.vector), model)
 
 
 @contextlib.contextmanager
-def _clear_errors(connection: Connection) -> Iterator[None]:
-    """What can be wrong with a question, or with a database that holds no map yet."""
+def _query_errors(connection: Connection) -> Iterator[None]:
+    """Errors of a question that does not fit the map, or of a database without a map."""
     with database_errors(connection.info.dsn):
         try:
             yield

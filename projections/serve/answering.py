@@ -1,11 +1,7 @@
-"""What the service answers, whatever it is asked over: JSON in, JSON out, errors as replies.
+"""Answers to questions over any transport: JSON in, JSON out, rate limited, errors as replies.
 
-A question is what ``mapfold relocalize`` takes; an object with crops may also say ``top`` and
-``method``. Every refusal is ``{"error": {"kind", "message"}}`` with one of the kinds below.
-
-How much a service takes on: questions a second, and questions that wait.
-
-Lines for people about what may happen often: the first at once, its like once a minute.
+A question is what ``mapfold relocalize`` takes; an object with crops may also have ``top`` and
+``method``. Every refusal is ``{"error": {"kind", "message"}}`` with one of the kinds in ``_KINDS``.
 """
 
 import contextlib
@@ -40,23 +36,23 @@ from .pools import Pools
 
 
 class TooMuchError(MapfoldError):
-    """The service has more questions than it may answer; ask again later."""
+    """More questions than the service answers; ask again later."""
 
 
 class BusyError(TooMuchError):
-    """Too many questions wait already, or this one has waited for too long."""
+    """Too many questions are queued, or this one has waited for too long."""
 
 
-class Bucket:
-    """At most ``per_second`` questions a second in the long run, twice as many at once."""
+class TokenBucket:
+    """A token bucket: ``per_second`` questions a second in the long run, twice as many at once."""
 
     def __init__(self, per_second: float, now: Callable[[], float] = time.monotonic) -> None:
         self._rate, self._size = per_second, max(1.0, 2.0 * per_second)
         self._now, self._lock = now, threading.Lock()
         self._tokens, self._filled = self._size, now()
 
-    def take(self) -> None:
-        """Take one token. Raises TooMuchError when there is none."""
+    def take_token(self) -> None:
+        """Raises TooMuchError when there is none."""
         with self._lock:
             now = self._now()
             self._tokens = min(self._size, self._tokens + (now - self._filled) * self._rate)
@@ -68,30 +64,33 @@ class Bucket:
             self._tokens -= 1.0
 
 
-EVERY_S: Final = 60.0
-_MOST: Final = 100
+REPEAT_S: Final = 60.0
+_MAX_LINES: Final = 100
 
 
-class Notices:
-    """Passes lines on to ``tell``, from any thread; counts those that it holds back."""
+class RepeatFilter:
+    """Passes lines on to ``tell``, each at once and again after ``REPEAT_S`` at the earliest.
+
+    Repeats in between are counted. For any thread.
+    """
 
     def __init__(
         self, tell: Callable[[str], None], now: Callable[[], float] = time.monotonic
     ) -> None:
         self._tell, self._now, self._lock = tell, now, threading.Lock()
-        self._told: dict[str, tuple[float, int]] = {}  # when last told, and how often since
+        self._passed: dict[str, tuple[float, int]] = {}  # when last passed on, and repeats since
 
     def __call__(self, line: str) -> None:
-        """Tell the line, unless it was told within the last minute."""
+        """Pass ``line`` on, or count it."""
         with self._lock:
             now = self._now()
-            at, count = self._told.get(line, (-EVERY_S, 0))
-            if now - at < EVERY_S:
-                self._told[line] = (at, count + 1)
+            at, count = self._passed.get(line, (-REPEAT_S, 0))
+            if now - at < REPEAT_S:
+                self._passed[line] = (at, count + 1)
                 return
-            if len(self._told) >= _MOST:
-                self._told.clear()
-            self._told[line] = (now, 0)
+            if len(self._passed) >= _MAX_LINES:
+                self._passed.clear()
+            self._passed[line] = (now, 0)
         self._tell(f"{line} (and {count} more like it since)" if count else line)
 
 
@@ -110,14 +109,14 @@ _KINDS: Final[tuple[tuple[type[MapfoldError], str, int, str | None], ...]] = (
     (DatabaseError, "database", 503, "the database cannot be asked; the service tells why"),
     (MapfoldError, "failed", 500, "failed; the service tells why"),
 )
-"""Kinds of errors and what others may read. What names databases and paths, the service's own
-stderr says (`Answerer`)."""
+"""Error, kind, HTTP status and the message for others; None: the error's own. Messages that name
+databases and paths only go to the service's stderr (`Answerer`)."""
 
 
 class Answerer:
     """Answers questions from the live databases; safe to use from many threads.
 
-    ``tell`` gets a line for people when a question fails for a reason that is not the asker's.
+    ``tell`` gets a line for people when a question fails because of the database.
     """
 
     def __init__(
@@ -129,10 +128,10 @@ class Answerer:
         camera: Camera = DEFAULT_CAMERA,
         tell: Callable[[str], None] = lambda _: None,
     ) -> None:
-        self._pools, self._bucket, self._camera = pools, Bucket(per_second), camera
-        self._notices = Notices(tell)
-        # One at a time: the JSON parser keeps the interpreter to itself for up to 30 ms, and the
-        # thread that reads from the network must get its turn.
+        self._pools, self._bucket, self._camera = pools, TokenBucket(per_second), camera
+        self._complaints = RepeatFilter(tell)
+        # One at a time: the JSON parser holds the GIL for up to 30 ms, and the thread that reads
+        # from the network must run in between.
         self._parsing = threading.Lock()
         self.max_bytes = max_bytes
 
@@ -144,8 +143,8 @@ class Answerer:
             )
         with self._parsing:
             crops, top, method = _read(payload, options)
-        with self._telling():
-            self._bucket.take()
+        with self._reporting_errors():
+            self._bucket.take_token()
             candidates = self._pools.candidates(crops)
         return rank(crops, candidates, top=top, method=method, camera=self._camera).document()
 
@@ -158,22 +157,22 @@ class Answerer:
             )
         x, y = _number(options, "x"), _number(options, "y")
         radius = _number(options, "radius", DEFAULT_RADIUS_M)
-        with self._telling():
-            self._bucket.take()
+        with self._reporting_errors():
+            self._bucket.take_token()
             return {what: self._pools.on_graph(lambda c: near(c, x, y, radius))}
 
     def health(self) -> dict[str, str]:
         """``{"status": "ok"}``. Raises DatabaseError when questions cannot be answered now."""
-        with self._telling():
+        with self._reporting_errors():
             self._pools.check()
         return {"status": "ok"}
 
     @contextlib.contextmanager
-    def _telling(self) -> Iterator[None]:
+    def _reporting_errors(self) -> Iterator[None]:
         try:
             yield
         except DatabaseError as error:
-            self._notices(f"mapfold: {error}")
+            self._complaints(f"mapfold: {error}")
             raise
 
 
@@ -192,9 +191,9 @@ def encode(document: Mapping[str, Any]) -> bytes:
 
 def _read(payload: bytes, options: Mapping[str, str]) -> tuple[tuple[Crop, ...], int, Method]:
     document = parse_json(payload)
-    said = document if isinstance(document, dict) else {}
-    top = _top(options.get("top", said.get("top", 3)))
-    method = _method(options.get("method", said.get("method", "joint")))
+    fields = document if isinstance(document, dict) else {}
+    top = _top(options.get("top", fields.get("top", 3)))
+    method = _method(options.get("method", fields.get("method", "joint")))
     return read_crops(document), top, method
 
 

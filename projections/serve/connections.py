@@ -1,18 +1,18 @@
-"""HTTP connections that cannot be used against the service: uvicorn's, with limits.
+"""uvicorn's HTTP connections with limits on their number, time and memory.
 
 uvicorn waits for a request for ever, on as many connections as the process may open. Here
 
 * a request, head and body, must be complete ``REQUEST_S`` after its connection was opened or, on a
-  connection that was used before, after its first byte; bytes that drip in do not extend that;
-* an answer must have been read after ``ANSWER_S``, and all answers that wait to be read may hold
+  connection that was used before, after its first byte; single bytes do not extend that;
+* an answer must have been read after ``ANSWER_S``, and all unread answers together may have
   ``MAX_UNREAD`` bytes;
-* ``MAX_CONNECTIONS`` are open at most. A newcomer takes the place of one that waits for its peer:
-  of the peer with the most connections the one that has waited longest. When all are being
-  answered, the peer with the most loses its newest to one with fewer. So half-open ones give way,
-  and whoever asks on very many at once, and honest clients get in.
+* at most ``MAX_CONNECTIONS`` are open. When they are, a new one replaces one without a complete
+  request: of the peer with the most connections the one that has waited longest. When all are
+  being answered, the peer with the most loses its newest to a peer with fewer. So half-open
+  connections and peers with very many do not keep others out.
 
-A body must say its length: one sent in a million chunks would keep the event loop busy for seconds.
-Refusals have the form of all others.
+A body needs a Content-Length: one sent in a million chunks would keep the event loop busy for
+seconds. Refusals have the same JSON form as all others.
 """
 
 import asyncio
@@ -36,50 +36,50 @@ MAX_UNREAD: Final = 64 * 1024 * 1024
 MAX_HEAD: Final = 16 * 1024
 REQUEST_S: Final = 10.0
 ANSWER_S: Final = 60.0
-_LAST_WORDS_S: Final = 1.0
+_CLOSE_S: Final = 1.0
 _MAX_SHOWN: Final = 200
 
 
 class Connections:
-    """Those that are open. ``tell`` gets a line for people for each one that is closed early."""
+    """The open connections. ``tell`` gets a line for people for each one that is closed early."""
 
     def __init__(self, tell: Callable[[str], None], most: int) -> None:
         self._open: dict[Connection, None] = {}
         self._tell, self._most = tell, most
 
     def admit(self, newcomer: "Connection") -> bool:
-        """Make room for a newcomer; False when all others are being answered, and no peer has more
-        of them than the newcomer's."""
+        """Add a new connection, if need be in place of another; False when all others are being
+        answered and no peer has more of them than the new one's."""
         if len(self._open) >= self._most:
             self._evict(newcomer.peer)
         if len(self._open) >= self._most:
-            self.note(f"{self._most} were open, all being answered")
+            self.report(f"{self._most} were open, all being answered")
             return False
         self._open[newcomer] = None
         return True
 
     def forget(self, connection: "Connection") -> None:
-        """It is closed."""
+        """Remove a closed connection."""
         self._open.pop(connection, None)
 
-    def note(self, reason: str) -> None:
-        """Tell why one is closed."""
+    def report(self, reason: str) -> None:
+        """Report why a connection is closed."""
         self._tell(f"http: closed a connection: {reason}")
 
     def drop(self, connection: "Connection", reason: str) -> None:
-        """Close one at once, and tell why."""
-        self.note(reason)
+        """Close a connection at once, and report why."""
+        self.report(reason)
         self.forget(connection)
         connection.abort()
 
-    def close_unmade(self) -> None:
-        """Close those that are not made yet; of those uvicorn knows nothing."""
+    def close_handshakes(self) -> None:
+        """Close those in a TLS handshake, which uvicorn does not know."""
         for connection in [*self._open]:
             if not connection.is_made:
                 connection.abort()
 
     def limit_unread(self) -> None:
-        """Close those with the longest unread answers when all of these are too long."""
+        """Close those with the longest unread answers while all together exceed ``MAX_UNREAD``."""
         unread = {connection: connection.unread for connection in self._open}
         while sum(unread.values()) > MAX_UNREAD:
             longest = max(unread, key=lambda connection: unread[connection])
@@ -87,20 +87,20 @@ class Connections:
             del unread[longest]
 
     def _evict(self, newcomer: str) -> None:
-        crowd = Counter(connection.peer for connection in self._open)
+        per_peer = Counter(connection.peer for connection in self._open)
         waiting = [connection for connection in self._open if connection.waits_since is not None]
         if waiting:
-            oldest = min(waiting, key=lambda c: (-crowd[c.peer], c.waits_since))
+            oldest = min(waiting, key=lambda c: (-per_peer[c.peer], c.waits_since))
             self.drop(oldest, f"{self._most} were open, and it had no request under way")
             return
-        heaviest, count = crowd.most_common(1)[0]
-        if count > crowd[newcomer] + 1:
+        heaviest, count = per_peer.most_common(1)[0]
+        if count > per_peer[newcomer] + 1:
             newest = next(c for c in reversed(self._open) if c.peer == heaviest)
             self.drop(newest, f"{self._most} were open, all being answered, {count} for its peer")
 
 
 class _Requests(h11.Connection):
-    """h11's reading of requests; keeps why it could not read one."""
+    """h11's parser of requests, which keeps the status and the reason of a refusal."""
 
     fault: tuple[int, str] = (400, "not an HTTP request")
 
@@ -122,7 +122,7 @@ def _refuse_chunks(event: Any) -> None:
 
 
 class Connection(H11Protocol):
-    """One connection. ``waits_since`` is when its peer's turn began; None while we work."""
+    """One connection. ``waits_since`` is since when it waits for its peer; None while we work."""
 
     def __init__(
         self, config: Config, state: ServerState, connections: Connections, accepted: socket.socket
@@ -137,11 +137,11 @@ class Connection(H11Protocol):
 
     @property
     def unread(self) -> int:
-        """Bytes that wait for the peer to read."""
+        """Bytes written that the peer has not read."""
         return self.transport.get_write_buffer_size() if self.is_made else 0
 
     def abort(self) -> None:
-        """Close at once, whatever it is at."""
+        """Close at once, in any state."""
         if self.is_made:
             self.transport.abort()
         else:  # in a TLS handshake, which then fails
@@ -149,39 +149,38 @@ class Connection(H11Protocol):
                 self._accepted.shutdown(socket.SHUT_RDWR)
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """The peer may send."""
+        """Called by asyncio when the connection is ready (with TLS: after the handshake)."""
         super().connection_made(transport)
         self.is_made = True
         self._await_peer()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """It is closed."""
+        """Called by asyncio when the connection is closed."""
         self._stop_timer()
         self._unset_keepalive_if_required()
         self._connections.forget(self)
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Bytes came."""
+        """Called by asyncio with received bytes."""
         if self._idle:
             self._await_peer()
         super().data_received(data)
-        self._note_whose_turn_it_is()
+        self._update_waits_since()
 
     def on_response_complete(self) -> None:
-        """The answer is written; maybe the next request is here already."""
+        """Called by uvicorn when an answer is written; the next request may be here already."""
         self._await_peer()
         self._connections.limit_unread()
         super().on_response_complete()
-        self._note_whose_turn_it_is()
+        self._update_waits_since()
 
-    def send_400_response(self, msg: str) -> None:  # noqa: ARG002  uvicorn's words say less
-        """Refuse what is no request that h11 reads."""
-        status, said = self._requests.fault
-        self._refuse(status, said)
+    def send_400_response(self, msg: str) -> None:  # noqa: ARG002  h11's reason says more
+        """Called by uvicorn for a request that h11 cannot parse: refuse it."""
+        self._refuse(*self._requests.fault)
 
     def shutdown(self) -> None:
-        """The service ends: what was not asked completely is not answered."""
+        """Called by uvicorn at the end of the service: incomplete requests are not answered."""
         if self.waits_since is None:
             super().shutdown()
         else:
@@ -189,7 +188,7 @@ class Connection(H11Protocol):
 
     @property
     def _request(self) -> RequestResponseCycle | None:
-        return self.cycle  # None at first, which uvicorn's types do not say
+        return self.cycle  # None at first, unlike its type in uvicorn
 
     @property
     def _idle(self) -> bool:
@@ -197,7 +196,7 @@ class Connection(H11Protocol):
         answered = request is not None and request.response_complete
         return answered and self.conn.their_state is h11.IDLE and not self.conn.trailing_data[0]
 
-    def _note_whose_turn_it_is(self) -> None:
+    def _update_waits_since(self) -> None:
         request = self._request
         if request is not None and not request.more_body and not request.response_complete:
             self._stop_timer()
@@ -207,22 +206,22 @@ class Connection(H11Protocol):
         self._stop_timer()
         self.waits_since = time.monotonic()
         seconds = ANSWER_S if self.unread else REQUEST_S
-        self._timer = self.loop.call_later(seconds, self._give_up)
+        self._timer = self.loop.call_later(seconds, self._time_out)
 
     def _stop_timer(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
 
-    def _give_up(self) -> None:
+    def _time_out(self) -> None:
         if self.unread or self._idle or self.transport.is_closing():
             self._connections.drop(self, f"no answer was read within {ANSWER_S:g} s")
             return
-        self._connections.note(f"no complete request within {REQUEST_S:g} s")
+        self._connections.report(f"no complete request within {REQUEST_S:g} s")
         self._refuse(408, f"no complete request within {REQUEST_S:g} s")
 
     def _refuse(self, status: int, message: str) -> None:
-        """Send a refusal if nothing was answered yet, and close."""
+        """Send a refusal, if no answer was begun, and close."""
         if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
             body = encode({"error": {"kind": "bad_question", "message": message}})
             headers = [
@@ -240,11 +239,11 @@ class Connection(H11Protocol):
             request.disconnected = True  # the application must not answer too
         self.transport.close()
         self._stop_timer()
-        self._timer = self.loop.call_later(_LAST_WORDS_S, self.transport.abort)
+        self._timer = self.loop.call_later(_CLOSE_S, self.transport.abort)
 
 
 def peer_of(address: str) -> str:
-    """Who is behind an address: of IPv6 a whole /64, which one peer has to itself."""
+    """The peer of an address: the address itself, or of IPv6 its /64, which one peer has."""
     found = ipaddress.ip_address(address.partition("%")[0])
     if found.version == 4:
         return address

@@ -1,9 +1,9 @@
-"""Which HTTP requests are let in: ``Host``, ``Origin`` and a token, checked before anything else.
+"""HTTP access control: ``Host``, ``Origin`` and a token, checked before anything else.
 
-* ``Host`` must name this machine, or what ``--allow-host`` adds. Otherwise a web page could point
-  its own name at this address and read the answers (DNS rebinding).
-* ``Origin``, which browsers send with other sites' requests, must be the one that was asked.
-* With a token, every path demands it: ``Authorization: Bearer TOKEN``.
+* ``Host`` must be an address of this machine, localhost or a name of ``--allow-host``. Otherwise a
+  web page could point its own name at this address and read the answers (DNS rebinding).
+* ``Origin``, which browsers send with requests of other sites, must equal ``Host``.
+* With a token, every path requires it: ``Authorization: Bearer TOKEN``.
 """
 
 import hmac
@@ -24,7 +24,7 @@ TOKEN_VARIABLE: Final = "MAPFOLD_TOKEN"  # noqa: S105  the name of a variable
 MIN_TOKEN: Final = 16
 _MAX_FILE: Final = 4096
 _LOOPBACK: Final = frozenset({"localhost", "127.0.0.1", "::1"})
-_MAKE_ONE: Final = "make one with: openssl rand -hex 32"
+_ADVICE: Final = "make one with: openssl rand -hex 32"
 
 
 def read_token(
@@ -32,8 +32,8 @@ def read_token(
 ) -> str | None:
     """The token of ``file``, else of the environment, else None.
 
-    Raises MisuseError for one that is empty, short or no token. ``warn`` is told when others may
-    read the file.
+    Raises MisuseError for one that is empty, short or malformed. ``warn`` gets a line when other
+    users may read the file.
     """
     if file is None:
         given = environment.get(TOKEN_VARIABLE)
@@ -52,17 +52,17 @@ def _checked(text: str, where: str) -> str:
     token = text.rstrip("\r\n")
     if len(token) < MIN_TOKEN:
         raise MisuseError(
-            f"{where}: the token has {len(token)} characters, fewer than {MIN_TOKEN}; {_MAKE_ONE}"
+            f"{where}: the token has {len(token)} characters, fewer than {MIN_TOKEN}; {_ADVICE}"
         )
     if not token.isascii() or not token.isprintable() or " " in token:
         raise MisuseError(
-            f"{where}: a token is one line of printable ASCII without spaces; {_MAKE_ONE}"
+            f"{where}: a token is one line of printable ASCII without spaces; {_ADVICE}"
         )
     return token
 
 
 class Guard:
-    """An ASGI application in front of another one, which gets only what is let in."""
+    """ASGI middleware that passes on what is allowed and refuses the rest."""
 
     def __init__(self, app: ASGIApp, token: str | None = None, hosts: Iterable[str] = ()) -> None:
         self._app = app
@@ -70,7 +70,7 @@ class Guard:
         self._hosts = _LOOPBACK | {host.lower().strip("[]") for host in hosts}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer the request, or refuse it."""
+        """Pass the request on, or refuse it."""
         refused = self._refusal(scope)
         await (self._app if refused is None else refused)(scope, receive, send)
 
@@ -87,7 +87,7 @@ class Guard:
         origin = headers.get("origin")
         if origin is not None and _site(origin) != authority.lower():
             return _refuse(403, "the Origin header names another site")
-        if self._token is not None and not self._is_ours(headers.get("authorization", "")):
+        if self._token is not None and not self._has_token(headers.get("authorization", "")):
             return _refuse(
                 401,
                 "send the service's token: Authorization: Bearer TOKEN",
@@ -95,14 +95,14 @@ class Guard:
             )
         return None
 
-    def _is_ours(self, authorization: str) -> bool:
+    def _has_token(self, authorization: str) -> bool:
         scheme, _, given = authorization.partition(" ")
         ours = self._token or b""
         return hmac.compare_digest(given.strip().encode(), ours) and scheme.lower() == "bearer"
 
 
 def _own_address(scope: Scope) -> str:
-    """What the client connected to: one of this machine's addresses."""
+    """The address of this machine that the client connected to."""
     return str(scope["server"][0]).removeprefix("::ffff:")
 
 
@@ -118,7 +118,7 @@ def _name(authority: str) -> str | None:
 
 
 def _site(origin: str) -> str | None:
-    """What an Origin header names: host and port."""
+    """Host and port of an Origin header; None when it is malformed."""
     try:
         parts = urlsplit(origin)
     except ValueError:

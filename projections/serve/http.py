@@ -1,7 +1,7 @@
-"""The service over HTTP: an ASGI app that describes itself at ``/openapi.json`` and ``/docs``.
+"""The service over HTTP: an ASGI app with its description at ``/openapi.json`` and ``/docs``.
 
-Needs the extra ``mapfold[serve]`` (fastapi, uvicorn). The event loop only takes in requests; the
-waiting room works on them, because the databases are asked synchronously.
+Needs the extra ``mapfold[serve]`` (fastapi, uvicorn). The event loop only reads requests; the
+threads of the `FairQueue` answer them, because database access is synchronous.
 """
 
 import asyncio
@@ -20,7 +20,7 @@ from projections.relocalize import describe_value
 
 from .answering import DEFAULT_RADIUS_M, MAX_TOP, Answerer, TooMuchError, encode, refusal
 from .connections import peer_of
-from .room import Room
+from .fair_queue import FairQueue
 
 _EXAMPLE = {"crops": [{"class": "cup", "bbox": [120, 80, 250, 310], "embedding": "<base64>"}]}
 _QUESTION = {
@@ -32,7 +32,7 @@ _QUESTION = {
 }
 
 
-_REFUSED: dict[int | str, dict[str, Any]] = {
+_REFUSALS: dict[int | str, dict[str, Any]] = {
     status: {
         "description": text,
         "content": {
@@ -44,23 +44,23 @@ _REFUSED: dict[int | str, dict[str, Any]] = {
         ("5XX", "No answer just now: the database is away, or too many ask", "database"),
     )
 }
-_DRAINED = 8
+_DRAIN_FACTOR = 8
 _RETRY_AFTER = {"Retry-After": "1"}
 
 
-def create_app(answerer: Answerer, room: Room) -> FastAPI:
-    """The ASGI application; it owns nothing, so closing pools and room is its maker's business."""
+def create_app(answerer: Answerer, queue: FairQueue) -> FastAPI:
+    """The ASGI application. The caller closes the pools and the queue."""
     app = FastAPI(
         title="mapfold",
         summary="Where is the robot, and what stands near a pose?",
-        responses=_REFUSED,
+        responses=_REFUSALS,
         redirect_slashes=False,
     )
-    _refuse_in_our_words(app)
+    _add_error_handlers(app)
 
     async def answered(request: Request, work: Callable[[], dict[str, Any]]) -> Response:
         peer = "" if request.client is None else peer_of(request.client.host)
-        future = room.submit(peer, lambda: encode(work()))
+        future = queue.submit(peer, lambda: encode(work()))
         return Response(await asyncio.wrap_future(future), media_type="application/json")
 
     @app.post(
@@ -71,7 +71,7 @@ def create_app(answerer: Answerer, room: Room) -> FastAPI:
         top: int | None = Query(None, ge=1, le=MAX_TOP),
         method: str | None = None,
     ) -> Response:
-        payload = await _limited(request, answerer.max_bytes)
+        payload = await _read_body(request, answerer.max_bytes)
         given = {"top": top, "method": method}
         options = {name: str(value) for name, value in given.items() if value is not None}
         return await answered(request, lambda: answerer.relocalize(payload, options))
@@ -90,8 +90,8 @@ def create_app(answerer: Answerer, room: Room) -> FastAPI:
     return app
 
 
-def _refuse_in_our_words(app: FastAPI) -> None:
-    """Every refusal has the same form, whoever finds the question wrong."""
+def _add_error_handlers(app: FastAPI) -> None:
+    """Give all refusals, also those of FastAPI, the same JSON form."""
 
     @app.exception_handler(MapfoldError)
     async def refuse(_: Request, error: MapfoldError) -> JSONResponse:
@@ -103,38 +103,38 @@ def _refuse_in_our_words(app: FastAPI) -> None:
     async def refuse_parameter(_: Request, error: RequestValidationError) -> JSONResponse:
         first = error.errors()[0]
         found = "missing" if first["type"] == "missing" else describe_value(first["input"])
-        said = f"{first['loc'][-1]} is {found}; {first['msg'].lower()}"
-        status, document = refusal(QuestionError(said))
+        message = f"{first['loc'][-1]} is {found}; {first['msg'].lower()}"
+        status, document = refusal(QuestionError(message))
         return JSONResponse(document, status)
 
     @app.exception_handler(HTTPException)
     async def refuse_path(request: Request, error: HTTPException) -> JSONResponse:
         asked = f"{request.method} {describe_value(request.scope['path'])}"
-        said = f"{asked}: {error.detail}; /docs tells what there is"
-        _, document = refusal(QuestionError(said))
+        message = f"{asked}: {error.detail}; /docs tells what there is"
+        _, document = refusal(QuestionError(message))
         return JSONResponse(document, error.status_code, headers=error.headers)
 
     @app.exception_handler(ClientDisconnect)
-    async def nobody_to_answer(_: Request, __: ClientDisconnect) -> Response:
+    async def disconnected(_: Request, __: ClientDisconnect) -> Response:
         return Response(status_code=400)
 
     @app.exception_handler(Exception)
-    async def failed(_: Request, __: Exception) -> JSONResponse:  # uvicorn logs what it was
+    async def failed(_: Request, __: Exception) -> JSONResponse:  # uvicorn logs the exception
         status, document = refusal(MapfoldError())
         return JSONResponse(document, status)
 
 
-async def _limited(request: Request, most: int) -> bytes:
-    """The body; refused when it is longer than ``most``, of which no more is kept.
+async def _read_body(request: Request, most: int) -> bytes:
+    """The body, at most ``most`` bytes. Raises QuestionError for a longer one.
 
-    Some of what is too long is still read: a client that is cut off while sending sees a broken
-    connection and not the reason.
+    Some of a longer one is still read: a client that is cut off while sending sees a broken
+    connection instead of the reason.
     """
     body, length = bytearray(), 0
     async for part in request.stream():
         length += len(part)
         body += part if length <= most else b""
-        if length > _DRAINED * most:
+        if length > _DRAIN_FACTOR * most:
             break
     if length > most:
         raise QuestionError(f"the question has more than {most} bytes; send fewer crops")

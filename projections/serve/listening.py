@@ -1,8 +1,8 @@
 """The HTTP server: a bound address, TLS, and uvicorn behind an accept loop of our own.
 
-asyncio accepts whatever comes, and has TLS handshakes in progress that nobody counts. Here each
+asyncio accepts without a limit, and TLS handshakes in progress are not counted. Here each
 connection is counted from the moment it is accepted (`connections`), and a few are accepted in each
-turn of the event loop, so that those which are there already are heard in between.
+turn of the event loop, so that open connections are served in between.
 """
 
 import asyncio
@@ -20,7 +20,7 @@ from starlette.types import ASGIApp
 
 from eventsrc.errors import MisuseError, TransportError
 
-from .answering import Notices
+from .answering import RepeatFilter
 from .connections import MAX_CONNECTIONS, REQUEST_S, Connection, Connections
 
 _BACKLOG: Final = 1024
@@ -28,11 +28,11 @@ _KEEP_ALIVE_S: Final = 5
 _PAUSE_S: Final = 0.1
 _AT_ONCE: Final = 32
 """Connections accepted in a turn of the event loop. A turn takes milliseconds when many are being
-answered, so that one a turn let a newcomer wait four seconds behind a thousand others."""
+answered: with one a turn a newcomer waited four seconds behind a thousand others."""
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """A socket bound to the address; nobody can connect yet. Raises TransportError."""
+    """A socket bound to the address, not listening yet. Raises TransportError."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listener = socket.socket(family)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -52,7 +52,7 @@ def is_loopback(listener: socket.socket) -> bool:
 
 
 def tls_context(certificate: Path, key: Path) -> ssl.SSLContext:
-    """TLS as a server with this certificate. Raises MisuseError that names what cannot be used."""
+    """A server's TLS context with this certificate. Raises MisuseError naming the unusable file."""
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     for option, file in (("--tls-cert", certificate), ("--tls-key", key)):
         try:
@@ -60,7 +60,7 @@ def tls_context(certificate: Path, key: Path) -> ssl.SSLContext:
         except OSError as error:
             raise MisuseError(f"{option} {file}: {error.strerror or error}") from None
     try:
-        context.load_cert_chain(certificate, key, password=lambda: b"")  # not asked on a terminal
+        context.load_cert_chain(certificate, key, password=lambda: b"")  # never prompt
     except (ssl.SSLError, ValueError) as error:
         why = getattr(error, "reason", None) or error
         raise MisuseError(
@@ -95,7 +95,7 @@ class _Server(uvicorn.Server):
         for task in self._accepting:
             task.cancel()
         await asyncio.wait(self._accepting)
-        self._connections.close_unmade()
+        self._connections.close_handshakes()
         await super().shutdown(sockets)
 
     async def _accept(self, listener: socket.socket) -> None:
@@ -104,11 +104,11 @@ class _Server(uvicorn.Server):
             try:
                 accepted, _ = await loop.sock_accept(listener)
             except OSError as error:  # such as no free file descriptor
-                self._connections.note(error.strerror or str(error))
+                self._connections.report(error.strerror or str(error))
                 await asyncio.sleep(_PAUSE_S)
                 continue
             self._begin(accepted)
-            for more in waiting(listener, _AT_ONCE - 1):
+            for more in accept_pending(listener, _AT_ONCE - 1):
                 self._begin(more)
             await asyncio.sleep(0)
 
@@ -133,9 +133,9 @@ class _Server(uvicorn.Server):
             self._connections.forget(connection)
 
 
-def waiting(listener: socket.socket, most: int) -> Iterator[socket.socket]:
-    """Accept what has connected already."""
-    with contextlib.suppress(OSError):  # none waits, or none can be had: the next turn tells
+def accept_pending(listener: socket.socket, most: int) -> Iterator[socket.socket]:
+    """Accept at most ``most`` connections that are in the backlog."""
+    with contextlib.suppress(OSError):  # none waits, or no file descriptor is free
         for _ in range(most):
             yield listener.accept()[0]
 
@@ -147,7 +147,7 @@ def serving(
     tls: ssl.SSLContext | None = None,
     tell: Callable[[str], None] = lambda _: None,
 ) -> Iterator[int]:
-    """Serve in a thread; yields the port. Ends gracefully: requests under way are answered."""
+    """Serve in a thread; yields the port. At the end requests under way are answered."""
     config = uvicorn.Config(
         app,
         loop="asyncio",
@@ -160,9 +160,9 @@ def serving(
         server_header=False,
         timeout_keep_alive=_KEEP_ALIVE_S,
     )
-    server = _Server(config, Connections(Notices(tell), MAX_CONNECTIONS), tls)
+    server = _Server(config, Connections(RepeatFilter(tell), MAX_CONNECTIONS), tls)
     listener.setblocking(False)
-    listener.listen(_BACKLOG)  # from now on clients wait instead of being refused
+    listener.listen(_BACKLOG)  # from now on clients can connect
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, name="http")
     thread.start()
     try:

@@ -1,11 +1,8 @@
-"""Connection pools to the live databases, ready for searching.
+"""Connection pools to the live databases, which survive a restart of the server.
 
-A connection that the server has dropped is noticed when it is used. Then the server is brought
-back if it is ours, waited for a little if not, and the question is asked once more on a fresh
-connection; so a restart of the database costs no answer. Of a server that stays away questions hear
-at once.
-
-A database that is away: how long questions wait for it, and one line for people each way.
+A lost connection is noticed when it is used. Then the server is restarted if it is the embedded
+one, else waited for, and the question is asked once more on a new connection; so a restart of the
+database costs no answer. After ``PATIENCE_S`` of an outage questions fail at once.
 """
 
 import contextlib
@@ -30,11 +27,12 @@ from projections.queries.relocalize import fetch, prepare_graph, prepare_vectors
 from projections.relocalize import Candidates, Crop
 
 PATIENCE_S: Final = 10.0
-"""Questions asked before that many seconds of an outage wait for its end, later ones do not."""
+"""Questions in the first seconds of an outage wait for its end, later ones fail at once."""
 
 
 class Outage:
-    """Begins with the first failure and ends with the first success; for many threads."""
+    """Begins with the first failure and ends with the first success; one line for people each. For
+    many threads."""
 
     def __init__(self, tell: Callable[[str], None], now: Callable[[], float] = time.monotonic):
         self._tell, self._now, self._lock = tell, now, threading.Lock()
@@ -42,18 +40,18 @@ class Outage:
 
     @property
     def is_on(self) -> bool:
-        """Whether the last thing known is a failure."""
+        """Whether the last attempt failed."""
         return self._until is not None
 
     def begin(self, error: Exception) -> None:
-        """Something failed."""
+        """An attempt failed."""
         with self._lock:
             if self._until is None:
                 self._until = self._now() + PATIENCE_S
                 self._tell(f"{error}; trying again")
 
     def end(self) -> None:
-        """Something went well."""
+        """An attempt succeeded."""
         with self._lock:
             if self._until is not None:
                 self._until = None
@@ -61,7 +59,7 @@ class Outage:
 
     @property
     def worth_waiting(self) -> bool:
-        """Whether it is young enough for a question to wait for its end."""
+        """Whether it is so new that a question waits for its end."""
         until = self._until
         return until is not None and self._now() < until
 
@@ -72,8 +70,8 @@ FIRST_WAIT_S: Final = 9.0
 LAST_WAIT_S: Final = 1.0
 RETRY_S: Final = 0.1
 GIVE_UP_S: Final = 0.5
-"""Left alone a pool tries again after ever longer pauses, minutes in the end; so it gives up soon,
-and the next question makes it try."""
+"""By default a pool retries with ever longer pauses, up to minutes; so it gives up soon, and the
+next question makes it try again."""
 
 
 class _NoneFreeError(DatabaseUnavailable):
@@ -90,7 +88,7 @@ class Pools:
         self, targets: Targets, size: int, tell: Callable[[str], None] = lambda _: None
     ) -> None:
         self._targets, self._size, self._outage = targets, size, Outage(tell)
-        self.check()  # a clear error at once, where a pool would try on in silence
+        self.check()  # a clear error at once; a pool would retry without one
         self._vectors = _pool(targets.vector_url, size, self._prepare_vectors)
         self._graph = self._vectors
         if not targets.one_database:
@@ -101,20 +99,20 @@ class Pools:
         prepare_graph(connection)
 
     def check(self) -> None:
-        """Bring the server back if it is ours and died. Raises DatabaseError unless there is a map.
+        """Restart the embedded server if it died. Raises DatabaseError unless there is a map.
 
-        Asked on connections of its own, so that an answer says how things are now.
+        Uses new connections, so that it sees the present state.
         """
-        self._targets.revive()
-        _see("graph", self._targets.graph_url)
-        _see("vectors", self._targets.vector_url)
+        self._targets.restart_embedded()
+        _require_map("graph", self._targets.graph_url)
+        _require_map("vectors", self._targets.vector_url)
 
     def candidates(self, crops: Sequence[Crop]) -> Candidates:
         """`projections.queries.relocalize.fetch` over pooled connections."""
         return self._ask(lambda wait_s: self._candidates(crops, wait_s))
 
     def on_graph(self, ask: Callable[[Connection], Result]) -> Result:
-        """Ask the graph's database something."""
+        """``ask`` on a pooled connection to the graph's database."""
 
         def once(wait_s: float) -> Result:
             with self._borrow(self._graph, self._targets.graph_url, wait_s) as connection:
@@ -131,19 +129,19 @@ class Pools:
 
     def _ask(self, ask: Callable[[float], Result]) -> Result:
         if self._outage.is_on:
-            self._mend()
+            self._recover()
         try:
             return ask(FIRST_WAIT_S)
-        except _NoneFreeError:  # too much to do, or away for all of that time
-            self._mend()
+        except _NoneFreeError:  # too many questions, or the server is away
+            self._recover()
             return ask(LAST_WAIT_S)
         except DatabaseUnavailable as error:
             self._outage.begin(error)
-            self._mend()
+            self._recover()
             return ask(FIRST_WAIT_S)
 
-    def _mend(self) -> None:
-        """Have the server back, or raise what is wrong with it."""
+    def _recover(self) -> None:
+        """Wait until the server is back; raise its error when it stays away."""
         while True:
             try:
                 self.check()
@@ -183,7 +181,7 @@ class Pools:
         self.close()
 
 
-def _see(sink: SinkName, url: str) -> None:
+def _require_map(sink: SinkName, url: str) -> None:
     """Raise DatabaseError unless the server answers and has a map."""
     with (
         connect(url, application="mapfold serve", autocommit=True) as connection,

@@ -1,8 +1,8 @@
 """The service over Zenoh: ``mapfold/relocalize`` and ``mapfold/state/places|objects``.
 
-Zenoh's thread only hands a question to the waiting room. What is too long is refused before it is
-read, and when too many wait one is refused at once, so nobody waits for an answer that cannot come
-in time. Every question gets a reply, an error if need be: silence would leave a lost robot waiting.
+Zenoh's thread only puts a question into the `FairQueue`. One that is too long is refused before it
+is read, and when too many wait one is refused at once. Every question gets a reply, if need be an
+error: without one a robot would wait for its timeout.
 """
 
 import logging
@@ -14,34 +14,34 @@ from eventsrc.transport.session import Query, Session
 from projections.errors import QuestionError
 
 from .answering import Answerer, encode, refusal
-from .room import Room
+from .fair_queue import FairQueue
 
 RELOCALIZE: Final = "mapfold/relocalize"
 STATE: Final = "mapfold/state"
 MAX_SELECTOR: Final = 4096
 _PEER: Final = "zenoh"
-"""Zenoh does not tell who asks: all of its questions share the turns of one peer."""
+"""Zenoh does not say who asks: all of its questions are one peer's."""
 _log = logging.getLogger(__name__)
 
 
 class ZenohService:
-    """Answers on a session until closed; the room answers what it has taken by then."""
+    """Answers on a session until closed; the queue still answers what it has by then."""
 
-    def __init__(self, session: Session, answerer: Answerer, room: Room) -> None:
-        self._answerer, self._room = answerer, room
+    def __init__(self, session: Session, answerer: Answerer, queue: FairQueue) -> None:
+        self._answerer, self._queue = answerer, queue
         self._declared = [
-            session.queryable(RELOCALIZE, self._take),
-            session.queryable(f"{STATE}/**", self._take),
+            session.queryable(RELOCALIZE, self._receive),
+            session.queryable(f"{STATE}/**", self._receive),
         ]
         session.confirm()
 
     def close(self) -> None:
-        """Take no more questions. May be called twice."""
+        """Stop receiving questions. May be called twice."""
         for declared in self._declared:
             declared.close()
         self._declared = []
 
-    def _take(self, query: Query) -> None:
+    def _receive(self, query: Query) -> None:
         most = self._answerer.max_bytes
         if query.size > most or query.selector_size > MAX_SELECTOR:
             error = QuestionError(
@@ -50,7 +50,7 @@ class ZenohService:
             )
             query.reply_error(encode(refusal(error)[1]))
             return
-        answered = self._room.submit(_PEER, lambda: self._document(query))
+        answered = self._queue.submit(_PEER, lambda: self._document(query))
         answered.add_done_callback(lambda future: _reply(query, future))
 
     def _document(self, query: Query) -> tuple[str, dict[str, Any]]:
@@ -73,6 +73,6 @@ def _reply(query: Query, answered: "Future[tuple[str, dict[str, Any]]]") -> None
     except MapfoldError as error:
         query.reply_error(encode(refusal(error)[1]))
     finally:
-        if not query.ended:  # a mistake of ours, which is logged; still no silence
+        if not query.ended:  # an unexpected exception, which is logged
             query.reply_error(encode(refusal(MapfoldError())[1]))
             _log.error("a question could not be answered", exc_info=answered.exception())

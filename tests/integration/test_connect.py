@@ -20,7 +20,7 @@ from projections.database.connection import (
 from projections.database.cypher import connect_for_cypher
 from projections.database.embedded import EmbeddedServer
 from projections.errors import DatabaseUnavailable, ExtensionMissing
-from projections.queries.relocalize import Reader
+from projections.queries.relocalize import CandidateReader
 
 
 @pytest.fixture(autouse=True)
@@ -180,7 +180,7 @@ def test_cypher_without_the_extension(bare_pg_url: str) -> None:
 
 def test_a_question_to_a_database_that_nothing_was_ever_projected_into(bare_pg_url: str) -> None:
     with pytest.raises(ExtensionMissing, match=r"nothing has been projected .*; run mapfold"):
-        Reader(Targets(bare_pg_url, bare_pg_url))
+        CandidateReader(Targets(bare_pg_url, bare_pg_url))
 
 
 def test_a_described_target_has_no_password() -> None:

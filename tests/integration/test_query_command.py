@@ -10,10 +10,10 @@ from projections.database import rebuild
 from projections.database.connection import Targets, connect
 from projections.model.fold import fold_log
 from projections.model.view import MapView
-from projections.queries.ask import (
-    Asker,
-    LiveAsker,
-    ViewAsker,
+from projections.queries.map_queries import (
+    FoldedMap,
+    LiveMap,
+    MapSource,
     objects_of,
     path_between,
     places_holding,
@@ -40,10 +40,10 @@ def test_live_answers_equal_the_folded_maps(
     log: Path, view: MapView, one_database: Targets
 ) -> None:
     rebuild(log, one_database, Settings())
-    folded: Asker = ViewAsker(view)
+    folded: MapSource = FoldedMap(view)
     with connect(one_database.graph_url, autocommit=True) as connection:
         prepare_graph(connection)
-        live = LiveAsker(connection)
+        live = LiveMap(connection)
         for thing in view.objects:
             ours, theirs = where_is(live, thing.object_id), where_is(folded, thing.object_id)
             assert list(ours.items()) == list(theirs.items())  # the order of the columns too

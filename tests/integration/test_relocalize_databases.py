@@ -13,7 +13,7 @@ from projections.database.connection import Targets
 from projections.errors import ProjectionMismatch, ProjectionMissing, QuestionError
 from projections.model.fold import fold_log
 from projections.model.view import MapView
-from projections.queries.relocalize import Reader, relocalize
+from projections.queries.relocalize import CandidateReader, relocalize
 from projections.relocalize import Candidates, Crop, ExactIndex, rank, read_crops
 from projections.settings import Settings
 from tests.commands import Commands
@@ -70,7 +70,7 @@ def found(candidates: Candidates) -> list[list[tuple[object, ...]]]:
 
 def test_candidates_are_those_of_exact_search(targets: Targets, view: MapView) -> None:
     index = ExactIndex(view)
-    with Reader(targets) as reader:
+    with CandidateReader(targets) as reader:
         asked = 0
         for crops in questions():
             live, exact = reader.candidates(crops, 200), index.search(crops, 200)
@@ -135,7 +135,7 @@ def test_two_round_trips_at_most(targets: Targets, monkeypatch: pytest.MonkeyPat
         return execute(*args, **kwargs)  # type: ignore[arg-type]
 
     crops = next(questions())
-    with Reader(targets) as reader:
+    with CandidateReader(targets) as reader:
         monkeypatch.setattr(psycopg.Connection, "execute", counted)
         reader.candidates(crops)
     assert sent == (1 if targets.one_database else 2)

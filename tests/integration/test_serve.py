@@ -23,8 +23,8 @@ from projections.database.embedded import EmbeddedServer
 from projections.errors import DatabaseUnavailable, ProjectionMissing
 from projections.queries.relocalize import relocalize
 from projections.relocalize import parse_question
-from projections.serve import Answerer, Pools, Room, ZenohService
-from projections.serve.answering import Bucket, TooMuchError
+from projections.serve import Answerer, FairQueue, Pools, ZenohService
+from projections.serve.answering import TokenBucket, TooMuchError
 from projections.serve.guard import Guard
 from projections.serve.http import create_app
 from projections.serve.listening import bind, serving
@@ -55,13 +55,13 @@ def answerer(pools: Pools) -> Answerer:
 
 
 @pytest.fixture
-def room() -> Iterator[Room]:
-    with Room(4, patience_s=DEADLINE_S) as room:
+def room() -> Iterator[FairQueue]:
+    with FairQueue(4, max_wait_s=DEADLINE_S) as room:
         yield room
 
 
 @contextmanager
-def http_at(answerer: Answerer, room: Room, port: int = 0) -> Iterator[int]:
+def http_at(answerer: Answerer, room: FairQueue, port: int = 0) -> Iterator[int]:
     app = Guard(create_app(answerer, room))
     with serving(app, bind("127.0.0.1", port)) as bound:
         yield bound
@@ -82,7 +82,7 @@ class TestZenoh:
 
     @pytest.fixture
     def service(
-        self, connected: Callable[[], Session], answerer: Answerer, room: Room
+        self, connected: Callable[[], Session], answerer: Answerer, room: FairQueue
     ) -> Iterator[ZenohService]:
         with ZenohService(connected(), answerer, room) as service:
             yield service
@@ -171,7 +171,7 @@ class TestZenoh:
         self, connected: Callable[[], Session], answerer: Answerer
     ) -> None:
         session, answers = connected(), []
-        room = Room(1, patience_s=DEADLINE_S)
+        room = FairQueue(1, max_wait_s=DEADLINE_S)
         service = ZenohService(connected(), answerer, room)
         threads = [
             threading.Thread(
@@ -201,15 +201,15 @@ def test_too_many_questions_are_refused_not_queued_forever(pools: Pools) -> None
 
 def test_the_bucket_fills_with_time() -> None:
     now = [0.0]
-    bucket = Bucket(2.0, now=lambda: now[0])
+    bucket = TokenBucket(2.0, now=lambda: now[0])
     for _ in range(4):
-        bucket.take()
+        bucket.take_token()
     with pytest.raises(TooMuchError):
-        bucket.take()
+        bucket.take_token()
     now[0] = 0.5
-    bucket.take()
+    bucket.take_token()
     with pytest.raises(TooMuchError):
-        bucket.take()
+        bucket.take_token()
 
 
 def fetch(url: str, data: bytes | None = None) -> tuple[int, Any]:
@@ -226,7 +226,7 @@ class TestHttp:
     """The ASGI app behind a real server on a free port."""
 
     @pytest.fixture
-    def http(self, answerer: Answerer, room: Room) -> Iterator[str]:
+    def http(self, answerer: Answerer, room: FairQueue) -> Iterator[str]:
         with http_at(answerer, room) as port:
             yield f"http://127.0.0.1:{port}"
 
@@ -274,14 +274,14 @@ class TestHttp:
         status, found = fetch(f"{http}/state/places?x=0&y=0&radius=1000")
         assert (status, bool(found["places"])) == (200, True)
 
-    def test_too_much_is_429(self, pools: Pools, room: Room) -> None:
+    def test_too_much_is_429(self, pools: Pools, room: FairQueue) -> None:
         with http_at(Answerer(pools, per_second=0.01), room) as port:
             url = f"http://127.0.0.1:{port}/relocalize"
             assert fetch(url, question())[0] == 200
             assert fetch(url, question())[0] == 429
 
     def test_it_ends_with_its_block_and_frees_the_port(
-        self, answerer: Answerer, room: Room
+        self, answerer: Answerer, room: FairQueue
     ) -> None:
         with http_at(answerer, room) as port:
             assert fetch(f"http://127.0.0.1:{port}/health")[0] == 200
@@ -340,7 +340,7 @@ class TestKilledServer:
         assert [line.endswith("trying again") for line in told[:4]] == [True, False, True, False]
 
     def test_another_is_waited_for_a_little_and_missed_at_once_after_that(
-        self, server: EmbeddedServer, room: Room, monkeypatch: pytest.MonkeyPatch
+        self, server: EmbeddedServer, room: FairQueue, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr("projections.serve.pools.PATIENCE_S", 0.5)
         told: list[str] = []

@@ -18,7 +18,7 @@ from projections.database.connection import Targets
 from projections.database.connection import connect as connect_database
 from projections.database.embedded import EmbeddedServer
 from projections.errors import QuestionError
-from projections.serve import Answerer, Pools, Room, ZenohService
+from projections.serve import Answerer, FairQueue, Pools, ZenohService
 from projections.serve.answering import encode
 from projections.settings import Settings
 from tests.http_attacks import DEADLINE_S, Served, ask, connect, request, served, status
@@ -139,7 +139,7 @@ class TestOverZenoh:
     def asking(self, connected: Callable[[], Session], targets: Targets) -> Iterator[Session]:
         with (
             Pools(targets, 2) as pools,
-            Room(2, patience_s=DEADLINE_S) as room,
+            FairQueue(2, max_wait_s=DEADLINE_S) as room,
             ZenohService(connected(), Answerer(pools, per_second=10_000.0), room),
         ):
             yield connected()

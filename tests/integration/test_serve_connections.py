@@ -13,7 +13,7 @@ from starlette.responses import Response
 from starlette.types import Receive, Scope, Send
 
 from projections.serve import connections
-from projections.serve.listening import bind, serving, tls_context, waiting
+from projections.serve.listening import accept_pending, bind, serving, tls_context
 from tests.fixtures_tls import Certificate
 from tests.http_attacks import DEADLINE_S, answer, ask, connect, request, status
 
@@ -237,5 +237,5 @@ def test_those_who_stand_in_line_are_accepted_a_few_at_a_time() -> None:
         for _ in range(5):
             clients.enter_context(socket.create_connection(listener.getsockname(), DEADLINE_S))
         for most, accepted in ((3, 3), (10, 2), (10, 0)):
-            taken = [clients.enter_context(one) for one in waiting(listener, most)]
+            taken = [clients.enter_context(one) for one in accept_pending(listener, most)]
             assert len(taken) == accepted

@@ -14,9 +14,9 @@ from eventsrc.log import ALWAYS, Event, LogWriter
 from eventsrc.upcast import read_envelope
 from projections.database import RebuildProgress, TailProgress, TailReport, rebuild, tail
 from projections.database.connection import Targets
-from projections.database.progress import serving_tail_metrics
 from projections.database.retry import retry
 from projections.database.status import projection_status
+from projections.database.tail_progress import serving_tail_metrics
 from projections.errors import ProjectionBusy, ProjectionMismatch
 from projections.settings import Settings
 from tests.envelopes import envelope, payload

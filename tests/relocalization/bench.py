@@ -26,7 +26,7 @@ from eventsrc.transport.session import ZenohOptions, open_session
 from projections.database import rebuild
 from projections.database.connection import Targets
 from projections.database.embedded import EmbeddedServer
-from projections.queries.relocalize import Reader
+from projections.queries.relocalize import CandidateReader
 from projections.relocalize import Crop, rank
 from projections.settings import Settings
 from tests.relocalization.buildings import Building
@@ -96,7 +96,7 @@ def percentiles(seconds: Sequence[float]) -> str:
 
 def library(targets: Targets, asked: Sequence[tuple[Crop, ...]]) -> None:
     """Candidates and ranking in this process, one question after the other."""
-    with Reader(targets) as reader:
+    with CandidateReader(targets) as reader:
         for crops in asked[:20]:
             rank(crops, reader.candidates(crops))
         fetched, ranked = [], []
@@ -111,9 +111,9 @@ def library(targets: Targets, asked: Sequence[tuple[Crop, ...]]) -> None:
 
 def recall(targets: Targets, asked: Sequence[tuple[Crop, ...]]) -> None:
     """Share of the true nearest that the index finds, at ten and at all that are fetched."""
-    with Reader(targets) as reader:
+    with CandidateReader(targets) as reader:
         indexed = [reader.candidates(crops) for crops in asked[:40]]
-        reader.exactly()
+        reader.disable_index()
         exact = [reader.candidates(crops) for crops in asked[:40]]
     for count in (10, len(exact[0].matches[0])):
         shares = []

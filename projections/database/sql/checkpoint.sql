@@ -1,8 +1,8 @@
--- Where each sink stands, in a schema of its own beside the rows, so that rows and progress commit
--- together. `sink` is 'graph' or 'vectors'.
+-- Each sink's checkpoint, in the database of its rows, so that both commit together. `sink` is
+-- 'graph' or 'vectors'.
 
 -- name: schema_owner
--- NULL when there is no such schema, else its comment ('' for none): ours carries our mark.
+-- No row when there is no such schema, else its comment ('' for none), by which we know ours.
 SELECT coalesce(obj_description(oid, 'pg_namespace'), '') FROM pg_namespace WHERE nspname = 'mapfold'
 
 -- name: create
@@ -37,13 +37,13 @@ FROM mapfold.checkpoint WHERE sink = %(sink)s
 SELECT to_regclass(%(table)s) IS NOT NULL
 
 -- name: create_first
--- A first checkpoint; two tails that both find none must not both get one.
+-- The first checkpoint, of one tail only if two start at once.
 INSERT INTO mapfold.checkpoint (sink, log_id, fingerprint, settings, next_offset, last_event)
 VALUES (%(sink)s, %(log_id)s, %(fingerprint)s, %(settings)s, 0, '')
 ON CONFLICT (sink) DO NOTHING
 
 -- name: advance
--- Compare-and-set: moves only from the offset we think it is at, of the log and settings we have.
+-- Compare-and-set: moves only from the offset, log and settings that the caller expects.
 UPDATE mapfold.checkpoint
 SET next_offset = %(next_offset)s, last_event = %(last_event)s, digest = NULL,
     moved_at = now(), heartbeat_at = now()
@@ -52,7 +52,7 @@ WHERE sink = %(sink)s AND next_offset = %(expected)s
 RETURNING next_offset
 
 -- name: replace
--- A rebuild starts a new history, whatever was there.
+-- A rebuild overwrites whatever was there.
 INSERT INTO mapfold.checkpoint
     (sink, log_id, fingerprint, settings, next_offset, last_event, digest)
 VALUES (%(sink)s, %(log_id)s, %(fingerprint)s, %(settings)s, %(next_offset)s, %(last_event)s,
@@ -82,7 +82,7 @@ WHERE sink = %(sink)s ORDER BY log_offset
 DELETE FROM mapfold.dead_letter WHERE sink = %(sink)s
 
 -- name: lock
--- One writer per sink and database. The numbers are 'mapf' and the sink's own.
+-- One writer per sink and database. The key is 'mapf' and the sink's number.
 SELECT pg_try_advisory_lock(1835102310, %(number)s)
 
 -- name: wait_for_lock

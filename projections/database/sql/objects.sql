@@ -1,4 +1,4 @@
--- Objects and Places as people ask for them. Properties come back as agtype and are read as JSON;
+-- Objects and Places for `mapfold query` and `serve`. Properties are agtype, parsed as JSON;
 -- `ag_catalog.agtype_access_operator` with a constant key is what the btree indexes serve.
 
 -- name: places
@@ -32,8 +32,8 @@ WHERE ag_catalog.agtype_access_operator(VARIADIC ARRAY[its.properties, '"place_i
     = %(id)s::text::ag_catalog.agtype
 ORDER BY thing.id
 
--- name: holders
--- Places that hold an Object of a class, with how many.
+-- name: object_counts
+-- Places with Objects of a class, and how many.
 SELECT located.end_id::text, count(*)
 FROM {object} AS thing JOIN {located_in} AS located ON located.start_id = thing.id
 WHERE ag_catalog.agtype_access_operator(VARIADIC ARRAY[thing.properties, '"class_name"'::ag_catalog.agtype])

@@ -1,7 +1,7 @@
--- From crops to candidates: nearest observations, and from each along the graph to its Object, that
--- Object's Place, and the Place its keyframe lies in. Ids follow from the observation's number
--- (det_pk), so every step but the search is a look-up of an indexed id. `{questions}` is a VALUES list of
--- (crop, vector) bind parameters. Each half ends with what it was made from: log and settings.
+-- From crops to candidates: the nearest observations; of each its Object, the Object's Place, and the
+-- Place of its keyframe. Graph ids follow from the observation's number (det_pk), so every step but the
+-- search is a look-up of an indexed id. `{questions}` is a VALUES list of (crop, vector) bind parameters.
+-- The last column of each half is its origin: log id and settings fingerprint.
 
 -- name: near
 -- The nearest `%(neighbours)s` observations of each crop, from the vectors' database.
@@ -15,8 +15,8 @@ FROM question CROSS JOIN LATERAL (
     FROM public.detection_embeddings ORDER BY embedding <=> question.wanted LIMIT %(neighbours)s
 ) AS near
 
--- name: along
--- Object, its Place and the keyframe's Place of observations, from the graph's database.
+-- name: graph
+-- Object, its Place and the keyframe's Place of each observation, from the graph's database.
 SELECT seen.det_pk, thing.properties, its.id, its.properties, there.id, there.properties,
        (SELECT log_id || ' ' || fingerprint FROM mapfold.checkpoint WHERE sink = 'graph')
 FROM unnest(%(det_pks)s::bigint[]) AS seen (det_pk)
@@ -30,7 +30,7 @@ LEFT JOIN {has_observation} AS has
 LEFT JOIN {in_place} AS in_place ON in_place.start_id = has.start_id
 LEFT JOIN {place} AS there ON there.id = in_place.end_id
 
--- name: near_and_along
+-- name: near_and_graph
 -- Both in one round trip and one snapshot, when they share a database.
 WITH question (crop, wanted) AS ({questions})
 SELECT question.crop, near.det_pk, near.det_id, near.run_id, 1 - near.distance, near.class_name,

@@ -1,11 +1,11 @@
-"""The waiting room: a bounded queue of questions, fair to those who ask, and threads that answer.
+"""A bounded queue of questions that is fair to peers, and the threads that answer them.
 
-* Peers take turns: one question of each, round robin. So a peer that sends thousands of questions
-  delays its own and not those of others.
-* When the room is full, the peer with the most questions in it loses its newest.
-* A question that has waited for ``patience_s`` is refused instead of answered too late.
+* Round robin: one question of each peer in turn. So a peer that sends thousands of questions delays
+  its own and not those of others.
+* When the queue is full, the peer with the most questions in it loses its newest.
+* A question that has waited for ``max_wait_s`` is refused instead of answered too late.
 
-A thread of its own tells those that are refused, because it may take long to reach them.
+Refusals are sent by a thread of their own, because sending one may take long.
 """
 
 import threading
@@ -20,22 +20,22 @@ from .answering import BusyError
 
 Result = TypeVar("Result")
 
-WAITING: Final = 64
-PATIENCE_S: Final = 1.5
+CAPACITY: Final = 64
+MAX_WAIT_S: Final = 1.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Job:
     work: Callable[[], Any]
     future: "Future[Any]"
-    come_s: float
+    submitted_s: float
 
     def run(self) -> None:
         if not self.future.set_running_or_notify_cancel():
             return
         try:
             result = self.work()
-        except BaseException as error:  # noqa: BLE001  whoever holds the future handles it
+        except BaseException as error:  # noqa: BLE001  passed on by the future
             self.future.set_exception(error)
         else:
             self.future.set_result(result)
@@ -47,14 +47,14 @@ class _Job:
             )
 
 
-class Room:
-    """Runs what is submitted on ``workers`` threads. Close it, or use it in a ``with`` block."""
+class FairQueue:
+    """Runs submitted work on ``workers`` threads. Close it, or use it in a ``with`` block."""
 
     def __init__(
-        self, workers: int, *, waiting: int = WAITING, patience_s: float = PATIENCE_S
+        self, workers: int, *, capacity: int = CAPACITY, max_wait_s: float = MAX_WAIT_S
     ) -> None:
-        self._most, self._patience_s = waiting, patience_s
-        self._turns: dict[str, deque[_Job]] = {}  # in the order in which the peers are served
+        self._capacity, self._max_wait_s = capacity, max_wait_s
+        self._queued: dict[str, deque[_Job]] = {}  # by peer, in the order of their turns
         self._refused: list[_Job] = []
         self._closing = False
         self._changed = threading.Condition()
@@ -65,22 +65,22 @@ class Room:
             thread.start()
 
     def submit(self, peer: str, work: Callable[[], Result]) -> "Future[Result]":
-        """Have ``work`` done in the turn of ``peer``. The future may raise BusyError."""
+        """Queue ``work`` for a turn of ``peer``. The future may raise BusyError."""
         job = _Job(work, Future(), time.monotonic())
         with self._changed:
             if self._closing:
                 job.refuse()
                 return job.future
-            self._turns.setdefault(peer, deque()).append(job)
-            if sum(map(len, self._turns.values())) > self._most:
-                heaviest = max(self._turns, key=lambda name: len(self._turns[name]))
-                self._refused.append(self._turns[heaviest].pop())
+            self._queued.setdefault(peer, deque()).append(job)
+            if sum(map(len, self._queued.values())) > self._capacity:
+                heaviest = max(self._queued, key=lambda name: len(self._queued[name]))
+                self._refused.append(self._queued[heaviest].pop())
                 self._drop_empty()
             self._changed.notify_all()
         return job.future
 
     def close(self) -> None:
-        """Take no more, do what was taken. May be called twice."""
+        """Refuse new work and finish what is queued. May be called twice."""
         with self._changed:
             self._closing = True
             self._changed.notify_all()
@@ -90,7 +90,7 @@ class Room:
     def _answer(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._turns or self._closing)
+                self._changed.wait_for(lambda: self._queued or self._closing)
                 job = self._next()
             if job is not None:
                 job.run()
@@ -110,27 +110,27 @@ class Room:
                 job.refuse()
 
     def _next(self) -> _Job | None:
-        for peer in self._turns:
-            jobs = self._turns.pop(peer)
+        for peer in self._queued:
+            jobs = self._queued.pop(peer)
             job = jobs.popleft()
             if jobs:
-                self._turns[peer] = jobs  # behind all others
+                self._queued[peer] = jobs  # after all other peers
             return job
         return None
 
     def _expire(self) -> None:
-        oldest = time.monotonic() - self._patience_s
-        for jobs in () if self._closing else self._turns.values():
-            while jobs and jobs[0].come_s <= oldest:
+        oldest = time.monotonic() - self._max_wait_s
+        for jobs in () if self._closing else self._queued.values():
+            while jobs and jobs[0].submitted_s <= oldest:
                 self._refused.append(jobs.popleft())
         self._drop_empty()
 
     def _until_next_expires(self) -> float | None:
-        first = min((jobs[0].come_s for jobs in self._turns.values()), default=None)
-        return None if first is None else max(0.0, first + self._patience_s - time.monotonic())
+        first = min((jobs[0].submitted_s for jobs in self._queued.values()), default=None)
+        return None if first is None else max(0.0, first + self._max_wait_s - time.monotonic())
 
     def _drop_empty(self) -> None:
-        self._turns = {peer: jobs for peer, jobs in self._turns.items() if jobs}
+        self._queued = {peer: jobs for peer, jobs in self._queued.items() if jobs}
 
     def __enter__(self) -> Self:
         return self

@@ -1,6 +1,6 @@
-"""The questions people ask, as documents ready for JSON: live, or of a folded map.
+"""Queries of the map for `mapfold query`, as documents for JSON: of the live databases or a fold.
 
-`Asker` is what a question needs to know; the databases and a folded map are two of them.
+A `MapSource` has the data they need: `LiveMap` in the graph's database, `FoldedMap` in a view.
 """
 
 from collections.abc import Sequence
@@ -11,10 +11,10 @@ from projections.errors import QuestionError
 from projections.model.view import MapView
 from projections.relocalize import Candidates, Crop
 
-from .graph_reads import read_holders, read_object, read_objects_of_place, read_place_graph
+from .graph_reads import read_object, read_object_counts, read_objects_of_place, read_place_graph
 from .place_graph import PlaceGraph
 
-_THING = (
+_OBJECT_FIELDS = (
     "object_id",
     "class_name",
     "mean_x",
@@ -24,27 +24,27 @@ _THING = (
     "last_seen",
     "place_id",
 )
-"""What is told of an Object, in this order wherever it comes from; agtype has its own order."""
+"""The fields of an Object in their order; agtype has its own order."""
 
 
-class Asker(Protocol):
-    """Where answers come from."""
+class MapSource(Protocol):
+    """The data of a map."""
 
     def place_graph(self) -> PlaceGraph:
         """All Places and their adjacency."""
 
-    def holders(self, class_name: str) -> dict[int, int]:
-        """Objects of a class per Place ordinal."""
+    def count_objects(self, class_name: str) -> dict[int, int]:
+        """Number of Objects of a class, by Place ordinal; only Places that have one."""
 
-    def thing(self, object_id: str) -> dict[str, Any] | None:
+    def find_object(self, object_id: str) -> dict[str, Any] | None:
         """An Object with its place_id."""
 
-    def contents(self, place_id: str) -> list[dict[str, Any]]:
+    def objects_in(self, place_id: str) -> list[dict[str, Any]]:
         """The Objects of a Place."""
 
 
-class LiveAsker:
-    """Asks the graph's database; ``connection`` was set up by `prepare_graph`."""
+class LiveMap:
+    """The graph's database; ``connection`` was set up by `prepare_graph`."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
@@ -53,22 +53,22 @@ class LiveAsker:
         """All Places and their adjacency."""
         return read_place_graph(self._connection)
 
-    def holders(self, class_name: str) -> dict[int, int]:
-        """Objects of a class per Place ordinal."""
-        return read_holders(self._connection, class_name)
+    def count_objects(self, class_name: str) -> dict[int, int]:
+        """Number of Objects of a class, by Place ordinal; only Places that have one."""
+        return read_object_counts(self._connection, class_name)
 
-    def thing(self, object_id: str) -> dict[str, Any] | None:
+    def find_object(self, object_id: str) -> dict[str, Any] | None:
         """An Object with its place_id."""
         found = read_object(self._connection, object_id)
         return None if found is None else _ordered(found)
 
-    def contents(self, place_id: str) -> list[dict[str, Any]]:
+    def objects_in(self, place_id: str) -> list[dict[str, Any]]:
         """The Objects of a Place."""
         return [_ordered(thing) for thing in read_objects_of_place(self._connection, place_id)]
 
 
-class ViewAsker:
-    """Asks a folded map."""
+class FoldedMap:
+    """A folded map."""
 
     def __init__(self, view: MapView) -> None:
         self._view = view
@@ -77,22 +77,22 @@ class ViewAsker:
         """All Places and their adjacency."""
         return PlaceGraph.of_view(self._view)
 
-    def holders(self, class_name: str) -> dict[int, int]:
-        """Objects of a class per Place ordinal."""
-        held: dict[int, int] = {}
+    def count_objects(self, class_name: str) -> dict[int, int]:
+        """Number of Objects of a class, by Place ordinal; only Places that have one."""
+        counts: dict[int, int] = {}
         for thing in self._view.objects:
             if thing.class_name == class_name and thing.place is not None:
-                held[thing.place] = held.get(thing.place, 0) + 1
-        return held
+                counts[thing.place] = counts.get(thing.place, 0) + 1
+        return counts
 
-    def thing(self, object_id: str) -> dict[str, Any] | None:
+    def find_object(self, object_id: str) -> dict[str, Any] | None:
         """An Object with its place_id."""
         return next(
             (self._document(o.ordinal) for o in self._view.objects if o.object_id == object_id),
             None,
         )
 
-    def contents(self, place_id: str) -> list[dict[str, Any]]:
+    def objects_in(self, place_id: str) -> list[dict[str, Any]]:
         """The Objects of a Place."""
         return [
             self._document(o.ordinal)
@@ -115,39 +115,42 @@ class ViewAsker:
 
 
 def _ordered(thing: dict[str, Any]) -> dict[str, Any]:
-    return {name: thing[name] for name in _THING}
+    return {name: thing[name] for name in _OBJECT_FIELDS}
 
 
-def where_is(asker: Asker, object_id: str) -> dict[str, Any]:
+def where_is(source: MapSource, object_id: str) -> dict[str, Any]:
     """An Object and the Place it is located in. Raises QuestionError if there is none."""
-    thing = asker.thing(object_id)
+    thing = source.find_object(object_id)
     if thing is None:
         raise QuestionError(f"no object {object_id!r} in this map; mapfold state --json lists them")
     return thing
 
 
-def objects_of(asker: Asker, place_id: str) -> list[dict[str, Any]]:
+def objects_of(source: MapSource, place_id: str) -> list[dict[str, Any]]:
     """The Objects of a Place. Raises QuestionError if there is no such Place."""
-    found = asker.contents(place_id)
+    found = source.objects_in(place_id)
     if not found:
-        asker.place_graph().find(place_id)
+        source.place_graph().find(place_id)
     return found
 
 
-def places_holding(asker: Asker, class_name: str, start: str, hops: int) -> list[dict[str, Any]]:
-    """Places within ``hops`` steps of ``start`` that hold a class, nearest first."""
-    graph = asker.place_graph()
+def places_holding(
+    source: MapSource, class_name: str, start: str, hops: int
+) -> list[dict[str, Any]]:
+    """Places within ``hops`` steps of ``start`` with an Object of a class, nearest first."""
+    graph = source.place_graph()
     within = graph.hops_from(graph.find(start), hops)
-    held = asker.holders(class_name)
-    order = sorted((p for p in within if p in held), key=lambda p: (within[p], p))
+    counts = source.count_objects(class_name)
+    order = sorted((p for p in within if p in counts), key=lambda p: (within[p], p))
     return [
-        {"place_id": graph.places[p].place_id, "hops": within[p], "objects": held[p]} for p in order
+        {"place_id": graph.places[p].place_id, "hops": within[p], "objects": counts[p]}
+        for p in order
     ]
 
 
-def path_between(asker: Asker, start: str, goal: str) -> list[dict[str, Any]]:
-    """The Places on the way, both ends included; empty if there is no way."""
-    graph = asker.place_graph()
+def path_between(source: MapSource, start: str, goal: str) -> list[dict[str, Any]]:
+    """The Places on the shortest path, both ends included; empty if there is no path."""
+    graph = source.place_graph()
     way = graph.path(graph.find(start), graph.find(goal)) or []
     return [
         {
@@ -169,8 +172,8 @@ def similar_objects(
         for match in row:
             if match.object_id is None:
                 continue
-            known = best.get(match.object_id)
-            if known is None or match.similarity > known["similarity"]:
+            earlier = best.get(match.object_id)
+            if earlier is None or match.similarity > earlier["similarity"]:
                 best[match.object_id] = {
                     "object_id": match.object_id,
                     "class_name": match.class_name,

@@ -1,7 +1,4 @@
-"""A tail's progress, for others to read and to wait for.
-
-A tail's numbers for Prometheus.
-"""
+"""A tail's progress, for other threads and for Prometheus."""
 
 import threading
 import time
@@ -19,7 +16,7 @@ from .checkpoints import DeadLetter
 
 @dataclass(slots=True)
 class TailReport:
-    """What a tail did so far: batches and events written, where it stands, what it parked."""
+    """What a tail did so far: batches and events written, its offset, what it parked."""
 
     next_offset: Offset = FIRST_OFFSET
     events: int = 0
@@ -38,11 +35,11 @@ class TailProgress:
         self.batches = 0
         self.restarts = 0
         self.parked = 0
-        self.troubles = 0
+        self.failures = 0
         self.committed_at: float | None = None
 
     def update(self, report: TailReport) -> None:
-        """Take in where the tail is, at its start and after each commit; wakes who waits."""
+        """Set the progress, at the tail's start and after each commit, and wake waiting threads."""
         with self._moved:
             if report.batches > self.batches:
                 self.committed_at = time.monotonic()
@@ -51,13 +48,13 @@ class TailProgress:
             self.restarts, self.parked = report.restarts, len(report.parked)
             self._moved.notify_all()
 
-    def trouble(self, _what: str) -> None:
+    def count_failure(self) -> None:
         """Count a failed attempt."""
         with self._moved:
-            self.troubles += 1
+            self.failures += 1
 
     def wait(self, next_offset: Offset, timeout_s: float) -> bool:
-        """True once ``next_offset`` events are committed; False when that takes too long."""
+        """True once ``next_offset`` events are committed; False after ``timeout_s`` seconds."""
         with self._moved:
             return self._moved.wait_for(lambda: self.next_offset >= next_offset, timeout_s)
 
@@ -70,7 +67,7 @@ def serving_tail_metrics(
 
 
 def tail_numbers(progress: TailProgress, log: Path) -> Iterator[MetricValue]:
-    """Read when somebody scrapes; the lag is against the log as it is then."""
+    """The metrics at the time of a scrape; the lag is counted from the log's end then."""
     with LogReader(log) as reader:
         end = reader.next_offset
     yield MetricValue("mapfold_tail_events", "Events written.", progress.events, counter=True)
@@ -79,7 +76,7 @@ def tail_numbers(progress: TailProgress, log: Path) -> Iterator[MetricValue]:
     )
     yield MetricValue("mapfold_tail_parked", "Events left out.", progress.parked, counter=True)
     yield MetricValue("mapfold_tail_restarts", "Folds begun anew.", progress.restarts, counter=True)
-    yield MetricValue("mapfold_tail_troubles", "Failed attempts.", progress.troubles, counter=True)
+    yield MetricValue("mapfold_tail_troubles", "Failed attempts.", progress.failures, counter=True)
     yield MetricValue("mapfold_tail_next_offset", "Events in the databases.", progress.next_offset)
     yield MetricValue("mapfold_tail_log_next_offset", "Events in the log.", end)
     yield MetricValue(
