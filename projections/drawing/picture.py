@@ -73,7 +73,7 @@ def compose(
     left_out = draw_objects(canvas, view, min_observations)
     canvas.header(0, title, 14, palette.INK, "bold")
     canvas.header(1, _numbers(view, min_observations), 9.5, palette.SMALL_PRINT)
-    for line, text in enumerate(_legend(lost, bridges, left_out)):
+    for line, text in enumerate(legend_lines(lost, bridges, left_out)):
         canvas.footer(line, text, palette.SMALL_PRINT)
     return canvas
 
@@ -90,7 +90,8 @@ def _numbers(view: MapView, min_observations: int) -> str:
     )
 
 
-def _legend(lost: LostRobot | None, bridges: Sequence[Bridge], left_out: int) -> list[str]:
+def legend_lines(lost: LostRobot | None, bridges: Sequence[Bridge], left_out: int) -> list[str]:
+    """The lines below the map; ``left_out`` counts labels without room."""
     parts = []
     if bridges:
         parts.append("○ keyframe that made two places one")

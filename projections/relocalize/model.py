@@ -1,4 +1,4 @@
-"""Every number the ranking relies on, with where it comes from.
+"""Parameters of the ranking, with where each comes from.
 
 The similarity model: a crop of an object and an observation of the same object in another session,
 seen from directions Δ apart, have a cosine near ``floor + side · exp(kappa · (cos Δ − 1))``. Floor,
@@ -22,35 +22,35 @@ class Model:
     sigma_observation: float = 0.016
     sigma_instance: float = 0.009
     independent: float = 6.0
-    """Observations of one object err alike: more than this many count no more."""
+    """Errors of one object's observations are correlated: no more than this many count."""
     too_similar: float = 3.0
     """A crop *more* like an object than expected is penalised no further than this χ²."""
     usual_best: float = 0.885
     """No observation counts as more similar than this."""
     same_crop: float = 0.04
-    """Beyond that by this much, the crop is the very one in the map …"""
+    """An observation more similar than ``usual_best`` by this much is the very crop asked with."""
     same_crop_worth: float = 15.0
-    """… which decides between look-alikes."""
+    """Log-likelihood that it adds to its landmark; decides between look-alikes."""
     usual_third: float = 0.875
-    """A third best match in a run above this tells that the run is of the question's own session:
-    then all cosines against it are higher, and are shifted down (`sessions`)."""
+    """A run whose third best match is above this is of the question's own session: all cosines
+    against it are higher, and are shifted down (`sessions`)."""
     session: float = 0.048
     """By how much cosines within a session are higher than between two: 0.911 against 0.863 from
     the same side, in house-a and house-b as in home-1 and home-2."""
     session_price: float = 1.0
     """Log-likelihood that a landmark loses for each run it takes for the question's own session."""
     relevant: float = 0.72
-    """Less similar observations show another model and are not looked at."""
+    """Less similar observations show another thing and are ignored."""
     unknown_price: float = 7.0
-    """Log-likelihood a perfect match has over 'this crop is not in the map'."""
+    """Log-likelihood of a perfect match above that of 'this crop is not in the map'."""
     sigma_bearing: float = 0.04
     sigma_bearing_cut: float = 0.08
     sigma_log_depth: float = 0.15
     sigma_log_depth_cut: float = 0.3
     sigma_landmark: float = 0.1
     vague: float = 0.5
-    """How much of the log of the error ellipse's area counts: a landmark whose place is vague fits
-    everything a little, which must not be worth as much as one that fits sharply."""
+    """How much of the log of the error ellipse's area counts: a landmark of uncertain position fits
+    everything a little, which must not score as high as a close fit of a certain one."""
     map_bearing: float = 0.02
     map_bearing_cut: float = 0.08
     map_log_depth: float = 0.08
@@ -65,13 +65,14 @@ class Model:
     usual_depth: float = 2.6
     usual_depth_spread: float = 0.45
     driven: float = 0.7
-    """The robot is where it has been before, within about this …"""
+    """Standard deviation of the robot's distance from poses where robots have been."""
     driven_most: float = 2.5
-    """… unless three things speak against it: half of a building may not be explored yet."""
+    """Greatest penalty for it: a part of the building may not be explored yet."""
     seen_from: float = 4.0
     seen_from_no_box: float = 0.8
-    """… and sees an object from about where that was seen before; without boxes all hangs on it."""
+    """Standard deviation of the distance from poses that saw the landmark; without boxes the
+    position depends on it alone."""
 
 
 MODEL: Final = Model()
-"""The shipped numbers."""
+"""The defaults."""

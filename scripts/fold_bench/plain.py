@@ -1,4 +1,4 @@
-"""The plain online DBSCAN that one writes first: every newcomer asks everybody. O(n²)."""
+"""Plain online DBSCAN, the baseline: each new point is compared with all others. O(n²)."""
 
 
 def fold_plain(points: list[tuple[int, int]], eps_um: int, min_samples: int) -> list[int]:

@@ -1,4 +1,4 @@
-"""Every claim about the fold's cost as a ratio within one run, so that no machine matters."""
+"""The fold's cost as ratios within one run, so that they hold on any machine."""
 
 import json
 import resource

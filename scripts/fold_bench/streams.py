@@ -15,7 +15,7 @@ MODEL = "ViT-B-32/laion2b_s34b_b79k"
 
 
 def random_walk(count: int, step_m: float = 1.0) -> list[tuple[int, int]]:
-    """A robot that turns a little and goes a step, out into the open; micrometres."""
+    """A robot that turns a little and goes a step, on an open plane; micrometres."""
     rng, points = random.Random(7), []
     x = y = heading = 0.0
     for _ in range(count):
@@ -26,7 +26,7 @@ def random_walk(count: int, step_m: float = 1.0) -> list[tuple[int, int]]:
 
 
 def house_walk(count: int) -> Iterator[tuple[float, float]]:
-    """One robot for ever in a house of 20 × 15 m with a wall and a door in the middle; metres."""
+    """A robot that keeps driving in a house of 20 × 15 m with a wall and a door; metres."""
     rng = random.Random(8)
     x, y, heading = 5.0, 7.0, 0.0
     for _ in range(count):

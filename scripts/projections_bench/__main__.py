@@ -1,4 +1,4 @@
-"""`scripts/bench_projections`: everything measured in one run on one machine, told as ratios.
+"""`scripts/bench_projections`: everything measured in one run on one machine, as ratios.
 
 Wall times mean little on a busy machine; the load average is printed with them, and CPU seconds of
 our own process stand beside the wall seconds.

@@ -1,18 +1,17 @@
-"""The floor of a rebuild: COPY of the very same rows from ready files, and reading the log.
+"""Lower bounds of a rebuild's time: COPY of the same rows from ready files, and reading the log.
 
-Three floors are told, each with all of the one before:
+Three bounds, each including the one before:
 
 *   *bare*: COPY of all rows into new, empty tables that have the constraints and indexes which AGE
-    and the table's definition bring, and reading every event of the log. No fold, no making of rows
-*   *kept*: making those tables, and the commit. With ``wal_level=minimal`` it is the commit that
-    writes the rows to disk; before it, nothing of a COPY would survive a crash. Server and settings
-    are the rebuild's
-*   *served*: our own indexes, statistics and the counts, so that what stands there in the end is
-    all that a rebuild leaves
+    and the table's definition bring, and reading every event of the log. No fold, no rows made
+*   *kept*: making those tables, and the commit. With ``wal_level=minimal`` the commit
+    writes the rows to disk. Server and settings are those of the rebuild
+*   *served*: our own indexes, statistics and the counts: all that a
+    rebuild leaves
 
 The rebuild is the whole call: reading, folding, making rows, writing, indexes, checks, digest, the
-swap and its commit, having the old map dropped. Each replaces a map of its own size. The server
-drops that on its own afterwards; how long as much takes is told too.
+swap and its commit. Each replaces a map of its own size, which the server drops afterwards; the
+time of that is given too.
 """
 
 import time
@@ -54,7 +53,7 @@ class Seconds:
 
 
 def against_floor(server: EmbeddedServer, folder: Path, quick: bool) -> None:
-    """An in-process rebuild of 20,000 keyframes without HNSW, against its floors."""
+    """An in-process rebuild of 20,000 keyframes without HNSW, against its lower bounds."""
     size = 2_000 if quick else 20_000
     log = make_log(folder / f"log-{size}", size)
     targets = Targets(server.url, server.url)

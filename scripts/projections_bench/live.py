@@ -1,4 +1,4 @@
-"""Tail: how fast when behind, how soon when live."""
+"""The tail: events per second when behind, and delay when live."""
 
 import threading
 import time
@@ -40,11 +40,11 @@ def latency(server: EmbeddedServer, folder: Path, quick: bool) -> None:
     log = make_log(folder / "log-live", 2_000)
     targets = Targets(server.url, server.url)
     progress = TailProgress()
-    stop, seen = threading.Event(), _Seen(server.url)
+    stop, seen = threading.Event(), _Visibility(server.url)
     durable: dict[int, float] = {}
 
     def on_batch(report: TailReport) -> None:
-        seen.look(report.next_offset)
+        seen.check(report.next_offset)
 
     thread = threading.Thread(
         target=tail,
@@ -68,15 +68,15 @@ def latency(server: EmbeddedServer, folder: Path, quick: bool) -> None:
     )
 
 
-class _Seen:
+class _Visibility:
     """When each event was first visible to another session, in both databases' queries."""
 
     def __init__(self, url: str) -> None:
         self._connection = connect_for_cypher(url)
         self._visible: list[tuple[int, float]] = []
 
-    def look(self, next_offset: int) -> None:
-        """After a commit: look with other eyes whether it is there, and when that was."""
+    def check(self, next_offset: int) -> None:
+        """After a commit: check in another session whether the events are visible."""
         keyframes = self._connection.execute(
             'SELECT count(*) FROM semantic_map."Keyframe" WHERE id >= _graphid(4, %s)',
             [next_offset],

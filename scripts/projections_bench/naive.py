@@ -11,8 +11,7 @@ What a graph-builder service beside an ingest service does, by the recipes of th
 * the embeddings go to pgvector one INSERT each, in a transaction of their own, its index on det_id
   only
 
-The fold is not its business: it is handed the finished places and objects, so what it writes is
-right, and its time is that of writing alone.
+It is given the finished places and objects, so its time is that of writing alone.
 """
 
 import json
@@ -148,7 +147,7 @@ def _run(connection: psycopg.Connection[Any], query: LiteralString, values: Any)
 def _write_keyframe(
     connection: psycopg.Connection[Any], view: MapView, k: Any, before: int | None
 ) -> int | None:
-    """One keyframe with all that hangs on it; its place, or the last one before it."""
+    """One keyframe with its detections; returns its place, or the last one before it."""
     values = {"run_id": k.run_id, "keyframe_id": k.keyframe_id, "timestamp": k.timestamp}
     values |= {"x": k.pose.x_um / 1e6, "y": k.pose.y_um / 1e6, "yaw": k.pose.yaw_rad}
     for query in KEYFRAME:

@@ -1,6 +1,7 @@
-"""Per-node Cypher with everything it can be given without changing what it is, one transaction per
-keyframe: property indexes made up front, expressions that use them, CREATE for what must be new,
-prepared statements. It writes the graph only, without adjacency. See `naive` for the usual way.
+"""Per-node Cypher, tuned as far as it stays per-node Cypher, one transaction per keyframe.
+
+Property indexes made up front, expressions that use them, CREATE for what must be new, prepared
+statements. It writes the graph only, without adjacency. See `naive` for the usual way.
 """
 
 import json

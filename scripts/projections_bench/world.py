@@ -1,4 +1,4 @@
-"""A synthetic log of a given size: a robot that wanders over a plane and sees three things."""
+"""A synthetic log of a given size: a robot on a random walk that sees three things."""
 
 import base64
 import json

@@ -67,7 +67,7 @@ def test_every_keyframe_went_through_the_router_into_the_log(played: Played) -> 
     assert f"{len(events)} of {len(events)} keyframes" in "\n".join(played.story)
 
 
-def test_the_map_it_tells_of_is_the_fold_of_the_log(played: Played) -> None:
+def test_the_reported_map_is_the_fold_of_the_log(played: Played) -> None:
     settings = settings_from(played.out / "settings.json", None)
     with LogReader(played.out / "log") as reader:
         _, view = fold_log(reader, settings)
@@ -135,7 +135,7 @@ def test_the_picture_is_there(played: Played) -> None:
     assert picture.stat().st_size > 50_000
 
 
-def test_the_commands_it_ends_with_work_as_they_stand(played: Played) -> None:
+def test_the_commands_it_ends_with_work_as_printed(played: Played) -> None:
     start = next(i for i, line in enumerate(played.story) if "Go on with it" in line)
     commands = [line.strip() for line in played.story[start + 1 :]]
     assert len(commands) >= 6
@@ -162,7 +162,7 @@ def test_it_can_be_played_again_into_its_own_folder(played: Played) -> None:
     assert again["record"]["intact"] is True
 
 
-def test_it_takes_no_folder_that_is_not_its_own(tmp_path: Path) -> None:
+def test_a_folder_that_no_demo_made_is_refused(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
     done = _run("--out", str(tmp_path))
     assert done.returncode == 2

@@ -1,4 +1,4 @@
-"""How fast the past of a long log is; see docs/time-travel.md for the numbers.
+"""Speed of time travel on a long log; see docs/time-travel.md for the numbers.
 
 Makes a log of a robot that drives about a house for a long time, unless --log names one that an
 earlier run kept, and times the library calls behind the commands. Every ratio is against one plain
@@ -35,7 +35,7 @@ T = TypeVar("T")
 
 
 def timed(work: Callable[[], T]) -> tuple[float, T]:
-    """Seconds, and what came of it."""
+    """Seconds, and the result."""
     start = time.perf_counter()
     result = work()
     return time.perf_counter() - start, result

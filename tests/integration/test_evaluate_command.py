@@ -86,7 +86,7 @@ def test_a_pose_may_lie_in_a_room_the_map_never_entered(mapfold: Commands, runs:
     assert whole["room_at_pose"] > 0.8
 
 
-def test_it_is_deterministic_but_for_the_clock(mapfold: Commands, runs: list[str]) -> None:
+def test_it_is_deterministic_but_for_latencies(mapfold: Commands, runs: list[str]) -> None:
     one, other = (mapfold("evaluate", *runs, "--json").json for _ in range(2))
     for scores in (one, other):
         for column in scores["relocalization"].values():
@@ -94,7 +94,7 @@ def test_it_is_deterministic_but_for_the_clock(mapfold: Commands, runs: list[str
     assert one == other
 
 
-def test_the_table_and_the_plain_recipe(mapfold: Commands, runs: list[str]) -> None:
+def test_the_table_and_the_plain_method(mapfold: Commands, runs: list[str]) -> None:
     said = mapfold("evaluate", *runs, "--method", "plain")
     assert "re-localisation (plain)" in said.out
     assert "pose error p50" in said.out

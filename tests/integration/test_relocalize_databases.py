@@ -1,4 +1,4 @@
-"""Asking the databases gives what exact search in the folded map gives, in one database or two."""
+"""Candidates from one database or two equal those of exact search in the folded map."""
 
 import json
 from collections.abc import Iterator
@@ -142,7 +142,7 @@ def test_two_round_trips_at_most(targets: Targets, monkeypatch: pytest.MonkeyPat
 
 
 class TestCommand:
-    """`mapfold relocalize` as a person runs it."""
+    """`mapfold relocalize` as a user runs it."""
 
     @pytest.fixture
     def mapfold(self, tmp_path: Path) -> Commands:

@@ -26,7 +26,7 @@ def test_agreement_is_sklearns(pairs: list[tuple[int, int]]) -> None:
 
 
 @given(LABELS, st.randoms())
-def test_agreement_knows_no_order(pairs: list[tuple[int, int]], random: object) -> None:
+def test_agreement_does_not_depend_on_order(pairs: list[tuple[int, int]], random: object) -> None:
     shuffled = list(pairs)
     random.shuffle(shuffled)  # type: ignore[attr-defined]
     one, other = (agreement([a for a, _ in p], [b for _, b in p]) for p in (pairs, shuffled))

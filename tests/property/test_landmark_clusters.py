@@ -1,4 +1,4 @@
-"""Points along rays: told apart across them, settled where they cross, sure only where seen."""
+"""Landmarks from points along rays: clusters, positions and their covariances."""
 
 import math
 from collections.abc import Sequence
@@ -23,14 +23,14 @@ def seen(things: Sequence[Spot], origins: Sequence[Spot], stretch: float = 1.0) 
 
 
 def test_neighbours_half_a_metre_apart_are_two_things() -> None:
-    """A circle wide enough for the errors along the rays would take them for one."""
+    """A circle wide enough for the errors along the rays would merge them."""
     origins = [(0.0, 0.0), (0.2, 0.0), (0.4, 0.0)]
     points = seen([(-0.25, 3.0), (0.35, 3.0)], origins)
     groups = cluster_points(points, np.ones(6), 9, MODEL)
     assert sorted(sorted(group.tolist()) for group in groups) == [[0, 1, 2], [3, 4, 5]]
 
 
-def test_crossing_bearings_tell_the_place_though_the_range_is_wrong() -> None:
+def test_crossing_bearings_give_the_position_though_the_range_is_wrong() -> None:
     """Two views square to each other, ranges a tenth too long: the crossing is nearer."""
     points = seen([(0.0, 0.0)], [(3.0, 0.0), (0.0, 3.0)], stretch=1.1)
     found = estimate_position(points, MODEL)

@@ -1,4 +1,4 @@
-"""A map with a part of the lost robot's own run beside another run: what a live tail makes."""
+"""A map with a part of the lost robot's own run beside another run, as a live tail makes it."""
 
 import math
 from functools import cache

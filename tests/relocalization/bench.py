@@ -1,4 +1,4 @@
-"""How fast are questions at 300,000 observations: library call, Zenoh, eight clients; and recall.
+"""Speed of questions at 300,000 observations: library call, Zenoh, eight clients; and recall.
 
 Generated buildings side by side, so that crops have look-alikes everywhere. The first call builds
 log and databases in ``--data`` (minutes: the HNSW index alone takes most of them); later calls

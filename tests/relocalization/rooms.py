@@ -1,4 +1,4 @@
-"""Candidates whose Places are the true rooms, so that ranking is tried without clustering."""
+"""Candidates whose Places are the true rooms, so that ranking is tested without clustering."""
 
 from collections.abc import Sequence
 from dataclasses import replace

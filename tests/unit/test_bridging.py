@@ -1,4 +1,4 @@
-"""One keyframe that makes three places one, and one that only lends a neighbour."""
+"""Merges: three places joined by one keyframe, and a bridging keyframe that is no core point."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -33,7 +33,7 @@ def names(opened: Timeline, keyframes: tuple[int, ...]) -> list[str]:
     return [keyframe_name(opened.history, k).removeprefix("run-a:") for k in keyframes]
 
 
-def test_three_places_hang_on_one_hub(tmp_path: Path) -> None:
+def test_one_keyframe_merges_three_places(tmp_path: Path) -> None:
     with drive(tmp_path, [*ARMS, (0, 0)]) as opened:
         (merge,) = opened.merges()
         assert (merge.survivor, merge.absorbed, merge.absorbed_sizes) == (0, (1, 2), (3, 3))
@@ -47,7 +47,7 @@ def test_three_places_hang_on_one_hub(tmp_path: Path) -> None:
         assert (tmp_path / "hub.png").stat().st_size > 10_000
 
 
-def test_a_keyframe_between_is_a_core_point_itself(tmp_path: Path) -> None:
+def test_a_keyframe_between_two_places_is_a_core_point_itself(tmp_path: Path) -> None:
     xs = (0, 0.5, 1, 3, 3.5, 4, 2)
     with drive(tmp_path, [(x, 0) for x in xs]) as opened:
         (merge,) = opened.merges()
@@ -57,7 +57,7 @@ def test_a_keyframe_between_is_a_core_point_itself(tmp_path: Path) -> None:
         )
 
 
-def test_a_bridge_may_stand_off_the_chain(tmp_path: Path) -> None:
+def test_the_bridging_keyframe_may_be_no_part_of_the_chain(tmp_path: Path) -> None:
     """1.0 lacks one neighbour of four until a keyframe comes beside it that is no core point."""
     spots = [(x, 0.0) for x in (-0.4, -0.3, -0.2, 0.1, 1.9, 2.2, 2.3, 2.4, 1.0)] + [(1.0, 0.95)]
     with drive(tmp_path, spots, min_samples=4) as opened:

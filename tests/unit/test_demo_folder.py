@@ -1,4 +1,4 @@
-"""The demo's folder: one demo at a time, and nothing of anybody else's."""
+"""The demo's folder: locked while a demo runs, refused if no demo made it."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from eventsrc.errors import MisuseError
 from projections.demo.folder import fresh_folder
 
 
-def test_a_second_demo_does_not_take_the_log_of_one_at_work(tmp_path: Path) -> None:
+def test_a_second_demo_in_the_same_folder_is_refused(tmp_path: Path) -> None:
     with fresh_folder(tmp_path / "demo") as folder:
         folder.log.mkdir()
         with pytest.raises(MisuseError, match="another demo is at work there; wait"):
@@ -18,7 +18,7 @@ def test_a_second_demo_does_not_take_the_log_of_one_at_work(tmp_path: Path) -> N
         assert not again.log.exists()
 
 
-def test_a_folder_of_somebody_elses_is_left_alone(tmp_path: Path) -> None:
+def test_a_folder_that_no_demo_made_is_refused(tmp_path: Path) -> None:
     (tmp_path / "log").mkdir()
     with pytest.raises(MisuseError, match="not made by the demo"), fresh_folder(tmp_path):
         raise AssertionError

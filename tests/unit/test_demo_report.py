@@ -46,42 +46,42 @@ def _result() -> DemoResult:
     return DemoResult(1, Settings(), RECORDED, FOLLOWED, REPLAYED, True, FOLDED, lost=None)  # type: ignore[arg-type]
 
 
-def test_a_merge_across_rooms_is_told_before_a_larger_one_within_a_room() -> None:
+def test_a_merge_across_rooms_is_preferred_to_a_larger_one_within_a_room() -> None:
     within, across = _merge(3, "hall", "hall", 29), _merge(7, "hall", "study", 12)
     assert most_telling([within, across]) is across
     assert most_telling([within]) is within
     assert most_telling([]) is None
 
 
-def test_no_merge_is_said_to_be_none() -> None:
+def test_no_merges() -> None:
     assert list(report.tell_merges(())) == ["   no two places became one on this drive"]
 
 
-def test_a_merge_is_told_with_its_numbers() -> None:
-    told = "\n".join(report.tell_merges((_merge(7, "hall", "study", 12),)))
+def test_a_merge_is_reported_with_its_numbers() -> None:
+    lines = "\n".join(report.tell_merges((_merge(7, "hall", "study", 12),)))
     for wanted in ("p0 (30 keyframes, hall)", "p1 (12 keyframes, study)", "event 7", "5 places"):
-        assert wanted in told
-    assert "such moments" not in told
+        assert wanted in lines
+    assert "such moments" not in lines
 
 
-def test_what_is_not_whole_is_said_loudly() -> None:
+def test_an_incomplete_log_is_reported() -> None:
     good = "\n".join(report.tell_recording(RECORDED, FOLLOWED, 5, 8, 30.0))
     assert "byte for byte" in good
     assert "NOT" not in good
     torn = replace(RECORDED, recorded=9, intact=False, lost=1)
-    told = "\n".join(report.tell_recording(torn, FOLLOWED, 5, 8, 30.0))
-    assert "9 of 10" in told
-    assert "NOT byte for byte; 0 rejected, 1 lost" in told
+    lines = "\n".join(report.tell_recording(torn, FOLLOWED, 5, 8, 30.0))
+    assert "9 of 10" in lines
+    assert "NOT byte for byte; 0 rejected, 1 lost" in lines
 
 
 @pytest.mark.parametrize(("same", "says"), [(True, "the same rows as"), (False, "OTHER rows than")])
-def test_a_replay_with_other_rows_is_said_loudly(same: bool, says: str) -> None:
+def test_a_replay_with_other_rows_is_reported(same: bool, says: str) -> None:
     assert says in "\n".join(report.tell_replay(REPLAYED, FOLDED, same))
 
 
-def test_a_replay_with_another_digest_is_said_loudly() -> None:
-    told = "\n".join(report.tell_replay(replace(REPLAYED, digest="0" * 64), FOLDED, True))
-    assert "ANOTHER digest" in told
+def test_a_replay_with_another_digest_is_reported() -> None:
+    lines = "\n".join(report.tell_replay(replace(REPLAYED, digest="0" * 64), FOLDED, True))
+    assert "ANOTHER digest" in lines
 
 
 def test_a_demo_is_sound_only_if_everything_agrees() -> None:
@@ -103,9 +103,9 @@ def test_lines_fit_a_terminal() -> None:
     assert max(map(len, lines)) <= 100
 
 
-def test_one_is_singular() -> None:
+def test_singular_forms() -> None:
     at_once = replace(FOLLOWED, batches=1)
-    told = "\n".join(report.tell_recording(RECORDED, at_once, 1, 1, 30.0))
-    assert "through 1 room, " in told
-    assert "with 1 detection are in the log" in told
-    assert "in 1 transaction:" in told
+    lines = "\n".join(report.tell_recording(RECORDED, at_once, 1, 1, 30.0))
+    assert "through 1 room, " in lines
+    assert "with 1 detection are in the log" in lines
+    assert "in 1 transaction:" in lines

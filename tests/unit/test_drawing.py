@@ -1,4 +1,4 @@
-"""Map pictures: what stands on them, the same bytes each time, clear refusals."""
+"""Map pictures: their texts, the same bytes each time, refusals."""
 
 import re
 import struct
@@ -11,7 +11,7 @@ from eventsrc.sim import build_house
 from projections import deltas as d
 from projections.drawing import Bridge, Floor, LostRobot, Spot, draw_map, floor_of
 from projections.drawing.canvas import Canvas, place_colour
-from projections.drawing.picture import _legend, compose
+from projections.drawing.picture import compose, legend_lines
 from projections.model.view import MapView
 from projections.settings import Settings
 
@@ -119,8 +119,8 @@ def test_labels_that_find_no_room_are_counted_on_the_picture() -> None:
     assert any(f"{297 - drawn} object labels had no room" in text for text in texts)
 
 
-def test_one_label_without_room_is_no_labels() -> None:
-    assert _legend(None, (), 1)[1] == "1 object label had no room"
+def test_one_label_without_room_is_singular() -> None:
+    assert legend_lines(None, (), 1)[1] == "1 object label had no room"
 
 
 def test_a_lost_robot_without_an_estimate_is_drawn_too(tmp_path: Path) -> None:
@@ -131,7 +131,7 @@ def test_a_lost_robot_without_an_estimate_is_drawn_too(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", ["png", "svg", "pdf"])
 def test_a_class_may_be_called_anything(tmp_path: Path, suffix: str) -> None:
-    """``$…$`` is no formula, and letters that the font lacks are no warning to the reader."""
+    """``$…$`` is not parsed as a formula, and letters that the font lacks raise no warning."""
     view, out = _two_places(), tmp_path / f"map.{suffix}"
     for number, name in enumerate(
         ("$\\frac$", "a $x$ $b", "\u2615 \U0001f916", "\u65e5\u672c"), start=3

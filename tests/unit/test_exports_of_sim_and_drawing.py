@@ -1,4 +1,4 @@
-"""What these packages offer, and that nobody pays for pictures who draws none."""
+"""Public names of sim, drawing and demo; matplotlib is not imported before something is drawn."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""What a question may look like, and how a bad one is refused."""
+"""Questions: accepted forms, and how bad ones are refused."""
 
 import json
 import tracemalloc
@@ -86,10 +86,8 @@ WRONG = [b'""', b"{}", b"[]", b"null", b"true", b"1e400", b"9" * 999]
 
 @pytest.mark.parametrize("wrong", WRONG, ids=lambda wrong: wrong.decode()[:5])
 @pytest.mark.parametrize("field", [b"embedding", b"bbox", b"crops", b"detections"])
-def test_an_error_is_made_of_the_first_wrong_item_and_not_of_each(
-    field: bytes, wrong: bytes
-) -> None:
-    """Pydantic's error for one wrong item takes 2 kB; a question had room for 300,000 of them."""
+def test_validation_ends_at_the_first_wrong_item(field: bytes, wrong: bytes) -> None:
+    """Pydantic's error for one wrong item takes 2 kB; a question has room for 300,000 of them."""
     items = b",".join([wrong] * (9_000 if len(wrong) < 9 else 900))
     asked = b'[{"%b":[%b]}]' if field in (b"embedding", b"bbox") else b'{"%b":[%b]}'
     tracemalloc.start()

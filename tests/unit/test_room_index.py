@@ -26,7 +26,7 @@ def truth() -> Truth:
 ROOMS = RoomIndex([k.accepted for k in MAPPED], [k.accepted for k in (*ASKED, *FOREIGN)], truth())
 
 
-def test_where_a_keyframe_was_is_its_room() -> None:
+def test_a_keyframes_position_is_in_its_room() -> None:
     for keyframe in MAPPED:
         at = keyframe.accepted.envelope
         assert at.map_x is not None
@@ -42,7 +42,7 @@ def test_another_buildings_runs_name_no_room_here() -> None:
         assert not room.startswith("foreign")
 
 
-def test_a_keyframe_does_not_vouch_for_itself() -> None:
+def test_the_keyframe_asked_from_is_left_out() -> None:
     only = [MAPPED[0].accepted]
     rooms = RoomIndex(only, [], truth())
     assert rooms.room(0.0, 0.0, ("nobody", 0)) == MAPPED[0].room

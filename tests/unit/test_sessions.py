@@ -1,4 +1,4 @@
-"""Cosines of each run made comparable: which runs are shifted, by how much, and which stay open."""
+"""Session shifts: which runs have one, how large it is, and which runs stay open."""
 
 import math
 
@@ -30,23 +30,23 @@ def test_each_run_has_a_shift_of_its_own() -> None:
     assert shifts == {"own": pytest.approx(0.91 - MODEL.usual_third), "other": 0.0}
 
 
-def test_the_crop_that_tells_most_tells_for_all() -> None:
+def test_a_runs_shift_is_the_largest_over_all_crops() -> None:
     rows = [row(own=[0.85, 0.84, 0.83]), row(own=[0.92, 0.915, 0.91], other=[0.8])]
     assert session_shifts(rows, MODEL)["own"] == pytest.approx(0.91 - MODEL.usual_third)
 
 
-def test_the_very_crop_says_nothing_about_others() -> None:
+def test_a_single_identical_crop_makes_no_shift() -> None:
     assert session_shifts([row(own=[1.0, 0.87, 0.86])], MODEL) == {"own": 0.0}
 
 
-def test_a_run_with_too_few_matches_is_left_alone() -> None:
+def test_a_run_with_fewer_than_three_matches_has_no_shift() -> None:
     rows = [row(own=[1.0, 0.95], other=[0.87, 0.86, 0.85])] * 2
     shifts = session_shifts(rows, MODEL)
     assert shifts == {"own": 0.0, "other": 0.0}
     assert subtract_shifts(rows[0], shifts) == rows[0]
 
 
-def test_only_the_own_runs_matches_move_and_the_order_follows() -> None:
+def test_only_the_own_runs_matches_are_shifted_and_the_order_follows() -> None:
     crop = row(own=[0.9375, 0.875], other=[0.9, 0.8125])
     moved = subtract_shifts(crop, {"own": 0.0625, "other": 0.0})
     assert [(m.run_id, m.similarity) for m in moved] == [
@@ -58,7 +58,7 @@ def test_only_the_own_runs_matches_move_and_the_order_follows() -> None:
     assert moved[2].observation < moved[3].observation
 
 
-def test_what_a_shift_lacks_of_a_whole_sessions() -> None:
+def test_the_remaining_shift_is_a_sessions_less_the_subtracted() -> None:
     crop = row(own=[0.9], other=[0.8])
     found = remaining_shifts(crop, {"own": 0.03, "other": 0.0, "else": 0.1}, MODEL)
     assert found.several_runs
@@ -70,21 +70,21 @@ def test_a_run_that_is_too_similar_from_behind_is_the_own_session() -> None:
     """Seen from the first direction run 1 is as much too similar as a session makes it."""
     run = np.array([1, 0, 1, 0, 1, 0])
     error = np.array([[MODEL.session * (r == 1) for r in run], [-0.02] * 6])
-    less, paid = apply_remaining_shifts(
+    less, price = apply_remaining_shifts(
         error, RemainingShifts(run, np.full(6, MODEL.session)), MODEL
     )
     assert less[0].tolist() == pytest.approx([0.0] * 6)
     assert less[1].tolist() == error[1].tolist()
-    assert paid.tolist() == [MODEL.session_price, 0.0]
+    assert price.tolist() == [MODEL.session_price, 0.0]
 
 
-def test_a_run_whose_shift_is_told_whole_is_not_open() -> None:
+def test_a_run_whose_shift_is_fully_subtracted_is_unchanged() -> None:
     error = np.full((3, 4), 0.05)
-    less, paid = apply_remaining_shifts(
+    less, price = apply_remaining_shifts(
         error, RemainingShifts(np.array([0, 0, 1, 1]), np.zeros(4)), MODEL
     )
     assert less.tolist() == error.tolist()
-    assert paid.tolist() == [0.0] * 3
+    assert price.tolist() == [0.0] * 3
 
 
 def looks_at_the_origin(number: int, run: str, x: float, y: float, similarity: float) -> Match:
@@ -94,10 +94,10 @@ def looks_at_the_origin(number: int, run: str, x: float, y: float, similarity: f
     return Match(number, f"d{number}", run, similarity, (x, y, math.atan2(-y, -x)), box, "cup")
 
 
-def test_a_landmark_two_runs_have_seen_is_known_from_the_side_the_other_run_saw() -> None:
+def test_two_runs_that_saw_opposite_sides_of_a_thing_make_one_landmark_that_fits_in_front() -> None:
     """The own session saw it from behind, as similar as another session's from the flank.
 
-    As one run these views say: from neither side does it look as it should.
+    Were all views of one run, the similarities would fit from neither side.
     """
     behind = MODEL.floor + MODEL.side * math.exp(-2.0 * MODEL.kappa) + MODEL.session
     front = MODEL.floor + MODEL.side

@@ -1,4 +1,4 @@
-"""Laws of the ranking, on generated buildings with the true rooms as Places."""
+"""Properties of the ranking, on generated buildings with the true rooms as Places."""
 
 import itertools
 import math
@@ -54,7 +54,7 @@ def test_asking_twice_gives_the_same_answer_to_the_last_bit(seed: int, data: st.
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_consistent_crop_never_lowers_the_true_place(seed: int) -> None:
+def test_one_more_consistent_crop_never_lowers_the_true_place(seed: int) -> None:
     """Noise-free: the crops are the map's own observations of one keyframe."""
     mapped = room_map(seed)
     seen = [k for k in mapped.run if len(k.instances) >= 3 and None not in k.instances][::7]
@@ -109,7 +109,7 @@ def test_the_pose_is_twice_as_near_as_the_rooms_centre(seed: int) -> None:
     assert 2.0 * median_error(seed, 3, plain=False) <= median_error(seed, 3, plain=True)
 
 
-def test_a_stranger_is_unknown() -> None:
+def test_questions_from_another_building_are_unknown() -> None:
     mapped = room_map(SEEDS[0])
     strangers = drive(Building(99, things=40), "stranger", 7, 80)
     answers = [
@@ -121,7 +121,7 @@ def test_a_stranger_is_unknown() -> None:
     assert sum(answer.unknown for answer in answers) >= 0.95 * len(answers)
 
 
-def test_nothing_to_go_by_is_no_answer() -> None:
+def test_without_candidates_the_answer_is_empty() -> None:
     crop: list[Crop] = crops_of(other_session(SEEDS[0])[0])[:1]
     answer = rank(crop, Candidates(((),), {}))
     assert (answer.places, answer.pose, answer.confidence) == ((), None, 0.0)
