@@ -13,16 +13,16 @@ from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 from eventsrc.text import counted
 from projections.evaluate.truth import read_truth
-from projections.history import Expression, ExpressionError, Story, Timeline
+from projections.history import Explanation, Expression, ExpressionError, Timeline
 from projections.history.condition_functions import functions_help
 from projections.history.merges import merge_document
 from projections.history.records import Merge
 from projections.history.rendering import (
     difference_text,
+    explanation_text,
     merge_text,
     merges_text,
     search_text,
-    story_text,
     whatif_text,
 )
 from projections.history.whatif import Alternative, WhatIf, alternatives, assigned, what_if
@@ -145,16 +145,16 @@ def why(
     if (thing is None) == (same is None):
         raise MisuseError("give one of PLACE_ID, OBJECT_ID and --same RUN:KEYFRAME RUN:KEYFRAME")
     with _timeline(log, settings_file, set_) as timeline:
-        story = _story(timeline, thing, same, point(timeline.reader, at))
+        found = _explanation(timeline, thing, same, point(timeline.reader, at))
     if json_:
-        emit(story.document())
+        emit(found.document())
     else:
-        display(story_text(story))
+        display(explanation_text(found))
 
 
-def _story(
+def _explanation(
     timeline: Timeline, thing: str | None, same: tuple[str, str] | None, end: Offset
-) -> Story:
+) -> Explanation:
     if same is not None:
         return timeline.why_same(*same, end)
     return timeline.why(thing or "", end)
@@ -306,7 +306,7 @@ def whatif(
         )  # fmt: skip
     from .evaluate import warn_of_no_truth  # here: it imports all of re-localisation
 
-    warn_of_no_truth(log, found.base.outcome.scores)
+    warn_of_no_truth(log, found.base.result.scores)
     if picture is not None:
         _draw_maps(found, picture)
     if json_:
@@ -319,13 +319,13 @@ def _draw_maps(found: WhatIf, out: Path) -> None:
     # Here and not above: matplotlib takes longer to import than most commands take to run.
     from projections.history.picture import draw_maps
 
-    maps = [(_title(each), each.outcome.view) for each in found.all]
+    maps = [(_title(each), each.result.view) for each in found.all]
     draw_maps([(title, view) for title, view in maps if view is not None], out)
     say(f"wrote {out}: {counted(len(maps), 'map')}")
 
 
 def _title(each: Alternative) -> str:
-    counts = each.outcome.counts
+    counts = each.result.counts
     return f"{each.name}: {counted(counts['places'], 'place')}, {counts['noise']} noise"
 
 

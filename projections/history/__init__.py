@@ -1,16 +1,16 @@
-"""Time travel: why the map is what it is, and what it would be under other settings.
+"""Time travel: past maps, why the map is what it is, and what it would be under other settings.
 
 `Timeline` answers for one log under one setting: the map at any offset, every merge and its cause,
-the chronicle of a place or an object, the difference of two moments, and the event that made a
+the explanation of a place or an object, the difference of two maps, and the event that made a
 condition true. `what_if` folds the log under other settings and compares.
 """
 
 from .bisect import Search, Turn
 from .conditions import Expression, ExpressionError
 from .diff import Difference
+from .explanation import Entry, Explanation
+from .names import NoSuchThing
 from .records import Cause
-from .same_place import NoSuchThing
-from .story import Entry, Story
 from .timeline import Progress, Timeline
 from .whatif import WhatIf, what_if
 
@@ -18,12 +18,12 @@ __all__ = [
     "Cause",
     "Difference",
     "Entry",
+    "Explanation",
     "Expression",
     "ExpressionError",
     "NoSuchThing",
     "Progress",
     "Search",
-    "Story",
     "Timeline",
     "Turn",
     "WhatIf",

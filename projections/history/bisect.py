@@ -1,14 +1,9 @@
-"""Finding when a condition over the map turned true: binary search where it is sure, else a scan.
+"""The first event that made a condition over the map true: binary search or a scan.
 
-An expression that can only turn true once (`Direction.RISING`) is searched; it and its answer are
-then checked at two neighbouring offsets by construction. Any other one is asked after every event:
-the history answers in logarithmic time, so that is no second fold. So the answer is always the
-first offset at which the condition *became* true, whatever the condition.
-
-Answers to an expression's questions, read from a history at any offset in logarithmic time.
-
-So asking at every offset of a log costs about one fold's walk over its events, not one fold each.
-A scan is as cheap as that and needs no assumption about the expression.
+A condition that can become true but not false again (`Direction.RISING`) is searched by bisection.
+Any other one is evaluated after every event: a history gives each value in logarithmic time, so a
+scan of a whole log costs about as much as iterating over its events, not a fold per event. The
+answer is always the first offset at which the condition *became* true.
 """
 
 from array import array
@@ -18,30 +13,30 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from eventsrc.envelope import KeyframeId, Offset, RunId
-from projections.deltas import KeyframeOrdinal
+from eventsrc.envelope import Offset
 
 from .condition_functions import Direction, Names, Value
 from .conditions import Expression
 from .history import NEVER, History
+from .names import id_of_place, keyframe_ordinal
 from .records import Cause, count_before
 
 
-class Tallies:
-    """Sorted offsets at which counts went up or down, made once from a history."""
+class CountIndex:
+    """Sorted offsets at which counts rise or fall, made once from a history."""
 
     def __init__(self, history: History) -> None:
         self.posed = array("q", (k.offset for k in history.keyframes if k.pose is not None))
         self.placed = _sorted(offset for offset in history.placed_offsets if offset != NEVER)
-        self.formed = _sorted(life.formed.offset for life in history.places)
+        self.formed = _sorted(place.formed.offset for place in history.places)
         self.absorbed = _sorted(m.cause.offset for m in history.merges for _ in m.absorbed)
         self.keyframes_of: defaultdict[str, array[int]] = defaultdict(lambda: array("q"))
         self.objects_of: defaultdict[str, array[int]] = defaultdict(lambda: array("q"))
         for keyframe in history.keyframes:
             self.keyframes_of[keyframe.run_id].append(keyframe.offset)
-        for life in history.objects:
-            self.objects_of[life.found.class_name].append(life.found.offset)
-        self.objects = _sorted(life.found.offset for life in history.objects)
+        for each in history.objects:
+            self.objects_of[each.found.class_name].append(each.found.offset)
+        self.objects = _sorted(each.found.offset for each in history.objects)
 
 
 def _sorted(offsets: Iterable[int]) -> "array[int]":
@@ -49,61 +44,65 @@ def _sorted(offsets: Iterable[int]) -> "array[int]":
 
 
 class HistoryFacts:
-    """The map after the events below ``end``, which may be moved; answers `expression.Facts`."""
+    """The map after the events below ``end``, which may be set: `Facts` read from a history."""
 
-    def __init__(self, history: History, tallies: Tallies, end: Offset) -> None:
+    def __init__(self, history: History, index: CountIndex, end: Offset) -> None:
         self._history = history
-        self._tallies = tallies
+        self._index = index
         self.end = end
 
     def place_count(self) -> int:
-        return self._count(self._tallies.formed) - self._count(self._tallies.absorbed)
+        return self._count(self._index.formed) - self._count(self._index.absorbed)
 
     def noise_count(self) -> int:
-        return self._count(self._tallies.posed) - self._count(self._tallies.placed)
+        return self._count(self._index.posed) - self._count(self._index.placed)
 
     def keyframe_count(self, run_id: str | None = None) -> int:
         if run_id is None:
             return self._history.keyframe_count(self.end)
-        return self._count(self._tallies.keyframes_of.get(run_id, ()))
+        return self._count(self._index.keyframes_of.get(run_id, ()))
 
     def object_count(self, class_name: str | None = None) -> int:
         if class_name is None:
-            return self._count(self._tallies.objects)
-        return self._count(self._tallies.objects_of.get(class_name, ()))
+            return self._count(self._index.objects)
+        return self._count(self._index.objects_of.get(class_name, ()))
 
     def place_of(self, keyframe: str) -> str | None:
-        number = keyframe_number(self._history, keyframe)
-        return None if number is None else self._place_id(self._history.place_at(number, self.end))
+        ordinal = keyframe_ordinal(self._history, keyframe)
+        if ordinal is None:
+            return None
+        return id_of_place(self._history, self._history.place_at(ordinal, self.end))
 
     def located_in(self, object_id: str) -> str | None:
-        number = self._history.object_numbers.get(object_id)
-        if number is None:
+        ordinal = self._history.object_ordinals.get(object_id)
+        if ordinal is None:
             return None
-        return self._place_id(self._history.objects[number].place(self.end))
+        return id_of_place(self._history, self._history.objects[ordinal].place(self.end))
 
     def sightings(self, object_id: str) -> int:
-        number = self._history.object_numbers.get(object_id)
-        return 0 if number is None else count_before(self._history.objects[number].seen, self.end)
+        ordinal = self._history.object_ordinals.get(object_id)
+        if ordinal is None:
+            return 0
+        return count_before(self._history.objects[ordinal].sightings, self.end)
 
     def size(self, place_id: str) -> int:
-        number = self._history.place_numbers.get(place_id)
-        if number is None or not self._history.places[number].stands(self.end):
+        ordinal = self._history.place_ordinals.get(place_id)
+        if ordinal is None or not self._history.places[ordinal].stands(self.end):
             return 0
-        change = self._history.places[number].change(self.end)
+        change = self._history.places[ordinal].change(self.end)
         return 0 if change is None else change.keyframe_count
 
     def transitions(self, a: str, b: str) -> int:
-        first, second = (self._history.place_numbers.get(place) for place in (a, b))
+        first, second = (self._history.place_ordinals.get(place) for place in (a, b))
         if first is None or second is None:
             return 0
         return self._history.transitions(first, second, self.end)
 
     def merged(self, place_id: str) -> bool:
-        number = self._history.place_numbers.get(place_id)
-        if number is None:
+        ordinal = self._history.place_ordinals.get(place_id)
+        if ordinal is None:
             return False
-        merge = self._history.places[number].absorbed
+        merge = self._history.places[ordinal].absorbed_by
         return merge is not None and merge.cause.offset < self.end
 
     def names(self, kind: Names) -> Iterable[str]:
@@ -112,28 +111,16 @@ class HistoryFacts:
             case Names.KEYFRAME:
                 return [f"{k.run_id}:{k.keyframe_id}" for k in self._history.keyframes]
             case Names.PLACE:
-                return self._history.place_numbers.keys()
+                return self._history.place_ordinals.keys()
             case Names.OBJECT:
-                return self._history.object_numbers.keys()
+                return self._history.object_ordinals.keys()
             case Names.CLASS:
-                return self._tallies.objects_of.keys()
+                return self._index.objects_of.keys()
             case Names.RUN:
-                return self._tallies.keyframes_of.keys()
+                return self._index.keyframes_of.keys()
 
     def _count(self, offsets: "array[int] | tuple[()]") -> int:
         return bisect_left(offsets, self.end)
-
-    def _place_id(self, place: int | None) -> str | None:
-        return None if place is None else self._history.places[place].place_id
-
-
-def keyframe_number(history: History, text: str) -> KeyframeOrdinal | None:
-    """The ordinal of the keyframe ``run_id:keyframe_id`` names; a run id may hold colons."""
-    run_id, _, number = text.rpartition(":")
-    try:
-        return history.keyframe_numbers.get((RunId(run_id), KeyframeId(int(number))))
-    except ValueError:
-        return None
 
 
 Readings = tuple[tuple[str, Value], ...]
@@ -141,9 +128,10 @@ Readings = tuple[tuple[str, Value], ...]
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """The condition turned: false before the event of ``cause``, true after it, or the reverse.
+    """An event that changed the truth of a condition; ``becomes`` is what it is after it.
 
-    It shows from ``--at`` ``cause.offset + 1`` on.
+    ``before`` and ``after`` are the values of the functions in the condition. The change shows from
+    ``--at`` ``cause.offset + 1`` on.
     """
 
     cause: Cause
@@ -163,11 +151,11 @@ class Turn:
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """When ``expression`` turned between ``start`` and ``end``.
+    """When ``expression`` turned true or false between ``start`` and ``end``.
 
-    ``found`` is the first turn to true, None if there is none; ``turns`` are all turns when a scan
-    was asked for, else those up to ``found``. ``holds`` says whether it is true at the start and at
-    the end, ``at_end`` what it reads there. ``asked`` is how many maps were asked.
+    ``found`` is the first turn to true, None if there is none; ``turns`` are all turns of a full
+    scan, else those up to ``found``. ``holds`` is its truth at the start and at the end, ``at_end``
+    the values of its functions there. ``evaluations`` counts the offsets it was evaluated at.
     """
 
     expression: Expression
@@ -177,7 +165,7 @@ class Search:
     found: Turn | None
     turns: tuple[Turn, ...]
     at_end: Readings
-    asked: int
+    evaluations: int
 
     def document(self) -> dict[str, Any]:
         return {
@@ -189,12 +177,12 @@ class Search:
             "at_end": dict(self.at_end),
             "found": None if self.found is None else self.found.document(),
             "turns": [turn.document() for turn in self.turns],
-            "maps_asked": self.asked,
+            "maps_asked": self.evaluations,
         }
 
 
 class Searcher:
-    """Asks one expression of one history at many offsets, and counts."""
+    """Evaluates one expression over one history at many offsets."""
 
     def __init__(
         self, expression: Expression, facts: HistoryFacts, cause_at: Callable[[Offset], Cause]
@@ -202,7 +190,7 @@ class Searcher:
         self._expression = expression
         self._facts = facts
         self._cause_at = cause_at
-        self._asked = 0
+        self._evaluations = 0
 
     def search(self, start: Offset, end: Offset, *, scan: bool) -> Search:
         """The first turn to true by an event in ``start`` … ``end`` − 1; with ``scan``, all."""
@@ -221,16 +209,16 @@ class Searcher:
             found,
             tuple(turns),
             self._readings(end),
-            self._asked,
+            self._evaluations,
         )
 
     def _holds(self, end: Offset) -> bool:
-        self._asked += 1
+        self._evaluations += 1
         self._facts.end = end
         return self._expression.holds(self._facts)
 
     def _bisect(self, low: int, high: int) -> Turn:
-        """False after ``low`` events, true after ``high``."""
+        """The turn of a rising condition, false after ``low`` events and true after ``high``."""
         while high - low > 1:
             middle = Offset((low + high) // 2)
             if self._holds(middle):

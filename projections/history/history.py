@@ -1,16 +1,11 @@
-"""The history of a map: one fold over the deltas that remembers instead of forgetting.
+"""The history of a map: what happened to every place and object, and by which event.
 
-It is fed the deltas of each event, in order, and keeps for every place and object what happened to
-it and because of which event. `merges`, `why`, `bisect` and a map at any offset are read from it
-without folding again. It holds no embeddings. Which place a keyframe is in is found through the
-chain of absorptions (`place_at`), so a merge costs nothing per member.
+`History` is fed the deltas of each event, in order. `merges`, `why`, `bisect` and a map at any
+offset (`view_at`) are read from it without folding again. It holds no embeddings. The place of a
+keyframe is found through the chain of absorptions (`History.place_at`), so a merge costs nothing
+per member.
 
-An ``end`` is a number of events: what is told is the map after the events 0 … end − 1.
-
-Who was near a keyframe at any moment: what a merge is explained and drawn with.
-
-Counts as the fold's own rule does, exactly and from the poses alone: a keyframe is a core point
-when at least ``min_samples`` posed keyframes, itself included, are within ε of it, inclusive.
+An ``end`` is a number of events: the answer is about the map after the events 0 … end − 1.
 """
 
 from array import array
@@ -18,9 +13,6 @@ from bisect import bisect_left
 from collections.abc import Callable, MutableSequence, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
-
-import numpy as np
-from numpy.typing import NDArray
 
 from eventsrc.envelope import FIRST_OFFSET, KeyframeId, Offset, RunId
 from projections.deltas import (
@@ -40,82 +32,34 @@ from projections.deltas import (
     PlacesMerged,
     RunSeen,
 )
-from projections.exact import distance_um, metres_to_um
+from projections.model.view import (
+    KeyframeRecord,
+    MapView,
+    ObjectRecord,
+    ObservationRecord,
+    PlaceRecord,
+    RunRecord,
+)
 from projections.reducers import packed
+from projections.reducers.survivors import PlaceSurvivors
 from projections.settings import Settings
 
-from .records import Cause, EdgeChange, Merge, ObjectLife, PlaceLife, cause_of, last_before
-
-
-class Neighbours:
-    """The poses of keyframes in a grid of ε, for asking who is within ε of whom."""
-
-    def __init__(self, keyframes: Sequence[KeyframeAdded], settings: Settings) -> None:
-        self._radius = metres_to_um(settings.eps_m)
-        self._min_samples = settings.min_samples
-        posed = [(k.keyframe, k.offset, k.pose) for k in keyframes if k.pose is not None]
-        self._numbers = [n for n, _, _ in posed]
-        self._offsets = [offset for _, offset, _ in posed]
-        self._spots = np.array([(p.x_um, p.y_um) for _, _, p in posed], np.int64).reshape(-1, 2)
-        self._row = {number: row for row, number in enumerate(self._numbers)}
-        self._cells = _rows_by_cell(self._spots // self._radius)
-
-    def of(self, keyframe: KeyframeOrdinal, end: Offset) -> list[KeyframeOrdinal]:
-        """Keyframes within ε of a posed ``keyframe``, itself too, after ``end`` events; ascending
-        ordinals."""
-        x, y = self._spots[self._row[keyframe]]
-        column, row = int(x) // self._radius, int(y) // self._radius
-        around = [(column + i, row + j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-        rows = np.concatenate([self._cells[cell] for cell in around if cell in self._cells])
-        rows = np.sort(rows[rows < bisect_left(self._offsets, end)])
-        # In these cells a difference is at most 2·10⁹ µm, so its square fits int64.
-        near = ((self._spots[rows] - (x, y)) ** 2).sum(axis=1) <= self._radius**2
-        return [self._numbers[row] for row in rows[near]]
-
-    def is_core(self, keyframe: KeyframeOrdinal, end: Offset) -> bool:
-        """Whether it is a core point after ``end`` events; false before it came."""
-        row = self._row.get(keyframe)
-        if row is None or self._offsets[row] >= end:
-            return False
-        return len(self.of(keyframe, end)) >= self._min_samples
-
-    def made_core(self, bridge: KeyframeOrdinal, offset: Offset) -> list[KeyframeOrdinal]:
-        """The keyframes that the coming of ``bridge`` at ``offset`` made core points."""
-        if bridge not in self._row:
-            return []
-        return [
-            keyframe
-            for keyframe in self.of(bridge, Offset(offset + 1))
-            if self.is_core(keyframe, Offset(offset + 1)) and not self.is_core(keyframe, offset)
-        ]
-
-    def distance_um(self, a: KeyframeOrdinal, b: KeyframeOrdinal) -> int:
-        """The distance of two posed keyframes, rounded down."""
-        (ax, ay), (bx, by) = (map(int, self._spots[self._row[k]]) for k in (a, b))
-        return distance_um(ax, ay, bx, by)
-
-    def spots(self, keyframes: Sequence[KeyframeOrdinal]) -> NDArray[np.float64]:
-        """Positions of posed keyframes in metres, shape (n, 2)."""
-        metres: NDArray[np.float64] = self._spots[[self._row[k] for k in keyframes]] / 1e6
-        return metres
-
-
-def _rows_by_cell(cells: NDArray[np.int64]) -> dict[tuple[int, int], NDArray[np.int64]]:
-    """Which rows of ``cells``, shape (n, 2), hold which cell; ascending rows."""
-    if not len(cells):
-        return {}
-    order = np.lexsort((cells[:, 1], cells[:, 0]))  # stable, so rows stay ascending
-    found = cells[order]
-    starts = np.flatnonzero((found[1:] != found[:-1]).any(axis=1)) + 1
-    firsts = found[np.concatenate(([0], starts))]
-    keys = [(column, row) for column, row in firsts.tolist()]
-    return dict(zip(keys, np.split(order, starts), strict=True))
-
+from .neighbours import Neighbours
+from .records import (
+    Cause,
+    EdgeChange,
+    Merge,
+    ObjectHistory,
+    PlaceHistory,
+    cause_of,
+    count_before,
+    last_before,
+)
 
 NEVER = Offset(2**63 - 1)
-"""The offset of what has not happened."""
+"""The offset of an event that has not happened."""
 NO_PLACE = PlaceOrdinal(-1)
-"""What `History.placed_in` holds for a keyframe in no place."""
+"""The value of `History.placed_in` for a keyframe in no place."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,8 +71,8 @@ class _Move:
 class History:
     """Everything that happened to places and objects in the events applied so far.
 
-    ``keyframe_offsets`` gives each keyframe's event, ``placed_offsets`` and ``placed_in`` the event
-    that placed it (`NEVER` for noise) and the place it joined then; all by keyframe ordinal.
+    By keyframe ordinal: ``keyframe_offsets`` is the event that added it, ``placed_offsets`` the
+    event that placed it (`NEVER` for noise) and ``placed_in`` the place it joined then.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -138,19 +82,19 @@ class History:
         self.keyframe_offsets = array("q")
         self.placed_offsets = array("q")
         self.placed_in: MutableSequence[PlaceOrdinal] = packed("q")
-        self.places: list[PlaceLife] = []
-        self.objects: list[ObjectLife] = []
+        self.places: list[PlaceHistory] = []
+        self.objects: list[ObjectHistory] = []
         self.merges: list[Merge] = []
         self.runs: list[list[RunSeen]] = []
         self.skipped: list[EventSkipped] = []
         self.edges: dict[tuple[PlaceOrdinal, PlaceOrdinal], list[PlacesLinked]] = {}
-        self.keyframe_numbers: dict[tuple[RunId, KeyframeId], KeyframeOrdinal] = {}
-        self.place_numbers: dict[str, PlaceOrdinal] = {}
-        self.object_numbers: dict[str, ObjectOrdinal] = {}
+        self.keyframe_ordinals: dict[tuple[RunId, KeyframeId], KeyframeOrdinal] = {}
+        self.place_ordinals: dict[str, PlaceOrdinal] = {}
+        self.object_ordinals: dict[str, ObjectOrdinal] = {}
         self._neighbours: tuple[int, Neighbours] | None = None
 
     def apply(self, offset: Offset, deltas: Sequence[Delta]) -> None:
-        """Remember what the event at ``offset`` did."""
+        """Add the deltas of the event at ``offset``."""
         self.next_offset = Offset(offset + 1)
         if not deltas:
             return
@@ -172,7 +116,7 @@ class History:
 
     @property
     def neighbours(self) -> Neighbours:
-        """Who is near whom, among the keyframes so far."""
+        """Neighbourhoods of the keyframes so far; made anew when there are more."""
         count = len(self.keyframes)
         if self._neighbours is None or self._neighbours[0] != count:
             self._neighbours = count, Neighbours(self.keyframes, self.settings)
@@ -186,9 +130,9 @@ class History:
         return self.survivor_of(self.placed_in[keyframe], end)
 
     def survivor_of(self, place: PlaceOrdinal, end: Offset | None = None) -> PlaceOrdinal:
-        """Who stands for ``place`` after the events below ``end`` (default: all so far)."""
+        """The place that ``place`` is part of after the events below ``end`` (default: all)."""
         end = self.next_offset if end is None else end
-        while (merge := self.places[place].absorbed) is not None and merge.cause.offset < end:
+        while (merge := self.places[place].absorbed_by) is not None and merge.cause.offset < end:
             place = merge.survivor
         return place
 
@@ -214,7 +158,7 @@ class History:
         self.runs[delta.run].append(delta)
 
     def _keyframe_added(self, delta: KeyframeAdded, _: Cause) -> None:
-        self.keyframe_numbers[delta.run_id, delta.keyframe_id] = delta.keyframe
+        self.keyframe_ordinals[delta.run_id, delta.keyframe_id] = delta.keyframe
         self.keyframes.append(delta)
         self.keyframe_offsets.append(delta.offset)
         self.placed_offsets.append(NEVER)
@@ -224,8 +168,8 @@ class History:
         self.skipped.append(delta)
 
     def _place_formed(self, delta: PlaceFormed, cause: Cause) -> None:
-        self.place_numbers[delta.place_id] = delta.place
-        self.places.append(PlaceLife(delta, cause))
+        self.place_ordinals[delta.place_id] = delta.place
+        self.places.append(PlaceHistory(delta, cause))
 
     def _keyframe_placed(self, delta: KeyframePlaced, _: Cause) -> None:
         self.placed_offsets[delta.keyframe] = delta.offset
@@ -236,13 +180,13 @@ class History:
         self.places[delta.place].changes.append(delta)
 
     def _object_found(self, delta: ObjectFound, cause: Cause) -> None:
-        self.object_numbers[delta.object_id] = delta.object
-        self.objects.append(ObjectLife(delta, cause))
+        self.object_ordinals[delta.object_id] = delta.object
+        self.objects.append(ObjectHistory(delta, cause))
 
     def _object_seen(self, delta: ObjectSeen, _: Cause) -> None:
-        self.objects[delta.object].seen.append(delta)
+        self.objects[delta.object].sightings.append(delta)
 
-    # Of the class, not bound to the history; `MapView` says why.
+    # Functions of the class, not methods bound to the history, as in `MapView`.
     _APPLIERS: ClassVar[dict[type, Callable[["History", Any, Cause], None]]] = {
         RunSeen: _run_seen,
         KeyframeAdded: _keyframe_added,
@@ -255,9 +199,9 @@ class History:
     }
 
     def _object_moved(self, delta: ObjectMoved) -> _Move:
-        life = self.objects[delta.object]
-        move = _Move(delta.object, life.located[-1].place if life.located else None)
-        life.located.append(delta)
+        moves = self.objects[delta.object].moves
+        move = _Move(delta.object, moves[-1].place if moves else None)
+        moves.append(delta)
         return move
 
     def _places_linked(self, delta: PlacesLinked) -> EdgeChange:
@@ -285,4 +229,132 @@ class History:
         self.merges.append(merge)
         self.places[delta.survivor].merges.append(merge)
         for place in delta.absorbed:
-            self.places[place].absorbed = merge
+            self.places[place].absorbed_by = merge
+
+
+def view_at(history: History, latest: MapView, end: Offset, settings: Settings) -> MapView:
+    """The `MapView` that applying every delta below ``end`` makes, without folding.
+
+    ``latest`` is a view of at least as many events. What never changes after its event
+    (observations, poses) is shared with it; places, objects and the place of a keyframe are made
+    anew, so that changing one view does not change another.
+    """
+    view = MapView(settings, keep_embeddings=latest.keep_embeddings)
+    view.all_places = _places(history, end)
+    view.survivors = _survivors(history, end)
+    absorbed_by = view.survivors.absorbed_by
+    view.places = {p.ordinal: p for p in view.all_places if p.ordinal not in absorbed_by}
+    view.keyframes = _keyframes(history, latest, view.survivors, end)
+    view.observations = _observations(history, latest, end)
+    view.objects = _objects(history, end)
+    view.runs = _runs(history, view.keyframes, end)
+    view.adjacency = _adjacency(history, end)
+    for skipped in history.skipped[: count_before(history.skipped, end)]:
+        view.skipped[skipped.kind] += 1
+    view.advance(end)
+    return view
+
+
+def _places(history: History, end: Offset) -> list[PlaceRecord]:
+    count = bisect_left(history.places, end, key=lambda p: p.formed.offset)
+    records = []
+    for place in history.places[:count]:
+        formed = place.formed
+        record = PlaceRecord(formed.place, formed.place_id, formed.founder, formed.offset)
+        record.unordered_members = [
+            d.keyframe for d in place.joined[: count_before(place.joined, end)]
+        ]
+        if (change := place.change(end)) is not None:
+            record.keyframe_count = change.keyframe_count
+            record.sum_x_um, record.sum_y_um = change.sum_x_um, change.sum_y_um
+        records.append(record)
+    _apply_merges(history, records, end)
+    return records
+
+
+def _apply_merges(history: History, records: list[PlaceRecord], end: Offset) -> None:
+    """Move members to the survivors, in the order of the merges."""
+    for merge in history.merges:
+        if merge.cause.offset >= end:
+            return
+        survivor = records[merge.survivor]
+        for place in merge.absorbed:
+            absorbed = records[place]
+            survivor.unordered_members += absorbed.unordered_members
+            absorbed.unordered_members = []
+
+
+def _survivors(history: History, end: Offset) -> PlaceSurvivors:
+    survivors = PlaceSurvivors()
+    for merge in history.merges:
+        if merge.cause.offset < end:
+            survivors.merge(merge.survivor, merge.absorbed)
+    return survivors
+
+
+def _keyframes(
+    history: History, latest: MapView, survivors: PlaceSurvivors, end: Offset
+) -> list[KeyframeRecord]:
+    count = history.keyframe_count(end)
+    return [
+        KeyframeRecord(
+            k.ordinal,
+            k.offset,
+            k.run,
+            k.run_id,
+            k.keyframe_id,
+            k.timestamp,
+            k.pose,
+            survivors,
+            k.observations,
+            place if placed < end else None,
+        )
+        for k, placed, place in zip(
+            latest.keyframes[:count], history.placed_offsets, history.placed_in, strict=False
+        )
+    ]
+
+
+def _observations(history: History, latest: MapView, end: Offset) -> list[ObservationRecord]:
+    keyframes = history.keyframe_count(end)
+    return latest.observations[
+        : bisect_left(latest.observations, keyframes, key=lambda o: o.keyframe)
+    ]
+
+
+def _objects(history: History, end: Offset) -> list[ObjectRecord]:
+    count = bisect_left(history.objects, end, key=lambda o: o.found.offset)
+    return [_object(each, end) for each in history.objects[:count]]
+
+
+def _object(history: ObjectHistory, end: Offset) -> ObjectRecord:
+    found, seen = history.found, history.sightings[: count_before(history.sightings, end)]
+    record = ObjectRecord(found.object, found.object_id, found.class_name)
+    record.observations = [delta.observation for delta in seen]
+    if seen:
+        last = seen[-1]
+        record.obs_count = last.obs_count
+        record.sum_x_um, record.sum_y_um = last.sum_x_um, last.sum_y_um
+        record.first_seen, record.last_seen = last.first_seen, last.last_seen
+    record.place = history.place(end)
+    return record
+
+
+def _runs(history: History, keyframes: list[KeyframeRecord], end: Offset) -> list[RunRecord]:
+    records = []
+    for seen in history.runs:
+        last = last_before(seen, end)
+        if last is not None:
+            records.append(RunRecord(last.run, last.run_id, last.started_at))
+    for keyframe in keyframes:
+        records[keyframe.run].keyframe_count += 1
+    return records
+
+
+def _adjacency(history: History, end: Offset) -> dict[tuple[PlaceOrdinal, PlaceOrdinal], int]:
+    found = ((pair, last_before(linked, end)) for pair, linked in history.edges.items())
+    return {
+        pair: last.shared_transitions
+        for pair, last in found
+        if last is not None and last.shared_transitions
+    }

@@ -1,20 +1,17 @@
-"""Merges as people and programs read them.
-
-How one keyframe made two places one: the chain of core points that joins them.
+"""Why places merged: the chain of core points that joins them, in words and as JSON.
 
 Places merge when a path of core points, each within ε of the next, leads from one to the other. The
-keyframe that came last need not be on that path: standing near a point, it may give it the last
-neighbour that a core point needs. So the path leads from an old core point of the one place, over
-points that this event made core, to an old core point of the other; the shortest one is told.
+bridging keyframe, whose event merged them, need not be on that path: it may be the last neighbour
+that a point of the path needed to become a core point. So the path leads from an old core point of
+one place, over points that this event made core, to an old core point of the other. The shortest
+such path is the chain.
 
-When an event joins several places, the chains make a tree: each further place hangs on one that is
-joined already.
-
-Why two places became one, in words and as JSON.
+When an event joins several places, the chains form a tree: each further place is joined to one that
+is joined already.
 """
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -23,8 +20,8 @@ from eventsrc.envelope import Offset
 from projections.deltas import KeyframeOrdinal, Link, PlaceOrdinal
 
 from .history import History
+from .names import keyframe_name, place_name
 from .records import EdgeChange, Merge
-from .story import keyframe_name, listed, place_name
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,71 +44,74 @@ class Chain:
 
 
 def chains_of(history: History, merge: Merge) -> list[Chain]:
-    """A chain for each absorbed place, nearest to the survivor first.
+    """A chain for each absorbed place, in the order of joining, shortest first.
 
-    Empty when the merge was made by another rule than plain distance.
+    Empty when another rule than distance merged the places.
     """
     made = history.neighbours.made_core(merge.bridge, merge.cause.offset)
-    doors = {keyframe: _doors(history, merge, keyframe) for keyframe in made}
-    joined, waiting, chains = {merge.survivor}, set(merge.absorbed), list[Chain]()
-    while waiting:
-        chain = _shortest(history, merge, doors, joined, waiting)
+    contacts = {keyframe: _contacts(history, merge, keyframe) for keyframe in made}
+    joined, remaining, chains = {merge.survivor}, set(merge.absorbed), list[Chain]()
+    while remaining:
+        chain = _shortest(history, merge, contacts, joined, remaining)
         if chain is None:
             break
         chains.append(chain)
         joined.add(chain.absorbed)
-        waiting.remove(chain.absorbed)
+        remaining.remove(chain.absorbed)
     return chains
 
 
-def _doors(
+def _contacts(
     history: History, merge: Merge, keyframe: KeyframeOrdinal
 ) -> dict[PlaceOrdinal, KeyframeOrdinal]:
     """By place the nearest old core point within ε of a new one."""
     offset, neighbours = merge.cause.offset, history.neighbours
-    doors: dict[PlaceOrdinal, KeyframeOrdinal] = {}
+    contacts: dict[PlaceOrdinal, KeyframeOrdinal] = {}
     near = (k for k in neighbours.of(keyframe, Offset(offset + 1)) if neighbours.is_core(k, offset))
     for old in sorted(near, key=lambda k: (neighbours.distance_um(keyframe, k), k)):
         place = history.place_at(old, offset)
         if place is not None:
-            doors.setdefault(place, old)
-    return doors
+            contacts.setdefault(place, old)
+    return contacts
 
 
 def _shortest(
     history: History,
     merge: Merge,
-    doors: dict[KeyframeOrdinal, dict[PlaceOrdinal, KeyframeOrdinal]],
+    contacts: dict[KeyframeOrdinal, dict[PlaceOrdinal, KeyframeOrdinal]],
     joined: set[PlaceOrdinal],
-    waiting: set[PlaceOrdinal],
+    remaining: set[PlaceOrdinal],
 ) -> Chain | None:
-    """Breadth first over the new core points, from joined places to one that waits."""
+    """Breadth first over the new core points, from the joined places to a remaining one."""
     paths: deque[tuple[PlaceOrdinal, tuple[KeyframeOrdinal, ...]]] = deque(
-        (place, (old, new)) for new in doors for place, old in doors[new].items() if place in joined
+        (place, (old, new))
+        for new in contacts
+        for place, old in contacts[new].items()
+        if place in joined
     )
-    seen = {path[-1] for _, path in paths}
+    visited = {path[-1] for _, path in paths}
     while paths:
         place, path = paths.popleft()
-        for goal in sorted(doors[path[-1]].keys() & waiting):
-            return _chain(history, place, goal, (*path, doors[path[-1]][goal]))
-        for new in _next(history, merge, path[-1], doors):
-            if new not in seen:
-                seen.add(new)
+        for goal in sorted(contacts[path[-1]].keys() & remaining):
+            return _chain_of(history, place, goal, (*path, contacts[path[-1]][goal]))
+        for new in _new_core_neighbours(history, merge, path[-1], contacts):
+            if new not in visited:
+                visited.add(new)
                 paths.append((place, (*path, new)))
     return None
 
 
-def _next(
+def _new_core_neighbours(
     history: History,
     merge: Merge,
     keyframe: KeyframeOrdinal,
-    doors: dict[KeyframeOrdinal, dict[PlaceOrdinal, KeyframeOrdinal]],
+    contacts: dict[KeyframeOrdinal, dict[PlaceOrdinal, KeyframeOrdinal]],
 ) -> Iterator[KeyframeOrdinal]:
     near = history.neighbours.of(keyframe, Offset(merge.cause.offset + 1))
-    return (k for k in near if k in doors)
+    return (k for k in near if k in contacts)
 
 
-def _chain(
+def _chain_of(
     history: History,
     joined: PlaceOrdinal,
     absorbed: PlaceOrdinal,
@@ -121,8 +121,8 @@ def _chain(
     return Chain(joined, absorbed, points, distances)
 
 
-def reason(history: History, merge: Merge) -> str:
-    """Who bridged, what that made core, and the chain of core points to each absorbed place."""
+def merge_reason(history: History, merge: Merge) -> str:
+    """The bridging keyframe, the core points it made, and the chain to each absorbed place."""
     if merge.cause.kind != "keyframe":
         return merge.cause.name
     chains = chains_of(history, merge)
@@ -134,7 +134,12 @@ def reason(history: History, merge: Merge) -> str:
     names = ["itself" if k == merge.bridge else keyframe_name(history, k) for k in made]
     what = "a core point" if len(made) == 1 else "core points"
     joins = "; ".join(chain_text(history, chain) for chain in chains)
-    return f"{bridge} made {listed(names)} {what}: {joins}"
+    return f"{bridge} made {_enumerated(names)} {what}: {joins}"
+
+
+def _enumerated(names: Sequence[str]) -> str:
+    """``a``, ``a and b``, ``a, b and c``."""
+    return " and ".join(part for part in (", ".join(names[:-1]), names[-1]) if part)
 
 
 def chain_text(history: History, chain: Chain) -> str:
@@ -154,7 +159,7 @@ def _link_text(history: History, link: Link) -> str:
 
 
 def link_document(history: History, link: Link) -> dict[str, Any]:
-    """A link of the merge, as the fold states it."""
+    """A link of the merge as JSON."""
     return {
         "core": keyframe_name(history, link.core),
         "neighbour": keyframe_name(history, link.neighbour),
@@ -163,7 +168,7 @@ def link_document(history: History, link: Link) -> dict[str, Any]:
 
 
 def chain_document(history: History, chain: Chain) -> dict[str, Any]:
-    """A chain of core points from a joined place to an absorbed one."""
+    """A chain of core points as JSON."""
     return {
         "from": place_name(history, chain.joined),
         "to": place_name(history, chain.absorbed),
@@ -171,9 +176,6 @@ def chain_document(history: History, chain: Chain) -> dict[str, Any]:
         "distances_m": [distance / 1e6 for distance in chain.distances_um],
         "made_core": [keyframe_name(history, point) for point in chain.made_core],
     }
-
-
-HEADER = ("#", "offset", "time", "bridge", "survivor", "absorbed", "keyframes", "objects", "edges")
 
 
 def merge_document(history: History, merge: Merge) -> dict[str, Any]:
@@ -202,18 +204,3 @@ def _edge_document(history: History, edge: EdgeChange) -> dict[str, Any]:
         "before": edge.before,
         "after": edge.after,
     }
-
-
-def merge_row(history: History, merge: Merge) -> tuple[str, ...]:
-    """One row of the table under `HEADER`."""
-    return (
-        str(merge.number),
-        f"{merge.cause.offset:,}",
-        merge.cause.when,
-        keyframe_name(history, merge.bridge),
-        place_name(history, merge.survivor),
-        ", ".join(place_name(history, place) for place in merge.absorbed),
-        " + ".join(str(size) for size in (merge.survivor_size, *merge.absorbed_sizes)),
-        str(len(merge.objects)),
-        str(len(merge.edges)),
-    )

@@ -1,46 +1,135 @@
-"""Folding one log under several settings at once, on several processes.
+"""Fold one log under several settings in parallel processes.
 
-Each process reads and validates the log once and feeds all of its settings from that, so reading is
-paid once per process and not once per setting. Few events are folded here and now: starting
-a process takes longer than they do.
+Each process reads and validates the log once for all of its settings. Few events are folded in this
+process, since starting one takes longer.
+
+A `FoldResult` is small enough to send between processes, and comparable: keyframes and observations
+have the same ordinals under any settings, since the log alone decides them. Places and objects do
+not, so places are numbered here by the event that founded them and then by their first member, and
+two folds have the same numbers until they differ.
 """
 
 import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from array import array
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import islice
 from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
+from typing import Any, TypeAlias
 
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.errors import MapfoldError
 from eventsrc.log import Event, LogReader
-from projections.deltas import KeyframeAdded, KeyframePlaced, PlaceFormed, PlacesMerged
+from projections.deltas import (
+    KeyframeAdded,
+    KeyframePlaced,
+    PlaceFormed,
+    PlacesMerged,
+)
+from projections.evaluate.scores import object_scores, place_scores
 from projections.evaluate.truth import Truth
+from projections.model.digest import map_digest
 from projections.model.fold import AHEAD, ReadEvent, fold_read, no_cycle_search, read_together
 from projections.model.view import MapView
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 
 from .history import History
-from .outcome import Outcome, outcome_of
+from .records import PlaceHistory
+from .timeline import Progress
 
-Progress = Callable[[int, int], None]
+Offsets: TypeAlias = "array[int]"
 
-WORTH_A_PROCESS = 20_000
+MIN_PARALLEL_EVENTS = 20_000
 """Events times settings from which processes are started: about two seconds of folding."""
 _POLL_S = 0.2
-_OF_PLACES = frozenset({KeyframeAdded, PlaceFormed, KeyframePlaced, PlacesMerged})
-"""What a comparison of histories needs; the view knows the rest."""
+_PLACE_DELTAS = frozenset({KeyframeAdded, PlaceFormed, KeyframePlaced, PlacesMerged})
+"""The deltas that `fold_result` needs from a history; the rest is in the view."""
 
 _done: "Synchronized[int] | None" = None
-"""In a worker process: events folded by all of them together."""
+"""In a worker process: the number of events that all workers have folded."""
+
+
+@dataclass(frozen=True, slots=True)
+class FoldResult:
+    """The map of a log under one setting, and how it was built.
+
+    ``places`` are place ids by keyframe, ``objects`` object ids by observation, None for none;
+    ``posed`` are the ordinals of keyframes with a pose. By keyframe, ``placed_offsets`` is the
+    event that placed it and ``placed_in`` the number of the place it joined; ``merged`` are the
+    merges as (offset, absorbed, survivor); by observation, ``fused_into`` is its object (-1 for
+    none) and ``observation_offsets`` its event. ``seconds`` is the time of the fold.
+    """
+
+    settings: Settings
+    digest: str
+    counts: dict[str, int]
+    merges: int
+    places: tuple[str | None, ...]
+    objects: tuple[str | None, ...]
+    posed: Offsets
+    placed_offsets: Offsets
+    placed_in: Offsets
+    merged: tuple[tuple[int, int, int], ...]
+    fused_into: Offsets
+    observation_offsets: Offsets
+    scores: dict[str, dict[str, Any]] | None
+    """``places`` and ``objects`` against the truth (`projections.evaluate.scores`)."""
+    seconds: float
+    view: MapView | None = None
+    """The map itself, if asked for; do not change it."""
+
+
+def fold_result(view: MapView, history: History, truth: Truth | None, seconds: float) -> FoldResult:
+    """The result of a fold that took ``seconds``."""
+    numbers = _place_numbers(history.places)
+    fused = array("q", (-1 if o.object is None else o.object for o in view.observations))
+    offsets = history.keyframe_offsets
+    return FoldResult(
+        settings=view.settings,
+        digest=map_digest(view),
+        counts=view.counts(),
+        merges=len(history.merges),
+        places=tuple(view.place_id(keyframe.place) for keyframe in view.keyframes),
+        objects=tuple(None if n < 0 else view.objects[n].object_id for n in fused),
+        posed=array("q", (k.ordinal for k in view.keyframes if k.pose is not None)),
+        placed_offsets=history.placed_offsets,
+        placed_in=array("q", (-1 if p < 0 else numbers[p] for p in history.placed_in)),
+        merged=tuple(
+            (merge.cause.offset, numbers[place], numbers[merge.survivor])
+            for merge in history.merges
+            for place in merge.absorbed
+        ),
+        fused_into=fused,
+        observation_offsets=array("q", (offsets[o.keyframe] for o in view.observations)),
+        scores=None if truth is None else _scores(view, truth),
+        seconds=seconds,
+    )
+
+
+def _scores(view: MapView, truth: Truth) -> dict[str, dict[str, Any]]:
+    return {"places": place_scores(view, truth), "objects": object_scores(view, truth)}
+
+
+def _place_numbers(places: Sequence[PlaceHistory]) -> list[int]:
+    """By ordinal the rank of a place by founding event, then by first member."""
+
+    def founding(ordinal: int) -> tuple[int, int]:
+        place = places[ordinal]
+        members = [d.keyframe for d in place.joined if d.offset == place.formed.offset]
+        return place.formed.offset, min(members, default=place.formed.founder)
+
+    numbers = [0] * len(places)
+    for number, ordinal in enumerate(sorted(range(len(places)), key=founding)):
+        numbers[ordinal] = number
+    return numbers
 
 
 def fold_all(
@@ -52,21 +141,21 @@ def fold_all(
     processes: int | None = None,
     progress: Progress | None = None,
     keep_views: bool = False,
-) -> list[Outcome]:
-    """The outcome of the first ``end`` events under each of ``settings``, in their order.
+) -> list[FoldResult]:
+    """The results of the first ``end`` events under each of ``settings``, in their order.
 
     With ``keep_views`` each has its map too, without embeddings. Raises FoldError at an event that
     cannot be folded.
     """
     workers = min(processes or _processors(), len(settings))
-    if workers <= 1 or (processes is None and end * len(settings) < WORTH_A_PROCESS):
-        return fold_several(log, settings, end, truth, progress, keep_views=keep_views)
+    if workers <= 1 or (processes is None and end * len(settings) < MIN_PARALLEL_EVENTS):
+        return fold_in_this_process(log, settings, end, truth, progress, keep_views=keep_views)
     shares = [list(settings[index::workers]) for index in range(workers)]
-    outcomes = _in_processes(log, shares, end, truth, progress, keep_views=keep_views)
-    return [outcomes[index % workers][index // workers] for index in range(len(settings))]
+    results = _in_processes(log, shares, end, truth, progress, keep_views=keep_views)
+    return [results[index % workers][index // workers] for index in range(len(settings))]
 
 
-def fold_several(
+def fold_in_this_process(
     log: Path,
     settings: Sequence[Settings],
     end: Offset,
@@ -74,8 +163,8 @@ def fold_several(
     progress: Progress | None = None,
     *,
     keep_views: bool = False,
-) -> list[Outcome]:
-    """The same in this process: one pass over the log for all of ``settings``."""
+) -> list[FoldResult]:
+    """As `fold_all`, in this process: one pass over the log for all of ``settings``."""
     folds = [_Fold(each) for each in settings]
     with LogReader(log) as reader:
         events = reader.read(FIRST_OFFSET, end)
@@ -84,11 +173,11 @@ def fold_several(
                 _fold_chunk(chunk, folds)
                 if progress is not None:
                     progress(chunk[-1].offset + 1, end)
-            return [fold.outcome(truth, keep_view=keep_views) for fold in folds]
+            return [fold.result(truth, keep_view=keep_views) for fold in folds]
 
 
 class _Fold:
-    """One setting's map, view and history, and the time they took."""
+    """The fold under one setting, and the time it took."""
 
     def __init__(self, settings: Settings) -> None:
         self.map = SemanticMap(settings)
@@ -96,24 +185,23 @@ class _Fold:
         self.history = History(settings)
         self.seconds = 0.0
 
-    def take(self, read: ReadEvent) -> None:
-        """Fold one event."""
+    def fold(self, read: ReadEvent) -> None:
         offset, deltas = read.offset, fold_read(read, self.map)
         self.view.apply_event(offset, deltas)
-        self.history.apply(offset, [delta for delta in deltas if type(delta) in _OF_PLACES])
+        self.history.apply(offset, [delta for delta in deltas if type(delta) in _PLACE_DELTAS])
 
-    def outcome(self, truth: Truth | None, *, keep_view: bool) -> Outcome:
-        outcome = outcome_of(self.view, self.history, truth, self.seconds)
-        return replace(outcome, view=self.view) if keep_view else outcome
+    def result(self, truth: Truth | None, *, keep_view: bool) -> FoldResult:
+        result = fold_result(self.view, self.history, truth, self.seconds)
+        return replace(result, view=self.view) if keep_view else result
 
 
 def _fold_chunk(chunk: Sequence[Event], folds: Sequence[_Fold]) -> None:
-    """As `projections.model.fold.fold_events`, reading and validating once for all folds."""
+    """As `projections.model.fold.fold_events`, but validating once for all folds."""
     read = read_together(chunk)
     for fold in folds:
         started = time.perf_counter()
         for event in read:
-            fold.take(event)
+            fold.fold(event)
         fold.seconds += time.perf_counter() - started
 
 
@@ -125,7 +213,7 @@ def _in_processes(
     progress: Progress | None,
     *,
     keep_views: bool,
-) -> list[list[Outcome]]:
+) -> list[list[FoldResult]]:
     # Spawned, not forked: the caller may have threads (a writer, a Zenoh session) whose locks a
     # fork would copy in whatever state they are.
     context = multiprocessing.get_context("spawn")
@@ -133,21 +221,23 @@ def _in_processes(
     with ProcessPoolExecutor(
         len(shares), mp_context=context, initializer=_start_worker, initargs=(done,)
     ) as pool:
-        with _no_ctrl_c():
-            futures = [pool.submit(_work, log, each, end, truth, keep_views) for each in shares]
-        _watch(futures, done, end * len(shares), progress)
+        with _sigint_blocked():
+            futures = [
+                pool.submit(_fold_share, log, each, end, truth, keep_views) for each in shares
+            ]
+        _report_progress(futures, done, end * len(shares), progress)
         try:
             return [future.result() for future in futures]
         except BrokenProcessPool:
             raise MapfoldError(
-                f"{log}: a process that folded it was killed, perhaps for want of memory; "
+                f"{log}: a process that folded it was killed, perhaps for lack of memory; "
                 "try fewer --processes"
             ) from None
 
 
 @contextmanager
-def _no_ctrl_c() -> Iterator[None]:
-    """Hold Ctrl-C back: what is started inside does so too, until it says what is to happen."""
+def _sigint_blocked() -> Iterator[None]:
+    """Block SIGINT; processes started inside inherit that, until they set their own handler."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -158,28 +248,28 @@ def _no_ctrl_c() -> Iterator[None]:
 def _start_worker(done: "Synchronized[int]") -> None:
     global _done
     _done = done
-    # Ctrl-C reaches the whole group: the parent says so, its workers just end.
+    # Ctrl-C reaches the whole process group: the parent reports it, its workers just end.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
-def _work(
+def _fold_share(
     log: Path, settings: list[Settings], end: Offset, truth: Truth | None, keep_views: bool
-) -> list[Outcome]:
-    counted = 0
+) -> list[FoldResult]:
+    reported = 0
 
     def report(folded: int, _: int) -> None:
-        nonlocal counted
+        nonlocal reported
         if _done is not None:
             with _done.get_lock():
-                _done.value += folded - counted
-        counted = folded
+                _done.value += folded - reported
+        reported = folded
 
-    return fold_several(log, settings, end, truth, report, keep_views=keep_views)
+    return fold_in_this_process(log, settings, end, truth, report, keep_views=keep_views)
 
 
-def _watch(
-    futures: "list[Future[list[Outcome]]]",
+def _report_progress(
+    futures: "list[Future[list[FoldResult]]]",
     done: "Synchronized[int]",
     total: int,
     progress: Progress | None,

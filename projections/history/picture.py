@@ -1,6 +1,6 @@
-"""Pictures of time travel: a merge before and after, and maps under several settings side by side.
+"""Draw a merge before and after, and maps under several settings side by side.
 
-Built of `projections.drawing`'s layers, one small sheet per map in one figure.
+Each map is a panel of one figure, drawn with `projections.drawing`.
 """
 
 import math
@@ -18,69 +18,69 @@ from projections.drawing.canvas import HALO, Bounds, Canvas, check_suffix
 from projections.drawing.overlays import draw_place_names
 from projections.model.view import MapView
 
-from .merges import chains_of, reason
+from .merges import chains_of, merge_reason
+from .names import keyframe_name, place_name
 from .records import Merge
-from .story import keyframe_name, place_name
 from .timeline import Timeline
 
 _PANEL_IN = 6.5
 _SMALL_PANEL_IN = 4.2
-_HEAD_IN = 0.6
+_HEADER_IN = 0.6
 _TITLE_IN = 0.4
 _LEGEND = (
     "★ bridging keyframe    dashed: ε around it    ○ its neighbours    "
     "red: the core points that join them    ■ start of the run"
 )
 _AROUND_EPS = 4.0
-"""How many ε around the bridge a merge's picture shows at least."""
+"""The least margin around the core points of a merge, in ε."""
 
 
 def draw_merge(timeline: Timeline, merge: Merge, out: Path) -> None:
-    """The merge's surroundings just before and just after it, side by side, to ``out``.
+    """Draw the surroundings of a merge before and after it, side by side, to ``out``.
 
-    On both: the bridging keyframe, its ε circle, the core points that met. Raises MisuseError when
-    ``out`` is no picture's name or cannot be written.
+    Both show the bridging keyframe, its ε circle and the chain of core points. Raises MisuseError
+    when ``out`` is not the name of a picture or cannot be written.
     """
     before, after = timeline.at(merge.cause.offset), timeline.at(Offset(merge.cause.offset + 1))
-    bounds = _around(timeline, merge)
-    figure, panels = _sheet(2, bounds, (2, _PANEL_IN), _HEAD_IN)
+    bounds = _bounds_of_merge(timeline, merge)
+    figure, panels = _panels(2, bounds, (2, _PANEL_IN), _HEADER_IN)
     for panel, view, when in zip(panels, (before, after), ("before", "after"), strict=True):
-        _panel(panel, view)
-        _draw_links(panel, timeline, merge)
+        _draw_map(panel, view)
+        _draw_chains(panel, timeline, merge)
         names = [place_name(timeline.history, place) for place in merge.places]
-        said = " and ".join(names) if when == "before" else names[0]
-        panel.axes.set_title(f"--at {view.next_offset}, {when}: {said}", fontsize=10)
+        shown = " and ".join(names) if when == "before" else names[0]
+        panel.axes.set_title(f"--at {view.next_offset}, {when}: {shown}", fontsize=10)
     history = timeline.history
-    head = f"merge {merge.number}, {merge.cause.when}: {reason(history, merge)}"
-    figure.suptitle(f"{head}\n{_LEGEND}", fontsize=9.5)
+    header = f"merge {merge.number}, {merge.cause.when}: {merge_reason(history, merge)}"
+    figure.suptitle(f"{header}\n{_LEGEND}", fontsize=9.5)
     _save(figure, out)
 
 
 def draw_maps(maps: Sequence[tuple[str, MapView]], out: Path) -> None:
-    """Maps of one log under several settings, each with its title, side by side."""
-    bounds = _whole([view for _, view in maps])
+    """Draw (title, map) pairs side by side, at one scale, to ``out``."""
+    bounds = _bounds_of_maps([view for _, view in maps])
     columns = min(len(maps), max(2, math.ceil(math.sqrt(len(maps)))))
-    figure, panels = _sheet(len(maps), bounds, (columns, _SMALL_PANEL_IN), 0.0)
+    figure, panels = _panels(len(maps), bounds, (columns, _SMALL_PANEL_IN), 0.0)
     for panel, (title, view) in zip(panels, maps, strict=True):
-        _panel(panel, view)
+        _draw_map(panel, view)
         panel.axes.set_title(title, fontsize=8.5)
     _save(figure, out)
 
 
-def _sheet(
-    count: int, bounds: Bounds, layout: tuple[int, float], head_in: float
+def _panels(
+    count: int, bounds: Bounds, layout: tuple[int, float], header_in: float
 ) -> tuple[Figure, list[Canvas]]:
     """A figure with ``count`` equal panels of ``bounds`` (metres x0, y0, x1, y1); ``layout`` is
-    the columns and their width, ``head_in`` the space above, in inches."""
+    the columns and their width, ``header_in`` the space above, in inches."""
     columns, width_in = layout
     x0, y0, x1, y1 = bounds
     rows = math.ceil(count / columns)
     height_in = width_in * (y1 - y0) / (x1 - x0) + _TITLE_IN
-    figure = Figure(figsize=(columns * width_in, rows * height_in + head_in), facecolor="white")
+    figure = Figure(figsize=(columns * width_in, rows * height_in + header_in), facecolor="white")
     grid = figure.subplots(rows, columns, squeeze=False)
     figure.subplots_adjust(
         left=0.01, right=0.99, bottom=0.01, wspace=0.02, hspace=_TITLE_IN / height_in,
-        top=1 - (head_in + _TITLE_IN) / (rows * height_in + head_in),
+        top=1 - (header_in + _TITLE_IN) / (rows * height_in + header_in),
     )  # fmt: skip
     axes: list[Axes] = list(grid.flat)
     for each in axes:
@@ -89,7 +89,7 @@ def _sheet(
     return figure, [Canvas(figure, each, bounds, unit) for each in axes[:count]]
 
 
-def _panel(panel: Canvas, view: MapView) -> None:
+def _draw_map(panel: Canvas, view: MapView) -> None:
     x0, y0, x1, y1 = panel.bounds
     draw_regions(panel, view)
     draw_drives(panel, view)
@@ -101,19 +101,19 @@ def _panel(panel: Canvas, view: MapView) -> None:
     panel.axes.set_aspect("equal")
 
 
-def _draw_links(panel: Canvas, timeline: Timeline, merge: Merge) -> None:
-    """The bridge with its ε circle and neighbours, and the core points that met."""
+def _draw_chains(panel: Canvas, timeline: Timeline, merge: Merge) -> None:
+    """The bridge with its ε circle and neighbours, and the chains of core points."""
     history, end = timeline.history, Offset(merge.cause.offset + 1)
-    x, y = map(float, history.neighbours.spots([merge.bridge])[0])
+    x, y = map(float, history.neighbours.positions([merge.bridge])[0])
     circle = Circle((x, y), timeline.settings.eps_m, fill=False, lw=1.2, ls="--", zorder=12)
     circle.set_edgecolor(palette.BRIDGE)
     panel.axes.add_patch(circle)
-    near = history.neighbours.spots(history.neighbours.of(merge.bridge, end))
+    near = history.neighbours.positions(history.neighbours.of(merge.bridge, end))
     panel.axes.scatter(
         near[:, 0], near[:, 1], s=26, facecolor="none", edgecolor=palette.BRIDGE, lw=0.9, zorder=12
     )
     for chain in chains_of(history, merge):
-        path = history.neighbours.spots(chain.points)
+        path = history.neighbours.positions(chain.points)
         panel.axes.plot(*path.T, color=palette.ESTIMATE, lw=2.2, marker="o", ms=5, zorder=14)
     panel.axes.scatter([x], [y], s=90, marker="*", color=palette.BRIDGE, zorder=15)
     panel.axes.annotate(
@@ -122,18 +122,18 @@ def _draw_links(panel: Canvas, timeline: Timeline, merge: Merge) -> None:
     )  # fmt: skip
 
 
-def _around(timeline: Timeline, merge: Merge) -> Bounds:
+def _bounds_of_merge(timeline: Timeline, merge: Merge) -> Bounds:
     """A square around the bridge and the core points that join the places."""
     history = timeline.history
     points = [merge.bridge, *(k for chain in chains_of(history, merge) for k in chain.points)]
-    spots = history.neighbours.spots(points)
+    spots = history.neighbours.positions(points)
     (x0, y0), (x1, y1) = spots.min(axis=0), spots.max(axis=0)
     x, y = float(x0 + x1) / 2, float(y0 + y1) / 2
     half = float(max(x1 - x0, y1 - y0)) / 2 + _AROUND_EPS * timeline.settings.eps_m
     return x - half, y - half, x + half, y + half
 
 
-def _whole(views: Sequence[MapView]) -> Bounds:
+def _bounds_of_maps(views: Sequence[MapView]) -> Bounds:
     poses = [k.pose for view in views for k in view.keyframes if k.pose is not None]
     if not poses:
         return (-1.0, -1.0, 1.0, 1.0)

@@ -1,14 +1,11 @@
-"""What time travel remembers of each thing: plain records that `history` fills from deltas.
+"""Records of a history: causes, merges, and what happened to each place and object.
 
-Keyframes, places and objects are meant by ordinal here, as in the deltas; ids are for people and
-are put in where something is told. Places and objects never leave a history: an absorbed place
-keeps its life, and where it ended.
+Keyframes, places and objects are ordinals here, as in the deltas; ids are put in where text or JSON
+is made. No record is removed: an absorbed place keeps its history and the merge that ended it.
 
-What made something happen: today always a keyframe, later also an operator's command.
-
-Everything time travel reports carries a `Cause`, and nothing but this module looks at which kind it
-is. A command on ``mapfold/command`` will be one more kind with a text of its own; the chronicle,
-the diff and the merge table then name it without a change.
+Every record has a `Cause`: the event that made it happen. Today that is always a keyframe. An
+operator's command on ``mapfold/command`` will be one more kind with a text of its own; only this
+module looks at the kind, so explanations, diffs and the merge table need no change for it.
 """
 
 from bisect import bisect_left
@@ -54,7 +51,7 @@ class Cause:
 
     @property
     def name(self) -> str:
-        """``run:keyframe``, or what a command said."""
+        """``run:keyframe``, or the text of a command."""
         if self.kind == "keyframe":
             return f"{self.run_id}:{self.keyframe_id}"
         return self.what or f"{self.kind} at offset {self.offset}"
@@ -66,7 +63,7 @@ class Cause:
 
     @property
     def when(self) -> str:
-        """Its time for people, its name where it has none."""
+        """Its time, or its name where it has none."""
         return self.time or self.name
 
     @property
@@ -75,7 +72,7 @@ class Cause:
         return self.name if self.time is None else f"{self.name}, {self.time}"
 
     def document(self) -> dict[str, Any]:
-        """The fields every JSON answer says a cause with."""
+        """The fields of a cause in every JSON answer."""
         return {
             "offset": self.offset,
             "time": self.time,
@@ -111,11 +108,11 @@ class EdgeChange:
 
 @dataclass(frozen=True, slots=True)
 class Merge:
-    """Places became one, and everything that changed hands with it.
+    """A merge of places, with the objects and edges it moved.
 
     ``number`` counts merges from 1. Sizes are members before the merge; ``absorbed`` and
-    ``absorbed_sizes`` run parallel. ``objects`` are those whose place was absorbed and that are in
-    the survivor now. ``edges`` are all adjacency changes of the event that touch the places.
+    ``absorbed_sizes`` are parallel. ``objects`` are those that the event moved out of an absorbed
+    place. ``edges`` are all adjacency changes of the event that touch the places.
     """
 
     number: int
@@ -131,22 +128,22 @@ class Merge:
 
     @property
     def places(self) -> tuple[PlaceOrdinal, ...]:
-        """The survivor and the absorbed ones."""
+        """The survivor first, then the absorbed places."""
         return (self.survivor, *self.absorbed)
 
 
 @dataclass(slots=True)
-class PlaceLife:
-    """A place from its founding on. The lists are in order of offset."""
+class PlaceHistory:
+    """What happened to a place, from its founding on. The lists are in order of offset."""
 
     formed: PlaceFormed
     cause: Cause
     joined: list[KeyframePlaced] = field(default_factory=list)
-    """Its own joins, without those of places merged in."""
+    """Keyframes that joined it, without those of absorbed places."""
     changes: list[PlaceChanged] = field(default_factory=list)
     merges: list[Merge] = field(default_factory=list)
     """Merges it survived."""
-    absorbed: Merge | None = None
+    absorbed_by: Merge | None = None
     """The merge that ended it."""
 
     @property
@@ -154,9 +151,9 @@ class PlaceLife:
         return self.formed.place_id
 
     def stands(self, end: Offset) -> bool:
-        """Whether it is there, formed and not absorbed, after the events below ``end``."""
+        """Whether it is formed and not absorbed after the events below ``end``."""
         return self.formed.offset < end and (
-            self.absorbed is None or self.absorbed.cause.offset >= end
+            self.absorbed_by is None or self.absorbed_by.cause.offset >= end
         )
 
     def change(self, end: Offset) -> PlaceChanged | None:
@@ -165,21 +162,21 @@ class PlaceLife:
 
 
 @dataclass(slots=True)
-class ObjectLife:
-    """An object from its first sighting on. The lists are in order of offset."""
+class ObjectHistory:
+    """What happened to an object, from its first sighting on. The lists are in order of offset."""
 
     found: ObjectFound
     cause: Cause
-    seen: list[ObjectSeen] = field(default_factory=list)
-    located: list[ObjectMoved] = field(default_factory=list)
+    sightings: list[ObjectSeen] = field(default_factory=list)
+    moves: list[ObjectMoved] = field(default_factory=list)
 
     @property
     def object_id(self) -> str:
         return self.found.object_id
 
     def place(self, end: Offset) -> PlaceOrdinal | None:
-        """The place it joined last by the events below ``end``."""
-        moved = last_before(self.located, end)
+        """The place it is located in after the events below ``end``."""
+        moved = last_before(self.moves, end)
         return None if moved is None else moved.place
 
 
@@ -193,7 +190,7 @@ _offset = attrgetter("offset")
 
 
 def count_before(items: Sequence[_HasOffset], end: Offset) -> int:
-    """How many items, sorted by offset, were caused by events below ``end``."""
+    """How many of the items, sorted by offset, are of events below ``end``."""
     return bisect_left(items, end, key=_offset)
 
 

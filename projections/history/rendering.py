@@ -1,15 +1,4 @@
-"""`mapfold diff` for people: the digests, a line per kind, then the things that changed.
-
-A plain table: columns as wide as their widest cell, two spaces between, no lines.
-
-`mapfold merges` for people.
-
-`mapfold bisect` for people.
-
-`mapfold why` for people: the summary first, then the chronicle.
-
-`mapfold whatif` for people: one row per setting, then how each differs from the first.
-"""
+"""Text output of `mapfold diff`, `merges`, `bisect`, `why` and `whatif`."""
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -21,17 +10,18 @@ from projections.model.partitions import Regrouping
 
 from .bisect import Search, Turn
 from .diff import Difference, ObjectRow, PlaceRow, object_shift_m, place_shift_m
+from .explanation import Explanation
 from .history import History
-from .merges import HEADER, merge_row, reason
+from .merges import merge_reason
+from .names import keyframe_name, place_name
 from .records import EdgeChange, Merge
-from .story import Story, place_name
 from .whatif import Alternative, WhatIf
 
 
 def table(
     header: Sequence[str], rows: Iterable[Sequence[str]], *, right: Collection[str] = ()
 ) -> str:
-    """The rows under the header, a line each; ``right`` names the columns aligned to the right."""
+    """Rows under the header in columns two spaces apart; ``right`` names those aligned right."""
     cells = [list(header), *(list(row) for row in rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(header))]
     to_right = [name in right for name in header]
@@ -46,23 +36,23 @@ def table(
 
 
 def shortened(lines: Sequence[str], most: int | None, hint: str) -> list[str]:
-    """The first ``most`` lines, and how many more there are."""
+    """The first ``most`` lines, and a line with the number of the others; all for None."""
     if most is None or len(lines) <= most:
         return list(lines)
     return [*lines[:most], f"… and {len(lines) - most:,} more ({hint})"]
 
 
-HINT = "--all shows them"
+_HINT = "--all shows them"
 _MOVED_M = 0.005
-"""Less than this is not told as a move: it would print as 0.00 m."""
+"""A shorter move is not printed: it would be 0.00 m."""
 
 
 def difference_text(diff: Difference, *, most: int | None) -> str:
-    """What changed; ``most`` things are named of each kind, all of them for None."""
-    return "".join(f"{line}\n" for line in _lines(diff, most))
+    """The digests, a line per kind, and up to ``most`` things of each kind; None for all."""
+    return "".join(f"{line}\n" for line in _difference_lines(diff, most))
 
 
-def _lines(diff: Difference, most: int | None) -> Iterator[str]:
+def _difference_lines(diff: Difference, most: int | None) -> Iterator[str]:
     first, second = diff.digests
     if diff.same:
         yield f"the same map at {diff.start:,} and {diff.end:,}: digest {first[:16]}"
@@ -72,7 +62,7 @@ def _lines(diff: Difference, most: int | None) -> Iterator[str]:
     for title, summary, groups in (_places(diff), _objects(diff), _edges(diff)):
         yield f"{title:<11}{summary}"
         for group in groups:
-            yield from (f"  {line}" for line in shortened(group, most, HINT))
+            yield from (f"  {line}" for line in shortened(group, most, _HINT))
 
 
 def _keyframes(diff: Difference) -> str:
@@ -85,10 +75,10 @@ def _keyframes(diff: Difference) -> str:
         (out_of_noise, "left noise"),
         (len(relabelled) - out_of_noise, "changed place"),
     ]
-    return _parts(parts)
+    return _counts_text(parts)
 
 
-def _parts(parts: Sequence[tuple[int, str]]) -> str:
+def _counts_text(parts: Sequence[tuple[int, str]]) -> str:
     return ", ".join(f"{count:,} {what}" for count, what in parts if count) or "unchanged"
 
 
@@ -104,7 +94,7 @@ def _places(diff: Difference) -> tuple[str, str, list[list[str]]]:
         [f"- {row.place_id}{_into(diff, row)}" for row in found.went],
         [f"~ {_place_change(before, after)}" for before, after in found.changed],
     ]
-    return "places", _parts(parts), groups
+    return "places", _counts_text(parts), groups
 
 
 def _size(row: PlaceRow) -> str:
@@ -172,7 +162,7 @@ def _objects(diff: Difference) -> tuple[str, str, list[list[str]]]:
         [f"> {change.text()}" for change in relocated],
         [f"~ {change.text()}" for change in others],
     ]
-    return "objects", _parts(parts), groups
+    return "objects", _counts_text(parts), groups
 
 
 def _edges(diff: Difference) -> tuple[str, str, list[list[str]]]:
@@ -186,36 +176,65 @@ def _edges(diff: Difference) -> tuple[str, str, list[list[str]]]:
             for before, after in found.changed
         ],
     ]
-    return "adjacency", _parts(parts), groups
+    return "adjacency", _counts_text(parts), groups
 
 
-MOST = 12
+_MERGES_HEADER = (
+    "#",
+    "offset",
+    "time",
+    "bridge",
+    "survivor",
+    "absorbed",
+    "keyframes",
+    "objects",
+    "edges",
+)
+MOST_THINGS = 12
+"""Objects and edges of one merge that the text lists."""
 
 
 def merges_text(history: History, merges: Sequence[Merge], end: Offset) -> str:
     """The table of merges, or that there are none."""
     if not merges:
-        formed = sum(life.formed.offset < end for life in history.places)
+        formed = sum(place.formed.offset < end for place in history.places)
         return f"no merges: {counted(end, 'event')} formed {counted(formed, 'place')}\n"
     rows = [merge_row(history, merge) for merge in merges]
-    return table(HEADER, rows, right=("#", "offset", "objects", "edges"))
+    return table(_MERGES_HEADER, rows, right=("#", "offset", "objects", "edges"))
 
 
 def merge_text(history: History, merge: Merge) -> str:
-    """One merge with everything that made it and that changed hands."""
+    """One merge: its reason, its places, and the objects and edges it moved."""
     cause, after = merge.cause, merge.cause.offset + 1
     lines = [
         f"merge {merge.number} at offset {cause.offset:,} ({cause.when}), shows from --at {after}",
-        f"because   {reason(history, merge)}",
+        f"because   {merge_reason(history, merge)}",
         f"survivor  {_place(history, merge.survivor, merge.survivor_size)}",
     ]
     for place, size in zip(merge.absorbed, merge.absorbed_sizes, strict=True):
         lines.append(f"absorbed  {_place(history, place, size)}")
     objects = [history.objects[number] for number in merge.objects]
     named = [f"object    {o.object_id} ({o.found.class_name})" for o in objects]
-    lines += shortened(named, MOST, "--json lists all")
-    lines += shortened([_edge_text(history, e) for e in merge.edges], MOST, "--json lists all")
+    lines += shortened(named, MOST_THINGS, "--json lists all")
+    lines += shortened(
+        [_edge_text(history, e) for e in merge.edges], MOST_THINGS, "--json lists all"
+    )
     return "".join(f"{line}\n" for line in lines)
+
+
+def merge_row(history: History, merge: Merge) -> tuple[str, ...]:
+    """One row of the table of `merges_text`."""
+    return (
+        str(merge.number),
+        f"{merge.cause.offset:,}",
+        merge.cause.when,
+        keyframe_name(history, merge.bridge),
+        place_name(history, merge.survivor),
+        ", ".join(place_name(history, place) for place in merge.absorbed),
+        " + ".join(str(size) for size in (merge.survivor_size, *merge.absorbed_sizes)),
+        str(len(merge.objects)),
+        str(len(merge.edges)),
+    )
 
 
 def _place(history: History, place: PlaceOrdinal, size: int) -> str:
@@ -228,14 +247,14 @@ def _edge_text(history: History, edge: EdgeChange) -> str:
 
 
 def search_text(search: Search, *, most: int | None) -> str:
-    """When it turned true and what made it, with the values on both sides; then other turns."""
+    """The event that made the condition true, the values before and after it, and other turns."""
     lines = [_verdict(search)]
     if search.found is not None:
         lines += _values(search.found)
     else:
         lines += [f"  {name}: {_value(value)} at the end" for name, value in search.at_end]
     others = [turn for turn in search.turns if turn is not search.found]
-    lines += shortened([_turn(turn) for turn in others], most, "--json lists all")
+    lines += shortened([_turn_text(turn) for turn in others], most, "--json lists all")
     return "".join(f"{line}\n" for line in lines)
 
 
@@ -264,7 +283,7 @@ def _values(turn: Turn) -> list[str]:
     ]
 
 
-def _turn(turn: Turn) -> str:
+def _turn_text(turn: Turn) -> str:
     word = "true" if turn.becomes else "false"
     cause = turn.cause
     return f"  turned {word} at offset {cause.offset:,} ({cause.title})"
@@ -276,12 +295,12 @@ def _value(value: object) -> str:
     return "none" if value is None else str(value)
 
 
-def story_text(story: Story) -> str:
-    """The story, one entry a line: offset, time, what happened."""
-    subject = story.subject if story.kind == "same" else f"{story.kind} {story.subject}"
-    lines = [f"{subject}: {story.summary}"]
-    width = max((len(f"{e.cause.offset:,}") for e in story.entries), default=1)
-    for entry in story.entries:
+def explanation_text(found: Explanation) -> str:
+    """The summary, then one entry a line: offset, time, what happened."""
+    subject = found.subject if found.kind == "same" else f"{found.kind} {found.subject}"
+    lines = [f"{subject}: {found.summary}"]
+    width = max((len(f"{e.cause.offset:,}") for e in found.entries), default=1)
+    for entry in found.entries:
         time = entry.cause.when
         lines.append(f"  {entry.cause.offset:>{width},}  {time}  {entry.text}")
     return "".join(f"{line}\n" for line in lines)
@@ -289,12 +308,12 @@ def story_text(story: Story) -> str:
 
 _HEADER = ("settings", "places", "noise", "merges", "objects", "places ARI", "objects ARI")
 _TRUTH_HEADER = ("rooms V", "instances V")
-WHATIF_HINT = "--json lists all"
+_WHATIF_HINT = "--json lists all"
 
 
 def whatif_text(found: WhatIf, *, most: int | None) -> str:
-    """The table, and below it which places split and joined, ``most`` of them per setting."""
-    truth = found.base.outcome.scores is not None
+    """The table of settings, then up to ``most`` places per setting that split or joined."""
+    truth = found.base.result.scores is not None
     header = (*_HEADER, *_TRUTH_HEADER) if truth else _HEADER
     rows = [_row(each, truth=truth) for each in found.all]
     lines = [line for each in found.alternatives for line in _differences(each, most)]
@@ -302,12 +321,12 @@ def whatif_text(found: WhatIf, *, most: int | None) -> str:
 
 
 def _row(each: Alternative, *, truth: bool) -> tuple[str, ...]:
-    counts = each.outcome.counts
+    counts = each.result.counts
     row = (
         each.name,
         f"{counts['places']:,}",
         f"{counts['noise']:,}",
-        f"{each.outcome.merges:,}",
+        f"{each.result.merges:,}",
         f"{counts['objects']:,}",
         f"{float(each.places.adjusted_rand):.3f}",
         f"{float(each.objects.adjusted_rand):.3f}",
@@ -316,7 +335,7 @@ def _row(each: Alternative, *, truth: bool) -> tuple[str, ...]:
 
 
 def _scores(each: Alternative) -> tuple[str, ...]:
-    scores = each.outcome.scores or {}
+    scores = each.result.scores or {}
     return tuple(
         f"{scores[table]['v_measure']:.3f}" if scores[table][scored] else "-"
         for table, scored in (("places", "keyframes"), ("objects", "observations"))
@@ -325,28 +344,30 @@ def _scores(each: Alternative) -> tuple[str, ...]:
 
 def _differences(each: Alternative, most: int | None) -> Iterator[str]:
     yield ""
-    yield f"{each.name}: {_partings(each)}"
+    yield f"{each.name}: {_first_differences(each)}"
     splits = [f"  {_split(found)}" for found in each.places.splits]
     joins = [f"  {_join(found)}" for found in each.places.joins]
-    yield from shortened([*splits, *joins], most, WHATIF_HINT)
+    yield from shortened([*splits, *joins], most, _WHATIF_HINT)
 
 
-def _partings(each: Alternative) -> str:
-    if each.parted_places is None and each.parted_objects is None:
+def _first_differences(each: Alternative) -> str:
+    if each.places_part_at is None and each.objects_part_at is None:
         return "the same map, event by event"
     return "; ".join(
-        _parting(what, offset, same=compared.same)
+        _first_difference(what, offset, same=compared.same)
         for what, offset, compared in (
-            ("places", each.parted_places, each.places),
-            ("objects", each.parted_objects, each.objects),
+            ("places", each.places_part_at, each.places),
+            ("objects", each.objects_part_at, each.objects),
         )
     )
 
 
-def _parting(what: str, offset: Offset | None, *, same: bool) -> str:
+def _first_difference(what: str, offset: Offset | None, *, same: bool) -> str:
     if offset is None:
         return f"{what} are the same"
-    return f"{what} part ways at offset {offset:,}" + (" and end the same" if same else "")
+    return f"{what} differ from offset {offset:,} on" + (
+        ", and are the same at the end" if same else ""
+    )
 
 
 def _split(found: Regrouping) -> str:

@@ -1,7 +1,7 @@
-"""One log under one setting, and every moment of its map.
+"""The maps of one log under one setting at every offset, and why they are as they are.
 
-A timeline folds its log once, when something is first asked, and keeps the history; after that
-every question is a look-up. An event at offset o, and a merge it causes, shows in ``at(o + 1)``.
+A timeline folds its log once, at the first question, and keeps the history; after that every
+question is a look-up. An event at offset o, and a merge it causes, shows in ``at(o + 1)``.
 """
 
 from collections.abc import Callable, Iterator
@@ -19,26 +19,26 @@ from projections.model.view import MapView
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 
-from .bisect import HistoryFacts, Search, Searcher, Tallies
+from .bisect import CountIndex, HistoryFacts, Search, Searcher
 from .conditions import Expression
 from .diff import Difference, difference_of, rows_of
-from .history import History
-from .moments import view_at
+from .explanation import Explanation, explain_object, explain_place
+from .history import History, view_at
+from .names import NoSuchThing, find_keyframe, find_object, find_place, place_name
 from .records import Cause, Merge
-from .same_place import NoSuchThing, find_keyframe, find_object, find_place, same_story
-from .stories import object_story, place_story
-from .story import Story, place_name
+from .same_place import explain_same_place
 
 Progress: TypeAlias = Callable[[int, int], None]
-"""Told (events folded, events in all) from time to time."""
+"""Called with (events folded, events in all) from time to time."""
 
 _PROGRESS_EVERY = 500
 
 
 class Timeline:
-    """A context manager over a log; questions at an ``end``: the map after that many events.
+    """A context manager over a log. An ``end`` means the map after that many events.
 
-    ``progress`` is told while events are folded, ``note`` of snapshots that could not be used.
+    ``progress`` is called while events are folded, ``note`` with a line about each snapshot that
+    could not be used.
     """
 
     def __init__(
@@ -53,11 +53,11 @@ class Timeline:
         self.reader = LogReader(log)
         self._progress = progress
         self._note = note
-        self._asked_before = False
+        self._snapshot_tried = False
         self._map = SemanticMap(self.settings)
         self._latest = MapView(self.settings, keep_embeddings=False)
         self._history = History(self.settings)
-        self._tallies: Tallies | None = None
+        self._index: CountIndex | None = None
 
     def __enter__(self) -> "Timeline":
         return self
@@ -71,28 +71,28 @@ class Timeline:
         return self.reader.next_offset
 
     def refresh(self) -> Offset:
-        """Take in what was recorded since; the new `end`."""
+        """Include events recorded since; returns the new `end`."""
         return self.reader.refresh()
 
     @property
     def history(self) -> History:
-        """What happened so far; folds what is not folded yet. Raises FoldError at a bad event."""
+        """The history up to `end`; folds new events first. Raises FoldError at a bad event."""
         if self._history.next_offset < self.end:
-            self._tallies = None
+            self._index = None
             with no_cycle_search():
                 self._fold_to(self.end)
         return self._history
 
     def at(self, end: Offset | None = None) -> MapView:
-        """The map after the first ``end`` events, all of them for None; yours to change.
+        """The map after the first ``end`` events, all of them for None; the caller may change it.
 
-        Its observations carry no embeddings, only their checksums. The first time it is taken from
-        the nearest snapshot beside the log, if there is one; who asks again gets the history
-        folded, and from then on it is a look-up.
+        Its observations carry no embeddings, only their checksums. The first call folds from the
+        nearest snapshot beside the log, if there is one; a later call folds the history, from then
+        on it is a look-up.
         """
         wanted = self._end(end)
-        if self._history.next_offset < wanted and not self._asked_before:
-            self._asked_before = True
+        if self._history.next_offset < wanted and not self._snapshot_tried:
+            self._snapshot_tried = True
             if (view := self._from_snapshot(wanted)) is not None:
                 return view
         history = self.history
@@ -102,8 +102,8 @@ class Timeline:
     def deltas(
         self, start: Offset = FIRST_OFFSET, end: Offset | None = None
     ) -> Iterator[FoldedEvent]:
-        """What each event from ``start`` to before ``end`` changed, by a fold of its own that
-        starts from the nearest snapshot."""
+        """The deltas of each event from ``start`` to before ``end``, by a separate fold from the
+        nearest snapshot."""
         found = self._snapshots().latest(self._end(start))
         semantic_map = SemanticMap(self.settings) if found is None else found[0]
         events = self.reader.read(semantic_map.next_offset, self._end(end))
@@ -115,24 +115,24 @@ class Timeline:
         before = self._end(end)
         return [merge for merge in self.history.merges if merge.cause.offset < before]
 
-    def why(self, thing: str, end: Offset | None = None) -> Story:
-        """The chronicle of a place or an object; raises NoSuchThing with the nearest names."""
+    def why(self, thing: str, end: Offset | None = None) -> Explanation:
+        """What happened to a place or an object; raises NoSuchThing with the nearest names."""
         history = self.history
-        if thing in history.object_numbers:
-            life = find_object(history, thing)
-            det_ids = [self._latest.observations[seen.observation].det_id for seen in life.seen]
-            return object_story(history, det_ids, life, self._end(end))
-        if thing not in history.place_numbers and thing.startswith("obj-"):
-            raise NoSuchThing("object", thing, history.object_numbers)
-        return place_story(history, find_place(history, thing), self._end(end))
+        if thing in history.object_ordinals:
+            found = find_object(history, thing)
+            det_ids = [self._latest.observations[s.observation].det_id for s in found.sightings]
+            return explain_object(history, det_ids, found, self._end(end))
+        if thing not in history.place_ordinals and thing.startswith("obj-"):
+            raise NoSuchThing("object", thing, history.object_ordinals)
+        return explain_place(history, find_place(history, thing), self._end(end))
 
-    def why_same(self, first: str, second: str, end: Offset | None = None) -> Story:
+    def why_same(self, first: str, second: str, end: Offset | None = None) -> Explanation:
         """Since when, and by which merges, two keyframes (``run:keyframe``) are in one place."""
         a, b = (find_keyframe(self.history, text) for text in (first, second))
-        return same_story(self.history, a, b, self._end(end))
+        return explain_same_place(self.history, a, b, self._end(end))
 
     def diff(self, start: Offset, end: Offset | None = None) -> Difference:
-        """What turns the map after ``start`` events into that after ``end``."""
+        """The difference between the maps after ``start`` and after ``end`` events."""
         last = self._end(end)
         before, after = self.at(start), self.at(last)
         return difference_of(
@@ -145,11 +145,11 @@ class Timeline:
         )
 
     def facts(self, end: Offset | None = None) -> HistoryFacts:
-        """The map after ``end`` events as expressions ask it."""
+        """The map after ``end`` events, for evaluating conditions."""
         history = self.history
-        if self._tallies is None:
-            self._tallies = Tallies(history)
-        return HistoryFacts(history, self._tallies, self._end(end))
+        if self._index is None:
+            self._index = CountIndex(history)
+        return HistoryFacts(history, self._index, self._end(end))
 
     def bisect(
         self,
@@ -200,7 +200,8 @@ class Timeline:
         return SnapshotCache(self.reader.path, self.reader.log_id, self.settings, self._note)
 
     def _check_names(self, expression: Expression, facts: HistoryFacts) -> None:
-        """A misspelt id would make any condition quietly false; say so instead."""
+        """Raises ExpressionError for a name that is not in the log: a condition on it would never
+        hold."""
         for mention in expression.mentions():
             names = facts.names(mention.kind)
             if mention.text not in names:

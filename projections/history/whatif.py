@@ -1,7 +1,4 @@
-"""What would have become of a log under other settings, side by side with what it is.
-
-Which settings a what-if tries: from ``--set``, ``--try`` and ``--grid`` to `Settings`.
-"""
+"""The maps of one log under other settings, compared with the map under base settings."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,8 +12,8 @@ from projections.evaluate.truth import Truth
 from projections.model.partitions import PartitionComparison, Regrouping, compare_partitions
 from projections.settings import Settings
 
-from .outcome import Outcome, objects_part, places_part
-from .parallel import Progress, fold_all
+from .parallel import FoldResult, fold_all
+from .timeline import Progress
 
 MOST_ALTERNATIVES = 200
 
@@ -24,10 +21,10 @@ MOST_ALTERNATIVES = 200
 def alternatives(
     base: Settings, sets: Sequence[str], tries: Sequence[str], grids: Sequence[str]
 ) -> list[Settings]:
-    """The settings to try beside ``base``, each once, in the order given.
+    """The settings of ``--set``, ``--try`` and ``--grid``, each once, in the order given.
 
     ``sets`` together make one alternative (``eps_m=1.0``), and hold for all of the grid; each of
-    ``tries`` is one of its own, several assignments in it parted by spaces or commas; ``grids``
+    ``tries`` is one alternative of assignments separated by spaces or commas; ``grids``
     (``eps_m=0.5,1.0``) make every combination. Raises SettingsError that names the bad one.
     """
     common = base.with_assignments(sets)
@@ -45,7 +42,7 @@ def alternatives(
 
 
 def assigned(settings: Settings, text: str, option: str) -> Settings:
-    """``settings`` changed by several assignments in the text of an option, parted by spaces or
+    """``settings`` changed by the assignments in the text of an option, separated by spaces or
     commas."""
     return settings.with_assignments(text.replace(",", " ").split(), option)
 
@@ -65,25 +62,25 @@ def changed_settings(base: Settings, other: Settings) -> dict[str, object]:
 
 
 def settings_name(base: Settings, other: Settings) -> str:
-    """``eps_m=1.0 min_samples=8``: what is different from the base."""
+    """``eps_m=1.0 min_samples=8``: the settings that differ from the base."""
     changed = changed_settings(base, other)
     return " ".join(f"{name}={value}" for name, value in changed.items()) or "no change"
 
 
 @dataclass(frozen=True, slots=True)
 class Alternative:
-    """One alternative beside the base: how its places and objects differ, and since which event.
+    """One alternative compared with the base.
 
-    ``parted_places`` and ``parted_objects`` are offsets of the first event after which they are
-    different, None for never.
+    ``places_part_at`` and ``objects_part_at`` are the offsets of the first event after which the
+    places or objects of the two folds differ, None for never.
     """
 
     name: str
-    outcome: Outcome
+    result: FoldResult
     places: PartitionComparison
     objects: PartitionComparison
-    parted_places: Offset | None
-    parted_objects: Offset | None
+    places_part_at: Offset | None
+    objects_part_at: Offset | None
 
     @property
     def same(self) -> bool:
@@ -106,7 +103,7 @@ class WhatIf:
 
     def document(self) -> dict[str, Any]:
         """JSON: settings in full for the base, changed ones for each alternative."""
-        base = self.base.outcome.settings
+        base = self.base.result.settings
         return {
             "events": self.end,
             "settings": base.model_dump(),
@@ -128,61 +125,76 @@ def what_if(
 ) -> WhatIf:
     """Fold the first ``end`` events of a log under ``base`` and ``others``, and compare.
 
-    A setting that stands several times is folded once. With ``keep_views`` each outcome has its
-    map too.
+    Equal settings are folded once. With ``keep_views`` each result has its map too.
     """
     wanted = list(dict.fromkeys((base, *others)))
     folded = fold_all(
         log, wanted, end,
         truth=truth, processes=processes, progress=progress, keep_views=keep_views,
     )  # fmt: skip
-    outcomes = dict(zip(wanted, folded, strict=True))
-    first = outcomes[base]
+    results = dict(zip(wanted, folded, strict=True))
+    first = results[base]
     changed = base != Settings()
     base_name = f"base: {settings_name(Settings(), base) if changed else 'defaults'}"
     return WhatIf(
         end=end,
         base=_compare(first, first, base_name),
         alternatives=tuple(
-            _compare(first, outcomes[each], settings_name(base, each)) for each in others
+            _compare(first, results[each], settings_name(base, each)) for each in others
         ),
     )
 
 
-def _compare(base: Outcome, other: Outcome, name: str) -> Alternative:
+def _compare(base: FoldResult, other: FoldResult, name: str) -> Alternative:
     posed = base.posed
     return Alternative(
         name=name,
-        outcome=other,
+        result=other,
         places=compare_partitions(
             [base.places[k] for k in posed], [other.places[k] for k in posed]
         ),
         objects=compare_partitions(base.objects, other.objects),
-        parted_places=places_part(base, other),
-        parted_objects=objects_part(base, other),
+        places_part_at=_places_part_at(base, other),
+        objects_part_at=_objects_part_at(base, other),
     )
 
 
+def _places_part_at(first: FoldResult, second: FoldResult) -> Offset | None:
+    """The first event after which the places of two folds of one log differ; None for never."""
+    placings = zip(
+        first.placed_offsets, first.placed_in, second.placed_offsets, second.placed_in, strict=True
+    )
+    differ = [min(o1, o2) for o1, p1, o2, p2 in placings if (o1, p1) != (o2, p2)]
+    differ += [offset for offset, _, _ in set(first.merged) ^ set(second.merged)]
+    return Offset(min(differ)) if differ else None
+
+
+def _objects_part_at(first: FoldResult, second: FoldResult) -> Offset | None:
+    """The first event after which the objects of two folds of one log differ; None for never."""
+    pairs = zip(first.fused_into, second.fused_into, first.observation_offsets, strict=True)
+    return next((Offset(offset) for a, b, offset in pairs if a != b), None)
+
+
 def _document(each: Alternative, base: Settings) -> dict[str, Any]:
-    outcome, counts = each.outcome, each.outcome.counts
+    result, counts = each.result, each.result.counts
     return {
-        "set": changed_settings(base, outcome.settings),
-        "digest": outcome.digest,
+        "set": changed_settings(base, result.settings),
+        "digest": result.digest,
         "places": counts["places"],
         "noise": counts["noise"],
-        "merges": outcome.merges,
+        "merges": result.merges,
         "objects": counts["objects"],
         "same": each.same,
         "places_adjusted_rand": float(each.places.adjusted_rand),
         "objects_adjusted_rand": float(each.objects.adjusted_rand),
-        "places_part_at": each.parted_places,
-        "objects_part_at": each.parted_objects,
+        "places_part_at": each.places_part_at,
+        "objects_part_at": each.objects_part_at,
         "places_split": [_regrouping(found) for found in each.places.splits],
         "places_joined": [_regrouping(found) for found in each.places.joins],
         "objects_split": len(each.objects.splits),
         "objects_joined": len(each.objects.joins),
-        "truth": outcome.scores,
-        "fold_seconds": round(outcome.seconds, 3),
+        "truth": result.scores,
+        "fold_seconds": round(result.seconds, 3),
     }
 
 

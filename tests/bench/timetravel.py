@@ -132,7 +132,10 @@ def bench_timeline(timeline: Timeline, one_fold: float, asks: int) -> None:
     ):
         seconds, found = timed(lambda e=expression, s=scan: timeline.bisect(e, scan=s))
         how = "--scan" if scan else ""
-        say(f"bisect {expression!r} {how}", f"{1e3 * seconds:.0f} ms, {found.asked:,} maps asked")
+        say(
+            f"bisect {expression!r} {how}",
+            f"{1e3 * seconds:.0f} ms, {found.evaluations:,} maps asked",
+        )
     seconds, _ = timed(lambda: timeline.diff(timeline.end // 2, timeline.end))
     say("diff of the middle and the end", f"{seconds:.2f} s")
 

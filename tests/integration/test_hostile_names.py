@@ -9,7 +9,7 @@ from eventsrc.append import append_payload
 from eventsrc.log import LogWriter
 from tests.commands import Commands, Said
 from tests.envelopes import detection, envelope, payload
-from tests.unit.test_terminal import obeyed
+from tests.unit.test_text_escaping import obeyed
 
 CONTROL = "\x1b]0;owned\x07\x9b2J\n       9  forged line"
 BIDI = "\u202e\u2066[red][link=file:///etc/passwd]\u2028"

@@ -62,10 +62,10 @@ def test_it_is_each_fold_alone_compared(
                 states[each].append(map_digest(views[-1]))
     for each, alternative in zip(others, found.alternatives, strict=True):
         base, other = states[BASE], states[each]
-        assert alternative.outcome.digest == other[-1]
+        assert alternative.result.digest == other[-1]
         assert alternative.places.same is (base[-2][0] == other[-2][0])
         assert alternative.objects.same is (base[-2][1] == other[-2][1])
-        for index, parted in enumerate((alternative.parted_places, alternative.parted_objects)):
+        for index, parted in enumerate((alternative.places_part_at, alternative.objects_part_at)):
             expected = parting([s[index] for s in base[:-1]], [s[index] for s in other[:-1]])
             assert parted == expected
 
@@ -78,9 +78,9 @@ def test_todays_settings_change_nothing(documents: list[dict[str, Any]]) -> None
         found = what_if(log, BASE, [BASE], len(documents))
     (same,) = found.alternatives
     assert same.same
-    assert same.parted_places is None
-    assert same.parted_objects is None
-    assert same.outcome.digest == found.base.outcome.digest
+    assert same.places_part_at is None
+    assert same.objects_part_at is None
+    assert same.result.digest == found.base.result.digest
     assert same.name == "no change"
 
 
@@ -94,7 +94,7 @@ def test_a_long_chain_of_merges_comes_back_from_a_process(tmp_path: Path) -> Non
     documents = [*first, *second, *between]
     log = write_log(tmp_path / "log", documents)
     found = what_if(log, far, [BASE], len(documents), processes=2, keep_views=True)
-    assert found.base.outcome.merges == count - 1
+    assert found.base.result.merges == count - 1
     for each in found.all:
-        assert each.outcome.view is not None
-        assert map_digest(each.outcome.view) == each.outcome.digest
+        assert each.result.view is not None
+        assert map_digest(each.result.view) == each.result.digest

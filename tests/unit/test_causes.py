@@ -12,12 +12,12 @@ from projections.deltas import (
     PlacesMerged,
     Pose,
 )
+from projections.history.explanation import explain_place
 from projections.history.history import History
-from projections.history.merges import merge_document, merge_row
+from projections.history.merges import merge_document
 from projections.history.records import Cause, cause_of
-from projections.history.rendering import merge_text, story_text
-from projections.history.same_place import same_story
-from projections.history.stories import place_story
+from projections.history.rendering import explanation_text, merge_row, merge_text
+from projections.history.same_place import explain_same_place
 from projections.settings import Settings
 
 
@@ -52,12 +52,12 @@ def test_the_cause_is_the_command(commanded: History) -> None:
 
 def test_every_text_names_it(commanded: History) -> None:
     (merge,) = commanded.merges
-    story = place_story(commanded, commanded.places[1], 3)
+    story = explain_place(commanded, commanded.places[1], 3)
     texts = [
         merge_text(commanded, merge),
         " ".join(merge_row(commanded, merge)),
-        story_text(story),
-        story_text(same_story(commanded, 0, 1, 3)),
+        explanation_text(story),
+        explanation_text(explain_same_place(commanded, 0, 1, 3)),
     ]
     for text in texts:
         assert "command at offset 2" in text

@@ -191,7 +191,7 @@ def test_a_monotone_condition_asks_few_maps(corridor: Timeline) -> None:
     search = corridor.bisect("keyframe_count >= 6")
     assert search.found is not None
     assert search.found.cause.offset == 5
-    assert search.asked <= 6
+    assert search.evaluations <= 6
 
 
 def test_equal_moments_say_so(corridor: Timeline) -> None:

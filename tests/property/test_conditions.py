@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from projections.history.conditions import Expression, ExpressionError
-from tests.unit.test_expression import FakeFacts
+from tests.unit.test_conditions import FakeFacts
 
 numbers = st.one_of(
     st.integers(-9, 9).map(str),

@@ -8,9 +8,9 @@ import pytest
 
 from eventsrc.errors import MisuseError
 from projections.history import Timeline
-from projections.history.merges import chains_of, reason
+from projections.history.merges import chains_of, merge_reason
+from projections.history.names import keyframe_name
 from projections.history.picture import draw_merge
-from projections.history.story import keyframe_name
 from projections.settings import Settings
 from tests.envelopes import envelope
 from tests.fixtures_timetravel import write_log
@@ -51,7 +51,7 @@ def test_a_keyframe_between_two_places_is_a_core_point_itself(tmp_path: Path) ->
     xs = (0, 0.5, 1, 3, 3.5, 4, 2)
     with drive(tmp_path, [(x, 0) for x in xs]) as opened:
         (merge,) = opened.merges()
-        assert reason(opened.history, merge) == (
+        assert merge_reason(opened.history, merge) == (
             "run-a:6 made itself a core point: "
             "run-a:2 (run-a_p0) –1.000 m– run-a:6 –1.000 m– run-a:3 (run-a_p1)"
         )
@@ -63,7 +63,7 @@ def test_the_bridging_keyframe_may_be_no_part_of_the_chain(tmp_path: Path) -> No
     with drive(tmp_path, spots, min_samples=4) as opened:
         (merge,) = opened.merges()
         assert not opened.history.neighbours.is_core(merge.bridge, opened.end)
-        assert reason(opened.history, merge) == (
+        assert merge_reason(opened.history, merge) == (
             "run-a:9 made run-a:8 a core point: "
             "run-a:3 (run-a_p0) –0.900 m– run-a:8 –0.900 m– run-a:4 (run-a_p1)"
         )

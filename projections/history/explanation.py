@@ -1,0 +1,296 @@
+"""Why a place or an object is what it is: what happened to it, event by event."""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from eventsrc.envelope import Offset
+from eventsrc.text import counted
+from projections.deltas import PlaceOrdinal, Pose
+from projections.exact import Q40, mean_m
+
+from .history import History
+from .merges import merge_reason
+from .names import id_of_place, keyframe_name, place_name
+from .records import Cause, Merge, ObjectHistory, PlaceHistory, count_before, last_before
+
+MOST_FOUNDERS = 6
+"""Founding members that are named; one event may place many keyframes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """An event of an explanation: ``what`` is its kind, ``text`` a sentence, ``facts`` for JSON."""
+
+    cause: Cause
+    what: str
+    text: str
+    facts: dict[str, Any] = field(default_factory=dict)
+
+    def document(self) -> dict[str, Any]:
+        return {**self.cause.document(), "what": self.what, "text": self.text, **self.facts}
+
+
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """What happened to ``subject``, in order, and in ``summary`` its state afterwards.
+
+    ``kind`` is ``place``, ``object`` or ``same``.
+    """
+
+    kind: str
+    subject: str
+    summary: str
+    entries: tuple[Entry, ...]
+    facts: dict[str, Any] = field(default_factory=dict)
+
+    def document(self) -> dict[str, Any]:
+        """JSON: the subject, its summary and facts, and every entry."""
+        return {
+            "kind": self.kind,
+            "subject": self.subject,
+            "summary": self.summary,
+            **self.facts,
+            "entries": [entry.document() for entry in self.entries],
+        }
+
+
+def explain_place(history: History, record: PlaceHistory, end: Offset) -> Explanation:
+    """What happened to a place in the events below ``end``."""
+    entries = sorted(
+        (e for e in _place_entries(history, record) if e.cause.offset < end),
+        key=lambda e: e.cause.offset,
+    )
+    stands = record.stands(end)
+    describe = _standing_place_summary if stands else _other_place_summary
+    return Explanation(
+        kind="place",
+        subject=record.place_id,
+        summary=describe(history, record, end),
+        entries=tuple(entries),
+        facts={"stands": stands, "absorbed_by": _absorbed_by_document(history, record, end)},
+    )
+
+
+def _place_entries(history: History, record: PlaceHistory) -> Iterator[Entry]:
+    yield _founding(history, record)
+    yield from _growth(history, record)
+    for merge in record.merges:
+        yield _absorbed_others(history, merge)
+    if record.absorbed_by is not None:
+        yield _absorbed_by(history, record, record.absorbed_by)
+
+
+def _founding(history: History, record: PlaceHistory) -> Entry:
+    founder = record.formed.founder
+    first = [d.keyframe for d in record.joined if d.offset == record.formed.offset]
+    named = ", ".join(keyframe_name(history, k) for k in first[:MOST_FOUNDERS])
+    more = f" and {len(first) - MOST_FOUNDERS} more" if len(first) > MOST_FOUNDERS else ""
+    where = position_text(history.keyframes[founder].pose)
+    return Entry(
+        record.cause,
+        "founded",
+        f"founded: {keyframe_name(history, founder)} at {where} became the first core point; "
+        f"members {named}{more}",
+        {
+            "founder": keyframe_name(history, founder),
+            "members": [keyframe_name(history, k) for k in first],
+        },
+    )
+
+
+def _growth(history: History, record: PlaceHistory) -> Iterator[Entry]:
+    """An entry each time its size passes 10, 20, 50, 100 … by growth, not by a merge."""
+    merged = {merge.cause.offset for merge in record.merges}
+    before = 0
+    for change in record.changes:
+        passed = _passed_milestone(before, change.keyframe_count)
+        before = change.keyframe_count
+        if passed and change.offset not in merged and change.offset != record.formed.offset:
+            cause = history.cause_at(change.offset)
+            text = f"grew to {counted(change.keyframe_count, 'keyframe')}"
+            yield Entry(cause, "grew", text, {"keyframe_count": change.keyframe_count})
+
+
+def _absorbed_others(history: History, merge: Merge) -> Entry:
+    parts = ", ".join(
+        f"{place_name(history, place)} ({counted(size, 'keyframe')})"
+        for place, size in zip(merge.absorbed, merge.absorbed_sizes, strict=True)
+    )
+    return Entry(
+        merge.cause,
+        "absorbed",
+        f"absorbed {parts}, having {merge.survivor_size:,} itself; {merge_reason(history, merge)}",
+        {"merge": merge.number, "places": [place_name(history, p) for p in merge.absorbed]},
+    )
+
+
+def _absorbed_by(history: History, record: PlaceHistory, merge: Merge) -> Entry:
+    size = merge.absorbed_sizes[merge.absorbed.index(record.formed.place)]
+    survivor = place_name(history, merge.survivor)
+    return Entry(
+        merge.cause,
+        "ended",
+        f"absorbed by {survivor} ({counted(merge.survivor_size, 'keyframe')}), having {size:,} "
+        f"itself; {merge_reason(history, merge)}",
+        {"merge": merge.number, "survivor": survivor, "keyframe_count": size},
+    )
+
+
+def _other_place_summary(history: History, record: PlaceHistory, end: Offset) -> str:
+    merge = record.absorbed_by
+    if merge is None or record.formed.offset >= end:
+        return f"not founded yet; {record.cause.name} founds it at offset {record.formed.offset:,}"
+    now = history.survivor_of(record.formed.place, end)
+    then = "" if now == merge.survivor else f"; that is part of {place_name(history, now)} now"
+    by = place_name(history, merge.survivor)
+    return f"absorbed by {by} at offset {merge.cause.offset:,} ({merge.cause.when}){then}"
+
+
+def _absorbed_by_document(
+    history: History, record: PlaceHistory, end: Offset
+) -> dict[str, object] | None:
+    merge = record.absorbed_by
+    if merge is None or merge.cause.offset >= end:
+        return None
+    return {"place_id": place_name(history, merge.survivor), **merge.cause.document()}
+
+
+def _standing_place_summary(history: History, record: PlaceHistory, end: Offset) -> str:
+    parts = [
+        _objects_text(history, record.formed.place, end),
+        _neighbours_text(history, record.formed.place, end),
+    ]
+    if (change := record.change(end)) is not None:
+        x, y = (mean_m(s, change.keyframe_count) for s in (change.sum_x_um, change.sum_y_um))
+        parts.insert(0, f"{counted(change.keyframe_count, 'keyframe')} around ({x:.2f}, {y:.2f})")
+    return "; ".join(parts)
+
+
+def _objects_text(history: History, place: PlaceOrdinal, end: Offset) -> str:
+    classes = Counter(
+        o.found.class_name
+        for o in history.objects
+        if o.found.offset < end and o.place(end) == place
+    )
+    if not classes:
+        return "no objects"
+    most = sorted(classes.items(), key=lambda item: (-item[1], item[0]))
+    named = ", ".join(name if count == 1 else f"{name} ×{count}" for name, count in most[:8])
+    others = len(most) - 8
+    more = f" and {others} more {'class' if others == 1 else 'classes'}" if others > 0 else ""
+    return f"{counted(classes.total(), 'object')}: {named}{more}"
+
+
+def _neighbours_text(history: History, place: PlaceOrdinal, end: Offset) -> str:
+    found = [
+        (count, b if a == place else a)
+        for a, b in history.edges
+        if place in (a, b) and (count := history.transitions(a, b, end))
+    ]
+    if not found:
+        return "next to no other place"
+    found.sort(key=lambda item: (-item[0], item[1]))
+    return "next to " + ", ".join(f"{place_name(history, p)} ({n}×)" for n, p in found)
+
+
+def explain_object(
+    history: History, det_ids: Sequence[str], record: ObjectHistory, end: Offset
+) -> Explanation:
+    """What happened to an object in the events below ``end``.
+
+    ``det_ids`` are the detections of its sightings, parallel to ``record.sightings``.
+    """
+    entries = sorted(
+        (e for e in _object_entries(history, det_ids, record) if e.cause.offset < end),
+        key=lambda entry: entry.cause.offset,
+    )
+    seen = count_before(record.sightings, end)
+    return Explanation(
+        kind="object",
+        subject=record.object_id,
+        summary=_object_summary(history, record, end),
+        entries=tuple(entries),
+        facts={
+            "class_name": record.found.class_name,
+            "place_id": id_of_place(history, record.place(end)),
+            "det_ids": det_ids[:seen],
+        },
+    )
+
+
+def _object_summary(history: History, record: ObjectHistory, end: Offset) -> str:
+    last = last_before(record.sightings, end)
+    if last is None:
+        return "not seen yet"
+    x, y = mean_m(last.sum_x_um, last.obs_count), mean_m(last.sum_y_um, last.obs_count)
+    sightings = record.sightings[: count_before(record.sightings, end)]
+    least = min(seen.similarity_q40 for seen in sightings) / Q40
+    similar = f", each at least {least:.2f} like it" if last.obs_count > 1 else ""
+    return (
+        f"a {record.found.class_name} seen {counted(last.obs_count, 'time')}{similar}, "
+        f"on average from ({x:.2f}, {y:.2f}); in {place_name(history, record.place(end))}"
+    )
+
+
+def _object_entries(
+    history: History, det_ids: Sequence[str], record: ObjectHistory
+) -> Iterator[Entry]:
+    pose = history.keyframes[history.keyframe_count(Offset(record.found.offset + 1)) - 1].pose
+    yield Entry(
+        record.cause,
+        "found",
+        f"found: {det_ids[0]}, seen from {position_text(pose)}, "
+        f"was like no {record.found.class_name} near it",
+        {"det_id": det_ids[0]},
+    )
+    yield from _sightings(history, record)
+    yield from _moves(history, record)
+
+
+def _sightings(history: History, record: ObjectHistory) -> Iterator[Entry]:
+    before = 1
+    for seen in record.sightings:
+        if _passed_milestone(before, seen.obs_count):
+            text = f"seen {counted(seen.obs_count, 'time')}"
+            yield Entry(history.cause_at(seen.offset), "seen", text, {"obs_count": seen.obs_count})
+        before = seen.obs_count
+
+
+def _moves(history: History, record: ObjectHistory) -> Iterator[Entry]:
+    before: PlaceOrdinal | None = None
+    for moved in record.moves:
+        cause = history.cause_at(moved.offset)
+        facts = {"from": id_of_place(history, before), "to": id_of_place(history, moved.place)}
+        yield Entry(cause, "located", _move_text(history, before, moved.place, moved.offset), facts)
+        before = moved.place
+
+
+def _move_text(
+    history: History, before: PlaceOrdinal | None, after: PlaceOrdinal | None, offset: Offset
+) -> str:
+    to = place_name(history, after)
+    if before is None:
+        return f"located in {to}"
+    merge = history.places[before].absorbed_by
+    if merge is not None and merge.cause.offset == offset:
+        return f"located in {to}, which absorbed {place_name(history, before)}"
+    return f"located in {to} instead of {place_name(history, before)}: most sightings are there"
+
+
+def position_text(pose: Pose | None) -> str:
+    """``(x, y)`` of a pose in metres, or ``no pose``."""
+    return "no pose" if pose is None else f"({pose.x_um / 1e6:.2f}, {pose.y_um / 1e6:.2f})"
+
+
+def _passed_milestone(before: int, after: int) -> bool:
+    """Whether a count passed one of 10, 20, 50, 100, 200, 500 …: growth that gets an entry."""
+    return _milestones_up_to(after) > _milestones_up_to(before)
+
+
+def _milestones_up_to(count: int) -> int:
+    if count < 10:
+        return 0
+    digits = str(count)
+    return 3 * (len(digits) - 2) + sum(digits[0] >= lead for lead in "125")
