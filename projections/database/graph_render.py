@@ -1,14 +1,12 @@
-"""What a row of the graph says: its graphid, its ends, and its properties as agtype text.
-
-The bulk of a map's floats is written by ``repr``, which is what `agtype.number` does for a float.
-They are finite: the envelope lets nothing else in, and the server would refuse it.
-
-Values as agtype text: what AGE's input function reads back as exactly the same value.
+"""Rows of the graph as AGE stores them: graphid, ends of an edge, properties as agtype text.
 
 agtype's text is JSON with two differences that matter: integer and float are different types, and a
 number is a float exactly when it is written with a point or an exponent. Python's ``repr`` of a
-float always has one of the two and is the shortest text that names that float; the server reads it
-back to the same bits. Strings are escaped as JSON has it: quote, backslash and control characters.
+float always has one of the two and is the shortest text for that float; the server reads it back to
+the same bits. Strings are escaped as JSON has it: quote, backslash and control characters.
+
+Most floats of a map are written by ``repr`` alone, which is `number` without its check: they are
+finite, as the envelope refuses others, and so would the server.
 
 Nothing here is query text. The result is a *value*: a bind parameter or a field of COPY data.
 """
@@ -49,7 +47,7 @@ BASE: Final = {label: graphid_base(label) + 1 for label in LABELS}
 
 
 def expected_rows(view: MapView, label: Label) -> Iterator[Row]:
-    """Every row of a label that the map has, by graphid: what a table must hold, streamed."""
+    """All rows that the table of a label must hold, by graphid."""
     keyframes, observations = range(len(view.keyframes)), range(len(view.observations))
     objects = range(len(view.objects))
     rows: dict[Label, Callable[[], Iterator[Row]]] = {
@@ -83,17 +81,17 @@ def keyframe_rows(view: MapView, keyframes: Iterable[int]) -> Iterator[VertexRow
     base = BASE["Keyframe"]
     for i in keyframes:
         k = view.keyframes[i]
-        yield base + i, f'{{{_said_by(k)}, "timestamp": {k.timestamp!r}}}'
+        yield base + i, f'{{{_keyframe_key(k)}, "timestamp": {k.timestamp!r}}}'
 
 
 def pose_rows(view: MapView, keyframes: Iterable[int]) -> Iterator[VertexRow]:
-    """The Poses of those keyframes that have one."""
+    """Poses of the keyframes that have one."""
     base = BASE["Pose"]
     for i in keyframes:
         k = view.keyframes[i]
         if (pose := k.pose) is not None:
             properties = (
-                f'{{{_said_by(k)}, "map_x": {pose.x_um / UM_PER_M!r},'
+                f'{{{_keyframe_key(k)}, "map_x": {pose.x_um / UM_PER_M!r},'
                 f' "map_y": {pose.y_um / UM_PER_M!r}, "map_yaw": {pose.yaw_rad!r}}}'
             )
             yield base + i, properties
@@ -101,15 +99,15 @@ def pose_rows(view: MapView, keyframes: Iterable[int]) -> Iterator[VertexRow]:
 
 def observation_rows(view: MapView, observations: Iterable[int]) -> Iterator[VertexRow]:
     """Observations."""
-    base, keyframe, said = BASE["Observation"], -1, ""
+    base, keyframe, key = BASE["Observation"], -1, ""
     for i in observations:
         o = view.observations[i]
         if o.keyframe != keyframe:
-            keyframe, said = o.keyframe, _said_by(view.keyframes[o.keyframe])
+            keyframe, key = o.keyframe, _keyframe_key(view.keyframes[o.keyframe])
         x0, y0, x1, y1 = o.bbox
         properties = (
             f'{{"det_id": {text(o.det_id)}, "class_name": {text(o.class_name)},'
-            f' "confidence": {o.confidence!r}, "bbox": [{x0!r}, {y0!r}, {x1!r}, {y1!r}], {said}}}'
+            f' "confidence": {o.confidence!r}, "bbox": [{x0!r}, {y0!r}, {x1!r}, {y1!r}], {key}}}'
         )
         yield base + i, properties
 
@@ -140,37 +138,39 @@ def place_rows(view: MapView, places: Iterable[int]) -> Iterator[VertexRow]:
 
 
 def has_keyframe_rows(view: MapView, keyframes: Iterable[int]) -> Iterator[EdgeRow]:
-    """The edges from their runs to keyframes."""
+    """Edges from runs to keyframes."""
     edge, run, keyframe = BASE["HAS_KEYFRAME"], BASE["Run"], BASE["Keyframe"]
     return ((edge + k, run + view.keyframes[k].run, keyframe + k, _NONE) for k in keyframes)
 
 
 def has_pose_rows(view: MapView, keyframes: Iterable[int]) -> Iterator[EdgeRow]:
-    """The edges to the poses of those keyframes that have one."""
+    """Edges from keyframes to poses."""
     edge, keyframe, pose = BASE["HAS_POSE"], BASE["Keyframe"], BASE["Pose"]
     posed = (k for k in keyframes if view.keyframes[k].pose is not None)
     return ((edge + k, keyframe + k, pose + k, _NONE) for k in posed)
 
 
 def has_observation_rows(view: MapView, observations: Iterable[int]) -> Iterator[EdgeRow]:
-    """The edges from their keyframes to observations."""
-    edge, keyframe, seen = BASE["HAS_OBSERVATION"], BASE["Keyframe"], BASE["Observation"]
+    """Edges from keyframes to observations."""
+    edge, keyframe, observation = BASE["HAS_OBSERVATION"], BASE["Keyframe"], BASE["Observation"]
     records = view.observations
-    return ((edge + o, keyframe + records[o].keyframe, seen + o, _NONE) for o in observations)
+    return (
+        (edge + o, keyframe + records[o].keyframe, observation + o, _NONE) for o in observations
+    )
 
 
 def observes_rows(view: MapView, observations: Iterable[int]) -> Iterator[EdgeRow]:
-    """The edges from those observations that were fused to their objects."""
-    edge, seen, fused = BASE["OBSERVES"], BASE["Observation"], BASE["Object"]
+    """Edges from observations that were fused to their objects."""
+    edge, observation, fused = BASE["OBSERVES"], BASE["Observation"], BASE["Object"]
     for i in observations:
         o = view.observations[i]
         if o.object is not None and o.similarity_q40 is not None:
             properties = f'{{"similarity": {o.similarity_q40 / Q40!r}}}'
-            yield edge + i, seen + i, fused + o.object, properties
+            yield edge + i, observation + i, fused + o.object, properties
 
 
 def located_in_rows(view: MapView, objects: Iterable[int]) -> Iterator[EdgeRow]:
-    """The edges of those objects that are in a place."""
+    """Edges from objects that are in a place to it."""
     for o in objects:
         place = view.objects[o].place
         if place is not None:
@@ -178,7 +178,7 @@ def located_in_rows(view: MapView, objects: Iterable[int]) -> Iterator[EdgeRow]:
 
 
 def in_place_rows(view: MapView, keyframes: Iterable[int]) -> Iterator[EdgeRow]:
-    """The edges of those keyframes that are in a place."""
+    """Edges from keyframes that are in a place to it."""
     for k in keyframes:
         place = view.keyframes[k].place
         if place is not None:
@@ -186,7 +186,7 @@ def in_place_rows(view: MapView, keyframes: Iterable[int]) -> Iterator[EdgeRow]:
 
 
 def adjacent_to_rows(view: MapView, links: Iterable[tuple[int, int]]) -> Iterator[EdgeRow]:
-    """The edges of those pairs of places that still have one."""
+    """Edges of those pairs of places that have one now."""
     base = graphid_base("ADJACENT_TO")
     for a, b in links:
         shared = view.adjacency.get((PlaceOrdinal(a), PlaceOrdinal(b)))
@@ -196,5 +196,5 @@ def adjacent_to_rows(view: MapView, links: Iterable[tuple[int, int]]) -> Iterato
             yield edge, BASE["Place"] + a, BASE["Place"] + b, properties
 
 
-def _said_by(keyframe: KeyframeRecord) -> str:
+def _keyframe_key(keyframe: KeyframeRecord) -> str:
     return f'"run_id": {text(keyframe.run_id)}, "keyframe_id": {keyframe.keyframe_id}'

@@ -1,10 +1,10 @@
-"""Making, finding, indexing and swapping graphs.
+"""AGE graphs: create, find, index, count, lock, swap and drop them.
 
 AGE keeps a graph as a schema, so a graph is *ours* when the schema carries our mark as its comment.
 Anything else under our names is somebody's and is refused, never touched.
 
-The old graph is renamed by the swap, and dropped later, when every transaction that may still have
-its name has ended (see `swap`).
+The swap renames the old graph; it is dropped later, when every transaction that may still have
+looked up its name has ended (see `swap`).
 """
 
 from collections.abc import Collection
@@ -72,7 +72,7 @@ def create(connection: Connection, graph: str) -> None:
 def index(
     connection: Connection, graph: str, labels: Collection[Label] = frozenset(LABELS)
 ) -> None:
-    """The indexes of our queries and upserts, but for those that AGE has made itself."""
+    """Create the indexes for queries and upserts that AGE has not made itself."""
     run = statements("graph")
     rows = connection.execute(run["indexed"], {"graph": graph}).fetchall()
     unique = {(table, column): is_unique for table, column, is_unique in rows}
@@ -98,13 +98,13 @@ def index(
 
 def counts(connection: Connection, graph: str) -> dict[str, int]:
     """Rows by label."""
-    each = [
+    selects = [
         sql.SQL("SELECT {}, count(*) FROM {}").format(
             sql.Literal(label), sql.Identifier(graph, label)
         )
         for label in LABELS
     ]
-    return dict(connection.execute(sql.SQL(" UNION ALL ").join(each)).fetchall())
+    return dict(connection.execute(sql.SQL(" UNION ALL ").join(selects)).fetchall())
 
 
 def lock(connection: Connection, graph: str) -> None:
@@ -115,7 +115,7 @@ def lock(connection: Connection, graph: str) -> None:
 
 
 def swap_in(connection: Connection, shadow: str) -> None:
-    """Give ``shadow`` the readers' name; what had it becomes the old graph."""
+    """Rename the readers' graph to `OLD_GRAPH` and ``shadow`` to the readers' name."""
     _use_age(connection)
     run = statements("graph")
     if exists(connection, GRAPH):
@@ -144,7 +144,8 @@ def drop_in_background(connection: Connection, graph: str) -> None:
 def analyze(connection: Connection, graph: str) -> None:
     """Gather statistics, so that the planner knows which labels are large.
 
-    Inside a transaction. What readers look up is all but unique, which a small sample shows.
+    Inside a transaction. The keys that readers look up are nearly unique, which a small sample
+    shows.
     """
     connection.execute(statements("graph")["sample"])
     for label in LABELS:
@@ -156,5 +157,5 @@ def analyze(connection: Connection, graph: str) -> None:
 
 
 def _use_age(connection: Connection) -> None:
-    """AGE's own functions find their operator classes by the search path only."""
+    """AGE's own functions find their operator classes only through the search path."""
     connection.execute("SET LOCAL search_path = ag_catalog, public")

@@ -1,8 +1,8 @@
-"""The names and numbers of the graph: labels, their ids, and how a row's id is computed.
+"""Names of the graph, its labels and the table of vectors; ids of vertices and edges.
 
-A graph of AGE is a schema and each label a table. A vertex or edge is known by its graphid,
-``label id << 48 | number``. AGE numbers labels per graph in the order in which they are made, from
-3 on; we make ours in the order written here, so the label ids are constants. The numbers come from
+A graph of AGE is a schema and each label a table. The id of a vertex or edge is its graphid,
+``label id << 48 | number``. AGE numbers labels per graph in the order in which they are created,
+from 3 on; we create ours in the order written here, so the label ids are constants. The numbers are
 the fold's ordinals, so every id follows from the log alone and no write has to look one up:
 
     Run, Keyframe, Observation, Object, Place     ordinal + 1
@@ -18,7 +18,7 @@ GRAPH: Final = "semantic_map"
 NEXT_GRAPH: Final = "semantic_map_next"
 """The shadow a rebuild writes."""
 OLD_GRAPH: Final = "semantic_map_old"
-"""What the shadow replaced, until the last reader has left it."""
+"""The graph that a shadow replaced, until its last reader has ended."""
 TABLE: Final = "detection_embeddings"
 
 VertexLabel: TypeAlias = Literal["Run", "Keyframe", "Pose", "Observation", "Object", "Place"]
@@ -62,7 +62,7 @@ KEYS: Final[dict[VertexLabel, str]] = {
     "Object": "object_id",
     "Place": "place_id",
 }
-"""The property by which a reader finds a vertex; each gets a btree index."""
+"""The property by which readers find a vertex; each gets a btree index."""
 
 MATCHED: Final[tuple[VertexLabel, ...]] = ("Observation", "Object", "Place")
 """Vertices that readers find by ``{key: value}``, which only a GIN index serves."""

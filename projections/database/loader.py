@@ -1,18 +1,16 @@
-"""The port through which new rows reach a table in bulk, and its two implementations.
+"""Bulk insertion of new rows: the port `Loader` and its two implementations.
 
-`CopyLoader` streams COPY, which is what a rebuild wants. `InsertLoader` sends one ``INSERT …
-SELECT unnest`` per call, for servers and proxies that do not let COPY through, and for batches so
-small that COPY's own round trips would cost more. Both write the same rows: one contract test
-class runs on both.
+`CopyLoader` streams COPY, for rebuilds and large batches. `InsertLoader` sends ``INSERT … SELECT
+unnest``, for servers and proxies that do not let COPY through, and for batches so small that COPY's
+own round trips would cost more. Both write the same rows: one contract test class runs on both.
 
-A loader makes a `Load` of the rows: all that takes time in this process is done then, and what is
-left is sending. A rebuild sends in a thread; were the thread to make bytes of rows too, it and the
-fold would take the interpreter from each other tens of thousands of times, a fifth of both.
+A loader makes a `Load` of the rows: all work of this process is done then, and only sending is
+left. A rebuild sends in a thread; if the thread encoded rows too, it and the fold would take the
+interpreter from each other tens of thousands of times, a fifth of the time of both.
 
-Rows of ``detection_embeddings`` in the binary format of COPY.
-
-Written by hand because this is the bulk of a rebuild's bytes: 2 KiB of float32 per row go through
-one numpy byte swap instead of a type adapter per field (18k rows/s there, several times that here).
+Rows of ``detection_embeddings`` are encoded here in COPY's binary format, as they are most of a
+rebuild's bytes: 2 KiB of float32 per row go through one numpy byte swap instead of a type adapter
+per field (18k rows/s there, several times that here).
 
 The format (PostgreSQL manual, "COPY", Binary Format): a signature, flags and a header length; then
 for each row an int16 number of fields and for each field an int32 length (-1 for NULL) and its
@@ -44,7 +42,7 @@ COPIED: Final = (
     "run_id", "keyframe_id", "map_x", "map_y", "map_yaw", "ingested_at",
     "det_pk", "confidence", "bbox", "det_id", "class_name", "embedding_model", "embedding",
 )  # fmt: skip
-"""The columns in the order of the fields: first those that a keyframe's rows have in common."""
+"""The columns in the order of the fields: first those that all rows of a keyframe share."""
 _HEADER: Final = b"PGCOPY\n\xff\r\n\0" + struct.pack(">ii", 0, 0)
 _TRAILER: Final = struct.pack(">h", -1)
 _NULL: Final = struct.pack(">i", -1)
@@ -60,22 +58,22 @@ _vector = struct.Struct(">ihh").pack
 
 
 def copy_document(rows: Sequence[VectorRow], first: bool, last: bool) -> bytes:
-    """The bytes of ``rows``, with the header when they come first, the trailer when last."""
+    """``rows`` as bytes, with the header if they are the ``first``, the trailer if the ``last``."""
     parts: list[bytes | memoryview] = [_HEADER] if first else []
-    keyframe, common = -1, b""
+    keyframe, shared = -1, b""
     for row, vector in zip(rows, _vectors(rows), strict=True):
         added = row.added
         if added.keyframe != keyframe:
-            keyframe, common = added.keyframe, _common(row)
-        names = _names(added.class_name, added.embedding_model)
-        parts += (common, _own(row, added), _text(added.det_id), names, vector)
+            keyframe, shared = added.keyframe, _shared_fields(row)
+        names = _name_fields(added.class_name, added.embedding_model)
+        parts += (shared, _number_fields(row, added), _text(added.det_id), names, vector)
     if last:
         parts.append(_TRAILER)
     return b"".join(parts)
 
 
 def _vectors(rows: Sequence[VectorRow]) -> list[memoryview]:
-    """The vectors' fields. All are of one dimension, the table's, and made in one go."""
+    """The fields of the vectors, encoded together; all have the table's dimension."""
     if not rows:
         return []
     units = np.array([row.unit for row in rows])
@@ -87,30 +85,30 @@ def _vectors(rows: Sequence[VectorRow]) -> list[memoryview]:
     return [flat[start : start + size] for start in range(0, len(flat), size)]
 
 
-def _common(row: VectorRow) -> bytes:
+def _shared_fields(row: VectorRow) -> bytes:
     return b"".join((
         _count(len(COPIED)),
         _text(row.added.run_id),
         _int64(8, row.added.keyframe_id),
-        _NULL * 3 if row.pose is None else _numbers(row.pose),
+        _NULL * 3 if row.pose is None else _pose_fields(row.pose),
         _int64(8, row.ingested_us - _POSTGRES_EPOCH_US),
     ))  # fmt: skip
 
 
-def _own(row: VectorRow, added: ObservationAdded) -> bytes:
+def _number_fields(row: VectorRow, added: ObservationAdded) -> bytes:
     try:
-        return _own_with(added, *added.bbox)
+        return _packed_numbers(added, *added.bbox)
     except OverflowError:  # a corner beyond float32
-        return _own_with(added, *row.bbox)
+        return _packed_numbers(added, *row.bbox)
 
 
-def _own_with(added: ObservationAdded, x0: float, y0: float, x1: float, y1: float) -> bytes:
+def _packed_numbers(added: ObservationAdded, x0: float, y0: float, x1: float, y1: float) -> bytes:
     key, confidence = added.observation + 1, added.confidence
     array = (52, 1, 0, _FLOAT4_OID, 4, 1)
     return _fixed(8, key, 8, confidence, *array, 4, x0, 4, y0, 4, x1, 4, y1)
 
 
-def _numbers(pose: tuple[float, float, float]) -> bytes:
+def _pose_fields(pose: tuple[float, float, float]) -> bytes:
     x, y, yaw = pose
     return _pose(8, x, 8, y, 8, yaw)
 
@@ -121,27 +119,27 @@ def _text(value: str) -> bytes:
 
 
 @lru_cache(maxsize=4096)
-def _names(class_name: str, model: str | None) -> bytes:
-    """What many rows say."""
+def _name_fields(class_name: str, model: str | None) -> bytes:
+    """Cached, as many rows have the same."""
     return _text(class_name) + (_NULL if model is None else _text(model))
 
 
 LoaderName: TypeAlias = Literal["copy", "insert"]
 Load: TypeAlias = Callable[[Connection], None]
-"""Sends rows that are not there yet; the connection is inside a transaction."""
+"""Sends rows that are not in the table yet, inside a transaction."""
 TypeName: TypeAlias = Callable[[], sql.Composable]
-"""Names pgvector's type. Asked when rows are sent: when they are made, a rebuild's other thread may
-not have learnt yet in which schema the server has it."""
+"""Returns pgvector's type. Called when rows are sent: when they are encoded, a rebuild's thread may
+not have read yet in which schema the server has it."""
 INSERT_CHUNK: Final = 5_000
-"""Rows of one INSERT: a statement's parameters are held in memory whole, on both sides."""
+"""Rows of one INSERT: both sides hold a statement's parameters in memory whole."""
 VECTOR_CHUNK: Final = 500
 COPY_CHUNK: Final = 60
-"""Vectors made and sent together: 128 kB, as psycopg sends it. Larger ones are slower, as their
-memory is asked of the system anew each time."""
+"""Vectors encoded and sent together: 128 kB, psycopg's own size. Larger ones are slower, as their
+memory is allocated by the system anew each time."""
 
 
 class Loader(Protocol):
-    """Makes what writes rows that are not there yet."""
+    """Makes what inserts rows that are not in the table yet."""
 
     def vertices(self, graph: str, label: VertexLabel, rows: Sequence[VertexRow]) -> Load:
         """Add vertices of one label."""
@@ -159,12 +157,12 @@ class CopyLoader:
     def vertices(self, graph: str, label: VertexLabel, rows: Sequence[VertexRow]) -> Load:
         """Add vertices of one label."""
         lines = [f"{i}\t{properties}\n" for i, properties in rows]
-        return _copy(_about("copy_vertex", graph, label), [_text_document(lines)])
+        return _copy(_graph_statement("copy_vertex", graph, label), [_text_document(lines)])
 
     def edges(self, graph: str, label: EdgeLabel, rows: Sequence[EdgeRow]) -> Load:
         """Add edges of one label."""
         lines = [f"{i}\t{start}\t{end}\t{properties}\n" for i, start, end, properties in rows]
-        return _copy(_about("copy_edge", graph, label), [_text_document(lines)])
+        return _copy(_graph_statement("copy_edge", graph, label), [_text_document(lines)])
 
     def vectors(
         self,
@@ -207,9 +205,9 @@ class InsertLoader:
 def unnest_columns(
     statement: str, graph: str, label: str, rows: Sequence[VertexRow] | Sequence[EdgeRow]
 ) -> Load:
-    """One of the unnest statements of ``sql/graph.sql``, with the columns of ``rows``."""
+    """Runs one of the unnest statements of ``sql/graph.sql`` with the columns of ``rows``."""
     as_text = [tuple(map(str, row)) for row in rows]
-    query = _about(statement, graph, label)
+    query = _graph_statement(statement, graph, label)
     return _unnest(lambda: query, as_text, INSERT_CHUNK)
 
 
@@ -218,7 +216,7 @@ def loader_of(name: LoaderName) -> Loader:
     return CopyLoader() if name == "copy" else InsertLoader()
 
 
-def _about(statement: str, graph: str, label: str) -> sql.Composed:
+def _graph_statement(statement: str, graph: str, label: str) -> sql.Composed:
     return statements("graph")[statement].format(
         graph=sql.Identifier(graph), label=sql.Identifier(label)
     )
@@ -242,7 +240,7 @@ def _copy(statement: sql.Composed, documents: list[bytes]) -> Load:
 def _unnest(
     statement: Callable[[], sql.Composed], rows: Sequence[tuple[object, ...]], size: int
 ) -> Load:
-    """``size`` rows with one statement."""
+    """One statement for each ``size`` rows."""
     chunks = [
         [list(column) for column in zip(*rows[start : start + size], strict=True)]
         for start in range(0, len(rows), size)

@@ -1,8 +1,8 @@
 """A thread that writes to the database while the fold goes on.
 
-The fold keeps one core busy and PostgreSQL another; waiting for each other would cost the sum. Jobs
-run one after the other on one connection, which nobody else may use before `flush`. Few of them may
-wait, so memory stays bounded: who brings one more waits.
+The fold keeps one core busy and PostgreSQL another; taking turns would cost the sum of both. Jobs
+run one after the other on one connection, which nothing else may use before `flush`. At most
+`WAITING_JOBS` wait, so memory stays bounded: `put` blocks while there are more.
 """
 
 import queue
@@ -17,14 +17,15 @@ Job: TypeAlias = Callable[[], None]
 
 WAITING_JOBS: Final = 4
 SWITCH_S: Final = 0.0005
-"""How long the fold may keep the writing thread from going on; Python's own 5 ms would add up, as a
-COPY asks for its turn with every 128 kB."""
+"""How long the fold may hold the interpreter while this thread waits for it. Python's own 5 ms
+would add up, as a COPY asks for it with every 128 kB."""
 
 
 class LoadingThread:
     """Use as a context manager; leaving it ends the thread.
 
-    Left by an error, it drops what was not begun and has ``cancel`` break off what was.
+    An error inside drops the jobs that have not begun and calls ``cancel`` to interrupt the one
+    that has.
     """
 
     def __init__(self, cancel: Callable[[], None] = lambda: None) -> None:
@@ -49,12 +50,12 @@ class LoadingThread:
             self._thread.join()
 
     def put(self, job: Job) -> None:
-        """Have ``job`` done. Raises what an earlier one raised."""
+        """Run ``job`` in the thread. Raises what an earlier one raised."""
         self._raise()
         self._jobs.put(job)
 
     def flush(self) -> None:
-        """Wait until all is done. Raises what a job raised."""
+        """Wait until all jobs are done. Raises what one raised."""
         self._jobs.join()
         self._raise()
 
@@ -67,7 +68,7 @@ class LoadingThread:
             try:
                 if self._failed is None:
                     job()
-            except BaseException as error:  # noqa: BLE001 - carried to whoever waits
+            except BaseException as error:  # noqa: BLE001 - raised by `put` and `flush`
                 self._failed = self._failed or error
             finally:
                 self._jobs.task_done()
@@ -75,7 +76,7 @@ class LoadingThread:
 
 @contextmanager
 def short_turns() -> Iterator[None]:
-    """Let threads take turns more often than Python does by itself."""
+    """Have threads switch every `SWITCH_S` instead of Python's default."""
     before = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_S)
     try:

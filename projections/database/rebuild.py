@@ -1,22 +1,20 @@
-"""Rebuild: fold the whole log into shadows, and swap them in for what readers see.
+"""Rebuild: fold the whole log into shadows, and swap them in for the map that readers see.
 
-Everything up to the swap happens in *one* transaction per database: creating the shadow, COPY,
-indexes, the counts, the checkpoint, the swap. So an interruption at any moment, of any kind, leaves
-the old map served and nothing to clean up. What comes after the commit only helps: dropping what
-was replaced and the HNSW index of a large table.
-
-One thread a database writes while the fold goes on (`loading_thread`).
+Creating the shadow, COPY, indexes, comparing numbers, the checkpoint and the swap are *one*
+transaction per database. So an interruption of any kind at any moment leaves the old map in place
+and nothing to clean up. After the commit only what was replaced is dropped and, for a large table,
+the HNSW index built. A thread for each database writes while the fold goes on (`loading_thread`).
 
 Readers name the graph and AGE resolves each label's table by that name, so a reader in the middle
 of a statement must not find half of its tables before the swap and half after. Therefore everything
-that is replaced, graph and table, is locked exclusively *before* any name moves: a reader that
-already has one of the tables is waited for; one that comes later waits at its first table, and
+that is replaced, graph and table, is locked exclusively *before* any name changes: we wait for a
+reader that already has one of the tables; one that comes later waits at its first table, and
 PostgreSQL resolves the name again when it gets the lock.
 
-While we wait with some of the locks in hand, a reader may wait for us: a deadlock. So we wait only
-briefly, let go of all of them, and try again; below the server's deadlock_timeout (1 s) it is
-always us who give way. That goes for the locks of two databases together: no server sees a deadlock
-between them, and the readers of one are not to wait until those of the other have ended.
+While we wait and hold some of the locks, a reader may wait for us: a deadlock. So we wait only
+briefly, release all of them, and try again; below the server's deadlock_timeout (1 s) it is always
+we who give way. The locks of two databases are taken and released together: no server sees a
+deadlock between them, and the readers of one must not wait until those of the other have ended.
 """
 
 import contextlib
@@ -51,8 +49,8 @@ from .vector_table import HnswReport, build_hnsw
 
 
 @dataclass(frozen=True, slots=True)
-class StoreRebuild:
-    """A store, the shadows of its sinks in their order, and the thread that fills them.
+class ShadowWriter:
+    """Writes the shadows of a store's sinks, which are in their order, in a thread.
 
     ``rows`` is the number of rows by label or table, once a shadow is finished.
     """
@@ -78,24 +76,24 @@ class StoreRebuild:
         self.rows.update(finish(connection))
 
     def _put(self, job: Callable[[Connection], None]) -> None:
-        self.thread.put(partial(self.store.do, job))
+        self.thread.put(partial(self.store.run, job))
 
 
 @contextlib.contextmanager
-def _store_rebuilds(stores: list[Store]) -> Iterator[list[StoreRebuild]]:
+def _shadow_writers(stores: list[Store]) -> Iterator[list[ShadowWriter]]:
     """A thread for each store, which begins with creating the shadows."""
     with contextlib.ExitStack() as threads:
-        rebuilds = []
+        writers = []
         for store in stores:
             thread = threads.enter_context(LoadingThread(partial(_cancel, store.connection)))
             shadows = [sink.shadow() for sink in store.sinks]
             thread.put(partial(_create, store, shadows))
-            rebuilds.append(StoreRebuild(store, shadows, thread))
-        yield rebuilds
+            writers.append(ShadowWriter(store, shadows, thread))
+        yield writers
 
 
 def _cancel(connection: Connection) -> None:
-    with contextlib.suppress(psycopg.Error):  # the server is gone, and what it was at with it
+    with contextlib.suppress(psycopg.Error):  # the server is gone, nothing is left to cancel
         connection.cancel_safe()
 
 
@@ -104,29 +102,29 @@ def _create(store: Store, shadows: Sequence[Shadow[Connection]]) -> None:
         for sink in store.sinks:
             sink.drop_leftovers(connection)
     for shadow in shadows:
-        store.do(shadow.create)
+        store.run(shadow.create)
 
 
-ATTEMPT: Final = "SET LOCAL lock_timeout = '200ms'; SET LOCAL statement_timeout = '400ms'"
-"""A sink's tables are locked by one statement, which may wait for one reader after the other: both
-sinks together stay below a second."""
-DONE: Final = "SET LOCAL lock_timeout = 0; SET LOCAL statement_timeout = 0"
+SHORT_TIMEOUTS: Final = "SET LOCAL lock_timeout = '200ms'; SET LOCAL statement_timeout = '400ms'"
+"""For one attempt to lock. A sink's tables are locked by one statement, which may wait for several
+readers in turn: both sinks together stay below a second."""
+NO_TIMEOUTS: Final = "SET LOCAL lock_timeout = 0; SET LOCAL statement_timeout = 0"
 PAUSE_S: Final = 0.02
 PATIENCE_S: Final = 120.0
 
 
-def lock_readers(rebuilds: Sequence[StoreRebuild]) -> None:
-    """Lock what the shadows will replace. Raises DatabaseError when readers never let go."""
+def lock_readers(writers: Sequence[ShadowWriter]) -> None:
+    """Lock what the shadows will replace. Raises DatabaseError after `PATIENCE_S`."""
     deadline = time.monotonic() + PATIENCE_S
-    while (store := _store_with_readers(rebuilds)) is not None:
+    while (store := _store_with_readers(writers)) is not None:
         if time.monotonic() > deadline:
             raise DatabaseError(
                 f"{store.place}: readers kept the map locked for {PATIENCE_S:.0f} s; end their"
                 " transactions, then run the rebuild again"
             )
         time.sleep(PAUSE_S)
-    for each in rebuilds:
-        each.store.connection.execute(DONE)
+    for writer in writers:
+        writer.store.connection.execute(NO_TIMEOUTS)
 
 
 class _HasReaders(Exception):
@@ -136,27 +134,27 @@ class _HasReaders(Exception):
         self.store = store
 
 
-def _store_with_readers(rebuilds: Sequence[StoreRebuild]) -> Store | None:
-    """Try once: None when all is locked, else a store whose readers hold locks; then nothing is."""
+def _store_with_readers(writers: Sequence[ShadowWriter]) -> Store | None:
+    """Try once: None when all is locked; else nothing is, and readers hold locks in this store."""
     try:
         with contextlib.ExitStack() as savepoints:  # rolling back to them releases the locks
-            for each in rebuilds:
-                with database_errors(each.store.url):
-                    savepoints.enter_context(each.store.connection.transaction())
-                    _lock(each)
+            for writer in writers:
+                with database_errors(writer.store.url):
+                    savepoints.enter_context(writer.store.connection.transaction())
+                    _lock(writer)
     except _HasReaders as found:
         return found.store
     return None
 
 
-def _lock(rebuild: StoreRebuild) -> None:
-    connection = rebuild.store.connection
+def _lock(writer: ShadowWriter) -> None:
+    connection = writer.store.connection
     try:
-        connection.execute(ATTEMPT)
-        for shadow in rebuild.shadows:
+        connection.execute(SHORT_TIMEOUTS)
+        for shadow in writer.shadows:
             shadow.lock_readers(connection)
     except (psycopg.errors.LockNotAvailable, psycopg.errors.QueryCanceled):
-        raise _HasReaders(rebuild.store) from None
+        raise _HasReaders(writer.store) from None
 
 
 TICK_EVENTS: Final = 256
@@ -168,7 +166,7 @@ vanish, few enough that the server has something to do from early on."""
 
 @dataclass(frozen=True, slots=True)
 class RebuildProgress:
-    """``done`` of ``total`` events are folded; ``stage`` says what is going on."""
+    """``done`` of ``total`` events are folded; ``stage`` is what the rebuild does now."""
 
     stage: str
     done: int
@@ -182,7 +180,7 @@ OnProgress: TypeAlias = Callable[[RebuildProgress], None]
 class RebuildReport:
     """What a rebuild did. ``rows`` is by graph label and table; times are seconds.
 
-    ``foreign`` is the first of the embeddings that were left out for their space.
+    ``foreign`` is the first embedding that was left out because it is outside the map's space.
     """
 
     events: int
@@ -206,13 +204,13 @@ def rebuild(
     hnsw: bool = True,
     progress: OnProgress | None = None,
 ) -> RebuildReport:
-    """Fold the first ``until`` events (all for None) and put the result in the databases' place.
+    """Fold the first ``until`` events (all for None) and replace the map in the databases.
 
     Raises FoldError at an event that cannot be folded, ProjectionBusy beside a tail or another
-    rebuild, and DatabaseError; the old map is served on then.
+    rebuild, and DatabaseError; the old map stays then.
     """
     started = time.monotonic()
-    tell = progress or (lambda _: None)
+    notify = progress or (lambda _: None)
     with (
         no_cycle_search(),
         LogReader(log) as reader,
@@ -223,18 +221,18 @@ def rebuild(
         total = reader.next_offset if until is None else min(until, reader.next_offset)
         fold = LiveFold(settings)
         with _transactions(stores):
-            with short_turns(), _store_rebuilds(stores) as rebuilds:
+            with short_turns(), _shadow_writers(stores) as writers:
                 events, advice = reader.read(FIRST_OFFSET, total), partial(_advice, log, settings)
-                last = _fold_into(fold, events, rebuilds, total, tell, advice)
+                last = _fold_into(fold, events, writers, total, notify, advice)
                 folded = time.monotonic()
-                tell(RebuildProgress("writing", total, total))
+                notify(RebuildProgress("writing", total, total))
                 changes = fold.recorder.drain()
-                for each in rebuilds:
-                    each.load(changes, fold.view)
-                    each.finish(fold.view)
+                for writer in writers:
+                    writer.load(changes, fold.view)
+                    writer.finish(fold.view)
                 digest = map_digest(fold.view)
-                for each in rebuilds:
-                    each.thread.flush()
+                for writer in writers:
+                    writer.thread.flush()
             checkpoint = Checkpoint(
                 reader.log_id,
                 settings.fingerprint(),
@@ -243,22 +241,22 @@ def rebuild(
                 checkpoints.event_hash(last),
                 digest,
             )
-            for each in rebuilds:
-                each.store.do(partial(_replace_checkpoints, each.store, checkpoint))
-            tell(RebuildProgress("swapping", total, total))
-            lock_readers(rebuilds)
-            for each in rebuilds:
-                for shadow in each.shadows:
-                    each.store.do(shadow.swap_in)
-        tell(RebuildProgress("tidying", total, total))
-        with _swapped():
-            index = _after(stores, tell, total, hnsw=hnsw)
+            for writer in writers:
+                writer.store.run(partial(_replace_checkpoints, writer.store, checkpoint))
+            notify(RebuildProgress("swapping", total, total))
+            lock_readers(writers)
+            for writer in writers:
+                for shadow in writer.shadows:
+                    writer.store.run(shadow.swap_in)
+        notify(RebuildProgress("tidying", total, total))
+        with _errors_after_swap():
+            index = _drop_replaced(stores, notify, total, hnsw=hnsw)
         ended = time.monotonic()
         return RebuildReport(
             total,
             digest,
             fold.view.counts(),
-            {label: rows for each in rebuilds for label, rows in each.rows.items()},
+            {label: rows for writer in writers for label, rows in writer.rows.items()},
             folded - started,
             ended - started,
             index,
@@ -268,7 +266,7 @@ def rebuild(
 
 @contextlib.contextmanager
 def _transactions(stores: list[Store]) -> Iterator[None]:
-    """A transaction in each store, of which either all are committed or, unless one fails, none."""
+    """A transaction in each store, committed in turn; an error inside rolls all of them back."""
     with contextlib.ExitStack() as transactions:
         for store in stores:
             transactions.enter_context(database_errors(store.url))
@@ -279,9 +277,9 @@ def _transactions(stores: list[Store]) -> Iterator[None]:
 def _fold_into(
     fold: LiveFold,
     events: Iterable[Event],
-    rebuilds: list[StoreRebuild],
+    writers: list[ShadowWriter],
     total: int,
-    tell: OnProgress,
+    notify: OnProgress,
     advice: Callable[[int], str],
 ) -> Event | None:
     last: Event | None = None
@@ -290,11 +288,11 @@ def _fold_into(
             if failed is not None:
                 raise FoldError(failed.offset, f"{failed.reason}; {advice(failed.offset)}")
         last = batch[-1]
-        tell(RebuildProgress("folding", last.offset + 1, total))
+        notify(RebuildProgress("folding", last.offset + 1, total))
         if fold.recorder.added >= STREAM_ROWS:
             changes = fold.recorder.drain()
-            for each in rebuilds:
-                each.load(changes, fold.view)
+            for writer in writers:
+                writer.load(changes, fold.view)
     return last
 
 
@@ -313,22 +311,24 @@ def _replace_checkpoints(store: Store, checkpoint: Checkpoint, connection: Conne
 
 
 @contextlib.contextmanager
-def _swapped() -> Iterator[None]:
-    """What fails now leaves nobody with the old map, and should not sound as if it did."""
+def _errors_after_swap() -> Iterator[None]:
+    """Add to a DatabaseError that the new map is in place."""
     try:
         yield
     except DatabaseError as error:
         raise type(error)(f"{error}; the new map is in place all the same") from error
 
 
-def _after(stores: list[Store], tell: OnProgress, total: int, *, hnsw: bool) -> HnswReport | None:
+def _drop_replaced(
+    stores: list[Store], notify: OnProgress, total: int, *, hnsw: bool
+) -> HnswReport | None:
     index: HnswReport | None = None
     for store in stores:
         for sink in store.sinks:
             with store.throwaway_connection() as connection:
                 sink.drop_replaced(connection)
         if hnsw and any(sink.name == "vectors" for sink in store.sinks):
-            tell(RebuildProgress("indexing", total, total))
+            notify(RebuildProgress("indexing", total, total))
             with store.throwaway_connection() as connection:
                 index = build_hnsw(connection)
     return index

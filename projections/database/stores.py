@@ -1,4 +1,4 @@
-"""The databases of a run, and which sinks live in which: what shares one, commits together."""
+"""The databases of a run and the sinks in each; sinks in one database commit together."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -51,7 +51,7 @@ class Store:
         return describe_target(self.url)
 
     def reconnect(self) -> None:
-        """Replace a lost connection; the sinks' locks are taken again."""
+        """Replace a lost connection and take the sinks' locks again."""
         self.connection.close()
         self.connection = _open(self.url, self.application, self.sinks)
 
@@ -68,13 +68,13 @@ class Store:
             pin_session_settings(connection)
             yield connection
 
-    def do(self, job: Callable[[Connection], None]) -> None:
-        """Do ``job`` with the connection; of two stores, an error names the right one."""
+    def run(self, job: Callable[[Connection], None]) -> None:
+        """Call ``job`` with the connection. Raises DatabaseError that names this database."""
         with database_errors(self.url):
             job(self.connection)
 
     def close(self) -> None:
-        """Close the connection, which gives the locks back."""
+        """Close the connection, which releases the locks."""
         self.connection.close()
 
 
@@ -90,7 +90,7 @@ def open_stores(
     """The stores of ``targets``, each sink's writer lock held. Raises ProjectionBusy."""
     stores: list[Store] = []
     try:
-        for url, sinks in _layout(targets, settings, only, loader):
+        for url, sinks in _sinks_by_url(targets, settings, only, loader):
             stores.append(Store(url, application, sinks, _open(url, application, sinks)))
         yield stores
     finally:
@@ -98,7 +98,7 @@ def open_stores(
             store.close()
 
 
-def _layout(
+def _sinks_by_url(
     targets: Targets, settings: Settings, only: Only, loader: LoaderName
 ) -> list[tuple[str, tuple[DatabaseSink, ...]]]:
     graph = GraphSink(loader)
@@ -117,12 +117,12 @@ def _open(url: str, application: str, sinks: tuple[DatabaseSink, ...]) -> Connec
     try:
         _refuse_encoding(connection, url)
         with database_errors(url):
-            # AGE and the schema commands talk; only what goes wrong is of interest.
+            # AGE and schema commands send notices.
             connection.execute("SET client_min_messages = warning")
             pin_session_settings(connection)
             for sink in sinks:
                 checkpoints.lock_writer(connection, sink.name)
-            _ensure_store(connection)
+            _ensure_schema(connection)
     except BaseException:
         connection.close()
         raise
@@ -138,9 +138,9 @@ def _refuse_encoding(connection: Connection, url: str) -> None:
         )
 
 
-def _ensure_store(connection: Connection) -> None:
+def _ensure_schema(connection: Connection) -> None:
     try:
         with connection.transaction():
             checkpoints.ensure_schema(connection)
     except (psycopg.errors.DuplicateSchema, psycopg.errors.UniqueViolation):
-        pass  # the other sink's service made it in the same moment
+        pass  # another service created it at the same moment

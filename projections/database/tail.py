@@ -1,18 +1,16 @@
 """Tail: keep the databases at the end of the log while it grows.
 
 A tail folds the log from its start, or from the last snapshot below the checkpoints (the fold's
-state lives nowhere else), and each sink listens from its own checkpoint on. One such pass
-(`_tail_pass`) lasts until the tail is stopped, unless the server loses commits that it had not
+state is kept nowhere else), and writes to each sink from its own checkpoint on. One pass
+(`TailPass`) lasts until the tail is stopped, unless the server loses commits that it had not
 flushed: then the fold is ahead of the databases, and another pass begins at their checkpoints.
 
-One pass of a tail over the log: from the checkpoints on, to its end or for as long as it grows.
-
-A batch is what has come since the last one: one event when little comes, many when it is behind.
-Each batch is one transaction per database (`_writing`).
+A batch is what has come since the last one: one event when little comes, up to `BATCH_EVENTS` when
+the tail is behind. Each batch is one transaction per database (`writer`).
 
 An event that cannot be folded is parked: its offset and the reason go to the dead letters in the
-same transaction that moves past it. Parked events stay out at every later start, so that the rows
-remain what the fold says, until a rebuild tries them again.
+same transaction that moves past it. Parked events are left out at every later start too, so that
+the rows remain what the fold says, until a rebuild tries them again.
 """
 
 import threading
@@ -39,8 +37,12 @@ from .origin import refuse_mismatch, replay_advice, rows_dropped
 from .sink import Checkpoint, SinkName
 from .stores import Only, Store, open_stores
 from .tail_progress import TailProgress, TailReport
-from .writing import AWAY, Backoff, LostCommits, OnTrouble, SinkBatch, Writer
+from .writer import AWAY, Backoff, LostCommits, OnTrouble, SinkBatch, Writer
 
+BATCH_EVENTS: Final = 500
+"""At most this many events in one transaction: about half a second of work when behind."""
+ONCE_PATIENCE_S: Final = 60.0
+"""How long `tail` with ``once`` waits for a database that is away."""
 HEARTBEAT_S: Final = 5.0
 
 OnBatch: TypeAlias = Callable[[TailReport], None]
@@ -49,7 +51,7 @@ Note: TypeAlias = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class TailPlan:
-    """What a tail was asked to do, and who wants to hear of it; see `tail`."""
+    """The arguments of `tail`."""
 
     log: Path
     targets: Targets
@@ -67,7 +69,11 @@ class TailPlan:
 
 @dataclass(slots=True)
 class TailPass:
-    """One pass; `tail` begins another when commits were lost. `begin`, then `follow`."""
+    """From the checkpoints to the end of the log, or for as long as it grows.
+
+    Call `begin`, then `follow`. ``parked`` has all dead letters by offset, ``letters`` those that
+    are to be written with the next batch.
+    """
 
     plan: TailPlan
     stores: list[Store]
@@ -80,20 +86,22 @@ class TailPass:
         """Fold and write what comes. Raises LostCommits, CheckpointMoved, ProjectionMismatch."""
         plan = self.plan
         cache = SnapshotCache(plan.log, reader.log_id, plan.settings, plan.note)
-        fold = LiveFold(plan.settings, cache.latest(self._start_at_most()))
+        fold = LiveFold(plan.settings, cache.latest(self._latest_usable_snapshot()))
         start = fold.map.next_offset
         writers = self._writers()
-        beaten = time.monotonic()
+        last_beat = time.monotonic()
         plan.on_fold(start)
-        for batch in batches(self._events(reader, start), plan.batch_events, self._starts()):
+        for batch in batches(
+            self._events(reader, start), plan.batch_events, self._checkpoint_offsets()
+        ):
             last = self._fold(fold, batch)
             if last is not None:
                 self._write(fold, writers, last)
                 plan.on_fold(Offset(last.offset + 1))
-            if time.monotonic() - beaten > HEARTBEAT_S:
-                beaten = time.monotonic()
+            if time.monotonic() - last_beat > HEARTBEAT_S:
+                last_beat = time.monotonic()
                 for writer in writers:
-                    writer.beat()
+                    writer.write_heartbeat()
             if plan.once and plan.stop.is_set():
                 break
         if fold.map.next_offset - start >= WORTH_A_SNAPSHOT and not self.parked:
@@ -118,18 +126,17 @@ class TailPass:
             for store in self.stores
         ]
 
-    def _starts(self) -> set[Offset]:
-        """Where the sinks begin to listen. A batch does not go beyond such an offset, so each batch
-        is for a sink as a whole or not at all."""
+    def _checkpoint_offsets(self) -> set[Offset]:
+        """Batches end there, so that a sink gets a batch as a whole or not at all."""
         return {checkpoint.next_offset for checkpoint in self.checkpoints.values()}
 
-    def _start_at_most(self) -> Offset:
-        """Up to which offset a snapshot is what this tail would fold: another command may have made
-        one with events that are parked here."""
+    def _latest_usable_snapshot(self) -> Offset:
+        """The highest offset of a snapshot to start from: below all checkpoints and parked events,
+        which another command may have folded."""
         return min([c.next_offset for c in self.checkpoints.values()] + list(self.parked))
 
     def begin(self, reader: LogReader) -> None:
-        """Make what is missing, read the checkpoints, refuse what does not fit."""
+        """Create what is missing, read the checkpoints, refuse those that do not match."""
         plan = self.plan
         parked: dict[Offset, DeadLetter] = {}
         for store in self.stores:
@@ -142,7 +149,7 @@ class TailPass:
                     refuse_mismatch(found, sink.name, store.place, plan.log, reader, plan.settings)
                     if made and found.next_offset:
                         raise rows_dropped(found, sink.name, store.place, plan.log, plan.settings)
-                    # At once: from here on the lock says that a tail is at work.
+                    # Now, as with the lock held `status` takes the sink for followed.
                     checkpoints.write_heartbeat(store.connection, sink.name)
                     self.checkpoints[sink.name] = found
                     letters = checkpoints.parked(store.connection, sink.name)
@@ -155,7 +162,7 @@ class TailPass:
         return replay_advice(self.plan.log, self.plan.settings)
 
     def _fold(self, fold: LiveFold, batch: list[Event]) -> Event | None:
-        """Fold a batch; its last event, None for an empty one."""
+        """Fold a batch; returns its last event, None for an empty one."""
         rest = batch
         while rest:
             stretch = list(takewhile(lambda event: event.offset not in self.parked, rest))
@@ -164,7 +171,7 @@ class TailPass:
                     self._park(event, error)
             rest = rest[len(stretch) :]
             if rest:
-                # Parked by the other sink, which is further: it has to stay out of this one too.
+                # Parked by the other sink, which is ahead: leave it out of this one too.
                 self.letters.append(self.parked[rest[0].offset])
                 fold.skip(rest[0].offset)
                 rest = rest[1:]
@@ -212,11 +219,6 @@ class TailPass:
             self.plan.on_batch(self.report)
 
 
-BATCH_EVENTS: Final = 500
-"""At most this many events in one transaction: about half a second of work when behind."""
-ONCE_PATIENCE_S: Final = 60.0
-
-
 def tail(
     log: Path,
     targets: Targets,
@@ -258,21 +260,21 @@ def tail(
     outage: Backoff | None = None
     while True:
         try:
-            if _pass(plan, report, only, loader, outage):
+            if _run_pass(plan, report, only, loader, outage):
                 return report
         except LostCommits:
             report.restarts += 1
-            # What lost them may happen again while the next pass begins.
+            # The database may be away while the next pass begins.
             at = describe_target(targets.graph_url)
             outage = Backoff(at, plan.stop, on_trouble, plan.patience_s)
 
 
-def _pass(
+def _run_pass(
     plan: TailPlan, report: TailReport, only: Only, loader: LoaderName, outage: Backoff | None
 ) -> bool:
-    """One pass; False when the database was away at its beginning. Raises LostCommits.
+    """Run one pass; False when the database was away at its beginning. Raises LostCommits.
 
-    ``outage`` is given for all but the first: that one is no place for patience.
+    ``outage`` is None for the first pass, which does not wait for a database that is away.
     """
     begun = False
     try:

@@ -25,13 +25,13 @@ _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class VectorRow(msgspec.Struct, frozen=True, eq=False, gc=False):
-    """One row, as the delta that adds it says it; what the columns hold is worked out when asked.
+    """One row: the delta that adds it; the values of the columns are computed when asked for.
 
-    ``at`` is the keyframe's pose; the event was logged at ``logged_ns``.
+    ``keyframe_pose`` is None when the robot had no pose; the event was logged at ``logged_ns``.
     """
 
     added: ObservationAdded
-    at: Pose | None
+    keyframe_pose: Pose | None
     logged_ns: int
 
     @property
@@ -51,12 +51,12 @@ class VectorRow(msgspec.Struct, frozen=True, eq=False, gc=False):
     @property
     def pose(self) -> tuple[float, float, float] | None:
         """Metres and radians; None when the robot had no pose."""
-        at = self.at
+        at = self.keyframe_pose
         return None if at is None else (at.x_um / UM_PER_M, at.y_um / UM_PER_M, at.yaw_rad)
 
     @property
     def unit(self) -> UnitVector:
-        """The embedding as the fold has it. Only what has one is a row."""
+        """The embedding as the fold has it. Every row has one."""
         assert self.added.embedding is not None  # noqa: S101 - see `BatchChanges.embedded`
         return self.added.embedding
 
@@ -72,7 +72,7 @@ class VectorRow(msgspec.Struct, frozen=True, eq=False, gc=False):
 
     @property
     def ingested_at(self) -> datetime:
-        """The same as PostgreSQL's timestamptz has it."""
+        """The same as a value of timestamptz."""
         return _EPOCH + timedelta(microseconds=self.ingested_us)
 
 

@@ -1,19 +1,17 @@
-"""Writing batches so that each is in exactly once, whatever the server does meanwhile.
+"""Write each batch exactly once, whatever the server does meanwhile.
 
 Rows and checkpoint move in one transaction, the checkpoint by compare-and-set. When a transaction
-fails because the server or the connection did, nobody knows at first whether it was committed. So
-the batch is kept, the connection is made anew (with growing pauses), and the checkpoint is asked:
+fails because the server or the connection did, it is unknown whether it was committed. So the batch
+is kept, the connection is made anew (with growing pauses), and the checkpoint is read:
 
-* it stands where the batch begins: the batch was not committed; write it again
-* it stands where the batch ends: it was committed, only the answer was lost; go on
-* it stands before: the server lost commits it had not yet flushed (``synchronous_commit = off``);
+* it is where the batch begins: the batch was not committed; write it again
+* it is where the batch ends: it was committed, only the answer was lost; go on
+* it is before that: the server lost commits it had not yet flushed (``synchronous_commit = off``);
   the rows went with it, so fold again from there (`LostCommits`)
 * anything else: somebody else writes; stop (CheckpointMoved)
 
-A heartbeat that finds the connection lost is a batch of nothing: the same is asked after it, of
-every sink of the store, so that no commit that was lost while nothing came goes unnoticed.
-
-Pauses between attempts to reach a database that is away.
+A heartbeat that finds the connection lost is treated as an empty batch, for every sink of the
+store, so that a commit that was lost while no event came is noticed.
 """
 
 import contextlib
@@ -37,7 +35,8 @@ from .sink import Checkpoint, PreparedWrite, SinkName
 from .stores import DatabaseSink, Store
 
 AWAY: Final = (DatabaseUnavailable, EmbeddedServerError)
-"""What another attempt may mend: a server killed once more while it starts does not start."""
+"""Errors after which another attempt may succeed. EmbeddedServerError: a server that is killed
+while it starts does not start."""
 FIRST_PAUSE_S: Final = 0.1
 LONGEST_PAUSE_S: Final = 5.0
 
@@ -46,7 +45,7 @@ OnTrouble: TypeAlias = Callable[[str], None]
 
 @dataclass(slots=True)
 class Backoff:
-    """One outage. Gives up after ``patience_s`` without a connection; None never does."""
+    """Growing pauses during one outage. Gives up after ``patience_s``, never for None."""
 
     place: str
     stop: threading.Event
@@ -64,7 +63,7 @@ class Backoff:
             )
 
     def failed(self, error: DatabaseError) -> None:
-        """An attempt failed: tell of it and wait longer next time. Raises it out of patience."""
+        """Report a failed attempt and double the next pause. Raises it after ``patience_s``."""
         self.waited_s += self.pause_s
         if self.patience_s is not None and self.waited_s > self.patience_s:
             raise error
@@ -72,17 +71,17 @@ class Backoff:
         self.pause_s = min(self.pause_s * 2, LONGEST_PAUSE_S)
 
 
-Found: TypeAlias = dict[SinkName, Checkpoint | None]
+FoundCheckpoints: TypeAlias = dict[SinkName, Checkpoint | None]
 """The checkpoints of a store's sinks; None where there is none."""
 
 
 class LostCommits(Exception):
-    """The database is behind what was written to it: fold again from its checkpoint."""
+    """The server lost commits: fold again from its checkpoint."""
 
 
 @dataclass(frozen=True, slots=True)
 class SinkBatch:
-    """What one sink gets in one transaction, and the checkpoints before and after it."""
+    """What is written to one sink in one transaction, and its checkpoint before and after."""
 
     sink: DatabaseSink
     write: PreparedWrite[Connection]
@@ -94,10 +93,10 @@ class SinkBatch:
 
 @dataclass(slots=True)
 class Writer:
-    """Writes to one store. ``revive`` restarts a server that is ours; ``trouble`` is told of it.
+    """Writes to one store. ``revive`` restarts a server that is ours; ``trouble`` gets messages.
 
-    ``checkpoints`` are where the sinks stand as far as we know; who calls `write` moves them.
-    Gives up after ``patience_s`` without a connection; None never does.
+    ``checkpoints`` are the sinks' as far as we know; the caller of `write` updates them.
+    Gives up after ``patience_s`` without a connection, never for None.
     """
 
     store: Store
@@ -108,7 +107,7 @@ class Writer:
     patience_s: float | None = None
 
     def write(self, batch: list[SinkBatch]) -> list[Checkpoint]:
-        """Commit a batch; the new checkpoints, in its order."""
+        """Commit a batch; returns the new checkpoints, in its order."""
         while True:
             try:
                 with database_errors(self.store.url):
@@ -119,8 +118,8 @@ class Writer:
             if not self._unchanged(found):
                 return self._committed(batch, found)
 
-    def beat(self) -> None:
-        """Say that the tail lives; a lost connection is made again.
+    def write_heartbeat(self) -> None:
+        """Record that the tail is alive; a lost connection is made again.
 
         Raises LostCommits when the server came back without what it had committed.
         """
@@ -138,10 +137,13 @@ class Writer:
 
     def _transaction(self, batch: list[SinkBatch]) -> list[Checkpoint]:
         connection = self.store.connection
-        # Few rows: all statements go out at once, two round trips in all instead of twenty, which
-        # is what the delay of a live tail is made of. COPY cannot be part of a pipeline.
-        few = all(part.write.is_small for part in batch)
-        with connection.pipeline() if few else contextlib.nullcontext(), connection.transaction():
+        # A pipeline takes two round trips instead of twenty, which is most of the delay of a live
+        # tail. COPY cannot be part of one.
+        is_small = all(part.write.is_small for part in batch)
+        with (
+            connection.pipeline() if is_small else contextlib.nullcontext(),
+            connection.transaction(),
+        ):
             for part in batch:
                 part.write.send(connection)
                 for letter in part.letters:
@@ -153,33 +155,33 @@ class Writer:
                 for part in batch
             ]
 
-    def _reconnect(self) -> Found:
-        """A new connection, and what the checkpoints are there."""
+    def _reconnect(self) -> FoundCheckpoints:
+        """Make a new connection; returns the checkpoints there."""
         backoff = Backoff(self.store.place, self.stop, self.trouble, self.patience_s)
         while True:
             backoff.wait()
             try:
                 self.revive()
                 self.store.reconnect()
-                return self._look()
+                return self._read_checkpoints()
             except AWAY as error:
                 backoff.failed(error)
 
-    def _look(self) -> Found:
-        connection, found = self.store.connection, Found()
+    def _read_checkpoints(self) -> FoundCheckpoints:
+        connection, found = self.store.connection, FoundCheckpoints()
         with database_errors(self.store.url), connection.transaction():
             for sink in self.store.sinks:
-                # What a rolled back transaction had made is not there, whatever the sink thinks.
+                # A transaction that was rolled back may have changed what the sink knows.
                 if sink.ensure(connection):
-                    raise LostCommits  # all the rows are gone; the next pass finds out why
+                    raise LostCommits  # all rows are gone; the next pass reports why
                 found[sink.name] = checkpoints.load(connection, sink.name)
         return found
 
-    def _unchanged(self, found: Found) -> bool:
-        return all(_same(found[s.name], self.checkpoints[s.name]) for s in self.store.sinks)
+    def _unchanged(self, found: FoundCheckpoints) -> bool:
+        return all(_is_same(found[s.name], self.checkpoints[s.name]) for s in self.store.sinks)
 
-    def _committed(self, batch: list[SinkBatch], found: Found) -> list[Checkpoint]:
-        """The checkpoints of a batch that is in, in its order."""
+    def _committed(self, batch: list[SinkBatch], found: FoundCheckpoints) -> list[Checkpoint]:
+        """The checkpoints of a batch that was committed, in its order."""
         ends = {part.sink.name: part.next_offset for part in batch}
         for sink in self.store.sinks:
             before, now = self.checkpoints[sink.name], found[sink.name]
@@ -194,6 +196,6 @@ class Writer:
         return [now for part in batch if (now := found[part.sink.name]) is not None]
 
 
-def _same(found: Checkpoint | None, ours: Checkpoint) -> bool:
-    """Whether a checkpoint is ours; only a rebuild notes the digest, and it changes nothing."""
+def _is_same(found: Checkpoint | None, ours: Checkpoint) -> bool:
+    """Whether they are equal but for the digest, which only a rebuild writes."""
     return found is not None and replace(found, digest=ours.digest) == ours
