@@ -261,7 +261,7 @@ def _compare_graph(
 ) -> None:
     fold = LiveFold(settings)
     for _ in _folded(fold, _events(connection, reader, checkpoint, "graph")):
-        fold.recorder.drain()
+        fold.tracker.drain()
     for label in LABELS:
         columns = ["id"] if label in VERTEX_LABELS else ["id", "start_id", "end_id"]
         ids = sql.SQL(", ").join(sql.SQL("{}::text").format(sql.Identifier(c)) for c in columns)
@@ -286,7 +286,7 @@ def _compare_vectors(
     expected = (
         _vector_row(row)
         for _ in _folded(fold, events)
-        for row in new_rows(fold.recorder.drain(), fold.view)
+        for row in new_rows(fold.tracker.drain(), fold.view)
     )
     # Binary, so that a float32 arrives as the float32 it is.
     with connection.cursor(name="check", binary=True) as cursor:

@@ -185,11 +185,13 @@ def in_place_rows(view: MapView, keyframes: Iterable[int]) -> Iterator[EdgeRow]:
             yield BASE["IN_PLACE"] + k, BASE["Keyframe"] + k, BASE["Place"] + place, _NONE
 
 
-def adjacent_to_rows(view: MapView, links: Iterable[tuple[int, int]]) -> Iterator[EdgeRow]:
+def adjacent_to_rows(
+    view: MapView, links: Iterable[tuple[PlaceOrdinal, PlaceOrdinal]]
+) -> Iterator[EdgeRow]:
     """Edges of those pairs of places that have one now."""
     base = graphid_base("ADJACENT_TO")
     for a, b in links:
-        shared = view.adjacency.get((PlaceOrdinal(a), PlaceOrdinal(b)))
+        shared = view.adjacency.get((a, b))
         if shared is not None:
             properties = f'{{"shared_transitions": {shared}}}'
             edge = base + adjacency_number(a, b)

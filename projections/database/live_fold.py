@@ -5,7 +5,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from eventsrc.envelope import Offset
 from eventsrc.log import Event
 from projections.errors import FoldError
-from projections.model.changes import ChangeRecorder
+from projections.model.changes import ChangeTracker
 from projections.model.fold import AHEAD, fold_events
 from projections.model.view import MapView
 from projections.reducers.semantic_map import SemanticMap
@@ -13,7 +13,7 @@ from projections.settings import Settings
 
 
 class LiveFold:
-    """The fold's state, its view without embeddings, and the recorder of the view's changes."""
+    """The fold's state, its view without embeddings, and the tracker of the view's changes."""
 
     def __init__(
         self, settings: Settings, start: tuple[SemanticMap, MapView] | None = None
@@ -23,7 +23,7 @@ class LiveFold:
             SemanticMap(settings),
             MapView(settings, keep_embeddings=False),
         )
-        self.recorder = ChangeRecorder(self.view)
+        self.tracker = ChangeTracker(self.view)
 
     def feed(self, events: Sequence[Event]) -> Iterator[FoldError | None]:
         """Fold events in order, a step for each: None, or why it failed.
@@ -37,7 +37,7 @@ class LiveFold:
             try:
                 for folded in fold_events(events[start:], self.map, ahead=AHEAD):
                     event = next(waiting)
-                    self.recorder.apply_event(event.offset, folded.deltas, event.logged_ns)
+                    self.tracker.apply_event(event.offset, folded.deltas, event.logged_ns)
                     start += 1
                     yield None
             except FoldError as error:

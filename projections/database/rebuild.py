@@ -226,7 +226,7 @@ def rebuild(
                 last = _fold_into(fold, events, writers, total, notify, advice)
                 folded = time.monotonic()
                 notify(RebuildProgress("writing", total, total))
-                changes = fold.recorder.drain()
+                changes = fold.tracker.drain()
                 for writer in writers:
                     writer.load(changes, fold.view)
                     writer.finish(fold.view)
@@ -289,8 +289,8 @@ def _fold_into(
                 raise FoldError(failed.offset, f"{failed.reason}; {advice(failed.offset)}")
         last = batch[-1]
         notify(RebuildProgress("folding", last.offset + 1, total))
-        if fold.recorder.added >= STREAM_ROWS:
-            changes = fold.recorder.drain()
+        if fold.tracker.added >= STREAM_ROWS:
+            changes = fold.tracker.drain()
             for writer in writers:
                 writer.load(changes, fold.view)
     return last

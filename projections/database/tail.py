@@ -191,7 +191,7 @@ class TailPass:
     def _write(self, fold: LiveFold, writers: list[Writer], last: Event) -> None:
         """Write a batch to the sinks that do not have it yet."""
         next_offset = Offset(last.offset + 1)
-        changes = fold.recorder.drain()
+        changes = fold.tracker.drain()
         written = 0
         for writer in writers:
             parts = [

@@ -1,7 +1,7 @@
 """Which rows of a `MapView` a batch of events added or changed.
 
-`ChangeRecorder` applies events to a view and records the ordinals they touch; a sink looks up what
-those say now in the view. So a thousand changes of one Object in a batch are one ordinal.
+`ChangeTracker` applies events to a view and collects the ordinals that they touch; a sink reads the
+values from the view afterwards. So a thousand changes of one Object in a batch are one ordinal.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,15 +11,19 @@ from typing import Any, ClassVar, TypeAlias
 from eventsrc.envelope import Offset
 from projections.deltas import (
     Delta,
+    KeyframeOrdinal,
     KeyframePlaced,
     ObjectFound,
     ObjectMoved,
+    ObjectOrdinal,
     ObjectSeen,
     ObservationAdded,
     PlaceChanged,
     PlaceFormed,
+    PlaceOrdinal,
     PlacesLinked,
     PlacesMerged,
+    RunOrdinal,
     RunSeen,
 )
 
@@ -45,16 +49,16 @@ class BatchChanges:
     keyframes: range
     observations: range
     embedded: list[Embedded]
-    runs: list[int]
-    objects: list[int]
-    places: list[int]
-    located: list[int]
-    placed: list[int]
-    links: list[tuple[int, int]]
+    runs: list[RunOrdinal]
+    objects: list[ObjectOrdinal]
+    places: list[PlaceOrdinal]
+    located: list[ObjectOrdinal]
+    placed: list[KeyframeOrdinal]
+    links: list[tuple[PlaceOrdinal, PlaceOrdinal]]
 
 
-class ChangeRecorder:
-    """Applies events to ``view`` and records what they change."""
+class ChangeTracker:
+    """Applies events to ``view`` and collects what they change."""
 
     def __init__(self, view: MapView) -> None:
         self.view = view
@@ -62,13 +66,13 @@ class ChangeRecorder:
 
     def apply_event(self, offset: Offset, deltas: Sequence[Delta], logged_ns: int) -> None:
         """Apply the deltas of the event at ``offset``, which was logged at ``logged_ns``."""
-        recorders = self._RECORDERS
+        collectors = self._COLLECTORS
         for delta in deltas:
             if type(delta) is ObservationAdded:
                 if delta.embedding is not None:
                     self._embedded.append((delta, logged_ns))
-            elif (record := recorders.get(type(delta))) is not None:
-                record(self, delta)
+            elif (collect := collectors.get(type(delta))) is not None:
+                collect(self, delta)
         self.view.apply_event(offset, deltas)
 
     @property
@@ -97,12 +101,12 @@ class ChangeRecorder:
         self._keyframes = len(self.view.keyframes)
         self._observations = len(self.view.observations)
         self._embedded: list[Embedded] = []
-        self._runs: set[int] = set()
-        self._objects: set[int] = set()
-        self._places: set[int] = set()
-        self._located: set[int] = set()
-        self._placed: set[int] = set()
-        self._links: set[tuple[int, int]] = set()
+        self._runs: set[RunOrdinal] = set()
+        self._objects: set[ObjectOrdinal] = set()
+        self._places: set[PlaceOrdinal] = set()
+        self._located: set[ObjectOrdinal] = set()
+        self._placed: set[KeyframeOrdinal] = set()
+        self._links: set[tuple[PlaceOrdinal, PlaceOrdinal]] = set()
 
     def _places_merged(self, delta: PlacesMerged) -> None:
         self._places.add(delta.survivor)
@@ -111,8 +115,8 @@ class ChangeRecorder:
             # Before the view applies it: afterwards they are members of the survivor.
             self._placed.update(self.view.all_places[place].unordered_members)
 
-    # Of the class, not bound to the recorder; `MapView` says why.
-    _RECORDERS: ClassVar[dict[type, Callable[["ChangeRecorder", Any], None]]] = {
+    # Of the class, not bound to the tracker; `MapView` says why.
+    _COLLECTORS: ClassVar[dict[type, Callable[["ChangeTracker", Any], None]]] = {
         RunSeen: lambda self, d: self._runs.add(d.run),
         ObjectFound: lambda self, d: self._objects.add(d.object),
         ObjectSeen: lambda self, d: self._objects.add(d.object),

@@ -185,7 +185,7 @@ class SinksAgree(RuleBasedStateMachine):
             for event in reader.read(self.memory.next_offset):
                 for _ in self.fold.feed([event]):
                     pass
-        MemorySink().prepare(self.fold.recorder.drain(), self.fold.view).send(self.memory)
+        MemorySink().prepare(self.fold.tracker.drain(), self.fold.view).send(self.memory)
         self.memory.next_offset = self.fold.map.next_offset
 
 

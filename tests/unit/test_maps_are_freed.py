@@ -47,11 +47,11 @@ def folding() -> object:
         folding,
         lambda: LiveFold(Settings()).view,
         GraphSink,
-        lambda: LiveFold(Settings()).recorder,
+        lambda: LiveFold(Settings()).tracker,
         VectorSink,
         lambda: History(Settings()),
     ],
-    ids=["view", "map", "live view", "graph sink", "recorder", "vector sink", "history"],
+    ids=["view", "map", "live view", "graph sink", "tracker", "vector sink", "history"],
 )
 def test_nobody_holds_on_to_it(make: Callable[[], object]) -> None:
     thing = make()

@@ -29,7 +29,7 @@ def followed(log: Path, size: int, start: int = 0) -> tuple[LiveFold, MemoryTabl
     with LogReader(log) as reader:
         for batch in batches(reader.read(0), size, [start]):
             assert not any(fold.feed(batch))
-            changes = fold.recorder.drain()
+            changes = fold.tracker.drain()
             if batch[0].offset >= start:
                 prepared = live.prepare(changes, fold.view)
                 prepared.send(tables)
@@ -46,7 +46,7 @@ def rebuilt(log: Path, size: int, tables: MemoryTables) -> tuple[LiveFold, dict[
     with LogReader(log) as reader:
         for batch in batches(reader.read(0), size):
             assert not any(fold.feed(batch))
-            shadow.load(fold.recorder.drain(), fold.view)(tables)
+            shadow.load(fold.tracker.drain(), fold.view)(tables)
     rows = shadow.finish(fold.view)(tables)
     shadow.lock_readers(tables)
     shadow.swap_in(tables)
@@ -77,7 +77,7 @@ def test_readers_see_the_old_rows_until_the_swap(log: Path) -> None:
     before = {label: dict(rows) for label, rows in tables.graph.items()}
     shadow = MemorySink().shadow()
     shadow.create(tables)
-    shadow.load(fold.recorder.drain(), fold.view)(tables)
+    shadow.load(fold.tracker.drain(), fold.view)(tables)
     shadow.finish(fold.view)(tables)
     assert tables.graph == before
 
