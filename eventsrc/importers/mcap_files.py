@@ -8,7 +8,7 @@ from eventsrc.errors import MapfoldError
 from eventsrc.log import LogReader
 from eventsrc.log.foreign_mcap import ForeignDamage, foreign_messages
 
-from .json_lines import ImportedMessage
+from .source import ImportedMessage
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 

@@ -18,8 +18,9 @@ from eventsrc.ingest import Rejected
 from eventsrc.log import FsyncPolicy, LogWriter
 from eventsrc.system_events import LOSS_KEY, REJECTED_KEY
 
-from .json_lines import ImportedMessage, JsonLines, Source
+from .json_lines import JsonLines
 from .mcap_files import MCAP_MAGIC, McapFile, OtherLog
+from .source import ImportedMessage, Source
 
 DEFAULT_KEY = "tb/detections"
 STDIN = "-"

@@ -24,7 +24,7 @@ from eventsrc.importers import (
     check_sources,
     import_files,
 )
-from eventsrc.importers.json_lines import Source
+from eventsrc.importers.source import Source
 from eventsrc.log import LogWriter
 from eventsrc.text import counted, visible
 from eventsrc.transport.config import check_key

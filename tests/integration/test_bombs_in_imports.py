@@ -1,4 +1,4 @@
-"""MCAP files of others that declare, or hold, far more than they are worth reading."""
+"""Import of MCAP files that are bombs or declare false sizes, in bounded memory."""
 
 import io
 import random
@@ -87,7 +87,7 @@ def test_a_bomb_ends_the_import_with_its_place_and_little_memory(name: str, tmp_
     assert [e.payload for e in read_log(log)] == [GOOD]
 
 
-def test_what_is_not_wanted_is_passed_by_whatever_its_size(tmp_path: Path) -> None:
+def test_other_channels_are_skipped_whatever_their_size(tmp_path: Path) -> None:
     """An attachment of two gibibytes, most of it a hole."""
     file, log = tmp_path / "file.mcap", tmp_path / "log"
     with file.open("wb") as out:
@@ -131,9 +131,7 @@ def test_every_message_of_a_good_file_is_read(whole: bytes) -> None:
 
 
 @given(data=st.data())
-def test_a_file_that_was_changed_is_damage_and_nothing_else(
-    whole: bytes, data: st.DataObject
-) -> None:
+def test_a_changed_file_raises_only_foreign_damage(whole: bytes, data: st.DataObject) -> None:
     changed = bytearray(whole)
     for _ in range(data.draw(st.integers(1, 3))):
         at = data.draw(st.integers(0, len(changed)))
@@ -142,7 +140,7 @@ def test_a_file_that_was_changed_is_damage_and_nothing_else(
     read(bytes(changed))
 
 
-def test_a_file_that_was_cut_gives_what_came_before(whole: bytes) -> None:
+def test_a_cut_file_gives_the_messages_before_the_cut(whole: bytes) -> None:
     everything, _ = read(whole)
     chance = random.Random(1)
     for at in sorted(chance.sample(range(len(whole)), 40)):

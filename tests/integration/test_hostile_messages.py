@@ -1,4 +1,4 @@
-"""What a stranger can send to a recorder: it goes on, and nothing is dropped in silence."""
+"""Hostile messages and keys: the recorder goes on, and nothing is dropped silently."""
 
 import subprocess
 import sys
@@ -79,7 +79,7 @@ def test_keys_of_any_length_stop_no_recorder(connected: Sessions, tmp_path: Path
     assert verify_log(tmp_path / "log").findings == ()
 
 
-def test_a_message_far_over_the_limit_is_lost_and_said_to_be(
+def test_a_message_far_over_the_limit_is_a_reported_loss(
     connected: Sessions, tmp_path: Path
 ) -> None:
     robot = connected()
@@ -103,14 +103,14 @@ def test_a_message_far_over_the_limit_is_lost_and_said_to_be(
     assert log_info(tmp_path / "log").lost == 2
 
 
-def test_what_zenoh_would_fail_inside_on_is_not_sent(connected: Sessions) -> None:
+def test_keys_that_make_zenoh_panic_are_not_sent(connected: Sessions) -> None:
     session = connected()
     for send in (lambda key: session.send(key, b""), session.publisher):
         with pytest.raises(TransportError, match=r"key 'kkk.*20,000 bytes are more than 16,384"):
             send("k" * 20_000)  # type: ignore[operator]
 
 
-def test_a_panic_of_zenoh_is_an_error_of_ours(endpoint: str) -> None:
+def test_a_panic_of_zenoh_is_a_transport_error(endpoint: str) -> None:
     done = subprocess.run(
         [sys.executable, "-c", PANIC, endpoint],
         capture_output=True,
@@ -125,7 +125,7 @@ def test_a_panic_of_zenoh_is_an_error_of_ours(endpoint: str) -> None:
     assert last == "interrupted"
 
 
-def test_half_a_surrogate_pair_in_a_key_is_kept(tmp_path: Path) -> None:
+def test_a_lone_surrogate_in_a_key_is_escaped(tmp_path: Path) -> None:
     """From a file: Zenoh's own keys are UTF-8."""
     with LogWriter(tmp_path / "log") as writer:
         append_payload(writer, "t/\ud800", payload(envelope(1)))

@@ -43,7 +43,7 @@ def test_a_log_and_its_segments_import_into_the_same_events(run: Commands) -> No
     assert read_log(run.folder / "a") == read_log(run.folder / "b") == read_log(run.folder / "c")
 
 
-def test_import_says_what_it_did(run: Commands) -> None:
+def test_import_prints_its_counts(run: Commands) -> None:
     report = run("import", "a", "-", "--json", stdin=b"\n".join([*PAYLOADS, b"junk"]), code=3).json
     assert report == {
         "log": "a",
@@ -68,12 +68,12 @@ def test_torn_gzip_keeps_what_came_before(run: Commands) -> None:
     assert 0 < len(payloads_of(run, "a")) < 10_000
 
 
-def test_nothing_is_made_when_a_file_is_missing(run: Commands) -> None:
+def test_no_log_is_created_when_a_file_is_missing(run: Commands) -> None:
     run("import", "a", "missing.jsonl", code=2)
     assert not (run.folder / "a").exists()
 
 
-def test_a_file_that_cannot_be_looked_at_is_one_line(run: Commands) -> None:
+def test_an_unreadable_file_is_one_line(run: Commands) -> None:
     said = run("import", "L2", "x" * 300, code=2)
     assert said.err.endswith("File name too long; check the path\n")
     assert said.err.count("\n") == 1

@@ -1,4 +1,4 @@
-"""MCAP files of others: JSON channels come in, in file order, the rest is counted."""
+"""Import of MCAP files: JSON channels in file order; other messages are counted."""
 
 from pathlib import Path
 
@@ -27,7 +27,7 @@ def run(tmp_path: Path) -> Commands:
     return Commands.in_folder(tmp_path)
 
 
-def test_json_channels_come_in_as_they_were(run: Commands) -> None:
+def test_json_channels_are_imported_unchanged(run: Commands) -> None:
     said = run("import", "L", "other.mcap", code=3)
     assert "4 messages other than JSON passed over, 1 rejected" in said.err
     events = read_log(run.folder / "L")
@@ -36,7 +36,7 @@ def test_json_channels_come_in_as_they_were(run: Commands) -> None:
     assert events[0].stamp_ns == 1774357200 * 10**9, "the envelope's own time, not the file's"
 
 
-def test_a_torn_file_gives_what_came_before(run: Commands) -> None:
+def test_a_torn_file_gives_the_messages_before_the_damage(run: Commands) -> None:
     file = run.folder / "other.mcap"
     file.write_bytes(file.read_bytes()[:900])
     said = run("import", "L", "other.mcap", code=1)

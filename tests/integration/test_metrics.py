@@ -22,7 +22,7 @@ REPORT = RecorderReport(
 )
 
 
-def test_every_number_is_scraped_as_it_is_at_that_moment(tmp_path: Path) -> None:
+def test_every_metric_is_scraped_with_its_current_value(tmp_path: Path) -> None:
     with serving_metrics(("127.0.0.1", 0), lambda: REPORT, tmp_path) as port:
         scraped = scrape(port)
     assert scraped.pop("mapfold_recorder_disk_free_bytes") > 0
@@ -51,7 +51,7 @@ def test_a_busy_port_is_one_clear_line(tmp_path: Path) -> None:
         pytest.fail("two servers on one port")
 
 
-def test_connections_held_open_keep_no_scrape_out_and_give_way(tmp_path: Path) -> None:
+def test_open_connections_block_no_scrape_and_the_oldest_are_closed(tmp_path: Path) -> None:
     with ExitStack() as held, serving_metrics(("127.0.0.1", 0), lambda: REPORT, tmp_path) as port:
         silent = [held.enter_context(connect(port)) for _ in range(5 * MAX_CONNECTIONS)]
         for connection in silent:
@@ -67,7 +67,7 @@ def test_a_silent_connection_is_closed(tmp_path: Path, monkeypatch: pytest.Monke
         assert ask(port, b"GET /metrics HTTP/1.1\r\n") == b""
 
 
-def test_numbers_that_others_can_read_are_warned_of(
+def test_a_metrics_address_off_loopback_gets_a_warning(
     start: Callable[..., Program], endpoint: str, tmp_path: Path
 ) -> None:
     args = ("record", str(tmp_path / "log"), "--connect", endpoint, "--metrics")
@@ -75,7 +75,7 @@ def test_numbers_that_others_can_read_are_warned_of(
     assert "everybody who can reach it reads" in recorder.wait_for("warning: --metrics 0.0.0.0:0")
 
 
-def test_the_record_command_serves_them(
+def test_the_record_command_serves_metrics(
     start: Callable[..., Program],
     publish: Callable[..., Program],
     endpoint: str,

@@ -73,7 +73,7 @@ def test_what_is_acknowledged_is_in_the_log(
     assert _stored(tmp_path / "log") == sent
 
 
-def test_a_dictionary_is_encoded(
+def test_a_dictionary_is_published_as_json(
     robot: EnvelopePublisher, recorder: Callable[[], Program], tmp_path: Path
 ) -> None:
     recorder()
@@ -97,7 +97,7 @@ def test_it_starts_without_a_router_and_sends_when_there_is_one(
     assert _stored(tmp_path / "log") == [payload(envelope(k)) for k in range(10)]
 
 
-def test_what_an_earlier_process_left_is_sent(
+def test_envelopes_spooled_by_an_earlier_process_are_sent(
     endpoint: str, recorder: Callable[[], Program], tmp_path: Path
 ) -> None:
     options = ZenohOptions(connect=(endpoint,))
@@ -128,7 +128,7 @@ def test_it_sends_again_until_a_recorder_answers(
     assert set(_stored(tmp_path / "log")) == {payload(envelope(1))}
 
 
-def test_only_a_window_is_under_way(endpoint: str, connected: Sessions, tmp_path: Path) -> None:
+def test_at_most_a_window_is_in_transit(endpoint: str, connected: Sessions, tmp_path: Path) -> None:
     """The viewer never acknowledges: until the first comes again, it has seen the window alone."""
     seen: list[int] = []
     again, more = threading.Event(), threading.Event()
@@ -154,7 +154,7 @@ def test_only_a_window_is_under_way(endpoint: str, connected: Sessions, tmp_path
         assert max(seen) <= 14
 
 
-def test_what_was_lost_does_not_fill_the_window(
+def test_lost_envelopes_do_not_fill_the_window(
     endpoint: str, connected: Sessions, tmp_path: Path
 ) -> None:
     """The first nine of a window of ten get no ack: they come again while the rest goes on."""
@@ -182,7 +182,7 @@ def test_what_was_lost_does_not_fill_the_window(
         assert seen.index(0, 1) > 10, "others were acknowledged before"
 
 
-def test_two_robots_hear_their_own_acks(
+def test_two_robots_get_their_own_acks(
     endpoint: str, recorder: Callable[[], Program], tmp_path: Path
 ) -> None:
     recorder()
@@ -252,7 +252,7 @@ def test_a_router_that_comes_and_goes_loses_nothing(start: Start, tmp_path: Path
 
 
 @pytest.mark.slow
-def test_a_recorder_that_stands_still_until_its_router_gives_it_up_loses_nothing(
+def test_a_recorder_stopped_until_its_router_disconnects_it_loses_nothing(
     robot: EnvelopePublisher,
     connected: Sessions,
     recorder: Callable[[], Program],
@@ -301,15 +301,15 @@ def test_nonsense_on_the_ack_key_acknowledges_nothing(
 @pytest.mark.parametrize(
     "bad", [b"no json", {"run_id": "run-a"}, envelope(1, timestamp=float("nan")), {"run_id": {1}}]
 )
-def test_what_no_recorder_accepts_is_refused_here(robot: EnvelopePublisher, bad: object) -> None:
+def test_an_invalid_envelope_is_refused_on_publishing(
+    robot: EnvelopePublisher, bad: object
+) -> None:
     with pytest.raises(InvalidEnvelope, match="envelope not published: "):
         robot.publish(bad)  # type: ignore[arg-type]
     assert robot.unacknowledged == 0
 
 
-def test_what_a_recorder_refuses_holds_nothing_up(
-    start: Start, endpoint: str, tmp_path: Path
-) -> None:
+def test_refused_envelopes_block_nothing(start: Start, endpoint: str, tmp_path: Path) -> None:
     """More envelopes are refused than may be under way, before and between good ones."""
     log = tmp_path / "log"
     recorder = start("record", str(log), "--connect", endpoint, "--max-payload", "1000")
@@ -333,7 +333,7 @@ def test_what_a_recorder_refuses_holds_nothing_up(
         assert {one.log_id for one in refused} == {reader.log_id}
 
 
-def test_what_was_refused_is_kept_and_can_be_sent_to_a_recorder_that_was_mended(
+def test_refused_envelopes_are_kept_and_can_be_sent_again(
     start: Start, endpoint: str, tmp_path: Path
 ) -> None:
     options = ZenohOptions(connect=(endpoint,))
@@ -353,7 +353,7 @@ def test_what_was_refused_is_kept_and_can_be_sent_to_a_recorder_that_was_mended(
     assert _stored(tmp_path / "log") == [payload(envelope(1))]
 
 
-def test_only_the_very_bytes_that_were_sent_are_refused(
+def test_refusals_apply_only_to_the_same_bytes_under_the_same_key(
     robot: EnvelopePublisher, connected: Sessions
 ) -> None:
     """Nonsense, other bytes of the same size, and another robot's key change nothing."""
@@ -383,7 +383,7 @@ def test_only_the_very_bytes_that_were_sent_are_refused(
     assert robot.flush(DEADLINE_S)
 
 
-def test_an_ack_that_comes_when_the_recorder_has_left_is_taken(
+def test_an_ack_after_the_recorder_has_unsubscribed_is_applied(
     robot: EnvelopePublisher, connected: Sessions
 ) -> None:
     """As a recorder leaves it unsubscribes, syncs what it has, and acknowledges that."""
@@ -404,7 +404,7 @@ def test_an_ack_that_comes_when_the_recorder_has_left_is_taken(
     assert robot.flush(DEADLINE_S)
 
 
-def test_a_robot_tells_how_far_it_has_got_and_tells_it_once_more_when_it_ends(
+def test_progress_is_published_and_once_more_at_the_end(
     endpoint: str, connected: Sessions, tmp_path: Path
 ) -> None:
     arrived = threading.Semaphore(0)
@@ -426,13 +426,13 @@ def test_a_robot_tells_how_far_it_has_got_and_tells_it_once_more_when_it_ends(
         awaited.discard(told.get(timeout=DEADLINE_S))
 
 
-def test_a_key_of_our_own_is_refused_at_once(tmp_path: Path) -> None:
+def test_a_reserved_key_is_misuse(tmp_path: Path) -> None:
     with pytest.raises(MisuseError, match="every recorder refuses envelopes under mapfold/"):
         EnvelopePublisher(ZenohOptions(), tmp_path / "spool", "mapfold/detections")
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_sending_thread_that_dies_is_told(
+def test_publish_raises_when_the_sending_thread_has_died(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def die(_: Sender) -> None:
@@ -448,13 +448,13 @@ def test_a_sending_thread_that_dies_is_told(
 
 
 @pytest.mark.parametrize("key", ["", "tb//detections", "/tb", "tb/*"])
-def test_a_key_that_nothing_can_be_sent_under_is_refused_at_once(tmp_path: Path, key: str) -> None:
+def test_an_invalid_key_is_misuse(tmp_path: Path, key: str) -> None:
     """Else it would be tried for ever, and only the spool would grow."""
     with pytest.raises(MisuseError, match="nothing can be published under it"):
         EnvelopePublisher(ZenohOptions(), tmp_path / "spool", key)
 
 
-def test_a_full_spool_is_the_callers_to_decide(endpoint: str, tmp_path: Path) -> None:
+def test_publish_raises_when_the_spool_is_full(endpoint: str, tmp_path: Path) -> None:
     message = payload(envelope(1))
     options = ZenohOptions(connect=(endpoint,))
     with EnvelopePublisher(options, tmp_path / "spool", max_spool_bytes=len(message)) as robot:
@@ -471,9 +471,7 @@ def test_a_full_spool_is_the_callers_to_decide(endpoint: str, tmp_path: Path) ->
         (ZenohOptions(config_file=Path("no-file")), "no such Zenoh configuration"),
     ],
 )
-def test_options_that_can_never_work_are_refused_at_once(
-    tmp_path: Path, options: ZenohOptions, complaint: str
-) -> None:
+def test_invalid_options_are_misuse(tmp_path: Path, options: ZenohOptions, complaint: str) -> None:
     with pytest.raises(MisuseError, match=complaint):
         EnvelopePublisher(options, tmp_path / "spool")
 

@@ -30,7 +30,9 @@ def test_every_keyframe_arrives_byte_for_byte_and_in_order(
     assert f"published {len(payloads)} on tb/detections" in program.lines[-1]
 
 
-def test_it_says_so_when_nobody_listens(endpoint: str, start: Callable[..., Program]) -> None:
+def test_simulate_without_a_subscriber_is_one_line(
+    endpoint: str, start: Callable[..., Program]
+) -> None:
     program = start("simulate", "--wait", "0.2", "--connect", endpoint)
     assert program.wait() == 1
     (line,) = program.lines
@@ -58,7 +60,7 @@ def test_a_file_is_written_with_its_numbers(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["", "two\nlines", "x" * 101])
-def test_a_run_that_could_not_be_told_from_others_is_refused(name: str) -> None:
+def test_an_unprintable_empty_or_long_run_name_is_misuse(name: str) -> None:
     command = "from projections.cli import main; main()"
     done = subprocess.run(
         [sys.executable, "-c", command, "simulate", "--run", name, "--out", "never.jsonl"],

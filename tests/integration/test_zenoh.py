@@ -1,4 +1,4 @@
-"""The door to Zenoh, on real sessions: what is sent arrives, what fails says so in one line."""
+"""Zenoh sessions against real routers: messages arrive, failures are errors of one line."""
 
 import queue
 import threading
@@ -66,7 +66,7 @@ def test_an_advanced_publishers_numbers_arrive_and_the_last_one_again(connected:
         pass
 
 
-def test_what_is_no_heartbeat_tells_nothing(connected: Sessions) -> None:
+def test_messages_that_are_no_heartbeats_are_ignored(connected: Sessions) -> None:
     told: queue.SimpleQueue[SequenceNumber] = queue.SimpleQueue()
     subscriber, sender = connected(), connected()
     subscriber.subscribe_heartbeats("tb/x", told.put)
@@ -76,7 +76,7 @@ def test_what_is_no_heartbeat_tells_nothing(connected: Sessions) -> None:
     assert told.get(timeout=DEADLINE_S) == SequenceNumber("b:2", 1)
 
 
-def test_a_publisher_knows_whether_anybody_listens(connected: Sessions) -> None:
+def test_a_publisher_knows_whether_there_is_a_subscriber(connected: Sessions) -> None:
     publisher = connected().publisher("tb/detections")
     assert not publisher.has_subscriber
     assert not publisher.wait_for_subscriber(0.01)
@@ -85,7 +85,7 @@ def test_a_publisher_knows_whether_anybody_listens(connected: Sessions) -> None:
     subscription.close()
 
 
-def test_a_closed_subscription_is_silent(connected: Sessions) -> None:
+def test_a_closed_subscription_receives_nothing(connected: Sessions) -> None:
     arrived: queue.SimpleQueue[Received] = queue.SimpleQueue()
     subscriber, publisher = connected(), connected().publisher("tb/detections")
     closed = subscriber.subscribe("tb/*", arrived.put)
@@ -97,7 +97,7 @@ def test_a_closed_subscription_is_silent(connected: Sessions) -> None:
     assert arrived.empty()
 
 
-def test_confirm_means_the_router_knows(connected: Sessions) -> None:
+def test_confirm_returns_when_the_router_has_the_declarations(connected: Sessions) -> None:
     publisher_session = connected()
     subscriber = connected()
     arrived = threading.Event()
@@ -107,7 +107,7 @@ def test_confirm_means_the_router_knows(connected: Sessions) -> None:
     assert arrived.wait(DEADLINE_S)
 
 
-def test_a_question_is_answered_or_refused(connected: Sessions) -> None:
+def test_a_query_gets_a_reply_or_an_error(connected: Sessions) -> None:
     def turn_around(query: Query) -> None:
         if query.payload:
             query.reply(query.key, query.payload[::-1])
@@ -125,7 +125,7 @@ def test_a_question_is_answered_or_refused(connected: Sessions) -> None:
     assert refused == [(False, b"nothing asked")]
 
 
-def test_a_peer_can_be_called_directly() -> None:
+def test_peers_connect_without_a_router() -> None:
     with open_session(LOOPBACK, mode="peer") as peer:
         assert not peer.is_connected
 
@@ -185,14 +185,14 @@ def test_sending_on_a_closed_session_is_an_error(connected: Sessions) -> None:
         publisher.put(b"x")
 
 
-def test_the_configuration_file_says_where(tmp_path: Path, endpoint: str) -> None:
+def test_the_configuration_file_has_the_endpoint(tmp_path: Path, endpoint: str) -> None:
     file = tmp_path / "zenoh.json5"
     file.write_text(f"{{ connect: {{ endpoints: ['{endpoint}'] }} }}")
     with open_session(ZenohOptions(config_file=file), mode="client") as session:
         assert session.is_connected
 
 
-def test_the_command_line_goes_before_the_file(tmp_path: Path, endpoint: str) -> None:
+def test_the_command_line_takes_precedence_over_the_file(tmp_path: Path, endpoint: str) -> None:
     file = tmp_path / "zenoh.json5"
     file.write_text("{ mode: 'router', connect: { endpoints: ['tcp/127.0.0.1:1'] } }")
     options = ZenohOptions(connect=(endpoint,), config_file=file)
@@ -210,6 +210,6 @@ def test_a_bad_configuration_file_is_named(tmp_path: Path, text: str | None) -> 
     assert str(file) in _one_line(caught.value)
 
 
-def test_a_recorder_is_a_peer_when_others_may_call_it() -> None:
+def test_a_recorder_that_listens_is_a_peer() -> None:
     assert ZenohOptions().mode == "client"
     assert ZenohOptions(listen=("tcp/127.0.0.1:0",)).mode == "peer"

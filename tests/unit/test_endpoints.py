@@ -1,4 +1,4 @@
-"""A malformed endpoint is named as such, and never as a router that is down."""
+"""Endpoints and addresses: malformed ones are reported as such."""
 
 import pytest
 
@@ -43,7 +43,7 @@ def test_a_malformed_endpoint_is_named(text: str, complaint: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_the_order_stays() -> None:
+def test_the_order_of_endpoints_is_kept() -> None:
     assert check_endpoints(["tcp/b:1", "tcp/a:2"]) == ("tcp/b:1", "tcp/a:2")
 
 
@@ -56,16 +56,16 @@ def test_an_address_is_a_port_or_host_and_port(text: str, address: tuple[str, in
 
 
 @pytest.mark.parametrize("text", ["", "x", ":1", "host:", "70000", "host:-1"])
-def test_what_is_no_address_names_the_option(text: str) -> None:
+def test_an_invalid_address_names_the_option(text: str) -> None:
     with pytest.raises(MisuseError, match=f"--metrics {text!r}"):
         parse_address(text, "--metrics")
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.9.9.9", "::1", "[::1]", "localhost"])
-def test_what_only_this_machine_reaches(host: str) -> None:
+def test_loopback_addresses(host: str) -> None:
     assert is_loopback(host)
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "[::]", "192.0.2.1", "example", "localhost.x"])
-def test_what_others_may_reach(host: str) -> None:
+def test_addresses_other_than_loopback(host: str) -> None:
     assert not is_loopback(host)

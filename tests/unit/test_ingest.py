@@ -1,4 +1,4 @@
-"""Every refusal of the envelope's contract, each with a reason that names the field."""
+"""Every rejection of an invalid envelope, with a reason that names the field."""
 
 import json
 from typing import Any
@@ -28,7 +28,7 @@ def without(document: dict[str, Any], field: str) -> dict[str, Any]:
     return {k: v for k, v in document.items() if k != field}
 
 
-def test_a_whole_envelope_is_read_as_it_was_sent() -> None:
+def test_a_valid_envelope_is_accepted_unchanged_with_its_vectors() -> None:
     sent = envelope(
         42, 2.14, 0.83, detections=[detection("cup", VECTOR, det_id="d"), detection("chair")]
     )
@@ -42,12 +42,12 @@ def test_a_whole_envelope_is_read_as_it_was_sent() -> None:
     assert read.vectors[1] is None
 
 
-def test_unknown_fields_are_let_through() -> None:
+def test_unknown_fields_are_accepted() -> None:
     accepted(envelope(battery=0.4, detections=[detection(track=7)]))
 
 
 @pytest.mark.parametrize("odd", [float("nan"), float("-inf"), [0.1, {"deep": [float("inf")]}]])
-def test_unknown_fields_must_be_json_too(odd: Any) -> None:
+def test_nan_and_infinity_in_unknown_fields_are_rejected(odd: Any) -> None:
     """Python would read it; the log is read by others as well, who would not."""
     assert refusal(envelope(covariance=odd)).startswith("covariance: holds NaN or infinity (got ")
     seen = [detection(), detection(depth=odd)]
@@ -63,7 +63,7 @@ def test_an_unknown_field_named_like_one_of_ours_changes_nothing() -> None:
     assert isinstance(read.envelope.model_dump(), dict)
 
 
-def test_a_robot_without_a_pose_is_heard() -> None:
+def test_an_envelope_without_a_pose_is_accepted() -> None:
     assert accepted(envelope(x=None)).envelope.map_x is None
     assert accepted(envelope(map_x=None, map_y=None, map_yaw=None)).envelope.map_x is None
 
@@ -189,7 +189,9 @@ def test_a_bad_vector_is_refused(fields: dict[str, Any], says: str) -> None:
     ],
     ids=["empty", "long", "nul", "tab", "c1"],
 )
-def test_ids_are_clean_text(field: str, text: str, says: str) -> None:
+def test_empty_long_or_control_characters_in_ids_are_rejected(
+    field: str, text: str, says: str
+) -> None:
     broken = (
         envelope(run_id=text)
         if field == "run_id"
@@ -198,7 +200,7 @@ def test_ids_are_clean_text(field: str, text: str, says: str) -> None:
     assert says in refusal(broken)
 
 
-def test_256_characters_are_not_too_many() -> None:
+def test_an_id_of_256_characters_is_accepted() -> None:
     accepted(envelope(run_id="x" * 256))
 
 
@@ -207,7 +209,7 @@ def test_a_det_id_twice_in_one_envelope_is_refused() -> None:
     assert refusal(envelope(detections=twice)).startswith("detections.2.det_id: 'd' stands twice")
 
 
-def test_a_given_det_id_may_not_clash_with_a_made_one() -> None:
+def test_a_det_id_equal_to_a_default_one_is_rejected() -> None:
     clash = [detection(det_id="run-a_kf1_d1"), detection()]
     assert "stands twice" in refusal(envelope(detections=clash))
 
@@ -222,7 +224,7 @@ def test_further_errors_are_counted() -> None:
     assert refusal({}) == "run_id: required field is missing (and 3 more)"
 
 
-def test_a_reason_quotes_a_long_value_shortly() -> None:
+def test_a_reason_abbreviates_a_long_value() -> None:
     assert len(refusal(envelope(timestamp="x" * 10_000))) < 200
 
 

@@ -101,26 +101,26 @@ def reason(document: Any) -> str:
     return said.reason
 
 
-def test_the_first_bad_detection_ends_the_reading() -> None:
+def test_parsing_stops_at_the_first_bad_detection() -> None:
     """`and 2 more` are those of this detection, not the thousands behind it."""
     broken = envelope(detections=[{}] * 5_000)
     assert reason(broken) == "detections.0.class: required field is missing (and 2 more)"
 
 
-def test_the_first_unknown_field_that_is_no_number_ends_the_reading() -> None:
+def test_parsing_stops_at_the_first_non_finite_unknown_field() -> None:
     odd = {f"f{n}": float("nan") for n in range(5_000)}
     assert reason(envelope(**odd)) == "f0: holds NaN or infinity (got nan)"
     assert reason(odd) == "f0: holds NaN or infinity (got nan)"
     assert reason({**odd, "detections": 7}) == "f0: holds NaN or infinity (got nan)"
 
 
-def test_of_a_field_that_stands_twice_the_last_counts() -> None:
+def test_the_last_of_a_repeated_field_counts() -> None:
     assert isinstance(ingest(payload(envelope())[:-1] + b',"u":NaN,"u":1}'), Accepted)
     assert reason(payload(envelope())[:-1] + b',"u":1,"u":NaN}').startswith("u: holds NaN")
     assert reason(payload(envelope())[:-1] + b',"run_id":"x","run_id":2}').endswith("(got 2)")
 
 
-def test_so_many_detections_and_no_more() -> None:
+def test_the_number_of_detections_is_bounded() -> None:
     most = [detection()] * MAX_DETECTIONS
     assert isinstance(ingest(payload(envelope(detections=most))), Accepted)
     assert reason(envelope(detections=[*most, detection()])).startswith(
@@ -128,7 +128,7 @@ def test_so_many_detections_and_no_more() -> None:
     )
 
 
-def test_so_many_values_and_no_more() -> None:
+def test_the_number_of_json_values_is_bounded() -> None:
     image = [0] * (MAX_JSON_VALUES - 100)
     assert isinstance(ingest(payload(envelope(depth=image))), Accepted)
     assert reason(envelope(depth=[*image, *[0] * 101])).endswith(
@@ -146,11 +146,11 @@ def test_so_many_values_and_no_more() -> None:
     ],
     ids=["text", "nested", "small", "empty"],
 )
-def test_a_reason_shows_how_a_wrong_value_begins(value: Any, shown: str) -> None:
+def test_a_reason_shows_the_start_of_a_wrong_value(value: Any, shown: str) -> None:
     assert reason(envelope(timestamp=value)).endswith(f"(got {shown})")
 
 
-def test_a_reason_escapes_what_a_terminal_would_obey() -> None:
+def test_a_reason_escapes_control_characters() -> None:
     said = reason(envelope(detections=[detection(**{"\x1b]0;x\x07\u202e": float("inf")})]))
     assert said.startswith(r"detections.0.\x1b]0;x\x07\u202e: holds NaN or infinity")
 

@@ -1,4 +1,4 @@
-"""Which keys messages can bear."""
+"""Keys that envelopes can be published under."""
 
 import pytest
 
@@ -9,7 +9,7 @@ from eventsrc.transport.config import check_key
 @pytest.mark.parametrize(
     "key", ["k", "k" * 1024, "tb/detections", "robot-7/küche/é", "@a/b", "a:b/c.d"]
 )
-def test_a_key(key: str) -> None:
+def test_valid_keys_pass(key: str) -> None:
     assert check_key(key, "--key") == key
 
 
@@ -31,7 +31,7 @@ def test_a_key(key: str) -> None:
         ("é" * 513, "1026 bytes long, more than 1024"),
     ],
 )
-def test_no_key(key: str, says: str) -> None:
+def test_invalid_keys_are_misuse(key: str, says: str) -> None:
     with pytest.raises(MisuseError, match="--key") as caught:
         check_key(key, "--key")
     assert says in str(caught.value)

@@ -5,7 +5,8 @@ import json
 
 import pytest
 
-from eventsrc.importers.json_lines import ImportedMessage, read_line
+from eventsrc.importers.json_lines import read_line
+from eventsrc.importers.source import ImportedMessage
 
 TS = 1740000000.123
 TS_NS = 1740000000123000000
@@ -16,7 +17,7 @@ def record(payload_text: bytes) -> bytes:
     return b'{"ts": 1740000000.123, "iso": "x", "key": "tb/d", "payload": %s}' % payload_text
 
 
-def test_json_is_cut_out_as_it_stands() -> None:
+def test_a_json_payload_is_cut_out_verbatim() -> None:
     assert read_line(record(ODD)) == ImportedMessage(ODD, "tb/d", TS_NS)
 
 
@@ -26,7 +27,7 @@ def test_members_may_stand_in_any_order(tail: bytes) -> None:
     assert read_line(line) == ImportedMessage(ODD, "k", TS_NS)
 
 
-def test_a_string_is_its_text() -> None:
+def test_a_string_payload_is_its_text() -> None:
     line = record(json.dumps('{"run_id": "é🙂"}').encode())
     assert read_line(line).payload == '{"run_id": "é🙂"}'.encode()
     assert read_line(record(b'"not json"')).payload == b"not json"
@@ -56,11 +57,11 @@ def test_the_older_logger_kept_bare_lists() -> None:
         b"plain",
     ],
 )
-def test_anything_else_is_the_message_itself(line: bytes) -> None:
+def test_any_other_line_is_the_message_itself(line: bytes) -> None:
     assert read_line(line) == ImportedMessage(line)
 
 
 @pytest.mark.parametrize("ts", [b'"soon"', b"null", b"-1", b"1e99", b"NaN", b"Infinity"])
-def test_a_time_that_is_none_is_left_out(ts: bytes) -> None:
+def test_an_invalid_time_is_left_out(ts: bytes) -> None:
     line = b'{"ts": %s, "key": "k", "payload": {}}' % ts
     assert read_line(line) == ImportedMessage(b"{}", "k", None)

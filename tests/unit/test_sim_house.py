@@ -70,7 +70,7 @@ def test_every_room_can_be_reached_through_doors(house: House) -> None:
     assert {door.width_m for door in house.plan.doors} == {DOOR_M, OPENING_M}
 
 
-def test_a_seed_is_a_house_and_another_seed_another() -> None:
+def test_equal_seeds_give_equal_houses_and_others_do_not() -> None:
     assert build_house(3).things == build_house(3).things
     assert build_floor_plan(3) == build_floor_plan(3)
     assert build_floor_plan(3) != build_floor_plan(4)

@@ -57,7 +57,7 @@ def test_the_seed_makes_the_run_byte_for_byte() -> None:
     assert digest == WITNESS_SHA256
 
 
-def test_runs_are_sessions_of_their_own() -> None:
+def test_runs_differ_in_session_and_tour() -> None:
     assert _run("a").run_id != _run("b").run_id
     assert _run("a").house.things == _run("b").house.things
     assert _run("b").envelopes[0]["timestamp"] > _run("a").envelopes[-1]["timestamp"]
@@ -133,7 +133,7 @@ def test_some_labels_are_wrong_and_some_detections_are_of_nothing() -> None:
     assert 0.008 < phantoms / keyframes < 0.04
 
 
-def test_the_truth_runs_parallel_and_never_stands_in_a_payload() -> None:
+def test_the_truth_is_parallel_to_the_envelopes_and_in_no_payload() -> None:
     run = _run("a")
     for envelope, truth in zip(run.envelopes, run.truth, strict=True):
         assert set(truth) == {"run_id", "keyframe_id", "room", "instances"}

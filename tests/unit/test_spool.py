@@ -1,4 +1,4 @@
-"""The robot's spool: bounded, in order, and still there after the process."""
+"""The robot's spool: bounded, ordered, durable beyond the process."""
 
 import sqlite3
 import subprocess
@@ -34,7 +34,7 @@ def spool(tmp_path: Path) -> Iterator[Spool]:
     spool.close()
 
 
-def test_it_keeps_the_order_and_counts_on(spool: Spool) -> None:
+def test_envelopes_keep_their_order_and_seq_grows(spool: Spool) -> None:
     for k in (3, 1, 2):
         spool.add("run-a", k, b"%d" % k)
     assert spool.after(0, 2) == [
@@ -46,7 +46,7 @@ def test_it_keeps_the_order_and_counts_on(spool: Spool) -> None:
     assert len(spool) == 3
 
 
-def test_an_ack_frees_the_bytes_it_names_and_nothing_else(spool: Spool) -> None:
+def test_an_ack_removes_only_the_bytes_it_names(spool: Spool) -> None:
     """Not even the same keyframe of the same run, with other bytes."""
     for message in (b"a", b"b", b"A", b"a"):
         spool.add("run-a", 1, message)
@@ -67,7 +67,7 @@ def test_it_is_bounded_and_an_ack_makes_room(spool: Spool) -> None:
     assert len(spool) == 2
 
 
-def test_what_was_refused_is_set_aside_with_its_reason(spool: Spool) -> None:
+def test_a_refused_envelope_is_quarantined_with_its_reason(spool: Spool) -> None:
     for k, message in enumerate((b"a", b"b", b"c", b"a")):
         spool.add("run-a", k, message)
     assert spool.refuse(_refusals(b"a", b"c", b"nobody's"), up_to=3) == 2
@@ -86,7 +86,7 @@ def test_what_was_refused_is_set_aside_with_its_reason(spool: Spool) -> None:
         assert again.refused(10) == []
 
 
-def test_an_ack_frees_what_was_refused_too(spool: Spool) -> None:
+def test_an_ack_removes_quarantined_envelopes_too(spool: Spool) -> None:
     """Of two recorders one refuses and the other does not."""
     for k in range(3):
         spool.add("run-a", k, b"%d" % k)
@@ -95,7 +95,9 @@ def test_an_ack_frees_what_was_refused_too(spool: Spool) -> None:
     assert [one.keyframe_id for one in spool.refused(10)] == [0]
 
 
-def test_what_was_refused_gives_way_but_is_not_forgotten(spool: Spool) -> None:
+def test_quarantined_bytes_are_dropped_for_new_envelopes_and_their_reason_stays(
+    spool: Spool,
+) -> None:
     for k in range(3):
         spool.add("run-a", k, b"%d" % k * 30)
     spool.refuse(_refusals(b"0" * 30, b"1" * 30), up_to=3)
@@ -114,7 +116,7 @@ def test_what_was_refused_gives_way_but_is_not_forgotten(spool: Spool) -> None:
             again.add("run-a", 5, b"x")
 
 
-def test_what_waits_is_there_for_the_next_process(tmp_path: Path) -> None:
+def test_spooled_envelopes_survive_the_process(tmp_path: Path) -> None:
     code = (
         "import os, sys; from pathlib import Path; from eventsrc.robot.spool import Spool\n"
         "spool = Spool(Path(sys.argv[1])); spool.add('run-a', 7, b'kept'); os._exit(9)"
@@ -127,7 +129,7 @@ def test_what_waits_is_there_for_the_next_process(tmp_path: Path) -> None:
         assert _payloads(spool) == [b"kept", b"after"]
 
 
-def test_numbers_are_never_used_twice(tmp_path: Path) -> None:
+def test_a_seq_is_never_used_twice(tmp_path: Path) -> None:
     """A cursor over the spool may outlive the row it points at."""
     spool = Spool(tmp_path / "spool")
     spool.add("run-a", 1, b"1")
@@ -138,7 +140,7 @@ def test_numbers_are_never_used_twice(tmp_path: Path) -> None:
         assert again.after(1, 10) == [Spooled(2, "run-a", 2, b"2")]
 
 
-def test_one_owner(tmp_path: Path, spool: Spool) -> None:
+def test_a_second_owner_is_refused(tmp_path: Path, spool: Spool) -> None:
     spool.add("run-a", 1, b"1")
     with pytest.raises(SpoolError, match="another robot process uses it"):
         Spool(tmp_path / "spool")
@@ -162,7 +164,7 @@ def test_a_place_where_no_file_can_be_is_named(tmp_path: Path) -> None:
         Spool(tmp_path)
 
 
-def test_a_closed_spool_says_so(spool: Spool) -> None:
+def test_using_a_closed_spool_is_an_error(spool: Spool) -> None:
     spool.close()
     with pytest.raises(SpoolError, match="closed"):
         spool.add("run-a", 1, b"1")
@@ -191,7 +193,7 @@ insert into refused values (1, 'run-a', 1, null, 'log', 'too blue'),
 """
 
 
-def test_a_spool_of_an_earlier_version_is_gone_on_from(tmp_path: Path) -> None:
+def test_a_spool_of_an_earlier_version_is_upgraded(tmp_path: Path) -> None:
     """It did not name payloads; acks name nothing else."""
     with closing(sqlite3.connect(tmp_path / "spool")) as db:
         db.executescript(_OLD_SCHEMA)

@@ -1,4 +1,4 @@
-"""Yesterday's payloads are recorded as they came and read as today's envelopes."""
+"""Payloads of older versions are recorded verbatim and read as current envelopes."""
 
 import json
 from pathlib import Path
@@ -45,13 +45,13 @@ def test_what_is_no_bare_list_is_refused_with_a_reason(payload: bytes) -> None:
     assert read.reason
 
 
-def test_a_version_from_the_future_is_named() -> None:
+def test_an_unknown_version_is_named() -> None:
     read = read_envelope(event(envelope(1), ENVELOPE_VERSION + 1))
     assert isinstance(read, Rejected)
     assert "upgrade" in read.reason
 
 
-def test_the_ladder_has_every_rung() -> None:
+def test_there_is_an_upcaster_for_every_older_version() -> None:
     assert sorted(UPCASTERS) == list(range(1, ENVELOPE_VERSION))
 
 
@@ -59,7 +59,7 @@ def test_the_ladder_has_every_rung() -> None:
     ("payload", "version"),
     [(BARE, 1), (b' \n[ {"class"', 1), (b"[1]", 2), (b"[]", 2), (b"{}", 2), (b"", 2)],
 )
-def test_guessing(payload: bytes, version: int) -> None:
+def test_the_version_is_detected_from_the_payload(payload: bytes, version: int) -> None:
     assert detect_version(payload) == version
 
 
@@ -79,7 +79,7 @@ def test_a_log_of_both_forms_keeps_the_bytes_and_folds(log_path: Path) -> None:
 
 
 @pytest.mark.parametrize("said", ["", "two", "\x00", "-1", "9" * 5_000])
-def test_a_channel_that_says_no_version_a_reader_knows_stops_no_reader(said: str) -> None:
+def test_a_channel_of_an_invalid_version_stops_no_reader(said: str) -> None:
     channel = key_channel(1, 1, KEY, ENVELOPE_VERSION)
     channel.metadata[ENVELOPE_VERSION_KEY] = said
     assert isinstance(read_envelope(event(envelope(1), envelope_version(channel))), Rejected)

@@ -1,4 +1,4 @@
-"""What a session is told to listen on, whatever a configuration file says or leaves out."""
+"""Listen endpoints and message bound of a session, with and without a configuration file."""
 
 import json
 from pathlib import Path
@@ -43,7 +43,7 @@ def _configured(
         ZENOHS_OWN,
     ],
 )
-def test_a_session_listens_on_loopback_or_nowhere_unless_told(
+def test_a_session_listens_on_loopback_or_nowhere_by_default(
     tmp_path: Path, text: str | None, mode: Mode
 ) -> None:
     listens = json.loads(_configured(tmp_path, text, mode).get_json("listen/endpoints"))
@@ -53,7 +53,9 @@ def test_a_session_listens_on_loopback_or_nowhere_unless_told(
 
 @pytest.mark.parametrize("mode", ["client", "peer", "router"])
 @pytest.mark.parametrize("text", [None, "{}", f"{{listen: {{endpoints: ['{ELSEWHERE}']}}}}"])
-def test_the_command_line_says_where_first(tmp_path: Path, text: str | None, mode: Mode) -> None:
+def test_endpoints_of_the_command_line_replace_those_of_the_file(
+    tmp_path: Path, text: str | None, mode: Mode
+) -> None:
     config = _configured(tmp_path, text, mode, ("tcp/127.0.0.3:0",))
     assert json.loads(config.get_json("listen/endpoints")) == ["tcp/127.0.0.3:0"]
 
@@ -68,7 +70,7 @@ def test_the_command_line_says_where_first(tmp_path: Path, text: str | None, mod
         ("[]", []),
     ],
 )
-def test_a_file_that_says_where_is_heeded(
+def test_listen_endpoints_of_a_file_are_used(
     tmp_path: Path, endpoints: str, listens: list[str]
 ) -> None:
     config = _configured(tmp_path, f"{{listen: {{endpoints: {endpoints}}}}}", "router")
@@ -83,7 +85,7 @@ def test_a_file_that_says_where_is_heeded(
         ("{transport: {link: {rx: {max_message_size: 77}}}}", 2**27, 77),
     ],
 )
-def test_a_file_says_how_large_a_message_may_be(
+def test_a_message_bound_of_a_file_is_used(
     tmp_path: Path, text: str, largest: int | None, size: int
 ) -> None:
     config = _configured(tmp_path, text, "client", largest=largest)

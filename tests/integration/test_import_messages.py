@@ -1,4 +1,4 @@
-"""What `mapfold import` tells people: what was rejected and where, and how far a cut import got."""
+"""Messages of `mapfold import`: rejections with their place, progress of an interrupted import."""
 
 import signal
 import subprocess
@@ -24,7 +24,9 @@ def _lines(first: int, count: int) -> list[bytes]:
     return [payload(envelope(k)) for k in range(first, first + count)]
 
 
-def test_rejects_are_told_with_file_line_and_reason_and_the_rest_counted(run: Commands) -> None:
+def test_rejections_are_printed_with_file_line_and_reason_and_the_rest_counted(
+    run: Commands,
+) -> None:
     (run.folder / "a.jsonl").write_bytes(b"\n".join([*_lines(0, 2), b"", b"junk", b"[1]"]))
     (run.folder / "b.jsonl").write_bytes(b"{}\n" * 8)
     said = run("import", "L", "a.jsonl", "b.jsonl", code=3).err.splitlines()
@@ -41,7 +43,7 @@ def test_rejects_are_told_with_file_line_and_reason_and_the_rest_counted(run: Co
     assert len(said) == 2
 
 
-def test_ctrl_c_says_what_is_kept_and_how_far_that_is(run: Commands) -> None:
+def test_ctrl_c_prints_what_is_kept_and_its_last_place(run: Commands) -> None:
     program = subprocess.Popen(
         [PROGRAM, "import", "L", "-"],
         cwd=run.folder,
@@ -66,7 +68,7 @@ def test_ctrl_c_says_what_is_kept_and_how_far_that_is(run: Commands) -> None:
     assert len(read_log(run.folder / "L")) == 4
 
 
-def test_a_cut_is_exact_also_in_the_midst_of_a_message(tmp_path: Path) -> None:
+def test_an_interruption_is_exact_also_within_a_message(tmp_path: Path) -> None:
     """Ctrl-C comes while a message that is refused is being appended."""
     files = [str(tmp_path / name) for name in ("a.jsonl", "b.jsonl")]
     Path(files[0]).write_bytes(b"\n".join(_lines(0, 100)))
