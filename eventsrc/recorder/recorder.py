@@ -1,4 +1,4 @@
-"""Zenoh to log: callback → bounded queue → one writer thread."""
+"""Record what is published over Zenoh: callback → bounded queue → one writer thread."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -13,23 +13,23 @@ from eventsrc.log import LogWriter
 from eventsrc.robot.acks import ACK_PREFIX, MAX_SENT_BYTES, sent_key
 from eventsrc.transport.session import Received, SequenceNumber, Session, SizeLimit, check_keys
 
-from .queue import DEFAULT_QUEUE_SIZE, Inbox
-from .writer_thread import RecorderReport, Writing
+from .queue import DEFAULT_QUEUE_SIZE, MessageQueue
+from .writer_thread import RecorderReport, WriterThread
 
 DEFAULT_KEYS: Final = ("tb/detections",)
-_REJECTED_WHOLE: Final = 2
-"""A message of up to so many times the size limit, or the default limit if that is larger, is
-rejected and kept, and its robot is told, so that it stops sending it. A larger one is a loss: it
-would be in memory several times over before it is on the disk."""
+_MAX_REJECTED: Final = 2
+"""A message of up to this many times the size limit (or the default limit, if larger) is rejected,
+kept and answered, so that its robot stops sending it. A larger one is counted as lost, because it
+would be in memory several times before it is on the disk."""
 
 
 class Recorder:
     """Records everything under ``keys`` from an open session into an open log.
 
-    Subscribed when the constructor returns: from then on nothing published passes it by. ``ledger``
-    is what the log already holds (see `eventsrc.gap_history`); without it, a gap between an earlier
-    recorder's last keyframe and this one's first is not seen, and no ledger is saved.
-    ``report_gaps`` off is for robots that do not count their keyframes by one.
+    It is subscribed when the constructor returns. ``ledger`` is the log's gap history
+    (`eventsrc.gap_history`); without it, a gap between an earlier recorder's last keyframe and this
+    one's first is not found, and no ledger is saved. Turn ``report_gaps`` off for robots that do
+    not count their keyframes by one.
     """
 
     def __init__(
@@ -46,28 +46,28 @@ class Recorder:
     ) -> None:
         check_keys(keys)
         self._session = session
-        self._inbox = Inbox(queue_size)
-        self._writing = Writing(
-            self._inbox,
+        self._queue = MessageQueue(queue_size)
+        self._writer_thread = WriterThread(
+            self._queue,
             writer,
             ledger,
-            self._answer,
+            self._send_reply,
             max_events=max_events,
             report_gaps=report_gaps,
             max_payload_bytes=max_payload_bytes,
         )
         limit = SizeLimit(
-            _REJECTED_WHOLE * max(max_payload_bytes, DEFAULT_MAX_PAYLOAD_BYTES), self._refuse
+            _MAX_REJECTED * max(max_payload_bytes, DEFAULT_MAX_PAYLOAD_BYTES), self._count_too_large
         )
-        # A longer one says nothing, like any that cannot be read: no event is lost with it.
+        # A larger announcement is ignored, as is one that cannot be read: it is no event.
         sent_limit = SizeLimit(MAX_SENT_BYTES, lambda _key, _number: None)
         self._subscriptions = [
             subscription
             for key in keys
             for subscription in (
                 session.subscribe(key, self._receive, limit=limit),
-                session.subscribe(sent_key(key), self._inbox.put, limit=sent_limit),
-                session.subscribe_heartbeats(key, self._inbox.told),
+                session.subscribe(sent_key(key), self._queue.put, limit=sent_limit),
+                session.subscribe_heartbeats(key, self._queue.put_heartbeat),
             )
         ]
         session.confirm()
@@ -81,22 +81,22 @@ class Recorder:
     ) -> RecorderReport:
         """Record until ``stop`` is set, then drain the queue and sync.
 
-        ``watch`` is called in this thread about every ``every_s`` seconds. Raises what ended the
-        writing early, a LogError, and `report` then says what was lost with it; ``stop`` is set
-        then too, and when ``max_events`` is reached.
+        ``watch`` is called in this thread about every ``every_s`` seconds. ``stop`` is also set
+        when ``max_events`` is reached or the log cannot be written; the latter raises LogError, and
+        `report` counts what was lost.
         """
         with ThreadPoolExecutor(1, thread_name_prefix="log-writer") as thread:
-            writing = thread.submit(self._writing.run)
+            writing = thread.submit(self._writer_thread.run)
             writing.add_done_callback(lambda _: stop.set())
             try:
                 self._wait(stop, every_s, watch)
             finally:
                 self._drain(writing)
-        return self._writing.report()
+        return self._writer_thread.report()
 
     def report(self) -> RecorderReport:
-        """The numbers so far; may be asked for from any thread."""
-        return self._writing.report()
+        """The numbers so far; may be called from any thread."""
+        return self._writer_thread.report()
 
     def _wait(
         self,
@@ -111,21 +111,21 @@ class Recorder:
     def _drain(self, writing: "Future[None]") -> None:
         for subscription in self._subscriptions:
             subscription.close()
-        self._inbox.close()
+        self._queue.close()
         writing.result()
 
     def _receive(self, message: Received) -> None:
-        # Under `**` a recorder hears acks and refusals, its own too. They are answers, not data.
+        # A recorder of `**` receives acks and refusals too, also its own. They are not data.
         if not message.key.startswith(ACK_PREFIX):
-            self._inbox.put(message)
+            self._queue.put(message)
 
-    def _refuse(self, key: str, number: SequenceNumber | None) -> None:
+    def _count_too_large(self, key: str, number: SequenceNumber | None) -> None:
         if not key.startswith(ACK_PREFIX):
-            self._inbox.refuse(key, number)
+            self._queue.count_too_large(key, number)
 
-    def _answer(self, key: str, payload: bytes) -> None:
+    def _send_reply(self, key: str, payload: bytes) -> None:
         try:
             self._session.send(key, payload)
         except TransportError:
-            # No way to tell the robot now. It will send again, and be answered again.
+            # The robot will send again, and this recorder reply again.
             return

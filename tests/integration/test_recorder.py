@@ -18,8 +18,8 @@ from eventsrc.gap_history import ledger_of, save_ledger
 from eventsrc.gaps import Gap
 from eventsrc.log import Event, FsyncPolicy, LogReader, LogWriter
 from eventsrc.recorder import Recorder, RecorderReport
-from eventsrc.recorder.queue import Inbox
-from eventsrc.recorder.writer_thread import Writing
+from eventsrc.recorder.queue import MessageQueue
+from eventsrc.recorder.writer_thread import WriterThread
 from eventsrc.robot.acks import (
     MAX_PER_ACK,
     MAX_SENT_BYTES,
@@ -143,7 +143,7 @@ def test_wildcards_record_every_key_under_its_own_name(connected: Sessions, tmp_
     }
 
 
-def test_our_own_events_cannot_be_forged_from_the_network(
+def test_system_events_cannot_be_forged_from_the_network(
     connected: Sessions, tmp_path: Path
 ) -> None:
     forged = Loss(publisher="run-a", count=5, cause="queue_full").model_dump_json().encode()
@@ -272,7 +272,9 @@ def test_a_refusal_follows_when_the_rejected_bytes_are_synced(
         assert heard[0].log_id == reader.log_id
 
 
-def test_a_queue_that_stays_full_loses_loudly(connected: Sessions, tmp_path: Path) -> None:
+def test_messages_lost_in_a_full_queue_are_counted_and_recorded(
+    connected: Sessions, tmp_path: Path
+) -> None:
     """The clock is the gate: the writer stands in its first append until the gate opens."""
     entered, gate = threading.Event(), threading.Event()
     gate.set()
@@ -315,7 +317,7 @@ def _losses(log: Path) -> list[Loss]:
     return [Loss.model_validate_json(e.payload) for e in _events(log) if e.key == LOSS_KEY]
 
 
-def test_what_an_advanced_publisher_sent_and_never_came_is_a_loss(
+def test_gaps_in_sequence_numbers_are_recorded_as_losses(
     connected: Sessions, tmp_path: Path
 ) -> None:
     """The numbers of an advanced publisher are put on by hand, so that some can be left out; and
@@ -342,7 +344,7 @@ def test_what_an_advanced_publisher_sent_and_never_came_is_a_loss(
     assert [(x.first, x.last) for x in losses if x.cause == "keyframe_gap"] == [(2, 3), (6, 8)]
 
 
-def test_the_last_keyframes_of_a_run_are_missed_when_their_robot_says_that_it_sent_them(
+def test_an_announcement_reveals_that_the_last_keyframes_are_missing(
     connected: Sessions, tmp_path: Path
 ) -> None:
     """The words of a publisher of ours, without the messages. What it says is nothing to record."""
@@ -458,7 +460,7 @@ def recording_later(session: Session, log: Path, gone: Router) -> Iterator[Runni
         yield running
 
 
-def test_it_stops_after_as_many_as_asked_for(connected: Sessions, tmp_path: Path) -> None:
+def test_it_stops_after_max_events(connected: Sessions, tmp_path: Path) -> None:
     with LogWriter(tmp_path / "log") as writer:
         running = Running(Recorder(connected(), writer, [KEY], max_events=3))
         publisher = connected().publisher(KEY)
@@ -515,12 +517,12 @@ def test_what_was_received_and_could_not_be_written_is_counted(
     assert (report.recorded, report.unwritten, report.lost, report.clean) == (0, 11, 11, False)
 
 
-def test_what_is_lost_before_it_was_answered_is_not_answered(tmp_path: Path) -> None:
-    """The recorder comes to tell of the first group when the second has found the file deleted."""
+def test_events_lost_before_their_acknowledgement_are_not_acknowledged(tmp_path: Path) -> None:
+    """The first group is processed only when the second has found the file deleted."""
     answered: list[tuple[str, bytes]] = []
     writer = LogWriter(tmp_path / "log")
-    writing = Writing(
-        Inbox(),
+    thread = WriterThread(
+        MessageQueue(),
         writer,
         None,
         lambda key, said: answered.append((key, said)),
@@ -529,12 +531,12 @@ def test_what_is_lost_before_it_was_answered_is_not_answered(tmp_path: Path) -> 
         max_payload_bytes=2**20,
     )
     for run_id, count in (("lost", 3), ("kept", 2)):
-        writing._record([Received(KEY, p) for p in _keyframes(*range(count), run_id=run_id)])
+        thread._append([Received(KEY, p) for p in _keyframes(*range(count), run_id=run_id)])
         writer.sync()
         if run_id == "lost":
             next((tmp_path / "log").glob("*.active")).unlink()
-    writing._follow_up()
-    report = writing.report()
+    thread._process_synced()
+    report = thread.report()
     assert (report.recorded, report.lost_from_log, report.clean) == (2, 3, False)
     assert {b"lost" in said for _, said in answered} == {False}
     assert len(answered) == 1
@@ -543,9 +545,7 @@ def test_what_is_lost_before_it_was_answered_is_not_answered(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("keys", [["tb/*", "tb/detections"], ["**", "a"], ["a", "a"]])
-def test_overlapping_keys_would_record_twice(
-    connected: Sessions, tmp_path: Path, keys: list[str]
-) -> None:
+def test_overlapping_keys_are_refused(connected: Sessions, tmp_path: Path, keys: list[str]) -> None:
     with LogWriter(tmp_path / "log") as writer, pytest.raises(MisuseError, match="overlap"):
         Recorder(connected(), writer, keys)
 
