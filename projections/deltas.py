@@ -1,9 +1,9 @@
-"""What changed in the map: the contract between the fold and everything built on it.
+"""Deltas: what an event changed in the map. The contract between the fold and all that uses it.
 
-Sinks, the view, time travel and the web page are folds over these deltas and never look into a
-reducer. A delta carries *absolute* new values (a count, not an increment), so applying the last one
-per thing is enough, and applying one twice does no harm. ``offset`` names the event that caused it;
-the cause need not be a keyframe.
+Sinks, the view and time travel are built from deltas and never look into a reducer. A delta carries
+*absolute* new values (a count, not an increment): the last one per thing is enough, and applying
+one twice does no harm. ``offset`` is that of the event that caused it, which need not be a
+keyframe.
 
 Ordinals number the things of one kind 0, 1, 2 … in the order in which the fold met or founded them.
 They are never reused, and a database's ids are computed from them. They are ints at run time; mypy
@@ -37,6 +37,7 @@ ObservationOrdinal = NewType("ObservationOrdinal", int)
 PlaceOrdinal = NewType("PlaceOrdinal", int)
 ObjectOrdinal = NewType("ObjectOrdinal", int)
 SkipKind: TypeAlias = Literal["duplicate", "conflict", "det_id_reused"]
+"""Why an envelope, or an observation of it, is left out of the map; see `EventSkipped`."""
 UnitVector: TypeAlias = NDArray[np.int32]
 """A unit vector as multiples of 2⁻²⁰, int32 of shape (dim,); see `projections.exact`."""
 
@@ -60,7 +61,7 @@ class Pose(msgspec.Struct, frozen=True, gc=False):
 
 
 class RunSeen(msgspec.Struct, frozen=True, gc=False):
-    """A run was met for the first time, or turned out to have started earlier.
+    """A run is new, or started earlier than known so far.
 
     ``started_at`` is the earliest keyframe timestamp of the run so far, in seconds.
     """
@@ -72,7 +73,7 @@ class RunSeen(msgspec.Struct, frozen=True, gc=False):
 
 
 class KeyframeAdded(msgspec.Struct, frozen=True, gc=False):
-    """A new keyframe; ``pose`` is None when the robot did not know where it was."""
+    """A new keyframe; ``pose`` is None when the envelope has none."""
 
     offset: Offset
     keyframe: KeyframeOrdinal
@@ -122,7 +123,7 @@ class EventSkipped(msgspec.Struct, frozen=True, gc=False):
 
 
 class PlaceFormed(msgspec.Struct, frozen=True, gc=False):
-    """A place was founded by the keyframe that became its first core point.
+    """A new place, founded by the keyframe ``founder``, its first core point.
 
     ``place_id`` is ``{run_id}_p{counter}`` with a counter from 0 per founding run.
     """

@@ -1,18 +1,18 @@
-"""Errors of the fold, its settings and the databases; this side's branch of `eventsrc.errors`.
+"""Errors of the fold, its settings and the databases; all are `eventsrc.errors.MapfoldError`.
 
 MapfoldError
 ├── SettingsError               2  a setting's name or value is wrong
-├── WhenceError                 2  a point in the log does not exist
+├── LogPointError               2  a point in the log does not exist
 ├── QuestionError               2  a question about the map cannot be asked as it is
 ├── FoldError                   1  an event cannot be folded; names its offset
 └── DatabaseError               1  a database cannot be used as asked
-    ├── DatabaseUnavailable     1  no server answers, or it refused us
+    ├── DatabaseUnavailable     1  no server answers, or it refused the connection
     ├── ExtensionMissing        1  the server lacks AGE or pgvector
     ├── EmbeddedServerError     1  the embedded server cannot run here or did not start
     ├── ProjectionMissing       1  nothing has been projected there yet
     ├── ProjectionMismatch      1  made from another log or with other settings
     ├── ProjectionBusy          1  a rebuild or a tail already writes this target
-    └── CheckpointMoved         1  someone else moved the checkpoint under us
+    └── CheckpointMoved         1  another process moved the checkpoint
 """
 
 from eventsrc.envelope import Offset
@@ -25,7 +25,7 @@ class SettingsError(MapfoldError):
     exit_code = 2
 
 
-class WhenceError(MapfoldError):
+class LogPointError(MapfoldError):
     """A point in the log does not exist."""
 
     exit_code = 2
@@ -46,7 +46,7 @@ class FoldError(MapfoldError):
         self.reason = reason
 
     def __reduce__(self) -> tuple[type["FoldError"], tuple[int, str]]:
-        """It travels between processes by what it was made of, not by its message."""
+        """Pickle the arguments, not the message, so that it passes between processes."""
         return FoldError, (self.offset, self.reason)
 
 
@@ -55,7 +55,7 @@ class DatabaseError(MapfoldError):
 
 
 class DatabaseUnavailable(DatabaseError):
-    """No server answers, or it refused us."""
+    """No server answers, or it refused the connection."""
 
 
 class ExtensionMissing(DatabaseError):
@@ -79,4 +79,4 @@ class ProjectionBusy(DatabaseError):
 
 
 class CheckpointMoved(DatabaseError):
-    """Someone else moved the checkpoint under us."""
+    """Another process moved the checkpoint."""

@@ -1,10 +1,9 @@
 """Arithmetic that gives the same bits on every machine, thread count and BLAS.
 
-Why it is exact. Floating-point sums depend on their order, and every BLAS kernel has its own. So
-nothing is summed here that is not an integer below 2⁵³ in magnitude, partial sums included: such
-sums are exact in float64 (and in int64), and what is exact has no order. What must be rounded is
-rounded by the operations that IEEE 754 defines to the last bit: +, ×, ÷, √ of two numbers, rint,
-and scaling by a power of two.
+Floating-point sums depend on their order, and every BLAS kernel has its own. So only integers are
+summed here whose sums, partial ones included, are below 2⁵³ in magnitude: these are exact in
+float64 (and in int64), whatever their order. What must be rounded is rounded by the operations that
+IEEE 754 defines to the last bit: +, ×, ÷ of two numbers, √, rint, and scaling by a power of two.
 
 Unit vectors are int32 multiples of 2⁻²⁰ (``UnitVector``). To make one, the float32 components are
 scaled by the power of two that brings the largest below 2²⁰ and rounded to integers; their squares
@@ -18,8 +17,6 @@ which up to 2¹² of them one product is enough, and two up to 2³² (`long_dot`
 Positions are integer micrometres, correctly rounded from the float that came; ±10¹³ (10,000 km,
 guarded by the envelope). Squared distances reach 8·10²⁶, so they are Python integers, never int64,
 unless the caller has bounded the difference first.
-
-Plane geometry in integer micrometres, and neighbourhoods other than plain distance.
 """
 
 import math
@@ -33,8 +30,8 @@ from numpy.typing import NDArray
 from .deltas import Pose, UnitVector
 
 Units: TypeAlias = tuple[NDArray[np.float64], UnitVector, int]
-"""A unit vector twice, the same integers, multiples of 2⁻²⁰, in float64 and in int32; and its exact
-squared norm, a multiple of 2⁻⁴⁰ near 1."""
+"""A unit vector in float64 and in int32, the same multiples of 2⁻²⁰, and its exact squared norm, a
+multiple of 2⁻⁴⁰ near 1."""
 
 UNIT_BITS = 20
 UNIT = 1 << UNIT_BITS
@@ -43,8 +40,8 @@ UM_PER_M = 1_000_000
 MAX_DIMENSION = 16_384
 MAX_IN_ONE_DOT = 1 << 12
 MAX_IN_A_SUM = 1 << 32
-"""Unit vectors; a component of their sum, a little over 2³² · 2²⁰ at most, is below 2⁵³. A robot
-that looks at one chair ten times a second gets there after thirteen years."""
+"""Unit vectors; a component of their sum, a little over 2³² · 2²⁰ at most, is below 2⁵³. At ten
+observations of one object a second, that is thirteen years."""
 _HALF_BITS = 21
 _SAFE_UM = 1e12
 
@@ -66,7 +63,7 @@ def mean_m(sum_um: int, count: int) -> float:
 
 
 def quantise(vector: NDArray[np.float32]) -> UnitVector:
-    """The direction of a finite, non-zero float32 vector of shape (dim,), dim ≤ 16,384."""
+    """The unit vector of a finite, non-zero float32 vector of shape (dim,), dim ≤ 16,384."""
     unit: UnitVector = quantise_rows(vector[np.newaxis])[0]
     return unit
 
@@ -97,10 +94,8 @@ def squared_norms(rows: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def unit_vectors(vectors: Sequence[NDArray[np.float32] | None]) -> list[Units | None]:
-    """`unit_rows` and `quantise_rows` of each vector that is there, made together.
-
-    A vector's result does not depend on the others; making many at once is what saves time.
-    """
+    """The `Units` of each vector, None for None. Many at once take less time than one by one; the
+    result for a vector does not depend on the others."""
     units: list[Units | None] = [None] * len(vectors)
     for dim in sorted({len(vector) for vector in vectors if vector is not None}):
         indices = [i for i, v in enumerate(vectors) if v is not None and len(v) == dim]
@@ -138,13 +133,13 @@ def long_dot(vector_sum: NDArray[np.float64], unit: NDArray[np.float64]) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Neighbourhood:
-    """``holds(a, b)`` says whether two poses are neighbours.
+    """A rule other than plain distance: ``holds(a, b)`` says whether two poses are neighbours.
 
-    It must be symmetric and pure. It is asked only for two poses that differ by at most
-    ``reach_um`` in x and in y; others are none, and a pose is its own neighbour whatever it says.
+    It must be symmetric and pure. It is called only for two different poses that differ by at most
+    ``reach_um`` in x and in y; others are not neighbours, and a pose is its own.
 
-    ``name`` stands for all of it in `Settings.neighbourhood`, and so in the fingerprint: a rule
-    that would say otherwise of any two poses needs another name.
+    ``name`` identifies the rule in `Settings.neighbourhood`, and so in the fingerprint: a rule that
+    gives another result for any two poses needs another name.
     """
 
     name: str

@@ -1,7 +1,7 @@
 """Every parameter that changes the fold, in one frozen model.
 
-The fingerprint is part of a checkpoint's identity: a projection made with other settings is another
-projection, and is refused rather than mixed.
+The fingerprint is part of a checkpoint's identity: a projection made with other settings is
+refused, not mixed.
 """
 
 import hashlib
@@ -15,7 +15,7 @@ from eventsrc.envelope import Text, describe_error
 
 from .errors import SettingsError
 
-_MOST_SHOWN = 80
+_MAX_SHOWN = 80
 
 
 class Settings(BaseModel):
@@ -42,7 +42,7 @@ class Settings(BaseModel):
     def fingerprint(self) -> str:
         """16 hex digits that are equal exactly when every setting is."""
         plain = {"neighbourhood"} if self.neighbourhood is None else None
-        canonical = self.model_dump_json(exclude=plain)  # as it was before there was the setting
+        canonical = self.model_dump_json(exclude=plain)  # fingerprints older than the setting hold
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
     def with_assignments(self, assignments: Iterable[str], option: str = "--set") -> "Settings":
@@ -65,12 +65,12 @@ class Settings(BaseModel):
             return Settings.model_validate(values)
         except ValidationError as error:
             first = error.errors()[0]
-            told = f"{first['loc'][0]}={_plain(str(first['input']))}: {_rule(first)}"
-            raise SettingsError(f"{option} {told}") from None
+            fault = f"{first['loc'][0]}={_plain(str(first['input']))}: {_rule(first)}"
+            raise SettingsError(f"{option} {fault}") from None
 
     @classmethod
     def from_document(cls, document: object) -> "Settings":
-        """Settings out of parsed JSON. Raises SettingsError that says what is wrong, not where."""
+        """Settings from parsed JSON. Raises SettingsError; its message does not name the file."""
         if not isinstance(document, dict):
             raise SettingsError('no JSON object; write one such as {"eps_m": 1.0}')
         try:
@@ -80,28 +80,27 @@ class Settings(BaseModel):
             name = str(first["loc"][0])
             if first["type"] == "extra_forbidden":
                 raise SettingsError(_no_setting(name)) from None
-            told = f"{name} is {_shown(first['input'])}: {_rule(first)}"
-            raise SettingsError(told) from None
+            raise SettingsError(f"{name} is {_shown(first['input'])}: {_rule(first)}") from None
         if settings.neighbourhood is not None:
             raise SettingsError(_no_setting("neighbourhood"))
         return settings
 
 
 def _rule(error: ErrorDetails) -> str:
-    """The rule a value breaks, as the end of a sentence."""
-    said = describe_error(error)
-    return said[:1].lower() + said[1:]
+    """The rule that a value breaks, as the end of a sentence."""
+    text = describe_error(error)
+    return text[:1].lower() + text[1:]
 
 
 def _shown(value: object) -> str:
-    """A wrong value, as much of it as helps."""
+    """A value's repr, cut to 80 characters."""
     text = repr(value)
-    return text if len(text) <= _MOST_SHOWN else f"{text[: _MOST_SHOWN - 3]}..."
+    return text if len(text) <= _MAX_SHOWN else f"{text[: _MAX_SHOWN - 3]}..."
 
 
 def _plain(text: str) -> str:
-    """What was typed: as it is, or escaped and cut when a terminal would not show it in a line."""
-    return text if text.isprintable() and len(text) <= _MOST_SHOWN else _shown(text)
+    """A text as typed; escaped and cut if it is not printable or is too long for a line."""
+    return text if text.isprintable() and len(text) <= _MAX_SHOWN else _shown(text)
 
 
 def _no_setting(name: str) -> str:

@@ -33,16 +33,16 @@ def draw(
         int, typer.Option(metavar="N", help="Leave out objects seen less often.", min=1)
     ] = 2,
     merges: Annotated[
-        bool, typer.Option("--merges", help="Mark the keyframes that made places one.")
+        bool, typer.Option("--merges", help="Mark the keyframes that merged places.")
     ] = False,
     set_: SetOption = None,
     settings_file: SettingsOption = None,
 ) -> None:
-    """A picture of the map, as of any point in the log.
+    """A picture of the map folded to a point in the log.
 
-    Drive, places in their own colours, objects, and which place is next to which.
+    The robot's path, places in colours, objects, and edges between adjacent places.
     """
-    # Here and not above: matplotlib takes longer to import than most commands take to run.
+    # Imported here: matplotlib takes longer to import than most commands take to run.
     from eventsrc.sim import build_house
     from projections.drawing import draw_map, floor_of
     from projections.drawing.picture import bridges_of, fold_with_merges

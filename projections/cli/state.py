@@ -28,10 +28,10 @@ def state(
 ) -> None:
     """The map folded to a point in the log.
 
-    Counts, settings, digest, and each place with its size and its neighbours; --json has it all.
+    Counts, settings, digest, and each place with its size and neighbours; --json prints all.
     """
     if json_ and digest:
-        raise MisuseError("--json and --digest together: --json holds the digest already")
+        raise MisuseError("--json and --digest together: --json prints the digest too")
     settings = settings_from(settings_file, set_)
     with LogReader(log) as reader:
         _, view = fold_log_cached(reader, settings, point(reader, at), note=say)

@@ -6,7 +6,7 @@ from eventsrc.envelope import Offset
 from eventsrc.log import Event
 from projections.errors import FoldError
 from projections.model.changes import ChangeTracker
-from projections.model.fold import AHEAD, fold_events
+from projections.model.fold import READ_AHEAD, fold_events
 from projections.model.view import MapView
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
@@ -35,7 +35,7 @@ class LiveFold:
         while start < len(events):
             waiting = iter(events[start:])
             try:
-                for folded in fold_events(events[start:], self.map, ahead=AHEAD):
+                for folded in fold_events(events[start:], self.map, ahead=READ_AHEAD):
                     event = next(waiting)
                     self.tracker.apply_event(event.offset, folded.deltas, event.logged_ns)
                     start += 1

@@ -32,7 +32,7 @@ from eventsrc.log import Event, LogReader
 from projections.errors import DatabaseError, FoldError
 from projections.model.changes import BatchChanges
 from projections.model.digest import map_digest
-from projections.model.fold import no_cycle_search
+from projections.model.fold import gc_paused
 from projections.model.view import MapView
 from projections.settings import Settings
 
@@ -212,7 +212,7 @@ def rebuild(
     started = time.monotonic()
     notify = progress or (lambda _: None)
     with (
-        no_cycle_search(),
+        gc_paused(),
         LogReader(log) as reader,
         open_stores(
             targets, settings, only=only, application="mapfold replay", loader=loader

@@ -24,7 +24,7 @@ from typing import Final, TypeAlias
 from eventsrc.envelope import Offset
 from eventsrc.log import Event, LogReader, follow
 from projections.errors import FoldError, ProjectionMismatch
-from projections.model.fold import WORTH_A_SNAPSHOT
+from projections.model.fold import SNAPSHOT_MIN_EVENTS
 from projections.model.snapshot_cache import SnapshotCache
 from projections.settings import Settings
 
@@ -104,7 +104,7 @@ class TailPass:
                     writer.write_heartbeat()
             if plan.once and plan.stop.is_set():
                 break
-        if fold.map.next_offset - start >= WORTH_A_SNAPSHOT and not self.parked:
+        if fold.map.next_offset - start >= SNAPSHOT_MIN_EVENTS and not self.parked:
             cache.keep(fold.map, fold.view)
 
     def _events(self, reader: LogReader, start: Offset) -> Iterable[Event | None]:

@@ -36,7 +36,7 @@ from projections.deltas import (
 from projections.evaluate.scores import object_scores, place_scores
 from projections.evaluate.truth import Truth
 from projections.model.digest import map_digest
-from projections.model.fold import AHEAD, ReadEvent, fold_read, no_cycle_search, read_together
+from projections.model.fold import READ_AHEAD, ParsedEvent, fold_parsed, gc_paused, parse_events
 from projections.model.view import MapView
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
@@ -168,8 +168,8 @@ def fold_in_this_process(
     folds = [_Fold(each) for each in settings]
     with LogReader(log) as reader:
         events = reader.read(FIRST_OFFSET, end)
-        with no_cycle_search():
-            while chunk := list(islice(events, AHEAD)):
+        with gc_paused():
+            while chunk := list(islice(events, READ_AHEAD)):
                 _fold_chunk(chunk, folds)
                 if progress is not None:
                     progress(chunk[-1].offset + 1, end)
@@ -185,8 +185,8 @@ class _Fold:
         self.history = History(settings)
         self.seconds = 0.0
 
-    def fold(self, read: ReadEvent) -> None:
-        offset, deltas = read.offset, fold_read(read, self.map)
+    def fold(self, read: ParsedEvent) -> None:
+        offset, deltas = read.offset, fold_parsed(read, self.map)
         self.view.apply_event(offset, deltas)
         self.history.apply(offset, [delta for delta in deltas if type(delta) in _PLACE_DELTAS])
 
@@ -197,7 +197,7 @@ class _Fold:
 
 def _fold_chunk(chunk: Sequence[Event], folds: Sequence[_Fold]) -> None:
     """As `projections.model.fold.fold_events`, but validating once for all folds."""
-    read = read_together(chunk)
+    read = parse_events(chunk)
     for fold in folds:
         started = time.perf_counter()
         for event in read:

@@ -11,9 +11,9 @@ from typing import TypeAlias
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
 from eventsrc.text import counted
-from projections.errors import WhenceError
+from projections.errors import LogPointError
 from projections.model.digest import map_digest
-from projections.model.fold import AHEAD, FoldedEvent, fold_events, fold_log_cached, no_cycle_search
+from projections.model.fold import READ_AHEAD, FoldedEvent, fold_events, fold_log_cached, gc_paused
 from projections.model.snapshot_cache import SnapshotCache
 from projections.model.view import MapView
 from projections.reducers.semantic_map import SemanticMap
@@ -79,7 +79,7 @@ class Timeline:
         """The history up to `end`; folds new events first. Raises FoldError at a bad event."""
         if self._history.next_offset < self.end:
             self._index = None
-            with no_cycle_search():
+            with gc_paused():
                 self._fold_to(self.end)
         return self._history
 
@@ -96,7 +96,7 @@ class Timeline:
             if (view := self._from_snapshot(wanted)) is not None:
                 return view
         history = self.history
-        with no_cycle_search():
+        with gc_paused():
             return view_at(history, self._latest, wanted, self.settings)
 
     def deltas(
@@ -107,7 +107,7 @@ class Timeline:
         found = self._snapshots().latest(self._end(start))
         semantic_map = SemanticMap(self.settings) if found is None else found[0]
         events = self.reader.read(semantic_map.next_offset, self._end(end))
-        folded = fold_events(events, semantic_map, ahead=AHEAD)
+        folded = fold_events(events, semantic_map, ahead=READ_AHEAD)
         return (event for event in folded if event.offset >= start)
 
     def merges(self, end: Offset | None = None) -> list[Merge]:
@@ -166,7 +166,7 @@ class Timeline:
         asked = Expression(expression) if isinstance(expression, str) else expression
         facts = self.facts(end)
         if self._end(start) > facts.end:
-            raise WhenceError(f"from {start} to {facts.end} nothing happens; swap them")
+            raise LogPointError(f"from {start} to {facts.end} nothing happens; swap them")
         self._check_names(asked, facts)
         return Searcher(asked, facts, self.history.cause_at).search(start, facts.end, scan=scan)
 
@@ -174,7 +174,7 @@ class Timeline:
         if end is None:
             return self.end
         if not 0 <= end <= self.end:
-            raise WhenceError(
+            raise LogPointError(
                 f"{end} is no point in {self.reader.path}, which holds "
                 f"{counted(self.end, 'event')}; give 0 to {self.end}"
             )
@@ -182,7 +182,7 @@ class Timeline:
 
     def _fold_to(self, end: Offset) -> None:
         events = self.reader.read(self._history.next_offset, end)
-        for folded in fold_events(events, self._map, ahead=AHEAD):
+        for folded in fold_events(events, self._map, ahead=READ_AHEAD):
             self._latest.apply_event(folded.offset, folded.deltas)
             self._history.apply(folded.offset, folded.deltas)
             if self._progress and folded.offset % _PROGRESS_EVERY == 0:

@@ -1,10 +1,9 @@
 """The digest of a map: SHA-256 over its canonical form.
 
-Two maps have the same digest exactly when a reader could not tell them apart. The form is the
-sections below in their order, one line for each thing by ordinal, each line a JSON array. Integers
-are exact; a float is written as the shortest decimal that names it; an embedding enters by its
-checksum. Settings, and how many events it took, are not part of it: the same map reached another
-way has the same digest.
+The canonical form is the sections of `_SECTIONS` in their order, one line for each thing by
+ordinal, each line a JSON array. Integers are exact, a float is written as the shortest decimal that
+names it, an embedding enters by its checksum. Settings and the number of events are not part of it:
+the same map reached another way has the same digest.
 """
 
 import hashlib
@@ -17,17 +16,17 @@ from typing import Any
 from .view import MapView
 
 VERSION = 1
-_LINES = 500
+_LINES_AT_ONCE = 500
 
 
 def map_digest(view: MapView) -> str:
-    """64 hex digits."""
+    """The digest of a view: 64 hex digits."""
     digest = hashlib.sha256(f"mapfold map {VERSION}\n".encode())
     for name, lines in _SECTIONS.items():
         digest.update(f"{name}\n".encode())
-        coming = lines(view)
-        while some := "".join(islice(coming, _LINES)):
-            digest.update(some.encode("ascii"))
+        remaining = lines(view)
+        while chunk := "".join(islice(remaining, _LINES_AT_ONCE)):
+            digest.update(chunk.encode("ascii"))
     return digest.hexdigest()
 
 
@@ -39,8 +38,8 @@ def _runs(view: MapView) -> Iterator[str]:
     return (_line((r.run_id, r.started_at)) for r in view.runs)
 
 
-# The sections of many lines are written by hand, which is twice as quick as an encoder. `repr` of
-# an int or a finite float is its JSON.
+# Long sections are formatted here, twice as fast as with an encoder. `repr` of an int or a finite
+# float is its JSON.
 
 
 def _keyframes(view: MapView) -> Iterator[str]:

@@ -1,18 +1,16 @@
-"""A map as one JSON document, ``mapfold state --json`` (DESIGN section 8).
-
-A map in a few lines for people, what ``mapfold state`` prints.
-"""
+"""What ``mapfold state`` prints: the map as a JSON document (DESIGN section 8) or as text."""
 
 from typing import Any
 
 from eventsrc.text import counted
+from projections.deltas import PlaceOrdinal
 from projections.settings import Settings
 
 from .view import MapView
 
 
 def state_document(view: MapView, digest: str) -> dict[str, Any]:
-    """The document. Every list is in the order in which the fold met or founded its things."""
+    """The JSON document. Every list is ordered by ordinal."""
     return {
         "offset": view.next_offset,
         "settings": view.settings.model_dump(),
@@ -71,11 +69,11 @@ def _objects(view: MapView) -> list[dict[str, Any]]:
     ]
 
 
-_MOST = 40
+_MAX_PLACES = 40
 
 
 def state_text(view: MapView, digest: str) -> str:
-    """The text, with a newline at its end."""
+    """Counts, settings, digest and the first 40 places, for people; ends in a newline."""
     lines = [
         f"after {counted(view.next_offset, 'event')}: {_counts(view)}",
         f"settings {_settings(view.settings)}",
@@ -97,9 +95,9 @@ def _counts(view: MapView) -> str:
         "foreign_embeddings": "{} of another embedding space",
     }
     things = {"det_ids_reused": "observation", "foreign_embeddings": "observation"}
-    for key, told in rare.items():
+    for key, phrase in rare.items():
         if counts[key]:
-            text += ", " + told.format(counted(counts[key], things.get(key, "keyframe")))
+            text += ", " + phrase.format(counted(counts[key], things.get(key, "keyframe")))
     return text
 
 
@@ -114,22 +112,22 @@ def _settings(settings: Settings) -> str:
 def _place_lines(view: MapView) -> list[str]:
     if not view.places:
         return ["no places yet"]
-    neighbours: dict[int, list[str]] = {place: [] for place in view.places}
+    neighbours: dict[PlaceOrdinal, list[str]] = {place: [] for place in view.places}
     for a, b, transitions in view.edges():
         neighbours[a].append(f"{view.place_id(b)} ×{transitions}")
         neighbours[b].append(f"{view.place_id(a)} ×{transitions}")
     objects = dict.fromkeys(view.places, 0)
-    for found in view.objects:
-        if found.place is not None:
-            objects[found.place] += 1
+    for record in view.objects:
+        if record.place is not None:
+            objects[record.place] += 1
     width = max(len(place.place_id) for place in view.places.values())
     lines = [f"{'place':<{width}}  keyframes  objects  centroid (m)        next to"]
-    for ordinal, place in list(view.places.items())[:_MOST]:
+    for ordinal, place in list(view.places.items())[:_MAX_PLACES]:
         centroid = f"({place.centroid_x:.2f}, {place.centroid_y:.2f})"
         lines.append(
             f"{place.place_id:<{width}}  {place.keyframe_count:>9}  {objects[ordinal]:>7}  "
             f"{centroid:<18}  {', '.join(neighbours[ordinal])}".rstrip()
         )
-    if len(view.places) > _MOST:
-        lines.append(f"… and {len(view.places) - _MOST} more places; --json lists all")
+    if len(view.places) > _MAX_PLACES:
+        lines.append(f"… and {len(view.places) - _MAX_PLACES} more places; --json lists all")
     return lines

@@ -1,4 +1,4 @@
-"""Folding a log: the shell around the pure fold that reads events and turns them into deltas."""
+"""Folding a log: reads and validates events, and passes them to the pure fold."""
 
 import gc
 import sys
@@ -21,11 +21,9 @@ from projections.settings import Settings
 from .snapshot_cache import SnapshotCache
 from .view import MapView
 
-AHEAD = 16
-"""How far to read ahead in a log that is there already: 50 vectors fit a core's cache."""
-
-
-WORTH_A_SNAPSHOT = 5_000
+READ_AHEAD = 16
+"""Events validated together in a bulk fold: their 50 vectors or so fit a core's cache."""
+SNAPSHOT_MIN_EVENTS = 5_000
 """Events; folding fewer takes about as long as reading a snapshot of them."""
 
 
@@ -36,14 +34,14 @@ class FoldedEvent(NamedTuple):
     deltas: list[Delta]
 
 
-class ReadEvent(NamedTuple):
-    """An event as the fold takes it: ``door`` is None for mapfold's own events.
+class ParsedEvent(NamedTuple):
+    """A validated event: ``parsed`` is None for mapfold's own events.
 
-    ``units`` runs parallel to the door's vectors; it is empty for what was refused.
+    ``units`` are the unit vectors of the envelope's detections, in order; empty if it was rejected.
     """
 
     offset: Offset
-    door: Accepted | Rejected | None
+    parsed: Accepted | Rejected | None
     units: list[Units | None]
 
 
@@ -52,17 +50,17 @@ def fold_events(
 ) -> Iterator[FoldedEvent]:
     """Fold events in offset order.
 
-    Up to ``ahead`` of them are read and validated together before the first of these is folded,
-    which is quicker; with 1, each is read as it is asked for, as befits a live log.
+    Up to ``ahead`` of them are read and validated together before the first is folded, which is
+    quicker. With 1, for a live log, each is read when its deltas are asked for.
 
-    Raises FoldError at an envelope that does not validate. The map has not taken it in then; its
-    ``next_offset`` is that event's offset, and ``semantic_map.skip(offset)`` passes over it. Go on
-    from the offset after it with another call; events read ahead are gone with this one.
+    Raises FoldError at an envelope that does not validate. The map is as before it then: its
+    ``next_offset`` is that event's offset, and ``semantic_map.skip(offset)`` passes over it.
+    Continue with another call from the offset after it; events read ahead are lost with this one.
     """
     coming = iter(events)
     while chunk := list(islice(coming, ahead)):
-        for read in read_together(chunk):
-            yield FoldedEvent(read.offset, fold_read(read, semantic_map))
+        for event in parse_events(chunk):
+            yield FoldedEvent(event.offset, fold_parsed(event, semantic_map))
 
 
 def fold_event(event: Event, semantic_map: SemanticMap) -> list[Delta]:
@@ -70,28 +68,28 @@ def fold_event(event: Event, semantic_map: SemanticMap) -> list[Delta]:
     return next(fold_events([event], semantic_map)).deltas
 
 
-def read_together(events: Sequence[Event]) -> list[ReadEvent]:
-    """Read and validate events, which for sixteen or so together is quicker than one by one."""
-    said = [event for event in events if not is_system_key(event.key)]
-    # The size limit belongs to the door; what is in the log was let in.
-    doors = read_envelopes(said, max_bytes=sys.maxsize)
-    units = iter(unit_vectors([v for a in doors if isinstance(a, Accepted) for v in a.vectors]))
-    coming, read = iter(doors), []
+def parse_events(events: Sequence[Event]) -> list[ParsedEvent]:
+    """Validate events; for sixteen or so together this is quicker than one by one."""
+    enveloped = [event for event in events if not is_system_key(event.key)]
+    # No size limit: it applied when the event was recorded.
+    outcomes = read_envelopes(enveloped, max_bytes=sys.maxsize)
+    units = iter(unit_vectors([v for a in outcomes if isinstance(a, Accepted) for v in a.vectors]))
+    coming, parsed_events = iter(outcomes), []
     for event in events:
-        door = None if is_system_key(event.key) else next(coming)
-        count = len(door.vectors) if isinstance(door, Accepted) else 0
-        read.append(ReadEvent(event.offset, door, list(islice(units, count))))
-    return read
+        parsed = None if is_system_key(event.key) else next(coming)
+        count = len(parsed.vectors) if isinstance(parsed, Accepted) else 0
+        parsed_events.append(ParsedEvent(event.offset, parsed, list(islice(units, count))))
+    return parsed_events
 
 
-def fold_read(read: ReadEvent, semantic_map: SemanticMap) -> list[Delta]:
-    """Fold what `read_together` read. Raises FoldError for what was refused; see `fold_events`."""
-    if read.door is None:
-        semantic_map.skip(read.offset)
+def fold_parsed(event: ParsedEvent, semantic_map: SemanticMap) -> list[Delta]:
+    """Fold one event of `parse_events`. Raises FoldError for a rejected one; see `fold_events`."""
+    if event.parsed is None:
+        semantic_map.skip(event.offset)
         return []
-    if isinstance(read.door, Rejected):
-        raise FoldError(read.offset, read.door.reason)
-    return semantic_map.fold(read.offset, read.door, read.units)
+    if isinstance(event.parsed, Rejected):
+        raise FoldError(event.offset, event.parsed.reason)
+    return semantic_map.fold(event.offset, event.parsed, event.units)
 
 
 def fold_log(
@@ -105,7 +103,7 @@ def fold_log(
     """Fold the first ``until`` events of a log, all of them for None."""
     semantic_map = SemanticMap(settings, neighbourhood)
     view = MapView(settings, keep_embeddings=keep_embeddings)
-    _fold_on(reader, semantic_map, view, until)
+    _fold_into(reader, semantic_map, view, until)
     return semantic_map, view
 
 
@@ -117,9 +115,10 @@ def fold_log_cached(
     note: Callable[[str], None] = lambda _: None,
     neighbourhood: Neighbourhood | None = None,
 ) -> tuple[SemanticMap, MapView]:
-    """`fold_log` without embeddings, from the nearest snapshot beside the log, and leaving one.
+    """`fold_log` without embeddings, from the nearest snapshot beside the log.
 
-    ``note`` is told of snapshots that could not be used or kept; the result is the same.
+    Keeps a snapshot of the result if it had to fold `SNAPSHOT_MIN_EVENTS` or more. ``note`` is told
+    of snapshots that could not be used or kept; the result is the same.
     """
     end = reader.next_offset if until is None else min(until, reader.next_offset)
     cache = SnapshotCache(reader.path, reader.log_id, settings, note, neighbourhood)
@@ -128,27 +127,27 @@ def fold_log_cached(
         MapView(settings, keep_embeddings=False),
     )
     start = semantic_map.next_offset
-    _fold_on(reader, semantic_map, view, end)
-    if end - start >= WORTH_A_SNAPSHOT:
+    _fold_into(reader, semantic_map, view, end)
+    if end - start >= SNAPSHOT_MIN_EVENTS:
         cache.keep(semantic_map, view)
     return semantic_map, view
 
 
-def _fold_on(
+def _fold_into(
     reader: LogReader, semantic_map: SemanticMap, view: MapView, until: Offset | None
 ) -> None:
     events = reader.read(semantic_map.next_offset, until)
-    with no_cycle_search():
-        for folded in fold_events(events, semantic_map, ahead=AHEAD):
+    with gc_paused():
+        for folded in fold_events(events, semantic_map, ahead=READ_AHEAD):
             view.apply_event(folded.offset, folded.deltas)
 
 
 @contextmanager
-def no_cycle_search() -> Iterator[None]:
-    """Keep the garbage collector from searching for cycles: a fold makes none, and only ever adds.
+def gc_paused() -> Iterator[None]:
+    """Pause the search for reference cycles: a fold makes none and frees next to nothing.
 
-    The search looks at all records again and again as a map grows, a fifth of the whole time.
-    Afterwards what is there counts as old, or the next search would look at all of it as news.
+    The search would traverse all records again and again as a map grows, a fifth of the whole time.
+    Afterwards all objects are in the oldest generation, so that the next search skips them.
     """
     was_on = gc.isenabled()
     gc.disable()

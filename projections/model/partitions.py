@@ -1,8 +1,8 @@
-"""How two partitions of the same things differ: adjusted Rand index, splits and joins.
+"""Comparison of two partitions of the same things: adjusted Rand index, splits and joins.
 
-A partition is a sequence of labels, one per thing; None means in no group (noise). Noise things are
-in no group with anybody, so for counting pairs each is a group of its own: moving a keyframe from
-a place to noise costs agreement, and two maps that are all noise agree.
+A partition is a sequence of labels, one per thing; None means in no group (noise). For counting
+pairs each noise thing is a group of its own: moving a keyframe from a place to noise costs
+agreement, and two maps that are all noise agree.
 
 Adjusted Rand index: Hubert and Arabie 1985, "Comparing partitions", computed as an exact fraction.
 """

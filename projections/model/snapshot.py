@@ -1,13 +1,10 @@
-"""A fold and its view as one container, and back.
-
-Named numpy arrays and JSON values as bytes, and back. No code is ever run to read one.
+"""Snapshots: a fold and its view as bytes, and back. Reading one never runs code from it.
 
     magic · SHA-256 of all that follows · zlib of (length of the index, index, arrays end to end)
 
-The index is JSON: the JSON values, and for each array its dtype, shape and place. Only plain
-number types are read; whatever else the bytes say is refused.
-
-A `MapView` as columns, and back. What the semantic map's own state says is not said again.
+The index is JSON: the JSON values, and for each numpy array its dtype, shape and position.
+Only plain number types are read; anything else is refused.
+docs/decisions/snapshot-container.md says why this is not `numpy.savez`.
 """
 
 import hashlib
@@ -29,7 +26,7 @@ from projections.deltas import (
     RunOrdinal,
 )
 from projections.exact import Neighbourhood
-from projections.reducers import part, prefixed
+from projections.reducers import State, part, prefixed
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 
@@ -38,18 +35,20 @@ from .view import KeyframeRecord, MapView, ObjectRecord, ObservationRecord, Plac
 MAGIC = b"mapfold snapshot 1\n"
 _TYPES = frozenset({"<i4", "<i8", "<f8", "|u1", "<u4", "|i1"})
 _LENGTH_BYTES = 8
-_MOST_UNFOLDED = 16
-_SMALL_BYTES = 64 * 1024 * 1024
-"""A snapshot that unfolds to more than this, and to more than so many times its size, is none of
-ours: those measured unfold to four times their size."""
+_MAX_RATIO = 16
+_ALWAYS_ALLOWED_BYTES = 64 * 1024 * 1024
+"""A snapshot that decompresses to more than this, and to more than `_MAX_RATIO` times its size, is
+refused. Those measured decompress to four times their size."""
+_NONE = -1
+"""What the packed columns of a view hold for None."""
 
 
-class NotAContainer(ValueError):
-    """These bytes are no container, or a damaged one; the message says how."""
+class MalformedSnapshot(ValueError):
+    """These bytes are no snapshot of this version, or a damaged one; the message says how."""
 
 
-def pack(values: dict[str, Any]) -> bytes:
-    """The bytes of a container."""
+def pack(values: State) -> bytes:
+    """Arrays and JSON values by name as bytes. Raises TypeError for an array of another type."""
     plain: dict[str, Any] = {}
     arrays: dict[str, tuple[str, tuple[int, ...], int]] = {}
     blobs: list[bytes] = []
@@ -69,42 +68,38 @@ def pack(values: dict[str, Any]) -> bytes:
     return MAGIC + hashlib.sha256(body).digest() + body
 
 
-def unpack(data: bytes) -> dict[str, Any]:
-    """What `pack` was given. Raises NotAContainer."""
+def unpack(data: bytes) -> State:
+    """What `pack` was given. Raises MalformedSnapshot."""
     head = len(MAGIC) + hashlib.sha256().digest_size
     if not data.startswith(MAGIC):
-        raise NotAContainer("it does not begin like a snapshot of this version")
+        raise MalformedSnapshot("it does not begin like a snapshot of this version")
     body = data[head:]
     if hashlib.sha256(body).digest() != data[len(MAGIC) : head]:
-        raise NotAContainer("its checksum does not match")
+        raise MalformedSnapshot("its checksum does not match")
     content = _decompress(body)
     start = _LENGTH_BYTES + int.from_bytes(content[:_LENGTH_BYTES], "little")
     index = json.loads(content[_LENGTH_BYTES:start])
-    values: dict[str, Any] = index["plain"]
+    values: State = index["plain"]
     for name, (dtype, shape, at) in index["arrays"].items():
         if dtype not in _TYPES:
-            raise NotAContainer(f"{name} is of the type {dtype!r}")
+            raise MalformedSnapshot(f"{name} is of the type {dtype!r}")
         flat = np.frombuffer(content, dtype, math.prod(shape), start + at)
         values[name] = flat.reshape(shape).copy()
     return values
 
 
 def _decompress(body: bytes) -> bytes:
-    """At most as much as a snapshot may hold: the checksum is no proof against a forger."""
-    most = max(_SMALL_BYTES, _MOST_UNFOLDED * len(body))
+    """Decompress up to a limit: a forged snapshot has a right checksum, too."""
+    limit = max(_ALWAYS_ALLOWED_BYTES, _MAX_RATIO * len(body))
     stream = zlib.decompressobj()
-    content = stream.decompress(body, most)
+    content = stream.decompress(body, limit)
     if not stream.eof:
-        raise NotAContainer(f"it is torn, or unfolds to more than {most:,} bytes")
+        raise MalformedSnapshot(f"it is cut off, or decompresses to more than {limit:,} bytes")
     return content
 
 
-State = dict[str, Any]
-_NONE = -1
-
-
 def dump_view(view: MapView) -> State:
-    """Everything but settings and embeddings."""
+    """A view as columns: everything but settings and embeddings."""
     return {
         "next_offset": view.next_offset,
         "skipped": view.skipped,
@@ -266,8 +261,10 @@ class SnapshotRefused(ValueError):
 def snapshot(
     semantic_map: SemanticMap, view: MapView, log_id: str, segments: Sequence[str] = ()
 ) -> bytes:
-    """Both, as of ``semantic_map.next_offset``; the view's embeddings are left out. ``segments`` is
-    the `eventsrc.log.lineage` of the events they were folded from."""
+    """The bytes of a map and its view without embeddings, as of ``semantic_map.next_offset``.
+
+    ``segments`` is the `eventsrc.log.lineage` of the events they were folded from.
+    """
     about = {
         "fold_version": FOLD_VERSION,
         "log_id": log_id,
@@ -289,18 +286,21 @@ def restore(
     neighbourhood: Neighbourhood | None = None,
     lineage_at: Callable[[int], Sequence[str]] = lambda _: (),
 ) -> tuple[SemanticMap, MapView]:
-    """The fold and the view of `snapshot`, the view without embeddings. ``lineage_at`` tells what
-    the log's first events are in now. Raises SnapshotRefused, and what ``lineage_at`` raises."""
+    """The map and the view of a `snapshot`.
+
+    ``lineage_at`` gives the log's `eventsrc.log.lineage` up to an offset, as it is now. Raises
+    SnapshotRefused, and what ``lineage_at`` raises.
+    """
     semantic_map = SemanticMap(settings, neighbourhood)
     view = MapView(settings, keep_embeddings=False)
     try:
         state = unpack(data)
         about = part("about", state)
-        _check(about, settings, log_id)
+        _check_identity(about, settings, log_id)
         _check_lineage(about["segments"], lineage_at(about["offset"]))
         semantic_map.load(part("map", state))
         load_view(view, part("view", state))
-    except (NotAContainer, zlib.error) as error:
+    except (MalformedSnapshot, zlib.error) as error:
         raise SnapshotRefused(str(error)) from None
     except SnapshotRefused:
         raise
@@ -309,7 +309,7 @@ def restore(
     return semantic_map, view
 
 
-def _check(about: dict[str, Any], settings: Settings, log_id: str) -> None:
+def _check_identity(about: dict[str, Any], settings: Settings, log_id: str) -> None:
     if about["fold_version"] != FOLD_VERSION:
         raise SnapshotRefused(f"it is of fold version {about['fold_version']}, not {FOLD_VERSION}")
     if about["log_id"] != log_id:

@@ -1,9 +1,9 @@
 """The cache of snapshots beside a log: ``<log>.snapshots/<fingerprint>-<offset>.map``.
 
-Files appear whole (written beside, then renamed) and are never changed. Anything that goes wrong
-with the cache is a note and a slower fold, never an error; a snapshot of events that the log has
-lost since, by recovery or deletion, is not used. It keeps a few snapshots for each
-setting: the newest, and others spread out below it.
+Files appear whole (written beside, then renamed) and are never changed. A failure of the cache is
+reported as a note and makes the fold slower, but never fails it. A snapshot of events that the log
+has lost since, by recovery or deletion, is not used. For each set of settings a few snapshots are
+kept: the newest, and others spread out below it.
 """
 
 import os
@@ -23,11 +23,11 @@ from .view import MapView
 
 Note = Callable[[str], None]
 _NAME = re.compile(r"([0-9a-f]{16})-(\d{20})\.map")
-_KEEP = 6
+_MAX_KEPT = 6
 
 
 class SnapshotCache:
-    """Snapshots of one log under one set of settings. ``note`` is told what could not be used."""
+    """Snapshots of one log under one set of settings; ``note`` is told of those not usable."""
 
     def __init__(
         self,
@@ -43,7 +43,7 @@ class SnapshotCache:
         self._settings = settings
         self._note = note
         self._neighbourhood = neighbourhood
-        self._unsound: set[Path] = set()
+        self._unusable: set[Path] = set()
 
     def offsets(self) -> list[Offset]:
         """The offsets there are snapshots for, ascending."""
@@ -55,7 +55,7 @@ class SnapshotCache:
         return sorted(Offset(int(m[2])) for m in found if m[1] == self._settings.fingerprint())
 
     def latest(self, until: Offset) -> tuple[SemanticMap, MapView] | None:
-        """The fold and view at the highest offset ≤ ``until`` whose snapshot is sound."""
+        """The fold and view of the usable snapshot with the highest offset ≤ ``until``."""
         for offset in reversed([offset for offset in self.offsets() if offset <= until]):
             path = self._path(offset)
             try:
@@ -65,21 +65,21 @@ class SnapshotCache:
                 )
             except (OSError, SnapshotRefused) as error:
                 self._note(f"{path}: this snapshot is not used: {error}; it is safe to delete")
-                self._unsound.add(path)
+                self._unusable.add(path)
                 continue
             if found[0].next_offset == offset:
                 return found
             self._note(f"{path}: this snapshot is of another offset; it is safe to delete")
-            self._unsound.add(path)
+            self._unusable.add(path)
         return None
 
     def keep(self, semantic_map: SemanticMap, view: MapView) -> None:
-        """Put a snapshot down for the map's offset, unless there is one that may be sound."""
+        """Write a snapshot for the map's offset, unless there is one that may be usable."""
         path = self._path(semantic_map.next_offset)
         beside = path.with_suffix(f".{os.getpid()}.part")
         try:
             self.folder.mkdir(exist_ok=True)
-            if not path.exists() or path in self._unsound:
+            if not path.exists() or path in self._unusable:
                 segments = self._lineage(semantic_map.next_offset)
                 beside.write_bytes(snapshot(semantic_map, view, self._log_id, segments))
                 beside.replace(path)
@@ -91,8 +91,8 @@ class SnapshotCache:
         return self.folder / f"{self._settings.fingerprint()}-{offset:020d}.map"
 
     def _thin_out(self) -> None:
-        """Drop, while there are too many, the one whose neighbours are closest together."""
+        """While there are too many, delete the one whose neighbours are closest together."""
         offsets = self.offsets()
-        while len(offsets) > _KEEP:
+        while len(offsets) > _MAX_KEPT:
             gaps = [(offsets[i + 1] - offsets[i - 1], i) for i in range(1, len(offsets) - 1)]
             self._path(offsets.pop(min(gaps)[1])).unlink(missing_ok=True)

@@ -18,7 +18,7 @@ from streams import DIM, MODEL, house_walk, keyframes, random_walk
 from eventsrc.ingest import Accepted, ingest
 from eventsrc.log import LogReader, LogWriter
 from projections.exact import unit_vectors
-from projections.model.fold import AHEAD, fold_events, fold_log, no_cycle_search
+from projections.model.fold import READ_AHEAD, fold_events, fold_log, gc_paused
 from projections.model.view import MapView
 from projections.reducers.core_index import CoreIndex
 from projections.reducers.places import Places
@@ -127,8 +127,8 @@ def growth() -> None:
 def _fold_time(count: int) -> float:
     semantic_map, view = SemanticMap(Settings()), MapView(Settings(), keep_embeddings=False)
     stream, seconds = keyframes(count, 3), 0.0
-    with no_cycle_search():
-        while chunk := list(islice(stream, AHEAD)):
+    with gc_paused():
+        while chunk := list(islice(stream, READ_AHEAD)):
             start = clock()
             units = iter(unit_vectors([v for accepted in chunk for v in accepted.vectors]))
             for accepted in chunk:
@@ -163,8 +163,8 @@ def _whole_once(reader: LogReader) -> list[float]:
         return clock() - start
 
     def fold_all() -> None:
-        with no_cycle_search():
-            for _ in fold_events(reader.read(), SemanticMap(Settings()), ahead=AHEAD):
+        with gc_paused():
+            for _ in fold_events(reader.read(), SemanticMap(Settings()), ahead=READ_AHEAD):
                 pass
 
     return [

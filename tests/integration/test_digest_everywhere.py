@@ -29,7 +29,7 @@ import numpy as np
 from eventsrc.ingest import ingest
 from eventsrc.log import Event
 from projections.model.digest import map_digest
-from projections.model.fold import AHEAD, fold_events
+from projections.model.fold import READ_AHEAD, fold_events
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 from projections.model.view import MapView
@@ -43,7 +43,7 @@ for offset, line in enumerate(lines):
     view.apply_event(offset, fold.fold(offset, accepted))
 ahead = MapView(settings)
 events = (Event(offset, "tb/detections", 0, 0, line) for offset, line in enumerate(lines))
-for folded in fold_events(events, SemanticMap(settings), ahead=AHEAD):
+for folded in fold_events(events, SemanticMap(settings), ahead=READ_AHEAD):
     ahead.apply_event(folded.offset, folded.deltas)
 assert map_digest(ahead) == map_digest(view)
 matrix = np.array(vectors[:200])

@@ -128,7 +128,7 @@ def test_people_read_a_short_table(mapfold: Commands, log: Path) -> None:
         (["--set", "eps=1"], 2, "no setting 'eps'"),
         (["--set", "eps_m=-1"], 2, "eps_m"),
         (["--at", "10"], 2, "beyond the end"),
-        (["--json", "--digest"], 2, "--json holds the digest already"),
+        (["--json", "--digest"], 2, "--json prints the digest too"),
         (["--settings", "absent.json"], 2, "absent.json"),
     ],
 )

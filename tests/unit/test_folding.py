@@ -8,7 +8,7 @@ from eventsrc.log import Event
 from eventsrc.system_events import LOSS_KEY
 from projections.deltas import KeyframeAdded
 from projections.errors import FoldError
-from projections.model.fold import fold_event, fold_events, no_cycle_search
+from projections.model.fold import fold_event, fold_events, gc_paused
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 from tests.envelopes import detection, envelope, payload
@@ -76,7 +76,7 @@ def test_the_garbage_collector_is_left_as_it_was(was_on: bool) -> None:
     before = gc.isenabled()
     try:
         (gc.enable if was_on else gc.disable)()
-        with no_cycle_search():
+        with gc_paused():
             assert not gc.isenabled()
         assert gc.isenabled() == was_on
     finally:

@@ -17,7 +17,7 @@ from projections.model.digest import map_digest
 from projections.model.fold import fold_log, fold_log_cached
 from projections.model.snapshot import (
     MAGIC,
-    NotAContainer,
+    MalformedSnapshot,
     SnapshotRefused,
     pack,
     restore,
@@ -51,7 +51,7 @@ def log(tmp_path: Path) -> Path:
 @pytest.fixture
 def eager(monkeypatch: pytest.MonkeyPatch) -> None:
     """Snapshots are worth it from one event on."""
-    monkeypatch.setattr(folding, "WORTH_A_SNAPSHOT", 1)
+    monkeypatch.setattr(folding, "SNAPSHOT_MIN_EVENTS", 1)
 
 
 def _digest(log: Path, until: int, notes: list[str], **settings: Any) -> str:
@@ -247,10 +247,10 @@ def test_restore_refuses_content_that_does_not_fit_together(instead: Any) -> Non
 
 
 def test_a_container_holds_no_objects() -> None:
-    with pytest.raises(NotAContainer, match="does not begin"):
+    with pytest.raises(MalformedSnapshot, match="does not begin"):
         unpack(b"\x80\x04pickle")
     body = zlib.compress(b"")
-    with pytest.raises(NotAContainer, match="checksum"):
+    with pytest.raises(MalformedSnapshot, match="checksum"):
         unpack(MAGIC + b"0" * 32 + body)
 
 
@@ -258,5 +258,5 @@ def test_a_snapshot_that_unfolds_to_very_much_is_refused() -> None:
     squeeze = zlib.compressobj(1)
     body = b"".join(squeeze.compress(bytes(1_000_000)) for _ in range(500)) + squeeze.flush()
     assert len(body) < 4_000_000
-    with pytest.raises(NotAContainer, match="unfolds to more than"):
+    with pytest.raises(MalformedSnapshot, match="decompresses to more than"):
         unpack(MAGIC + hashlib.sha256(body).digest() + body)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from eventsrc.log import LogWriter
-from projections.errors import WhenceError
+from projections.errors import LogPointError
 from projections.history import ExpressionError, NoSuchThing, Timeline
 from projections.history.merges import merge_document
 from projections.settings import Settings
@@ -207,9 +207,9 @@ def test_equal_moments_say_so(corridor: Timeline) -> None:
 
 def test_a_point_beyond_the_log_is_refused(corridor: Timeline) -> None:
     for ask in (corridor.at, corridor.merges):
-        with pytest.raises(WhenceError, match="give 0 to 10"):
+        with pytest.raises(LogPointError, match="give 0 to 10"):
             ask(11)
-    with pytest.raises(WhenceError):
+    with pytest.raises(LogPointError):
         corridor.at(-1)
 
 

@@ -1,10 +1,10 @@
-"""What a bulk fold makes is not searched for cycles, neither while it is made nor right after."""
+"""`gc_paused`: no search for cycles during a bulk fold, nor among its objects right after."""
 
 import gc
 
 import pytest
 
-from projections.model.fold import no_cycle_search
+from projections.model.fold import gc_paused
 
 
 def _is_young(thing: object) -> bool:
@@ -14,7 +14,7 @@ def _is_young(thing: object) -> bool:
 def test_nothing_is_searched_inside_and_what_was_made_is_old_afterwards() -> None:
     before = [[]]  # type: ignore[var-annotated]
     assert _is_young(before)
-    with no_cycle_search():
+    with gc_paused():
         assert not gc.isenabled()
         made = [[] for _ in range(1000)]  # type: ignore[var-annotated]
         assert _is_young(made)
@@ -24,12 +24,12 @@ def test_nothing_is_searched_inside_and_what_was_made_is_old_afterwards() -> Non
 
 
 def test_it_ends_also_with_an_error_and_leaves_off_what_was_off() -> None:
-    with pytest.raises(ZeroDivisionError), no_cycle_search():
+    with pytest.raises(ZeroDivisionError), gc_paused():
         raise ZeroDivisionError
     assert gc.isenabled()
     gc.disable()
     try:
-        with no_cycle_search():
+        with gc_paused():
             pass
         assert not gc.isenabled()
     finally:
