@@ -1,7 +1,7 @@
-"""The functions that a condition over the map may call, the types and directions of their values,
-and the port through which they ask a map.
+"""Functions of conditions over the map, the types of their values, and how these can change.
 
-One table, `FUNCTIONS`, is read by the reader of conditions, by ``bisect --help`` and by the docs.
+The parser, ``bisect --help`` and the docs take them from one table, `FUNCTIONS`; the values come
+from a map through `Facts`.
 """
 
 from collections.abc import Callable
@@ -13,15 +13,15 @@ Value: TypeAlias = int | str | bool | None
 
 
 class Type(Enum):
-    """What a part of a condition evaluates to; the value is how a message calls it."""
+    """The type of a part of a condition; the value is its name in messages."""
 
     NUMBER = "a number"
     TEXT = "a text or none"
-    TRUTH = "true or false"
+    BOOLEAN = "true or false"
 
 
 class Names(Enum):
-    """What a text given to a function names; the value is how a message calls it."""
+    """What a text argument names; the value is its name in messages."""
 
     KEYFRAME = "keyframe"
     PLACE = "place"
@@ -31,8 +31,7 @@ class Names(Enum):
 
 
 class Direction(Enum):
-    """How the value of a condition can change as events are added, which is what binary search
-    needs to know: some counts only rise, and some truths once true stay true."""
+    """How a value can change as events are added: binary search is for rising conditions only."""
 
     STEADY = "never changes"
     RISING = "once true, stays true"
@@ -41,23 +40,23 @@ class Direction(Enum):
 
     @property
     def opposite(self) -> "Direction":
-        """That of ``not`` this."""
+        """The direction of ``not`` this."""
         return {Direction.RISING: Direction.FALLING, Direction.FALLING: Direction.RISING}.get(
             self, self
         )
 
     def joined(self, other: "Direction") -> "Direction":
-        """That of a value which rises with both."""
+        """The direction of a value that rises when either rises."""
         if Direction.STEADY in (self, other):
             return self if other is Direction.STEADY else other
         return self if self is other else Direction.EITHER_WAY
 
 
 class Facts(Protocol):
-    """The map at one moment, asked by id. Anything that implements this can be bisected over.
+    """The map at one offset, as conditions see it.
 
-    Ids are texts as people write them: a keyframe is ``run_id:keyframe_id``. A thing that is not in
-    the map (yet) is no error here: it is in no place, and its counts are 0.
+    Arguments are ids; a keyframe is ``run_id:keyframe_id``. For a thing that is not in the map
+    (yet) the place is None and counts are 0.
     """
 
     def place_count(self) -> int:
@@ -93,7 +92,7 @@ class Facts(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Function:
-    """A question to the map: its name, what its texts name, and how it is answered."""
+    """A function of a condition: what its arguments name, and the function that evaluates it."""
 
     name: str
     parameters: tuple[Names, ...]
@@ -103,11 +102,11 @@ class Function:
     optional: bool = False
     """Whether the one parameter may be left out."""
     rises: bool = False
-    """Whether more events never lower it (nor turn it from true to false)."""
+    """Whether more events never lower it, or turn it from true to false."""
 
     @property
     def signature(self) -> str:
-        """As a person writes it: ``object_count([class])``."""
+        """Name and parameters: ``object_count([class])``."""
         inner = ", ".join(p.value for p in self.parameters)
         return f"{self.name}([{inner}])" if self.optional else f"{self.name}({inner})"
 
@@ -148,7 +147,7 @@ _ALL = (
     Function(
         "same_place",
         (_KF, _KF),
-        Type.TRUTH,
+        Type.BOOLEAN,
         _same_place,
         "two keyframes are in one place",
         rises=True,
@@ -175,7 +174,7 @@ _ALL = (
     Function(
         "merged",
         (_PLACE,),
-        Type.TRUTH,
+        Type.BOOLEAN,
         lambda f, p: f.merged(p),
         "a place was absorbed",
         rises=True,

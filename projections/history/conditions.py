@@ -1,16 +1,16 @@
-"""Conditions over the map, the language of ``bisect``: ``place_count < 3 and not merged('a_p0')``.
+"""Parser of conditions over the map, as ``bisect`` takes: ``place_count < 3 and not merged('p0')``.
 
 A condition is a subset of a Python expression: ``and``, ``or``, ``not``, one comparison at a time,
 whole numbers, quoted texts, ``none`` and the functions of `condition_functions`; a function without
 arguments may be written without parentheses. The standard library's `ast` parses it, and only the
-node types named here are read; nothing is compiled or evaluated as code. Types are checked before
-anything is asked of a map: a comparison needs two numbers or two texts, texts know only == and !=,
-and the whole must be a truth. Each refusal names its column.
+node types named here are accepted; nothing is compiled or evaluated as code. Types are checked
+when parsing: a comparison needs two numbers or two texts, texts have only == and !=, and the whole
+must be true or false. Each error names its column.
 
-The text is split into tokens first, for three reasons: ids may hold any character, so a text ends
-at its quote and knows no escapes but that of a quote or a backslash; what Python allows and a
-condition does not (``0x10``, ``1.5``, ``# …``) is refused where it stands; and `ast` reads the
-tokens joined by single spaces, so that a node's offset names a token and with it a column.
+The source is split into tokens first, for three reasons: ids may hold any character, so a text ends
+at its quote, with escapes for a quote and a backslash only; what Python allows and a condition does
+not (``0x10``, ``1.5``, ``# …``) is an error at its column; and `ast` parses the tokens joined by
+single spaces, so that a node's offset gives a token and with it a column.
 """
 
 import ast
@@ -29,14 +29,14 @@ from eventsrc.errors import MisuseError
 from .condition_functions import FUNCTIONS, Direction, Facts, Function, Names, Type, Value
 
 MAX_DEPTH = 100
-"""How deep parentheses and ``not`` may be nested: it bounds every recursion over the tree."""
+"""Greatest depth of parentheses and ``not``; it bounds every recursion over the tree."""
 
 _TOKEN = re.compile(
     r"\s*(?:(?P<number>-?\d+)|(?P<name>[A-Za-z_]\w*)|(?P<sign><=|>=|==|!=|[<>(),])"
     r"""|(?P<text>'(?:[^'\\]|\\['"\\])*'|"(?:[^"\\]|\\['"\\])*"))"""
 )
-_WORDS = ("and", "or", "not")
-_SIGNS: dict[type[ast.cmpop], tuple[str, Callable[[Any, Any], bool]]] = {
+_OPERATOR_WORDS = ("and", "or", "not")
+_COMPARISONS: dict[type[ast.cmpop], tuple[str, Callable[[Any, Any], bool]]] = {
     ast.Lt: ("<", operator.lt),
     ast.LtE: ("<=", operator.le),
     ast.Eq: ("==", operator.eq),
@@ -47,9 +47,9 @@ _SIGNS: dict[type[ast.cmpop], tuple[str, Callable[[Any, Any], bool]]] = {
 
 
 class ExpressionError(MisuseError):
-    """A condition cannot be read; ``column`` counts from 1, ``pointer`` shows the spot.
+    """A condition that cannot be parsed; ``column`` counts from 1.
 
-    The message stays one line like every other error; a command prints ``pointer`` above it.
+    The message is one line like that of every error; a command prints ``pointer`` above it.
     """
 
     def __init__(self, source: str, column: int, reason: str) -> None:
@@ -66,7 +66,7 @@ class ExpressionError(MisuseError):
 
 @dataclass(frozen=True, slots=True)
 class Mention:
-    """A thing a condition names, such as keyframe ``house-a:12``, and where it names it."""
+    """A name in a condition, such as keyframe ``house-a:12``, what it names, and its column."""
 
     kind: Names
     text: str
@@ -88,7 +88,7 @@ class _Call:
 
 @dataclass(frozen=True, slots=True)
 class _Term:
-    """A checked part of a condition: its type, and how to get its value from a map."""
+    """A part of a condition with its type, and the function of a map that gives its value."""
 
     column: int
     type: Type
@@ -101,7 +101,7 @@ class _Term:
 class _Token:
     kind: Literal["number", "text", "name", "sign", "end"]
     text: str
-    """As a person means it: a text without its quotes."""
+    """A text is without its quotes."""
     column: int
 
     def __str__(self) -> str:
@@ -113,20 +113,20 @@ class _Token:
 
     @property
     def ends_value(self) -> bool:
-        return self.text == ")" if self._is_sign else self.text not in _WORDS
+        return self.text == ")" if self._is_sign else self.text not in _OPERATOR_WORDS
 
     @property
     def _is_sign(self) -> bool:
         return self.kind in ("sign", "end")
 
     def python(self) -> str:
-        """The token for `ast`; ASCII only, for offsets count bytes there."""
+        """The token as source for `ast`; ASCII only, since offsets count bytes there."""
         match self.kind:
             case "number":
                 return str(int(self.text))
             case "text":
                 return ascii(self.text)
-            case "name" if keyword.iskeyword(self.text) and self.text not in _WORDS:
+            case "name" if keyword.iskeyword(self.text) and self.text not in _OPERATOR_WORDS:
                 return f"_{self.text}"
             case "name":
                 return ascii(self.text)[1:-1].replace("\\", "_")
@@ -135,11 +135,11 @@ class _Token:
 
 
 class Expression:
-    """A condition over the map, read once, asked often. Raises ExpressionError when unreadable."""
+    """A condition over the map, parsed once. Raises ExpressionError for a text that is none."""
 
     def __init__(self, source: str) -> None:
         self.source = source
-        self._term = _Reader(source).whole()
+        self._term = _Parser(source).parse()
 
     def __str__(self) -> str:
         return self.source
@@ -149,12 +149,12 @@ class Expression:
         return bool(self._term.value(facts))
 
     def readings(self, facts: Facts) -> tuple[tuple[str, Value], ...]:
-        """Every function it calls as written, with its value: why it holds or not."""
+        """Every function call as written, with its value."""
         return tuple({str(call): call.value(facts) for call in self._term.calls}.items())
 
     @property
     def direction(self) -> Direction:
-        """Which way it can turn as events are added."""
+        """How its truth can change as events are added."""
         return self._term.direction
 
     def mentions(self) -> tuple[Mention, ...]:
@@ -162,12 +162,12 @@ class Expression:
         return tuple(mention for call in self._term.calls for mention in call.mentions)
 
     def error_at(self, column: int, reason: str) -> ExpressionError:
-        """An error that points into this condition."""
+        """An error at a column of this condition."""
         return ExpressionError(self.source, column, reason)
 
 
-class _Reader:
-    """Reads one condition; every method returns a checked term or raises ExpressionError."""
+class _Parser:
+    """Parses one condition; its methods return checked terms or raise ExpressionError."""
 
     def __init__(self, source: str) -> None:
         self._source = source
@@ -179,13 +179,13 @@ class _Reader:
             self._starts.append(self._starts[-1] + len(word) + 1)
         self._text = " ".join(words)
 
-    def whole(self) -> _Term:
+    def parse(self) -> _Term:
         try:
             tree = ast.parse(self._text, mode="eval")
         except SyntaxError as error:
             token = self._tokens[self._index((error.offset or 1) - 1)]
             raise self._error(token, _expected_value(token)) from None
-        return self._truth(self._term(tree.body), "an expression")
+        return self._boolean(self._term(tree.body), "an expression")
 
     def _split(self) -> Iterator[_Token]:
         index, end = 0, len(self._source.rstrip())
@@ -193,8 +193,8 @@ class _Reader:
             match = _TOKEN.match(self._source, index)
             if match is None:
                 start = index + len(self._source[index:]) - len(self._source[index:].lstrip())
-                complaint = _lexical_complaint(self._source[start])
-                raise ExpressionError(self._source, start + 1, complaint)
+                reason = _token_error(self._source[start])
+                raise ExpressionError(self._source, start + 1, reason)
             kind: Any = match.lastgroup
             text = match[kind]
             if kind == "text":
@@ -204,15 +204,15 @@ class _Reader:
         yield _Token("end", "", len(self._source) + 1)
 
     def _check_order(self) -> None:
-        """Refuse tokens that cannot follow one another, parentheses that do not match and nesting
-        that is too deep, which Python's parser reports at other columns or not at all."""
-        open_at: list[tuple[bool, int]] = []  # whether of a call, and the depth outside
+        """Check the order of tokens, the pairs of parentheses and the depth of nesting, which
+        Python's parser reports at other columns or not at all."""
+        open_at: list[tuple[bool, int]] = []  # is it a call, and the depth outside
         depth = 0
         before = _Token("sign", "(", 0)
         called = False
         for token in self._tokens:
             opens_call = token.text == "(" and token.kind == "sign" and before.kind == "name"
-            opens_call = opens_call and before.text not in _WORDS
+            opens_call = opens_call and before.text not in _OPERATOR_WORDS
             closes_empty_call = called and token.kind == "sign" and token.text == ")"
             if before.ends_value and token.begins_value and not opens_call:
                 in_call = bool(open_at) and open_at[-1][0]
@@ -251,10 +251,10 @@ class _Reader:
             case ast.Call(func=ast.Name() as name, args=arguments):
                 return self._call(name, arguments)
             case ast.UnaryOp(op=ast.Not(), operand=operand):
-                inner = self._truth(self._term(operand), "what stands after not")
+                inner = self._boolean(self._term(operand), "the operand of not")
                 return _Term(
                     self._token(node).column,
-                    Type.TRUTH,
+                    Type.BOOLEAN,
                     lambda facts: not inner.value(facts),
                     inner.direction.opposite,
                     inner.calls,
@@ -273,12 +273,12 @@ class _Reader:
                 raise self._error(self._token(node), _expected_value(self._token(node)))
 
     def _joined(self, node: ast.expr, every: bool, values: list[ast.expr]) -> _Term:
-        side = "a side of and" if every else "a side of or"
-        terms = [self._truth(self._term(value), side) for value in values]
+        operand = "an operand of and" if every else "an operand of or"
+        terms = [self._boolean(self._term(value), operand) for value in values]
         join = all if every else any
         return _Term(
             self._token(node).column,
-            Type.TRUTH,
+            Type.BOOLEAN,
             lambda facts: join(term.value(facts) for term in terms),
             functools.reduce(Direction.joined, (term.direction for term in terms)),
             tuple(call for term in terms for call in term.calls),
@@ -286,15 +286,15 @@ class _Reader:
 
     def _compared(self, node: ast.Compare) -> _Term:
         left, right = self._term(node.left), self._term(node.comparators[0])
-        sign, holds = _SIGNS[type(node.ops[0])]
+        sign, holds = _COMPARISONS[type(node.ops[0])]
         at = self._after(node.left, sign)
         if len(node.ops) > 1:
-            at = self._after(node.comparators[0], _SIGNS[type(node.ops[1])][0])
+            at = self._after(node.comparators[0], _COMPARISONS[type(node.ops[1])][0])
             raise self._error(at, "one comparison at a time; join two with and")
         if left.type is not right.type:
             raise self._error(at, f"cannot compare {left.type.value} with {right.type.value}")
-        if left.type is Type.TRUTH:
-            raise self._error(at, "truths are not compared; write and, or, not")
+        if left.type is Type.BOOLEAN:
+            raise self._error(at, "true and false cannot be compared; use and, or, not")
         if left.type is Type.TEXT and sign not in ("==", "!="):
             raise self._error(at, f"texts have no order; {sign!r} needs numbers")
         match sign:
@@ -307,7 +307,7 @@ class _Reader:
                 direction = Direction.STEADY if steady else Direction.EITHER_WAY
         return _Term(
             at.column,
-            Type.TRUTH,
+            Type.BOOLEAN,
             lambda facts: holds(left.value(facts), right.value(facts)),
             direction,
             left.calls + right.calls,
@@ -341,8 +341,8 @@ class _Reader:
             raise self._error(token, f"{function.signature} takes texts in quotes, not {token}")
         return token
 
-    def _truth(self, term: _Term, what: str) -> _Term:
-        if term.type is Type.TRUTH:
+    def _boolean(self, term: _Term, what: str) -> _Term:
+        if term.type is Type.BOOLEAN:
             return term
         reason = f"{what} must be true or false, and this is {term.type.value}"
         raise ExpressionError(self._source, term.column, reason)
@@ -354,7 +354,7 @@ class _Reader:
         return self._tokens[self._index(node.col_offset)]
 
     def _after(self, node: ast.expr, text: str) -> _Token:
-        """The first sign ``text`` behind ``node``."""
+        """The first sign ``text`` after ``node``."""
         start = self._index((node.end_col_offset or 1) - 1) + 1
         return next(t for t in self._tokens[start:] if t.kind == "sign" and t.text == text)
 
@@ -379,12 +379,12 @@ def _no_function(name: str) -> str:
     return f"no function {name!r}; there are {', '.join(sorted(FUNCTIONS))}"
 
 
-def _lexical_complaint(char: str) -> str:
+def _token_error(char: str) -> str:
     match char:
         case "'" | '"':
             return f"this text is not closed; it needs another {char}"
         case "=":
-            return "a single '=' compares nothing; write '=='"
+            return "'=' is not a comparison; write '=='"
         case "&" | "|" | "!":
             return f"{char!r} is not an operator here; write and, or, not, !="
         case ".":

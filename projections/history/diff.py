@@ -1,8 +1,7 @@
-"""What is different between two maps: a difference applied to the first gives the second.
+"""The difference between two maps; applied to the first it gives the second.
 
-A map as rows by id: what a difference between two maps is taken of.
-
-Ids, not ordinals, so that the rows of two logs or two settings can stand side by side too.
+Maps are compared as rows by id, not by ordinal, so that maps of two logs or two settings can be
+compared too.
 """
 
 import math
@@ -18,7 +17,7 @@ from .records import Cause
 
 @dataclass(frozen=True, slots=True)
 class PlaceRow:
-    """A standing place; its centroid in metres."""
+    """A place that is not absorbed; its centroid in metres."""
 
     place_id: str
     centroid_x: float
@@ -28,7 +27,7 @@ class PlaceRow:
 
 @dataclass(frozen=True, slots=True)
 class ObjectRow:
-    """An object; its mean position in metres, its sightings in order."""
+    """An object: its mean position in metres, its detections in order."""
 
     object_id: str
     class_name: str
@@ -52,7 +51,7 @@ class KeyframeRow:
 
 @dataclass(frozen=True, slots=True)
 class EdgeRow:
-    """Two places next to each other."""
+    """Two adjacent places."""
 
     a: str
     b: str
@@ -65,29 +64,29 @@ R = TypeVar("R")
 
 @dataclass(frozen=True, slots=True)
 class Changes(Generic[K, R]):
-    """What turns one table into another: rows that came, went, and changed (before, after)."""
+    """Differences of two tables: rows added, removed, and changed (before, after)."""
 
-    came: tuple[R, ...]
-    went: tuple[R, ...]
+    added: tuple[R, ...]
+    removed: tuple[R, ...]
     changed: tuple[tuple[R, R], ...]
 
     @property
     def none(self) -> bool:
         """Whether nothing changed."""
-        return not (self.came or self.went or self.changed)
+        return not (self.added or self.removed or self.changed)
 
     def apply(self, rows: dict[K, R], key: Callable[[R], K]) -> dict[K, R]:
         """The table after the changes; ``rows`` is the one before."""
-        gone = {key(row) for row in self.went}
-        kept = {k: row for k, row in rows.items() if k not in gone}
-        return kept | {key(after): after for _, after in self.changed} | _by(key, self.came)
+        removed = {key(row) for row in self.removed}
+        kept = {k: row for k, row in rows.items() if k not in removed}
+        return kept | {key(after): after for _, after in self.changed} | _by(key, self.added)
 
 
 def changes(before: dict[K, R], after: dict[K, R]) -> Changes[K, R]:
-    """What turns ``before`` into ``after``, in the order of the tables."""
+    """The differences of two tables by key, in the order of the tables."""
     return Changes(
-        came=tuple(row for key, row in after.items() if key not in before),
-        went=tuple(row for key, row in before.items() if key not in after),
+        added=tuple(row for key, row in after.items() if key not in before),
+        removed=tuple(row for key, row in before.items() if key not in after),
         changed=tuple(
             (row, after[key]) for key, row in before.items() if key in after and after[key] != row
         ),
@@ -100,7 +99,7 @@ Edges: TypeAlias = dict[tuple[str, str], EdgeRow]
 
 @dataclass(frozen=True, slots=True)
 class MapRows:
-    """A whole map by id."""
+    """The tables of a map, by id."""
 
     keyframes: Keyframes
     places: dict[str, PlaceRow]
@@ -109,7 +108,7 @@ class MapRows:
 
 
 def rows_of(view: MapView) -> MapRows:
-    """The rows of a map, each table in the order of founding."""
+    """The rows of a map, each table in the order of the view."""
     ids = [place.place_id for place in view.all_places]
     return MapRows(
         keyframes=_by(keyframe_key, _keyframe_rows(view, ids)),
@@ -169,10 +168,10 @@ def _object_rows(view: MapView, ids: list[str]) -> Iterable[ObjectRow]:
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """What turns the map after ``start`` events into that after ``end``.
+    """The difference of the map after ``start`` events and that after ``end``.
 
-    ``absorbed`` says into which place, and because of what, a place went that is gone; it is empty
-    when time runs backwards (``end`` < ``start``).
+    ``absorbed`` gives, by id of an absorbed place, the surviving place and the cause; it is empty
+    when ``end`` < ``start``.
     """
 
     start: Offset
@@ -215,10 +214,10 @@ class Difference:
 
     def _places(self) -> dict[str, Any]:
         return {
-            "formed": [_place(row) for row in self.places.came],
+            "formed": [_place(row) for row in self.places.added],
             "gone": [
                 {**_place(row), **_into(self.absorbed.get(row.place_id))}
-                for row in self.places.went
+                for row in self.places.removed
             ],
             "changed": [
                 {
@@ -240,7 +239,7 @@ def difference_of(
     counts: tuple[dict[str, int], dict[str, int]],
     absorbed: dict[str, tuple[str, Cause]],
 ) -> Difference:
-    """Take the difference of two maps given as rows."""
+    """The difference of two maps given as rows."""
     before, after = rows
     return Difference(
         start=start,
@@ -256,12 +255,12 @@ def difference_of(
 
 
 def place_shift_m(before: PlaceRow, after: PlaceRow) -> float:
-    """How far a centroid moved."""
+    """The distance between two centroids in metres."""
     return math.hypot(after.centroid_x - before.centroid_x, after.centroid_y - before.centroid_y)
 
 
 def object_shift_m(before: ObjectRow, after: ObjectRow) -> float:
-    """How far a mean position moved."""
+    """The distance between two mean positions in metres."""
     return math.hypot(after.mean_x - before.mean_x, after.mean_y - before.mean_y)
 
 
@@ -293,8 +292,8 @@ def _object(row: ObjectRow) -> dict[str, Any]:
 
 def _objects(found: Changes[str, ObjectRow]) -> dict[str, Any]:
     return {
-        "new": [{**_object(row), "det_ids": list(row.det_ids)} for row in found.came],
-        "gone": [_object(row) for row in found.went],
+        "new": [{**_object(row), "det_ids": list(row.det_ids)} for row in found.added],
+        "gone": [_object(row) for row in found.removed],
         "changed": [
             {
                 "object_id": before.object_id,
@@ -311,8 +310,8 @@ def _objects(found: Changes[str, ObjectRow]) -> dict[str, Any]:
 
 def _keyframes(found: Changes[tuple[str, int], KeyframeRow]) -> dict[str, Any]:
     return {
-        "new": [_keyframe(row) for row in found.came],
-        "gone": [_keyframe(row) for row in found.went],
+        "new": [_keyframe(row) for row in found.added],
+        "gone": [_keyframe(row) for row in found.removed],
         "changed": [
             {**_keyframe(after), "before": before.place_id} for before, after in found.changed
         ],
@@ -332,9 +331,9 @@ def _keyframe(row: KeyframeRow) -> dict[str, Any]:
 
 
 def _edges(found: Changes[tuple[str, str], EdgeRow]) -> list[dict[str, Any]]:
-    came = [(row, 0, row.shared_transitions) for row in found.came]
-    went = [(row, row.shared_transitions, 0) for row in found.went]
+    added = [(row, 0, row.shared_transitions) for row in found.added]
+    removed = [(row, row.shared_transitions, 0) for row in found.removed]
     changed = [(b, b.shared_transitions, a.shared_transitions) for b, a in found.changed]
     return [
-        {"a": row.a, "b": row.b, "before": b, "after": a} for row, b, a in came + went + changed
+        {"a": row.a, "b": row.b, "before": b, "after": a} for row, b, a in added + removed + changed
     ]

@@ -70,8 +70,8 @@ def _keyframes(diff: Difference) -> str:
     relabelled = [(b.place_id, a.place_id) for b, a in found.changed]
     out_of_noise = sum(before is None for before, _ in relabelled)
     parts = [
-        (len(found.came), "new"),
-        (len(found.went), "gone"),
+        (len(found.added), "new"),
+        (len(found.removed), "gone"),
         (out_of_noise, "left noise"),
         (len(relabelled) - out_of_noise, "changed place"),
     ]
@@ -85,13 +85,13 @@ def _counts_text(parts: Sequence[tuple[int, str]]) -> str:
 def _places(diff: Difference) -> tuple[str, str, list[list[str]]]:
     found = diff.places
     parts = [
-        (len(found.came), "formed"),
-        (len(found.went), "gone"),
+        (len(found.added), "formed"),
+        (len(found.removed), "gone"),
         (len(found.changed), "changed"),
     ]
     groups = [
-        [f"+ {_place_row_text(row)}" for row in found.came],
-        [f"- {row.place_id}{_into(diff, row)}" for row in found.went],
+        [f"+ {_place_row_text(row)}" for row in found.added],
+        [f"- {row.place_id}{_into(diff, row)}" for row in found.removed],
         [f"~ {_place_change(before, after)}" for before, after in found.changed],
     ]
     return "places", _counts_text(parts), groups
@@ -151,14 +151,14 @@ def _objects(diff: Difference) -> tuple[str, str, list[list[str]]]:
     relocated = [change for change in changed if change.relocated]
     others = [change for change in changed if not change.relocated]
     parts = [
-        (len(found.came), "new"),
-        (len(found.went), "gone"),
+        (len(found.added), "new"),
+        (len(found.removed), "gone"),
         (sum(change.seen > 0 for change in changed), "seen again"),
         (len(relocated), "relocated"),
     ]
     groups = [
-        [f"+ {o.object_id} {o.class_name} in {o.place_id or 'no place'}" for o in found.came],
-        [f"- {o.object_id} {o.class_name}" for o in found.went],
+        [f"+ {o.object_id} {o.class_name} in {o.place_id or 'no place'}" for o in found.added],
+        [f"- {o.object_id} {o.class_name}" for o in found.removed],
         [f"> {change.text()}" for change in relocated],
         [f"~ {change.text()}" for change in others],
     ]
@@ -167,10 +167,14 @@ def _objects(diff: Difference) -> tuple[str, str, list[list[str]]]:
 
 def _edges(diff: Difference) -> tuple[str, str, list[list[str]]]:
     found = diff.edges
-    parts = [(len(found.came), "new"), (len(found.went), "gone"), (len(found.changed), "changed")]
+    parts = [
+        (len(found.added), "new"),
+        (len(found.removed), "gone"),
+        (len(found.changed), "changed"),
+    ]
     groups = [
-        [f"+ {e.a} – {e.b}: {counted(e.shared_transitions, 'transition')}" for e in found.came],
-        [f"- {e.a} – {e.b}" for e in found.went],
+        [f"+ {e.a} – {e.b}: {counted(e.shared_transitions, 'transition')}" for e in found.added],
+        [f"- {e.a} – {e.b}" for e in found.removed],
         [
             f"~ {after.a} – {after.b}: {before.shared_transitions:,} → {after.shared_transitions:,}"
             for before, after in found.changed
