@@ -1,4 +1,4 @@
-"""`mapfold record`: Zenoh to log, until a signal ends it."""
+"""`mapfold record`: record from Zenoh to a log until a signal ends it."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -19,13 +19,13 @@ from eventsrc.transport.config import parse_address
 from eventsrc.transport.session import check_keys, open_session
 
 from .options import ConfigOption, ConnectOption, JsonOption, ListenOption, zenoh_options
-from .recorder_text import EVERY_S, RecorderEnd, say_restart, watching
+from .recorder_text import EVERY_S, RecorderSummary, say_restart, show_status
 from .signals import stop_on_signals
 from .terminal import say, say_metrics
 
 _LARGEST_BYTES: Final = 128 * 1024 * 1024
-"""What Zenoh puts together of one message, however small ``--max-payload``: it tells nobody of what
-it drops, so most of what is too large should come this far and be counted."""
+"""Lower bound of Zenoh's own size limit, which drops messages silently: most messages that are too
+large should reach the recorder and be counted."""
 
 
 def record(
@@ -84,7 +84,7 @@ def record(
     check_keys(keys)
     address = None if metrics is None else parse_address(metrics, "--metrics")
     with (
-        RecorderEnd(log, json=json) as end,
+        RecorderSummary(log, json=json) as summary,
         stop_on_signals() as stop,
         open_session(options, mode=options.mode) as session,
         LogWriter(log, fsync=policy) as writer,
@@ -96,34 +96,34 @@ def record(
             keys,
             queue_size=queue,
             max_events=max_events,
-            ledger=_ledger(log),
+            ledger=_gap_history(log),
             report_gaps=gaps,
             max_payload_bytes=max_payload,
         )
-        end.watch(writer, recorder)
-        with _measured(address, recorder, log), watching(log) as watch:
+        summary.watch(writer, recorder)
+        with _metrics(address, recorder, log), show_status(log) as watch:
             named = ", ".join(keys)
             say(f"recording {named} to {log} from offset {writer.next_offset}; Ctrl-C ends it")
             recorder.run(stop, every_s=EVERY_S, watch=watch)
-    end.finish()
+    summary.finish()
 
 
-def _ledger(log: Path) -> GapLedger[RunId] | None:
-    """What the log lacks so far. Damage in an old segment is no reason not to record."""
+def _gap_history(log: Path) -> GapLedger[RunId] | None:
+    """The log's gap history, or None if the log is damaged: recording goes on without it."""
     try:
         with LogReader(log) as reader:
             return keep_ledger(reader, note=say)
     except LogDamaged as error:
-        say(f"recording all the same, without knowing what the log lacks so far: {error}")
+        say(f"recording without gap history: {error}")
         return None
 
 
 @contextmanager
-def _measured(address: tuple[str, int] | None, recorder: Recorder, log: Path) -> Iterator[None]:
+def _metrics(address: tuple[str, int] | None, recorder: Recorder, log: Path) -> Iterator[None]:
     if address is None:
         yield
         return
-    from eventsrc.metrics import serving_metrics  # costs nothing unless asked for
+    from eventsrc.metrics import serving_metrics  # not imported unless needed
 
     with serving_metrics(address, recorder.report, log) as port:
         say_metrics(address, port)

@@ -1,11 +1,4 @@
-"""What a recorder says while it records: one line on a terminal, and losses everywhere.
-
-What a writer found when it opened a log: one line for people, numbers for programs.
-
-How a recording ended: the last lines for people and the numbers for programs.
-
-Said also when the log could not be written any more, for that is when the numbers matter.
-"""
+"""Text and JSON of a recorder: status line, warnings, what was recovered at the start, summary."""
 
 import shutil
 import time
@@ -27,11 +20,11 @@ from .terminal import emit, finish, people, say
 
 EVERY_S = 1.0
 _FEW_UNSEALED = 3
-"""So many segments may wait to be sealed without anybody being told: sealing runs behind."""
+"""Up to this many unsealed segments are normal and not shown."""
 
 
-class RecorderLine:
-    """Turns successive reports into the status line, and speaks up when losses grow."""
+class RecorderStatus:
+    """The status line and warnings from successive reports of a recorder."""
 
     def __init__(self, log: Path, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._log = log
@@ -42,7 +35,7 @@ class RecorderLine:
         self._faults = 0
 
     def line(self, report: RecorderReport, free_bytes: int) -> str:
-        """The status line; the rate is that since the call before."""
+        """The status line; the rate is since the previous call."""
         now_s = self._clock()
         rate = (report.recorded - self._recorded) / max(now_s - self._at_s, 1e-9)
         self._at_s, self._recorded = now_s, report.recorded
@@ -53,19 +46,19 @@ class RecorderLine:
             f"{free_bytes / 1e9:,.1f} GB free{_unsealed(report)}"
         )
 
-    def complaints(self, report: RecorderReport) -> list[str]:
-        """A line for whatever has grown since the call before."""
+    def warnings(self, report: RecorderReport) -> list[str]:
+        """A line for each kind of loss that has grown since the previous call."""
         lines = []
         lost = report.queue_full + report.too_large + report.transport_missed
         if lost > self._lost:
             lines.append(
-                f"LOST {lost - self._lost} messages ({report.queue_full} in a full queue, "
-                f"{report.too_large} too large, {report.transport_missed} on the way, in all); "
-                f"see mapfold/loss in {self._log}"
+                f"LOST {counted(lost - self._lost, 'message')} (in all {report.queue_full:,} in a "
+                f"full queue, {report.too_large:,} too large, {report.transport_missed:,} on the "
+                f"way); see mapfold/loss in {self._log}"
             )
         if report.rejected > self._rejected:
             lines.append(
-                f"rejected {report.rejected - self._rejected} payloads; "
+                f"rejected {counted(report.rejected - self._rejected, 'payload')}; "
                 f"see mapfold/rejected in {self._log}"
             )
         lines += [
@@ -87,21 +80,22 @@ def _unsealed(report: RecorderReport) -> str:
 
 
 @contextmanager
-def watching(log: Path) -> Iterator[Callable[[RecorderReport], None]]:
-    """What to give `Recorder.run` as ``watch``."""
-    status = RecorderLine(log)
+def show_status(log: Path) -> Iterator[Callable[[RecorderReport], None]]:
+    """The ``watch`` function for `Recorder.run`: prints warnings, and on a terminal the status
+    line."""
+    status = RecorderStatus(log)
 
-    def complain(report: RecorderReport) -> None:
-        for line in status.complaints(report):
+    def warn(report: RecorderReport) -> None:
+        for line in status.warnings(report):
             say(line)
 
     if not people.is_terminal:
-        yield complain
+        yield warn
         return
     with Live(console=people, transient=True, auto_refresh=False) as live:
 
         def show(report: RecorderReport) -> None:
-            complain(report)
+            warn(report)
             text = status.line(report, shutil.disk_usage(log).free)
             live.update(Text(text, no_wrap=True, overflow="ellipsis"), refresh=True)
 
@@ -109,7 +103,7 @@ def watching(log: Path) -> Iterator[Callable[[RecorderReport], None]]:
 
 
 def say_restart(log: Path, writer: LogWriter) -> None:
-    """Say what was recovered and what was cut off; nothing, if the log was left in order."""
+    """Print what was recovered and what was cut off, if the last writer did not finish."""
     found = writer.restart
     if not (found.recovered_segments or found.torn_bytes or found.torn_events):
         return
@@ -118,12 +112,12 @@ def say_restart(log: Path, writer: LogWriter) -> None:
         f"{counted(found.recovered_segments, 'segment')} with "
         f"{counted(found.recovered_events, 'event')}, cut off "
         f"{counted(found.torn_bytes, 'torn byte')} with "
-        f"{counted(found.torn_events, 'event')} that never counted as recorded"
+        f"{counted(found.torn_events, 'event')} that were never recorded"
     )
 
 
 def restart_as_json(writer: LogWriter) -> dict[str, int]:
-    """The same for programs."""
+    """What was recovered and cut off, for ``--json``."""
     found = writer.restart
     return {
         "recovered_segments": found.recovered_segments,
@@ -133,8 +127,12 @@ def restart_as_json(writer: LogWriter) -> dict[str, int]:
     }
 
 
-class RecorderEnd:
-    """Wrap it around everything, `watch` the recorder once there is one, and `finish` at last."""
+class RecorderSummary:
+    """Prints the last lines of a recording, also when the log could not be written any more.
+
+    A context manager around the recording: `watch` the recorder as soon as there is one, and call
+    `finish` at the end.
+    """
 
     def __init__(self, log: Path, *, json: bool) -> None:
         self._log = log
@@ -142,7 +140,7 @@ class RecorderEnd:
         self._watched: tuple[LogWriter, Recorder] | None = None
 
     def watch(self, writer: LogWriter, recorder: Recorder) -> None:
-        """From here on there is something to tell."""
+        """Print the numbers of ``recorder`` at the end."""
         self._watched = writer, recorder
 
     def __enter__(self) -> Self:
@@ -156,18 +154,18 @@ class RecorderEnd:
         writer, recorder = self._watched
         report = recorder.report()
         if report.unwritten:
-            say(lost_in_queue(report))
+            say(unwritten_text(report))
         say(summary(self._log, report))
         if self._json:
             emit(as_json(report) | restart_as_json(writer))
 
     def finish(self) -> None:
-        """Exit with 3 when the recorder lost or rejected something."""
+        """Exit with 3 if the recorder lost or rejected something."""
         finish(findings=self._watched is not None and not self._watched[1].report().clean)
 
 
-def lost_in_queue(report: RecorderReport) -> str:
-    """What went down with a log that takes no more."""
+def unwritten_text(report: RecorderReport) -> str:
+    """A line about messages that were received and not written."""
     return (
         f"LOST {counted(report.unwritten, 'message')} that had come in and could not be written, "
         f"{report.queue_depth:,} of them in the queue; robots with a spool send theirs again"
@@ -175,7 +173,7 @@ def lost_in_queue(report: RecorderReport) -> str:
 
 
 def summary(log: Path, report: RecorderReport) -> str:
-    """The last line for people."""
+    """The last line of a recording."""
     return (
         f"{log}: {report.recorded:,} recorded, {report.rejected:,} rejected, {report.lost:,} lost, "
         f"{counted(report.missing, 'keyframe')} missing; "
@@ -184,7 +182,7 @@ def summary(log: Path, report: RecorderReport) -> str:
 
 
 def as_json(report: RecorderReport) -> dict[str, int | str | None]:
-    """The final numbers for programs."""
+    """The final numbers, for ``--json``."""
     return {
         "recorded": report.recorded,
         "rejected": report.rejected,

@@ -93,7 +93,7 @@ def test_a_rejected_payload_is_exit_3(
 
 
 @pytest.mark.parametrize(("option", "code", "losses"), [("--gaps", 3, 2), ("--no-gaps", 0, 0)])
-def test_robots_that_do_not_count_by_one(
+def test_no_gaps_is_for_robots_that_do_not_count_by_one(
     start: Start,
     publish: Start,
     endpoint: str,
@@ -120,7 +120,7 @@ def test_without_a_router_it_is_one_line_and_no_log(start: Start, tmp_path: Path
     assert not (tmp_path / "log").exists()
 
 
-def test_robots_may_call_a_recorder_without_any_router(
+def test_a_robot_can_connect_to_a_recorder_without_a_router(
     start: Start, start_code: Start, tmp_path: Path
 ) -> None:
     with Router(LOOPBACK) as gone:
@@ -133,7 +133,7 @@ def test_robots_may_call_a_recorder_without_any_router(
     assert len(_stored(log)) == 1
 
 
-def test_a_second_recorder_is_told_who_holds_the_log(
+def test_a_second_recorder_is_refused_with_the_name_of_the_holder(
     start: Start, endpoint: str, tmp_path: Path
 ) -> None:
     with LogWriter(tmp_path / "log"):
@@ -264,7 +264,7 @@ def test_a_full_disk_is_one_line_and_what_is_synced_stays(
     assert f"{len(stored)} recorded, 0 rejected, {numbers['unwritten']} lost" in summary
 
 
-def test_a_segment_that_cannot_be_sealed_is_told_with_the_numbers(
+def test_a_failing_seal_is_reported_with_the_numbers(
     start: Start, endpoint: str, connected: Sessions, tmp_path: Path
 ) -> None:
     """The disk fills up when all is synced: there is no room for the sealed segment."""
@@ -289,7 +289,7 @@ def test_a_segment_that_cannot_be_sealed_is_told_with_the_numbers(
     assert len(_stored(log)) == 1
 
 
-def test_a_recorder_that_is_killed_soon_leaves_little_to_be_read_again(
+def test_the_ledger_is_saved_soon_after_the_start(
     start: Start, publish: Start, endpoint: str, tmp_path: Path
 ) -> None:
     log = tmp_path / "log"
@@ -322,7 +322,7 @@ def _known(log: Path) -> int:
         return reader.next_offset - unread_events(reader)
 
 
-def test_a_segment_that_is_cut_short_ends_no_recording_and_is_told(
+def test_a_segment_that_is_cut_short_is_reported_and_recording_goes_on(
     start: Start, endpoint: str, tmp_path: Path
 ) -> None:
     log = tmp_path / "log"
@@ -364,7 +364,7 @@ def _leave_torn(log: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["record", "import"])
-def test_what_a_killed_writer_left_is_told(
+def test_what_a_killed_writer_left_is_reported(
     start: Start, endpoint: str, tmp_path: Path, command: str
 ) -> None:
     log, nothing = tmp_path / "log", tmp_path / "nothing.jsonl"
@@ -382,7 +382,7 @@ def test_what_a_killed_writer_left_is_told(
     assert (numbers["torn_bytes"] > 20, numbers["torn_events"]) == (True, 1)
     assert program.lines[0] == (
         f"{log}: the last writer did not finish; recovered 1 segment with 3 events, cut off "
-        f"{numbers['torn_bytes']} torn bytes with 1 event that never counted as recorded"
+        f"{numbers['torn_bytes']} torn bytes with 1 event that were never recorded"
     )
 
 
@@ -396,7 +396,7 @@ def test_a_place_where_no_log_can_be_is_one_line(
     assert str(tmp_path / "file") in line
 
 
-def test_rot_in_an_old_segment_does_not_keep_a_robot_from_recording(
+def test_recording_goes_on_without_gap_history_when_an_old_segment_is_damaged(
     start: Start, publish: Start, endpoint: str, tmp_path: Path
 ) -> None:
     log = tmp_path / "log"
@@ -409,7 +409,7 @@ def test_rot_in_an_old_segment_does_not_keep_a_robot_from_recording(
     rotten[len(rotten) // 2] ^= 0xFF
     segment.write_bytes(rotten)
     recorder = start("record", str(log), "--connect", endpoint)
-    recorder.wait_for("recording all the same")
+    recorder.wait_for("recording without gap history")
     recorder.wait_for("from offset 3")
     assert publish(KEY, payload(envelope(3)).decode()).wait() == 0
     assert recorder.end(signal.SIGINT) == 0
@@ -417,7 +417,7 @@ def test_rot_in_an_old_segment_does_not_keep_a_robot_from_recording(
     assert not (log / NAME).exists()
 
 
-def test_news_that_find_no_room_end_no_recording(
+def test_a_full_stderr_does_not_end_a_recording(
     publish: Start, endpoint: str, tmp_path: Path
 ) -> None:
     """What it says goes to a file on a full disk; the log is on another one."""
