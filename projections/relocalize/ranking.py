@@ -85,7 +85,10 @@ class Answer:
     def document(self) -> dict[str, Any]:
         """The answer as JSON, in the shape of ``relocalize --json``."""
         return {
-            "places": [asdict(place) for place in self.places],
+            "places": [
+                asdict(place) | {"evidence": [asdict(evidence) for evidence in place.evidence]}
+                for place in self.places
+            ],
             "pose": None if self.pose is None else asdict(self.pose),
             "confidence": self.confidence,
             "unknown": self.unknown,

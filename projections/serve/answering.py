@@ -106,8 +106,8 @@ _KINDS: Final[tuple[tuple[type[MapfoldError], str, int, str | None], ...]] = (
     (ProjectionMissing, "database", 503, "there is no map yet; ask again later"),
     (ProjectionMismatch, "database", 503, "graph and vectors are not of one map"),
     (DatabaseUnavailable, "database", 503, "the database does not answer; ask again later"),
-    (DatabaseError, "database", 503, "the database cannot be asked; the service tells why"),
-    (MapfoldError, "failed", 500, "failed; the service tells why"),
+    (DatabaseError, "database", 503, "the database cannot be asked; see the service's stderr"),
+    (MapfoldError, "failed", 500, "failed; see the service's stderr"),
 )
 """Error, kind, HTTP status and the message for others; None: the error's own. Messages that name
 databases and paths only go to the service's stderr (`Answerer`)."""

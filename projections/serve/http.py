@@ -110,7 +110,7 @@ def _add_error_handlers(app: FastAPI) -> None:
     @app.exception_handler(HTTPException)
     async def refuse_path(request: Request, error: HTTPException) -> JSONResponse:
         asked = f"{request.method} {describe_value(request.scope['path'])}"
-        message = f"{asked}: {error.detail}; /docs tells what there is"
+        message = f"{asked}: {error.detail}; see /docs"
         _, document = refusal(QuestionError(message))
         return JSONResponse(document, error.status_code, headers=error.headers)
 
