@@ -1,4 +1,4 @@
-"""Which database a command uses, and the one line it says when that database fails it."""
+"""Which database a command uses, and the one-line errors of databases."""
 
 import socket
 import subprocess
@@ -46,7 +46,7 @@ def test_two_databases() -> None:
         assert not targets.one_database
 
 
-def test_options_win_over_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_options_override_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MAPFOLD_DB", A)
     monkeypatch.setenv("MAPFOLD_VECTOR_DB", B)
     with open_targets() as targets:
@@ -58,7 +58,7 @@ def test_options_win_over_the_environment(monkeypatch: pytest.MonkeyPatch) -> No
 @pytest.mark.parametrize(
     "url", ["nonsense", "mysql://u:secret@host/db", "postgresql://u:secret@host/db?no_such=1"]
 )
-def test_a_bad_url_is_misuse_and_keeps_the_password_to_itself(url: str) -> None:
+def test_a_bad_url_is_misuse_and_shows_no_password(url: str) -> None:
     with pytest.raises(MisuseError, match="not a PostgreSQL URL") as caught, open_targets(url):
         pass
     assert "secret" not in str(caught.value)
@@ -77,7 +77,7 @@ def test_a_server_that_is_down() -> None:
     assert "database db at 127.0.0.1" in message
 
 
-def test_trouble_with_the_embedded_server_is_not_about_urls(
+def test_errors_of_the_embedded_server_do_not_mention_urls(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MAPFOLD_HOME", str(tmp_path))
@@ -102,7 +102,7 @@ with connect(url, autocommit=True) as killer, connect(url) as connection:
 """
 
 
-def test_a_lost_connection_is_told_once_and_by_us(pg_url: str) -> None:
+def test_a_lost_connection_is_reported_once(pg_url: str) -> None:
     done = subprocess.run(
         [sys.executable, "-c", CUT, pg_url], capture_output=True, text=True, check=True
     )
@@ -111,18 +111,18 @@ def test_a_lost_connection_is_told_once_and_by_us(pg_url: str) -> None:
     assert done.stdout.startswith("database ")
 
 
-def test_a_database_that_is_not_there(pg_server: EmbeddedServer) -> None:
+def test_a_missing_database(pg_server: EmbeddedServer) -> None:
     with pytest.raises(DatabaseUnavailable, match=r'"nowhere" does not exist; create it with'):
         connect(pg_server.url_of("nowhere"))
 
 
-def test_a_user_that_is_not_there(pg_server: EmbeddedServer) -> None:
+def test_a_missing_user(pg_server: EmbeddedServer) -> None:
     url = pg_server.url.replace("postgres@", "stranger@")
     with pytest.raises(DatabaseUnavailable, match=r"stranger.*does not exist; create it with"):
         connect(url)
 
 
-def test_extensions_are_created_once_and_their_version_told(bare_pg_url: str) -> None:
+def test_extensions_are_created_once_and_their_version_returned(bare_pg_url: str) -> None:
     with connect(bare_pg_url) as connection:
         assert ensure_extension(connection, "vector") == ensure_extension(connection, "vector")
         assert ensure_extension(connection, "age").startswith("1.")
@@ -178,7 +178,7 @@ def test_cypher_without_the_extension(bare_pg_url: str) -> None:
         connect_for_cypher(bare_pg_url)
 
 
-def test_a_question_to_a_database_that_nothing_was_ever_projected_into(bare_pg_url: str) -> None:
+def test_a_question_to_a_database_without_a_projection(bare_pg_url: str) -> None:
     with pytest.raises(ExtensionMissing, match=r"nothing has been projected .*; run mapfold"):
         CandidateReader(Targets(bare_pg_url, bare_pg_url))
 

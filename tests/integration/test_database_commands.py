@@ -42,7 +42,7 @@ def server(commands: Commands) -> EmbeddedServer:
     return EmbeddedServer(Path(commands.env["MAPFOLD_HOME"]))
 
 
-def test_the_life_of_a_projection(mapfold: Commands, log: Path) -> None:
+def test_replay_tail_status_and_check(mapfold: Commands, log: Path) -> None:
     assert mapfold("status", log, code=3).out.count("missing") == 2
     replayed = mapfold("replay", log, "--until", "run-a:29", "--json").json
     assert replayed["events"] == 30
@@ -133,7 +133,7 @@ def test_a_refusal_names_the_settings_that_fit(mapfold: Commands, log: Path) -> 
     assert advised(said) == ["replay", str(log), "--set", "min_samples=4"]
 
 
-def test_another_log_is_not_so_and_so_far_behind(mapfold: Commands, log: Path) -> None:
+def test_another_log_has_no_lag(mapfold: Commands, log: Path) -> None:
     mapfold("replay", log)
     other = write_log(mapfold.folder / "other", walk(5))
     said = mapfold("status", other, code=3)
@@ -143,7 +143,7 @@ def test_another_log_is_not_so_and_so_far_behind(mapfold: Commands, log: Path) -
     assert "the vectors there were made from log" in said.err
 
 
-def test_a_replay_says_what_it_left_out(mapfold: Commands) -> None:
+def test_a_replay_prints_what_it_left_out(mapfold: Commands) -> None:
     first = envelope(0, detections=[detection("cup", [1.0] * 8)])
     others = walk(6, first=1, dim=16, detections=3)
     again = {**others[0], "map_x": 77.0}
@@ -164,7 +164,7 @@ def test_a_replay_says_what_it_left_out(mapfold: Commands) -> None:
     assert document["counts"]["foreign_embeddings"] == many + 1
 
 
-def test_a_replay_of_everything_leaves_nothing_to_say(mapfold: Commands, log: Path) -> None:
+def test_a_complete_replay_prints_no_left_out_line(mapfold: Commands, log: Path) -> None:
     assert "left out" not in mapfold("replay", log).err
 
 
@@ -174,7 +174,7 @@ def test_db_stop_says_whether_anything_ran(mapfold: Commands) -> None:
     assert mapfold("db", "stop").err == "stopped\n"
 
 
-def test_a_live_tail_says_when_it_follows(mapfold: Commands, log: Path) -> None:
+def test_a_live_tail_prints_when_it_has_caught_up(mapfold: Commands, log: Path) -> None:
     running = subprocess.Popen(
         [str(PROGRAM), "tail", str(log)], env=dict(mapfold.env), cwd=mapfold.folder,
         stderr=subprocess.PIPE, text=True,
@@ -198,9 +198,7 @@ def read_screen(screen: int) -> str:
     return shown.decode()
 
 
-def test_a_tail_that_catches_up_shows_how_far_it_is_on_a_terminal(
-    mapfold: Commands, log: Path
-) -> None:
+def test_a_tail_that_catches_up_shows_a_bar_on_a_terminal(mapfold: Commands, log: Path) -> None:
     ours, theirs = pty.openpty()
     running = subprocess.Popen(
         [str(PROGRAM), "tail", str(log), "--once"],
@@ -219,7 +217,7 @@ def test_roles_are_sql(mapfold: Commands) -> None:
 
 
 @pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGINT])
-def test_a_live_tail_drains_and_leaves_no_server(
+def test_a_signal_ends_a_live_tail_after_its_batch_and_leaves_no_server(
     mapfold: Commands, log: Path, signum: signal.Signals
 ) -> None:
     running = subprocess.Popen(

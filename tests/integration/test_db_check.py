@@ -91,7 +91,7 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("damage", DAMAGE)
-def test_damage_is_named_and_repaired(
+def test_every_kind_of_damage_is_named_and_repaired(
     log: Path, one_database: Targets, pg: psycopg.Connection, damage: str
 ) -> None:
     rebuild(log, one_database, SETTINGS)
@@ -155,7 +155,7 @@ DROPS = {
 
 
 @pytest.mark.parametrize("sink", DROPS)
-def test_what_somebody_has_dropped_is_missed_and_not_gone_on_with(
+def test_dropped_tables_are_reported_and_not_written_to(
     log: Path, one_database: Targets, pg: psycopg.Connection, sink: str
 ) -> None:
     rebuild(log, one_database, SETTINGS)
@@ -176,7 +176,7 @@ def test_what_somebody_has_dropped_is_missed_and_not_gone_on_with(
 
 
 @pytest.mark.parametrize("sink", DROPS)
-def test_a_rebuild_that_swaps_beside_a_check_is_no_difference(
+def test_a_rebuild_beside_a_check_makes_no_difference(
     log: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch, sink: SinkName
 ) -> None:
     """To the check's snapshot the tables of such a rebuild would be empty."""
@@ -217,7 +217,7 @@ FOREIGN = {
 }
 
 
-def test_labels_and_tables_that_are_not_ours_are_found_kept_and_removed_as_told(
+def test_foreign_tables_are_found_and_copied_and_removed_by_the_sql_given(
     log: Path, one_database: Targets, pg: psycopg.Connection
 ) -> None:
     rebuild(log, one_database, SETTINGS)
@@ -235,7 +235,7 @@ def test_labels_and_tables_that_are_not_ours_are_found_kept_and_removed_as_told(
         assert pg.execute(count).fetchone() == (FOREIGN[table][1],)
 
 
-def test_the_command_names_them_and_repair_does_not_drop_them(
+def test_the_command_names_foreign_tables_and_repair_does_not_drop_them(
     log: Path, one_database: Targets, pg: psycopg.Connection
 ) -> None:
     mapfold = Commands.in_folder(log.parent)

@@ -1,4 +1,4 @@
-"""The embedded server: shared by commands, stopped after the last, never left behind."""
+"""The embedded server: shared by commands, stopped by the last, never left running."""
 
 import os
 import signal
@@ -77,7 +77,7 @@ def test_starts_serves_and_stops(home: Path) -> None:
     assert not answers(server)
 
 
-def test_data_outlives_the_server(home: Path) -> None:
+def test_data_survives_a_restart_of_the_server(home: Path) -> None:
     with EmbeddedServer(home) as server, psycopg.connect(server.url) as connection:
         connection.execute("CREATE TABLE kept AS SELECT 7 AS n")
     with EmbeddedServer(home) as server, psycopg.connect(server.url) as connection:
@@ -104,7 +104,7 @@ def test_db_start_keeps_it_and_db_stop_ends_that(home: Path) -> None:
     assert not server.running
 
 
-def test_db_stop_leaves_a_command_at_work_alone(home: Path) -> None:
+def test_db_stop_does_not_stop_a_server_in_use(home: Path) -> None:
     with holder(home) as other:
         server = EmbeddedServer(home)
         assert server.stop(discard_keep=True) is True
@@ -121,7 +121,7 @@ def test_a_signal_leaves_no_server_behind(home: Path, signum: signal.Signals) ->
     assert not EmbeddedServer(home).running
 
 
-def test_after_a_killed_command_the_next_one_stops_it(home: Path) -> None:
+def test_after_a_killed_command_the_next_command_stops_it(home: Path) -> None:
     with holder(home) as other:
         other.kill()
         other.wait(WAIT_S)
@@ -147,7 +147,7 @@ def test_a_path_with_spaces_quotes_and_percent(home: Path) -> None:
         assert answers(server)
 
 
-def test_a_server_that_cannot_start_says_what_its_log_says(home: Path) -> None:
+def test_a_server_that_cannot_start_quotes_its_log(home: Path) -> None:
     with EmbeddedServer(home) as server:
         pass
     (server.data / "postgresql.auto.conf").write_text("no_such_setting = 1\n")

@@ -1,4 +1,4 @@
-"""`mapfold query`: live answers equal those of the folded log, whatever things are called."""
+"""`mapfold query`: live answers equal those of the folded log, with any names."""
 
 import json
 from pathlib import Path
@@ -36,7 +36,7 @@ def view(log: Path) -> MapView:
         return fold_log(reader, Settings())[1]
 
 
-def test_live_answers_equal_the_folded_maps(
+def test_live_answers_equal_those_of_the_folded_map(
     log: Path, view: MapView, one_database: Targets
 ) -> None:
     rebuild(log, one_database, Settings())

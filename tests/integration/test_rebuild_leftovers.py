@@ -1,4 +1,4 @@
-"""What a swap replaced is dropped by the server on its own, if need be by the next rebuild."""
+"""The old map is dropped by the server after a swap, if need be by the next rebuild."""
 
 import sys
 from functools import partial
@@ -41,7 +41,7 @@ def nobody_drops(connection: Connection, statement: sql.Composed) -> None:
     connection.close()
 
 
-def test_nothing_is_left_when_the_server_is_through(
+def test_nothing_is_left_after_the_drop(
     log: Path, one_database: Targets, pg: psycopg.Connection
 ) -> None:
     for until in (30, None):

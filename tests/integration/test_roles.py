@@ -1,4 +1,4 @@
-"""What docs/projections.md promises about the two least-privilege roles."""
+"""The two least-privilege roles can do what docs/projections.md says and nothing else."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -54,7 +54,7 @@ def _readers_use_cypher(pg: psycopg.Connection) -> None:
 
 
 @pytest.mark.usefixtures("_readers_use_cypher")
-def test_a_reader_reads_and_writes_nothing(log: Path, projected: Targets) -> None:
+def test_a_reader_reads_and_cannot_write(log: Path, projected: Targets) -> None:
     reader = as_role(projected, "a_reader")
     for _ in range(2):  # before and after a rebuild by the owner
         with connect_for_cypher(reader.graph_url) as connection:
@@ -178,7 +178,7 @@ def test_a_writer_writes_through_cypher(projected: Targets) -> None:
         assert all_rows(projected) != before, name
 
 
-def test_the_rows_made_up_above_are_there(projected: Targets, pg: psycopg.Connection) -> None:
+def test_the_rows_of_the_write_attempts_exist(projected: Targets, pg: psycopg.Connection) -> None:
     tables = pg.execute(
         "SELECT tableoid::regclass::text FROM semantic_map._ag_label_vertex"
         " WHERE id::text IN ('844424930131969', '1125899906842625')"
@@ -190,7 +190,7 @@ def test_the_rows_made_up_above_are_there(projected: Targets, pg: psycopg.Connec
     ]  # fmt: skip
 
 
-def test_without_row_security_readers_may_not_use_cypher_and_status_tells_who_can_write(
+def test_without_row_security_readers_may_not_use_cypher_and_status_names_who_can_write(
     log: Path, projected: Targets, pg: psycopg.Connection
 ) -> None:
     """As it is with a graph of an earlier mapfold, or with an AGE that heeds no policies."""

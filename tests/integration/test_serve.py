@@ -55,14 +55,14 @@ def answerer(pools: Pools) -> Answerer:
 
 
 @pytest.fixture
-def room() -> Iterator[FairQueue]:
-    with FairQueue(4, max_wait_s=DEADLINE_S) as room:
-        yield room
+def queue() -> Iterator[FairQueue]:
+    with FairQueue(4, max_wait_s=DEADLINE_S) as queue:
+        yield queue
 
 
 @contextmanager
-def http_at(answerer: Answerer, room: FairQueue, port: int = 0) -> Iterator[int]:
-    app = Guard(create_app(answerer, room))
+def http_at(answerer: Answerer, queue: FairQueue, port: int = 0) -> Iterator[int]:
+    app = Guard(create_app(answerer, queue))
     with serving(app, bind("127.0.0.1", port)) as bound:
         yield bound
 
@@ -82,13 +82,13 @@ class TestZenoh:
 
     @pytest.fixture
     def service(
-        self, connected: Callable[[], Session], answerer: Answerer, room: FairQueue
+        self, connected: Callable[[], Session], answerer: Answerer, queue: FairQueue
     ) -> Iterator[ZenohService]:
-        with ZenohService(connected(), answerer, room) as service:
+        with ZenohService(connected(), answerer, queue) as service:
             yield service
 
     @pytest.mark.usefixtures("service")
-    def test_the_answer_is_the_librarys(
+    def test_the_answer_equals_the_librarys(
         self, connected: Callable[[], Session], targets: Targets
     ) -> None:
         good, answer = ask(connected(), "mapfold/relocalize", question())
@@ -167,12 +167,12 @@ class TestZenoh:
             )
         assert ask(session, "mapfold/relocalize", question())[0]
 
-    def test_a_closed_service_answered_what_it_took(
+    def test_a_closed_service_has_answered_queued_questions(
         self, connected: Callable[[], Session], answerer: Answerer
     ) -> None:
         session, answers = connected(), []
-        room = FairQueue(1, max_wait_s=DEADLINE_S)
-        service = ZenohService(connected(), answerer, room)
+        queue = FairQueue(1, max_wait_s=DEADLINE_S)
+        service = ZenohService(connected(), answerer, queue)
         threads = [
             threading.Thread(
                 target=lambda: answers.extend(
@@ -185,7 +185,7 @@ class TestZenoh:
             thread.start()
         service.close()
         service.close()
-        room.close()
+        queue.close()
         for thread in threads:
             thread.join()
         assert all(json.loads(answer) for _, answer in answers)
@@ -226,11 +226,11 @@ class TestHttp:
     """The ASGI app behind a real server on a free port."""
 
     @pytest.fixture
-    def http(self, answerer: Answerer, room: FairQueue) -> Iterator[str]:
-        with http_at(answerer, room) as port:
+    def http(self, answerer: Answerer, queue: FairQueue) -> Iterator[str]:
+        with http_at(answerer, queue) as port:
             yield f"http://127.0.0.1:{port}"
 
-    def test_the_answer_is_the_librarys(self, http: str, targets: Targets) -> None:
+    def test_the_answer_equals_the_librarys(self, http: str, targets: Targets) -> None:
         expected = relocalize(targets, parse_question(question()), top=1).document()
         assert fetch(f"{http}/relocalize?top=1", question()) == (200, expected)
 
@@ -260,13 +260,13 @@ class TestHttp:
         assert status == 400
         assert document["error"]["kind"] == "bad_question"
 
-    def test_what_is_not_there_is_refused_in_the_same_form(self, http: str) -> None:
+    def test_an_unknown_path_is_refused_in_the_same_form(self, http: str) -> None:
         status, document = fetch(f"{http}/nothing")
         assert (status, document["error"]["kind"]) == (404, "bad_question")
         status, document = fetch(f"{http}/relocalize")
         assert (status, document["error"]["kind"]) == (405, "bad_question")
 
-    def test_it_promises_no_refusal_that_it_never_gives(self, http: str) -> None:
+    def test_it_describes_no_refusal_that_it_never_gives(self, http: str) -> None:
         _, document = fetch(f"{http}/openapi.json")
         assert "422" not in document["paths"]["/relocalize"]["post"]["responses"]
 
@@ -274,20 +274,20 @@ class TestHttp:
         status, found = fetch(f"{http}/state/places?x=0&y=0&radius=1000")
         assert (status, bool(found["places"])) == (200, True)
 
-    def test_too_much_is_429(self, pools: Pools, room: FairQueue) -> None:
-        with http_at(Answerer(pools, per_second=0.01), room) as port:
+    def test_too_much_is_429(self, pools: Pools, queue: FairQueue) -> None:
+        with http_at(Answerer(pools, per_second=0.01), queue) as port:
             url = f"http://127.0.0.1:{port}/relocalize"
             assert fetch(url, question())[0] == 200
             assert fetch(url, question())[0] == 429
 
     def test_it_ends_with_its_block_and_frees_the_port(
-        self, answerer: Answerer, room: FairQueue
+        self, answerer: Answerer, queue: FairQueue
     ) -> None:
-        with http_at(answerer, room) as port:
+        with http_at(answerer, queue) as port:
             assert fetch(f"http://127.0.0.1:{port}/health")[0] == 200
-            with pytest.raises(TransportError, match="in use"), http_at(answerer, room, port):
+            with pytest.raises(TransportError, match="in use"), http_at(answerer, queue, port):
                 pytest.fail("two servers on one port")
-        with http_at(answerer, room, port) as again:
+        with http_at(answerer, queue, port) as again:
             assert again == port
 
 
@@ -326,7 +326,7 @@ class TestKilledServer:
             rebuild(write_log(tmp_path / "log", walk(60, seed=3)), targets, Settings())
             yield server
 
-    def test_our_own_is_started_again(self, server: EmbeddedServer) -> None:
+    def test_the_embedded_server_is_restarted(self, server: EmbeddedServer) -> None:
         told: list[str] = []
         with Pools(Targets(server.url, server.url, server), 4, told.append) as pools:
             answerer = Answerer(pools, per_second=10_000.0)
@@ -339,8 +339,8 @@ class TestKilledServer:
             assert answerer.relocalize(question(), {}) == before
         assert [line.endswith("trying again") for line in told[:4]] == [True, False, True, False]
 
-    def test_another_is_waited_for_a_little_and_missed_at_once_after_that(
-        self, server: EmbeddedServer, room: FairQueue, monkeypatch: pytest.MonkeyPatch
+    def test_questions_wait_for_another_server_at_first_and_fail_at_once_later(
+        self, server: EmbeddedServer, queue: FairQueue, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr("projections.serve.pools.PATIENCE_S", 0.5)
         told: list[str] = []
@@ -348,7 +348,7 @@ class TestKilledServer:
             answerer = Answerer(pools, per_second=10_000.0)
             answerer.relocalize(question(), {})
             kill_postgres(server)
-            with http_at(answerer, room) as port:
+            with http_at(answerer, queue) as port:
                 for path, data in (("relocalize", question()), ("health", None)):
                     status, document = fetch(f"http://127.0.0.1:{port}/{path}", data)
                     assert (status, document["error"]["kind"]) == (503, "database")
@@ -362,7 +362,7 @@ class TestKilledServer:
         assert told[1:] == ["the database answers again"]
 
 
-def test_connections_all_in_use_are_no_outage(
+def test_all_connections_in_use_is_no_outage(
     targets: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("FIRST_WAIT_S", "LAST_WAIT_S"):
@@ -378,12 +378,12 @@ def test_connections_all_in_use_are_no_outage(
     assert told == []
 
 
-def test_it_does_not_begin_to_answer_without_a_map(one_database: Targets) -> None:
+def test_it_does_not_start_without_a_map(one_database: Targets) -> None:
     with pytest.raises(ProjectionMissing, match="run mapfold replay"):
         Pools(one_database, 1)
 
 
-def test_people_hear_of_a_cut_connection_in_our_words_only(targets: Targets) -> None:
+def test_a_cut_connection_is_reported_in_one_line_of_ours(targets: Targets) -> None:
     program = subprocess.Popen(
         [
             *(sys.executable, "-m", "projections.cli", "serve", "--no-zenoh"),

@@ -1,4 +1,4 @@
-"""`mapfold serve` while others attack it: honest clients are answered, memory stays small."""
+"""`mapfold serve` under attack: honest clients are answered, memory stays small."""
 
 import json
 import struct
@@ -56,7 +56,7 @@ def question() -> bytes:
 HALVES = [b"", b"P", b"POST /relocalize HTTP/1.1\r\nHost: 127.0.0.1\r\n", question()[:-1]]
 
 
-def test_half_open_connections_keep_nobody_out(service: Served) -> None:
+def test_half_open_connections_do_not_block_others(service: Served) -> None:
     held = []
     try:
         for number in range(HALF_OPEN):
@@ -81,7 +81,7 @@ JUNK = [
 ]
 
 
-def test_junk_questions_delay_others_little(service: Served) -> None:
+def test_invalid_questions_delay_others_little(service: Served) -> None:
     over, wrong = threading.Event(), []
 
     def attack(number: int) -> None:
@@ -139,8 +139,8 @@ class TestOverZenoh:
     def asking(self, connected: Callable[[], Session], targets: Targets) -> Iterator[Session]:
         with (
             Pools(targets, 2) as pools,
-            FairQueue(2, max_wait_s=DEADLINE_S) as room,
-            ZenohService(connected(), Answerer(pools, per_second=10_000.0), room),
+            FairQueue(2, max_wait_s=DEADLINE_S) as queue,
+            ZenohService(connected(), Answerer(pools, per_second=10_000.0), queue),
         ):
             yield connected()
 
@@ -162,7 +162,7 @@ class TestOverZenoh:
                 assert (good, error["kind"]) == (False, "bad_question"), selector[:50]
                 assert len(error["message"]) < 500
 
-    def test_a_question_is_measured_before_it_is_read(self, asking: Session) -> None:
+    def test_the_size_of_a_question_is_checked_before_it_is_read(self, asking: Session) -> None:
         ((good, got),) = asking.get_replies(
             "mapfold/relocalize", bytes(10**7), timeout_s=DEADLINE_S
         )
@@ -170,7 +170,7 @@ class TestOverZenoh:
         assert "has 10000000 bytes" in json.loads(got)["error"]["message"]
 
 
-def test_zenoh_puts_together_no_question_that_is_far_too_long(
+def test_zenoh_drops_a_far_too_long_question(
     targets: Targets, endpoint: str, connected: Callable[[], Session]
 ) -> None:
     args = ("--connect", endpoint, "--http", "127.0.0.1:0", "--db", targets.graph_url)
@@ -223,9 +223,7 @@ def answerer(targets: Targets) -> Iterator[Answerer]:
 
 @settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.one_of(QUESTIONS, st.binary(max_size=64)))
-def test_any_question_has_an_answer_in_json_or_is_wrong(
-    answerer: Answerer, question: bytes
-) -> None:
+def test_any_question_is_answered_in_json_or_refused(answerer: Answerer, question: bytes) -> None:
     try:
         answer = answerer.relocalize(question, {})
     except QuestionError as error:
@@ -243,7 +241,7 @@ def test_any_question_has_an_answer_in_json_or_is_wrong(
         st.sampled_from(["x", "y", "radius"]), st.one_of(NUMBERS.map(str), st.text(max_size=9))
     ),
 )
-def test_any_state_has_an_answer_or_is_wrong(
+def test_any_state_question_is_answered_or_refused(
     answerer: Answerer, what: str, options: dict[str, str]
 ) -> None:
     try:

@@ -1,4 +1,4 @@
-"""HTTP connections that never end and requests that are none: real sockets, a small application."""
+"""Incomplete and malformed HTTP requests, unread answers: real sockets, a small application."""
 
 import json
 import socket
@@ -77,12 +77,12 @@ def refused(response: bytes) -> tuple[int, str]:
     [b"", b"P", b"POST / HTTP/1.1\r\nHost: x\r\n", request("POST", "/", b"12345")[:-1]],
     ids=["nothing", "a byte", "half a head", "a body without its end"],
 )
-def test_a_request_that_does_not_end_is_ended(start: START, told: list[str], sent: bytes) -> None:
+def test_an_incomplete_request_times_out(start: START, told: list[str], sent: bytes) -> None:
     assert refused(ask(start(), sent)) == (408, "bad_question")
     assert told == ["http: closed a connection: no complete request within 0.5 s"]
 
 
-def test_bytes_that_drip_in_extend_nothing(start: START, told: list[str]) -> None:
+def test_single_bytes_do_not_extend_the_time(start: START, told: list[str]) -> None:
     with connect(start()) as dripping:
         dripping.sendall(request("POST", "/", b"x" * 10**6)[: -(10**6)])
         dripping.settimeout(0.02)
@@ -96,7 +96,7 @@ def test_bytes_that_drip_in_extend_nothing(start: START, told: list[str]) -> Non
     assert told == ["http: closed a connection: no complete request within 0.5 s"]
 
 
-def test_a_connection_may_be_used_again_and_then_has_time_anew(start: START) -> None:
+def test_a_reused_connection_has_the_full_time_again(start: START) -> None:
     with connect(start(seconds=DEADLINE_S)) as one, one.makefile("rb") as answers:
         for _ in range(3):
             one.sendall(request("POST", "/", b"12345", {"Connection": "keep-alive"}))
@@ -104,7 +104,7 @@ def test_a_connection_may_be_used_again_and_then_has_time_anew(start: START) -> 
             assert answers.read(1) == b"5"
 
 
-def test_an_answer_that_nobody_reads_is_given_up(start: START, told: list[str]) -> None:
+def test_an_unread_answer_times_out(start: START, told: list[str]) -> None:
     port = start()
     with connect(port) as deaf:
         deaf.sendall(request("GET", "/long"))
@@ -155,9 +155,7 @@ class TestFull:
             assert mine.endswith(b"\r\n\r\n5")
             assert not answer(others[-1]).endswith(b"0\r\n\r\n"), "cut off in the middle"
 
-    def test_handshakes_that_do_not_end_count_too(
-        self, start: START, certificate: Certificate
-    ) -> None:
+    def test_incomplete_handshakes_count_too(self, start: START, certificate: Certificate) -> None:
         port = start(most=6, seconds=DEADLINE_S, tls=tls_context(certificate.cert, certificate.key))
         client = ssl.create_default_context(cafile=str(certificate.cert))
         with ExitStack() as held:
@@ -168,7 +166,9 @@ class TestFull:
                 honest.sendall(request("POST", "/", b"12345"))
                 assert answer(honest).endswith(b"5")
 
-    def test_a_handshake_has_its_time_too(self, start: START, certificate: Certificate) -> None:
+    def test_an_incomplete_handshake_times_out(
+        self, start: START, certificate: Certificate
+    ) -> None:
         port = start(tls=tls_context(certificate.cert, certificate.key))
         assert ask(port, b"") == b""
         assert ask(port, b"GET / HTTP/1.1\r\n\r\n") == b""
@@ -189,7 +189,7 @@ class TestFull:
     ],
     ids=lambda value: str(value)[:50],
 )
-def test_what_is_no_request_is_refused_in_the_form_of_all_others(
+def test_malformed_requests_are_refused_in_the_form_of_all_others(
     start: START, sent: bytes, expected: int
 ) -> None:
     code, kind = refused(ask(start(), sent))
@@ -197,18 +197,18 @@ def test_what_is_no_request_is_refused_in_the_form_of_all_others(
     assert code == expected
 
 
-def test_an_upgrade_is_answered_as_what_it_is(start: START) -> None:
+def test_an_upgrade_request_is_answered_without_upgrade(start: START) -> None:
     upgrade = {"Connection": "Upgrade, close", "Upgrade": "websocket"}
     assert status(ask(start(), request("GET", "/", headers=upgrade))) == 200
 
 
-def test_requests_sent_ahead_are_answered_one_after_the_other(start: START) -> None:
+def test_pipelined_requests_are_answered_in_order(start: START) -> None:
     ahead = request("POST", "/", b"123", {"Connection": "keep-alive"}) * 50
     got = ask(start(seconds=DEADLINE_S), ahead + request("POST", "/", b"1"))
     assert got.count(b"HTTP/1.1 200 OK") == 51
 
 
-def test_an_end_waits_for_no_half_request(start: START) -> None:
+def test_the_end_does_not_wait_for_an_incomplete_request(start: START) -> None:
     listener = bind("127.0.0.1", 0)
     with ExitStack() as held, serving(application, listener) as port:
         for sent in (b"", b"P", request("POST", "/", b"12345")[:-1]):
@@ -226,11 +226,11 @@ def test_an_end_waits_for_no_half_request(start: START) -> None:
         ("::ffff:192.0.2.7", "192.0.2.7"),
     ],
 )
-def test_who_is_behind_an_address(address: str, peer: str) -> None:
+def test_the_peer_of_an_address(address: str, peer: str) -> None:
     assert connections.peer_of(address) == peer
 
 
-def test_those_who_stand_in_line_are_accepted_a_few_at_a_time() -> None:
+def test_pending_connections_are_accepted_a_few_at_a_time() -> None:
     with bind("127.0.0.1", 0) as listener, ExitStack() as clients:
         listener.setblocking(False)
         listener.listen(16)

@@ -1,4 +1,4 @@
-"""Who may ask `mapfold serve` over HTTP: the token, TLS, the Host and Origin headers."""
+"""HTTP access control of `mapfold serve`: token, TLS, the Host and Origin headers."""
 
 import json
 import re
@@ -53,7 +53,7 @@ class TestOffLoopback:
             assert said.err.startswith(f"mapfold: --http {http} can be reached by others")
             assert "--token-file FILE or MAPFOLD_TOKEN" in said.err
 
-    def test_it_lets_in_who_has_the_token_and_warns_that_there_is_no_tls(
+    def test_the_token_is_required_and_missing_tls_warned_of(
         self, base: tuple[str, ...], token_file: Path
     ) -> None:
         args = (*base, "--http", "0.0.0.0:0", "--token-file", str(token_file))
@@ -79,7 +79,7 @@ class TestOffLoopback:
                 assert TOKEN not in document["error"]["message"]
 
 
-def test_the_environment_may_hold_the_token_and_on_loopback_it_counts_too(
+def test_a_token_of_the_environment_is_required_on_loopback_too(
     base: tuple[str, ...],
 ) -> None:
     with served(*base, "--http", "127.0.0.1:0", MAPFOLD_TOKEN=TOKEN) as service:
@@ -146,7 +146,7 @@ class TestMisuse:
             ("0123456789abcdéf", "one line of printable ASCII without spaces"),
         ],
     )
-    def test_a_token_that_is_none(self, mapfold: Commands, content: str, said: str) -> None:
+    def test_a_malformed_token_is_refused(self, mapfold: Commands, content: str, said: str) -> None:
         file = mapfold.folder / "wrong"
         file.write_text(content)
         args = ("serve", "--no-zenoh", "--http", "127.0.0.1:0", "--token-file", file)
@@ -159,7 +159,7 @@ class TestMisuse:
         said = mapfold("serve", "--no-zenoh", "--http", "0.0.0.0:0", code=2).err
         assert "MAPFOLD_TOKEN of the environment: the token has 0 characters" in said
 
-    def test_a_token_file_that_others_may_read_is_told_of(
+    def test_a_token_file_that_others_may_read_is_warned_of(
         self, mapfold: Commands, token_file: Path
     ) -> None:
         token_file.chmod(0o644)
@@ -169,7 +169,7 @@ class TestMisuse:
         said = mapfold(*args, "--db", "postgresql://127.0.0.1:1/none", code=1).err
         assert f"other users may read it; run chmod 600 {token_file}" in said.replace("\n", " ")
 
-    def test_options_that_mean_nothing_alone(
+    def test_options_that_need_another_are_refused(
         self, mapfold: Commands, certificate: Certificate, token_file: Path
     ) -> None:
         for option, value in (
@@ -184,7 +184,7 @@ class TestMisuse:
             said = mapfold("serve", "--http", "127.0.0.1:0", option, file, code=2).err
             assert "need each other" in said
 
-    def test_files_that_are_no_certificate(
+    def test_invalid_certificate_files_are_refused(
         self, mapfold: Commands, certificate: Certificate
     ) -> None:
         def said(cert: Path, key: Path) -> str:

@@ -1,4 +1,4 @@
-"""Servers that somebody else has set up: other schemas, short timeouts, no superuser for us."""
+"""Servers with other defaults: schemas, timeouts, output formats, an owner who is no superuser."""
 
 import os
 import re
@@ -67,9 +67,7 @@ def test_pgvector_in_a_schema_of_its_own(
     assert [r.differing for r in check(log, targets, SETTINGS)] == [0, 0]
 
 
-def test_timeouts_meant_for_others(
-    log: Path, one_database: Targets, pg: psycopg.Connection
-) -> None:
+def test_short_default_timeouts(log: Path, one_database: Targets, pg: psycopg.Connection) -> None:
     """A rebuild's session idles in its transaction for as long as the fold takes."""
     database = sql.Identifier(pg.info.dbname)
     for (name,) in pg.execute(TIMEOUTS).fetchall():
@@ -99,7 +97,7 @@ def test_timeouts_meant_for_others(
         "default_transaction_isolation = 'serializable'",
     ],
 )
-def test_values_are_what_they_are_however_they_are_written_there(
+def test_output_formats_of_the_server_change_no_value(
     log: Path, one_database: Targets, pg: psycopg.Connection, setting: str, loader: LoaderName
 ) -> None:
     rebuild(log, one_database, SETTINGS)
@@ -114,7 +112,7 @@ def test_values_are_what_they_are_however_they_are_written_there(
     assert all_rows(one_database) == rows
 
 
-def test_a_database_that_cannot_hold_every_name(log: Path, pg_server: EmbeddedServer) -> None:
+def test_a_database_that_is_not_in_utf8_is_refused(log: Path, pg_server: EmbeddedServer) -> None:
     name = f"latin_{os.getpid()}"
     with connect(pg_server.url, autocommit=True) as admin:
         admin.execute(
@@ -133,7 +131,7 @@ def test_a_database_that_cannot_hold_every_name(log: Path, pg_server: EmbeddedSe
             admin.execute(sql.SQL("DROP DATABASE {}").format(sql.Identifier(name)))
 
 
-def test_a_peer_that_went_without_a_word_is_missed_within_a_minute(
+def test_a_vanished_peer_is_noticed_within_a_minute(
     pg_url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By both sides; only so does a writer's lock come back when its machine has lost power."""
@@ -189,7 +187,7 @@ def test_an_owner_who_is_no_superuser(log: Path, owned: str) -> None:
     assert names == [("semantic_map",)]
 
 
-def test_a_writer_cannot_change_the_dimension_and_says_who_can(
+def test_a_writer_cannot_change_the_dimension_and_names_who_can(
     tmp_path: Path, superuser: psycopg.Connection, owned: str
 ) -> None:
     owner, writer = as_user(owned, OWNER), as_user(owned, WRITER)

@@ -1,4 +1,4 @@
-"""Nobody else's folder, link or server is taken for the embedded server's own."""
+"""Folders, links and servers of other users are not used for the embedded server's socket."""
 
 import contextlib
 import itertools
@@ -144,7 +144,7 @@ def test_it_is_made_for_the_server_alone_and_found_again(home: Path, folders: li
         assert socket_folder(server) == folder
 
 
-def test_gone_it_is_made_again_under_the_name_that_urls_hold(
+def test_a_removed_folder_is_made_again_under_the_same_name(
     home: Path, folders: list[Path]
 ) -> None:
     folder = started_once(home, folders)
