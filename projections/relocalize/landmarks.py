@@ -88,11 +88,6 @@ class CropEvidence:
     cut_y: bool
     sigma_log_size: float
 
-    @property
-    def in_robot_frame(self) -> tuple[float, float]:
-        """Metres ahead and left of the robot; only for a crop with a box."""
-        return self.depth, self.depth * math.tan(self.bearing or 0.0)
-
 
 def crop_evidence(
     crops: Sequence[Crop], matches: Sequence[Sequence[Match]], camera: Camera, model: Model
@@ -149,8 +144,7 @@ def _find_landmarks(
     found = []
     for members in cluster_points(points, weight, 3 * MAX_LANDMARKS, model):
         at = estimate_position(points.subset(members), model)
-        of_runs = remaining.subset(members)
-        table = _similarity_table(poses[members], at, similarity[members], of_runs, model)
+        table = _similarity_table(members, at, poses, similarity, remaining, model)
         found.append(LandmarkHypothesis(at.x, at.y, members, table, at.spread, at.slide))
     found.sort(key=lambda landmark: (-float(landmark.table.max()), int(landmark.members[0])))
     return tuple(found[:MAX_LANDMARKS]), depth * median_px, sigma
@@ -310,16 +304,21 @@ def _solve(xx: float, xy: float, yy: float, x: float, y: float) -> tuple[float, 
 
 
 def _similarity_table(
-    poses: Floats, at: Position, similarity: Floats, remaining: RemainingShifts, model: Model
+    members: Indices,
+    at: Position,
+    poses: Floats,
+    similarity: Floats,
+    remaining: RemainingShifts,
+    model: Model,
 ) -> Floats:
     """Log-likelihood (up to a constant) per direction from which the robot looks at the thing."""
+    poses, similarity = poses[members], similarity[members]
     directions = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS)
     seen_from = np.arctan2(poses[:, 1] - at.y, poses[:, 0] - at.x)
     apart = np.cos(directions[:, None] - seen_from[None])
     expected = model.floor + model.side * np.exp(model.kappa * (apart - 1.0))
-    error, price = np.minimum(similarity, model.usual_best)[None] - expected, np.zeros(DIRECTIONS)
-    if remaining.several_runs:
-        error, price = apply_remaining_shifts(error, remaining, model)
+    error = np.minimum(similarity, model.usual_best)[None] - expected
+    error, price = apply_remaining_shifts(error, remaining.subset(members), model)
     mean = error.mean(1)
     count = min(float(len(similarity)), model.independent)
     scatter = ((error - mean[:, None]) ** 2).mean(1) * (count / model.sigma_observation**2)

@@ -17,7 +17,7 @@ within 0.3 m of it. The answer is the pose with the least expected error, errors
 as 3 m (a median, not a mean: between two look-alike spots stands nothing), moved to the mean of
 what lies within 1 m of it.
 
-``confidence`` is a logistic model on a few features of these weights: the probability that the pose
+The confidence is a logistic model on a few features of these weights: the probability that the pose
 is within 1.5 m (the default ε) of the truth, counting a robot that is somewhere the map does not
 know as never right. Its weights come from `scripts/fit_confidence`, which fits them on generated
 buildings; the runs reported in docs/relocalization.md were not used.
@@ -57,7 +57,7 @@ _NEAR_M: Final = 1.0
 _MIN_YAW_AGREEMENT: Final = 0.8
 
 WEIGHTS: Final[tuple[float, ...]] = (-6.144, 0.159, 0.105, 0.740, 4.466, -0.776)
-"""Of the confidence: intercept, then one for each of `features`."""
+"""Of the confidence: intercept, then one for each of `Posterior.features`."""
 _MAX_FEATURE: Final = 7.0
 """A crop explains no more than this, so that one lucky feature does not decide alone."""
 
@@ -67,9 +67,10 @@ class Posterior:
     """``poses`` (h, 3) with ``weights`` (h,) that add up to 1, likeliest first.
 
     ``x``, ``y`` and ``yaw`` (None when the evidence leaves it open) are the answer; ``spread_m``
-    is the root mean square distance of all poses from it, ``expected_error_m`` the mean distance
-    with 3 m as the most, ``mass`` the weight within 1 m. ``total`` is the best pose's
-    log-likelihood ratio and ``shares`` its parts by crop, falling.
+    is the root mean square distance of all poses from it. ``confidence`` is computed from
+    ``features``: the largest and second largest share of a crop in the best pose's log-likelihood
+    ratio, that ratio per crop, the weight within 1 m of the answer, and the mean distance from it
+    with 3 m as the most.
     """
 
     poses: Floats
@@ -78,10 +79,8 @@ class Posterior:
     y: float
     yaw: float | None
     spread_m: float
-    expected_error_m: float
-    mass: float
-    total: float
-    shares: tuple[float, ...]
+    features: tuple[float, ...]
+    confidence: float
 
 
 def locate(
@@ -98,7 +97,7 @@ def locate(
     poses = np.concatenate((poses, around))
     total, shares = np.append(total, more_total), np.append(shares, more_shares, axis=1)
     kept = _likeliest(total, _KEPT)
-    return _choose(poses[kept], total[kept], shares[:, kept[0]])
+    return _choose(poses[kept], total[kept], shares[:, kept[0]], len(crops))
 
 
 def _likeliest(total: Floats, count: int) -> "np.ndarray[tuple[int], np.dtype[np.intp]]":
@@ -133,7 +132,7 @@ def _circle(crop: CropEvidence, landmark: LandmarkHypothesis) -> Floats:
 
 
 def _resect(one: CropEvidence, other: CropEvidence) -> Iterator[tuple[float, float, float]]:
-    (ax, ay), (bx, by) = one.in_robot_frame, other.in_robot_frame
+    (ax, ay), (bx, by) = _in_robot_frame(one), _in_robot_frame(other)
     seen, seen_yaw = math.hypot(bx - ax, by - ay), math.atan2(by - ay, bx - ax)
     for a in one.landmarks:
         for b in other.landmarks:
@@ -148,6 +147,11 @@ def _resect(one: CropEvidence, other: CropEvidence) -> Iterator[tuple[float, flo
                 (a.y + b.y) / 2 - (sin * mx + cos * my),
                 yaw,
             )
+
+
+def _in_robot_frame(crop: CropEvidence) -> tuple[float, float]:
+    """Metres ahead and left of the robot; only for a crop with a box."""
+    return crop.depth, crop.depth * math.tan(crop.bearing or 0.0)
 
 
 def _grid_around(poses: Floats) -> Floats:
@@ -262,8 +266,11 @@ def _wrap(angle: Floats) -> Floats:
     return turned
 
 
-def _choose(poses: Floats, total: Floats, shares: Floats) -> Posterior:
-    """Weigh the poses and choose one; ``shares`` (crops,) are those of the likeliest."""
+def _choose(poses: Floats, total: Floats, shares: Floats, crops: int) -> Posterior:
+    """Weigh the poses and choose one.
+
+    ``shares`` are the likeliest pose's, one for each crop with evidence; ``crops`` counts all.
+    """
     apart = np.sqrt(_squared_distances(poses, poses))
     weights = np.exp(total - total[0]) / (apart < _DENSITY_RADIUS_M).sum(1)
     weights = weights / math.fsum(weights.tolist())
@@ -273,6 +280,14 @@ def _choose(poses: Floats, total: Floats, shares: Floats) -> Posterior:
     mass = float(near.sum())
     x, y = (float((poses[:, axis] * near).sum()) / mass for axis in (0, 1))
     squared = (poses[:, 0] - x) ** 2 + (poses[:, 1] - y) ** 2
+    first, second, *_ = *sorted((float(share) for share in shares), reverse=True), 0.0
+    features = (
+        min(first, _MAX_FEATURE),
+        min(second, _MAX_FEATURE),
+        min(float(total[0]) / crops, _MAX_FEATURE),
+        mass,
+        float(expected[best]),
+    )
     return Posterior(
         poses,
         weights,
@@ -280,10 +295,8 @@ def _choose(poses: Floats, total: Floats, shares: Floats) -> Posterior:
         y,
         _mean_yaw(poses[:, 2], near / mass),
         math.sqrt(float((squared * weights).sum())),
-        float(expected[best]),
-        mass,
-        float(total[0]),
-        tuple(sorted((float(share) for share in shares), reverse=True)),
+        features,
+        _confidence(features),
     )
 
 
@@ -293,22 +306,9 @@ def _mean_yaw(yaws: Floats, weights: Floats) -> float | None:
     return math.atan2(sin, cos) if math.hypot(sin, cos) >= _MIN_YAW_AGREEMENT else None
 
 
-def confidence(posterior: Posterior, crops: int) -> float:
-    """A probability in 0 … 1; ``crops`` counts all crops asked with, at least 1."""
+def _confidence(features: Sequence[float]) -> float:
+    """A probability in 0 … 1."""
     score = WEIGHTS[0] + math.fsum(
-        weight * value
-        for weight, value in zip(WEIGHTS[1:], features(posterior, crops), strict=True)
+        weight * value for weight, value in zip(WEIGHTS[1:], features, strict=True)
     )
     return 1.0 / (1.0 + math.exp(-max(-40.0, min(40.0, score))))
-
-
-def features(posterior: Posterior, crops: int) -> tuple[float, ...]:
-    """What the confidence depends on; ``crops`` as for `confidence`."""
-    shares = (*posterior.shares, 0.0, 0.0)
-    return (
-        min(shares[0], _MAX_FEATURE),
-        min(shares[1], _MAX_FEATURE),
-        min(posterior.total / crops, _MAX_FEATURE),
-        posterior.mass,
-        posterior.expected_error_m,
-    )

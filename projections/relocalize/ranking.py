@@ -22,7 +22,7 @@ from projections.deltas import PlaceOrdinal
 from .camera import Camera
 from .candidates import Candidates, Match
 from .model import MODEL, Model
-from .pose import Posterior, confidence, locate
+from .pose import Posterior, locate
 from .question import Crop
 
 Method = Literal["joint", "plain"]
@@ -111,10 +111,10 @@ def rank(
     if method == "plain":
         return _rank_plain(candidates, top)
     posterior = locate(crops, candidates.matches, camera, model)
-    return _answer(candidates, posterior, len(crops), top)
+    return _answer(candidates, posterior, top)
 
 
-def _answer(candidates: Candidates, posterior: Posterior | None, crops: int, top: int) -> Answer:
+def _answer(candidates: Candidates, posterior: Posterior | None, top: int) -> Answer:
     sums = _similarity_sums(candidates.matches)
     shares = {} if posterior is None else _place_shares(candidates, posterior)
     known = sorted(shares.keys() | sums.keys())
@@ -124,7 +124,7 @@ def _answer(candidates: Candidates, posterior: Posterior | None, crops: int, top
     if posterior is None:
         return Answer(places, None, 0.0)
     pose = PoseHypothesis(posterior.x, posterior.y, posterior.yaw, posterior.spread_m)
-    return Answer(places, pose, confidence(posterior, crops))
+    return Answer(places, pose, posterior.confidence)
 
 
 def _place_shares(candidates: Candidates, posterior: Posterior) -> dict[PlaceOrdinal, float]:

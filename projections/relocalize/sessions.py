@@ -70,11 +70,6 @@ class RemainingShifts:
         """Those at ``index``."""
         return RemainingShifts(self.run[index], self.shift[index])
 
-    @property
-    def several_runs(self) -> bool:
-        """Whether there are matches of more than one run."""
-        return bool((self.run != self.run[0]).any())
-
 
 def remaining_shifts(
     matches: Sequence[Match], shifts: Mapping[str, float], model: Model
@@ -93,9 +88,11 @@ def apply_remaining_shifts(
     """Subtract the remaining shift of each run where one landmark's similarities fit better so.
 
     ``error`` of shape (directions, n) is similarity less the expected one. For each direction a run
-    counts as of the own session where that fits better by more than ``session_price``. Returns the
-    errors after it, and the prices of shape (directions,).
+    counts as of the own session where that fits better by more than ``session_price``; matches of
+    one run alone are left as they are. Returns the errors after it, and the prices (directions,).
     """
+    if (remaining.run == remaining.run[0]).all():
+        return error, np.zeros(len(error))
     order = np.argsort(remaining.run, kind="stable")
     _, first, which, count = np.unique(
         remaining.run[order], return_index=True, return_inverse=True, return_counts=True

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from projections.evaluate.scores import auroc, expected_calibration_error
 from projections.relocalize import Camera, ExactIndex
 from projections.relocalize.model import MODEL
-from projections.relocalize.pose import WEIGHTS, features, locate
+from projections.relocalize.pose import WEIGHTS, locate
 from tests.relocalization.buildings import Building, Keyframe
 from tests.relocalization.drives import drive
 from tests.relocalization.rooms import crops_of, fold
@@ -68,7 +68,7 @@ def _row(index: ExactIndex, instances: set[str], keyframe: Keyframe, drawn: list
         return (0.0,) * (len(WEIGHTS) - 1), False, known, len(crops)
     envelope = keyframe.accepted.envelope
     error = math.hypot(posterior.x - (envelope.map_x or 0), posterior.y - (envelope.map_y or 0))
-    return features(posterior, len(crops)), known and error <= WITHIN_M, known, len(crops)
+    return posterior.features, known and error <= WITHIN_M, known, len(crops)
 
 
 def fit(x: NDArray[np.float64], y: NDArray[np.bool_]) -> NDArray[np.float64]:

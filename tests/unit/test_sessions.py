@@ -61,8 +61,8 @@ def test_only_the_own_runs_matches_are_shifted_and_the_order_follows() -> None:
 def test_the_remaining_shift_is_a_sessions_less_the_subtracted() -> None:
     crop = row(own=[0.9], other=[0.8])
     found = remaining_shifts(crop, {"own": 0.03, "other": 0.0, "else": 0.1}, MODEL)
-    assert found.several_runs
-    assert not found.subset(np.array([0])).several_runs
+    assert found.run[0] != found.run[1]
+    assert found.subset(np.array([0])).run.tolist() == [found.run[0]]
     assert found.shift.tolist() == pytest.approx([MODEL.session - 0.03, MODEL.session])
 
 
