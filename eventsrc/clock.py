@@ -1,4 +1,4 @@
-"""The one place that reads the wall clock, so that everything else can be given a time."""
+"""The only place that reads the wall clock; everything else is given a `Clock` or a time."""
 
 import time
 from collections.abc import Callable

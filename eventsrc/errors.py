@@ -1,7 +1,7 @@
-"""Errors a person can act on.
+"""The errors of `eventsrc`.
 
-Every message names the value, the place and the next step. The command line prints it as one line
-and exits with ``exit_code``; nothing here is ever shown as a traceback.
+Every message names the value, the place and the next step. The command line prints it as one line,
+without a traceback, and exits with ``exit_code``.
 
     MapfoldError                    1  something failed
     ├── MisuseError                 2  the call itself is wrong

@@ -1,16 +1,14 @@
-"""The gap ledger of a log: folded from its events when a recorder opens it, or when one asks.
+"""The gap ledger of a log: keyframes its runs lack, folded from its events and saved beside it.
 
-Of an envelope only two fields are needed, and reading those two is several times quicker than the
-whole door. Envelopes of older versions do not count their keyframes and are passed over. A recorder
-saves its ledger beside the log, so only the first reading ever is of the whole log.
+Of an envelope only run and keyframe id are needed, and reading these two is several times quicker
+than a full validation. Envelopes of older versions do not count their keyframes and are skipped.
 
-A saved gap ledger beside its log: ``.ledger.json``, a cache, safe to delete.
-
-It is believed only if it is what was saved, to the byte, if a ledger can be like that at all, if it
-is of this log, of no more events than the log has, and if the segments it was folded from are still
-there: a ledger that knows events which the log has lost would have a recorder acknowledge them, and
-the robot throw away the last copy. Recovery, which takes events away, deletes it first. Where there
-is any doubt the log is counted again, and the reason told.
+The saved ledger, ``.ledger.json``, is a cache that is safe to delete; with it only the first
+reading is of the whole log. It is used only if its checksum holds, its content is consistent, it is
+of this log and of no more events than the log has, and the segments it was folded from are still
+there: with a ledger of events that the log has lost, a recorder would acknowledge them, and the
+robot would delete the last copy. Recovery, which removes events, deletes it first. If it is not
+used, the log is read again and the reason is reported.
 
 The file is one JSON object, ``{"sha256": …, "ledger": {…}}``; the hash is that of the bytes of the
 inner object.
@@ -31,21 +29,20 @@ from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError
 from eventsrc.log.durable_files import delete_durably, unlink_quietly, write_all
 from eventsrc.log.event import Event
 from eventsrc.log.format import LEDGER
-from eventsrc.log.log_identity import lineage, still_holds
+from eventsrc.log.log_identity import same_but_sealed, segment_signatures
 from eventsrc.log.reader import LogReader
 
 from .envelope import ENVELOPE_VERSION, FIRST_OFFSET, Int64, KeyframeId, Offset, RunId
-from .gaps import DEFAULT_SETTLE_NS, GapLedger, RunState, gap_of, sound
+from .gaps import DEFAULT_SETTLE_NS, GapLedger, RunState, gap_of, is_consistent
 from .system_events import LOSS_KEY, Loss, is_system_key
 
-NAME: Final = LEDGER
 MAX_BYTES: Final = 8 * 1024 * 1024
-"""Half a million gaps. A larger ledger is not saved: reading it would cost more memory than the log
-it is of."""
-_FORM: Final = re.compile(rb'\{"sha256":"([0-9a-f]{64})","ledger":(\{.*\})\}', re.DOTALL)
+"""Half a million gaps. A larger ledger is not saved: reading it would take more memory than reading
+the log."""
+_FILE_PATTERN: Final = re.compile(rb'\{"sha256":"([0-9a-f]{64})","ledger":(\{.*\})\}', re.DOTALL)
 
 Note = Callable[[str], None]
-"""Takes one line for people."""
+"""Receives one line of text for people."""
 
 
 Run = tuple[RunId, Int64, Int64, Annotated[tuple[tuple[Int64, Int64, bool], ...], FailFast()]]
@@ -68,20 +65,19 @@ class SavedLedger(BaseModel):
         return [RunState(*run) for run in self.runs]
 
 
-class _Doubt(Exception):
-    """Why a saved ledger is not believed."""
+class _Unusable(Exception):
+    """The reason why a saved ledger is not used."""
 
 
-def load(reader: LogReader, note: Note | None = None) -> SavedLedger | None:
-    """The saved ledger of a log; None if there is none, or none that can be believed, which
-    ``note`` is told."""
-    path = reader.path / NAME
+def _load(reader: LogReader, note: Note | None = None) -> SavedLedger | None:
+    """The saved ledger of a log; None if there is none or it is not used, with a ``note``."""
+    path = reader.path / LEDGER
     try:
         saved = _decode(_read(path))
-        _check(saved, reader)
+        _check_belongs(saved, reader)
     except FileNotFoundError:
         return None
-    except (OSError, _Doubt) as error:
+    except (OSError, _Unusable) as error:
         if note is not None:
             reason = error.strerror if isinstance(error, OSError) else error
             note(f"{path} is not used: {reason}; what it says is counted again from the log")
@@ -90,55 +86,43 @@ def load(reader: LogReader, note: Note | None = None) -> SavedLedger | None:
 
 
 def _read(path: Path) -> bytes:
-    """Raises OSError, also for a symbolic link, and _Doubt for what is no file or a huge one."""
+    """The file's bytes. Raises OSError, also for a symbolic link, and _Unusable for anything but a
+    regular file, and for a huge one."""
     fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     try:
         status = os.fstat(fd)
         if not stat.S_ISREG(status.st_mode):
-            raise _Doubt("it is not a regular file")
+            raise _Unusable("it is not a regular file")
         if status.st_size > MAX_BYTES:
-            raise _Doubt(f"it is {status.st_size:,} bytes large, more than {MAX_BYTES:,}")
+            raise _Unusable(f"it is {status.st_size:,} bytes large, more than {MAX_BYTES:,}")
         return os.read(fd, MAX_BYTES)
     finally:
         os.close(fd)
 
 
 def _decode(data: bytes) -> SavedLedger:
-    found = _FORM.fullmatch(data)
+    found = _FILE_PATTERN.fullmatch(data)
     if found is None:
-        raise _Doubt("it is not a ledger as this version of mapfold saves it")
+        raise _Unusable("it is not a ledger as this version of mapfold saves it")
     if hashlib.sha256(found[2]).hexdigest().encode() != found[1]:
-        raise _Doubt("its checksum does not match its content")
+        raise _Unusable("its checksum does not match its content")
     try:
         return SavedLedger.model_validate_json(found[2])
     except ValidationError as error:
         fault = error.errors(include_url=False, include_context=False, include_input=False)[0]
         place = ".".join(map(str, fault["loc"]))
-        raise _Doubt(f"it holds what no ledger does: {place}: {fault['msg']}") from None
+        raise _Unusable(f"it holds what no ledger does: {place}: {fault['msg']}") from None
 
 
-def _check(saved: SavedLedger, reader: LogReader) -> None:
-    if not sound(saved.states(), saved.next_offset):
-        raise _Doubt("it holds keyframes or gaps that contradict each other")
+def _check_belongs(saved: SavedLedger, reader: LogReader) -> None:
+    if not is_consistent(saved.states(), saved.next_offset):
+        raise _Unusable("it holds keyframes or gaps that contradict each other")
     if saved.log_id != reader.log_id:
-        raise _Doubt("it is of another log")
+        raise _Unusable("it is of another log")
     if saved.next_offset > reader.next_offset:
-        raise _Doubt(f"it knows {saved.next_offset} events and the log has {reader.next_offset}")
-    if not still_holds(saved.segments, lineage(reader.path, saved.next_offset)):
-        raise _Doubt("segments that it was made from have changed or are gone")
-
-
-def save(path: Path, log_id: str, next_offset: Offset, ledger: GapLedger[RunId]) -> None:
-    """Replace the saved ledger. That it cannot be written is no error: it is a cache. Nor is it one
-    if the log names keyframes that no envelope can have."""
-    with contextlib.suppress(OSError, ValidationError):
-        saved = SavedLedger(
-            log_id=log_id,
-            next_offset=next_offset,
-            segments=lineage(path, next_offset),
-            runs=ledger.state(),
-        )
-        _write(path, encode(saved.model_dump_json().encode()))
+        raise _Unusable(f"it knows {saved.next_offset} events and the log has {reader.next_offset}")
+    if not same_but_sealed(saved.segments, segment_signatures(reader.path, saved.next_offset)):
+        raise _Unusable("segments that it was made from have changed or are gone")
 
 
 def encode(ledger: bytes) -> bytes:
@@ -149,22 +133,22 @@ def encode(ledger: bytes) -> bytes:
 
 def _write(path: Path, data: bytes) -> None:
     if len(data) > MAX_BYTES:
-        unlink_quietly(path / NAME)
+        unlink_quietly(path / LEDGER)
         return
-    temporary = path / f"{NAME}.new"
+    temporary = path / f"{LEDGER}.new"
     unlink_quietly(temporary)
     fd = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o644)
     try:
         write_all(fd, data)
     finally:
         os.close(fd)
-    temporary.replace(path / NAME)
+    temporary.replace(path / LEDGER)
 
 
 SAVE_EVERY: Final = 50_000
-"""Events; they take a second or two to read."""
-_MANY: Final = 100_000
-"""Events that take seconds to read. With fewer no line is printed."""
+"""Events between saves; a second or two of reading."""
+_NOTED_EVENTS: Final = 100_000
+"""From so many events to read on, which takes seconds, a line says so."""
 
 
 class _Identity(BaseModel):
@@ -183,23 +167,23 @@ def ledger_of(
     now_ns: int | None = None,
     note: Note | None = None,
 ) -> GapLedger[RunId]:
-    """The ledger of a whole log, beginning where a saved one ends.
+    """The ledger of a whole log, from the saved one where that can be used.
 
-    Holes the log never reported count as open since ``now_ns`` (by default: now, monotonic clock).
-    ``note`` is told why a saved ledger is not used.
+    Unreported holes count as open since ``now_ns`` (by default now, on the monotonic clock).
+    ``note`` gets a line if a saved ledger is not used.
     """
     now_ns = time.monotonic_ns() if now_ns is None else now_ns
-    start, ledger = _resume(reader, settle_ns, now_ns, note)
+    start, ledger = _load_or_new(reader, settle_ns, now_ns, note)
     return fold_ledger(reader.read(start), ledger, now_ns)
 
 
-def keep_ledger(reader: LogReader, *, note: Note | None = None) -> GapLedger[RunId]:
-    """`ledger_of` for the log's writer, which saves it: on the way through a long log as well, so
-    that one that is killed meanwhile reads no event twice but the last `SAVE_EVERY`."""
+def fold_and_save_ledger(reader: LogReader, *, note: Note | None = None) -> GapLedger[RunId]:
+    """`ledger_of` for the log's writer: saved, and every `SAVE_EVERY` events on the way, so that a
+    killed process has to read no more than those again."""
     now_ns = time.monotonic_ns()
-    at, ledger = _resume(reader, DEFAULT_SETTLE_NS, now_ns, note)
+    at, ledger = _load_or_new(reader, DEFAULT_SETTLE_NS, now_ns, note)
     end = reader.next_offset
-    if note is not None and end - at >= _MANY:
+    if note is not None and end - at >= _NOTED_EVENTS:
         note(f"reading {reader.path} once, to know which keyframes it lacks …")
     while at < end:
         upto = min(Offset(at + SAVE_EVERY), end)
@@ -211,12 +195,12 @@ def keep_ledger(reader: LogReader, *, note: Note | None = None) -> GapLedger[Run
     return ledger
 
 
-def _resume(
+def _load_or_new(
     reader: LogReader, settle_ns: int, now_ns: int, note: Note | None
 ) -> tuple[Offset, GapLedger[RunId]]:
-    """The saved ledger and the offset behind what it knows; an empty one and 0 if there is none."""
+    """The saved ledger and its next offset; an empty ledger and 0 if there is none."""
     ledger: GapLedger[RunId] = GapLedger(settle_ns)
-    saved = load(reader, note)
+    saved = _load(reader, note)
     if saved is None:
         return FIRST_OFFSET, ledger
     ledger.restore(saved.states(), now_ns)
@@ -225,29 +209,37 @@ def _resume(
 
 def unread_events(reader: LogReader) -> int:
     """How many events `ledger_of` would have to read."""
-    saved = load(reader)
+    saved = _load(reader)
     return reader.next_offset - (0 if saved is None else saved.next_offset)
 
 
 def save_ledger(path: Path, log_id: str, next_offset: Offset, ledger: GapLedger[RunId]) -> None:
-    """Save the ledger of the first ``next_offset`` events of the log at ``path``, as a cache.
+    """Save the ledger of the first ``next_offset`` events of the log at ``path``.
 
-    They must be durable, with everything the ledger reported among them.
+    They must be durable, with everything the ledger reported among them. Failing to write is no
+    error, for it is a cache; nor are keyframe ids in the log that no envelope can have.
     """
-    save(path, log_id, next_offset, ledger)
+    with contextlib.suppress(OSError, ValidationError):
+        saved = SavedLedger(
+            log_id=log_id,
+            next_offset=next_offset,
+            segments=segment_signatures(path, next_offset),
+            runs=ledger.state(),
+        )
+        _write(path, encode(saved.model_dump_json().encode()))
 
 
-def forget_ledger(path: Path) -> None:
-    """Delete the saved ledger of the log at ``path``: the log has lost events that it knows."""
-    with contextlib.suppress(OSError):  # it is not believed either while a segment is missing
-        delete_durably(path / NAME)
+def delete_ledger(path: Path) -> None:
+    """Delete the saved ledger of the log at ``path``, which has lost events that it counts."""
+    with contextlib.suppress(OSError):  # it is not used either while a segment is missing
+        delete_durably(path / LEDGER)
 
 
 def fold_ledger(events: Iterable[Event], ledger: GapLedger[RunId], now_ns: int) -> GapLedger[RunId]:
-    """Take ``events`` into ``ledger``, which is also returned."""
+    """Add ``events`` to ``ledger``, which is also returned."""
     for event in events:
         if event.key == LOSS_KEY:
-            _take_loss(ledger, event.payload, now_ns)
+            _add_loss(ledger, event.payload, now_ns)
         elif not is_system_key(event.key):
             identity = _identity(event)
             if identity is not None:
@@ -255,14 +247,14 @@ def fold_ledger(events: Iterable[Event], ledger: GapLedger[RunId], now_ns: int) 
     return ledger
 
 
-def _take_loss(ledger: GapLedger[RunId], payload: bytes, now_ns: int) -> None:
+def _add_loss(ledger: GapLedger[RunId], payload: bytes, now_ns: int) -> None:
     try:
         loss = Loss.model_validate_json(payload)
     except ValidationError:
         return  # of a later version; what it says was lost is still seen in the keyframes
     gap = gap_of(loss)
     if gap is not None:
-        ledger.assume(gap, now_ns)
+        ledger.add_reported(gap, now_ns)
 
 
 def _identity(event: Event) -> tuple[RunId, KeyframeId] | None:

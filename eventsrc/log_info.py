@@ -1,11 +1,9 @@
-"""What `mapfold log info` tells: counted from the indexes, hardly reading any events.
+"""Facts about a log (`mapfold log info`), counted from its indexes, reading hardly any events.
 
-Above the log, because what is missing from a run is computed by the gap ledger, which reads logs.
-
-The stamps are those of robots' events: mapfold's own are stamped when they were written, which for
-a log imported today is months after the run. A sealed segment names the bounds of all its stamps,
-exact where it has no event of ours. Else its chunks are read if that could still move the answer;
-mostly it cannot, for the segments around it are exact.
+First and last stamp are those of robots' events: mapfold's own events are stamped when they were
+written, which for an imported log is months after the run. A sealed segment names the bounds of all
+its stamps, which are exact if it has no events of ours. Otherwise its chunks are read if that could
+still change the answer; mostly it cannot, because the segments around it are exact.
 """
 
 from collections import Counter
@@ -44,9 +42,8 @@ class SegmentInfo:
 @dataclass(frozen=True, slots=True)
 class LogInfo:
     """A log at a glance. Times are int nanoseconds, None while the log is empty; the first is the
-    earliest and the last the latest, whatever their order in the log; stamps are those of the
-    robots' events, not of our own. ``lost`` is what the log says was lost, less the keyframes that
-    came late after all."""
+    earliest and the last the latest, whatever their order in the log; stamps are those of robots'
+    events. ``lost`` is what the log reports as lost, less the keyframes that came late."""
 
     log_id: str
     path: Path
@@ -64,33 +61,33 @@ class LogInfo:
 
 @dataclass(slots=True)
 class _RobotStamps:
-    """Stamps of robots' events in int nanoseconds: ``first`` and ``last``, None while there are
-    none."""
+    """The bounds of robots' stamps in int nanoseconds: ``first`` and ``last``, None while there
+    are none."""
 
     first: int | None = None
     last: int | None = None
     _doubtful: list[tuple[int, int, SegmentPath]] = field(default_factory=list)
 
-    def take(self, stamp_ns: int) -> None:
-        """The stamp of one robot's event."""
+    def add(self, stamp_ns: int) -> None:
+        """Add the stamp of one robot's event."""
         self.first = stamp_ns if self.first is None else min(self.first, stamp_ns)
         self.last = stamp_ns if self.last is None else max(self.last, stamp_ns)
 
-    def take_sealed(self, entry: SegmentPath, segment: SealedFile) -> None:
-        """The bounds that a sealed segment names."""
+    def add_sealed(self, entry: SegmentPath, segment: SealedFile) -> None:
+        """Add the bounds that a sealed segment names."""
         first, last = segment.first_stamp_ns, segment.last_stamp_ns
-        if _holds_ours(segment):
+        if _has_system_events(segment):
             self._doubtful.append((first, last, entry))
         else:
-            self.take(first)
-            self.take(last)
+            self.add(first)
+            self.add(last)
 
-    def settle(self, reader: LogReader) -> None:
-        """Read the segments that leave it open, as far as they can be read."""
+    def read_doubtful(self, reader: LogReader) -> None:
+        """Read the segments with events of ours that could still move the bounds."""
         for first, last, entry in sorted(self._doubtful, key=lambda d: d[1], reverse=True):
             if self.first is None or self.last is None or first < self.first or last > self.last:
                 for stamp_ns in _stamps(reader.open_segment(entry)):
-                    self.take(stamp_ns)
+                    self.add(stamp_ns)
 
 
 @dataclass(slots=True)
@@ -101,12 +98,12 @@ class _Tally:
 
 
 def log_info(path: Path, *, note: Callable[[str], None] | None = None) -> LogInfo:
-    """Count a log. Raises LogNotFound, NotALog or LogDamaged. ``note`` takes a line for people: why
-    a ledger saved beside the log is not used."""
+    """Count a log. Raises LogNotFound, NotALog or LogDamaged. ``note`` gets a line if a saved gap
+    ledger is not used, with the reason."""
     tally = _Tally(Counter(), [], _RobotStamps())
     with LogReader(path) as reader:
         segments = tuple(_count(reader, entry, tally) for entry in reader.segments)
-        tally.stamps.settle(reader)
+        tally.stamps.read_doubtful(reader)
         return LogInfo(
             log_id=reader.log_id,
             path=path,
@@ -127,7 +124,7 @@ def _count(reader: LogReader, entry: SegmentPath, tally: _Tally) -> SegmentInfo:
     segment = reader.open_segment(entry)
     if isinstance(segment, SealedFile):
         _count_sealed(segment, tally)
-        tally.stamps.take_sealed(entry, segment)
+        tally.stamps.add_sealed(entry, segment)
     else:
         _count_growing(segment, tally)
     return SegmentInfo(
@@ -150,19 +147,18 @@ def _count_growing(segment: ActiveFile, tally: _Tally) -> None:
     for chunk in segment.chunks:
         body = segment.read_chunk(chunk)
         channels = segment.channels_of(body)
-        robots = _robots_of(channels)
+        robot_channels = _robot_channels(channels)
         for channel, _, log_ns, stamp_ns, _, _ in _mcap.walk(body):
             tally.keys[channels[channel].topic] += 1
             tally.logged.append(log_ns)
-            if channel in robots:
-                tally.stamps.take(stamp_ns)
+            if channel in robot_channels:
+                tally.stamps.add(stamp_ns)
 
 
 def _count_lost(reader: LogReader, note: Callable[[str], None] | None = None) -> int:
-    """How many events a log lacks: reported losses, less the keyframes that came late after all.
+    """How many events were lost: reported losses, less the keyframes that came late.
 
-    Reads the losses, and for gaps of keyframes, which may be closed, the log's gap ledger.
-    ``note`` is told why a saved one is not used."""
+    Reads the losses, and for gaps of keyframes, which may have been filled, the gap ledger."""
     losses = [loss for event in reader.read(keys={LOSS_KEY}) if (loss := _loss(event)) is not None]
     others = [loss.count for loss in losses if gap_of(loss) is None]
     if len(others) == len(losses):
@@ -177,24 +173,24 @@ def _loss(event: Event) -> Loss | None:
         return None
 
 
-def _robots_of(channels: dict[int, Channel]) -> set[int]:
+def _robot_channels(channels: dict[int, Channel]) -> set[int]:
     """The ids of the channels that are not mapfold's own."""
     return {id_ for id_, channel in channels.items() if not is_system_key(channel.topic)}
 
 
-def _holds_ours(segment: SealedFile) -> bool:
-    robots = _robots_of(segment.channels)
+def _has_system_events(segment: SealedFile) -> bool:
+    robot_channels = _robot_channels(segment.channels)
     counts = segment.statistics.channel_message_counts
-    return any(count and channel not in robots for channel, count in counts.items())
+    return any(count and channel not in robot_channels for channel, count in counts.items())
 
 
 def _stamps(segment: OpenSegment) -> Iterator[int]:
     for chunk in segment.chunks:
         try:
             body = segment.read_chunk(chunk)
-        except LogDamaged:  # whoever reads the events will be told
+        except LogDamaged:  # reported to whoever reads the events
             continue
-        robots = _robots_of(segment.channels_of(body))
+        robot_channels = _robot_channels(segment.channels_of(body))
         for channel, _, _, stamp_ns, _, _ in _mcap.walk(body):
-            if channel in robots:
+            if channel in robot_channels:
                 yield stamp_ns

@@ -1,11 +1,9 @@
-r"""Numbers in sentences.
+r"""Text for people: numbers with a noun, and text from outside made safe for a terminal.
 
-Text from outside, made fit for a terminal.
-
-A terminal obeys what it is sent: escape sequences, which begin with a C0 or C1 control, move its
-cursor, set its title or type answers; bidirectional overrides and isolates show a name in another
-order than it has; and a line break in a name forges a line. mapfold prints none of these on
-purpose but the ends of its own lines, so they are shown as escapes: ``\x1b``, ``\u202e``, ``\n``.
+Escape sequences, which begin with a C0 or C1 control, can move a terminal's cursor, set its title
+or type answers; bidirectional overrides and isolates show a name in another order than it has; a
+line break in a name forges a line. mapfold prints none of these except its own line ends, so they
+are shown as escapes: ``\x1b``, ``\u202e``, ``\n``.
 """
 
 import re
@@ -25,19 +23,18 @@ _UNSAFE: Final = re.compile(
 
 
 def visible(text: str) -> str:
-    """``text`` on one line with nothing in it that a terminal would obey: a key, a name, a path."""
+    """``text`` (a key, a name, a path) on one line, with control characters as escapes."""
     return text if text.isprintable() else _UNSAFE.sub(_escaped, text)
 
 
 def visible_lines(text: str) -> str:
-    """``text`` that has been laid out in lines, with nothing but their ends for a terminal to obey.
-
-    What came from outside and went into it has gone through `visible` first, or it adds lines."""
+    """``text`` of several lines, with all other control characters as escapes. Text from outside in
+    it must have gone through `visible` before, or it can add lines."""
     return "\n".join(map(visible, text.split("\n")))
 
 
 def visible_json(text: str) -> str:
-    """JSON text, indented or not, of the same value, with nothing that a terminal would obey."""
+    """JSON ``text``, indented or not, with control characters as JSON escapes of the same value."""
     if text.isascii() and "\x7f" not in text:
         return text  # JSON itself escapes C0
     return "\n".join(_UNSAFE.sub(_escaped_in_json, line) for line in text.split("\n"))

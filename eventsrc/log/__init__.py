@@ -3,7 +3,7 @@
 from .durable_files import ALWAYS, GROUP_COMMIT, NEVER, FsyncPolicy, parse_fsync
 from .event import Event, NewEvent
 from .file_fault import FileFault
-from .log_identity import lineage, still_holds
+from .log_identity import same_but_sealed, segment_signatures
 from .reader import LogReader
 from .recover import RecoveryReport, SegmentRecovery, recover_log
 from .segment import Unreadable
@@ -29,9 +29,9 @@ __all__ = [
     "Unreadable",
     "Verification",
     "follow",
-    "lineage",
     "parse_fsync",
     "recover_log",
-    "still_holds",
+    "same_but_sealed",
+    "segment_signatures",
     "verify_log",
 ]

@@ -1,5 +1,8 @@
-"""A growing or left-over segment, read side. It has no index; its chunk heads and commit marks are
-hopped over once (80 bytes each) and again only from where that ended."""
+"""Reading an active segment, growing or left over from a crash.
+
+It has no index: its chunk heads and commit marks (80 bytes a commit) are read once, and later only
+those that have been added.
+"""
 
 import os
 from pathlib import Path
@@ -10,12 +13,12 @@ from . import mcap_records as _mcap
 from .durable_files import FileBytes
 from .format import SEALED, mark_seed, segment_path
 from .mcap_records import BadRecord, Channel
-from .resync import Stretch, resume
+from .resync import DamagedBytes, skip_damaged
 from .segment import ChunkRef, SegmentFile, Unreadable
 
 
 class ActiveFile(SegmentFile):
-    """A growing or left-over segment, known as far as its commit marks go."""
+    """An active segment up to its last commit mark."""
 
     def __init__(self, path: Path, base: Offset) -> None:
         super().__init__(path, base)
@@ -28,17 +31,17 @@ class ActiveFile(SegmentFile):
             raise
 
     def refresh(self) -> Offset:
-        """Take in what was committed since; the next offset."""
+        """Read the commit marks added since the last call; the next offset."""
         try:
-            while self._take_commit():
+            while self._read_commit():
                 pass
         except BadRecord:
-            # Either a chunk is just being written or the end is torn: nothing more is durable.
-            # Whether good chunks lie behind is asked once, by `LogReader` and by verify.
+            # A chunk that is being written, or a torn end: nothing more is durable. Whether commits
+            # follow behind it is looked up by `rot`.
             pass
         return self.next_offset
 
-    def _take_commit(self) -> bool:
+    def _read_commit(self) -> bool:
         head_bytes = os.pread(self._fd, _mcap.PLAIN_CHUNK_HEAD, self.position)
         if len(head_bytes) < _mcap.PLAIN_CHUNK_HEAD:
             return False
@@ -55,7 +58,7 @@ class ActiveFile(SegmentFile):
         return True
 
     def was_replaced(self) -> bool:
-        """Whether another file stands for this segment by now: sealed, or begun anew."""
+        """Whether this segment is another file now: the sealed one, or a new active one."""
         try:
             now = self.path.stat()
         except FileNotFoundError:
@@ -63,28 +66,32 @@ class ActiveFile(SegmentFile):
         return now.st_ino != os.fstat(self._fd).st_ino
 
     def rot(self) -> Unreadable | None:
-        """What once was durable behind the last readable commit. A crash tears only the end, and
-        no commit mark can follow what was never synced; so where one does, bytes have rotted."""
+        """The durable events behind the last readable commit, None if there are none.
+
+        A crash damages only the end of the file, and no commit mark follows what was never synced.
+        So where a mark follows, bytes have rotted."""
         while self.position < self.size():
             with FileBytes(self._fd, self.position) as rest:
-                promised = self._promised_in(rest)
+                recorded_end = self._recorded_end_in(rest)
             before = self.next_offset
-            if self.refresh() == before:  # else a writer was at work between the two looks
-                if promised <= before:
+            if self.refresh() == before:  # else a writer has added commits meanwhile
+                if recorded_end <= before:
                     return None
-                return Unreadable(before, Offset(promised - 1), f"damaged at byte {self.position}")
+                return Unreadable(
+                    before, Offset(recorded_end - 1), f"damaged at byte {self.position}"
+                )
         return None
 
-    def _promised_in(self, rest: FileBytes) -> Offset:
-        """How far marks in ``rest``, which cannot be read, say that the segment was recorded."""
-        stretch = Stretch(0, self.next_offset)
-        at, promised = 0, self.next_offset
+    def _recorded_end_in(self, rest: FileBytes) -> Offset:
+        """The end of what was recorded, by the commit marks found in the unreadable ``rest``."""
+        damaged = DamagedBytes(0, self.next_offset)
+        at, recorded_end = 0, self.next_offset
         while at < len(rest):
-            at, said = resume(rest, at, stretch, self._seed)
-            promised = max(promised, said)
-        return promised
+            at, marked_end = skip_damaged(rest, at, damaged, self._seed)
+            recorded_end = max(recorded_end, marked_end)
+        return recorded_end
 
     def channels_of(self, body: bytes) -> dict[int, Channel]:
-        """By id, from the records that lead the chunk."""
+        """By id, from the records before the first message."""
         _, channels = _mcap.definitions(body, leading=True)
         return {channel.id: channel for channel in channels}

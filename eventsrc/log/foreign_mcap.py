@@ -1,11 +1,9 @@
-"""Messages of MCAP files that others wrote, in file order.
+"""Reading MCAP files that other programs wrote: their messages or records, in file order.
 
-The mcap package takes as much memory as a file declares that it needs, and a file of 98 kB can
-declare, and hold, gigabytes. So records are read here, against limits, and what is not a channel, a
-chunk or a message is passed by in pieces.
-
-The content of a chunk that another program compressed, checked against limits before memory is
-taken: what a chunk declares of itself may be anything, and so may what its compression declares.
+The mcap package allocates as much memory as a file declares, and a file of 98 kB can declare, and
+hold, gigabytes. So records are read here, and every declared size (of a record, a chunk, its
+compressed content) is checked against a limit before memory is allocated. Other records are skipped
+in pieces.
 """
 
 import struct
@@ -22,25 +20,25 @@ from . import mcap_records as _mcap
 from .mcap_records import FRAME, MAGIC, BadRecord, Channel, Opcode
 
 MAX_FOREIGN_BYTES: Final = 64 * 1024 * 1024
-"""Of a chunk, compressed or not, and of a message. One of that size that is no envelope can still
-be kept in a log."""
+"""Limit for a chunk, compressed or not, and for a message. A message of that size that is no
+envelope still fits into a log."""
 _HEAD = struct.Struct("<QQQII")
 """First and last log time, uncompressed size and its CRC, length of the compression's name."""
 _U64 = struct.Struct("<Q")
 
 
-def check_size(what: str, size: int, most: int) -> None:
+def check_size(what: str, size: int, max_bytes: int) -> None:
     """BadRecord when a ``what`` declares a ``size`` that is over the limit."""
-    if size > most:
+    if size > max_bytes:
         raise BadRecord(
-            f"a {what} declares {size:,} bytes, more than {most:,} are read; if that "
+            f"a {what} declares {size:,} bytes, more than {max_bytes:,} are read; if that "
             "is right, write the file again in smaller chunks (`mcap compress --chunk-size`)"
         )
 
 
-def foreign_body(content: bytes, most: int) -> bytes:
-    """The records in the chunk whose record has this content, ``most`` bytes of them at most.
-    Raises BadRecord."""
+def decode_foreign_chunk(content: bytes, max_bytes: int) -> bytes:
+    """The decompressed records of a chunk, from the content of its chunk record. Raises BadRecord,
+    also for more than ``max_bytes``."""
     try:
         _, _, size, crc, name_size = _HEAD.unpack_from(content)
         data_at = _HEAD.size + name_size + _U64.size
@@ -48,10 +46,10 @@ def foreign_body(content: bytes, most: int) -> bytes:
     except struct.error:
         raise BadRecord("a chunk's head is cut short") from None
     name = content[_HEAD.size : _HEAD.size + name_size]
-    check_size("chunk", size, most)
+    check_size("chunk", size, max_bytes)
     if data_at + data_size > len(content):
         raise BadRecord("a chunk's content is longer than the chunk")
-    body = _plain(name, content[data_at : data_at + data_size], size)
+    body = _decompress(name, content[data_at : data_at + data_size], size)
     if len(body) != size:
         than = "more" if len(body) > size else "less"
         raise BadRecord(f"a chunk holds {than} than the {size:,} bytes that it declares")
@@ -60,14 +58,14 @@ def foreign_body(content: bytes, most: int) -> bytes:
     return body
 
 
-def _plain(name: bytes, data: bytes, size: int) -> bytes:
-    """At most one byte more than ``size``."""
+def _decompress(name: bytes, data: bytes, size: int) -> bytes:
+    """At max_bytes one byte more than ``size``."""
     try:
         match name:
             case b"":
                 return data[: size + 1]
             case b"zstd":
-                return _zstd(data, size)
+                return _decompress_zstd(data, size)
             case b"lz4":
                 return bytes(LZ4FrameDecompressor().decompress(data, size + 1))
     except (zstandard.ZstdError, RuntimeError, EOFError) as error:
@@ -75,7 +73,7 @@ def _plain(name: bytes, data: bytes, size: int) -> bytes:
     raise BadRecord(f"a chunk is compressed with {name[:32]!r}; zstd and lz4 are read")
 
 
-def _zstd(data: bytes, size: int) -> bytes:
+def _decompress_zstd(data: bytes, size: int) -> bytes:
     decompressor = zstandard.ZstdDecompressor()
     if zstandard.frame_content_size(data) == size:
         return decompressor.decompress(data)
@@ -83,14 +81,14 @@ def _zstd(data: bytes, size: int) -> bytes:
         return stream.read(size + 1)
 
 
-_PIECE: Final = 1024 * 1024
+_PIECE_BYTES: Final = 1024 * 1024
 _MESSAGE: Final = struct.Struct("<HIQQ")
 _CRC: Final = struct.Struct("<I")
-_OF_MESSAGES: Final = (Opcode.CHANNEL, Opcode.MESSAGE)
+_MESSAGE_OPCODES: Final = (Opcode.CHANNEL, Opcode.MESSAGE)
 
 
 class ForeignDamage(ValueError):
-    """The file is torn, rotten, or more than is read; says where, which is at byte ``at``."""
+    """The file is damaged or over a limit from byte ``at`` on."""
 
     def __init__(self, text: str, at: int) -> None:
         super().__init__(text)
@@ -98,7 +96,7 @@ class ForeignDamage(ValueError):
 
 
 class ForeignRecord(NamedTuple):
-    """A record, and the byte at which it stands, or the chunk that it is in."""
+    """A record; ``at`` is the byte at which it, or the chunk around it, starts."""
 
     opcode: int
     content: bytes
@@ -107,7 +105,7 @@ class ForeignRecord(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ForeignMessage:
-    """One message: MCAP's topic is the key, its log and publish time are int nanoseconds."""
+    """One message. ``key`` is its MCAP topic; times are int nanoseconds."""
 
     key: str
     encoding: str
@@ -116,32 +114,32 @@ class ForeignMessage:
     payload: bytes
 
 
-class _Named(NamedTuple):
-    """What is kept of a channel."""
+class _ChannelName(NamedTuple):
+    """The topic and message encoding of a channel."""
 
     key: str
     encoding: str
 
 
 def foreign_messages(file: BinaryIO) -> Iterator[ForeignMessage]:
-    """Every message, with CRCs checked. Raises ForeignDamage after the last good one."""
-    source = _Source(file)
-    with _damage_in(source):
-        yield from _messages(_records(source, _OF_MESSAGES, MAX_FOREIGN_BYTES))
+    """Every message; CRCs are checked. Raises ForeignDamage after the last good one."""
+    source = _CrcReader(file)
+    with _raising_foreign_damage(source):
+        yield from _messages(_records(source, _MESSAGE_OPCODES, MAX_FOREIGN_BYTES))
 
 
 def foreign_records(
-    file: BinaryIO, opcodes: Collection[int], most_bytes: int
+    file: BinaryIO, opcodes: Collection[int], max_bytes: int
 ) -> Iterator[ForeignRecord]:
-    """Every record of these opcodes, in chunks or not, with CRCs checked; neither it nor its chunk
-    has more than ``most_bytes``. Raises ForeignDamage after the last good one."""
-    source = _Source(file)
-    with _damage_in(source):
-        yield from _records(source, opcodes, most_bytes)
+    """Every record of these opcodes, in chunks or not, of at most ``max_bytes`` like its chunk;
+    CRCs are checked. Raises ForeignDamage after the last good one."""
+    source = _CrcReader(file)
+    with _raising_foreign_damage(source):
+        yield from _records(source, opcodes, max_bytes)
 
 
 @contextmanager
-def _damage_in(source: "_Source") -> Iterator[None]:
+def _raising_foreign_damage(source: "_CrcReader") -> Iterator[None]:
     try:
         yield
     except BadRecord as error:
@@ -151,8 +149,8 @@ def _damage_in(source: "_Source") -> Iterator[None]:
         ) from None
 
 
-class _Source:
-    """Reads front to back, a piece at a time; ``crc`` is that of everything read."""
+class _CrcReader:
+    """Reads a file from front to back in pieces; ``crc`` covers everything read."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
@@ -161,23 +159,23 @@ class _Source:
         self.crc = 0
 
     def read(self, length: int) -> bytes:
-        """Exactly so many bytes. Memory is taken as they come, not as they are announced."""
+        """Exactly ``length`` bytes. Memory grows with what is there, not with what is declared."""
         data = b"".join(self._pieces(length))
         self.crc = zlib.crc32(data, self.crc)
         return data
 
     def skip(self, length: int) -> None:
-        """Pass by so many bytes."""
+        """Read ``length`` bytes and drop them."""
         for piece in self._pieces(length):
             self.crc = zlib.crc32(piece, self.crc)
 
     def begin_record(self) -> None:
-        """Remember the place, for who tells of damage."""
+        """Note the current position as the start of a record, for error messages."""
         self.record_at = self._at
 
     def _pieces(self, length: int) -> Iterator[bytes]:
         while length > 0:
-            piece = self._file.read(min(length, _PIECE))
+            piece = self._file.read(min(length, _PIECE_BYTES))
             if not piece:
                 raise BadRecord(f"the file ends {length:,} bytes too soon")
             self._at += len(piece)
@@ -185,7 +183,9 @@ class _Source:
             yield piece
 
 
-def _records(source: _Source, opcodes: Collection[int], most: int) -> Iterator[ForeignRecord]:
+def _records(
+    source: _CrcReader, opcodes: Collection[int], max_bytes: int
+) -> Iterator[ForeignRecord]:
     _check_magic(source)
     while True:
         source.begin_record()
@@ -198,26 +198,26 @@ def _records(source: _Source, opcodes: Collection[int], most: int) -> Iterator[F
             if opcode == Opcode.FOOTER:
                 return _check_magic(source)
             continue
-        check_size("record", length, most)
+        check_size("record", length, max_bytes)
         content = source.read(length)
         if opcode == Opcode.CHUNK:
-            body = foreign_body(content, most)
+            body = decode_foreign_chunk(content, max_bytes)
             del content
             for inner, data in _mcap.records(body):
                 if inner in opcodes:
                     yield ForeignRecord(inner, data, source.record_at)
         elif opcode == Opcode.DATA_END:
-            _check_data(content, crc)
+            _check_data_crc(content, crc)
         else:
             yield ForeignRecord(opcode, content, source.record_at)
 
 
-def _check_magic(source: _Source) -> None:
+def _check_magic(source: _CrcReader) -> None:
     if source.read(len(MAGIC)) != MAGIC:
         raise BadRecord("no MCAP magic")
 
 
-def _check_data(content: bytes, crc: int) -> None:
+def _check_data_crc(content: bytes, crc: int) -> None:
     if len(content) < _CRC.size or _CRC.unpack_from(content)[0] not in (0, crc):
         raise BadRecord("the data does not match its CRC")
 
@@ -226,30 +226,30 @@ def _messages(records: Iterator[ForeignRecord]) -> Iterator[ForeignMessage]:
     channels = _Channels()
     for opcode, content, _ in records:
         if opcode == Opcode.CHANNEL:
-            channels.take(content)
+            channels.add(content)
         else:
             yield channels.message(content)
 
 
 class _Channels:
     def __init__(self) -> None:
-        self._named: dict[int, _Named] = {}
+        self._names: dict[int, _ChannelName] = {}
         self._names_size = 0
 
-    def take(self, content: bytes) -> None:
+    def add(self, content: bytes) -> None:
         _mcap.check_definitions(len(content))
         channel = _mcap.decode_as(Channel, content)
-        named = _Named(channel.topic, channel.message_encoding)
-        if self._named.get(channel.id) != named:
-            self._names_size += len(named.key) + len(named.encoding)
+        name = _ChannelName(channel.topic, channel.message_encoding)
+        if self._names.get(channel.id) != name:
+            self._names_size += len(name.key) + len(name.encoding)
             _mcap.check_definitions(self._names_size)
-            self._named[channel.id] = named
+            self._names[channel.id] = name
 
     def message(self, content: bytes) -> ForeignMessage:
         if len(content) < _MESSAGE.size:
             raise BadRecord("a message is cut short")
         id_, _, logged_ns, published_ns = _MESSAGE.unpack_from(content)
-        if id_ not in self._named:
+        if id_ not in self._names:
             raise BadRecord(f"a message of channel {id_}, which nothing defines")
         payload = content[_MESSAGE.size :]
-        return ForeignMessage(*self._named[id_], logged_ns, published_ns, payload)
+        return ForeignMessage(*self._names[id_], logged_ns, published_ns, payload)

@@ -1,8 +1,8 @@
-"""Reading a log by offset, in order, a chunk at a time.
+"""Reading the events of a log by offset, in order, one chunk at a time.
 
-A reader shows durable events only: of the growing segment, the chunks with a commit mark. It holds
-no lock and may read while a writer writes, rotates and seals. Damage stops it with LogDamaged,
-after every event before it has been given out; `on_gap` lets it go on and be told what is missing.
+A reader yields durable events only: of the growing segment, the chunks with a commit mark. It takes
+no lock and can read while a writer writes, rotates and seals. At damage it yields every event
+before it and raises LogDamaged; with ``on_gap`` it reports what is missing and continues.
 """
 
 import contextlib
@@ -18,7 +18,7 @@ from eventsrc.errors import LogDamaged, LogError, LogNotFound, NotALog
 from .active_file import ActiveFile
 from .event import Event
 from .format import ACTIVE, SEALED, SegmentPath, list_growing, segment_path
-from .log_identity import mixed_up
+from .log_identity import mixed_logs_message
 from .sealed_segment import SealedFile
 from .segment import Unreadable, chunk_events
 
@@ -38,7 +38,7 @@ class LogReader:
         self._segments = segments_of(path)
         self._last = _open_segment(path, self._segments[-1])
         self.log_id = self._last.log_id
-        """As its last segment says; no other is read if it says otherwise."""
+        """From its last segment; reading stops at a segment with another id."""
 
     @property
     def next_offset(self) -> Offset:
@@ -51,15 +51,15 @@ class LogReader:
         return tuple(self._segments)
 
     def refresh(self) -> Offset:
-        """Take in what was committed since; the new `next_offset`."""
+        """Find what was committed since; the new `next_offset`."""
         while True:
             if isinstance(self._last, ActiveFile):
                 self._last.refresh()
             following = self._following()
             if following is not None:
-                last = self._open_own(following)
+                last = self._open_checked(following)
                 self._segments.append(following)
-                self._remember(self._last)
+                self._keep_open(self._last)
                 self._last = last
             elif isinstance(self._last, ActiveFile) and self._last.was_replaced():
                 self._reopen_last()
@@ -67,14 +67,14 @@ class LogReader:
                 return self.next_offset
 
     def check_end(self) -> None:
-        """See whether there is really nothing behind `next_offset`. Raises LogDamaged where events
-        were recorded there that cannot be read, and LogNotFound when the log is gone."""
+        """Raise LogDamaged if recorded events behind `next_offset` cannot be read, and LogNotFound
+        if the log is gone."""
         if not self.path.exists():
             raise LogNotFound(f"the log at {self.path} is gone; check the path")
-        stop = _stop_at_gap(self.path)
-        self._look_for_rot(FIRST_OFFSET, stop)
+        stop = _raise_at_gap(self.path)
+        self._report_rot(FIRST_OFFSET, stop)
         segments = list_growing(self.path)
-        known = self.refresh()  # after the look at the folder: a writer may be at work
+        known = self.refresh()  # after listing the folder: a writer may be active
         for newest in segments[-1:]:
             if newest.base > known:
                 stop(
@@ -82,16 +82,16 @@ class LogReader:
                 )
 
     def _reopen_last(self) -> None:
-        """A restarted writer has sealed the segment, perhaps with events that had no commit mark
-        yet, or has begun an empty one anew."""
-        self._last = self._open_own(self._segments[-1])
+        """Open the last segment again: a restarted writer has sealed it, perhaps with events that
+        had no commit mark yet, or has replaced an empty one."""
+        self._last = self._open_checked(self._segments[-1])
 
     def _following(self) -> SegmentPath | None:
         """The segment that starts where the last one ends, once its writer has begun it."""
         base = self.next_offset
         if base == self._last.base:
             return None
-        # Sealed between the first two looks, it is seen by the third.
+        # The third test finds a segment that was sealed between the first two.
         for suffix, sealed in ((SEALED, True), (ACTIVE, False), (SEALED, True)):
             path = segment_path(self.path, base, suffix)
             if path.exists():
@@ -108,12 +108,12 @@ class LogReader:
     ) -> Iterator[Event]:
         """Events from offset ``start`` to before ``end`` (default: `next_offset` as of now).
 
-        Where events cannot be read this raises LogDamaged; with ``on_gap`` it calls that instead
-        and goes on behind the gap.
+        Raises LogDamaged where events cannot be read; with ``on_gap`` calls that instead and
+        continues behind the gap.
         """
         known = self.next_offset
         stop = known if end is None else min(end, known)
-        report = on_gap or _stop_at_gap(self.path)
+        report = on_gap or _raise_at_gap(self.path)
         at = max(start, FIRST_OFFSET)
         for entry, following in self._entries_from(at):
             if at < min(entry.base, stop):  # the log's first segment is gone
@@ -122,22 +122,22 @@ class LogReader:
                 at = entry.base
             if at >= stop:
                 break
-            upto = min(stop, following)
-            at = yield from self._read_segment(entry, at, upto, keys, report)
-            if at < upto:
-                report(Unreadable(at, Offset(upto - 1), f"missing after {entry.path.name}"))
-                at = upto
+            segment_end = min(stop, following)
+            at = yield from self._read_segment(entry, at, segment_end, keys, report)
+            if at < segment_end:
+                report(Unreadable(at, Offset(segment_end - 1), f"missing after {entry.path.name}"))
+                at = segment_end
         if end is None or end > known:
-            self._look_for_rot(start, report)
+            self._report_rot(start, report)
 
-    def _look_for_rot(self, start: Offset, report: OnGap) -> None:
-        """Whether more was recorded than the growing segment still shows."""
+    def _report_rot(self, start: Offset, report: OnGap) -> None:
+        """Report recorded events that the growing segment no longer shows."""
         rot = self._last.rot() if isinstance(self._last, ActiveFile) else None
         if rot is not None and rot.last >= start:
             report(rot)
 
     def _entries_from(self, start: Offset) -> Iterator[tuple[SegmentPath, Offset]]:
-        """Each segment from the one that holds ``start`` on, and the base of the next one."""
+        """Each segment from the one that holds ``start``, with the base of the next one."""
         first = bisect_right(self._segments, start, key=lambda entry: entry.base) - 1
         for index in range(max(first, 0), len(self._segments)):
             is_last = index + 1 == len(self._segments)
@@ -151,7 +151,7 @@ class LogReader:
         keys: Collection[str] | None,
         report: OnGap,
     ) -> Generator[Event, None, Offset]:
-        """The events of one segment; returns the offset behind the last it can account for."""
+        """The events of one segment; returns the offset after the last one yielded or reported."""
         try:
             segment = self.open_segment(entry)
         except LogDamaged as error:
@@ -174,27 +174,29 @@ class LogReader:
         return at
 
     def open_segment(self, entry: SegmentPath) -> OpenSegment:
-        """One of `segments`, open. The last one is always the object that `refresh` keeps up."""
+        """One of `segments`, open. The last one is the object that `refresh` updates."""
         if entry.base == self._last.base:
             return self._last
-        segment = self._open.get(entry.base) or self._open_own(entry)
-        self._remember(segment)
+        segment = self._open.get(entry.base) or self._open_checked(entry)
+        self._keep_open(segment)
         return segment
 
-    def _open_own(self, entry: SegmentPath) -> OpenSegment:
+    def _open_checked(self, entry: SegmentPath) -> OpenSegment:
         segment = _open_segment(self.path, entry)
         if segment.log_id != self.log_id:
-            raise LogDamaged(mixed_up(entry.path, segment.log_id, self._last.path, self.log_id))
+            raise LogDamaged(
+                mixed_logs_message(entry.path, segment.log_id, self._last.path, self.log_id)
+            )
         return segment
 
-    def _remember(self, segment: OpenSegment) -> None:
+    def _keep_open(self, segment: OpenSegment) -> None:
         self._open[segment.base] = segment
         self._open.move_to_end(segment.base)
         if len(self._open) > _OPEN_SEGMENTS:
             self._open.popitem(last=False)
 
     def close(self) -> None:
-        """Let go of the files; iterators that still run keep theirs."""
+        """Close the files; iterators still running keep theirs open."""
         self._open.clear()
 
     def __enter__(self) -> "LogReader":
@@ -228,7 +230,7 @@ def _segments_of(path: Path) -> list[SegmentPath]:
 
 
 def _open_segment(log: Path, entry: SegmentPath) -> OpenSegment:
-    """Open it under whichever name it has by now: sealing may have renamed it since."""
+    """Open a segment under its current name: it may have been sealed since it was listed."""
     try:
         if not entry.sealed:
             with contextlib.suppress(FileNotFoundError):
@@ -239,7 +241,7 @@ def _open_segment(log: Path, entry: SegmentPath) -> OpenSegment:
         raise LogDamaged(f"{entry.path}: {reason}; check the file and the disk") from error
 
 
-def _stop_at_gap(log: Path) -> OnGap:
+def _raise_at_gap(log: Path) -> OnGap:
     def stop(gap: Unreadable) -> None:
         raise LogDamaged(
             f"{log}: offsets {gap.first} to {gap.last} cannot be read: {gap.reason}; "
@@ -250,7 +252,7 @@ def _stop_at_gap(log: Path) -> OnGap:
 
 
 def _wanted_channels(segment: OpenSegment, keys: Collection[str] | None) -> set[int] | None:
-    """Which channels carry ``keys``; None where that cannot be told before reading a chunk."""
+    """The ids of the channels with these ``keys``; None if that is known only from each chunk."""
     if keys is None or not isinstance(segment, SealedFile):
         return None
     return {id_ for id_, channel in segment.channels.items() if channel.topic in keys}

@@ -1,9 +1,8 @@
-"""A new sealed segment from what a scan found good, every offset accounted for.
+"""Write a new sealed segment from the good chunks of a damaged one.
 
-An event that is gone leaves a ``mapfold/loss`` event at its offset, cause ``rot``: offsets are what
-checkpoints, maps and people point at, so none may move, and every reader of the log sees a loss
-that is in it. Timestamps of lost events are estimated from their neighbours: those of the event
-before, or else of the one behind; the time of the recovery says nothing about them.
+Every offset is kept, because checkpoints, maps and people refer to offsets: a lost event is
+replaced by a ``mapfold/loss`` event with cause ``rot``. Timestamps of lost events are estimated
+from their neighbours: those of the event before, or else of the one behind.
 """
 
 import os
@@ -21,41 +20,41 @@ from . import mcap_records as _mcap
 from .active_file import ActiveFile
 from .format import SegmentPath, key_channel, schema_of
 from .mcap_records import Channel, Schema
-from .scan import Scan, read_body
+from .scan import read_body
 from .seal import SegmentPlan, seal
 from .sealed_segment import SealedFile
-from .segment import ChunkRef
+from .segment import ChunkRef, Scan
 
 
-class Moment(NamedTuple):
-    """The times of an event, int nanoseconds."""
+class EventTimes(NamedTuple):
+    """Log time and stamp of an event, int nanoseconds."""
 
     logged_ns: int
     stamp_ns: int
 
 
-UNKNOWN = Moment(0, 0)
+UNKNOWN_TIMES = EventTimes(0, 0)
 
 
-def moments(body: bytes) -> tuple[Moment, Moment]:
-    """Those of the first and of the last event in the body of a good chunk."""
-    times = [Moment(log_ns, stamp_ns) for _, _, log_ns, stamp_ns, _, _ in _mcap.walk(body)]
+def first_and_last_times(body: bytes) -> tuple[EventTimes, EventTimes]:
+    """The times of the first and the last event in the body of a good chunk."""
+    times = [EventTimes(log_ns, stamp_ns) for _, _, log_ns, stamp_ns, _, _ in _mcap.walk(body)]
     return times[0], times[-1]
 
 
-def moment_between(before: SegmentPath | None, behind: SegmentPath | None) -> Moment:
-    """The time of the event before a lost segment, else of the one behind it, if either can be
-    read."""
+def adjacent_times(before: SegmentPath | None, behind: SegmentPath | None) -> EventTimes:
+    """The times of the event before a lost segment, or else of the one behind it; zeros if neither
+    can be read."""
     for segment, chunk, which in ((before, -1, 1), (behind, 0, 0)):
         if segment is None:
             continue
         try:
             file = (SealedFile if segment.sealed else ActiveFile)(segment.path, segment.base)
             if file.chunks:
-                return moments(file.read_chunk(file.chunks[chunk]))[which]
+                return first_and_last_times(file.read_chunk(file.chunks[chunk]))[which]
         except (LogDamaged, NotALog):
             continue
-    return UNKNOWN
+    return UNKNOWN_TIMES
 
 
 _BATCH = 4096
@@ -63,12 +62,12 @@ _BATCH = 4096
 
 @dataclass(slots=True)
 class _Definitions:
-    """The channels of the good chunks, their schemas, and one channel for losses."""
+    """Channels and schemas of the good chunks, and one channel for losses."""
 
     channels: dict[int, Channel] = field(default_factory=dict)
     schemas: dict[int, Schema] = field(default_factory=dict)
 
-    def learn(self, body: bytes) -> None:
+    def add(self, body: bytes) -> None:
         schemas, channels = _mcap.definitions(body)
         self.schemas.update((schema.id, schema) for schema in schemas)
         self.channels.update((channel.id, channel) for channel in channels)
@@ -83,7 +82,7 @@ class _Definitions:
         return id_
 
     def encode(self) -> bytes:
-        """All of them, schemas first. A schema that is gone is made again from its key."""
+        """All records, schemas first. A lost schema is generated again from its key."""
         for channel in self.channels.values():
             if channel.schema_id not in self.schemas:
                 name, text = schema_of(channel.topic)
@@ -93,69 +92,69 @@ class _Definitions:
         return _mcap.encode_all([*self.schemas.values(), *self.channels.values()])
 
 
-def rebuild(plan: SegmentPlan, source: Path | None, scan: Scan, nearby: Moment) -> str:
-    """Seal the good chunks of ``source`` and losses for the gaps; the new file's SHA-256. The
-    losses are dated ``nearby`` where there is no good chunk to go by."""
+def rebuild_segment(plan: SegmentPlan, source: Path | None, scan: Scan, times: EventTimes) -> str:
+    """Seal the good chunks of ``source``, with losses for the gaps; the new file's SHA-256. Losses
+    have ``times`` if there is no good chunk to take them from."""
     if source is None:
-        return seal(plan, _bodies(-1, scan, nearby))
+        return seal(plan, _chunk_bodies(-1, scan, times))
     fd = os.open(source, os.O_RDONLY)
     try:
-        return seal(plan, _bodies(fd, scan, nearby))
+        return seal(plan, _chunk_bodies(fd, scan, times))
     finally:
         os.close(fd)
 
 
-def _bodies(fd: int, scan: Scan, nearby: Moment) -> Iterator[bytes]:
+def _chunk_bodies(fd: int, scan: Scan, times: EventTimes) -> Iterator[bytes]:
     definitions = _Definitions(dict(scan.channels))
     for chunk in scan.chunks:
-        definitions.learn(read_body(fd, chunk))
+        definitions.add(read_body(fd, chunk))
     loss_channel = definitions.loss_channel() if scan.gaps else 0
     prelude = definitions.encode()
     if scan.chunks:
-        nearby = moments(read_body(fd, scan.chunks[0]))[0]
+        times = first_and_last_times(read_body(fd, scan.chunks[0]))[0]
     pieces: list[tuple[int, ChunkRef | int]] = [(c.first, c) for c in scan.chunks]
     pieces += scan.gaps
     for first, rest in sorted(pieces, key=lambda piece: piece[0]):
         if isinstance(rest, ChunkRef):
             body = read_body(fd, rest)
-            nearby = moments(body)[1]
+            times = first_and_last_times(body)[1]
             yield prelude + body
             prelude = b""
         else:
             for start in range(first, rest + 1, _BATCH):
                 upto = min(start + _BATCH, rest + 1)
-                yield prelude + _losses(scan.base, loss_channel, start, upto, nearby)
+                yield prelude + _losses(scan.base, loss_channel, start, upto, times)
                 prelude = b""
 
 
-def _losses(base: Offset, channel: int, first: int, following: int, when: Moment) -> bytes:
+def _losses(base: Offset, channel: int, first: int, following: int, times: EventTimes) -> bytes:
     parts: list[bytes] = []
     for offset in range(first, following):
         loss = Loss(publisher="log", first=offset, last=offset, count=1, cause="rot")
         payload = loss.model_dump_json().encode()
         head = _mcap.encode_message_head(
-            channel, offset - base, when.logged_ns, when.stamp_ns, len(payload)
+            channel, offset - base, times.logged_ns, times.stamp_ns, len(payload)
         )
         parts += (head, payload)
     return b"".join(parts)
 
 
-def trimmed(source: Path, scan: Scan, first: Offset, end: Offset) -> Scan:
-    """What ``scan`` found in ``source`` from offset ``first`` to before ``end``, as a segment of
-    its own; offsets that are missing at its end are left out of it."""
+def slice_scan(source: Path, scan: Scan, first: Offset, end: Offset) -> Scan:
+    """The part of a scan of ``source`` from offset ``first`` to before ``end``, as a segment of its
+    own that ends with the last good event."""
     rest = Scan(first, scan.log_id, next_offset=first, channels=scan.channels)
     for chunk in scan.chunks:
         start, stop = max(first, chunk.first), min(end, chunk.following)
         if start < stop:
-            body = partial(_cut_out, source, chunk, scan.base, range(start, stop), first)
-            rest.take(ChunkRef(0, chunk.length, start, stop, body=body))
+            body = partial(_slice_chunk, source, chunk, scan.base, range(start, stop), first)
+            rest.add_chunk(ChunkRef(0, chunk.length, start, stop, body=body))
     return rest
 
 
-def _cut_out(
+def _slice_chunk(
     source: Path, chunk: ChunkRef, base: Offset, offsets: range, new_base: Offset
 ) -> bytes:
-    """The messages of a chunk that have these offsets, counted from another base."""
+    """The messages of a chunk with these offsets, renumbered from ``new_base``."""
     fd = os.open(source, os.O_RDONLY)
     try:
         body = read_body(fd, chunk)

@@ -1,11 +1,10 @@
-"""`mapfold log recover`: keep what can be kept of a damaged log, and say what could not.
+"""Recovery of a damaged log (`mapfold log recover`): keep every readable event, report the rest.
 
-Nothing is changed in place. Each segment that needs it is written anew beside, synced and renamed;
-an original in which anything recorded is damaged is kept as ``….damaged`` for a person to look at.
-A torn end that was never synced is cut off, as on any restart. Lost offsets become losses (see
-`_rebuild`). A rewritten segment notes the hash that its successor knows its original by, so the
-chain can still be followed. A ledger saved beside the log goes first: it may know events that the
-log is about to lose.
+Nothing is changed in place. A damaged segment is written anew, synced and renamed; an original in
+which something recorded is damaged is kept as ``….damaged`` for a person to look at. A torn end
+that was never synced is cut off, as on any restart. Lost offsets become loss events (see
+`rebuild_segment`). A rewritten segment notes the hash by which its successor knows the original, so
+that the hash chain holds. A saved gap ledger is deleted first: it may count events that are lost.
 """
 
 import uuid
@@ -18,7 +17,6 @@ from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.errors import LogDamaged, LogError, NotALog
 
 from .active_segment import ActiveSegment
-from .arrange import Arrangement, Moved, set_aside
 from .durable_files import GROUP_COMMIT, delete_durably, keep_copy, sync_directory, unlink_quietly
 from .format import (
     ACTIVE,
@@ -36,14 +34,16 @@ from .format import (
 from .lock import WriterLock
 from .mcap_records import MESSAGE_HEAD
 from .reader import segments_of
-from .rebuild_segment import moment_between, rebuild, trimmed
-from .scan import Scan, scan_active
+from .rebuild_segment import adjacent_times, rebuild_segment, slice_scan
+from .rename_segments import Moved, quarantine, rename_segments
+from .scan import scan_active
 from .scan_sealed import scan_sealed
 from .seal import NO_PREVIOUS, REPLACES, SegmentPlan, file_sha256
 from .sealed_segment import check_sealed
+from .segment import Scan
 
-UNASKED_LOSSES: Final = 100_000
-"""So many loss events recovery adds unasked, besides those that the damaged bytes can have held."""
+DEFAULT_MAX_LOSSES: Final = 100_000
+"""Loss events that recovery adds unasked, besides those that the damaged bytes can have held."""
 _MOST_IN_A_SEGMENT: Final = 1 << 31
 _BLOCK_BYTES: Final = 512
 """What `st_blocks` counts, on every file system."""
@@ -55,8 +55,8 @@ class TooManyLosses(LogError):
 
 @dataclass(frozen=True, slots=True)
 class SegmentRecovery:
-    """What became of one segment. ``gaps`` are first and last offsets of what was recorded and is
-    lost; ``torn_events`` were never synced; ``kept_copy`` names the damaged original."""
+    """A segment that was rewritten. ``gaps`` are the first and last offsets of recorded events that
+    are lost; ``torn_events`` were never synced; ``kept_copy`` names the damaged original."""
 
     name: str
     kept_events: int
@@ -70,7 +70,7 @@ class SegmentRecovery:
 
 @dataclass(frozen=True, slots=True)
 class RecoveryReport:
-    """``segments`` were rewritten, ``moved`` have other names now. Both empty: there was nothing to
+    """``segments`` were rewritten, ``moved`` were renamed. If both are empty, there was nothing to
     recover."""
 
     path: Path
@@ -80,23 +80,23 @@ class RecoveryReport:
 
     @property
     def findings(self) -> bool:
-        """Whether anything is gone, recorded or not, or did not belong where it stood."""
+        """Whether any bytes or events were lost, recorded or not, or any file was renamed."""
         lost = any(s.lost_events or s.torn_events or s.lost_bytes for s in self.segments)
         return lost or bool(self.moved)
 
 
 def recover_log(
-    log: Path, *, most_losses: int = UNASKED_LOSSES, clock: Clock = system_clock
+    log: Path, *, max_losses: int = DEFAULT_MAX_LOSSES, clock: Clock = system_clock
 ) -> RecoveryReport:
-    """Recover a log. Raises LogNotFound, NotALog, LogBusy, LogDamaged when its segments are of two
-    logs equally often or one was made by another program, TooManyLosses when more than
-    ``most_losses`` events would be added that the damaged bytes cannot have held, or LogError when
+    """Recover a log. Raises LogNotFound, NotALog, LogBusy, LogDamaged when its segments belong to
+    two logs in equal number or one was made by another program, TooManyLosses when more than
+    ``max_losses`` events would be added that the damaged bytes cannot have held, or LogError when
     the disk refuses."""
     if not (log.is_dir() and half_renamed(log)):
         segments_of(log)
     try:
         with WriterLock(log, clock):
-            return _Recovery(log, most_losses).run()
+            return _Recovery(log, max_losses).run()
     except OSError as error:
         raise LogError(
             f"{log}: {error.strerror or error}; nothing was replaced by less than it held. "
@@ -105,85 +105,88 @@ def recover_log(
 
 
 class _Recovery:
-    def __init__(self, log: Path, most_losses: int) -> None:
+    def __init__(self, log: Path, max_losses: int) -> None:
         self._log = log
-        self._losses_left = most_losses
-        self._spare: list[SegmentPath] = []
-        """Segments set aside because they overlap others, by base."""
-        self._done: list[SegmentRecovery] = []
-        self._next = FIRST_OFFSET
+        self._losses_left = max_losses
+        self._overlapping: list[SegmentPath] = []
+        """Segments set aside because they overlap others, in the order of their bases."""
+        self._recovered: list[SegmentRecovery] = []
+        self._next_offset = FIRST_OFFSET
         self._previous: SegmentPath | None = None
 
     def run(self) -> RecoveryReport:
         for path in leftovers(self._log):
             unlink_quietly(path)
-        arrangement = Arrangement(self._log)
-        arrangement.run()
-        self._moved = arrangement.moved
+        log_id, self._moved = rename_segments(self._log)
         if self._moved:
             delete_durably(self._log / LEDGER)
-        self._log_id = arrangement.log_id or uuid.uuid4().hex
+        self._log_id = log_id or uuid.uuid4().hex
         segments = list_segments(self._log)
         for index, segment in enumerate(segments):
             following = segments[index + 1] if index + 1 < len(segments) else None
-            if segment.base > self._next:
-                self._use_spares(segment)
-            if segment.base > self._next:
+            if segment.base > self._next_offset:
+                self._fill_from_overlapping(segment)
+            if segment.base > self._next_offset:
                 self._replace_missing(segment)
-            if segment.base < self._next:
+            if segment.base < self._next_offset:
                 self._set_aside_overlapping(segment)
             else:
-                self._visit(segment, following)
-        self._use_spares(None)
-        return RecoveryReport(self._log, self._next, tuple(self._done), tuple(self._moved))
+                self._recover_segment(segment, following)
+        self._fill_from_overlapping(None)
+        return RecoveryReport(
+            self._log, self._next_offset, tuple(self._recovered), tuple(self._moved)
+        )
 
     def _replace_missing(self, following: SegmentPath) -> None:
-        """A whole segment is gone: its offsets become losses."""
-        scan = Scan(self._next, None, next_offset=self._next)
-        scan.gap_up_to(following.base)
+        """Put a segment of losses in place of a missing one."""
+        scan = Scan(self._next_offset, None, next_offset=self._next_offset)
+        scan.add_gap_until(following.base)
         self._rewrite(None, scan, following)
 
-    def _visit(self, segment: SegmentPath, following: SegmentPath | None) -> None:
-        reach = following.base if following is not None and not self._spare else None
+    def _recover_segment(self, segment: SegmentPath, following: SegmentPath | None) -> None:
+        reach = following.base if following is not None and not self._overlapping else None
         if segment.sealed:
             unlink_quietly(segment_path(self._log, segment.base, ACTIVE))
             scan = _scan(segment, reach)
             good = not (scan.gaps or scan.rewritten or scan.index_fault)
             if good and check_sealed(segment.path).fault is None:
-                self._next = scan.next_offset
+                self._next_offset = scan.next_offset
                 self._previous = segment
                 return
         else:
             scan = _scan(segment, reach)
             if segment.base == 0 and scan.log_id and scan == Scan(FIRST_OFFSET, scan.log_id):
-                return  # an empty log, and whole
+                return  # an empty and undamaged log
         self._rewrite(segment, scan, following)
 
     def _set_aside_overlapping(self, segment: SegmentPath) -> None:
-        """A segment that begins before the one in front of it ends, out of a backup for example."""
-        reason = f"it begins before offset {self._next}, where the segment before it ends"
+        """Set aside a segment that begins before the previous one ends, from a backup perhaps."""
+        reason = f"it begins before offset {self._next_offset}, where the segment before it ends"
         delete_durably(self._log / LEDGER)
-        moved = set_aside(segment.path, DUPLICATE, reason)
+        moved = quarantine(segment.path, DUPLICATE, reason)
         self._moved.append(moved)
-        self._spare.append(replace(segment, path=self._log / moved.now))
+        self._overlapping.append(replace(segment, path=self._log / moved.now))
 
-    def _use_spares(self, following: SegmentPath | None) -> None:
-        """Take from overlapping segments what would be missing otherwise."""
-        for spare in self._spare:
-            scan = _scan(spare, None)
-            if scan.next_offset > self._next:
+    def _fill_from_overlapping(self, following: SegmentPath | None) -> None:
+        """Take missing events from the segments that were set aside."""
+        for overlapping in self._overlapping:
+            scan = _scan(overlapping, None)
+            if scan.next_offset > self._next_offset:
                 end = scan.next_offset if following is None else following.base
-                rest = trimmed(spare.path, scan, self._next, end)
+                rest = slice_scan(overlapping.path, scan, self._next_offset, end)
                 if rest.chunks:
                     self._rewrite(None, rest, following)
 
-    def _ask(self, segment: SegmentPath | None, scan: Scan, following: SegmentPath | None) -> None:
-        """Raise TooManyLosses rather than add losses without end at the word of one number."""
+    def _check_losses(
+        self, segment: SegmentPath | None, scan: Scan, following: SegmentPath | None
+    ) -> None:
+        """Raise TooManyLosses if too many losses would be added: one damaged number can claim
+        any."""
         losses = sum(last - first + 1 for first, last in scan.gaps)
         self._losses_left -= max(0, losses - _damaged_bytes(segment, scan) // MESSAGE_HEAD)
         if self._losses_left >= 0 and losses <= _MOST_IN_A_SEGMENT:
             return
-        said = f"{following.path.name} begins there" if following else "its end says so"
+        evidence = f"{following.path.name} begins there" if following else "its end says so"
         way_out = (
             f"If that is right, run `mapfold log recover {self._log} --yes`; else move the file "
             "that is wrong out of the log"
@@ -192,8 +195,8 @@ class _Recovery:
         )
         raise TooManyLosses(
             f"{self._log}: {losses:,} events from offset {scan.gaps[0][0]} to {scan.gaps[-1][1]} "
-            f"seem to be lost ({said}), more than the damaged bytes can have held, and each would "
-            f"get a loss event. {way_out}{self._moved_so_far()}"
+            f"seem to be lost ({evidence}), more than the damaged bytes can have held, and each "
+            f"would get a loss event. {way_out}{self._moved_so_far()}"
         )
 
     def _moved_so_far(self) -> str:
@@ -203,7 +206,7 @@ class _Recovery:
     def _rewrite(
         self, segment: SegmentPath | None, scan: Scan, following: SegmentPath | None
     ) -> None:
-        self._ask(segment, scan, following)
+        self._check_losses(segment, scan, following)
         delete_durably(self._log / LEDGER)
         copy = self._keep_copy(segment, scan)
         if scan.next_offset > scan.base:
@@ -213,19 +216,19 @@ class _Recovery:
                 scan.base,
                 file_sha256(self._previous.path) if self._previous else NO_PREVIOUS,
                 scan.next_offset,
-                _replaces(following),
+                _replaced_hash(following),
             )
-            nearby = moment_between(self._previous, following)
-            rebuild(plan, segment.path if segment else None, scan, nearby)
+            times = adjacent_times(self._previous, following)
+            rebuild_segment(plan, segment.path if segment else None, scan, times)
             self._previous = self._sealed(scan.base)
         if segment is not None:
             self._remove_original(segment, scan)
-        self._next = scan.next_offset
-        self._done.append(_told(segment, scan, copy))
+        self._next_offset = scan.next_offset
+        self._recovered.append(_segment_report(segment, scan, copy))
 
     def _remove_original(self, segment: SegmentPath, scan: Scan) -> None:
-        """Unless what takes its place has its name. A log without any event still has a segment,
-        for that carries its id."""
+        """Delete the original unless it was replaced under its name. A log without events gets an
+        empty segment, which carries its id."""
         replaced = segment.sealed and scan.next_offset > scan.base
         if scan.next_offset == 0:
             empty = ActiveSegment(self._log, self._log_id, FIRST_OFFSET, GROUP_COMMIT)
@@ -256,23 +259,23 @@ class _Recovery:
 
 
 def _scan(segment: SegmentPath, reach: Offset | None) -> Scan:
-    """Look at a segment, which ends at ``reach`` if that is known."""
+    """Scan a segment, which ends at ``reach`` if that is known."""
     if segment.sealed:
         return scan_sealed(segment.path, segment.base, reach)
     scan = scan_active(segment.path, segment.base, reach)
-    scan.gap_up_to(reach or segment.base)
+    scan.add_gap_until(reach or segment.base)
     return scan
 
 
 def _damaged_bytes(segment: SegmentPath | None, scan: Scan) -> int:
-    """How many bytes are damaged that can have held events; the holes of a sparse file cannot."""
+    """Damaged bytes that can have held events; the holes of a sparse file cannot."""
     if segment is None:
         return 0
     return min(scan.lost_bytes, segment.path.stat().st_blocks * _BLOCK_BYTES)
 
 
-def _replaces(following: SegmentPath | None) -> dict[str, str]:
-    """A note of the hash by which the next segment knows the one before it."""
+def _replaced_hash(following: SegmentPath | None) -> dict[str, str]:
+    """Metadata with the hash by which the next segment knows the one before it, if readable."""
     if following is None:
         return {}
     try:
@@ -282,7 +285,7 @@ def _replaces(following: SegmentPath | None) -> dict[str, str]:
     return {} if claim is None else {REPLACES: claim}
 
 
-def _told(segment: SegmentPath | None, scan: Scan, copy: str | None) -> SegmentRecovery:
+def _segment_report(segment: SegmentPath | None, scan: Scan, copy: str | None) -> SegmentRecovery:
     return SegmentRecovery(
         name=segment.path.name if segment else f"{scan.base:020d}{SEALED}",
         kept_events=sum(chunk.following - chunk.first for chunk in scan.chunks),

@@ -38,10 +38,11 @@ from .format import (
     mark_seed,
     segment_path,
 )
-from .log_identity import log_id_of
-from .scan import Scan, scan_active
+from .log_identity import common_log_id
+from .scan import scan_active
 from .seal import NO_PREVIOUS, SegmentPlan, file_sha256, seal
 from .sealed_segment import SealedFile
+from .segment import Scan
 
 
 @dataclass(slots=True)
@@ -92,7 +93,7 @@ def restart(log: Path) -> Restart:
     for path in half_renamed(log):
         raise LogDamaged(f"{path}: a recovery was interrupted; run `mapfold log recover {log}`")
     segments = list_segments(log)
-    log_id_of(segments)
+    common_log_id(segments)
     for segment in [s for s in segments if s.sealed][-1:]:
         SealedFile(segment.path, segment.base).close()  # before anything is changed
     for segment in segments:
@@ -142,7 +143,7 @@ def _look_at(segment: SegmentPath, reach: Offset | None) -> _Leftover:
     if finished is not None:
         return finished
     scan = scan_active(segment.path, segment.base)
-    scan.gap_up_to(reach or segment.base)
+    scan.add_gap_until(reach or segment.base)
     _refuse_rot(segment.path, scan)
     if scan.rewritten:
         raise LogDamaged(

@@ -1,15 +1,14 @@
-"""Where reading can go on behind a damaged record of an active segment.
+"""Resynchronise behind a damaged record of an active segment: find where reading can go on.
 
-The file is a row of chunks, each with its commit mark behind it. A mark counts only where a record
-begins, for the bytes in a chunk are other people's and may look like anything. So the walk goes by
-the lengths of the records:
+The file is a row of chunks, each followed by its commit mark. A mark counts only where a record
+begins, because the payloads in a chunk may contain anything, marks included. So records are skipped
+by their lengths:
 
-* Where the head of a chunk is good, its end is known, whatever has become of its content. A chunk
-  that would end behind the end of the file was being written when its writer died: nothing follows.
-* Where the head is damaged as well, nobody knows where the next record begins, and the next commit
-  mark is searched for. A mark found so must be made with the seed of its segment, which only its
-  writer and who can read the file know, and must promise no more events than the bytes before it
-  can hold.
+* If the head of a chunk is good, its end is known even if its content is damaged. A chunk that
+  would end behind the end of the file was being written when its writer died: nothing follows.
+* If the head is damaged too, the next commit mark is searched for. It must be made with the mark
+  seed of the segment, which publishers do not know, and must not claim more events than the bytes
+  before it can hold.
 """
 
 from typing import NamedTuple
@@ -22,36 +21,36 @@ from .mcap_records import BadRecord
 
 
 class Resumption(NamedTuple):
-    """Byte ``at`` is where reading can go on; a mark on the way promises that offsets up to before
-    ``promised`` were recorded (what was expected there, if no mark does)."""
+    """Reading can go on at byte ``at``; offsets before ``recorded_end`` were recorded, by a mark
+    that was passed (the expected offset if there was none)."""
 
     at: int
-    promised: Offset
+    recorded_end: Offset
 
 
-class Stretch(NamedTuple):
-    """What cannot be read: from byte ``start`` on, where offset ``expected`` should stand."""
+class DamagedBytes(NamedTuple):
+    """Unreadable bytes from ``start`` on, where the event of offset ``expected`` should be."""
 
     start: int
     expected: Offset
 
 
-def resume(data: FileBytes, at: int, stretch: Stretch, seed: int | None) -> Resumption:
-    """Pass by the damaged record at byte ``at`` of an unreadable stretch. Without the segment's
-    ``seed`` no mark can be told from bytes that look like one."""
+def skip_damaged(data: FileBytes, at: int, damaged: DamagedBytes, seed: int | None) -> Resumption:
+    """Skip the damaged record at byte ``at``. Without the segment's mark ``seed`` no mark can be
+    recognised."""
     end = _chunk_end(data, at)
     if end is None:
         if _chunk_end(data, at + _mcap.MARK_BYTES) is not None:  # a damaged mark
-            return Resumption(at + _mcap.MARK_BYTES, stretch.expected)
-        return _search(data, at, stretch, seed)
+            return Resumption(at + _mcap.MARK_BYTES, damaged.expected)
+        return _find_mark(data, at, damaged, seed)
     if end > len(data):
-        return Resumption(len(data), stretch.expected)
-    promised = _promised(data, end, stretch, seed)
-    if promised is not None:
-        return Resumption(end + _mcap.MARK_BYTES, promised)
+        return Resumption(len(data), damaged.expected)
+    recorded_end = _recorded_end(data, end, damaged, seed)
+    if recorded_end is not None:
+        return Resumption(end + _mcap.MARK_BYTES, recorded_end)
     if _chunk_end(data, end + _mcap.MARK_BYTES) is not None:
-        return Resumption(end + _mcap.MARK_BYTES, stretch.expected)
-    return _search(data, end, stretch, seed)
+        return Resumption(end + _mcap.MARK_BYTES, damaged.expected)
+    return _find_mark(data, end, damaged, seed)
 
 
 def _chunk_end(data: FileBytes, at: int) -> int | None:
@@ -62,24 +61,26 @@ def _chunk_end(data: FileBytes, at: int) -> int | None:
     return at + head.length
 
 
-def _promised(data: FileBytes, at: int, stretch: Stretch, seed: int | None) -> Offset | None:
-    """The next offset of the mark at byte ``at``, if one stands there and can be true."""
+def _recorded_end(
+    data: FileBytes, at: int, damaged: DamagedBytes, seed: int | None
+) -> Offset | None:
+    """The next offset of the commit mark at byte ``at``; None without a plausible mark."""
     if seed is None:
         return None
     try:
         first, following = _mcap.decode_mark(data[at : at + _mcap.MARK_BYTES], seed)
     except BadRecord:
         return None
-    most = (at - stretch.start) // _mcap.MESSAGE_HEAD
-    if stretch.expected <= first < following <= stretch.expected + most:
+    max_events = (at - damaged.start) // _mcap.MESSAGE_HEAD
+    if damaged.expected <= first < following <= damaged.expected + max_events:
         return following
     return None
 
 
-def _search(data: FileBytes, at: int, stretch: Stretch, seed: int | None) -> Resumption:
+def _find_mark(data: FileBytes, at: int, damaged: DamagedBytes, seed: int | None) -> Resumption:
     at -= 1
     while (at := data.find(_mcap.MARK_PATTERN, at + 1)) >= 0:
-        promised = _promised(data, at, stretch, seed)
-        if promised is not None:
-            return Resumption(at + _mcap.MARK_BYTES, promised)
-    return Resumption(len(data), stretch.expected)
+        recorded_end = _recorded_end(data, at, damaged, seed)
+        if recorded_end is not None:
+            return Resumption(at + _mcap.MARK_BYTES, recorded_end)
+    return Resumption(len(data), damaged.expected)

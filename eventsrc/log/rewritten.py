@@ -1,9 +1,9 @@
-"""Segments that another program has rewritten, as `mcap sort` does.
+"""Reading segments that another program has rewritten, as `mcap sort` does.
 
-Such a file has other chunks in another order, but the metadata still say which log and base it is
-of and each message has its sequence number, so every event that is there has its right offset. The
-reader of foreign files reads it, against the limits of our own segments. What it cannot read, or
-what is more than a segment holds, counts as lost bytes.
+Such a file has other chunks in another order. But its metadata still names the log and the base,
+and each message has its sequence number, so every event in it has its right offset. It is read by
+`foreign_mcap`, with the limits of our own segments. What cannot be read, or exceeds a segment,
+counts as lost bytes.
 """
 
 import struct
@@ -11,7 +11,7 @@ from bisect import bisect_right
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from eventsrc.envelope import FIRST_OFFSET, Offset
 
@@ -19,19 +19,16 @@ from . import mcap_records as _mcap
 from .foreign_mcap import ForeignDamage, ForeignRecord, foreign_records
 from .mcap_records import FRAME, BadRecord, Header, Opcode
 from .sealed_segment import SEAL_METADATA
-from .segment import ChunkRef
+from .segment import ChunkRef, Scan
 
-if TYPE_CHECKING:
-    from .scan import Scan
-
-_MOST_BYTES: Final = 1 << 28
-"""Of messages that are taken from one file, for they are all in memory; a segment holds a quarter
-of that, unless single events are larger."""
+_MAX_BYTES: Final = 1 << 28
+"""Limit for the messages of one file, which are held in memory; a segment holds a quarter of that,
+unless single events are larger."""
 _OVERHEAD_BYTES: Final = 256
-"""What a message takes in memory besides its bytes."""
+"""Memory of a message besides its bytes."""
 _RUN_BYTES: Final = 1 << 24
-"""Messages that are put together in one chunk."""
-_TAKEN: Final = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.METADATA)
+"""Size of the chunks that messages are put together in."""
+_OPCODES: Final = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.METADATA)
 _SEQUENCES: Final = 1 << 32
 _HEAD: Final = struct.Struct("<HIQQ")
 """Of a message: channel, sequence number, log and publish time."""
@@ -46,28 +43,28 @@ def is_rewritten(data: bytes) -> bool:
         return False
 
 
-def take_messages(path: Path, scan: "Scan", following: Offset | None) -> None:
-    """Take into ``scan`` every message of the file that is in none of its chunks. Those from offset
-    ``following`` on, where the next segment begins, are that one's."""
-    taken = _Taken(scan, following)
+def add_messages(path: Path, scan: Scan, following: Offset | None) -> None:
+    """Add to ``scan`` every message of the file that is in none of its chunks. Messages from offset
+    ``following`` on, where the next segment begins, are left out."""
+    messages = _Messages(scan, following)
     unread = 0
     with path.open("rb") as file:
         size = path.stat().st_size
         try:
-            for record in foreign_records(file, _TAKEN, _mcap.MAX_CHUNK_BYTES):
-                if not taken.take(record):
+            for record in foreign_records(file, _OPCODES, _mcap.MAX_CHUNK_BYTES):
+                if not messages.add(record):
                     unread = size - record.at
                     break
         except ForeignDamage as error:
             unread = size - error.at
-    taken.merge()
+    messages.merge()
     scan.lost_bytes, scan.torn_events = unread, 0
 
 
-class _Taken:
+class _Messages:
     """The messages of a file by offset, and the schemas and channels that they need."""
 
-    def __init__(self, scan: "Scan", following: Offset | None) -> None:
+    def __init__(self, scan: Scan, following: Offset | None) -> None:
         self._scan = scan
         self._end = Offset(scan.base + _SEQUENCES) if following is None else following
         self._known = list(scan.chunks)
@@ -77,33 +74,33 @@ class _Taken:
         self._messages: dict[Offset, bytes] = {}
         self._definition_bytes = self._message_bytes = 0
 
-    def take(self, record: ForeignRecord) -> bool:
-        """False when that is more than a segment holds, or cannot be read."""
+    def add(self, record: ForeignRecord) -> bool:
+        """Whether the record could be read and is within the limits."""
         opcode, content, _ = record
         if opcode == Opcode.MESSAGE:
-            return self._take_message(content)
+            return self._add_message(content)
         try:
             _mcap.check_definitions(len(content))
             if opcode == Opcode.METADATA:
                 metadata = _mcap.decode_as(_mcap.Metadata, content)
-                self._scan.gap_up_to(Offset(self._scan.base + _sealed_count(metadata)))
+                self._scan.add_gap_until(Offset(self._scan.base + _event_count_of_seal(metadata)))
                 return True
             if opcode == Opcode.CHANNEL:
                 self._channels.add(_mcap.decode_as(_mcap.Channel, content).id)
             else:
                 _mcap.decode_as(_mcap.Schema, content)
-            return self._take_definition(_framed(opcode, content))
+            return self._add_definition(_framed(opcode, content))
         except BadRecord:
             return False
 
-    def _take_definition(self, record: bytes) -> bool:
+    def _add_definition(self, record: bytes) -> bool:
         if record not in self._definitions:
             self._definition_bytes += len(record)
             _mcap.check_definitions(self._definition_bytes)
             self._definitions[record] = None
         return True
 
-    def _take_message(self, content: bytes) -> bool:
+    def _add_message(self, content: bytes) -> bool:
         if len(content) < _HEAD.size:
             return False
         channel, sequence, _, _ = _HEAD.unpack_from(content)
@@ -111,7 +108,7 @@ class _Taken:
         wanted = offset < self._end and offset not in self._messages and not self._has(offset)
         if wanted and channel in self._channels:
             self._message_bytes += len(content) + _OVERHEAD_BYTES
-            if self._message_bytes > _MOST_BYTES:
+            if self._message_bytes > _MAX_BYTES:
                 return False
             self._messages[offset] = _framed(Opcode.MESSAGE, content)
         return True
@@ -121,7 +118,7 @@ class _Taken:
         return index >= 0 and offset < self._known[index].following
 
     def merge(self) -> None:
-        """Put the messages between the chunks that were good already."""
+        """Make chunks of the messages and put them between the good chunks of the scan."""
         scan = self._scan
         definitions = b"".join(self._definitions)
         chunks = list(self._known)
@@ -132,16 +129,16 @@ class _Taken:
         end = scan.next_offset
         scan.chunks, scan.gaps, scan.next_offset = [], [], scan.base
         for chunk in sorted(chunks, key=lambda chunk: chunk.first):
-            scan.take(chunk)
-        scan.gap_up_to(end)
+            scan.add_chunk(chunk)
+        scan.add_gap_until(end)
 
 
 def _framed(opcode: int, content: bytes) -> bytes:
     return FRAME.pack(opcode, len(content)) + content
 
 
-def _sealed_count(record: _mcap.Metadata) -> int:
-    """How many events the segment held when it was sealed, if this is its seal."""
+def _event_count_of_seal(record: _mcap.Metadata) -> int:
+    """How many events the segment held when it was sealed; 0 if this record is not its seal."""
     try:
         if record.name == SEAL_METADATA:
             return int(_mcap.checked_metadata(record)["chunk_edges"].rsplit(",", 1)[-1])
@@ -151,7 +148,7 @@ def _sealed_count(record: _mcap.Metadata) -> int:
 
 
 def _runs(messages: dict[Offset, bytes]) -> Iterator[tuple[Offset, list[bytes]]]:
-    """Messages of consecutive offsets, with the first of these; some mebibytes at once."""
+    """Messages of consecutive offsets, some mebibytes at a time, with the first offset of each."""
     first, size = FIRST_OFFSET, 0
     run: list[bytes] = []
     for offset in sorted(messages):

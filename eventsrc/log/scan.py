@@ -1,75 +1,39 @@
-"""What can still be read of an active segment, whatever happened to its bytes.
+"""Scan an active segment for its good chunks, whatever happened to its bytes; read a scan's events.
 
-The file is a row of chunks and commit marks. A chunk counts when its CRC holds and its sequence
-numbers continue. Where no good chunk stands, `_resync` says where reading can go on. Then:
+The file is a row of chunks and commit marks. A chunk is good if its CRC holds and its sequence
+numbers continue. Where no good chunk is, `resync` says where reading can go on. Then:
 
-* Bytes at the end that no good chunk and no commit mark follows are *torn*: the write that a crash
-  cut short. They were never synced, so nobody was told that they are recorded.
+* Bytes at the end that no good chunk and no commit mark follow are *torn*: a write that a crash cut
+  short. They were never synced, so nobody was told that they are recorded.
 * Everything else that cannot be read is *rot*: a mark or a chunk behind it proves that it was
-  synced once. Its offsets are known from what stands around it, and named as a gap.
-
-Events straight from a chunk, without any index: what a scan found good.
+  synced. Its offsets are known from its neighbours and reported as a gap.
 """
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from eventsrc.envelope import FIRST_OFFSET, Offset
+from eventsrc.envelope import Offset
 from eventsrc.errors import LogDamaged, NotALog
 
 from . import mcap_records as _mcap
 from .durable_files import FileBytes
 from .event import Event
 from .format import HEAD_BYTES, WrongPlace, envelope_version, mark_seed, read_head
-from .mcap_records import BadRecord, Channel
-from .resync import Stretch, resume
-from .rewritten import is_rewritten, take_messages
-from .segment import ChunkRef
+from .mcap_records import BadRecord
+from .resync import DamagedBytes, skip_damaged
+from .rewritten import add_messages, is_rewritten
+from .segment import ChunkRef, Scan
 
-_IN_A_CHUNK = (_mcap.Opcode.SCHEMA, _mcap.Opcode.CHANNEL, _mcap.Opcode.MESSAGE)
-_MOST_TRIED: Final = 64
-"""So many times the size of a file is spent on what seems to be a chunk in it, at most; a sparse
-file may be of any size."""
-
-
-@dataclass(slots=True)
-class Scan:
-    """The good chunks of a segment and what is between and behind them."""
-
-    base: Offset
-    log_id: str | None
-    chunks: list[ChunkRef] = field(default_factory=list)
-    gaps: list[tuple[Offset, Offset]] = field(default_factory=list)
-    """First and last offset of events that were recorded once and are gone."""
-    index_fault: str | None = None
-    """Why the index of a sealed segment cannot be used, if so."""
-    lost_bytes: int = 0
-    torn_events: int = 0
-    """Events that had begun to be written in the torn end; none of them was synced."""
-    next_offset: Offset = FIRST_OFFSET
-    rewritten: bool = False
-    """Whether another program has written the file that it is in now."""
-    channels: dict[int, Channel] = field(default_factory=dict)
-    """What the segment's index says of channels; its chunks name their own as well."""
-
-    def take(self, chunk: ChunkRef) -> None:
-        """The next good chunk; what lies before it is a gap."""
-        self.gap_up_to(chunk.first)
-        self.chunks.append(chunk)
-        self.next_offset = chunk.following
-
-    def gap_up_to(self, offset: Offset) -> None:
-        """Offsets before ``offset`` that no good chunk holds are gone."""
-        if offset > self.next_offset:
-            self.gaps.append((self.next_offset, Offset(offset - 1)))
-            self.next_offset = offset
+_CHUNK_OPCODES = (_mcap.Opcode.SCHEMA, _mcap.Opcode.CHANNEL, _mcap.Opcode.MESSAGE)
+_MAX_PASSES: Final = 64
+"""Limit for the search of a first chunk: bytes checked, in multiples of the file's size (or of the
+largest chunk: a sparse file may be of any size)."""
 
 
-def chunk_extent(data: FileBytes, at: int, scan: Scan) -> tuple[int, Offset, Offset]:
+def check_chunk(data: FileBytes, at: int, scan: Scan) -> tuple[int, Offset, Offset]:
     """Length, first and next offset of the chunk at ``at``; BadRecord unless all of it is good."""
     head = _mcap.decode_chunk_head(data[at : at + _mcap.ZSTD_CHUNK_HEAD])
     if at + head.length > len(data):
@@ -91,13 +55,13 @@ def chunk_extent(data: FileBytes, at: int, scan: Scan) -> tuple[int, Offset, Off
 
 
 def scan_active(path: Path, base: Offset, following: Offset | None = None) -> Scan:
-    """Look at every byte of an active segment; ``following`` is the base of the next one, if there
-    is one. Raises WrongPlace for a segment of another base."""
+    """Scan every byte of an active segment; ``following`` is the base of the next one, if there is
+    one. Raises WrongPlace for a segment of another base."""
     with FileBytes.of(path) as data:
         scan = _Scanner(path, base, data).run()
         scan.rewritten = is_rewritten(data[:HEAD_BYTES])
     if scan.rewritten:
-        take_messages(path, scan, following)
+        add_messages(path, scan, following)
     return scan
 
 
@@ -115,7 +79,7 @@ class _Scanner:
         self._data = data
         self._at = 0
         self._good_end = 0
-        self._promised = base
+        self._recorded_end = base
         self._seed: int | None = None
         self.result = Scan(base, None, next_offset=base)
 
@@ -123,8 +87,8 @@ class _Scanner:
         self._read_head()
         while self._at < len(self._data):
             if not self._take_chunk(self._at):
-                self._pass_by()
-        self.result.gap_up_to(self._promised)
+                self._skip_damaged()
+        self.result.add_gap_until(self._recorded_end)
         return self.result
 
     def _read_head(self) -> None:
@@ -140,20 +104,20 @@ class _Scanner:
         self._good_end = self._at
 
     def _find_first_chunk(self) -> None:
-        """Where the head of the file is damaged, the row of good chunks that ends last tells the
-        seed, for nothing in a chunk ends behind it; reading starts with the first row of that seed.
-        """
-        rows = list(self._rows())
+        """Find where to start if the head of the file is damaged. The mark seed is that of the row
+        of good chunks that ends last: chunks inside a payload end before it. Reading starts with
+        the first row of that seed."""
+        rows = list(self._find_rows())
         if rows:
             self._seed = max(rows, key=lambda row: row.end).seed
         starts = [row.start for row in rows if row.seed == self._seed]
         self._at = min(starts, default=len(self._data))
-        self._lose(0)
+        self._count_lost(0)
 
-    def _rows(self) -> Iterator[_Row]:
-        """Good chunks with their marks, one directly behind the other, wherever they stand."""
+    def _find_rows(self) -> Iterator[_Row]:
+        """Every row of adjacent good chunks and marks in the file."""
         at = -1
-        effort = _MOST_TRIED * min(len(self._data), _mcap.MAX_CHUNK_BYTES)
+        effort = _MAX_PASSES * min(len(self._data), _mcap.MAX_CHUNK_BYTES)
         while effort > 0 and (at := self._data.find(b"\x06", at + 1)) >= 0:
             try:
                 head = _mcap.decode_chunk_head(self._data[at : at + _mcap.PLAIN_CHUNK_HEAD])
@@ -170,7 +134,7 @@ class _Scanner:
         end = at = start
         while True:
             try:
-                length, first, following = chunk_extent(self._data, at, self.result)
+                length, first, following = check_chunk(self._data, at, self.result)
             except BadRecord:
                 return _Row(start, end, seed) if end > start else None
             end = at = at + length
@@ -181,7 +145,7 @@ class _Scanner:
             at += _mcap.MARK_BYTES
 
     def _seed_of(self, at: int, first: Offset, following: Offset) -> int | None:
-        """The seed of the mark at byte ``at``, if it is that of a chunk of these offsets."""
+        """The seed of the mark at byte ``at``, None unless it marks a chunk of these offsets."""
         mark = self._data[at : at + _mcap.MARK_BYTES]
         if len(mark) < _mcap.MARK_BYTES:
             return None
@@ -189,41 +153,40 @@ class _Scanner:
         return seed if mark == _mcap.encode_mark(first, following, seed) else None
 
     def _take_chunk(self, at: int) -> bool:
-        """Accept the chunk at ``at`` and its mark; False when none is there."""
+        """Accept the chunk at byte ``at`` and its mark; False if there is no good chunk."""
         try:
-            length, first, following = chunk_extent(self._data, at, self.result)
+            length, first, following = check_chunk(self._data, at, self.result)
         except BadRecord:
             return False
         if first < self.result.next_offset:
             return False
-        self.result.take(ChunkRef(at, length, first, following))
+        self.result.add_chunk(ChunkRef(at, length, first, following))
         self._at = at + length
         if self._seed is not None and self._seed_of(self._at, first, following) == self._seed:
             self._at += _mcap.MARK_BYTES
         self._good_end = self._at
         return True
 
-    def _pass_by(self) -> None:
-        """Move on from a record that cannot be read."""
+    def _skip_damaged(self) -> None:
+        """Skip a record that cannot be read."""
         start = self._at
-        stretch = Stretch(self._good_end, self.result.next_offset)
-        self._at, promised = resume(self._data, start, stretch, self._seed)
-        self._promised = max(self._promised, promised)
-        self._lose(start)
+        damaged = DamagedBytes(self._good_end, self.result.next_offset)
+        self._at, recorded_end = skip_damaged(self._data, start, damaged, self._seed)
+        self._recorded_end = max(self._recorded_end, recorded_end)
+        self._count_lost(start)
 
-    def _lose(self, start: int) -> None:
+    def _count_lost(self, start: int) -> None:
         self.result.lost_bytes += self._at - start
         if self._at == len(self._data):
-            self.result.torn_events += _count_begun(self._data, start)
+            self.result.torn_events += _count_torn_events(self._data, start)
 
 
-def _count_begun(data: FileBytes, torn: int) -> int:
-    """How many events a chunk that is torn had begun; nothing of them can be trusted, their number
-    may."""
+def _count_torn_events(data: FileBytes, torn: int) -> int:
+    """How many events of a torn chunk were begun. Their content cannot be checked."""
     at, count = torn + _mcap.PLAIN_CHUNK_HEAD, 0
     while at + _mcap.FRAME.size <= len(data):
         opcode, length = _mcap.FRAME.unpack(data[at : at + _mcap.FRAME.size])
-        if opcode not in _IN_A_CHUNK:
+        if opcode not in _CHUNK_OPCODES:
             break
         count += opcode == _mcap.Opcode.MESSAGE
         at += _mcap.FRAME.size + length
@@ -231,13 +194,13 @@ def _count_begun(data: FileBytes, torn: int) -> int:
 
 
 def read_body(fd: int, chunk: ChunkRef) -> bytes:
-    """The body of a chunk that has been checked already."""
+    """The body of a chunk that a scan found good."""
     if chunk.body is not None:
         return chunk.body()
     return _mcap.read_chunk(partial(os.pread, fd), chunk.length, chunk.position)
 
 
-def raw_events(fd: int, scan: Scan, chunk: ChunkRef) -> Iterator[Event]:
+def scanned_events(fd: int, scan: Scan, chunk: ChunkRef) -> Iterator[Event]:
     """The events of a chunk of ``scan``."""
     body = read_body(fd, chunk)
     _, channels = _mcap.definitions(body)

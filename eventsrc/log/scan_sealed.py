@@ -1,5 +1,5 @@
-"""What can still be read of a sealed segment: by its index, or, where that is gone, by searching
-the bytes for chunks. Every chunk is decompressed and its CRC and sequence checked."""
+"""Scan a sealed segment for its good chunks, by its index or, if that is damaged, by searching the
+bytes for chunks. Every chunk is decompressed, and its CRC and sequence numbers are checked."""
 
 import contextlib
 from collections.abc import Iterable, Iterator
@@ -13,21 +13,20 @@ from . import mcap_records as _mcap
 from .durable_files import FileBytes
 from .format import HEAD_BYTES, WrongPlace, read_head
 from .mcap_records import BadRecord, Metadata
-from .rewritten import is_rewritten, take_messages
-from .scan import Scan, chunk_extent
+from .rewritten import add_messages, is_rewritten
+from .scan import check_chunk
 from .sealed_segment import SEAL_METADATA, SealedFile, sealed_edges
-from .segment import ChunkRef
+from .segment import ChunkRef, Scan
 
 
 def scan_sealed(path: Path, base: Offset, following: Offset | None) -> Scan:
-    """Look at every chunk. ``following`` is the base of the next segment, if there is one: how far
-    this one reached when its own index cannot say. Raises WrongPlace for a segment of another
-    base."""
+    """Scan every chunk. ``following`` is the base of the next segment, if there is one: where this
+    one ends if its index is damaged. Raises WrongPlace for a segment of another base."""
     with FileBytes.of(path) as data:
         scan = _scan(path, data, base, following)
         scan.rewritten = is_rewritten(data[:HEAD_BYTES])
     if scan.rewritten:
-        take_messages(path, scan, following)
+        add_messages(path, scan, following)
     return scan
 
 
@@ -36,28 +35,28 @@ def _scan(path: Path, data: FileBytes, base: Offset, following: Offset | None) -
     edges: set[tuple[Offset, Offset]] | None = None
     try:
         index = SealedFile(path, base)
-        promised = index.next_offset
+        recorded_end = index.next_offset
         scan.channels = index.channels
         places: Iterable[int] = [chunk.position for chunk in index.chunks]
     except (LogDamaged, NotALog) as error:
         scan.index_fault = str(error)
-        places = _chunk_places(data)
-        offsets = _sealed_edges(data, base, max(_chunk_places(data), default=0))
-        promised = offsets[-1]
+        places = _find_chunks(data)
+        offsets = _find_seal_edges(data, base, max(_find_chunks(data), default=0))
+        recorded_end = offsets[-1]
         edges = set(pairwise(offsets)) or None
     end = 0
     for at in places:
-        if at < end:  # bytes of the chunk before, which may look like anything
+        if at < end:  # inside the chunk before, where payloads may look like chunks
             continue
         try:
-            length, first, after = chunk_extent(data, at, scan)
+            length, first, after = check_chunk(data, at, scan)
         except BadRecord:
             continue
         if first >= scan.next_offset and (edges is None or (first, after) in edges):
-            scan.take(ChunkRef(at, length, first, after))
+            scan.add_chunk(ChunkRef(at, length, first, after))
             end = at + length
-    scan.gap_up_to(max(promised, following or base))
-    scan.lost_bytes = _unread_bytes(len(data), scan)
+    scan.add_gap_until(max(recorded_end, following or base))
+    scan.lost_bytes = _count_lost_bytes(len(data), scan)
     return scan
 
 
@@ -70,9 +69,9 @@ def _log_id(path: Path, base: Offset, data: FileBytes) -> str | None:
         return None
 
 
-def _chunk_places(data: FileBytes) -> Iterator[int]:
-    """Where chunks seem to start. What is in a chunk is other people's bytes, so where the head of
-    one is good its content is not searched, whatever has become of it."""
+def _find_chunks(data: FileBytes) -> Iterator[int]:
+    """Positions at which chunks seem to start. The content of a chunk with a good head is not
+    searched: payloads may look like chunks."""
     at = -1
     while (at := data.find(_mcap.ZSTD_PATTERN, at + 1)) >= 0:
         start = at - _mcap.ZSTD_PATTERN_AT
@@ -85,9 +84,9 @@ def _chunk_places(data: FileBytes) -> Iterator[int]:
             at = start + head.length - 1
 
 
-def _sealed_edges(data: FileBytes, base: Offset, last_chunk: int) -> list[Offset]:
-    """The offsets at which chunks begin and the last one ends, by the seal, if that can be found
-    behind the last chunk; else the base alone."""
+def _find_seal_edges(data: FileBytes, base: Offset, last_chunk: int) -> list[Offset]:
+    """The offsets at which chunks begin and the last one ends, from the seal behind the last chunk;
+    the base alone if the seal cannot be found."""
     name = SEAL_METADATA.encode()
     with contextlib.suppress(BadRecord):
         head = _mcap.decode_chunk_head(data[last_chunk : last_chunk + _mcap.ZSTD_CHUNK_HEAD])
@@ -105,8 +104,8 @@ def _sealed_edges(data: FileBytes, base: Offset, last_chunk: int) -> list[Offset
     return [base]
 
 
-def _unread_bytes(size: int, scan: Scan) -> int:
-    """Bytes between the chunks around each gap, indexes that stand there included."""
+def _count_lost_bytes(size: int, scan: Scan) -> int:
+    """Bytes between the chunks around each gap, including message indexes there."""
     lost, end, expected = 0, 0, scan.base
     for chunk in scan.chunks:
         if chunk.first > expected:

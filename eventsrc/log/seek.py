@@ -1,4 +1,4 @@
-"""Points in a log, as a person writes them: how many events a map "at W" is made of.
+"""Find a point in a log from text: how many events come before it.
 
     17                      the first 17 events, offsets 0 to 16
     end                     all of them
@@ -6,15 +6,15 @@
                             (UTC unless it says otherwise; a date alone is its midnight)
     robot-1:42              up to and including the first event with keyframe 42 of run robot-1
 
-Times are the robot's (stamp_ns): a log imported today of a run of last week is asked in last
-week's times. Stamps may run backwards between runs and when a clock is set; "the last event at or
-before" includes every event of that time or earlier, wherever it stands.
+Times are the robots' (stamp_ns): a run of last week that is imported today has last week's times.
+Stamps may run backwards between runs and when a clock is set; "the last event at or before"
+includes every event of that time or earlier, wherever it is in the log.
 
-mapfold's own events are stamped when we wrote them, so they do not say where a time is, and events
-that cannot be read do not either. Both count as stamped like the robots' event before them, and at
-the head of the log as earlier than all. So damage lies in a range that ends at a time if what is
-before it does, or anything behind it; and who then reads that range meets the damage. Only at the
-end of a growing segment there is nothing to read behind it, so it is met here.
+mapfold's own events are stamped when they were written, and the stamps of unreadable events are
+unknown. Both count as stamped like the robots' event before them, and at the start of the log as
+earlier than all. So damage is inside a range that ends at a time if the event before it is, or any
+event behind it; whoever reads that range meets the damage. Only damage at the end of a growing
+segment, with no readable event behind it, is reported here.
 """
 
 import re
@@ -44,22 +44,22 @@ class _Identity(BaseModel):
 
 
 Note = Callable[[str], None]
-"""Takes one line for people."""
+"""Receives one line of text for people."""
 
 
 def resolve(
     reader: LogReader, text: str, *, on_gap: OnGap | None = None, note: Note | None = None
 ) -> Offset:
-    """The number of events that ``text`` means; MisuseError when the log has no such point.
+    """The number of events before the point ``text``; MisuseError if the log has no such point.
 
-    ``note`` is told when events stamped later than a time are in the range up to it.
-    Damage on the way to a keyframe, and rot that a growing segment ends in where the range goes up
-    to there, raise LogDamaged, or are told to ``on_gap``.
+    ``note`` gets a line if events stamped later than a given time are included. Damage before a
+    keyframe is found, and rot at the end of a growing segment if the range goes up to there, raise
+    LogDamaged or are reported to ``on_gap``.
     """
     if text == "end":
         return _at_end(reader, on_gap)
     if text.isascii() and text.isdecimal():
-        return _within(reader, Offset(int(text)))
+        return _checked_offset(reader, Offset(int(text)))
     time_ns = time_of(text)
     if time_ns is not None:
         included, later = _at_time(reader, time_ns, on_gap)
@@ -76,10 +76,10 @@ def resolve(
     )
     if found:
         return found
-    raise MisuseError(_no_point(reader, text, named=keyframe is not None))
+    raise MisuseError(_no_point_message(reader, text, named=keyframe is not None))
 
 
-def _no_point(reader: LogReader, text: str, *, named: bool) -> str:
+def _no_point_message(reader: LogReader, text: str, *, named: bool) -> str:
     if not named:
         return (
             f"{text!r} is no point in a log; give an offset, a time such as 2026-03-24T13:00:00Z, "
@@ -97,10 +97,10 @@ def _no_point(reader: LogReader, text: str, *, named: bool) -> str:
 
 
 def resolve_start(reader: LogReader, text: str, *, on_gap: OnGap | None = None) -> Offset:
-    """The offset to start at so that what ``text`` names is included: an offset is itself, a
-    keyframe its own event, a time the robots' first event stamped then or later.
+    """The offset of the first event from the point ``text`` on: for a keyframe its own event, for a
+    time the robots' first event stamped then or later.
 
-    Damage on the way to a keyframe or a time raises LogDamaged, or is told to ``on_gap``.
+    Damage before a keyframe or a time is found raises LogDamaged, or is reported to ``on_gap``.
     """
     time_ns = time_of(text)
     if time_ns is not None:
@@ -111,7 +111,7 @@ def resolve_start(reader: LogReader, text: str, *, on_gap: OnGap | None = None) 
     return count if text == "end" or text.isdecimal() else Offset(count - 1)
 
 
-def _within(reader: LogReader, offset: Offset) -> Offset:
+def _checked_offset(reader: LogReader, offset: Offset) -> Offset:
     if offset > reader.next_offset:
         raise MisuseError(
             f"{offset} is beyond the end of {reader.path}, which holds "
@@ -121,7 +121,8 @@ def _within(reader: LogReader, offset: Offset) -> Offset:
 
 
 def time_of(text: str) -> int | None:
-    """Int nanoseconds of an ISO 8601 time; None when it is none, or an offset (``20260324``)."""
+    """Int nanoseconds of an ISO 8601 time; None for other text, and for an offset
+    (``20260324``)."""
     if text.isdecimal() or not re.match(r"\d{4}-?\d{2}-?\d{2}", text):
         return None
     try:
@@ -133,17 +134,17 @@ def time_of(text: str) -> int | None:
 
 
 def _at_time(reader: LogReader, time_ns: int, on_gap: OnGap | None) -> tuple[Offset, int]:
-    """How many events are included, and how many of them are the robots' of a later time."""
+    """How many events are included, and how many of them are robots' events of a later time."""
     included: int = 0
     later = later_included = 0
     in_time = True
 
-    def take_in(gap: Unreadable) -> None:
+    def include(gap: Unreadable) -> None:
         nonlocal included
         if in_time:
             included = gap.last + 1
 
-    for event in reader.read(on_gap=take_in):
+    for event in reader.read(on_gap=include):
         if not is_system_key(event.key):
             in_time = event.stamp_ns <= time_ns
             later += not in_time
@@ -155,7 +156,7 @@ def _at_time(reader: LogReader, time_ns: int, on_gap: OnGap | None) -> tuple[Off
 
 
 def _at_end(reader: LogReader, on_gap: OnGap | None) -> Offset:
-    """Where there are no more events, unless more was recorded than the growing segment shows."""
+    """The end of the log; reading from there reports events that the growing segment has lost."""
     list(reader.read(reader.next_offset, on_gap=on_gap))
     return reader.next_offset
 
@@ -163,7 +164,7 @@ def _at_end(reader: LogReader, on_gap: OnGap | None) -> Offset:
 def _at_keyframe(
     reader: LogReader, run_id: RunId, keyframe_id: KeyframeId, on_gap: OnGap | None
 ) -> Offset | None:
-    for event in _mentioning(reader, keyframe_id, on_gap):
+    for event in _events_mentioning(reader, keyframe_id, on_gap):
         try:
             identity = _Identity.model_validate_json(event.payload)
         except ValidationError:
@@ -173,10 +174,10 @@ def _at_keyframe(
     return None
 
 
-def _mentioning(
+def _events_mentioning(
     reader: LogReader, keyframe_id: KeyframeId, on_gap: OnGap | None
 ) -> Iterator[Event]:
-    """Events whose text has that keyframe id somewhere: parsing all of them takes 20 times as
+    """Events whose text contains that keyframe id: parsing all of them would take 20 times as
     long."""
     for event in reader.read(on_gap=on_gap):
         if not is_system_key(event.key) and any(

@@ -1,12 +1,12 @@
-"""Segments, read side: where each chunk of events stands, and the events of one chunk."""
+"""An open segment file: where each chunk is, and the events of one chunk."""
 
 import os
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from eventsrc.envelope import Offset
+from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.errors import LogDamaged
 
 from . import mcap_records as _mcap
@@ -17,8 +17,9 @@ from .mcap_records import BadRecord, Channel
 
 @dataclass(frozen=True, slots=True)
 class ChunkRef:
-    """Where a chunk stands and which offsets it holds. ``channels`` is None where not known.
-    ``body`` gives the records where the events do not stand in a chunk of ours."""
+    """Where a chunk is in its file (bytes) and which offsets it holds, ``first`` to before
+    ``following``. ``channels`` is None if unknown. ``body``, if given, returns the records instead:
+    they are put together from a file that another program wrote."""
 
     position: int
     length: int
@@ -35,6 +36,39 @@ class Unreadable:
     first: Offset
     last: Offset
     reason: str
+
+
+@dataclass(slots=True)
+class Scan:
+    """The good chunks of a segment, and the gaps between and behind them."""
+
+    base: Offset
+    log_id: str | None
+    chunks: list[ChunkRef] = field(default_factory=list)
+    gaps: list[tuple[Offset, Offset]] = field(default_factory=list)
+    """First and last offsets of recorded events that are lost."""
+    index_fault: str | None = None
+    """Why the index of a sealed segment cannot be used, None if it can."""
+    lost_bytes: int = 0
+    torn_events: int = 0
+    """Events in the torn end; none of them was synced."""
+    next_offset: Offset = FIRST_OFFSET
+    rewritten: bool = False
+    """Whether another program has rewritten the file."""
+    channels: dict[int, Channel] = field(default_factory=dict)
+    """The channels in the segment's index; chunks define theirs as well."""
+
+    def add_chunk(self, chunk: ChunkRef) -> None:
+        """Add the next good chunk; offsets missing before it become a gap."""
+        self.add_gap_until(chunk.first)
+        self.chunks.append(chunk)
+        self.next_offset = chunk.following
+
+    def add_gap_until(self, offset: Offset) -> None:
+        """Add the offsets from `next_offset` to before ``offset``, if any, as a gap."""
+        if offset > self.next_offset:
+            self.gaps.append((self.next_offset, Offset(offset - 1)))
+            self.next_offset = offset
 
 
 class SegmentFile:
@@ -73,13 +107,13 @@ class SegmentFile:
         return os.fstat(self._fd).st_size
 
     def close(self) -> None:
-        """Let go of the file. May be called twice."""
+        """Close the file. May be called twice."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
 
     def __del__(self) -> None:
-        # Iterators share a segment with the reader that opened it; the last one closes the file.
+        # Iterators share a segment with the reader that opened it; the last user closes the file.
         self.close()
 
 

@@ -1,11 +1,11 @@
 """Following a log as it grows: every event once, across rotations, milliseconds after its commit.
 
-Polls the file's commit marks: one `pread` of some 80 bytes, and five `stat` for the next segment,
-each 5 ms while nothing comes. That costs one to two percent of a core (58 to 86 µs a poll, most of
-it waking up), needs nothing from the platform, and works when the writer is another process.
+Polls the commit marks of the file: while nothing comes, one `pread` of some 80 bytes and five
+`stat` for the next segment every 5 ms. That costs one to two percent of a core (58 to 86 µs a poll,
+most of it waking up), needs nothing from the platform, and works across processes.
 
-A chunk that rots before the tail came to it looks like one that is just being written: nothing more
-is shown. So a tail that waits looks now and then whether there is something behind it.
+A chunk that rots before it was read looks like one that is being written. So a waiting tail checks
+once a second whether recorded events follow behind it.
 """
 
 import threading
@@ -18,26 +18,26 @@ from .event import Event
 from .reader import LogReader
 
 POLL_S = 0.005
-_LOOK_EVERY = 200
-"""Polls in vain; a second of them."""
+_CHECK_EVERY = 200
+"""Idle polls: one second of them."""
 
 
 def follow(
     path: Path, start: Offset, *, stop: threading.Event, poll_s: float = POLL_S
 ) -> Iterator[Event | None]:
-    """Events from ``start`` on, for as long as ``stop`` is not set.
+    """Events from ``start`` on, until ``stop`` is set.
 
-    Yields None whenever all that is durable has been given out, at each poll, so that the caller
-    can finish a batch or look at other things. Raises LogDamaged where events cannot be read, and
-    LogNotFound when the log is gone.
+    Yields None after each poll, when every durable event has been yielded, so that the caller can
+    finish a batch. Raises LogDamaged where events cannot be read, and LogNotFound when the log is
+    gone.
     """
     with LogReader(path) as reader:
         at = start
-        vain = 0
+        idle_polls = 0
         while not stop.is_set():
             end = reader.refresh()
-            vain = 0 if at < end else vain + 1
-            if vain % _LOOK_EVERY == _LOOK_EVERY - 1:
+            idle_polls = 0 if at < end else idle_polls + 1
+            if idle_polls % _CHECK_EVERY == _CHECK_EVERY - 1:
                 reader.check_end()
             for event in reader.read(at, end):
                 yield event

@@ -1,8 +1,7 @@
-"""`mapfold log verify`: read every byte and say everything that is not as it should be.
+"""Verification of a log (`mapfold log verify`): read every byte and report everything wrong.
 
-Of the files: magic, checksums, the hash chain, dense offsets, torn ends. Of the events: payloads
-the door would refuse today, keyframes that stand twice, clocks that ran backwards, losses. Findings
-that may be many are told once for each run or key, with their number and the first offset.
+In the files: magic, checksums, hash chain, dense offsets, torn ends. In the events, see
+`verify_events`: invalid payloads, duplicate keyframes, clocks that ran backwards, losses.
 """
 
 import os
@@ -15,18 +14,19 @@ from eventsrc.text import counted
 
 from .format import SEALED, SegmentPath, WrongPlace, claims_of, head_of, segment_path
 from .lock import is_held
-from .log_identity import majority_of
+from .log_identity import majority_log_id
 from .reader import segments_of
-from .scan import Scan, raw_events, scan_active
+from .scan import scan_active, scanned_events
 from .scan_sealed import scan_sealed
 from .seal import NO_PREVIOUS, REPLACES
 from .sealed_segment import check_sealed
+from .segment import Scan
 from .verify_events import EventFindings, Finding, Kind
 
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """What was looked at and what was found."""
+    """What was read and what was found."""
 
     path: Path
     log_id: str | None
@@ -37,7 +37,7 @@ class Verification:
 
 
 def verify_log(log: Path) -> Verification:
-    """Look at everything. Raises only when there is no log, or one that may not be read."""
+    """Verify a log. Raises LogNotFound, NotALog, or LogError if the disk cannot be read."""
     before: list[SegmentPath] = []
     while True:
         segments = segments_of(log)
@@ -55,20 +55,22 @@ class _Verifier:
     def __init__(self, log: Path, segments: list[SegmentPath]) -> None:
         self._log = log
         self._segments = segments
-        self._live = is_held(log)
+        self._has_writer = is_held(log)
         self._found: list[Finding] = []
         self._events = EventFindings()
-        self._log_id = _usual_log_id(segments)
-        self._next = FIRST_OFFSET
+        self._log_id = _majority_log_id(segments)
+        self._next_offset = FIRST_OFFSET
         self._count = 0
-        self._known_as: set[str] = {NO_PREVIOUS}
-        """Hashes by which a successor may know the segment before it."""
+        self._expected_hashes: set[str] = {NO_PREVIOUS}
+        """Hashes that the next segment may name for the one before it; empty if any."""
 
     def run(self) -> Verification:
         size = 0
         for index, segment in enumerate(self._segments):
             is_last = index + 1 == len(self._segments)
-            size += self._visit(segment, None if is_last else self._segments[index + 1].base)
+            size += self._verify_segment(
+                segment, None if is_last else self._segments[index + 1].base
+            )
         return Verification(
             self._log,
             self._log_id,
@@ -78,17 +80,19 @@ class _Verifier:
             (*self._found, *self._events.findings()),
         )
 
-    def _visit(self, segment: SegmentPath, reach: Offset | None) -> int:
-        """Look at one segment, which ends at ``reach`` if that is known; its size in bytes."""
+    def _verify_segment(self, segment: SegmentPath, reach: Offset | None) -> int:
+        """Verify one segment, which ends at ``reach`` if that is known; its size in bytes."""
         if not segment.sealed and not segment.path.exists():  # sealed since the folder was listed
             segment = SegmentPath(segment_path(self._log, segment.base, SEALED), segment.base, True)
         name = segment.path.name
-        if segment.base != self._next:
-            last = max(Offset(segment.base - 1), self._next)
-            self._add("gap", "events before this segment are missing", name, self._next, last)
+        if segment.base != self._next_offset:
+            last = max(Offset(segment.base - 1), self._next_offset)
+            self._add(
+                "gap", "events before this segment are missing", name, self._next_offset, last
+            )
         head = self._check_head(segment)
         if head is None:
-            self._pass_over(segment, reach)
+            self._skip_segment(segment, reach)
             return segment.path.stat().st_size
         if segment.sealed:
             scan = scan_sealed(segment.path, segment.base, reach)
@@ -96,22 +100,22 @@ class _Verifier:
         else:
             scan = scan_active(segment.path, segment.base, reach)
             if reach is not None:
-                scan.gap_up_to(reach)
+                scan.add_gap_until(reach)
             self._check_end(name, scan)
-            self._known_as = set()  # it gets its hash when it is sealed
+            self._expected_hashes = set()  # it has no hash before it is sealed
         for first, last in scan.gaps:
             self._add("gap", "recorded events cannot be read", name, first, last)
-        self._look_at_events(segment, scan)
-        self._next = scan.next_offset
+        self._verify_events(segment, scan)
+        self._next_offset = scan.next_offset
         return segment.path.stat().st_size
 
-    def _pass_over(self, segment: SegmentPath, reach: Offset | None) -> None:
-        """A segment that does not belong here holds none of the offsets that it stands for."""
+    def _skip_segment(self, segment: SegmentPath, reach: Offset | None) -> None:
+        """Report the offsets of a segment that does not belong here as missing."""
         if reach is not None:
             text = "the segment for these events is missing"
             self._add("gap", text, segment.path.name, segment.base, Offset(reach - 1))
-            self._next = reach
-        self._known_as = set()
+            self._next_offset = reach
+        self._expected_hashes = set()
 
     def _check_head(self, segment: SegmentPath) -> dict[str, str] | None:
         """None for a segment of another log or of another base; empty for a damaged head."""
@@ -142,21 +146,21 @@ class _Verifier:
             text = "another program has rewritten it; `mapfold log recover` puts it in order"
             self._add("crc", text, name)
         previous = head.get("previous_sha256", NO_PREVIOUS)
-        if head and self._known_as and previous not in self._known_as:
+        if head and self._expected_hashes and previous not in self._expected_hashes:
             self._add("chain", "was not written after the segment before it", name)
-        self._known_as = {check.sha256, head.get(REPLACES, check.sha256)}
+        self._expected_hashes = {check.sha256, head.get(REPLACES, check.sha256)}
 
     def _check_end(self, name: str, scan: Scan) -> None:
-        if scan.lost_bytes and not scan.gaps and not self._live:
+        if scan.lost_bytes and not scan.gaps and not self._has_writer:
             text = f"{counted(scan.lost_bytes, 'byte')} at its end: the writer died while writing"
             self._add("torn", text, name, count=scan.torn_events)
 
-    def _look_at_events(self, segment: SegmentPath, scan: Scan) -> None:
+    def _verify_events(self, segment: SegmentPath, scan: Scan) -> None:
         fd = os.open(segment.path, os.O_RDONLY)
         try:
             for chunk in scan.chunks:
-                for event in raw_events(fd, scan, chunk):
-                    self._events.take(event)
+                for event in scanned_events(fd, scan, chunk):
+                    self._events.check(event)
                     self._count += 1
         finally:
             os.close(fd)
@@ -176,8 +180,8 @@ class _Verifier:
         self._found.append(Finding(kind, message, segment, first, last, count))
 
 
-def _usual_log_id(segments: list[SegmentPath]) -> str | None:
-    """The log id that most segments carry; None where there is none such, and the first counts."""
+def _majority_log_id(segments: list[SegmentPath]) -> str | None:
+    """The log id that most segments carry; None without a majority, then the first one counts."""
     carried = []
     for segment in segments:
         try:
@@ -185,6 +189,6 @@ def _usual_log_id(segments: list[SegmentPath]) -> str | None:
         except (LogDamaged, NotALog):
             continue
     try:
-        return majority_of(carried)
+        return majority_log_id(carried)
     except LogDamaged:
         return None

@@ -1,18 +1,15 @@
-"""Looking at the events of a log one by one, for what no checksum can tell.
+"""Verification of events: findings that checksums cannot show.
 
-Which of the gaps that a log reports are still open: a late keyframe closes its gap, be it before
-or after somebody looked. A gap ledger is folded over the log, as `log info` and `status` do.
+Findings of a kind are counted and reported once for each run or key, with the first and last
+offset.
 
-Oddities in the stamps of runs.
+Gaps: a gap ledger is folded over the log, as by `log info` and `status`; late keyframes close gaps.
 
-A robot counts its keyframes in the order in which it took them, so its stamps should grow with
-their numbers, in whatever order they reached the log: one that was sent again late is no oddity.
-Odd is a keyframe stamped before the one it follows (the robot's clock was set back), and one
-stamped more than a day after it (a clock that was set while the robot drove: until then its stamps
-were from another year). That stamps are far from when they were logged is not odd: runs are
-imported long after, and robots have clocks of their own.
-
-What `mapfold log verify` may find.
+Stamps: a robot numbers its keyframes in the order it took them, so its stamps should grow with
+their numbers, in whatever order they reached the log. A finding is a keyframe stamped before its
+predecessor by number (the robot's clock was set back), or more than a day after it (the clock was
+set while the robot drove). Stamps far from the log time are none: runs are imported long after, and
+robots have clocks of their own.
 """
 
 from array import array
@@ -36,7 +33,7 @@ from .event import Event
 
 class OpenGaps(NamedTuple):
     """How many keyframes of a run were reported missing and never came, and the offsets of the
-    first and the last event that reports any of them."""
+    first and last event that reports any of them."""
 
     run_id: RunId
     missing: int
@@ -45,23 +42,23 @@ class OpenGaps(NamedTuple):
 
 
 class ReportedGaps:
-    """Takes keyframes and reported gaps in offset order."""
+    """The reported gaps that are still open. Keyframes and reports are added in offset order."""
 
     def __init__(self) -> None:
         self._ledger: GapLedger[RunId] = GapLedger()
         self._reports: defaultdict[RunId, list[tuple[Offset, Gap[RunId]]]] = defaultdict(list)
 
-    def take_keyframe(self, run_id: RunId, keyframe_id: KeyframeId) -> None:
-        """One that is recorded."""
+    def add_keyframe(self, run_id: RunId, keyframe_id: KeyframeId) -> None:
+        """Add a recorded keyframe."""
         self._ledger.record(run_id, keyframe_id, 0)
 
-    def take_report(self, offset: Offset, gap: Gap[RunId]) -> None:
-        """The loss event at ``offset`` reports ``gap``."""
+    def add_report(self, offset: Offset, gap: Gap[RunId]) -> None:
+        """Add the gap that the loss event at ``offset`` reports."""
         self._reports[gap.run_id].append((offset, gap))
-        self._ledger.assume(gap, 0)
+        self._ledger.add_reported(gap, 0)
 
     def still_open(self) -> Iterator[OpenGaps]:
-        """By run, what is still missing."""
+        """What is still missing, by run."""
         missing: defaultdict[RunId, list[Gap[RunId]]] = defaultdict(list)
         for gap in self._ledger.reported_gaps():
             missing[gap.run_id].append(gap)
@@ -79,8 +76,8 @@ class ReportedGaps:
 JUMP_NS = 24 * 3600 * 1_000_000_000
 
 
-class StampOddity(NamedTuple):
-    """``offset`` of a keyframe and what is odd about its stamp."""
+class StampFinding(NamedTuple):
+    """A finding about the stamp of the keyframe at ``offset``."""
 
     offset: Offset
     message: str
@@ -94,30 +91,31 @@ class _Run:
 
 
 class RunStamps:
-    """Takes each keyframe once, in offset order; three numbers of memory for each."""
+    """Checks the stamps of runs. Each keyframe is added once, in offset order; it takes three
+    numbers of memory."""
 
     def __init__(self) -> None:
         self._runs: dict[RunId, _Run] = {}
 
-    def take(self, run_id: RunId, keyframe_id: KeyframeId, stamp_ns: int, offset: Offset) -> None:
-        """The next keyframe in the log."""
+    def add(self, run_id: RunId, keyframe_id: KeyframeId, stamp_ns: int, offset: Offset) -> None:
+        """Add the next keyframe of the log."""
         run = self._runs.setdefault(run_id, _Run())
         run.keyframes.append(keyframe_id)
         run.stamps.append(stamp_ns)
         run.offsets.append(offset)
 
-    def oddities(self) -> Iterator[StampOddity]:
-        """What is odd, run by run in the order of keyframes."""
+    def findings(self) -> Iterator[StampFinding]:
+        """The findings, run by run in the order of keyframe ids."""
         for run_id, run in self._runs.items():
             order = sorted(range(len(run.keyframes)), key=run.keyframes.__getitem__)
             for before, this in pairwise(order):
                 step_ns = run.stamps[this] - run.stamps[before]
                 if step_ns < 0:
-                    yield StampOddity(
+                    yield StampFinding(
                         Offset(run.offsets[this]), f"stamps of run {run_id} run backwards"
                     )
                 elif step_ns > JUMP_NS:
-                    yield StampOddity(
+                    yield StampFinding(
                         Offset(run.offsets[this]), f"stamps of run {run_id} jump by more than a day"
                     )
 
@@ -127,10 +125,8 @@ Kind = Literal["crc", "gap", "chain", "log_id", "torn", "schema", "duplicate", "
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that is not as it should be.
-
-    ``first_offset`` and ``last_offset`` are the first and last event it concerns, None where it
-    concerns none; ``count`` is how many.
+    """One thing that is wrong. ``first_offset`` and ``last_offset`` are the first and last event it
+    concerns, None if it concerns none; ``count`` is how many.
 
     crc        bytes differ from what was written
     gap        events that were recorded are not there
@@ -158,7 +154,7 @@ _BACKWARDS = "logged_ns runs backwards: the clock was set back, or older recordi
 
 @dataclass(slots=True)
 class _Group:
-    """Like findings, told as one."""
+    """Findings that are reported as one."""
 
     kind: Kind
     message: str
@@ -168,7 +164,8 @@ class _Group:
 
 
 class EventFindings:
-    """Takes events in offset order; memory is a few numbers for each keyframe."""
+    """Findings about events, which are checked in offset order. Takes a few numbers of memory for
+    each keyframe."""
 
     def __init__(self) -> None:
         self._groups: dict[tuple[Kind, str], _Group] = {}
@@ -177,23 +174,23 @@ class EventFindings:
         self._gaps = ReportedGaps()
         self._logged_ns = 0
 
-    def take(self, event: Event) -> None:
-        """Look at the next event."""
+    def check(self, event: Event) -> None:
+        """Check the next event."""
         if event.logged_ns < self._logged_ns:
             self._add("time", "", event.offset, _BACKWARDS)
         self._logged_ns = event.logged_ns
         if event.key == LOSS_KEY:
-            self._take_loss(event)
+            self._check_loss(event)
         elif event.key == REJECTED_KEY:
             self._parse(RejectedPayload, event)
         elif not is_system_key(event.key):
-            self._take_envelope(event)
+            self._check_envelope(event)
 
-    def _take_loss(self, event: Event) -> None:
+    def _check_loss(self, event: Event) -> None:
         loss = self._parse(Loss, event)
         gap = None if loss is None else gap_of(loss)
         if gap is not None:
-            self._gaps.take_report(event.offset, gap)
+            self._gaps.add_report(event.offset, gap)
         elif loss is not None:
             what = f"{loss.cause} of {loss.publisher}"
             self._add("loss", what, event.offset, f"lost by {what}", loss.count)
@@ -206,7 +203,7 @@ class EventFindings:
             self._add("schema", what, event.offset, what)
             return None
 
-    def _take_envelope(self, event: Event) -> None:
+    def _check_envelope(self, event: Event) -> None:
         outcome = read_envelope(event)
         if not isinstance(outcome, Accepted):
             self._add(
@@ -222,9 +219,9 @@ class EventFindings:
             self._add("duplicate", run_id, event.offset, f"keyframes of run {run_id} stand again")
             return
         seen.add(keyframe_id)
-        self._stamps.take(run_id, keyframe_id, event.stamp_ns, event.offset)
+        self._stamps.add(run_id, keyframe_id, event.stamp_ns, event.offset)
         if event.version == ENVELOPE_VERSION:  # older ones count no keyframes
-            self._gaps.take_keyframe(run_id, keyframe_id)
+            self._gaps.add_keyframe(run_id, keyframe_id)
 
     def _add(self, kind: Kind, about: str, offset: Offset, message: str, count: int = 1) -> None:
         group = self._groups.setdefault((kind, about), _Group(kind, message, offset, offset))
@@ -233,9 +230,9 @@ class EventFindings:
         group.count += count
 
     def findings(self) -> Iterator[Finding]:
-        """What was found, by first offset. To be asked once, when all events were taken."""
-        for offset, oddity in self._stamps.oddities():
-            self._add("time", oddity, offset, oddity)
+        """The findings by first offset. Call once, after all events."""
+        for offset, message in self._stamps.findings():
+            self._add("time", message, offset, message)
         for run_id, missing, first, last in self._gaps.still_open():
             what = f"keyframe_gap of {run_id}"
             self._add("loss", what, first, f"lost by {what}", missing)

@@ -29,7 +29,7 @@ from pydantic import ValidationError
 from eventsrc.append import PreparedEvent, prepare_events
 from eventsrc.envelope import ENVELOPE_VERSION, KeyframeId, Offset, RunId
 from eventsrc.errors import LogError
-from eventsrc.gap_history import forget_ledger, save_ledger
+from eventsrc.gap_history import delete_ledger, save_ledger
 from eventsrc.gaps import Gap, GapLedger, Source
 from eventsrc.ingest import Rejected
 from eventsrc.log import LogWriter
@@ -332,7 +332,7 @@ class WriterThread:
         self._unsynced = deque(kept)
         if self._saves_ledger:
             self._saves_ledger = False
-            forget_ledger(self._writer.path)
+            delete_ledger(self._writer.path)
 
     def _sync(self) -> Offset:
         """Sync everything, so that the ledger covers the whole log; returns the log's end."""

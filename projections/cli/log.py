@@ -33,7 +33,7 @@ from eventsrc.log import (
     verify_log,
 )
 from eventsrc.log.reader import OnGap
-from eventsrc.log.recover import UNASKED_LOSSES
+from eventsrc.log.recover import DEFAULT_MAX_LOSSES
 from eventsrc.log.seek import resolve, resolve_start, time_of
 from eventsrc.log_info import LogInfo, SegmentInfo, log_info
 from eventsrc.system_events import is_system_key
@@ -307,7 +307,7 @@ def recover(
     own back. Lost offsets become mapfold/loss events; without --yes at most 100,000 more than the
     damaged bytes can have held. Exit 0: nothing was lost or out of place, 3: something was.
     """
-    report = recover_log(log, most_losses=sys.maxsize if yes else UNASKED_LOSSES)
+    report = recover_log(log, max_losses=sys.maxsize if yes else DEFAULT_MAX_LOSSES)
     if json_:
         emit({**asdict(report), "path": str(log)})
     for moved in report.moved:

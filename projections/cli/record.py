@@ -10,7 +10,7 @@ import typer
 
 from eventsrc.envelope import RunId
 from eventsrc.errors import LogDamaged
-from eventsrc.gap_history import keep_ledger
+from eventsrc.gap_history import fold_and_save_ledger
 from eventsrc.gaps import GapLedger
 from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES, MAX_PAYLOAD_BYTES
 from eventsrc.log import LogReader, LogWriter, parse_fsync
@@ -112,7 +112,7 @@ def _gap_history(log: Path) -> GapLedger[RunId] | None:
     """The log's gap history, or None if the log is damaged: recording goes on without it."""
     try:
         with LogReader(log) as reader:
-            return keep_ledger(reader, note=say)
+            return fold_and_save_ledger(reader, note=say)
     except LogDamaged as error:
         say(f"recording without gap history: {error}")
         return None

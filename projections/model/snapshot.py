@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from eventsrc.log import still_holds
+from eventsrc.log import same_but_sealed
 from projections.deltas import (
     KeyframeOrdinal,
     ObjectOrdinal,
@@ -263,7 +263,7 @@ def snapshot(
 ) -> bytes:
     """The bytes of a map and its view without embeddings, as of ``semantic_map.next_offset``.
 
-    ``segments`` is the `eventsrc.log.lineage` of the events they were folded from.
+    ``segments`` is the `eventsrc.log.segment_signatures` of the events they were folded from.
     """
     about = {
         "fold_version": FOLD_VERSION,
@@ -284,12 +284,12 @@ def restore(
     settings: Settings,
     log_id: str,
     neighbourhood: Neighbourhood | None = None,
-    lineage_at: Callable[[int], Sequence[str]] = lambda _: (),
+    signatures_at: Callable[[int], Sequence[str]] = lambda _: (),
 ) -> tuple[SemanticMap, MapView]:
     """The map and the view of a `snapshot`.
 
-    ``lineage_at`` gives the log's `eventsrc.log.lineage` up to an offset, as it is now. Raises
-    SnapshotRefused, and what ``lineage_at`` raises.
+    ``signatures_at`` gives the log's `eventsrc.log.segment_signatures` up to an offset, as it is
+    now. Raises SnapshotRefused, and what ``signatures_at`` raises.
     """
     semantic_map = SemanticMap(settings, neighbourhood)
     view = MapView(settings, keep_embeddings=False)
@@ -297,7 +297,7 @@ def restore(
         state = unpack(data)
         about = part("about", state)
         _check_identity(about, settings, log_id)
-        _check_lineage(about["segments"], lineage_at(about["offset"]))
+        _check_signatures(about["segments"], signatures_at(about["offset"]))
         semantic_map.load(part("map", state))
         load_view(view, part("view", state))
     except (MalformedSnapshot, zlib.error) as error:
@@ -318,6 +318,6 @@ def _check_identity(about: dict[str, Any], settings: Settings, log_id: str) -> N
         raise SnapshotRefused("it was made with other settings")
 
 
-def _check_lineage(before: Sequence[str], now: Sequence[str]) -> None:
-    if not still_holds(before, now):
+def _check_signatures(before: Sequence[str], now: Sequence[str]) -> None:
+    if not same_but_sealed(before, now):
         raise SnapshotRefused("the log has lost events since it was made")

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 
 from eventsrc.envelope import Offset
-from eventsrc.log import lineage
+from eventsrc.log import segment_signatures
 from projections.exact import Neighbourhood
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
@@ -38,7 +38,7 @@ class SnapshotCache:
         neighbourhood: Neighbourhood | None = None,
     ) -> None:
         self.folder = log.with_name(f"{log.name}.snapshots")
-        self._lineage = partial(lineage, log)
+        self._signatures = partial(segment_signatures, log)
         self._log_id = log_id
         self._settings = settings
         self._note = note
@@ -61,7 +61,7 @@ class SnapshotCache:
             try:
                 data = path.read_bytes()
                 found = restore(
-                    data, self._settings, self._log_id, self._neighbourhood, self._lineage
+                    data, self._settings, self._log_id, self._neighbourhood, self._signatures
                 )
             except (OSError, SnapshotRefused) as error:
                 self._note(f"{path}: this snapshot is not used: {error}; it is safe to delete")
@@ -80,7 +80,7 @@ class SnapshotCache:
         try:
             self.folder.mkdir(exist_ok=True)
             if not path.exists() or path in self._unusable:
-                segments = self._lineage(semantic_map.next_offset)
+                segments = self._signatures(semantic_map.next_offset)
                 beside.write_bytes(snapshot(semantic_map, view, self._log_id, segments))
                 beside.replace(path)
                 self._thin_out()

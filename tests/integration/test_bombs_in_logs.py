@@ -22,7 +22,7 @@ from eventsrc.log.format import (
     list_segments,
     segment_path,
 )
-from eventsrc.log.log_identity import log_id_of
+from eventsrc.log.log_identity import common_log_id
 from eventsrc.log.mcap_records import ChunkIndex, Statistics
 from eventsrc.log.recover import TooManyLosses
 from tests.fixtures_log import BY_HAND, KEY, envelope, flip, read_log, write_log
@@ -201,7 +201,7 @@ def test_the_holes_of_a_damaged_segment_cannot_have_held_events(log: Path) -> No
     os.truncate(sealed(log), HUGE)
     base = 1_000_000
     active(log).unlink()
-    head = file_head(head_metadata(log_id_of(list_segments(log)) or "", base))
+    head = file_head(head_metadata(common_log_id(list_segments(log)) or "", base))
     segment_path(log, base, ACTIVE).write_bytes(head)
     with pytest.raises(TooManyLosses, match="999,997 events from offset 3"):
         recover_log(log)

@@ -16,8 +16,9 @@ import pytest
 import zenoh
 
 from eventsrc.append import append_payload
-from eventsrc.gap_history import NAME, unread_events
+from eventsrc.gap_history import unread_events
 from eventsrc.log import LogReader, LogWriter
+from eventsrc.log.format import LEDGER
 from eventsrc.robot.acks import Ack, ack_key, payload_sha256
 from eventsrc.robot.publisher import EnvelopePublisher
 from eventsrc.transport.session import Received, Router, Session, ZenohOptions
@@ -346,7 +347,7 @@ def test_a_segment_that_is_cut_short_is_reported_and_recording_goes_on(
     assert "mapfold log recover" in recorder.lines[-1]
     with LogReader(log) as reader:
         assert [e.payload for e in reader.read(5)] == [payload(envelope(k)) for k in range(5, 9)]
-    assert not (log / NAME).exists(), "it would know keyframes that the log has lost"
+    assert not (log / LEDGER).exists(), "it would know keyframes that the log has lost"
 
 
 def _leave_torn(log: Path) -> None:
@@ -414,7 +415,7 @@ def test_recording_goes_on_without_gap_history_when_an_old_segment_is_damaged(
     assert publish(KEY, payload(envelope(3)).decode()).wait() == 0
     assert recorder.end(signal.SIGINT) == 0
     assert "1 recorded" in recorder.lines[-1]
-    assert not (log / NAME).exists()
+    assert not (log / LEDGER).exists()
 
 
 def test_a_full_stderr_does_not_end_a_recording(

@@ -11,9 +11,8 @@ from eventsrc import gap_history as ledger_module
 from eventsrc.append import append_payload
 from eventsrc.errors import LogDamaged
 from eventsrc.gap_history import (
-    NAME,
+    fold_and_save_ledger,
     fold_ledger,
-    keep_ledger,
     ledger_of,
     save_ledger,
     unread_events,
@@ -21,6 +20,7 @@ from eventsrc.gap_history import (
 from eventsrc.gaps import Gap, GapLedger
 from eventsrc.log import NEVER, Event, LogReader, LogWriter, recover, recover_log
 from eventsrc.log import seal as _parts
+from eventsrc.log.format import LEDGER
 from eventsrc.log_info import log_info
 from eventsrc.system_events import LOSS_KEY, Loss
 from tests.envelopes import detection, envelope, payload
@@ -118,7 +118,7 @@ def test_a_saved_ledger_that_cannot_be_believed_is_not(log: Path, spoil: str) ->
     else:
         _save(log)
     if spoil == "torn":
-        (log / NAME).write_text((log / NAME).read_text()[:-9])
+        (log / LEDGER).write_text((log / LEDGER).read_text()[:-9])
     assert not _holds(_ledger(log), "from-the-cache", 1)
     assert _ledger(log).missing == 5
 
@@ -202,11 +202,11 @@ def test_recovery_deletes_the_saved_ledger_before_it_replaces_anything(
     def crash(*_: object) -> None:
         raise RuntimeError("as if killed")
 
-    monkeypatch.setattr(recover, "rebuild", crash)
+    monkeypatch.setattr(recover, "rebuild_segment", crash)
     with pytest.raises(RuntimeError):
         recover_log(long_log)
     assert _segment(long_log, 4).read_bytes() == before
-    assert not (long_log / NAME).exists()
+    assert not (long_log / LEDGER).exists()
 
 
 @pytest.mark.parametrize("base", [0, 4, 8])
@@ -215,10 +215,10 @@ def test_another_segment_in_the_place_of_one_is_noticed_without_recovery(
 ) -> None:
     """As when a folder is put together again from copies."""
     _saved(long_log)
-    saved = (long_log / NAME).read_bytes()
+    saved = (long_log / LEDGER).read_bytes()
     _rot_the_event(long_log, base + 1)
     recover_log(long_log)
-    (long_log / NAME).write_bytes(saved)
+    (long_log / LEDGER).write_bytes(saved)
     assert not _holds(_ledger(long_log), "run-a", base + 1)
 
 
@@ -233,7 +233,7 @@ def test_a_power_cut_that_took_unsynced_events_takes_their_ledger(tmp_path: Path
         append_payload(writer, KEY, payload(envelope(3)))
         writer.sync()
         _saved(log)
-        shutil.copy(log / NAME, copy)
+        shutil.copy(log / LEDGER, copy)
     with LogWriter(copy) as writer:
         append_payload(writer, KEY, payload(envelope(7)))
         writer.sync()
@@ -288,7 +288,7 @@ class Counted:
         self.read = 0
         with LogReader(log) as reader:
             try:
-                ledger = keep_ledger(reader)
+                ledger = fold_and_save_ledger(reader)
             except KeyboardInterrupt:
                 return self.read, None
         return self.read, ledger
@@ -312,6 +312,6 @@ def test_a_start_that_is_killed_while_it_reads_the_log_is_gone_on_from(
 
 
 def test_that_the_cache_cannot_be_written_is_no_error(tmp_path: Path) -> None:
-    (tmp_path / f"{NAME}.new").mkdir()
+    (tmp_path / f"{LEDGER}.new").mkdir()
     save_ledger(tmp_path, "id", 0, GapLedger())
-    assert not (tmp_path / NAME).exists()
+    assert not (tmp_path / LEDGER).exists()

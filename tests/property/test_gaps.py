@@ -90,7 +90,7 @@ def test_what_a_publisher_said_is_missing_until_it_comes(
     for k in sorted(recorded):
         again.record("run-a", k, 0)
     for gap in ledger.gaps():  # as loss events of the log tell them
-        again.assume(gap, 0)
+        again.add_reported(gap, 0)
     assert {k for g in again.reported_gaps() for k in range(g.first, g.last + 1)} == wanted
     assert again.missing == len(wanted)
 

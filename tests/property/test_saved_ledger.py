@@ -15,9 +15,10 @@ from hypothesis import strategies as st
 
 from eventsrc import gap_history as _ledger_cache
 from eventsrc.append import append_payload
-from eventsrc.gap_history import MAX_BYTES, NAME, encode, keep_ledger, ledger_of
-from eventsrc.gaps import GapLedger, RunState, sound
+from eventsrc.gap_history import MAX_BYTES, encode, fold_and_save_ledger, ledger_of
+from eventsrc.gaps import GapLedger, RunState, is_consistent
 from eventsrc.log import LogReader, LogWriter
+from eventsrc.log.format import LEDGER
 from tests.envelopes import envelope, payload
 
 KEYFRAMES = (1, 2, 5, 6, 9)
@@ -33,19 +34,19 @@ def log() -> Iterator[Path]:
             for keyframe_id in KEYFRAMES:
                 append_payload(writer, "tb/detections", payload(envelope(keyframe_id)))
         with LogReader(path) as reader:
-            keep_ledger(reader)
+            fold_and_save_ledger(reader)
         yield path
 
 
 def state_beside(log: Path, saved: bytes) -> tuple[RunState, ...]:
     """The ledger that is made of the log with ``saved`` beside it; afterwards as before."""
-    before = (log / NAME).read_bytes()
-    (log / NAME).write_bytes(saved)
+    before = (log / LEDGER).read_bytes()
+    (log / LEDGER).write_bytes(saved)
     try:
         with LogReader(log) as reader:
             return ledger_of(reader, now_ns=0).state()
     finally:
-        (log / NAME).write_bytes(before)
+        (log / LEDGER).write_bytes(before)
 
 
 def right(log: Path) -> tuple[RunState, ...]:
@@ -56,7 +57,7 @@ def right(log: Path) -> tuple[RunState, ...]:
 def test_any_change_of_its_bytes_leaves_the_ledger_what_it_is(
     log: Path, data: st.DataObject
 ) -> None:
-    saved = bytearray((log / NAME).read_bytes())
+    saved = bytearray((log / LEDGER).read_bytes())
     for _ in range(data.draw(st.integers(1, 3))):
         at = data.draw(st.integers(0, len(saved)))
         length = data.draw(st.integers(0, 4))
@@ -77,10 +78,10 @@ def test_content_that_is_forged_with_a_right_checksum_ends_nothing(
     log: Path, runs: Any, next_offset: Any, fields: dict[str, Any]
 ) -> None:
     """Whoever may write there can make a ledger that could be; but never one that could not."""
-    good = json.loads((log / NAME).read_bytes())["ledger"]
+    good = json.loads((log / LEDGER).read_bytes())["ledger"]
     forged = {**good, "runs": runs, "next_offset": next_offset, **fields}
     found = state_beside(log, encode(json.dumps(forged).encode()))
-    assert sound(found, len(KEYFRAMES))
+    assert is_consistent(found, len(KEYFRAMES))
     ledger = GapLedger()
     ledger.restore(found, 0)
     assert [gap.count > 0 for gap in ledger.flush()] == [True] * len(list(ledger.gaps()))
@@ -103,18 +104,18 @@ def test_content_that_is_forged_with_a_right_checksum_ends_nothing(
     ],
 )
 def test_holes_that_cannot_be_are_counted_again(log: Path, holes: list[Any]) -> None:
-    good = json.loads((log / NAME).read_bytes())["ledger"]
+    good = json.loads((log / LEDGER).read_bytes())["ledger"]
     ((run_id, first, last, _),) = good["runs"]
     forged = {**good, "runs": [[run_id, first, last, holes]]}
     told: list[str] = []
-    (log / NAME).replace(log / "kept")
-    (log / NAME).write_bytes(encode(json.dumps(forged).encode()))
+    (log / LEDGER).replace(log / "kept")
+    (log / LEDGER).write_bytes(encode(json.dumps(forged).encode()))
     with LogReader(log) as reader:
         found = ledger_of(reader, now_ns=0, note=told.append).state()
-    (log / "kept").replace(log / NAME)
+    (log / "kept").replace(log / LEDGER)
     assert found == right(log)
     assert len(told) == 1
-    assert f"{log / NAME} is not used: it holds" in told[0]
+    assert f"{log / LEDGER} is not used: it holds" in told[0]
     assert told[0].endswith("counted again from the log")
 
 
@@ -175,29 +176,29 @@ def test_whatever_stands_there_is_told_and_counted_again(
 ) -> None:
     copy = tmp_path / "log"
     shutil.copytree(log, copy)
-    (copy / NAME).rename(copy / "saved")
-    make(copy / NAME)
+    (copy / LEDGER).rename(copy / "saved")
+    make(copy / LEDGER)
     told: list[str] = []
     with LogReader(copy) as reader:
-        ledger = keep_ledger(reader, note=told.append)
+        ledger = fold_and_save_ledger(reader, note=told.append)
         assert ledger.state() == right(log)
         assert ledger.missing == 4
         assert len(told) == 1
-        again = keep_ledger(reader, note=told.append)
+        again = fold_and_save_ledger(reader, note=told.append)
         assert again.state() == right(log)
-    assert (copy / "saved").read_bytes() == (log / NAME).read_bytes()
+    assert (copy / "saved").read_bytes() == (log / LEDGER).read_bytes()
 
 
 def test_saving_writes_through_no_link(log: Path, tmp_path: Path) -> None:
     copy, other = tmp_path / "log", tmp_path / "other"
     shutil.copytree(log, copy)
     other.write_bytes(b"precious")
-    (copy / NAME).unlink()
-    (copy / f"{NAME}.new").symlink_to(other)
+    (copy / LEDGER).unlink()
+    (copy / f"{LEDGER}.new").symlink_to(other)
     with LogReader(copy) as reader:
-        keep_ledger(reader)
+        fold_and_save_ledger(reader)
     assert other.read_bytes() == b"precious"
-    assert (copy / NAME).read_bytes() == (log / NAME).read_bytes()
+    assert (copy / LEDGER).read_bytes() == (log / LEDGER).read_bytes()
 
 
 @given(
@@ -207,7 +208,7 @@ def test_every_ledger_that_comes_of_events_is_sound(seen: list[tuple[str, int]])
     ledger = GapLedger()
     for run_id, keyframe_id in seen:
         ledger.record(run_id, keyframe_id, 0)
-    assert sound(ledger.state(), len(seen))
+    assert is_consistent(ledger.state(), len(seen))
 
 
 def test_a_ledger_that_would_be_too_large_to_read_is_not_left_behind(
@@ -217,5 +218,5 @@ def test_a_ledger_that_would_be_too_large_to_read_is_not_left_behind(
     shutil.copytree(log, copy)
     monkeypatch.setattr(_ledger_cache, "MAX_BYTES", 10)
     with contextlib.closing(LogReader(copy)) as reader:
-        assert keep_ledger(reader).state() == right(log)
-    assert not (copy / NAME).exists()
+        assert fold_and_save_ledger(reader).state() == right(log)
+    assert not (copy / LEDGER).exists()

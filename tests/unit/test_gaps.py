@@ -152,8 +152,8 @@ def test_a_jump_of_the_whole_range_costs_nothing() -> None:
 
 def test_a_loss_events_word_can_be_taken_for_a_gap() -> None:
     ledger = GapLedger(SETTLE_NS)
-    ledger.assume(Gap("run-a", 2, 4), now_ns=0)
-    ledger.assume(Gap("run-a", 8, 2**62), now_ns=0)
+    ledger.add_reported(Gap("run-a", 2, 4), now_ns=0)
+    ledger.add_reported(Gap("run-a", 8, 2**62), now_ns=0)
     assert ledger.missing_reported() == 3 + 2**62 - 7
     ledger.record("run-a", 3, 0)
     ledger.record("run-a", 9, 0)
@@ -164,5 +164,5 @@ def test_a_loss_events_word_can_be_taken_for_a_gap() -> None:
 def test_loss_events_that_follow_one_another_tell_of_the_end_of_a_run() -> None:
     ledger = _ledger(1)
     for gap in (Gap("run-a", 2, 3), Gap("run-a", 4, 6)):
-        ledger.assume(gap, now_ns=0)
+        ledger.add_reported(gap, now_ns=0)
     assert (ledger.missing, ledger.missing_reported(), ledger.flush()) == (5, 5, [])

@@ -1,0 +1,207 @@
+"""Give every segment file the name that its head asks for: the first step of a recovery.
+
+Log id and base in the head of a segment say which log and which offsets it holds. Its name may be
+wrong, because people copy, restore and rename files. The rules:
+
+* A segment of another log than most files here is set aside as ``….foreign``.
+* A segment under a wrong name is renamed.
+* Of several files with the same base the one with the most good events stays; the others are set
+  aside as ``….duplicate``.
+* A file with a damaged head keeps its name, unless another file claims it: then it is set aside as
+  ``….damaged``.
+* With an MCAP file that another program wrote, without our metadata, nothing is done at all.
+
+Nothing is deleted. A file is renamed in two steps, by way of ``….misnamed``; a recovery that was
+interrupted between them goes on from there.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from eventsrc.envelope import Offset
+from eventsrc.errors import LogDamaged, NotALog
+
+from . import mcap_records as _mcap
+from .durable_files import sync_directory
+from .format import (
+    ACTIVE,
+    DAMAGED,
+    DUPLICATE,
+    FOREIGN,
+    MISNAMED,
+    PREVIOUS,
+    SEALED,
+    SegmentPath,
+    claims_of,
+    free_name,
+    half_renamed,
+    segment_files,
+    segment_path,
+)
+from .log_identity import majority_log_id
+from .scan import scan_active
+from .scan_sealed import scan_sealed
+from .sealed_segment import check_sealed
+from .segment import Scan
+
+
+@dataclass(frozen=True, slots=True)
+class Moved:
+    """A renamed file: old name, new name, and why."""
+
+    name: str
+    now: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class _SegmentFile:
+    """``target`` is the segment that the file is by its head, or by its name if the head cannot be
+    read (``log_id`` is None then)."""
+
+    path: Path
+    target: SegmentPath
+    log_id: str | None
+
+
+def quarantine(path: Path, suffix: str, reason: str) -> Moved:
+    """Take a file out of the log: rename it to a free name with ``suffix``."""
+    aside = free_name(path, suffix)
+    path.rename(aside)
+    sync_directory(path.parent)
+    return Moved(path.name, aside.name, reason)
+
+
+class RenamedSegments(NamedTuple):
+    """What `rename_segments` did; ``log_id`` is None if no head could be read."""
+
+    log_id: str | None
+    moved: list[Moved]
+
+
+def rename_segments(log: Path) -> RenamedSegments:
+    """Set aside and rename segment files, holding the writer lock. Raises LogDamaged, with nothing
+    done, for segments of two logs in equal number, and for MCAP files of other programs."""
+    files = [_inspect(segment.path, segment) for segment in segment_files(log)]
+    files += [_inspect(path, _target_of(path)) for path in half_renamed(log)]
+    log_id = majority_log_id((f.path, f.log_id) for f in files if f.log_id is not None)
+    moved: list[Moved] = []
+    by_base: defaultdict[Offset, list[_SegmentFile]] = defaultdict(list)
+    for file in files:
+        if file.log_id in (None, log_id):
+            by_base[file.target.base].append(file)
+    for file in files:
+        if file.log_id not in (None, log_id):
+            reason = f"it belongs to log {file.log_id}, not {log_id}"
+            moved.append(quarantine(file.path, FOREIGN, reason))
+    bases = sorted(by_base)
+    for base, following in zip(bases, [*bases[1:], None], strict=True):
+        moved += _keep_best(by_base[base], following)
+    moved += _rename(log, [same_base[0] for same_base in by_base.values()])
+    return RenamedSegments(log_id, moved)
+
+
+def _keep_best(files: list[_SegmentFile], following: Offset | None) -> Iterator[Moved]:
+    """Sort ``files``, which have the same base, best first; set the others aside."""
+    if len(files) == 1 or _still_being_sealed(files):
+        files.sort(key=lambda file: not file.target.sealed)
+        return
+    files.sort(key=lambda file: _rank(file, following), reverse=True)
+    for file in files[1:]:
+        if file.log_id is None:
+            reason = "its head is damaged, and another file is this segment"
+            yield quarantine(file.path, DAMAGED, reason)
+        else:
+            reason = f"{files[0].target.path.name} holds the same offsets"
+            yield quarantine(file.path, DUPLICATE, reason)
+
+
+def _rename(log: Path, files: list[_SegmentFile]) -> list[Moved]:
+    moved: list[Moved] = []
+    for file in [f for f in files if f.path != f.target.path]:
+        if not file.path.name.startswith(file.target.path.name + MISNAMED):
+            file.path.rename(free_name(file.target.path, MISNAMED))
+        reason = f"its head says that it begins at offset {file.target.base}"
+        moved.append(Moved(file.path.name, file.target.path.name, reason))
+    sync_directory(log)
+    for path in half_renamed(log):
+        path.rename(_target_of(path).path)
+    sync_directory(log)
+    return moved
+
+
+def _target_of(path: Path) -> SegmentPath:
+    """The segment that a half-renamed file is to become."""
+    name = path.name.partition(MISNAMED)[0]
+    return SegmentPath(path.with_name(name), Offset(int(name[:20])), name.endswith(SEALED))
+
+
+def _inspect(path: Path, named: SegmentPath) -> _SegmentFile:
+    try:
+        claims = claims_of(path)
+    except LogDamaged:
+        return _SegmentFile(path, named, None)
+    except NotALog:
+        damaged = _SegmentFile(path, named, None)
+        if _is_mcap(path) and not _is_own_active(damaged):
+            raise LogDamaged(_other_program_message(path)) from None
+        return damaged
+    base, sealed = Offset(int(claims["base"])), PREVIOUS in claims
+    where = segment_path(path.parent, base, SEALED if sealed else ACTIVE)
+    return _SegmentFile(path, SegmentPath(where, base, sealed), claims["log_id"])
+
+
+def _is_own_active(file: _SegmentFile) -> bool:
+    """Whether a file with a damaged head is an active segment of ours: it has such chunks, and no
+    other program names a file ``.mcap.active``."""
+    return not file.target.sealed and bool(_scan(file).chunks)
+
+
+def _is_mcap(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(_mcap.MAGIC)) == _mcap.MAGIC
+
+
+def _other_program_message(path: Path) -> str:
+    log = path.parent
+    return (
+        f"{path} was written by another program and does not say which offsets it holds; nothing "
+        f"was changed. Put the original back, or move the file out of {log}, run `mapfold log "
+        f"recover {log}` if other segments are there, and append what it holds by `mapfold import "
+        f"{log} FILE`"
+    )
+
+
+def _still_being_sealed(files: list[_SegmentFile]) -> bool:
+    """Whether these are a good sealed segment and the active one it was made from, left by a
+    crash."""
+    if {file.path.name for file in files} != {
+        segment_path(file.path.parent, files[0].target.base, suffix).name
+        for file in files
+        for suffix in (SEALED, ACTIVE)
+    }:
+        return False
+    sealed, active = sorted(files, key=lambda file: not file.target.sealed)
+    if not sealed.target.sealed or active.target.sealed or check_sealed(sealed.path).fault:
+        return False
+    scan = _scan(active)
+    return scan.next_offset <= _scan(sealed).next_offset
+
+
+def _rank(file: _SegmentFile, following: Offset | None) -> tuple[int, bool, bool]:
+    """Sort key: good events before the next segment; then the right name; then sealed."""
+    events = sum(
+        chunk.following - chunk.first
+        for chunk in _scan(file).chunks
+        if following is None or chunk.first < following
+    )
+    return events, file.path == file.target.path, file.target.sealed
+
+
+def _scan(file: _SegmentFile) -> Scan:
+    if file.target.sealed:
+        return scan_sealed(file.path, file.target.base, None)
+    return scan_active(file.path, file.target.base)
