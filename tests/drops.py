@@ -1,11 +1,11 @@
-"""Waiting for what a rebuild leaves the server to do: dropping what was replaced."""
+"""Wait until the server has dropped what rebuilds replaced."""
 
 from projections.database.connection import Targets, connect
 from projections.database.swap import wait_for_drop
 
 
 def wait_for_drops(targets: Targets) -> None:
-    """Until the sessions that drop have ended, in whichever database they are."""
+    """Wait until the sessions that drop have ended, in all databases of the target."""
     for url in {targets.graph_url, targets.vector_url}:
         with connect(url) as connection:
             wait_for_drop(connection, "graph")

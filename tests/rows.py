@@ -1,4 +1,4 @@
-"""What a projection's tables must hold, two ways: read from the server, and said from the view.
+"""Rows of a projection's tables, read from the server and computed from the view.
 
 `expected_graph` is written for being obviously right, not fast, and shares nothing with the sinks
 but the label numbering that docs/projections.md promises.

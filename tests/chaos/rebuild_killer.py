@@ -1,4 +1,4 @@
-"""Run as a program: kill a rebuild at its n-th step, for every STRIDE-th n there is.
+"""Run as a program: kill a rebuild at its n-th step, for every STRIDE-th n.
 
 Steps are those of `crash_driver`. After each kill a database must hold exactly the old map, or
 the new one if the swap was through, and the next rebuild must make the new one. Two databases swap

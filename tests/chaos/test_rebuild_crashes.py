@@ -1,4 +1,4 @@
-"""Whatever dies or fails while a rebuild is at work, a whole map is served; the next one works."""
+"""Whatever dies or fails during a rebuild, a whole map is served, and the next rebuild works."""
 
 import json
 import os
@@ -39,7 +39,7 @@ def own_server() -> Iterator[EmbeddedServer]:
 
 @pytest.fixture
 def log(tmp_path: Path) -> Path:
-    """A log of a rebuild that is worth a hundred statements."""
+    """A log whose rebuild takes a hundred statements."""
     return write_log(tmp_path / "log", walk(60) + list(bridge()))
 
 
@@ -51,7 +51,7 @@ def in_small_streams(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def at_stage(stage: str, act: Callable[[], None]) -> Callable[[RebuildProgress], None]:
-    """Do something once when a rebuild gets there."""
+    """Call ``act`` once when a rebuild is at ``stage``."""
     done: list[str] = []
 
     def tell(at: RebuildProgress) -> None:
@@ -63,9 +63,7 @@ def at_stage(stage: str, act: Callable[[], None]) -> Callable[[RebuildProgress],
 
 
 @pytest.mark.parametrize("kind", ["one_database", "two_databases"])
-def test_killed_at_statements_all_through(
-    log: Path, kind: str, request: pytest.FixtureRequest
-) -> None:
+def test_killed_at_any_statement(log: Path, kind: str, request: pytest.FixtureRequest) -> None:
     targets: Targets = request.getfixturevalue(kind)
     result = subprocess.run(
         [
@@ -82,7 +80,7 @@ def test_killed_at_statements_all_through(
 
 
 @pytest.mark.parametrize("stage", ["folding", "writing", "swapping"])
-def test_a_session_that_is_ended_ends_the_rebuild_in_words(
+def test_a_terminated_session_ends_the_rebuild_with_a_message(
     log: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch, stage: str
 ) -> None:
     in_small_streams(monkeypatch)
@@ -105,7 +103,7 @@ def test_a_session_that_is_ended_ends_the_rebuild_in_words(
 
 @pytest.mark.parametrize("stage", ["folding", "writing", "swapping"])
 @pytest.mark.parametrize("of", ["graph_url", "vector_url"])
-def test_of_two_databases_the_one_that_went_is_named(
+def test_the_message_names_which_of_two_databases_failed(
     log: Path, two_databases: Targets, monkeypatch: pytest.MonkeyPatch, stage: str, of: str
 ) -> None:
     in_small_streams(monkeypatch)
@@ -122,7 +120,7 @@ def test_of_two_databases_the_one_that_went_is_named(
         rebuild(log, two_databases, SETTINGS, progress=at_stage(stage, end_sessions))
 
 
-def test_rows_the_server_refuses_in_the_middle_of_the_stream(
+def test_rows_that_the_server_refuses_while_the_fold_goes_on(
     log: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     in_small_streams(monkeypatch)
@@ -154,7 +152,7 @@ def kill(server: EmbeddedServer) -> None:
             list(witness.notifies(timeout=WAIT_S))
 
 
-def test_postgres_itself_is_killed_in_the_middle(
+def test_postgres_is_killed_during_a_rebuild(
     log: Path, own_server: EmbeddedServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     in_small_streams(monkeypatch)
@@ -172,10 +170,10 @@ def test_postgres_itself_is_killed_in_the_middle(
     assert all_rows(targets) != old
 
 
-def test_who_interrupts_a_rebuild_whose_server_has_gone_is_told_of_the_interruption(
+def test_an_interrupt_is_raised_also_when_the_server_is_gone(
     tmp_path: Path, own_server: EmbeddedServer
 ) -> None:
-    """There is nothing left to break off, which is no news to anybody."""
+    """Cancelling fails then, which is not reported."""
     targets = Targets(own_server.url, own_server.url, own_server)
     log = write_log(tmp_path / "short", walk(20))
     begun = threading.Event()

@@ -1,4 +1,4 @@
-"""Whatever dies while a tail is at work, the end equals a rebuild, row by row."""
+"""Whatever dies during a tail, the final rows equal those of a rebuild."""
 
 import json
 import subprocess
@@ -53,9 +53,7 @@ def own_server() -> Iterator[EmbeddedServer]:
         yield server
 
 
-def test_postgres_itself_is_killed_again_and_again(
-    tmp_path: Path, own_server: EmbeddedServer
-) -> None:
+def test_postgres_is_killed_again_and_again(tmp_path: Path, own_server: EmbeddedServer) -> None:
     log = write_log(tmp_path / "log", walk(60) + list(bridge()))
     targets = Targets(own_server.url, own_server.url, own_server)
     kills: list[int] = []
@@ -117,7 +115,7 @@ def cut_connections(url: str) -> None:
         )
 
 
-def test_a_cut_connection_is_made_again(tmp_path: Path, one_database: Targets) -> None:
+def test_a_cut_connection_is_reconnected(tmp_path: Path, one_database: Targets) -> None:
     log = write_log(tmp_path / "log", walk(60))
 
     def cut(_: TailReport) -> None:
@@ -137,8 +135,8 @@ def test_a_cut_connection_is_made_again(tmp_path: Path, one_database: Targets) -
     assert all_rows(one_database) == tailed
 
 
-def test_commits_the_server_lost_are_made_again(tmp_path: Path, one_database: Targets) -> None:
-    """A crash with synchronous_commit = off takes the database back a little, rows and all."""
+def test_commits_the_server_lost_are_written_again(tmp_path: Path, one_database: Targets) -> None:
+    """With synchronous_commit = off a crash loses the last commits, rows and checkpoint."""
     log = write_log(tmp_path / "log", walk(40) + list(bridge()))
 
     def go_back(report: TailReport) -> None:
@@ -153,10 +151,10 @@ def test_commits_the_server_lost_are_made_again(tmp_path: Path, one_database: Ta
     assert all_rows(one_database) == tailed
 
 
-def test_commits_lost_while_nothing_comes_are_made_again(
+def test_commits_lost_while_no_event_comes_are_written_again(
     tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is the heartbeat that finds the connection lost, and no batch is at hand to compare."""
+    """The heartbeat finds the connection lost; there is no batch to compare with."""
     monkeypatch.setattr(sys.modules["projections.database.tail"], "HEARTBEAT_S", 0.0)
     log = write_log(tmp_path / "log", walk(40))
     progress, stop, lost = TailProgress(), threading.Event(), threading.Event()
@@ -185,7 +183,7 @@ def test_commits_lost_while_nothing_comes_are_made_again(
 
 
 @pytest.mark.parametrize("again", [1, 3])
-def test_a_connection_cut_again_while_it_asks_what_is_in(
+def test_a_connection_cut_again_while_the_checkpoint_is_read(
     tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch, again: int
 ) -> None:
     log = write_log(tmp_path / "log", walk(40))
@@ -207,7 +205,7 @@ def test_a_connection_cut_again_while_it_asks_what_is_in(
     assert (report.next_offset, len(cuts)) == (40, again + 1)
 
 
-def test_a_database_away_when_a_new_pass_begins_is_waited_for(
+def test_a_new_pass_waits_for_a_database_that_is_away(
     tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = write_log(tmp_path / "log", walk(40))
@@ -242,7 +240,7 @@ def test_a_checkpoint_moved_by_somebody_else_stops_the_tail(
         tail(log, one_database, SETTINGS, once=True, batch_events=10, on_batch=overtake)
 
 
-def test_a_checkpoint_moved_behind_our_back_changes_no_row(
+def test_a_checkpoint_moved_during_a_transaction_changes_no_row(
     tmp_path: Path, one_database: Targets, pg: psycopg.Connection
 ) -> None:
     log = write_log(tmp_path / "log", walk(40))

@@ -87,7 +87,7 @@ def test_tail_in_small_steps_through_merges(tmp_path: Path, one_database: Target
     assert all_rows(one_database) == stepped
 
 
-def test_doing_it_twice_changes_nothing(log: Path, one_database: Targets) -> None:
+def test_a_second_replay_and_tail_change_nothing(log: Path, one_database: Targets) -> None:
     first = rebuild(log, one_database, SETTINGS)
     rows = all_rows(one_database)
     assert rebuild(log, one_database, SETTINGS).digest == first.digest
@@ -114,7 +114,7 @@ def test_each_sink_alone_has_its_own_checkpoint(log: Path, two_databases: Target
     assert all_rows(two_databases) == apart
 
 
-def test_the_table_is_what_the_design_says(
+def test_the_table_has_the_columns_of_the_design(
     log: Path, one_database: Targets, pg: psycopg.Connection
 ) -> None:
     rebuild(log, one_database, SETTINGS)
@@ -141,7 +141,7 @@ def test_the_table_is_what_the_design_says(
         assert round(row[-1].timestamp() * 1_000_000) == logged[offset] // 1000
 
 
-def test_both_queries_of_the_design_as_they_stand(
+def test_both_queries_of_the_design_work_verbatim(
     log: Path, one_database: Targets, pg: psycopg.Connection
 ) -> None:
     rebuild(log, one_database, SETTINGS)
@@ -207,7 +207,7 @@ def test_a_box_beyond_float32(tmp_path: Path, one_database: Targets) -> None:
     assert copied[1][0][6][:3] == [float("inf"), float("-inf"), 0.0]
 
 
-def test_other_settings_are_refused_in_words(log: Path, one_database: Targets) -> None:
+def test_other_settings_are_refused_with_the_difference(log: Path, one_database: Targets) -> None:
     rebuild(log, one_database, SETTINGS)
     rows = all_rows(one_database)
     other = SETTINGS.with_assignments(["eps_m=1.0"])
@@ -240,7 +240,7 @@ def test_a_log_that_was_cut_or_continued_differently_is_refused(
         tail(long, one_database, SETTINGS, once=True)
 
 
-def test_what_a_user_has_in_the_database_stays(
+def test_a_users_own_tables_and_graphs_stay(
     log: Path, one_database: Targets, pg: psycopg.Connection
 ) -> None:
     pg.execute("CREATE TABLE public.mine AS SELECT 1 AS n")
@@ -262,7 +262,7 @@ def test_what_a_user_has_in_the_database_stays(
         ("CREATE SCHEMA mapfold", "schema mapfold that mapfold did not make"),
     ],
 )
-def test_somebody_elses_things_under_our_names_are_refused(
+def test_foreign_objects_under_our_names_are_refused(
     log: Path, one_database: Targets, pg: psycopg.Connection, statement: str, told: str
 ) -> None:
     pg.execute(statement)  # type: ignore[arg-type]
@@ -274,7 +274,7 @@ def test_somebody_elses_things_under_our_names_are_refused(
             act()
 
 
-def test_a_view_on_the_table_stops_the_swap_and_nothing_is_lost(
+def test_a_view_on_the_table_stops_the_swap(
     log: Path, one_database: Targets, pg: psycopg.Connection
 ) -> None:
     rebuild(log, one_database, SETTINGS)
@@ -310,10 +310,10 @@ def test_an_event_that_cannot_be_folded(log: Path, one_database: Targets) -> Non
 
 
 @pytest.mark.parametrize("batch_events", [1, 200], ids=["pipelined", "plain"])
-def test_a_row_the_database_refuses_ends_the_tail_in_words(
+def test_a_row_the_database_refuses_ends_the_tail_with_a_message(
     tmp_path: Path, one_database: Targets, pg: psycopg.Connection, batch_events: int
 ) -> None:
-    """Not a lost connection, so no endless trying again; and the checkpoint stays."""
+    """It is no lost connection, so nothing is tried again; the checkpoint stays."""
     log = write_log(tmp_path / "log", walk(40))
     rebuild(log, one_database, SETTINGS, until=30)
     pg.execute(

@@ -28,7 +28,7 @@ def log(tmp_path: Path) -> Path:
 
 
 def left_over(pg: psycopg.Connection) -> set[str]:
-    """What there is of replaced and of unfinished maps."""
+    """Schemas of replaced and unfinished maps."""
     rows = pg.execute(
         "SELECT nspname FROM pg_namespace"
         " WHERE nspname IN ('semantic_map_old', 'semantic_map_next', 'mapfold_old')"
@@ -37,7 +37,7 @@ def left_over(pg: psycopg.Connection) -> set[str]:
 
 
 def nobody_drops(connection: Connection, statement: sql.Composed) -> None:
-    """Stands for a server that was stopped before it got there."""
+    """Simulates a server that was stopped before it dropped anything."""
     connection.close()
 
 
@@ -50,7 +50,7 @@ def test_nothing_is_left_after_the_drop(
     assert left_over(pg) == set()
 
 
-def test_what_the_server_could_not_drop_the_next_rebuild_drops(
+def test_the_next_rebuild_drops_what_the_server_did_not(
     log: Path, one_database: Targets, pg: psycopg.Connection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rebuild(log, one_database, SETTINGS, until=30)
@@ -65,9 +65,7 @@ def test_what_the_server_could_not_drop_the_next_rebuild_drops(
     assert all_rows(one_database) == rows
 
 
-def test_a_rebuild_waits_for_the_drop_before_its_swap_only(
-    log: Path, one_database: Targets
-) -> None:
+def test_a_rebuild_waits_for_a_drop_only_before_its_swap(log: Path, one_database: Targets) -> None:
     rebuild(log, one_database, SETTINGS, until=30)
     wait_for_drops(one_database)
     dropping = connect(one_database.graph_url, autocommit=True)
@@ -85,7 +83,7 @@ def test_a_rebuild_waits_for_the_drop_before_its_swap_only(
     assert dropping.closed
 
 
-def test_a_schema_of_somebody_else_stays(
+def test_a_foreign_schema_under_our_name_is_refused(
     log: Path, one_database: Targets, pg: psycopg.Connection
 ) -> None:
     pg.execute("CREATE SCHEMA mapfold_old")
@@ -94,7 +92,7 @@ def test_a_schema_of_somebody_else_stays(
     assert left_over(pg) == {"mapfold_old"}
 
 
-def test_what_fails_after_the_swap_does_not_sound_as_if_the_old_map_were_served(
+def test_an_error_after_the_swap_says_that_the_new_map_is_in_place(
     log: Path, one_database: Targets, pg: psycopg.Connection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pg.execute("CREATE TABLE public.taken (n int)")

@@ -36,7 +36,7 @@ COUNT_VECTORS = "SELECT count(*) FROM detection_embeddings"
 
 
 class Reader(threading.Thread):
-    """Runs a query until told to stop; keeps every answer and every error."""
+    """Runs a query until it is stopped; keeps every answer and every error."""
 
     def __init__(self, open_: Callable[[], psycopg.Connection], query: str, prepare: bool) -> None:
         super().__init__()
@@ -102,10 +102,10 @@ def test_readers_see_one_map_or_the_other_and_never_an_error(
     assert pg.execute("SELECT to_regnamespace('mapfold_old')").fetchone() == (None,)
 
 
-def test_a_reader_in_a_long_transaction_keeps_its_graph_and_the_next_rebuild_clears_it(
+def test_a_long_transaction_keeps_its_graph_and_the_next_rebuild_drops_it(
     tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It read only the table so far; its later look at the graph must still find a whole one."""
+    """It has read only the table so far; the graph it reads later must still be whole."""
     monkeypatch.setattr("projections.database.swap.WAIT_SECONDS", 0.2)
     log = write_log(tmp_path / "log", walk(60))
     rebuild(log, one_database, SETTINGS)
@@ -125,7 +125,7 @@ def test_a_reader_in_a_long_transaction_keeps_its_graph_and_the_next_rebuild_cle
 
 
 class Interrupted(Exception):
-    """Stands for whatever ends a rebuild in the middle."""
+    """Simulates what ends a rebuild in the middle."""
 
 
 @pytest.mark.parametrize("stage", ["folding", "writing", "swapping", "tidying", "indexing"])
@@ -217,7 +217,7 @@ def test_between_swap_and_commit_a_reader_waits_at_its_first_table(
     assert waited == [query]
 
 
-def test_a_reader_that_will_not_go_stops_the_swap_in_words(
+def test_a_reader_that_keeps_its_lock_stops_the_swap_with_a_message(
     tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys.modules["projections.database.rebuild"], "PATIENCE_S", 0.3)
@@ -234,7 +234,7 @@ def test_a_reader_that_will_not_go_stops_the_swap_in_words(
 @pytest.mark.parametrize(
     ("first", "second"), [(COUNT_VECTORS, COUNT_PATHS), (COUNT_PATHS, COUNT_VECTORS)]
 )
-def test_a_transaction_that_reads_both_is_never_the_victim_of_a_deadlock(
+def test_a_transaction_that_reads_both_is_never_ended_by_a_deadlock(
     tmp_path: Path, one_database: Targets, first: str, second: str
 ) -> None:
     log = write_log(tmp_path / "log", walk(60))
@@ -296,10 +296,10 @@ def test_readers_of_one_database_do_not_wait_for_those_of_the_other(
     assert tail(log, two_databases, SETTINGS, once=True).events == 0
 
 
-def test_readers_that_go_one_by_one_make_no_victim_of_one_that_waits(
+def test_readers_that_end_one_by_one_never_end_a_waiting_one_by_a_deadlock(
     tmp_path: Path, one_database: Targets
 ) -> None:
-    """The swap waits for each a little, and for all of them longer than deadlock_timeout, 1 s."""
+    """The swap waits briefly for one, but for all of them longer than deadlock_timeout, 1 s."""
     log = write_log(tmp_path / "log", walk(60))
     rebuild(log, one_database, SETTINGS, until=30)
     swapping, url = threading.Event(), one_database.graph_url

@@ -1,4 +1,4 @@
-"""A tail that follows: from append to visible, drained by its stop, watched by others."""
+"""A tail that follows a growing log: rows, status, metrics, stopping, dead letters."""
 
 import re
 import threading
@@ -64,7 +64,7 @@ def test_it_follows_across_writers_and_rotations(tmp_path: Path, one_database: T
     assert all_rows(one_database) == tailed
 
 
-def test_status_tells_the_conditions_apart(tmp_path: Path, one_database: Targets) -> None:
+def test_status_prints_each_state_of_a_tail(tmp_path: Path, one_database: Targets) -> None:
     log = write_log(tmp_path / "log", walk(20))
 
     def conditions() -> set[str]:
@@ -97,8 +97,8 @@ def test_status_tells_the_conditions_apart(tmp_path: Path, one_database: Targets
     ]
 
 
-def test_a_tail_lives_from_its_first_moment_on(tmp_path: Path, one_database: Targets) -> None:
-    """Its first heartbeat is not what an earlier tail left, long ago."""
+def test_a_tail_is_following_from_its_start(tmp_path: Path, one_database: Targets) -> None:
+    """It writes a heartbeat at once; an earlier tail's is old."""
     log = write_log(tmp_path / "log", walk(20))
     tail(log, one_database, SETTINGS, once=True)
     with psycopg.connect(one_database.graph_url) as connection:
@@ -110,7 +110,7 @@ def test_a_tail_lives_from_its_first_moment_on(tmp_path: Path, one_database: Tar
         assert found.healthy
 
 
-def test_a_replay_at_work_is_no_tail(tmp_path: Path, one_database: Targets) -> None:
+def test_status_of_a_running_replay_is_rebuilding(tmp_path: Path, one_database: Targets) -> None:
     log = write_log(tmp_path / "log", walk(20))
     rebuild(log, one_database, SETTINGS, until=10)
     seen = []
@@ -136,7 +136,7 @@ def test_a_first_replay_is_not_missing(tmp_path: Path, one_database: Targets) ->
     assert seen == [{("rebuilding", "mapfold replay", None)}]
 
 
-def test_who_is_told_to_wait_learns_what_the_number_is(
+def test_a_busy_sink_is_reported_with_its_writer_and_server_process(
     tmp_path: Path, one_database: Targets
 ) -> None:
     log = write_log(tmp_path / "log", walk(5))
@@ -170,9 +170,7 @@ def test_metrics_of_a_tail(tmp_path: Path, one_database: Targets) -> None:
     assert names == set(re.findall(r"mapfold_tail_\w+", page))
 
 
-def test_a_tail_that_has_committed_nothing_tells_no_time_of_it(
-    tmp_path: Path, one_database: Targets
-) -> None:
+def test_no_commit_age_before_the_first_commit(tmp_path: Path, one_database: Targets) -> None:
     log = write_log(tmp_path / "log", walk(12))
     rebuild(log, one_database, SETTINGS)
     with Tail(log, one_database) as running:
@@ -182,7 +180,7 @@ def test_a_tail_that_has_committed_nothing_tells_no_time_of_it(
     assert "commit_age" not in text
 
 
-def test_waiting_too_long_is_told() -> None:
+def test_progress_wait_times_out() -> None:
     assert not TailProgress().wait(1, 0.01)
 
 
@@ -219,7 +217,7 @@ def test_parked_events_are_tried_again(
 def test_parked_events_of_another_log_or_with_other_settings_are_not_tried(
     tmp_path: Path, one_database: Targets
 ) -> None:
-    """Nobody asked for a map with other settings, which is what a rebuild would make."""
+    """A rebuild would make a map with other settings than the one that is there."""
     log = write_log(tmp_path / "log", walk(10))
     append_raw(log, b"not an envelope")
     tail(log, one_database, SETTINGS, once=True)

@@ -1,4 +1,4 @@
-"""A tail begins at the nearest snapshot that is surely of its own fold, and leaves one."""
+"""A tail starts from the latest snapshot of its own fold, and saves one."""
 
 import sys
 from collections.abc import Iterator, Sequence
@@ -51,7 +51,7 @@ def leave_snapshot(log: Path, offset: int) -> Path:
     return next(cache_of(log).folder.glob(f"*-{offset:020d}.map"))
 
 
-def test_it_begins_at_the_snapshot_and_ends_at_the_rows_of_a_rebuild(
+def test_a_tail_starts_at_the_snapshot_and_writes_the_rows_of_a_rebuild(
     log: Path, one_database: Targets, folded: list[int]
 ) -> None:
     rebuild(log, one_database, SETTINGS, until=110)
@@ -65,7 +65,7 @@ def test_it_begins_at_the_snapshot_and_ends_at_the_rows_of_a_rebuild(
     assert all_rows(one_database) == tailed
 
 
-def test_a_damaged_snapshot_is_a_note_and_an_earlier_start(
+def test_a_damaged_snapshot_is_reported_and_an_earlier_one_used(
     log: Path, one_database: Targets, folded: list[int]
 ) -> None:
     rebuild(log, one_database, SETTINGS, until=110)
@@ -84,7 +84,7 @@ def test_a_damaged_snapshot_is_a_note_and_an_earlier_start(
     assert all_rows(one_database) == tailed
 
 
-def test_nothing_beyond_a_parked_event_is_taken_from_a_snapshot(
+def test_no_snapshot_after_a_parked_event_is_used(
     log: Path, one_database: Targets, folded: list[int]
 ) -> None:
     leave_snapshot(log, 100)
@@ -105,7 +105,7 @@ def test_nothing_beyond_a_parked_event_is_taken_from_a_snapshot(
     assert folded[0] == 100
 
 
-def test_it_leaves_one_if_it_folded_much(
+def test_a_tail_saves_a_snapshot_if_it_folded_much(
     log: Path, one_database: Targets, folded: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys.modules["projections.database.tail"], "SNAPSHOT_MIN_EVENTS", 50)

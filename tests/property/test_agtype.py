@@ -48,7 +48,7 @@ def trip(connection: psycopg.Connection, loader: Loader, texts: list[str]) -> li
 )
 @given(st.lists(st.tuples(names, finite, int64, st.lists(finite)), min_size=1))
 @pytest.mark.parametrize("loader", [CopyLoader(), InsertLoader()], ids=["copy", "insert"])
-def test_what_is_written_comes_back(
+def test_values_come_back_from_the_server_as_sent(
     connection: psycopg.Connection,
     loader: Loader,
     values: list[tuple[str, float, int, list[float]]],
@@ -79,11 +79,11 @@ def same_float(found: object, sent: float) -> bool:
     ("value", "text"),
     [(1.0, "1.0"), (-0.0, "-0.0"), (1e22, "1e+22"), (5e-324, "5e-324"), (0.1, "0.1")],
 )
-def test_a_float_is_written_as_one(value: float, text: str) -> None:
+def test_a_float_has_a_point_or_an_exponent(value: float, text: str) -> None:
     assert agtype.number(value) == text
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_what_is_no_number_is_refused(value: float) -> None:
+def test_infinity_and_nan_are_refused(value: float) -> None:
     with pytest.raises(ValueError, match="no number"):
         agtype.number(value)

@@ -1,8 +1,8 @@
-"""Memory, both loaders, one database and two: driven together through everything, always equal.
+"""Memory, both loaders, one database and two databases: after any steps their rows are equal.
 
 The machine writes events (walks, merges, duplicates, conflicts, unreadable ones), tails in batches
-of any size, crashes tails at any statement, rebuilds to any offset, and compares. Memory tails
-once, straight through; the databases go their crooked ways.
+of any size, crashes tails at any statement, rebuilds to any offset, and compares. The memory
+sink gets each event once, in order; the databases get crashes, retries and rebuilds.
 """
 
 import contextlib
@@ -45,11 +45,11 @@ PLACES = st.sampled_from(["one", "two"])
 
 
 class Crash(Exception):
-    """The tail's process dies here: nothing after it runs, its connections go."""
+    """Simulates the death of the tail's process."""
 
 
 class Bomb:
-    """Raises `Crash` at the n-th statement psycopg is asked to send."""
+    """Raises `Crash` at the n-th statement that psycopg sends."""
 
     def __init__(self, patch: pytest.MonkeyPatch, at: int) -> None:
         self.left = at
@@ -105,11 +105,11 @@ class SinksAgree(RuleBasedStateMachine):
         write_log(self.log, documents)
 
     @rule(conflict=st.booleans())
-    def something_comes_twice(self, conflict: bool) -> None:
+    def keyframe_comes_twice(self, conflict: bool) -> None:
         write_log(self.log, [envelope(0, 1.0 if conflict else None, run_id="first")] * 2)
 
     @rule()
-    def something_unreadable_comes(self) -> None:
+    def unreadable_event_comes(self) -> None:
         append_raw(self.log, b'{"run_id": "broken"}')
         self.unreadable = True
 
@@ -201,7 +201,7 @@ def machine(third_database: Targets, two_databases: Targets) -> type[SinksAgree]
 
 
 @pytest.mark.timeout(900)
-def test_all_sinks_always_agree(machine: type[SinksAgree]) -> None:
+def test_memory_and_all_databases_have_the_same_rows(machine: type[SinksAgree]) -> None:
     run_state_machine_as_test(
         machine,
         settings=settings(

@@ -1,4 +1,4 @@
-"""The thread that writes while the fold goes on: in order, bounded, and no error is lost."""
+"""`LoadingThread` runs jobs in order, lets few wait, and loses no error."""
 
 import sys
 import threading
@@ -9,7 +9,7 @@ import pytest
 from projections.database.loading_thread import WAITING_JOBS, LoadingThread, short_turns
 
 
-def test_jobs_are_done_in_order_and_elsewhere() -> None:
+def test_jobs_run_in_order_in_one_other_thread() -> None:
     done: list[int] = []
     threads: set[int] = set()
 
@@ -29,7 +29,7 @@ def test_jobs_are_done_in_order_and_elsewhere() -> None:
     assert threading.get_ident() not in threads
 
 
-def test_whoever_brings_more_than_may_wait_waits() -> None:
+def test_put_blocks_while_too_many_jobs_wait() -> None:
     gate, brought = threading.Event(), threading.Semaphore(0)
 
     def bring(loading: LoadingThread) -> None:
@@ -53,7 +53,7 @@ def _fail() -> None:
     raise LookupError("the server went away")
 
 
-def test_a_failure_is_raised_where_one_waits_and_ends_the_work() -> None:
+def test_a_failed_job_is_raised_by_flush_and_put_and_ends_the_work() -> None:
     done: list[int] = []
     with LoadingThread() as loading:
         loading.put(_fail)
@@ -65,7 +65,7 @@ def test_a_failure_is_raised_where_one_waits_and_ends_the_work() -> None:
     assert done == []
 
 
-def test_leaving_by_an_error_breaks_off_what_runs_and_drops_the_rest() -> None:
+def test_an_error_inside_cancels_the_running_job_and_drops_the_rest() -> None:
     cancelled, begun, done = threading.Event(), threading.Event(), list[int]()
 
     def first() -> None:
@@ -84,7 +84,7 @@ def test_leaving_by_an_error_breaks_off_what_runs_and_drops_the_rest() -> None:
     assert done == [1]
 
 
-def test_the_thread_ends_also_when_nothing_can_be_broken_off() -> None:
+def test_the_thread_ends_also_when_cancelling_fails() -> None:
     def leave() -> None:
         with LoadingThread(_fail):
             raise KeyboardInterrupt
@@ -95,7 +95,7 @@ def test_the_thread_ends_also_when_nothing_can_be_broken_off() -> None:
     assert threading.active_count() == before
 
 
-def test_turns_are_short_only_inside() -> None:
+def test_the_switch_interval_is_short_only_inside() -> None:
     before = sys.getswitchinterval()
     with short_turns():
         assert sys.getswitchinterval() < before
