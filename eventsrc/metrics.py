@@ -173,6 +173,6 @@ def _serving(address: tuple[str, int], collector: Collector) -> Iterator[int]:
         except OSError as error:
             raise TransportError(
                 f"cannot serve metrics on {host}:{port}: {error.strerror or error}; "
-                "choose another with --metrics"
+                "choose another address with --metrics"
             ) from None
         yield bound

@@ -105,9 +105,9 @@ class Sender:
             while not self._stopping:
                 self._connect_and_send()
         finally:
-            if not self._stopping:  # so that nobody spools for a thread that is gone
+            if not self._stopping:  # an unexpected error: `publish` must raise from now on
                 self._failure = TransportError(
-                    f"key {self._key!r}: the sending thread has died, stderr says of what; what is "
+                    f"key {self._key!r}: the sending thread has died, see stderr; what is "
                     "spooled stays. Close this publisher and open another"
                 )
                 self.stop()
@@ -252,7 +252,7 @@ class ResendTimer:
         self.restart()
 
     def restart(self) -> None:
-        """Start anew: envelopes have just been sent."""
+        """Start again: envelopes have just been sent."""
         self._pause_s = self._resend_after_s
         self._probed = self.recorder_answers = False
         self._due_s = self._clock() + self._pause_s

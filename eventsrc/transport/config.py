@@ -166,7 +166,7 @@ def _is_unset(config: Config, key: str) -> bool:
 MAX_KEY_BYTES: Final = 1024
 """Bound of a key in UTF-8. A log repeats the key in each chunk, and the key of a refusal is built
 from it; Zenoh itself panics on keys of 64 kB."""
-_WILDCARDS = frozenset("*$?#")
+_FORBIDDEN = frozenset("*$?#")
 
 
 def check_key(key: str, option: str) -> str:
@@ -198,10 +198,10 @@ def key_fault(key: str) -> str | None:
 
 
 def _publish_fault(key: str) -> str | None:
-    if any(character in _WILDCARDS for character in key):
-        return "it is a pattern for many keys"
+    if any(character in _FORBIDDEN for character in key):
+        return "it has one of the characters * $ ? #"
     if any(character.isspace() or not character.isprintable() for character in key):
-        return "it holds white space"
+        return "it has white space or control characters"
     if not all(key.split("/")):
         return "a part of it is empty"
     fault = key_fault(key)

@@ -33,7 +33,7 @@ def open_error(error: BaseException, connect: object, listen: object) -> Transpo
     if "listener" in message:
         return TransportError(
             f"cannot listen on {_joined(listen)}: {one_line(error)}; "
-            "stop what listens there or choose another place with --listen"
+            "stop what listens there or choose another endpoint with --listen"
         )
     if "Unable to connect" in message:
         return TransportError(

@@ -21,7 +21,7 @@ def mapfold(tmp_path: Path) -> Commands:
 @pytest.mark.parametrize(
     ("args", "says"),
     [
-        (("simulate", "--key", "a b/*"), "--key 'a b/*': it is a pattern for many keys"),
+        (("simulate", "--key", "a b/*"), "--key 'a b/*': it has one of the characters * $ ? #"),
         (("whatif", "log", "--try", "eps=1"), "--try eps=1: no setting 'eps'; there are"),
         (("whatif", "log", "--grid", "eps_m=1,x"), "--grid eps_m=x: input should be a valid"),
         (("whatif", "log", "--base", "eps=1"), "--base eps=1: no setting 'eps'; there are"),
