@@ -14,7 +14,7 @@ VECTORS = {"cup": [1.0, 0.0, 0.1, 0.0], "chair": [0.0, 1.0, 0.0, 0.1], "lamp": [
 
 
 NOT_AN_ENVELOPE = {"nothing": "a robot would send"}
-"""Refused at the door: it takes an offset in the log and changes nothing."""
+"""An invalid payload: it is logged as rejected and changes nothing."""
 
 
 def write_log(path: Path, documents: Iterable[dict[str, Any]]) -> Path:

@@ -9,7 +9,7 @@ from eventsrc.append import append_payload
 from eventsrc.log import LogWriter
 from tests.commands import Commands, Said
 from tests.envelopes import detection, envelope, payload
-from tests.unit.test_text_escaping import obeyed
+from tests.unit.test_text_escaping import control_characters
 
 CONTROL = "\x1b]0;owned\x07\x9b2J\n       9  forged line"
 BIDI = "\u202e\u2066[red][link=file:///etc/passwd]\u2028"
@@ -34,7 +34,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Commands:
 
 
 def check(said: Said) -> Said:
-    assert obeyed(said.out + said.err) <= {"\n"}
+    assert control_characters(said.out + said.err) <= {"\n"}
     assert not any(line.startswith("       9  forged") for line in said.out.splitlines())
     assert "Traceback" not in said.err
     return said

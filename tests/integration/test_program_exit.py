@@ -1,4 +1,4 @@
-"""Ctrl-C, readers that leave, --version: how the program itself ends, whatever the command."""
+"""Ctrl-C, closed pipes, full disks, closed streams and --version, for any command."""
 
 import json
 import os
@@ -65,7 +65,7 @@ def test_ctrl_c_is_one_line_and_130(tmp_path: Path, module: str, args: tuple[str
     assert (done.returncode, done.stderr) == (EXIT_INTERRUPTED, "mapfold: interrupted\n")
 
 
-def test_ctrl_c_while_a_worker_starts_shows_nothing_of_it(mapfold: Commands) -> None:
+def test_ctrl_c_in_a_starting_worker_is_one_line(mapfold: Commands) -> None:
     (mapfold.folder / "sitecustomize.py").write_text(_CTRL_C_IN_A_WORKER)
     env = {**mapfold.env, "PYTHONPATH": str(mapfold.folder)}
     said = Commands(mapfold.folder, env)(
@@ -101,20 +101,18 @@ def _into_closed_pipe(mapfold: Commands, *args: str, stream: str = "stdout") -> 
         (("log", "cat", "log", "--json"), EXIT_READER_GONE),
     ],
 )
-def test_a_reader_that_leaves_is_no_failure(
-    mapfold: Commands, args: tuple[str, ...], code: int
-) -> None:
+def test_a_closed_pipe_is_exit_141(mapfold: Commands, args: tuple[str, ...], code: int) -> None:
     assert _into_closed_pipe(mapfold, *args) == (code, "")
 
 
-def test_findings_show_also_when_nobody_reads_them(mapfold: Commands) -> None:
+def test_findings_are_exit_3_when_stdout_is_closed(mapfold: Commands) -> None:
     write_damaged_log(mapfold.folder / "damaged", walk(3))
     code, err = _into_closed_pipe(mapfold, "log", "verify", "damaged")
     assert code == 3
     assert "finding" in err
 
 
-def test_the_work_is_done_also_when_nobody_reads_the_news(mapfold: Commands) -> None:
+def test_an_import_completes_when_stderr_is_closed(mapfold: Commands) -> None:
     (mapfold.folder / "in.jsonl").write_text("not JSON\n")
     args = ("import", "new", "in.jsonl", "--json")
     code, out = _into_closed_pipe(mapfold, *args, stream="stderr")
@@ -134,7 +132,7 @@ def test_the_work_is_done_also_when_nobody_reads_the_news(mapfold: Commands) -> 
     ],
     ids=lambda args: args[0],
 )
-def test_output_that_finds_no_room_is_a_failure(
+def test_stdout_on_a_full_disk_is_a_failure(
     mapfold: Commands, args: tuple[str, ...], unbuffered: dict[str, str]
 ) -> None:
     env = {k: v for k, v in mapfold.env.items() if k != "PYTHONUNBUFFERED"}
@@ -153,7 +151,7 @@ def test_output_that_finds_no_room_is_a_failure(
     )
 
 
-def test_news_that_find_no_room_change_nothing(mapfold: Commands) -> None:
+def test_stderr_on_a_full_disk_changes_nothing(mapfold: Commands) -> None:
     with Path("/dev/full").open("wb") as full:
         done = subprocess.run(
             [str(PROGRAM), "log", "verify", "log", "--json"],
@@ -167,7 +165,7 @@ def test_news_that_find_no_room_change_nothing(mapfold: Commands) -> None:
     assert b'"findings": []' in done.stdout
 
 
-def test_a_program_without_streams_gives_their_numbers_to_no_file(mapfold: Commands) -> None:
+def test_numbers_of_closed_streams_are_not_reused(mapfold: Commands) -> None:
     program = (
         "import os; from pathlib import Path; from projections.cli.program import run_app\n"
         "def app():\n"
@@ -187,7 +185,7 @@ def test_a_program_without_streams_gives_their_numbers_to_no_file(mapfold: Comma
     assert said == "['/dev/null', '/dev/null', '/dev/null', True]"
 
 
-def test_characters_that_the_encoding_lacks_are_written_all_the_same(mapfold: Commands) -> None:
+def test_characters_outside_the_encoding_are_escaped(mapfold: Commands) -> None:
     encoded = Commands(mapfold.folder, {**mapfold.env, "PYTHONIOENCODING": "ascii"})
     assert r"saw \u2615 \U0001f916" in encoded("log", "cat", "log").out
     odd = os.fsdecode(b"l\xff")

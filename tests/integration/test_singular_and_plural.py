@@ -1,4 +1,4 @@
-"""One place is no "1 places": in what commands say, and on pictures."""
+"""Counts of one are singular in messages and pictures: "1 place", not "1 places"."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""merges, why, diff, bisect and whatif as a person runs them: streams, exit codes, JSON."""
+"""The commands merges, why, diff, bisect and whatif: streams, exit codes, JSON."""
 
 import json
 import sys
@@ -18,8 +18,8 @@ XS = (0.0, 1.0, 2.0, 6.0, 5.0, 4.0, 9.0, 3.0)
 """Two places of three keyframes, one keyframe of noise, and one between the places."""
 
 
-class Here:
-    """Runs commands in this process: as `Commands` does, but without starting Python anew."""
+class InProcess:
+    """Runs commands as `Commands` does, but in this process."""
 
     def __init__(self, folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
         self.folder = folder
@@ -48,20 +48,20 @@ def make_log(folder: Path) -> None:
 
 
 @pytest.fixture
-def mapfold(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> Here:
+def mapfold(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> InProcess:
     """Commands beside a log whose keyframe 8, at offset 7, makes two places one."""
     make_log(tmp_path)
-    return Here(tmp_path, capfd)
+    return InProcess(tmp_path, capfd)
 
 
-def test_the_program_itself(tmp_path: Path) -> None:
+def test_in_a_process_of_its_own(tmp_path: Path) -> None:
     make_log(tmp_path)
     program = Commands.in_folder(tmp_path)
     assert len(program("merges", "log", *RULES, "--json").json) == 1
     assert program("why", "log", "run-a_p9", code=2).err.startswith("mapfold: no place 'run-a_p9'")
 
 
-def test_merges(mapfold: Here) -> None:
+def test_merges(mapfold: InProcess) -> None:
     said = mapfold("merges", "log", *RULES)
     assert said.out.splitlines()[1].split() == [
         *("1", "7", "2026-03-24T13:00:08.000Z", "run-a:8", "run-a_p0", "run-a_p1"),
@@ -77,7 +77,7 @@ def test_merges(mapfold: Here) -> None:
     )
 
 
-def test_a_merge_shows_in_state_from_the_next_offset_on(mapfold: Here) -> None:
+def test_a_merge_shows_in_state_from_the_next_offset_on(mapfold: InProcess) -> None:
     (merge,) = mapfold("merges", "log", *RULES, "--json").json
     for at, places in ((merge["offset"], 2), (merge["offset"] + 1, 1)):
         state = mapfold("state", "log", *RULES, "--at", str(at), "--json").json
@@ -85,7 +85,7 @@ def test_a_merge_shows_in_state_from_the_next_offset_on(mapfold: Here) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["png", "svg"])
-def test_a_merge_is_drawn(mapfold: Here, suffix: str) -> None:
+def test_a_merge_is_drawn(mapfold: InProcess, suffix: str) -> None:
     said = mapfold("merges", "log", *RULES, "--draw", "1", "--out", f"merge.{suffix}")
     assert said.err == f"wrote merge.{suffix}: merge 1, before and after\n"
     drawn = (mapfold.folder / f"merge.{suffix}").read_bytes()
@@ -94,7 +94,7 @@ def test_a_merge_is_drawn(mapfold: Here, suffix: str) -> None:
     assert (mapfold.folder / f"again.{suffix}").read_bytes() == drawn
 
 
-def test_why(mapfold: Here) -> None:
+def test_why(mapfold: InProcess) -> None:
     said = mapfold("why", "log", "run-a_p1", *RULES)
     assert said.out.startswith("place run-a_p1: absorbed by run-a_p0 at offset 7 (2026-03-24T")
     story = mapfold("why", "log", "run-a_p1", *RULES, "--json").json
@@ -103,14 +103,14 @@ def test_why(mapfold: Here) -> None:
     assert mapfold("why", "log", "run-a_p1", "--at", "7", *RULES, "--json").json["stands"] is True
 
 
-def test_why_same(mapfold: Here) -> None:
+def test_why_same(mapfold: InProcess) -> None:
     said = mapfold("why", "log", "--same", "run-a:1", "run-a:4", *RULES)
     assert said.out.startswith("run-a:1 and run-a:4: in one place since offset 7 (run-a:8, ")
     story = mapfold("why", "log", "--same", "run-a:1", "run-a:7", *RULES, "--json").json
     assert (story["same"], story["since"]) == (False, None)
 
 
-def test_diff(mapfold: Here) -> None:
+def test_diff(mapfold: InProcess) -> None:
     said = mapfold("diff", "log", "7", "8", *RULES)
     assert "  - run-a_p1 (3 keyframes) into run-a_p0 at 7 (run-a:8)" in said.out.splitlines()
     diff = mapfold("diff", "log", "run-a:7", "end", *RULES, "--json").json
@@ -121,7 +121,7 @@ def test_diff(mapfold: Here) -> None:
     assert mapfold("diff", "log", "5", "5").out.startswith("the same map at 5 and 5: digest ")
 
 
-def test_bisect(mapfold: Here) -> None:
+def test_bisect(mapfold: InProcess) -> None:
     said = mapfold("bisect", "log", "merged('run-a_p1')", *RULES)
     assert said.out.startswith("became true at offset 7 (run-a:8, ")
     found = mapfold("bisect", "log", "place_count < 2", "--scan", "--json", *RULES).json
@@ -138,7 +138,7 @@ def test_bisect(mapfold: Here) -> None:
     )
 
 
-def test_bisect_points_at_what_it_cannot_read(mapfold: Here) -> None:
+def test_bisect_points_at_what_it_cannot_read(mapfold: InProcess) -> None:
     said = mapfold("bisect", "log", "place_count < 2 and plac > 1", code=2)
     expression, caret, message = said.err.splitlines()
     assert expression[caret.index("^") :] == "plac > 1"
@@ -146,7 +146,7 @@ def test_bisect_points_at_what_it_cannot_read(mapfold: Here) -> None:
     assert said.out == ""
 
 
-def test_whatif(mapfold: Here) -> None:
+def test_whatif(mapfold: InProcess) -> None:
     said = mapfold("whatif", "log", "--base", "eps_m=1", "--set", "eps_m=0.5")
     assert said.out.splitlines()[0].split()[:3] == ["settings", "places", "noise"]
     assert said.out.splitlines()[2].split()[:4] == ["eps_m=0.5", "0", "8", "0"]
@@ -156,7 +156,7 @@ def test_whatif(mapfold: Here) -> None:
     assert found["alternatives"][1]["places_part_at"] is None
 
 
-def test_whatif_in_processes_of_its_own_says_the_same(mapfold: Here) -> None:
+def test_whatif_in_several_processes_prints_the_same(mapfold: InProcess) -> None:
     asked = ("whatif", "log", "--grid", "eps_m=0.5,1", "--grid", "min_samples=2,3", "--json")
     documents = [mapfold(*asked, "--processes", count).json for count in ("1", "3")]
     for document in documents:
@@ -165,7 +165,7 @@ def test_whatif_in_processes_of_its_own_says_the_same(mapfold: Here) -> None:
     assert documents[0] == documents[1]
 
 
-def test_whatif_with_truth_and_picture(mapfold: Here) -> None:
+def test_whatif_with_truth_and_picture(mapfold: InProcess) -> None:
     truth = mapfold.folder / "truth.jsonl"
     lines = [
         {"run_id": "run-a", "keyframe_id": n, "room": "a" if x < 3 else "b", "instances": []}
@@ -184,7 +184,7 @@ def test_whatif_with_truth_and_picture(mapfold: Here) -> None:
 @pytest.mark.parametrize(
     "args", [("whatif", "log", "--try", "eps_m=1"), ("evaluate", "--map", "log")]
 )
-def test_truth_of_something_else_scores_nothing(mapfold: Here, args: tuple[str, ...]) -> None:
+def test_truth_of_another_log_scores_nothing(mapfold: InProcess, args: tuple[str, ...]) -> None:
     truth = mapfold.folder / "other.jsonl"
     line = {"run_id": "run-z", "keyframe_id": 1, "room": "a", "instances": ["cup-1"]}
     truth.write_text(json.dumps(line))
@@ -198,7 +198,7 @@ def test_truth_of_something_else_scores_nothing(mapfold: Here, args: tuple[str, 
 
 @pytest.mark.parametrize("processes", ["1", "2"])
 def test_whatif_draws_what_it_has_folded(
-    mapfold: Here, monkeypatch: pytest.MonkeyPatch, processes: str
+    mapfold: InProcess, monkeypatch: pytest.MonkeyPatch, processes: str
 ) -> None:
     folded = 0
     fold = SemanticMap.fold
@@ -227,11 +227,11 @@ def test_whatif_draws_what_it_has_folded(
     ],
     ids=lambda args: args[0],
 )
-def test_a_name_that_no_picture_has_is_told_before_a_long_fold(
+def test_a_wrong_picture_name_is_an_error_before_the_fold(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], args: tuple[str, ...]
 ) -> None:
     write_damaged_log(tmp_path / "log", [envelope(1)])  # who folds it first meets that instead
-    said = Here(tmp_path, capfd)(*args, code=2)
+    said = InProcess(tmp_path, capfd)(*args, code=2)
     assert said.err == "mapfold: m.gif: a picture is .png, .svg or .pdf; give such a name\n"
 
 
@@ -256,7 +256,7 @@ def test_a_name_that_no_picture_has_is_told_before_a_long_fold(
         (("whatif", "log", "--set", "eps_m=1", "--truth", "none.jsonl"), "--truth none.jsonl"),
     ],
 )
-def test_misuse_is_told_in_one_line(mapfold: Here, args: tuple[str, ...], says: str) -> None:
+def test_misuse_is_one_line(mapfold: InProcess, args: tuple[str, ...], says: str) -> None:
     said = mapfold(*args, code=2)
     assert says in said.err.splitlines()[-1]
     assert said.err.splitlines()[-1].startswith("mapfold: ")
@@ -275,6 +275,6 @@ def test_an_event_that_cannot_be_folded_is_named(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], args: tuple[str, ...]
 ) -> None:
     write_damaged_log(tmp_path / "log", [envelope(1), envelope(2)])
-    said = Here(tmp_path, capfd)(args[0], "log", *args[1:], code=1)
+    said = InProcess(tmp_path, capfd)(args[0], "log", *args[1:], code=1)
     assert said.err.startswith("mapfold: event at offset 2 cannot be folded: not JSON")
     assert len(said.err.splitlines()) == 1

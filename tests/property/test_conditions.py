@@ -1,4 +1,4 @@
-"""The condition language is a part of Python's, so Python is its oracle; no text breaks it."""
+"""Conditions evaluate as the Python expressions they are; any text is parsed or an error."""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -27,7 +27,7 @@ truths = st.recursive(
 
 
 @given(truths)
-def test_it_means_what_python_means(text: str) -> None:
+def test_a_condition_equals_pythons_eval(text: str) -> None:
     facts = FakeFacts()
     names = {
         name: getattr(facts, name)
@@ -38,7 +38,7 @@ def test_it_means_what_python_means(text: str) -> None:
 
 
 @given(st.text(alphabet="place_count()<=>!'\"\\ andortx019,.;\n", max_size=60))
-def test_any_text_is_read_or_refused_at_a_column(text: str) -> None:
+def test_any_text_is_parsed_or_an_error_at_a_column(text: str) -> None:
     column = _column_of_refusal(text)
     assert column is None or 1 <= column <= len(text) + 1
 

@@ -1,4 +1,4 @@
-"""Every answer of a timeline against the slow way: folding a shorter log, or a log without one
+"""Every answer of a timeline against a brute force: folding a shorter log, or a log without one
 event."""
 
 import math
@@ -59,7 +59,7 @@ def test_at_is_a_shorter_fold(documents: list[dict[str, Any]], data: st.DataObje
 
 @slow
 @given(walks(), st.data())
-def test_views_do_not_disturb_each_other(
+def test_changing_a_view_changes_no_other(
     documents: list[dict[str, Any]], data: st.DataObject
 ) -> None:
     """A view taken at one offset and folded on gives the later map, and changes no other view."""
@@ -138,7 +138,7 @@ class CallableCount(int):
 
 @settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.too_slow])
 @given(walks(most=20), st.sampled_from(EXPRESSIONS), st.data())
-def test_bisect_and_scan_are_a_linear_search(
+def test_bisect_and_scan_equal_a_linear_search(
     documents: list[dict[str, Any]], expression: str, data: st.DataObject
 ) -> None:
     with timeline(documents) as opened:

@@ -1,4 +1,4 @@
-"""What-if against folding each setting alone and comparing the maps after every event."""
+"""What-if against a fold of each setting alone, compared after every event."""
 
 import tempfile
 from pathlib import Path
@@ -48,7 +48,7 @@ def parting(first: list[Any], second: list[Any]) -> int | None:
 
 @settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.too_slow])
 @given(walks(most=20), OTHERS)
-def test_it_is_each_fold_alone_compared(
+def test_whatif_equals_separate_folds(
     documents: list[dict[str, Any]], others: list[Settings]
 ) -> None:
     with tempfile.TemporaryDirectory() as folder:
@@ -72,7 +72,7 @@ def test_it_is_each_fold_alone_compared(
 
 @settings(deadline=None, max_examples=20, suppress_health_check=[HealthCheck.too_slow])
 @given(walks(most=20))
-def test_todays_settings_change_nothing(documents: list[dict[str, Any]]) -> None:
+def test_equal_settings_change_nothing(documents: list[dict[str, Any]]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         log = write_log(Path(folder) / "log", documents)
         found = what_if(log, BASE, [BASE], len(documents))
@@ -84,7 +84,7 @@ def test_todays_settings_change_nothing(documents: list[dict[str, Any]]) -> None
     assert same.name == "no change"
 
 
-def test_a_long_chain_of_merges_comes_back_from_a_process(tmp_path: Path) -> None:
+def test_a_long_chain_of_merges_can_be_pickled(tmp_path: Path) -> None:
     """Each place is absorbed by the one founded before it, the last one first: a pickle that went
     from survivor to survivor would go too deep."""
     far, count = Settings(eps_m=1.0, min_samples=2), 3_000

@@ -1,4 +1,4 @@
-"""Which settings a what-if tries."""
+"""Settings of a what-if from --set, --try and --grid."""
 
 import pytest
 
@@ -17,7 +17,7 @@ def test_all_sets_are_one_alternative() -> None:
     assert names(["eps_m=1.0", "min_samples=8"], [], []) == ["eps_m=1.0 min_samples=8"]
 
 
-def test_each_try_is_one_of_its_own() -> None:
+def test_each_try_is_one_alternative() -> None:
     assert names([], ["eps_m=1.0, min_samples=8", "eps_m=0.5"], []) == [
         "eps_m=1.0 min_samples=8",
         "eps_m=0.5",

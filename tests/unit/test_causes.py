@@ -1,4 +1,4 @@
-"""A cause that is not a keyframe: what an operator's command will be, told like any other."""
+"""A cause that is not a keyframe, as an operator's command will be, in every output."""
 
 import pytest
 
@@ -33,7 +33,7 @@ def keyframe(number: int) -> list[Delta]:
 
 @pytest.fixture
 def commanded() -> History:
-    """Two places that an event without a keyframe made one."""
+    """Two places merged by an event without a keyframe."""
     history = History(Settings())
     history.apply(0, keyframe(0))
     history.apply(1, keyframe(1))
@@ -50,13 +50,13 @@ def test_the_cause_is_the_command(commanded: History) -> None:
     assert merge_document(commanded, merge)["time"] is None
 
 
-def test_every_text_names_it(commanded: History) -> None:
+def test_every_text_names_the_command(commanded: History) -> None:
     (merge,) = commanded.merges
-    story = explain_place(commanded, commanded.places[1], 3)
+    explanation = explain_place(commanded, commanded.places[1], 3)
     texts = [
         merge_text(commanded, merge),
         " ".join(merge_row(commanded, merge)),
-        explanation_text(story),
+        explanation_text(explanation),
         explanation_text(explain_same_place(commanded, 0, 1, 3)),
     ]
     for text in texts:
@@ -64,7 +64,7 @@ def test_every_text_names_it(commanded: History) -> None:
         assert "None" not in text
 
 
-def test_a_command_may_say_what_it_did() -> None:
+def test_the_name_of_a_command_is_its_text() -> None:
     assert Cause(7, "command", what="kitchen was renamed").name == "kitchen was renamed"
 
 

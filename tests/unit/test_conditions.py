@@ -1,4 +1,4 @@
-"""The condition language: what holds, what is refused, and at which column."""
+"""Conditions: evaluation, and errors with their columns."""
 
 from dataclasses import dataclass, field
 
@@ -120,7 +120,7 @@ def test_the_pointer_stands_under_the_column() -> None:
     assert source[caret.index("^") :].startswith("wrong")
 
 
-def test_deep_nesting_is_refused_not_overflowed() -> None:
+def test_deep_nesting_is_an_error_and_no_overflow() -> None:
     assert Expression("(" * 90 + "1 < 2" + ")" * 90).holds(FakeFacts())
     for text in ("(" * 5000 + "1 < 2", "not " * 5000 + "1 < 2"):
         with pytest.raises(ExpressionError, match="nested more than"):
@@ -132,7 +132,7 @@ def test_ids_may_hold_quotes_and_backslashes() -> None:
     assert Expression(r"""same_place('it\'s:1', "b\"\\s:1")""").holds(facts)
 
 
-def test_it_says_what_it_names_and_what_it_read() -> None:
+def test_mentions_and_readings() -> None:
     expression = Expression("same_place('a:1', 'a:3') or object_count('chair') > 9")
     assert [(m.kind.value, m.text, m.column) for m in expression.mentions()] == [
         ("keyframe", "a:1", 12),

@@ -1,4 +1,4 @@
-"""Ctrl-C ends a work between two of its steps."""
+"""`ctrl_c_between_steps`: Ctrl-C takes effect between two steps."""
 
 import signal
 
@@ -13,7 +13,7 @@ def _ctrl_c() -> None:
     signal.raise_signal(signal.SIGINT)
 
 
-def test_a_step_is_done_before_it_ends() -> None:
+def test_ctrl_c_in_a_step_takes_effect_after_it() -> None:
     done = []
     with pytest.raises(KeyboardInterrupt), ctrl_c_between_steps() as step:  # noqa: PT012
         for number in range(9):
@@ -25,12 +25,12 @@ def test_a_step_is_done_before_it_ends() -> None:
     assert signal.getsignal(signal.SIGINT) is _HANDLER
 
 
-def test_outside_of_steps_it_ends_at_once() -> None:
+def test_ctrl_c_outside_of_steps_takes_effect_at_once() -> None:
     with pytest.raises(KeyboardInterrupt), ctrl_c_between_steps():
         _ctrl_c()
 
 
-def test_the_second_one_does_not_wait() -> None:
+def test_a_second_ctrl_c_takes_effect_at_once() -> None:
     reached = []
     with pytest.raises(KeyboardInterrupt), ctrl_c_between_steps() as step, step:  # noqa: PT012
         _ctrl_c()

@@ -1,4 +1,4 @@
-"""The public names of time travel, and what importing them costs."""
+"""The public names of `projections.history`, and what importing it loads."""
 
 import subprocess
 import sys
@@ -6,7 +6,7 @@ import sys
 import projections.history
 
 
-def test_what_is_public_is_sorted_and_there() -> None:
+def test_all_is_sorted_and_complete() -> None:
     names = projections.history.__all__
     assert names == sorted(names)
     assert all(hasattr(projections.history, name) for name in names)

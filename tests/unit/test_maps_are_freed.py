@@ -1,4 +1,4 @@
-"""A map nobody wants any more is gone at once, not when Python next looks for cycles.
+"""A map is freed with its last reference, not by the cyclic garbage collector.
 
 A rebuild leaves hundreds of megabytes behind, and whoever folds in one process again and again (a
 tail that starts anew, ``whatif``, ``serve``) would hold several of them.
@@ -53,7 +53,7 @@ def folding() -> object:
     ],
     ids=["view", "map", "live view", "graph sink", "tracker", "vector sink", "history"],
 )
-def test_nobody_holds_on_to_it(make: Callable[[], object]) -> None:
+def test_it_is_in_no_reference_cycle(make: Callable[[], object]) -> None:
     thing = make()
     gone = weakref.ref(thing)
     del thing

@@ -1,4 +1,4 @@
-"""Whatever a name holds, a terminal gets nothing of it to obey, and JSON keeps its value."""
+"""Control characters of names are escaped in text and JSON output, and JSON keeps its value."""
 
 import json
 import unicodedata
@@ -19,8 +19,8 @@ HOSTILE = st.text(
 )
 
 
-def obeyed(text: str) -> set[str]:
-    """The characters that a terminal acts on instead of showing them, told by Unicode's tables."""
+def control_characters(text: str) -> set[str]:
+    """The characters that a terminal interprets instead of showing them, by Unicode's tables."""
     return {
         char
         for char in text
@@ -30,14 +30,14 @@ def obeyed(text: str) -> set[str]:
 
 
 @given(HOSTILE)
-def test_nothing_is_left_to_obey(text: str) -> None:
-    assert obeyed(visible(text)) == set()
-    assert obeyed(visible_lines(text)) <= {"\n"}
+def test_no_control_character_is_left(text: str) -> None:
+    assert control_characters(visible(text)) == set()
+    assert control_characters(visible_lines(text)) <= {"\n"}
     assert visible_lines(text).count("\n") == text.count("\n")
 
 
 @given(st.text(st.characters(categories=["L", "N", "P", "S", "Zs", "M"])))
-def test_names_in_any_script_stay_as_they_are(text: str) -> None:
+def test_letters_of_any_script_are_not_escaped(text: str) -> None:
     assert visible(text) == text == visible_lines(text) == visible_json(text)
 
 
@@ -51,7 +51,7 @@ def test_names_in_any_script_stay_as_they_are(text: str) -> None:
         ("Küche 🪑 مطبخ", "Küche 🪑 مطبخ"),
     ],
 )
-def test_what_is_escaped_can_still_be_read(text: str, shown: str) -> None:
+def test_escapes_are_readable(text: str, shown: str) -> None:
     assert visible(text) == shown
 
 
@@ -59,5 +59,5 @@ def test_what_is_escaped_can_still_be_read(text: str, shown: str) -> None:
 @pytest.mark.parametrize("indent", [None, 2])
 def test_json_keeps_its_value(indent: int | None, document: Any) -> None:
     text = visible_json(json.dumps(document, ensure_ascii=False, indent=indent))
-    assert obeyed(text) <= {"\n"}
+    assert control_characters(text) <= {"\n"}
     assert json.loads(text) == document

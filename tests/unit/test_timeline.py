@@ -1,4 +1,4 @@
-"""A merge written out by hand, and everything a timeline says about it."""
+"""Answers of a timeline over a small log with one merge."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -37,7 +37,7 @@ def corridor(tmp_path: Path) -> Iterator[Timeline]:
         yield opened
 
 
-def test_the_merge_is_told_whole(corridor: Timeline) -> None:
+def test_a_merge_with_its_chain_objects_and_edges(corridor: Timeline) -> None:
     (merge,) = corridor.merges()
     (cup,) = corridor.at().objects
     document = merge_document(corridor.history, merge)
@@ -73,13 +73,13 @@ def test_merges_before_an_offset(corridor: Timeline) -> None:
     assert len(corridor.merges(9)) == 1
 
 
-def test_it_shows_from_the_next_offset_on(corridor: Timeline) -> None:
+def test_a_merge_shows_from_the_next_offset_on(corridor: Timeline) -> None:
     assert [p.place_id for p in corridor.at(8).places.values()] == ["run-a_p0", "run-a_p1"]
     assert [p.place_id for p in corridor.at(9).places.values()] == ["run-a_p0"]
     assert corridor.bisect("merged('run-a_p1')").document()["found"]["at"] == 9
 
 
-def test_a_standing_place_is_told(corridor: Timeline) -> None:
+def test_why_of_a_standing_place(corridor: Timeline) -> None:
     story = corridor.why("run-a_p0")
     assert [(e.cause.offset, e.what) for e in story.entries] == [(2, "founded"), (8, "absorbed")]
     assert story.summary == "8 keyframes around (3.25, 0.00); 1 object: cup; next to no other place"
@@ -94,21 +94,21 @@ def test_a_standing_place_is_told(corridor: Timeline) -> None:
     )
 
 
-def test_an_absorbed_place_is_told_with_who_and_when(corridor: Timeline) -> None:
+def test_why_of_an_absorbed_place(corridor: Timeline) -> None:
     story = corridor.why("run-a_p1")
     assert story.summary == "absorbed by run-a_p0 at offset 8 (2026-03-24T13:00:09.000Z)"
     assert story.facts["absorbed_by"]["place_id"] == "run-a_p0"
     assert [e.what for e in story.entries] == ["founded", "ended"]
 
 
-def test_a_story_may_end_earlier(corridor: Timeline) -> None:
+def test_why_at_an_earlier_offset(corridor: Timeline) -> None:
     story = corridor.why("run-a_p1", 8)
     assert story.facts["stands"] is True
     assert [e.what for e in story.entries] == ["founded"]
     assert corridor.why("run-a_p1", 2).summary == ("not founded yet; run-a:6 founds it at offset 5")
 
 
-def test_an_object_is_told(corridor: Timeline) -> None:
+def test_why_of_an_object(corridor: Timeline) -> None:
     (cup,) = corridor.at().objects
     story = corridor.why(cup.object_id)
     assert story.summary == (
@@ -133,11 +133,13 @@ def test_an_object_is_told(corridor: Timeline) -> None:
         ("run-a:7", "run-a:8", "not in one place: run-a:7 has no pose; run-a:8 is noise"),
     ],
 )
-def test_pairs_are_told(corridor: Timeline, first: str, second: str, summary: str) -> None:
+def test_why_same_of_two_keyframes(
+    corridor: Timeline, first: str, second: str, summary: str
+) -> None:
     assert corridor.why_same(first, second).summary == summary
 
 
-def test_a_pair_that_has_not_come_yet(corridor: Timeline) -> None:
+def test_why_same_before_the_keyframes_are_recorded(corridor: Timeline) -> None:
     story = corridor.why_same("run-a:1", "run-a:10", 3)
     assert story.summary == ("not in one place: run-a:1 is in run-a_p0; run-a:10 has not come yet")
     assert story.facts == {"same": False, "since": None, "places": ["run-a_p0", None]}
@@ -162,13 +164,13 @@ def test_an_absent_keyframe_lists_the_near_ones(corridor: Timeline) -> None:
         corridor.why_same("run-a:1", "run-a:12")
 
 
-def test_a_condition_on_something_absent_is_refused_at_its_column(corridor: Timeline) -> None:
+def test_a_condition_on_an_unknown_name_is_an_error_at_its_column(corridor: Timeline) -> None:
     with pytest.raises(ExpressionError, match="no place 'run-a_p9'") as caught:
         corridor.bisect("place_count < 3 and merged('run-a_p9')")
     assert caught.value.column == 28
 
 
-def test_bisect_tells_the_values_on_both_sides(corridor: Timeline) -> None:
+def test_bisect_gives_the_values_before_and_after(corridor: Timeline) -> None:
     search = corridor.bisect("place_count == 1 and keyframe_count > 5")
     assert search.found is not None
     assert search.found.cause.name == "run-a:9"
@@ -182,19 +184,19 @@ def test_a_scan_lists_every_turn(corridor: Timeline) -> None:
     assert search.holds == (False, True)
 
 
-def test_what_never_turns(corridor: Timeline) -> None:
+def test_a_condition_that_never_becomes_true(corridor: Timeline) -> None:
     assert corridor.bisect("place_count > 9").found is None
     assert corridor.bisect("keyframe_count >= 0").holds == (True, True)
 
 
-def test_a_monotone_condition_asks_few_maps(corridor: Timeline) -> None:
+def test_a_monotone_condition_is_evaluated_at_few_offsets(corridor: Timeline) -> None:
     search = corridor.bisect("keyframe_count >= 6")
     assert search.found is not None
     assert search.found.cause.offset == 5
     assert search.evaluations <= 6
 
 
-def test_equal_moments_say_so(corridor: Timeline) -> None:
+def test_the_difference_of_equal_maps(corridor: Timeline) -> None:
     assert corridor.diff(4, 4).same
     diff = corridor.diff(8, 9)
     assert not diff.same
@@ -213,7 +215,7 @@ def test_a_point_beyond_the_log_is_refused(corridor: Timeline) -> None:
         corridor.at(-1)
 
 
-def test_it_takes_in_what_is_recorded_later(tmp_path: Path) -> None:
+def test_refresh_includes_later_events(tmp_path: Path) -> None:
     log = write_log(tmp_path / "log", CORRIDOR[:8])
     with Timeline(log, RULES) as opened:
         assert opened.merges() == []
