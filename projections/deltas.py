@@ -145,7 +145,7 @@ class Link(msgspec.Struct, frozen=True, gc=False):
 class PlacesMerged(msgspec.Struct, frozen=True, gc=False):
     """Places became one. All members of ``absorbed`` belong to ``survivor`` from now on.
 
-    No KeyframePlaced is emitted for them: whoever keeps members moves them all. ``bridge`` is the
+    No KeyframePlaced is emitted for them: who keeps members must move them all. ``bridge`` is the
     keyframe whose arrival did it, ``links`` the pairs of core points that join the parts, one pair
     for each absorbed place. ``survivor_count`` and ``absorbed_counts`` are members before
     the merge.

@@ -22,7 +22,7 @@ NearTest = Callable[[int, int], bool]
 
 
 def accepted(document: dict[str, Any]) -> Accepted:
-    """The document as the door lets it in."""
+    """The document as validation accepts it."""
     result = ingest(payload(document))
     assert isinstance(result, Accepted), result
     return result
@@ -45,7 +45,7 @@ class Folded:
         settings = (settings or Settings()).model_copy(update={"neighbourhood": named})
         return cls(SemanticMap(settings, neighbourhood), MapView(settings), [])
 
-    def take(self, documents: Iterable[dict[str, Any]]) -> "Folded":
+    def extend(self, documents: Iterable[dict[str, Any]]) -> "Folded":
         """Fold these too."""
         for document in documents:
             deltas = self.map.fold(self.map.next_offset, accepted(document))
@@ -60,7 +60,7 @@ class Folded:
 
 def fold(documents: Iterable[dict[str, Any]], **settings: Any) -> Folded:
     """Fold documents from nothing."""
-    return Folded.start(Settings(**settings)).take(documents)
+    return Folded.start(Settings(**settings)).extend(documents)
 
 
 def batch_dbscan(are_near: np.ndarray, min_samples: int) -> tuple[np.ndarray, set[int]]:

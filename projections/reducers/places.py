@@ -200,9 +200,9 @@ class Places:
                     own = place
                     touched.setdefault(place, (core, first))
                 elif place == own:
-                    index.mark_one_cluster(core, cell)  # type: ignore[arg-type]
+                    index.mark_one_cluster(core, cell)
                 elif place not in touched:
-                    neighbour = index.core_in_reach(cell, core)  # type: ignore[arg-type]
+                    neighbour = index.core_in_reach(cell, core)
                     if neighbour is not None:  # a fresh one has the older ``first`` beside it
                         pair = (neighbour, first) if neighbour in fresh else (core, neighbour)
                         touched[place] = pair
@@ -215,7 +215,7 @@ class Places:
             place = self.survivors.find(self.joined[first])
             if earliest is not None and earliest < place:
                 continue
-            if cell is None or index.core_in_reach(cell, point) is not None:  # type: ignore[arg-type]
+            if cell is None or index.core_in_reach(cell, point) is not None:
                 earliest = place
         return earliest
 

@@ -71,11 +71,11 @@ class RuleCoreIndex:
         """Each core point among the point's neighbours; see `CoreIndex.cores_around`."""
         return ((other, None) for other in self._neighbours(point) if self.is_core(other))
 
-    def core_in_reach(self, cell: None, point: int) -> int | None:
+    def core_in_reach(self, cell: object, point: int) -> int | None:
         """Never called: `cores_around` gives neighbours only."""
         raise NotImplementedError
 
-    def mark_one_cluster(self, point: int, cell: None) -> None:
+    def mark_one_cluster(self, point: int, cell: object) -> None:
         """Does nothing: under a rule, a cell is no cluster."""
 
     def non_core_around(self, point: int) -> Iterator[int]:

@@ -6,7 +6,7 @@ from projections.deltas import PlaceOrdinal
 
 
 class PlaceSurvivors:
-    """Tell it every merge, in order. Places never heard of stand for themselves.
+    """Absorbed places and their survivors; `merge` is called for every merge, in order.
 
     ``absorbed_by`` maps each absorbed place to one that took it over, which may have been absorbed
     itself; `find` shortens these chains.

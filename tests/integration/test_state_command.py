@@ -112,7 +112,7 @@ def test_settings_come_from_file_and_set_on_top(mapfold: Commands, log: Path) ->
     assert [p["keyframe_count"] for p in said["places"]] == [7]
 
 
-def test_people_read_a_short_table(mapfold: Commands, log: Path) -> None:
+def test_the_text_is_a_short_table(mapfold: Commands, log: Path) -> None:
     lines = mapfold("state", log).out.splitlines()
     assert lines[0] == (
         "after 9 events: 1 run, 8 keyframes, 7 observations, 3 objects, 2 places, "

@@ -1,4 +1,4 @@
-"""Everything the fold keeps up to date equals a count from scratch, after every keyframe."""
+"""The view and the reducers equal a recount from scratch after every keyframe."""
 
 import math
 import random
@@ -58,10 +58,10 @@ def _detection(rng: random.Random, det_id: str) -> dict[str, Any]:
 
 
 @given(documents=runs())
-def test_recounts(documents: list[dict[str, Any]]) -> None:
+def test_the_view_equals_a_recount_after_every_event(documents: list[dict[str, Any]]) -> None:
     folded = Folded.start(fold([], **SETTINGS).view.settings)
     for document in documents:
-        view = folded.take([document]).view
+        view = folded.extend([document]).view
         assert view.adjacency == recounted_adjacency(view)
         assert [found.place for found in view.objects] == recounted_locations(view)
         counted = recounted_places(view)
@@ -104,9 +104,9 @@ def test_applying_every_event_twice_changes_nothing(documents: list[dict[str, An
 
 
 @given(documents=runs(), cut=st.integers(0, 45))
-def test_chunks_do_not_matter(documents: list[dict[str, Any]], cut: int) -> None:
+def test_folding_in_two_parts_changes_nothing(documents: list[dict[str, Any]], cut: int) -> None:
     whole = fold(documents, **SETTINGS)
-    parts = Folded.start(whole.view.settings).take(documents[:cut]).take(documents[cut:])
+    parts = Folded.start(whole.view.settings).extend(documents[:cut]).extend(documents[cut:])
     assert map_digest(parts.view) == map_digest(whole.view)
 
 

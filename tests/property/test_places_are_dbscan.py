@@ -1,4 +1,4 @@
-"""After every keyframe the places are what batch DBSCAN and the rules, word by word, say."""
+"""After every keyframe the places equal batch DBSCAN and a naive implementation of the rules."""
 
 import math
 
@@ -79,7 +79,7 @@ def test_plain_distance_equals_batch_dbscan(points: list[Point], least: int) -> 
 
 
 @given(points=POINTS, least=st.integers(1, 5), eps=st.integers(0, 4))
-def test_the_smallest_epsilons_too(points: list[Point], least: int, eps: int) -> None:
+def test_smallest_epsilons_equal_batch_dbscan(points: list[Point], least: int, eps: int) -> None:
     small = [(x // 500_000, y // 500_000, yaw) for x, y, yaw in points]
 
     def is_near(i: int, j: int) -> bool:

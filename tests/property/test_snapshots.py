@@ -39,11 +39,11 @@ def test_restore_then_fold_is_fold_from_the_start(
     documents: list[dict[str, Any]], cut: int, least: int, rule: Neighbourhood | None
 ) -> None:
     settings = Settings(**{**SETTINGS, "min_samples": least})
-    whole = Folded.start(settings, rule).take(documents)
-    begun = Folded.start(settings, rule).take(documents[:cut])
+    whole = Folded.start(settings, rule).extend(documents)
+    begun = Folded.start(settings, rule).extend(documents[:cut])
     data = snapshot(begun.map, begun.view, "log")
     again = Folded(*restore(data, begun.view.settings, "log", rule), [])
-    again.take(documents[cut:])
+    again.extend(documents[cut:])
     assert [list(map(_plain, d)) for d in again.deltas] == [
         list(map(_plain, d)) for d in whole.deltas[cut:]
     ]
@@ -59,7 +59,7 @@ def test_a_restored_fold_gives_the_same_snapshot(documents: list[dict[str, Any]]
     assert _lists(unpack(data)) == _lists(unpack(snapshot(*again, "log")))
 
 
-def test_a_dump_does_not_tell_in_which_order_edges_came_and_went() -> None:
+def test_a_dump_does_not_depend_on_the_order_of_edge_changes() -> None:
     adjacency = Adjacency()
     for run, keyframe_id, place in ((0, 0, 3), (0, 10, 8), (1, 0, 4), (1, 1, 9), (0, 5, 5)):
         adjacency.keyframe_placed(run, keyframe_id, place)

@@ -26,7 +26,7 @@ def _check(order: list[int]) -> None:
 
 
 @given(order=st.lists(st.integers(-(10**5), 10**5), unique=True, max_size=60))
-def test_any_order(order: list[int]) -> None:
+def test_keys_added_in_any_order(order: list[int]) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_sorted_keys, "_BLOCK", 4)
         if order:
@@ -34,12 +34,12 @@ def test_any_order(order: list[int]) -> None:
 
 
 @pytest.mark.parametrize("seed", [None, 1])
-def test_more_than_a_few_blocks(seed: int | None) -> None:
+def test_keys_over_many_blocks(seed: int | None) -> None:
     order = list(range(9_000))
     if seed is not None:
         random.Random(seed).shuffle(order)
     _check(order)
 
 
-def test_backwards() -> None:
+def test_keys_added_in_descending_order() -> None:
     _check(list(range(9_000, 0, -1)))

@@ -1,4 +1,4 @@
-"""The fold, its deltas and its view together equal a fold written as plainly as can be."""
+"""The fold, its deltas and its view together equal a naive implementation."""
 
 import random
 from typing import Any
@@ -77,7 +77,7 @@ def test_after_every_event_the_digest_is_that_of_the_naive_map(
 
 
 @given(world=worlds())
-def test_and_so_it_is_under_another_neighbourhood(
+def test_the_digest_is_that_of_the_naive_map_under_another_neighbourhood(
     world: tuple[dict[str, Any], list[dict[str, Any]]],
 ) -> None:
     settings, documents = world
@@ -86,14 +86,14 @@ def test_and_so_it_is_under_another_neighbourhood(
 
 
 @given(world=worlds())
-def test_and_so_it_is_when_every_event_is_folded_by_a_restored_map(
+def test_the_digest_is_that_of_the_naive_map_when_every_event_is_folded_by_a_restored_map(
     world: tuple[dict[str, Any], list[dict[str, Any]]],
 ) -> None:
     raw, documents = world
     settings, naive = Settings(**raw), NaiveMap(raw)
     folded = Folded.start(settings)
     for document in documents:
-        folded.take([document])
+        folded.extend([document])
         naive.fold(document)
         assert map_digest(folded.view) == naive.digest()
         folded = Folded(*restore(snapshot(folded.map, folded.view, "log"), settings, "log"), [])
@@ -102,7 +102,7 @@ def test_and_so_it_is_when_every_event_is_folded_by_a_restored_map(
 
 def check_every_prefix(folded: Folded, naive: NaiveMap, documents: list[dict[str, Any]]) -> None:
     for document in documents:
-        folded.take([document])
+        folded.extend([document])
         naive.fold(document)
         assert map_digest(folded.view) == naive.digest()
     assert folded.view.skipped == {

@@ -1,4 +1,4 @@
-"""The digest's lines are JSON: those written by hand say what an encoder says."""
+"""The digest's lines are JSON: those formatted by hand equal those of an encoder."""
 
 import hashlib
 import json

@@ -1,4 +1,4 @@
-"""Exact arithmetic: correctly rounded where it rounds, guarded where it ends."""
+"""Exact arithmetic: correct rounding, and its bounds."""
 
 import math
 from decimal import ROUND_HALF_EVEN, Decimal

@@ -1,4 +1,4 @@
-"""Events to deltas: what is passed over, what is refused; reading ahead changes nothing."""
+"""Folding events: what is skipped, what is refused; reading ahead changes nothing."""
 
 import gc
 
@@ -72,7 +72,7 @@ def test_fold_event_gives_the_deltas_of_one() -> None:
 
 
 @pytest.mark.parametrize("was_on", [True, False])
-def test_the_garbage_collector_is_left_as_it_was(was_on: bool) -> None:
+def test_the_garbage_collector_is_left_on_or_off_as_it_was(was_on: bool) -> None:
     before = gc.isenabled()
     try:
         (gc.enable if was_on else gc.disable)()

@@ -1,4 +1,4 @@
-"""Small worlds whose places anyone can work out on paper."""
+"""Places of small worlds whose answers are known."""
 
 import random
 

@@ -1,4 +1,4 @@
-"""What the fold does with repeats, lost robots and foreign vectors; and that it asks nobody."""
+"""The fold: duplicates, conflicts, missing poses, foreign vectors, fusion; and its purity."""
 
 import builtins
 import datetime
@@ -87,7 +87,7 @@ def test_a_det_id_of_an_earlier_keyframe_is_left_out_and_the_rest_folded() -> No
     assert folded.view.counts()["det_ids_reused"] == 1
 
 
-def test_a_robot_without_a_pose_is_kept_but_neither_placed_nor_fused() -> None:
+def test_a_keyframe_without_a_pose_is_kept_but_neither_placed_nor_fused() -> None:
     lost = envelope(1, None, detections=[detection(vector=[1, 0])])
     view = fold([lost, *(envelope(i, 0.0, 0.0) for i in (2, 3, 4))]).view
     assert view.keyframes[0].pose is None
@@ -148,17 +148,17 @@ def test_fusion_is_inclusive_at_its_radius_and_exclusive_beyond() -> None:
     assert objects(3.000001) == 2
 
 
-def test_more_than_4096_sightings_stay_exact() -> None:
+def test_more_than_4096_observations_of_an_object_stay_exact() -> None:
     """Beyond 2¹² observations it takes two products; the cosine stays what it is."""
     folded = Folded.start(Settings())
-    folded.take(envelope(i, 0.0, 0.0, detections=[detection(vector=[3, 4])]) for i in range(4100))
+    folded.extend(envelope(i, 0.0, 0.0, detections=[detection(vector=[3, 4])]) for i in range(4100))
     assert folded.view.objects[0].obs_count == 4100
     assert {o.similarity_q40 for o in folded.view.observations} == {2**40}
     landmark = folded.map.landmarks.objects[0]
     assert landmark.norm2 == sum(int(v) ** 2 for v in landmark.vector_sum)
 
 
-def test_opposite_looks_leave_an_object_without_a_direction_and_the_fold_goes_on() -> None:
+def test_opposite_vectors_leave_an_object_without_a_direction() -> None:
     """At −1 everything fuses; the third look meets a sum of zero, whose cosine is 0."""
     looks = [[3, 4], [-3, -4], [3, 4]]
     documents = [
@@ -171,21 +171,23 @@ def test_opposite_looks_leave_an_object_without_a_direction_and_the_fold_goes_on
     assert len(view.objects) == 2
 
 
-def test_an_object_seen_for_years_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Five million sightings of one chair, and at the very last the bound is said in words."""
+def test_an_object_is_fused_up_to_the_bound_of_its_sums(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Five million observations of one chair; at the bound the error names the object."""
     folded = fold([envelope(0, 0.0, 0.0, detections=[detection(vector=[3, 4])])])
     chair = folded.map.landmarks.objects[0]
     times = 5_000_000
     chair.vector_sum *= times
     chair.norm2, chair.count = chair.norm2 * times**2, times
-    folded.take([envelope(1, 0.0, 0.0, detections=[detection(vector=[3, 4])])])
+    folded.extend([envelope(1, 0.0, 0.0, detections=[detection(vector=[3, 4])])])
     assert folded.view.objects[0].obs_count == times + 1
     assert folded.view.observations[1].similarity_q40 == 2**40
     assert chair.norm2 == sum(int(v) ** 2 for v in chair.vector_sum)
     monkeypatch.setattr(landmarks, "MAX_IN_A_SUM", times + 1)
     before = chair.vector_sum.copy()
     with pytest.raises(OverflowError, match=r"object 0 of class 'cup' has 5000001 observations"):
-        folded.take([envelope(2, 0.0, 0.0, detections=[detection(vector=[3, 4])])])
+        folded.extend([envelope(2, 0.0, 0.0, detections=[detection(vector=[3, 4])])])
     assert (chair.vector_sum == before).all()
 
 
@@ -215,7 +217,7 @@ def test_the_deltas_of_a_keyframe_come_in_the_order_of_the_contract() -> None:
     ]
 
 
-def test_a_fold_does_not_begin_by_another_neighbourhood_than_its_settings_name() -> None:
+def test_a_neighbourhood_other_than_the_settings_name_is_refused() -> None:
     rule = Neighbourhood("walls", 1_000_000, lambda _a, _b: True)
     for settings, given in (
         (Settings(), rule),
@@ -235,7 +237,7 @@ def test_skip_passes_over_an_offset_and_changes_nothing() -> None:
     assert [d.offset for d in deltas if type(d) is KeyframeAdded] == [1]
 
 
-def test_the_fold_asks_neither_clock_nor_chance_nor_disk_nor_network(
+def test_the_fold_uses_no_clock_chance_disk_or_network(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     documents = [

@@ -1,4 +1,4 @@
-"""Settings: assignments from the command line, fingerprints, refusals in words."""
+"""Settings: assignments from the command line, fingerprints, messages of refusals."""
 
 import pytest
 
@@ -78,9 +78,7 @@ def test_the_fingerprint_tells_settings_apart() -> None:
     assert Settings(eps_m=1.5).fingerprint() == Settings().fingerprint()
 
 
-def test_a_neighbourhood_by_name_changes_the_fingerprint_and_none_leaves_it_as_it_ever_was() -> (
-    None
-):
+def test_a_neighbourhood_changes_the_fingerprint_and_none_keeps_that_of_older_versions() -> None:
     """The first two were in checkpoints before the setting was there."""
     assert Settings().fingerprint() == "4bd37ebd4fe729af"
     assert Settings(eps_m=0.75, min_samples=8).fingerprint() == "9356e0fc03e32754"

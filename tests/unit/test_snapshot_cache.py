@@ -1,4 +1,4 @@
-"""The cache beside a log: used when sound, passed over with a note when not."""
+"""The snapshot cache: usable snapshots are used, others are passed over with a note."""
 
 import contextlib
 import hashlib
@@ -71,7 +71,7 @@ def _files(log: Path) -> list[Path]:
 
 
 @pytest.mark.usefixtures("eager")
-def test_a_fold_is_taken_up_where_the_nearest_snapshot_was_put_down(
+def test_a_fold_continues_from_the_nearest_snapshot(
     log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     notes: list[str] = []
@@ -172,7 +172,7 @@ def test_a_cache_that_cannot_be_written_is_a_note(log: Path) -> None:
 
 
 @pytest.mark.usefixtures("eager")
-def test_few_are_kept_the_newest_among_them(log: Path) -> None:
+def test_a_few_snapshots_are_kept_the_newest_among_them(log: Path) -> None:
     for until in range(1, 60, 4):
         _digest(log, until, [])
     with LogReader(log) as reader:
@@ -235,7 +235,7 @@ def test_restore_refuses_other_settings() -> None:
 @pytest.mark.parametrize("instead", [None, 7, "x", [], [[1]], {}, 1 << 70, np.zeros((2, 2))])
 def test_restore_refuses_content_that_does_not_fit_together(instead: Any) -> None:
     """Whatever stands in place of any value, by another hand: a refusal, or a map, but no crash."""
-    folded = Folded.start().take(_documents(5))
+    folded = Folded.start().extend(_documents(5))
     state = unpack(snapshot(folded.map, folded.view, "log"))
     for name in state:
         if not name.startswith("about."):
@@ -246,7 +246,7 @@ def test_restore_refuses_content_that_does_not_fit_together(instead: Any) -> Non
             restore(pack({k: v for k, v in state.items() if k != name}), Settings(), "log")
 
 
-def test_a_container_holds_no_objects() -> None:
+def test_bytes_with_another_head_or_checksum_are_refused() -> None:
     with pytest.raises(MalformedSnapshot, match="does not begin"):
         unpack(b"\x80\x04pickle")
     body = zlib.compress(b"")
@@ -254,7 +254,7 @@ def test_a_container_holds_no_objects() -> None:
         unpack(MAGIC + b"0" * 32 + body)
 
 
-def test_a_snapshot_that_unfolds_to_very_much_is_refused() -> None:
+def test_a_decompression_bomb_is_refused() -> None:
     squeeze = zlib.compressobj(1)
     body = b"".join(squeeze.compress(bytes(1_000_000)) for _ in range(500)) + squeeze.flush()
     assert len(body) < 4_000_000
