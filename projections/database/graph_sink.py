@@ -45,17 +45,17 @@ class GraphSink:
     def __init__(self, loader: LoaderName = "copy") -> None:
         self._loader: Loader = loader_of(loader)
 
-    def ensure(self, transaction: Connection) -> bool:
+    def ensure(self, connection: Connection) -> bool:
         """Create an empty graph if there is none."""
-        ensure_extension(transaction, "age")
-        if graph_schema.exists(transaction, GRAPH):
+        ensure_extension(connection, "age")
+        if graph_schema.exists(connection, GRAPH):
             return False
-        graph_schema.create(transaction, GRAPH)
-        graph_schema.index(transaction, GRAPH)
+        graph_schema.create(connection, GRAPH)
+        graph_schema.index(connection, GRAPH)
         return True
 
     def prepare(self, changes: BatchChanges, view: MapView) -> PreparedWrite[Connection]:
-        """Rows that a batch changed; new ones are not worth a COPY if they are few."""
+        """Rows that a batch changed."""
         rows = changed_rows(changes, view)
         is_small = sum(map(len, rows.inserted.values())) < SMALL_BATCH
         return PreparedWrite(partial(self._write, rows, is_small), is_small)
@@ -74,29 +74,29 @@ class GraphSink:
             )
             connection.execute(query, [[str(i) for i in ids]])
 
-    def drop_leftovers(self, transaction: Connection) -> None:
+    def drop_leftovers(self, connection: Connection) -> None:
         """Drop a replaced graph that a reader held on to; refuse a graph that is not ours.
 
         Not inside the rebuild's transaction: AGE 1.5 crashes the session that drops a graph after
         it has made another one in the same transaction.
         """
-        ensure_extension(transaction, "age")
-        graph_schema.exists(transaction, GRAPH)
-        if swap.try_drop_lock(transaction, self.name):
+        ensure_extension(connection, "age")
+        graph_schema.exists(connection, GRAPH)
+        if swap.try_drop_lock(connection, self.name):
             for graph in (OLD_GRAPH, NEXT_GRAPH):
-                with transaction.transaction():
-                    graph_schema.drop(transaction, graph)
+                with connection.transaction():
+                    graph_schema.drop(connection, graph)
 
     def shadow(self) -> "GraphShadow":
         """A shadow, not created yet."""
         return GraphShadow(self._loader)
 
-    def drop_replaced(self, transaction: Connection) -> None:
+    def drop_replaced(self, connection: Connection) -> None:
         """Have the replaced graph dropped once its last reader is gone."""
-        if swap.wait_for_earlier_transactions(transaction) and swap.try_drop_lock(
-            transaction, self.name
+        if swap.wait_for_earlier_transactions(connection) and swap.try_drop_lock(
+            connection, self.name
         ):
-            graph_schema.drop_in_background(transaction, OLD_GRAPH)
+            graph_schema.drop_in_background(connection, OLD_GRAPH)
 
 
 class GraphShadow:
@@ -105,17 +105,18 @@ class GraphShadow:
     def __init__(self, loader: Loader) -> None:
         self._loader = loader
 
-    def create(self, transaction: Connection) -> None:
+    def create(self, connection: Connection) -> None:
         """Create an empty graph and its early indexes."""
-        graph_schema.create(transaction, NEXT_GRAPH)
-        graph_schema.index(transaction, NEXT_GRAPH, EARLY)
+        graph_schema.create(connection, NEXT_GRAPH)
+        graph_schema.index(connection, NEXT_GRAPH, EARLY)
 
     def load(self, changes: BatchChanges, view: MapView) -> Load:
-        """What writes the fixed rows of new keyframes and observations."""
+        """Returns a function that writes the fixed rows of new keyframes and observations."""
         return self._load(fixed_rows(view, changes.keyframes, changes.observations))
 
     def finish(self, view: MapView) -> Callable[[Connection], Mapping[str, int]]:
-        """What writes the changing rows, builds the other indexes and compares numbers by label."""
+        """Returns a function that writes the changing rows, builds the other indexes and compares
+        numbers by label."""
         load, counts = self._load(changing_rows(view)), view.counts()
         expected = {label: counts[COUNT_KEYS[label]] for label in LABELS}
 
@@ -127,15 +128,15 @@ class GraphShadow:
 
         return finish
 
-    def lock_readers(self, transaction: Connection) -> None:
+    def lock_readers(self, connection: Connection) -> None:
         """Keep readers away from the graph."""
-        swap.wait_for_drop(transaction, GraphSink.name)
-        graph_schema.lock(transaction, GRAPH)
+        swap.wait_for_drop(connection, GraphSink.name)
+        graph_schema.lock(connection, GRAPH)
 
-    def swap_in(self, transaction: Connection) -> None:
+    def swap_in(self, connection: Connection) -> None:
         """Put the shadow in the readers' place, open to the same roles."""
-        copy_privileges(transaction, GRAPH, NEXT_GRAPH)
-        graph_schema.swap_in(transaction, NEXT_GRAPH)
+        copy_privileges(connection, GRAPH, NEXT_GRAPH)
+        graph_schema.swap_in(connection, NEXT_GRAPH)
 
     def _load(self, rows_of: Mapping[Label, list[Any]]) -> Load:
         loads = [

@@ -39,7 +39,7 @@ class MemoryTables:
 class MemorySink:
     """Implements `LiveSink` and `RebuildSink` for both graph and vectors."""
 
-    def ensure(self, transaction: MemoryTables) -> bool:  # noqa: ARG002 - the port
+    def ensure(self, connection: MemoryTables) -> bool:  # noqa: ARG002 - the port
         """Nothing to do: `MemoryTables` begins with its tables."""
         return False
 
@@ -53,14 +53,14 @@ class MemorySink:
 
         return PreparedWrite(send, is_small=True)
 
-    def drop_leftovers(self, transaction: MemoryTables) -> None:
+    def drop_leftovers(self, connection: MemoryTables) -> None:
         """Nothing to do: an unfinished shadow is in no table."""
 
     def shadow(self) -> "MemoryShadow":
         """A shadow, not created yet."""
         return MemoryShadow()
 
-    def drop_replaced(self, transaction: MemoryTables) -> None:
+    def drop_replaced(self, connection: MemoryTables) -> None:
         """Nothing to do: `MemoryShadow.swap_in` has let go of it."""
 
 
@@ -70,7 +70,7 @@ class MemoryShadow:
     def __init__(self) -> None:
         self._new = MemoryTables()
 
-    def create(self, transaction: MemoryTables) -> None:  # noqa: ARG002 - the port
+    def create(self, connection: MemoryTables) -> None:  # noqa: ARG002 - the port
         """Create it, empty."""
         self._new = MemoryTables()
 
@@ -96,12 +96,12 @@ class MemoryShadow:
 
         return finish
 
-    def lock_readers(self, transaction: MemoryTables) -> None:
+    def lock_readers(self, connection: MemoryTables) -> None:
         """Nothing to do: nobody reads in the middle of `swap_in`."""
 
-    def swap_in(self, transaction: MemoryTables) -> None:
+    def swap_in(self, connection: MemoryTables) -> None:
         """Replace the tables' rows."""
-        transaction.graph, transaction.vectors = self._new.graph, self._new.vectors
+        connection.graph, connection.vectors = self._new.graph, self._new.vectors
 
 
 def _write_graph(tables: MemoryTables, rows: GraphRows) -> None:

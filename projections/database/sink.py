@@ -1,10 +1,9 @@
 """The port between the fold and what the map is written to.
 
 A sink that follows a log implements `LiveSink`. For each batch of events the runner (`tail`) calls
-`prepare` with what the batch changed and the view, opens a transaction, calls what `prepare`
-returned, moves the sink's checkpoint and commits: rows and checkpoint are written together or not
-at all. After a lost connection it calls `ensure` and, if the batch was not committed, the same
-prepared write again.
+`prepare` with the ids that the batch changed and the view, opens a transaction, calls ``send`` of
+the prepared write, moves the sink's checkpoint and commits: both are written or none. After a lost
+connection it calls `ensure` and, if the batch was not committed, the same ``send`` again.
 
 A sink that can also be rebuilt from the start of a log implements `RebuildSink`; a sink of the
 databases (`stores.DatabaseSink`) does both. The runner (`rebuild`) calls, in this order:
@@ -12,17 +11,16 @@ databases (`stores.DatabaseSink`) does both. The runner (`rebuild`) calls, in th
 1. `RebuildSink.drop_leftovers`, outside a transaction; then it opens the one transaction of 2 to 5
 2. `Shadow.create`
 3. while the log is folded: `Shadow.load`, several times; at its end: `Shadow.finish`
-4. `Shadow.lock_readers`, for all shadows before any is swapped in, and again until all got theirs
-5. `Shadow.swap_in`; it replaces the checkpoint and commits. Readers see the old map until then
+4. `Shadow.lock_readers`, for all shadows before any is swapped in; again for all if one fails
+5. `Shadow.swap_in`; then it commits, with a new checkpoint. Readers see the old map until then
 6. `RebuildSink.drop_replaced`, outside a transaction
 
-``Tx`` is what an open transaction of the sink's store is: a psycopg connection for the databases,
-`memory_sink.MemoryTables` for memory. Methods that take the view take no transaction, so that the
-fold can go on while a thread sends what they returned.
+``Conn`` is what the sink writes through: a psycopg connection for the databases, `MemoryTables` for
+memory. It is in a transaction but for 1 and 6. Methods that take the view do not take it, so that
+the fold can go on while a thread calls what they returned.
 
-The runner writes only what the view has, and each event's changes once. Ordinals are ascending in
-`BatchChanges` and the same in every fold of a log: made into ids they give the same rows by tail
-and by rebuild, and no write has to look anything up.
+Each event's changes reach a sink once. Ordinals are the same in every fold of a log: a sink that
+computes its ids from them has the same rows after a tail and a rebuild, and never looks an id up.
 """
 
 from collections.abc import Callable, Mapping
@@ -35,7 +33,7 @@ from projections.model.view import MapView
 
 SinkName: TypeAlias = Literal["graph", "vectors"]
 """Under which checkpoints and locks in the databases know a sink."""
-Tx = TypeVar("Tx", contravariant=True)
+Conn = TypeVar("Conn", contravariant=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,62 +54,63 @@ class Checkpoint:
 
 
 @dataclass(frozen=True, slots=True)
-class PreparedWrite(Generic[Tx]):
+class PreparedWrite(Generic[Conn]):
     """The rows of a batch. ``send`` writes them, again if the first transaction failed.
 
     ``is_small`` says that ``send`` executes plain statements only, no COPY: a database can then
     take them in one round trip (a pipeline).
     """
 
-    send: Callable[[Tx], None]
+    send: Callable[[Conn], None]
     is_small: bool
 
 
-class LiveSink(Protocol[Tx]):
-    """Rows that follow the log."""
+class LiveSink(Protocol[Conn]):
+    """A sink that follows the log."""
 
-    def ensure(self, transaction: Tx) -> bool:
+    def ensure(self, connection: Conn) -> bool:
         """Create what is written to if it is missing; True then.
 
         Raises DatabaseError when something has its name that mapfold did not make.
         """
 
-    def prepare(self, changes: BatchChanges, view: MapView) -> PreparedWrite[Tx]:
-        """Rows to insert, update and delete after ``changes``, as ``view`` has them now."""
+    def prepare(self, changes: BatchChanges, view: MapView) -> PreparedWrite[Conn]:
+        """The write that makes the rows what ``view`` has now, after a batch's ``changes``."""
 
 
-class Shadow(Protocol[Tx]):
+class Shadow(Protocol[Conn]):
     """New rows beside those that readers see. It is made for one rebuild, which may fail."""
 
-    def create(self, transaction: Tx) -> None:
+    def create(self, connection: Conn) -> None:
         """Create it, empty."""
 
-    def load(self, changes: BatchChanges, view: MapView) -> Callable[[Tx], None]:
-        """What adds the rows of new keyframes and observations that never change again."""
+    def load(self, changes: BatchChanges, view: MapView) -> Callable[[Conn], None]:
+        """Returns a function that inserts rows of new keyframes and observations, those rows that
+        never change again."""
 
-    def finish(self, view: MapView) -> Callable[[Tx], Mapping[str, int]]:
-        """What adds all other rows, builds indexes and returns how many rows each table has.
+    def finish(self, view: MapView) -> Callable[[Conn], Mapping[str, int]]:
+        """Returns a function that inserts all other rows, builds indexes and counts rows by table.
 
-        That raises DatabaseError when the view has other numbers.
+        The function raises DatabaseError when the view has other numbers.
         """
 
-    def lock_readers(self, transaction: Tx) -> None:
+    def lock_readers(self, connection: Conn) -> None:
         """Lock what `swap_in` replaces against readers, until the transaction ends."""
 
-    def swap_in(self, transaction: Tx) -> None:
+    def swap_in(self, connection: Conn) -> None:
         """Put the shadow in the place of what readers see."""
 
 
-class RebuildSink(Protocol[Tx]):
-    """Rows that can be made anew while readers use the old ones."""
+class RebuildSink(Protocol[Conn]):
+    """A sink that can be made anew while readers use the old rows."""
 
-    def drop_leftovers(self, transaction: Tx) -> None:
+    def drop_leftovers(self, connection: Conn) -> None:
         """Drop what an earlier rebuild replaced or left. Raises DatabaseError like `ensure`."""
 
-    def shadow(self) -> Shadow[Tx]:
+    def shadow(self) -> Shadow[Conn]:
         """A shadow, not created yet."""
 
-    def drop_replaced(self, transaction: Tx) -> None:
+    def drop_replaced(self, connection: Conn) -> None:
         """Have what was replaced dropped, now or once its last reader is gone.
 
         It may close the connection and leave the server at work.

@@ -38,19 +38,19 @@ class VectorSink:
         self._dimension = dimension or DEFAULT_DIMENSION
         self._type: sql.Composable = sql.Identifier("vector")
 
-    def ensure(self, transaction: Connection) -> bool:
+    def ensure(self, connection: Connection) -> bool:
         """Create the table if there is none; learn the dimension it has."""
-        ensure_extension(transaction, "vector")
-        self._type = vector_table.vector_type(transaction)
-        dimension = vector_table.dimension(transaction)
+        ensure_extension(connection, "vector")
+        self._type = vector_table.vector_type(connection)
+        dimension = vector_table.dimension(connection)
         if dimension is None:
-            vector_table.create(transaction, READERS, self._type, self._dimension)
+            vector_table.create(connection, READERS, self._type, self._dimension)
             return True
         self._dimension = dimension
         return False
 
     def prepare(self, changes: BatchChanges, view: MapView) -> PreparedWrite[Connection]:
-        """Rows that a batch adds; they are not worth a COPY if they are few."""
+        """Rows that a batch adds."""
         rows = new_rows(changes, view)
         is_small = len(rows) < SMALL_BATCH
         return PreparedWrite(partial(self._write, rows, is_small), is_small)
@@ -66,24 +66,24 @@ class VectorSink:
         loader = InsertLoader() if is_small else self._loader
         loader.vectors(READERS, lambda: self._type, rows)(connection)
 
-    def drop_leftovers(self, transaction: Connection) -> None:
+    def drop_leftovers(self, connection: Connection) -> None:
         """Drop a replaced table that was left; refuse early if the name in use is not ours."""
-        ensure_extension(transaction, "vector")
-        vector_table.dimension(transaction)
-        if vector_table.has_old(transaction) and swap.try_drop_lock(transaction, self.name):
-            vector_table.drop_old(transaction)
+        ensure_extension(connection, "vector")
+        vector_table.dimension(connection)
+        if vector_table.has_old(connection) and swap.try_drop_lock(connection, self.name):
+            vector_table.drop_old(connection)
 
     def shadow(self) -> "VectorShadow":
         """A shadow, not created yet."""
         return VectorShadow(self._loader, self._dimension)
 
-    def drop_replaced(self, transaction: Connection) -> None:
+    def drop_replaced(self, connection: Connection) -> None:
         """Have the replaced table dropped."""
-        if vector_table.has_old(transaction) and swap.try_drop_lock(transaction, self.name):
-            vector_table.drop_old_in_background(transaction)
+        if vector_table.has_old(connection) and swap.try_drop_lock(connection, self.name):
+            vector_table.drop_old_in_background(connection)
 
     def _refuse_if_not_owner(self, connection: Connection, dimension: int) -> None:
-        """Asked beforehand: in a pipeline the server's own refusal comes too late to explain."""
+        """Checked beforehand: in a pipeline the server's own refusal comes too late to explain."""
         if not vector_table.is_owner(connection):
             raise DatabaseError(
                 f"{describe_connection(connection)}: the map's embeddings have {dimension}"
@@ -100,13 +100,13 @@ class VectorShadow:
         self._dimension = dimension
         self._type: sql.Composable = sql.Identifier("vector")
 
-    def create(self, transaction: Connection) -> None:
+    def create(self, connection: Connection) -> None:
         """Create an empty table."""
-        self._type = vector_table.vector_type(transaction)
-        vector_table.create(transaction, SHADOW, self._type, self._dimension)
+        self._type = vector_table.vector_type(connection)
+        vector_table.create(connection, SHADOW, self._type, self._dimension)
 
     def load(self, changes: BatchChanges, view: MapView) -> Load:
-        """What writes the rows of new observations."""
+        """Returns a function that writes the rows of new observations."""
         rows = new_rows(changes, view)
         if not rows:
             return lambda _: None
@@ -122,8 +122,8 @@ class VectorShadow:
         return load
 
     def finish(self, view: MapView) -> Callable[[Connection], Mapping[str, int]]:
-        """What gathers statistics and compares numbers. The keys' indexes are there already, HNSW
-        is built after the swap."""
+        """Returns a function that gathers statistics and compares numbers. The keys' indexes are
+        there already, HNSW is built after the swap."""
         expected = sum(o.embedding_crc is not None for o in view.observations)
 
         def finish(connection: Connection) -> Mapping[str, int]:
@@ -138,15 +138,15 @@ class VectorShadow:
 
         return finish
 
-    def lock_readers(self, transaction: Connection) -> None:
+    def lock_readers(self, connection: Connection) -> None:
         """Keep readers away from the table."""
-        swap.wait_for_drop(transaction, VectorSink.name)
-        if vector_table.dimension(transaction) is not None:
-            vector_table.lock(transaction)
+        swap.wait_for_drop(connection, VectorSink.name)
+        if vector_table.dimension(connection) is not None:
+            vector_table.lock(connection)
 
-    def swap_in(self, transaction: Connection) -> None:
+    def swap_in(self, connection: Connection) -> None:
         """Put the shadow in the readers' place, open to the same roles."""
-        if vector_table.dimension(transaction) is not None:
-            copy_privileges(transaction, READERS, SHADOW, table=TABLE)
-            vector_table.set_aside(transaction)
-        vector_table.move_in(transaction)
+        if vector_table.dimension(connection) is not None:
+            copy_privileges(connection, READERS, SHADOW, table=TABLE)
+            vector_table.set_aside(connection)
+        vector_table.move_in(connection)

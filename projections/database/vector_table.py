@@ -137,7 +137,7 @@ def drop_old(connection: Connection) -> None:
 
 
 def drop_old_in_background(connection: Connection) -> None:
-    """Have the server drop the replaced table; closes the connection."""
+    """Have the server drop the replaced table in the background; closes the connection."""
     swap.send_and_close(connection, statements("vectors")["drop_old"].format())
 
 
