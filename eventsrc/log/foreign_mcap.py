@@ -144,9 +144,7 @@ def _raising_foreign_damage(source: "_CrcReader") -> Iterator[None]:
         yield
     except BadRecord as error:
         at = source.record_at
-        raise ForeignDamage(
-            f"torn or damaged, or more than is read, at byte {at:,}: {error}", at
-        ) from None
+        raise ForeignDamage(f"torn, damaged or over a limit, at byte {at:,}: {error}", at) from None
 
 
 class _CrcReader:

@@ -92,7 +92,7 @@ def read_head(path: Path, data: bytes, base: Offset) -> tuple[dict[str, str], in
 
 def _read_head(path: Path, data: bytes) -> tuple[dict[str, str], int]:
     if not data.startswith(_mcap.MAGIC) and not _mcap.MAGIC.startswith(data):
-        raise NotALog(f"{path} is no MCAP file; it does not belong into a log, move it away")
+        raise NotALog(f"{path} is no MCAP file; it does not belong in a log, move it away")
     try:
         head = _find_head(data)
     except BadRecord as error:

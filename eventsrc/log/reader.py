@@ -221,7 +221,7 @@ def _segments_of(path: Path) -> list[SegmentPath]:
         raise LogNotFound(f"no log at {path}; record or import one, or check the path")
     if not path.is_dir():
         raise NotALog(
-            f"{path} is a file; a log is a directory. `mapfold import LOG {path}` reads it in"
+            f"{path} is a file; a log is a directory. `mapfold import LOG {path}` imports it"
         )
     segments = list_growing(path)
     if not segments:

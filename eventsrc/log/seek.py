@@ -67,7 +67,7 @@ def resolve(
             note(
                 f"{reader.path}: of the {counted(included, 'event')} up to {text}, {later:,} "
                 f"{'is' if later == 1 else 'are'} stamped later: stamps run backwards in this log; "
-                "an offset or RUN:KEYFRAME says what you mean"
+                "an offset or RUN:KEYFRAME is exact"
             )
         return included
     keyframe = _KEYFRAME_OF_RUN.fullmatch(text)

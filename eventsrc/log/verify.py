@@ -143,7 +143,7 @@ class _Verifier:
         elif scan.index_fault is not None and not scan.rewritten:
             self._add("crc", scan.index_fault, name)
         if scan.rewritten:
-            text = "another program has rewritten it; `mapfold log recover` puts it in order"
+            text = "another program has rewritten it; `mapfold log recover` repairs it"
             self._add("crc", text, name)
         previous = head.get("previous_sha256", NO_PREVIOUS)
         if head and self._expected_hashes and previous not in self._expected_hashes:

@@ -216,7 +216,9 @@ class EventFindings:
         run_id, keyframe_id = outcome.envelope.run_id, outcome.envelope.keyframe_id
         seen = self._seen.setdefault(run_id, set())
         if keyframe_id in seen:
-            self._add("duplicate", run_id, event.offset, f"keyframes of run {run_id} stand again")
+            self._add(
+                "duplicate", run_id, event.offset, f"keyframes of run {run_id} are recorded again"
+            )
             return
         seen.add(keyframe_id)
         self._stamps.add(run_id, keyframe_id, event.stamp_ns, event.offset)

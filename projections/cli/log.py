@@ -1,13 +1,4 @@
-"""`mapfold log …`: look at a log.
-
-How `mapfold log cat` shows an event, to a program and to a person.
-
-Watching what `mapfold log cat` shows, for what its reader might wonder about.
-
-A range by times is one of offsets: from the first event stamped then or later to the last one
-stamped then or earlier. Where stamps run backwards in between (runs of last year imported after
-this year's), events of other times lie inside. And a key that no event has shows nothing.
-"""
+"""The commands `mapfold log info`, `cat`, `verify` and `recover`."""
 
 import base64
 import contextlib
@@ -42,16 +33,16 @@ from eventsrc.text import counted, visible
 from .options import JsonOption, LogArgument
 from .terminal import display, emit, emit_lines, finish, say
 
-_SHORT = 100
+_SUMMARY_CHARS = 100
 
 
 def iso_time(time_ns: int) -> str:
-    """UTC to the microsecond; the number itself beyond what a calendar holds."""
+    """UTC to the microsecond; the number itself outside the calendar's years 1 to 9999."""
     try:
-        moment = datetime.fromtimestamp(time_ns // 1_000_000_000, UTC)
+        time = datetime.fromtimestamp(time_ns // 1_000_000_000, UTC)
     except (OverflowError, ValueError):
         return f"{time_ns} ns"
-    return f"{moment:%Y-%m-%dT%H:%M:%S}.{time_ns // 1000 % 1_000_000:06d}Z"
+    return f"{time:%Y-%m-%dT%H:%M:%S}.{time_ns // 1000 % 1_000_000:06d}Z"
 
 
 def event_document(event: Event) -> dict[str, Any]:
@@ -76,33 +67,38 @@ def event_document(event: Event) -> dict[str, Any]:
 
 def _value(text: str) -> Any:
     try:
-        return json.loads(text, parse_constant=_refuse)
+        return json.loads(text, parse_constant=_reject_constant)
     except (ValueError, RecursionError):
         return text
 
 
-def _refuse(name: str) -> None:
+def _reject_constant(name: str) -> None:
     raise ValueError(f"{name} is no JSON")
 
 
 def event_line(event: Event) -> str:
-    """Offset, time, key and the gist."""
-    text = f"{event.offset:>8}  {iso_time(event.stamp_ns)}  {event.key}  {_gist(event)}"
+    """Offset, time, key and a summary of the payload."""
+    text = f"{event.offset:>8}  {iso_time(event.stamp_ns)}  {event.key}  {_summary(event)}"
     return visible(text)
 
 
-def _gist(event: Event) -> str:
+def _summary(event: Event) -> str:
     value = _value(event.payload.decode(errors="replace"))
     if isinstance(value, dict) and isinstance(value.get("detections"), list):
         classes = [str(d.get("class", "?")) for d in value["detections"] if isinstance(d, dict)]
         seen = ", ".join(classes) or "nothing"
         return f"{value.get('run_id')}:{value.get('keyframe_id')} saw {seen}"
     text = event.payload.decode(errors="replace").replace("\n", " ")
-    return text if len(text) <= _SHORT else text[: _SHORT - 1] + "…"
+    return text if len(text) <= _SUMMARY_CHARS else text[: _SUMMARY_CHARS - 1] + "…"
 
 
-class Watch:
-    """Over the events of a range that ``--from`` and ``--to`` name, of ``keys`` if any."""
+class RangeNotes:
+    """Notes on what `log cat` showed: events outside the times asked for, and keys without events.
+
+    A range between two times is one of offsets: from the first event stamped then or later to the
+    last one stamped then or earlier. Where stamps run backwards in between (runs of last year
+    imported after this year's), events of other times are inside it.
+    """
 
     def __init__(self, first: str, last: str, keys: Sequence[str]) -> None:
         self._first_ns, self._last_ns = time_of(first), time_of(last)
@@ -117,14 +113,14 @@ class Watch:
         self._missing = dict.fromkeys(keys)
         self._outside = 0
 
-    def over(self, events: Iterable[Event]) -> Iterable[Event]:
-        """The same events."""
-        return self._watched(events) if self._times or self._missing else events
+    def watch(self, events: Iterable[Event]) -> Iterable[Event]:
+        """Pass ``events`` through, counting what `lines` reports."""
+        return self._counted(events) if self._times or self._missing else events
 
-    def _watched(self, events: Iterable[Event]) -> Iterator[Event]:
+    def _counted(self, events: Iterable[Event]) -> Iterator[Event]:
         for event in events:
             self._missing.pop(event.key, None)
-            if not is_system_key(event.key):  # ours are stamped when we wrote them
+            if not is_system_key(event.key):  # these are stamped when they were written
                 self._outside += self._is_outside(event.stamp_ns)
             yield event
 
@@ -132,19 +128,19 @@ class Watch:
         early = self._first_ns is not None and stamp_ns < self._first_ns
         return early or (self._last_ns is not None and stamp_ns > self._last_ns)
 
-    def told(self, log: Path) -> Iterator[str]:
-        """Lines for people, once all events have gone by."""
+    def lines(self, log: Path) -> Iterator[str]:
+        """Lines for people, after the last event."""
         if self._outside:
             verb = "is" if self._outside == 1 else "are"
             yield (
                 f"{log}: {counted(self._outside, 'event')} of these {verb} stamped {self._times}: "
-                "stamps run backwards in this log; offsets or RUN:KEYFRAME say what you mean"
+                "stamps run backwards in this log; offsets or RUN:KEYFRAME give an exact range"
             )
         if self._missing:
             yield from self._missing_keys(log)
 
     def _missing_keys(self, log: Path) -> Iterator[str]:
-        with contextlib.suppress(LogError):  # a damaged log: what can be read has been shown
+        with contextlib.suppress(LogError):  # a damaged log; what can be read was shown
             there = log_info(log).keys
             for key in self._missing:
                 if key not in there:
@@ -152,12 +148,14 @@ class Watch:
                     yield f"{log}: no event has the key {key!r}; there are {names}"
 
 
-log_app = typer.Typer(help="Look at a log: info, cat, verify, recover.", no_args_is_help=True)
+log_app = typer.Typer(
+    help="Inspect and repair a log: info, cat, verify, recover.", no_args_is_help=True
+)
 
 
 @log_app.command()
 def info(log: LogArgument, json_: JsonOption = False) -> None:
-    """What a log holds: id, segments, offsets, counts by key, rejected, losses, times."""
+    """Show what a log holds: id, segments, offsets, counts by key, rejected, losses, times."""
     report = log_info(log, note=say)
     if json_:
         emit(_info_document(report))
@@ -203,17 +201,17 @@ def _span(first_ns: int, last_ns: int) -> str:
 @log_app.command()
 def cat(
     log: LogArgument,
-    from_: Annotated[str, typer.Option("--from", metavar="W", help="Where to start.")] = "0",
-    to: Annotated[str, typer.Option("--to", metavar="W", help="Where to stop.")] = "end",
+    from_: Annotated[str, typer.Option("--from", metavar="W", help="First event.")] = "0",
+    to: Annotated[str, typer.Option("--to", metavar="W", help="End of the range.")] = "end",
     key: Annotated[
         list[str] | None, typer.Option(metavar="K", help="Only this key; may be given again.")
     ] = None,
     skip_damage: Annotated[
-        bool, typer.Option("--skip-damage", help="Name unreadable offsets and go on (exit 3).")
+        bool, typer.Option("--skip-damage", help="Report unreadable offsets and continue (exit 3).")
     ] = False,
     json_: JsonOption = False,
 ) -> None:
-    """The events of a log, in order, one a line.
+    """Print the events of a log in order, one per line.
 
     W is an offset, an ISO time, RUN:KEYFRAME or end. Offsets go from --from to before --to; a
     keyframe or a time is included at either end.
@@ -222,7 +220,7 @@ def cat(
 
     def note(gap: Unreadable) -> None:
         if any(known.first <= gap.first and gap.last <= known.last for known in gaps):
-            return  # met before, on the way to --from or --to
+            return  # reported before, in the search for --from or --to
         gaps.append(gap)
         say(f"{log}: offsets {gap.first} to {gap.last} cannot be read: {gap.reason}")
 
@@ -232,24 +230,22 @@ def cat(
         end = _end(reader, to, start, on_gap)
         last = reader.next_offset if end is None else end
         if start > last:
-            raise MisuseError(
-                f"--from {from_} is offset {start}, behind --to {to}, which is {last}"
-            )
-        watch = Watch(from_, to, key or ())
-        events = watch.over(reader.read(start, end, keys=key or None, on_gap=on_gap))
+            raise MisuseError(f"--from {from_} is offset {start}, after --to {to}, which is {last}")
+        notes = RangeNotes(from_, to, key or ())
+        events = notes.watch(reader.read(start, end, keys=key or None, on_gap=on_gap))
         if json_:
             emit_lines(map(event_document, events))
         else:
             for event in events:
                 display(event_line(event))
-    for line in watch.told(log):
+    for line in notes.lines(log):
         say(line)
     finish(findings=bool(gaps))
 
 
 def _end(reader: LogReader, to: str, start: Offset, on_gap: OnGap | None) -> Offset | None:
-    """Where a range from offset ``start`` on ends. None: at the end of the log, or at the damage on
-    the way to ``to``, where reading will stop; what is before that is shown first."""
+    """Where a range from offset ``start`` on ends. None for the end of the log, and if damage was
+    met in the search for ``to``: reading shows the events before it and stops there."""
     if to == "end":
         return None
     if on_gap is not None:
@@ -260,18 +256,18 @@ def _end(reader: LogReader, to: str, start: Offset, on_gap: OnGap | None) -> Off
     except MisuseError:
         if not met:
             raise
-        end = FIRST_OFFSET  # it may be among what cannot be read
+        end = FIRST_OFFSET  # the point may be among the unreadable events
     if met and met[0].last < start:
-        return resolve(reader, to)  # which says so
+        return resolve(reader, to)  # raises LogDamaged
     return None if met else end
 
 
 @log_app.command()
 def verify(log: LogArgument, json_: JsonOption = False) -> None:
-    """Read every byte of a log and say what is not as it should be; exit 3 if anything is not.
+    """Read every byte of a log and report everything that is wrong; exit 3 if anything is.
 
-    Checks magic, CRCs, hash chain, dense offsets and every payload; reports keyframes that stand
-    twice, clocks that ran backwards, and losses.
+    Checks magic, CRCs, hash chain, dense offsets and every payload; reports duplicate keyframes,
+    clocks that ran backwards, and losses.
     """
     result = verify_log(log)
     if json_:
@@ -295,16 +291,14 @@ def _finding_text(finding: Finding) -> str:
 @log_app.command()
 def recover(
     log: LogArgument,
-    yes: Annotated[
-        bool, typer.Option("--yes", help="Add however many loss events the log asks for.")
-    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Add any number of loss events.")] = False,
     json_: JsonOption = False,
 ) -> None:
-    """Bring a damaged or left-over log back in order, keeping everything that can be read.
+    """Repair a log that is damaged or was left by a crash, keeping everything that can be read.
 
-    Originals in which something recorded is damaged stay beside as *.damaged, segments of other
-    logs as *.foreign, those that others hold as *.duplicate; files with exchanged names get their
-    own back. Lost offsets become mapfold/loss events; without --yes at most 100,000 more than the
+    Originals in which something recorded is damaged are kept as *.damaged; segments of other logs
+    are renamed to *.foreign, those whose events others hold to *.duplicate; wrong names are
+    corrected. Lost offsets become mapfold/loss events; without --yes at most 100,000 more than the
     damaged bytes can have held. Exit 0: nothing was lost or out of place, 3: something was.
     """
     report = recover_log(log, max_losses=sys.maxsize if yes else DEFAULT_MAX_LOSSES)

@@ -40,5 +40,5 @@ def test_a_torn_file_gives_the_messages_before_the_damage(run: Commands) -> None
     file = run.folder / "other.mcap"
     file.write_bytes(file.read_bytes()[:900])
     said = run("import", "L", "other.mcap", code=1)
-    assert "torn or damaged" in said.err
+    assert "torn, damaged or over a limit" in said.err
     assert 0 < len(read_log(run.folder / "L")) < 5
