@@ -148,7 +148,7 @@ def _count_growing(segment: ActiveFile, tally: _Tally) -> None:
         body = segment.read_chunk(chunk)
         channels = segment.channels_of(body)
         robot_channels = _robot_channels(channels)
-        for channel, _, log_ns, stamp_ns, _, _ in _mcap.walk(body):
+        for channel, _, log_ns, stamp_ns, _, _ in _mcap.iter_messages(body):
             tally.keys[channels[channel].topic] += 1
             tally.logged.append(log_ns)
             if channel in robot_channels:
@@ -191,6 +191,6 @@ def _stamps(segment: OpenSegment) -> Iterator[int]:
         except LogDamaged:  # reported to whoever reads the events
             continue
         robot_channels = _robot_channels(segment.channels_of(body))
-        for channel, _, _, stamp_ns, _, _ in _mcap.walk(body):
+        for channel, _, _, stamp_ns, _, _ in _mcap.iter_messages(body):
             if channel in robot_channels:
                 yield stamp_ns

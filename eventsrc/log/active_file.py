@@ -10,7 +10,7 @@ from pathlib import Path
 from eventsrc.envelope import Offset
 
 from . import mcap_records as _mcap
-from .durable_files import FileBytes
+from .file_bytes import FileBytes
 from .format import SEALED, mark_seed, segment_path
 from .mcap_records import BadRecord, Channel
 from .resync import DamagedBytes, skip_damaged

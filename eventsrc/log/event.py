@@ -1,4 +1,4 @@
-"""One event as it stands in a log, and as it comes to one."""
+"""An event of a log, and an event to be appended."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -8,12 +8,12 @@ from eventsrc.envelope import ENVELOPE_VERSION, Offset
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One recorded message.
+    """A recorded message.
 
-    ``offset`` is its index in the log and its only order. ``logged_ns`` is when it was written,
-    ``stamp_ns`` when the robot says it happened, both int nanoseconds since the Unix epoch; either
-    may run backwards. ``payload`` is the message, byte for byte as it came, in the form of the
-    envelope's ``version`` (see `eventsrc.upcast`).
+    ``offset`` is its index in the log, which alone orders events. ``logged_ns`` is when it was
+    written, ``stamp_ns`` when the robot says it happened, both int nanoseconds since the Unix
+    epoch; either may run backwards. ``payload`` is the message verbatim, in the envelope form of
+    ``version`` (see `eventsrc.upcast`).
     """
 
     offset: Offset
@@ -25,7 +25,7 @@ class Event:
 
 
 class NewEvent(NamedTuple):
-    """What an `Event` is before the log gives it an offset."""
+    """An event to be appended; the log gives it an offset."""
 
     key: str
     payload: bytes

@@ -1,20 +1,19 @@
-"""The head of every segment: magic, MCAP header, and metadata that say whose segment it is.
-
-Channels and the JSON schemas behind them, generated from the models that check the payloads.
-
-Names of the files of a log.
+"""Names of a log's files, the head of every segment, and its channels and schemas.
 
     00000000000000000000.mcap          sealed: immutable, compressed, indexed
     00000000000000004711.mcap.active   growing, or left over and not sealed yet
-    ….mcap.new / .mcap.sealing         being made; means nothing until renamed, safe to delete
-    ….mcap.damaged, .mcap.active.damaged   what `mapfold log recover` replaced, kept for a person
-    ….foreign, ….duplicate                 what it set aside: of another log; held by other segments
+    ….mcap.new / .mcap.sealing         being made; worthless until renamed, safe to delete
+    ….mcap.damaged, .mcap.active.damaged   originals that `mapfold log recover` replaced
+    ….foreign, ….duplicate                 set aside by it: of another log; events of other segments
     ….misnamed                             a segment that it is giving its right name
     lock                               held by the one writer
     .ledger.json                       the gap ledger, folded from the events: a cache
 
-A segment is named by its base, the offset of its first event. While a sealed file takes the place
-of its active one, both exist for an instant; the sealed one counts.
+A segment is named by its base, the offset of its first event. While a sealed file replaces its
+active one, both exist for an instant; the sealed one counts.
+
+The head is magic, MCAP header and metadata that name log and base. JSON schemas are generated from
+the models that validate the payloads.
 """
 
 import functools
@@ -37,50 +36,50 @@ SEGMENT_METADATA = "mapfold.segment"
 PREVIOUS = "previous_sha256"
 """In the head of a sealed segment, and of no active one: the hash of the segment before."""
 MARK_SEED = "mark_seed"
-"""In the head of an active segment: what its commit marks are made with, in hex. Segments of
-earlier versions have none, which is seed 0."""
+"""In the head of an active segment, in hex: see `mcap_records.encode_mark`. Segments of earlier
+versions have none, which is seed 0."""
 _SEED = re.compile(r"[0-9a-f]{1,8}")
 _BASE = re.compile(r"\d{1,20}", re.ASCII)
 HEAD_BYTES = 4096
-"""More than any head of ours takes."""
+"""More than any head takes."""
 
 
 def head_metadata(log_id: str, base: Offset, extra: dict[str, str] | None = None) -> Metadata:
-    """What stands at the head of every segment, active and sealed."""
+    """The metadata at the head of a segment, active or sealed."""
     values = {"format": FORMAT, "log_id": log_id, "base": str(base), **(extra or {})}
-    return _mcap.own_metadata(SEGMENT_METADATA, values)
+    return _mcap.metadata_with_crc(SEGMENT_METADATA, values)
 
 
 def file_head(metadata: Metadata) -> bytes:
-    """Magic, header and our metadata."""
+    """Magic, header and ``metadata``."""
     header = Header(profile=_mcap.PROFILE, library=_mcap.LIBRARY)
     return _mcap.MAGIC + _mcap.encode_all([header, metadata])
 
 
 def mark_seed(head: dict[str, str]) -> int:
-    """The mark seed that the head of an active segment names."""
+    """The mark seed in the head of an active segment."""
     return int(head.get(MARK_SEED, "0"), 16)
 
 
 class WrongPlace(LogDamaged):
-    """A whole segment under the name of another one. Inside ``eventsrc.log`` only."""
+    """A segment under the name of another one. Inside ``eventsrc.log`` only."""
 
 
 def head_of(path: Path, base: Offset) -> dict[str, str]:
-    """Our metadata at the head of the segment at ``path``; see `read_head`."""
+    """Metadata at the head of the segment at ``path``; errors as `read_head`."""
     with path.open("rb") as file:
         return read_head(path, file.read(HEAD_BYTES), base)[0]
 
 
 def claims_of(path: Path) -> dict[str, str]:
-    """The same, whatever base the head names."""
+    """Metadata at the head of the segment at ``path``, whatever its base."""
     with path.open("rb") as file:
         return _read_head(path, file.read(HEAD_BYTES))[0]
 
 
 def read_head(path: Path, data: bytes, base: Offset) -> tuple[dict[str, str], int]:
-    """Our metadata at the head of a segment and the byte after it. Raises WrongPlace when it is not
-    the segment at offset ``base``, LogDamaged when it cannot be read, NotALog when it is none."""
+    """Metadata at the head of a segment, and the position after it. Raises WrongPlace if it is not
+    the segment at offset ``base``, LogDamaged if it is unreadable, NotALog if it is no segment."""
     values, end = _read_head(path, data)
     if values["base"] != str(base):
         raise WrongPlace(
@@ -105,7 +104,7 @@ def _read_head(path: Path, data: bytes) -> tuple[dict[str, str], int]:
 
 
 def _find_head(data: bytes) -> tuple[dict[str, str], int] | None:
-    """None for an MCAP head that is not ours."""
+    """Metadata and end of a head; None for another program's MCAP head."""
     at = len(_mcap.MAGIC)
     ours = True
     try:
@@ -137,15 +136,15 @@ def _checked_head(metadata: Metadata) -> dict[str, str]:
 
 ENVELOPE_VERSION_KEY = "mapfold.envelope_version"
 UNREADABLE_VERSION = 0
-"""Of a channel that says something else than a number: another program's, or forged. Its events are
-read, and not folded."""
+"""Of a channel whose version is not a number: forged, or another program's. Its events are read and
+not folded."""
 _A_VERSION = re.compile(r"[0-9]{1,9}")
 
 _SYSTEM_MODELS: dict[str, type[BaseModel]] = {REJECTED_KEY: RejectedPayload, LOSS_KEY: Loss}
 
 
 def schema_of(key: str) -> tuple[str, bytes]:
-    """Name and JSON schema text of what ``key`` carries."""
+    """Name and JSON schema text of the payloads under ``key``."""
     if not is_system_key(key):
         return "mapfold.Envelope", _json_schema(Envelope)
     model = _SYSTEM_MODELS.get(key)
@@ -160,7 +159,7 @@ def _json_schema(model: type[BaseModel]) -> bytes:
 
 
 def key_channel(channel_id: int, schema_id: int, key: str, version: int) -> Channel:
-    """The channel of a key whose envelopes are of ``version``."""
+    """The channel of ``key`` for envelopes of ``version``."""
     return Channel(
         id=channel_id,
         topic=key,
@@ -171,7 +170,7 @@ def key_channel(channel_id: int, schema_id: int, key: str, version: int) -> Chan
 
 
 def envelope_version(channel: Channel) -> int:
-    """The version of the envelopes on a channel; the current one where none is said."""
+    """The version of the envelopes on a channel; the current one if it has none."""
     said = channel.metadata.get(ENVELOPE_VERSION_KEY)
     if said is None:
         return ENVELOPE_VERSION
@@ -195,7 +194,7 @@ _MISNAMED = re.compile(_NAME.pattern + r"\.misnamed(-\d+)?")
 
 @dataclass(frozen=True, slots=True)
 class SegmentPath:
-    """A segment on disk: its base offset and whether it is sealed."""
+    """A segment's file, its base offset and whether it is sealed."""
 
     path: Path
     base: Offset
@@ -203,7 +202,7 @@ class SegmentPath:
 
 
 def segment_path(log: Path, base: Offset, suffix: str) -> Path:
-    """Where the segment that starts at offset ``base`` stands."""
+    """The file of the segment at offset ``base``, with one of the suffixes above."""
     return log / f"{base:020d}{suffix}"
 
 
@@ -217,7 +216,7 @@ def list_segments(log: Path) -> list[SegmentPath]:
 
 
 def segment_files(log: Path) -> list[SegmentPath]:
-    """Every file of ``log`` that is named as a segment; two of one base while one is sealed."""
+    """All files of ``log`` with a segment's name; two of one base while it is being sealed."""
     matches = ((entry, _NAME.fullmatch(entry.name)) for entry in log.iterdir())
     return sorted(
         (
@@ -230,13 +229,13 @@ def segment_files(log: Path) -> list[SegmentPath]:
 
 
 def half_renamed(log: Path) -> list[Path]:
-    """Segments that a recovery was giving their right names when it was interrupted."""
+    """Segments whose renaming by `mapfold log recover` was interrupted."""
     return sorted(p for p in log.iterdir() if _MISNAMED.fullmatch(p.name))
 
 
 def list_growing(log: Path) -> list[SegmentPath]:
-    """`list_segments` beside a writer: a folder that is read while a file takes another's place may
-    show neither. Bases only ever join, so two listings with the same ones missed nothing."""
+    """`list_segments` beside a writer. A folder read while a file replaces another may show
+    neither; bases are never removed, so two listings with the same bases are complete."""
     before = list_segments(log)
     while True:
         now = list_segments(log)
@@ -246,12 +245,12 @@ def list_growing(log: Path) -> list[SegmentPath]:
 
 
 def leftovers(log: Path) -> list[Path]:
-    """Half-made files that a crash left behind; they hold nothing that is not elsewhere."""
+    """Half-made files that a crash left behind; what they hold is elsewhere, too."""
     return sorted(p for p in log.iterdir() if p.name.endswith((NEW, SEALING)))
 
 
 def free_name(path: Path, suffix: str) -> Path:
-    """``path`` with a suffix that no other file has."""
+    """``path`` with ``suffix``, and a number if that file exists."""
     number = 1
     while True:
         counted = suffix if number == 1 else f"{suffix}-{number}"

@@ -45,7 +45,7 @@ class Group:
                 old = [schema for schema in self.schemas if schema not in definitions]
                 definitions = old + definitions
             parts = list(parts)
-            parts[::2] = [_mcap.renumbered(head, self.base - base) for head in parts[::2]]
+            parts[::2] = [_mcap.renumber(head, self.base - base) for head in parts[::2]]
         lead, body = b"".join(definitions), b"".join(parts)
         size = len(lead) + len(body)
         crc = zlib.crc32(body, zlib.crc32(lead))

@@ -1,10 +1,9 @@
-"""One writer for each log: an flock on ``LOG/lock``, which dies with the process that holds it.
+"""Lock a log for its one writer: an flock on ``LOG/lock``, released when its process ends.
 
-The file's text names the holder for whoever comes second. The text means nothing by itself: only
-the lock counts, so a file left behind by a killed writer blocks nobody.
-
-People delete lock files. A second writer would then make a new one, lock that, and take the first
-one's growing segment for left over. So the folder is locked as well, where its file system can.
+The file's text names the holder for error messages. Only the lock counts, so a file left behind by
+a killed writer blocks nobody. The log's folder is locked as well where the file system allows it:
+if somebody deletes the lock file, a second writer would make a new one, lock that, and treat the
+first writer's growing segment as left over.
 """
 
 import contextlib
@@ -25,11 +24,11 @@ from .format import LOCK
 
 _TRIES: Final = 5
 _LOOK_S: Final = 0.01
-"""Who only asks whether a log is held holds it itself for some microseconds."""
+"""`is_held` itself holds the lock for some microseconds."""
 
 
 class WriterLock:
-    """Held from construction until `release`. Raises LogBusy naming the holder."""
+    """The lock, held from construction until `release`. Raises LogBusy naming the holder."""
 
     def __init__(self, log: Path, clock: Clock) -> None:
         self._folder = -1
@@ -54,7 +53,7 @@ class WriterLock:
             os.pwrite(self._fd, text.encode(), 0)
 
     def release(self) -> None:
-        """Let the next writer in. The file stays: deleting it would race with that writer."""
+        """Release the lock. The file stays: deleting it would race with the next writer."""
         if self._fd >= 0:
             os.ftruncate(self._fd, 0)
             self._close()
@@ -73,7 +72,7 @@ class WriterLock:
 
 
 def _lock(fd: int) -> None:
-    """Raises BlockingIOError when another holds it for longer than `is_held` takes to look."""
+    """Raises BlockingIOError when another process holds it for longer than `is_held` does."""
     for _ in range(_TRIES):
         try:
             return fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -87,20 +86,20 @@ def _lock_folder(fd: int) -> None:
         _lock(fd)
     except BlockingIOError:
         raise
-    except OSError as error:  # NFS locks no folders; the file is locked all the same
+    except OSError as error:  # NFS cannot lock folders; the file is locked
         if error.errno not in (errno.EBADF, errno.EINVAL, errno.ENOLCK, errno.EOPNOTSUPP):
             raise
 
 
 def is_held(log: Path) -> bool:
-    """Whether a writer is at work on ``log`` right now."""
+    """Whether a writer has ``log`` open now."""
     return _is_locked(log / LOCK) or _is_locked(log)
 
 
 def _is_locked(path: Path) -> bool:
     try:
         fd = os.open(path, os.O_RDONLY)
-    except OSError:  # no lock, or a log of somebody else's that may only be read
+    except OSError:  # no lock file, or one that may not be read
         return False
     try:
         fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)

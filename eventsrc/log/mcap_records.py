@@ -1,17 +1,17 @@
-"""The one door to MCAP: how the records of a log look in bytes.
+"""Encode and decode the MCAP records of a log; the only module that imports the ``mcap`` package.
 
-Records that appear once a file or once a chunk are written and read by the ``mcap`` package.
-Messages, chunk frames and our commit mark are laid out here: the package spends 10 µs and several
-objects on each message, and neither syncs nor says how far a file is good.
+The package encodes records that appear once a file or once a chunk. Messages, chunk frames and the
+commit mark are encoded here: the package takes 10 µs and several objects for each message, and
+neither syncs nor says how far a file is intact.
 
-Layout and numbers are those of the MCAP specification (https://mcap.dev/spec). A record is an
-opcode byte, a u64 length and its content, all little-endian.
+Layout and numbers follow the MCAP specification (https://mcap.dev/spec). A record is an opcode
+byte, a u64 length and its content, all little-endian.
 
-The *commit mark* is ours: opcode 0x80, from the range the specification leaves to applications, so
-other readers skip it. Content: u64 first offset and u64 next offset of the chunk before it, and
-the CRC-32 of the record up to there, XORed with the random *mark seed* of its segment: a robot
-that publishes bytes which look like a mark does not know the seed. It is written after that chunk
-is synced.
+The *commit mark* has opcode 0x80, from the range that the specification leaves to applications, so
+other readers skip it. Content: u64 first offset and u64 next offset of the chunk before it, and the
+CRC-32 of the record up to there, XORed with the random *mark seed* of its segment. A robot does not
+know the seed, so it cannot publish bytes that are read as a mark. The mark is written after its
+chunk is synced.
 """
 
 import struct
@@ -47,9 +47,9 @@ MAGIC = b"\x89MCAP0\r\n"
 PROFILE = "mapfold"
 LIBRARY = "mapfold"
 MAX_EVENT_BYTES = 96 * 1024 * 1024
-"""Of one payload. A line of 64 MiB that is no envelope is kept as 85 MiB of base64."""
+"""Of one payload. A rejected payload of 64 MiB takes 85 MiB as base64."""
 MAX_GROUP_BYTES = 64 * 1024 * 1024
-"""A group takes no further event from here on."""
+"""From this size on a group takes no further event."""
 MAX_CHUNK_BYTES = 176 * 1024 * 1024
 """Of a chunk, compressed or not: a full group and one more event."""
 MAX_SUMMARY_BYTES = 32 * 1024 * 1024
@@ -78,10 +78,10 @@ FOOTER_BYTES = FRAME.size + 20
 TAIL_BYTES = FOOTER_BYTES + len(MAGIC)
 
 _COPIED = 1024 * 1024
-"""Chunks below this size are read whole and their body is copied out, which is quicker."""
+"""Chunks below this size are read whole and their body is copied, which is faster."""
 _ZSTD_LEVEL = 1
-"""Base64 of floats holds six bits a byte and little else to squeeze: of house-a, level 1 leaves
-0.696 of the size; level 3 takes three times as long and leaves 0.689."""
+"""Base64 of floats has six bits a byte and little else to compress: house-a shrinks to 0.696 of its
+size at level 1, and to 0.689 in three times the time at level 3."""
 
 Record = TypeVar("Record", bound=McapRecord)
 
@@ -92,9 +92,9 @@ class BadRecord(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class ChunkHead:
-    """The frame of a chunk: where its data stands and how to check it.
+    """The frame of a chunk: position, sizes and CRC of its data.
 
-    ``data_at`` counts from the start of the record; ``length`` is the whole record.
+    ``data_at`` counts from the start of the record; ``length`` is that of the whole record.
     """
 
     length: int
@@ -105,20 +105,20 @@ class ChunkHead:
 
 
 def encode(record: McapRecord) -> bytes:
-    """One record by the mcap package."""
+    """One record, encoded by the mcap package."""
     builder = RecordBuilder()
     record.write(builder)
     data: bytes = builder.end()  # type: ignore[no-untyped-call]
     return data
 
 
-def own_metadata(name: str, values: dict[str, str]) -> Metadata:
-    """A metadata record that can be checked by itself: MCAP gives these no CRC of their own."""
+def metadata_with_crc(name: str, values: dict[str, str]) -> Metadata:
+    """A metadata record with a CRC of its own, which MCAP does not provide."""
     return Metadata(name=name, metadata={**values, "crc32": _metadata_crc(values)})
 
 
 def checked_metadata(record: Metadata) -> dict[str, str]:
-    """The values of `own_metadata`; BadRecord when they are not what was written."""
+    """The values of a `metadata_with_crc`. Raises BadRecord if the CRC is wrong."""
     values = dict(record.metadata)
     if values.pop("crc32", None) != _metadata_crc(values):
         raise BadRecord(f"metadata {record.name!r} does not match its CRC")
@@ -131,25 +131,25 @@ def _metadata_crc(values: dict[str, str]) -> str:
 
 
 def encode_message_head(channel: int, sequence: int, log: int, publish: int, size: int) -> bytes:
-    """Everything of a message record before its ``size`` payload bytes."""
+    """A message record up to its ``size`` payload bytes."""
     return MESSAGE.pack(Opcode.MESSAGE, 22 + size, channel, sequence, log, publish)
 
 
-def renumbered(head: bytes, by: int) -> bytes:
-    """A message's head with its sequence number changed by ``by``."""
+def renumber(head: bytes, by: int) -> bytes:
+    """A message's head with ``by`` added to its sequence number."""
     opcode, length, channel, sequence, log, publish = MESSAGE.unpack(head)
     return MESSAGE.pack(opcode, length, channel, sequence + by, log, publish)
 
 
-def compressor() -> zstandard.ZstdCompressor:
-    """What `encode_chunk` compresses with; for one thread, and quicker when used again."""
+def new_compressor() -> zstandard.ZstdCompressor:
+    """A compressor for `encode_chunk`; for one thread, and faster when reused."""
     return zstandard.ZstdCompressor(level=_ZSTD_LEVEL)
 
 
-def encode_chunk(squeeze: zstandard.ZstdCompressor, body: bytes, first: int, last: int) -> bytes:
+def encode_chunk(compressor: zstandard.ZstdCompressor, body: bytes, first: int, last: int) -> bytes:
     """A compressed chunk record around ``body``: whole schema, channel and message records, logged
     from ``first`` to ``last`` (ns)."""
-    data = squeeze.compress(body)
+    data = compressor.compress(body)
     head = _CHUNK.pack(
         Opcode.CHUNK,
         _CHUNK.size - FRAME.size + 4 + _U64.size + len(data),
@@ -163,13 +163,13 @@ def encode_chunk(squeeze: zstandard.ZstdCompressor, body: bytes, first: int, las
 
 
 def encode_plain_chunk_head(size: int, crc: int, first_ns: int, last_ns: int) -> bytes:
-    """What stands before the ``size`` bytes of an uncompressed chunk's body."""
+    """An uncompressed chunk record up to the ``size`` bytes of its body."""
     length = PLAIN_CHUNK_HEAD - FRAME.size + size
     return _CHUNK.pack(Opcode.CHUNK, length, first_ns, last_ns, size, crc, 0) + _U64.pack(size)
 
 
 def decode_chunk_head(data: bytes) -> ChunkHead:
-    """The frame at the start of ``data``, of which `ZSTD_CHUNK_HEAD` bytes are enough."""
+    """The chunk frame at the start of ``data``; `ZSTD_CHUNK_HEAD` bytes are enough."""
     if len(data) < PLAIN_CHUNK_HEAD:
         raise BadRecord("cut short inside a chunk's head")
     opcode, length, _, _, size, crc, name_size = _CHUNK.unpack_from(data)
@@ -200,7 +200,7 @@ def decode_chunk(record: bytes) -> bytes:
 
 def read_chunk(read: Callable[[int, int], bytes], length: int, position: int) -> bytes:
     """The body of the chunk record of ``length`` bytes at ``position`` of a file, its CRC checked.
-    ``read`` gives that many bytes from that place."""
+    ``read(length, position)`` reads from the file."""
     if length < _COPIED:
         return decode_chunk(read(length, position))
     head = decode_chunk_head(read(ZSTD_CHUNK_HEAD, position))
@@ -228,7 +228,7 @@ def _decompress(data: bytes, size: int) -> bytes:
 
 
 def encode_message_index(channel: int, flat: list[int]) -> bytes:
-    """The index of one channel's messages in a chunk: log time and place in the body, by turns."""
+    """The index of one channel's messages in a chunk; ``flat`` alternates log time and position."""
     content = struct.pack(f"<HI{len(flat)}Q", channel, 8 * len(flat), *flat)
     return FRAME.pack(Opcode.MESSAGE_INDEX, len(content)) + content
 
@@ -240,7 +240,7 @@ def encode_mark(first: Offset, following: Offset, seed: int) -> bytes:
 
 
 def decode_mark(data: bytes, seed: int) -> tuple[Offset, Offset]:
-    """First and next offset of a commit mark of a segment with that mark seed."""
+    """First and next offset of a commit mark made with ``seed``. Raises BadRecord."""
     if len(data) < MARK_BYTES:
         raise BadRecord("cut short inside a commit mark")
     opcode, _, first, following = _MARK.unpack_from(data)
@@ -250,14 +250,14 @@ def decode_mark(data: bytes, seed: int) -> tuple[Offset, Offset]:
 
 
 def seed_of_mark(mark: bytes) -> int:
-    """The mark seed of the segment, if ``mark`` is a good commit mark."""
+    """The mark seed that ``mark`` was made with, if it is undamaged."""
     (crc,) = _CRC.unpack_from(mark, _MARK.size)
     return int(crc) ^ zlib.crc32(mark[: _MARK.size])
 
 
-def walk(body: bytes) -> Iterator[tuple[int, int, int, int, int, int]]:
-    """The messages of a chunk's body: channel, sequence, log time, publish time, and where the
-    payload starts and ends in ``body``. BadRecord where a record does not fit."""
+def iter_messages(body: bytes) -> Iterator[tuple[int, int, int, int, int, int]]:
+    """Channel, sequence, log time, publish time, payload start and payload end in ``body`` of each
+    message of a chunk. Raises BadRecord where a record does not fit."""
     at, size, unpack, message = 0, len(body), MESSAGE.unpack_from, int(Opcode.MESSAGE)
     try:
         while at < size:
@@ -275,8 +275,8 @@ def walk(body: bytes) -> Iterator[tuple[int, int, int, int, int, int]]:
 
 
 def definitions(body: bytes, *, leading: bool = False) -> tuple[list[Schema], list[Channel]]:
-    """The schema and channel records of a chunk's body; those before its first message only when
-    ``leading``."""
+    """The schema and channel records of a chunk's body; if ``leading``, only those before its first
+    message."""
     schemas: list[Schema] = []
     channels: list[Channel] = []
     at = total = 0
@@ -296,13 +296,13 @@ def definitions(body: bytes, *, leading: bool = False) -> tuple[list[Schema], li
 
 
 def check_definitions(total: int) -> None:
-    """BadRecord when schemas and channels take more bytes than they may: they are kept."""
+    """Raise BadRecord if schemas and channels, which are kept in memory, take too many bytes."""
     if total > MAX_DEFINITIONS_BYTES:
         raise BadRecord(f"schemas and channels of more than {MAX_DEFINITIONS_BYTES:,} bytes")
 
 
 def records(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Opcode and content of the records that fill ``data``; BadRecord where one is cut short."""
+    """Opcode and content of the records in ``data``. Raises BadRecord where one is cut short."""
     at = 0
     while at < len(data):
         if at + FRAME.size > len(data):
@@ -315,7 +315,7 @@ def records(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def decode_as(kind: type[Record], content: bytes) -> Record:
-    """One record by the mcap package, whose many ways to fail become BadRecord."""
+    """One record, decoded by the mcap package. Raises BadRecord for any of its errors."""
     stream = ReadDataStream(BytesIO(content))
     try:
         record: Record = kind.read(stream)  # type: ignore[attr-defined]
@@ -325,7 +325,7 @@ def decode_as(kind: type[Record], content: bytes) -> Record:
 
 
 def encode_all(items: Iterable[McapRecord]) -> bytes:
-    """Records one after the other."""
+    """Encoded records, joined."""
     return b"".join(encode(item) for item in items)
 
 

@@ -38,7 +38,9 @@ UNKNOWN_TIMES = EventTimes(0, 0)
 
 def first_and_last_times(body: bytes) -> tuple[EventTimes, EventTimes]:
     """The times of the first and the last event in the body of a good chunk."""
-    times = [EventTimes(log_ns, stamp_ns) for _, _, log_ns, stamp_ns, _, _ in _mcap.walk(body)]
+    times = [
+        EventTimes(log_ns, stamp_ns) for _, _, log_ns, stamp_ns, _, _ in _mcap.iter_messages(body)
+    ]
     return times[0], times[-1]
 
 
@@ -162,7 +164,7 @@ def _slice_chunk(
         os.close(fd)
     schemas, channels = _mcap.definitions(body)
     parts = [_mcap.encode_all([*schemas, *channels])]
-    for channel, sequence, log_ns, stamp_ns, at, end in _mcap.walk(body):
+    for channel, sequence, log_ns, stamp_ns, at, end in _mcap.iter_messages(body):
         offset = base + sequence
         if offset in offsets:
             head = _mcap.encode_message_head(channel, offset - new_base, log_ns, stamp_ns, end - at)

@@ -1,21 +1,19 @@
-"""Bringing a log that was left in the middle of things back in order.
+"""Clean up a log that its last writer did not finish, when the next writer opens it.
 
-On the next start, by itself: half-made files go, and every left-over active segment keeps all
-events whose CRC holds, synced or not. A torn end is what a crash leaves and is cut off without
-asking: nothing in it was ever called recorded. Rot is not: the writer refuses to start and names
-`mapfold log recover`, which a person must run.
+Half-made files are deleted, and every left-over active segment keeps all events whose CRC is right,
+synced or not. A torn end is what a crash leaves: it was never recorded, and is cut off. Damage
+elsewhere is rot: the writer refuses to start and names `mapfold log recover`, for a person to run.
 
-Sealing takes a second for each segment, and a recorder that restarts must listen at once. So a
-left-over is *finished* first, which is quick: its torn end is cut off, and a last chunk that was
-written but not marked gets its mark. Then it is like any segment behind a rotation, and is sealed
-in the background as those are. One that cannot be brought into that form (a mark has rotted, or a
-sealed segment stands behind it) is sealed at once, and with it all the others.
+Sealing takes up to a second a segment, and a restarted recorder must accept events at once. So a
+left-over segment is only *finished* here: its torn end is cut off, and a last chunk without a
+commit mark gets one. It is then sealed in the background like any full segment. If one of them
+cannot be finished (a mark is damaged, or a sealed segment follows), all are sealed at once.
 
-The last left-over is read byte by byte, for a crash may have torn it. Those before it were whole
-when it was begun: where their marks say so they are taken at their word, for a recorder that was
-killed under load leaves many. Should one have rotted since, sealing finds it and says so.
+The last left-over segment is read byte by byte, because a crash may have torn it. Those before it
+were complete when it was begun, so their marks are trusted; a recorder killed under load leaves
+many. If one is damaged, sealing reports it.
 
-An active file is deleted only after the sealed one that replaces it is synced under its name.
+An active file is deleted only after the sealed file that replaces it is synced under its name.
 """
 
 import os
@@ -47,9 +45,9 @@ from .segment import Scan
 
 @dataclass(slots=True)
 class Restart:
-    """Where a writer goes on, and what its predecessor left undone.
+    """Where a writer goes on, and what the last writer left unfinished.
 
-    ``torn_bytes`` and ``torn_events`` were being written when it died and were never synced.
+    ``torn_bytes`` and ``torn_events`` were being written when it died and were never recorded.
     """
 
     log_id: str | None = None
@@ -60,8 +58,7 @@ class Restart:
     torn_bytes: int = 0
     torn_events: int = 0
     unsealed: list[tuple[Offset, Offset]] = field(default_factory=list)
-    """Base and next offset of the left-over segments that are finished and still to be sealed, in
-    order."""
+    """Base and next offset of the finished segments to be sealed, in order."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,13 +66,13 @@ class _Leftover:
     segment: SegmentPath
     scan: Scan
     marked: int
-    """How many of the chunks that the scan found have their marks, one behind the other."""
+    """How many of the scan's first chunks have a commit mark."""
     position: int
-    """Where these end."""
+    """Where these end in the file."""
 
     @property
     def finishable(self) -> bool:
-        """Whether at most a last chunk lacks its mark."""
+        """Whether at most the last chunk lacks its mark."""
         chunks = self.scan.chunks
         if self.marked + 1 < len(chunks):
             return False
@@ -83,10 +80,10 @@ class _Leftover:
 
 
 def restart(log: Path) -> Restart:
-    """Put in order what is left over. The caller holds the writer lock.
+    """Clean up what is left over. The caller holds the writer lock.
 
-    Raises LogDamaged for rot in what a writer goes by, when the segments are not all of one log,
-    and when one has the name of another.
+    Raises LogDamaged for damage in what a writer needs, for segments of different logs, and for a
+    segment under the name of another.
     """
     for path in leftovers(log):
         unlink_quietly(path)
@@ -100,7 +97,7 @@ def restart(log: Path) -> Restart:
         if segment.sealed:
             unlink_quietly(segment_path(log, segment.base, ACTIVE))
     state = Restart()
-    found = _look_at_leftovers(log, segments, state)
+    found = _scan_leftovers(log, segments, state)
     last_sealed = max((s.base for s in segments if s.sealed), default=-1)
     if all(left.finishable and left.segment.base > last_sealed for left in found):
         for left in found:
@@ -113,14 +110,14 @@ def restart(log: Path) -> Restart:
     return state
 
 
-def _look_at_leftovers(log: Path, segments: list[SegmentPath], state: Restart) -> list[_Leftover]:
-    """Those with events; what holds none is deleted."""
+def _scan_leftovers(log: Path, segments: list[SegmentPath], state: Restart) -> list[_Leftover]:
+    """The left-over segments that have events; those without are deleted."""
     found = []
     for index, segment in enumerate(segments):
         if segment.sealed:
             continue
         reach = segments[index + 1].base if index + 1 < len(segments) else None
-        left = _look_at(segment, reach)
+        left = _scan_leftover(segment, reach)
         state.torn_bytes += left.scan.lost_bytes
         state.torn_events += left.scan.torn_events
         state.log_id = state.log_id or left.scan.log_id
@@ -137,8 +134,8 @@ def _look_at_leftovers(log: Path, segments: list[SegmentPath], state: Restart) -
     return found
 
 
-def _look_at(segment: SegmentPath, reach: Offset | None) -> _Leftover:
-    """``reach`` is the base of the next segment: this one was whole before that was begun."""
+def _scan_leftover(segment: SegmentPath, reach: Offset | None) -> _Leftover:
+    """``reach`` is the base of the next segment, or None for the last one."""
     finished = None if reach is None else _finished(segment, reach)
     if finished is not None:
         return finished
@@ -160,7 +157,7 @@ def _look_at(segment: SegmentPath, reach: Offset | None) -> _Leftover:
 
 
 def _finished(segment: SegmentPath, reach: Offset) -> _Leftover | None:
-    """A segment whose marks reach the next one, taken at their word; None for one to look into."""
+    """A segment whose marks reach the next one; None for one that must be scanned."""
     try:
         file = ActiveFile(segment.path, segment.base)
     except (LogDamaged, NotALog):
@@ -182,7 +179,7 @@ def _refuse_rot(path: Path, scan: Scan) -> None:
 
 
 def _finish(left: _Leftover) -> None:
-    """Leave marked chunks and nothing else. A chunk is synced before its mark says so."""
+    """Cut off the torn end and write a missing last mark, after syncing its chunk."""
     last = left.scan.chunks[-1]
     fd = os.open(left.segment.path, os.O_RDWR | os.O_APPEND)
     try:
@@ -209,7 +206,7 @@ def _seal_now(log: Path, left: _Leftover) -> None:
 
 
 def _read_end(log: Path, state: Restart, found: list[_Leftover]) -> None:
-    """Fill in where the log ends and what the next segment to be sealed carries on from."""
+    """Set the log's end, and the hash that the next sealed segment carries."""
     sealed = [segment for segment in list_segments(log) if segment.sealed]
     if sealed:
         last = SealedFile(sealed[-1].path, sealed[-1].base)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 from eventsrc.envelope import Offset
 
 from . import mcap_records as _mcap
-from .durable_files import FileBytes
+from .file_bytes import FileBytes
 from .mcap_records import BadRecord
 
 

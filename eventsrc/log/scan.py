@@ -19,8 +19,8 @@ from eventsrc.envelope import Offset
 from eventsrc.errors import LogDamaged, NotALog
 
 from . import mcap_records as _mcap
-from .durable_files import FileBytes
 from .event import Event
+from .file_bytes import FileBytes
 from .format import HEAD_BYTES, WrongPlace, envelope_version, mark_seed, read_head
 from .mcap_records import BadRecord
 from .resync import DamagedBytes, skip_damaged
@@ -41,7 +41,7 @@ def check_chunk(data: FileBytes, at: int, scan: Scan) -> tuple[int, Offset, Offs
     body = _mcap.read_chunk(lambda length, place: data[place : place + length], head.length, at)
     channels = {*scan.channels, *(channel.id for channel in _mcap.definitions(body)[1])}
     first = following = -1
-    for channel, sequence, _, _, _, _ in _mcap.walk(body):
+    for channel, sequence, _, _, _, _ in _mcap.iter_messages(body):
         if channel not in channels:
             raise BadRecord(f"a chunk uses channel {channel}, which nothing defines")
         if first < 0:
@@ -208,6 +208,6 @@ def scanned_events(fd: int, scan: Scan, chunk: ChunkRef) -> Iterator[Event]:
         channel.id: (channel.topic, envelope_version(channel))
         for channel in (*scan.channels.values(), *channels)
     }
-    for id_, sequence, log_ns, stamp_ns, at, stop in _mcap.walk(body):
+    for id_, sequence, log_ns, stamp_ns, at, stop in _mcap.iter_messages(body):
         key, version = known[id_]
         yield Event(Offset(scan.base + sequence), key, log_ns, stamp_ns, body[at:stop], version)

@@ -10,7 +10,7 @@ from eventsrc.envelope import Offset
 from eventsrc.errors import LogDamaged, NotALog
 
 from . import mcap_records as _mcap
-from .durable_files import FileBytes
+from .file_bytes import FileBytes
 from .format import HEAD_BYTES, WrongPlace, read_head
 from .mcap_records import BadRecord, Metadata
 from .rewritten import add_messages, is_rewritten

@@ -1,21 +1,17 @@
-"""Making a sealed segment: chunked, zstd, indexed, with every byte under some checksum.
+"""Seal a segment: chunk, compress and index it, with every byte under a checksum.
 
     magic · Header · Metadata "mapfold.segment" · ( chunk · message indexes )* ·
     Metadata "mapfold.seal" · DataEnd with the CRC of all before it ·
     summary with its CRC · Footer · magic
 
-The file is written beside (``.mcap.sealing``), synced and renamed, so a sealed name never holds
-half a segment. Bodies of active chunks are joined as they are into chunks of about 1 MiB: the
-events' bytes are not taken apart, only their heads are walked for the index.
+The file is written as ``.mcap.sealing``, synced and renamed, so a file with a sealed name is always
+complete. Chunks of a growing segment are as large as its commits; they are joined or split to about
+`CHUNK_BYTES`, which bounds what a flipped bit can cost and what reading one event takes. Events are
+copied as they are; only their heads are parsed, for the index. The channel records that a chunk
+needs lead it.
 
-The seal says how many events each chunk holds, which the MCAP index does not, so that an offset is
-found without reading chunks; and the SHA-256 of the segment before, which makes the chain.
-
-What goes into each chunk of a sealed segment.
-
-The chunks of a growing segment are as large as its commits happened to be. Sealed ones are of about
-`CHUNK_BYTES`: what one flipped bit can cost, and what one event takes to read. Small bodies are
-joined, large ones parted, and every part is led by the channels it needs.
+The seal holds the number of events in each chunk, which the MCAP index does not, so that an offset
+is found without reading chunks. The head holds the SHA-256 of the segment before: the chain.
 """
 
 import hashlib
@@ -65,11 +61,11 @@ CHUNK_BYTES = 1024 * 1024
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
-    """The body of one chunk and, parallel to one another, what its messages' heads say.
+class ChunkBody:
+    """The body of a chunk to be written, and columns of its messages' heads.
 
-    ``positions`` are where in the body they start; ``definitions`` are the records of schemas and
-    channels that come with this part and did not come with one before.
+    ``positions`` are the messages' starts in the body. ``definitions`` are the schema and channel
+    records of the joined chunks, in the first body made of them; later ones have none.
     """
 
     body: bytes
@@ -80,7 +76,7 @@ class Part:
     definitions: bytes
 
     def entries(self) -> dict[int, list[int]]:
-        """By channel: log time and position of each message, by turns, as an index has them."""
+        """By channel: log time and position of each message, alternating, as in an MCAP index."""
         entries: dict[int, list[int]] = {channel: [] for channel in self.channels}
         for channel, log_ns, position in zip(
             self.channels, self.log_ns, self.positions, strict=True
@@ -89,23 +85,23 @@ class Part:
         return entries
 
 
-def parts_of(bodies: Iterable[bytes]) -> Iterator[Part]:
-    """Bodies of chunks in offset order, joined or parted to about `CHUNK_BYTES`."""
+def rechunk(bodies: Iterable[bytes]) -> Iterator[ChunkBody]:
+    """Join or split chunk bodies, in offset order, to about `CHUNK_BYTES`."""
     waiting: list[bytes] = []
     size = 0
     for body in bodies:
         waiting.append(body)
         size += len(body)
         if size >= CHUNK_BYTES:
-            yield from _parted(b"".join(waiting))
+            yield from _split(b"".join(waiting))
             waiting, size = [], 0
     if waiting:
-        yield from _parted(b"".join(waiting))
+        yield from _split(b"".join(waiting))
 
 
-def _parted(body: bytes) -> Iterator[Part]:
-    """One part, or several of about the same size where it is two chunks large or more."""
-    rows, starts, others = _layout(body)
+def _split(body: bytes) -> Iterator[ChunkBody]:
+    """Split a body of two chunks or more into bodies of about the same size."""
+    rows, starts, others = _parse(body)
     _, _, channels, _, log_ns, stamp_ns = zip(*rows, strict=True)
     definitions = b"".join(body[start:end] for start, end in others)
     lead = b""
@@ -114,7 +110,7 @@ def _parted(body: bytes) -> Iterator[Part]:
         at = starts[first] if first else 0
         end = starts[last] if last < len(starts) else len(body)
         shift = len(lead) - at
-        yield Part(
+        yield ChunkBody(
             lead + body[at:end] if len(edges) > 2 else body,
             channels[first:last],
             log_ns[first:last],
@@ -126,14 +122,14 @@ def _parted(body: bytes) -> Iterator[Part]:
 
 
 def _edges(size: int, starts: list[int]) -> list[int]:
-    """Indexes of the messages that the parts begin with, and how many messages there are."""
+    """Indexes of the messages that the bodies begin with, and the number of messages."""
     count = max(1, size // CHUNK_BYTES)
     inner = {bisect_left(starts, size * part // count) for part in range(1, count)}
     return sorted({0, len(starts)} | inner)
 
 
-def _layout(body: bytes) -> tuple[list[tuple[int, ...]], list[int], list[tuple[int, int]]]:
-    """Heads and starts of all messages, and start and end of everything else."""
+def _parse(body: bytes) -> tuple[list[tuple[int, ...]], list[int], list[tuple[int, int]]]:
+    """Heads and starts of all messages, and start and end of every other record."""
     at, size, unpack, message = 0, len(body), MESSAGE.unpack_from, int(Opcode.MESSAGE)
     rows: list[tuple[int, ...]] = []
     starts: list[int] = []
@@ -159,15 +155,15 @@ def _layout(body: bytes) -> tuple[list[tuple[int, ...]], list[int], list[tuple[i
 
 NO_PREVIOUS = ""
 REPLACES = "replaces_sha256"
-"""In the head of a recovered segment: the hash its successor knows its original by."""
+"""In the head of a recovered segment: the hash of its original, which its successor carries."""
 
 
 @dataclass(frozen=True, slots=True)
 class SegmentPlan:
-    """What a sealed segment says of itself: its log, its base and the hash of the one before.
+    """Head of a sealed segment to be written: its log, base and the hash of the segment before.
 
-    ``following`` is the offset behind its last event. Bodies that end elsewhere are not sealed:
-    something has rotted, and the file they came from is all there is of the rest.
+    ``following`` is the offset after its last event. Bodies that end elsewhere are not sealed: the
+    source is damaged, and must be kept for what else is in it.
     """
 
     log: Path
@@ -187,9 +183,9 @@ def seal(plan: SegmentPlan, bodies: Iterable[bytes]) -> str:
     fd = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
     try:
         builder = _Builder(fd, plan)
-        for part in parts_of(bodies):
-            builder.add_chunk(part)
-        builder.expect_end(plan)
+        for body in rechunk(bodies):
+            builder.add_chunk(body)
+        builder.check_end(plan)
         builder.finish()
         sync_file(fd)
     except BadRecord as error:
@@ -205,14 +201,14 @@ def seal(plan: SegmentPlan, bodies: Iterable[bytes]) -> str:
 
 
 class _Builder:
-    """Writes front to back, keeping position, checksums and the index."""
+    """Writes a sealed file front to back and collects position, checksums and index."""
 
     def __init__(self, fd: int, plan: SegmentPlan) -> None:
         self._fd = fd
         self._at = 0
         self._crc = 0
         self.sha256 = hashlib.sha256()
-        self._squeeze = _mcap.compressor()
+        self._compressor = _mcap.new_compressor()
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._counts: dict[int, int] = defaultdict(int)
@@ -235,24 +231,24 @@ class _Builder:
         self._crc = zlib.crc32(data, self._crc)
         self.sha256.update(data)
 
-    def add_chunk(self, part: Part) -> None:
-        """One chunk and the index of its messages."""
-        schemas, channels = _mcap.definitions(part.definitions)
+    def add_chunk(self, body: ChunkBody) -> None:
+        """Write a chunk and its message indexes."""
+        schemas, channels = _mcap.definitions(body.definitions)
         self._schemas.update((s.id, s) for s in schemas)
         self._channels.update((c.id, c) for c in channels)
-        self._edges.append(self._edges[-1] + len(part.log_ns))
-        first_ns, last_ns = min(part.log_ns), max(part.log_ns)
+        self._edges.append(self._edges[-1] + len(body.log_ns))
+        first_ns, last_ns = min(body.log_ns), max(body.log_ns)
         self._log_ns += (first_ns, last_ns)
-        self._stamp_ns += (min(part.stamp_ns), max(part.stamp_ns))
-        entries = part.entries()
+        self._stamp_ns += (min(body.stamp_ns), max(body.stamp_ns))
+        entries = body.entries()
         for channel_id, flat in entries.items():
             self._counts[channel_id] += len(flat) // 2
-        self._write_chunk(part.body, first_ns, last_ns, entries)
+        self._write_chunk(body.body, first_ns, last_ns, entries)
 
     def _write_chunk(
         self, body: bytes, first_ns: int, last_ns: int, entries: dict[int, list[int]]
     ) -> None:
-        chunk = _mcap.encode_chunk(self._squeeze, body, first_ns, last_ns)
+        chunk = _mcap.encode_chunk(self._compressor, body, first_ns, last_ns)
         start = self._at
         self._write(chunk)
         indexes_at = self._at
@@ -274,8 +270,8 @@ class _Builder:
             )
         )
 
-    def expect_end(self, plan: SegmentPlan) -> None:
-        """Raise BadRecord unless everything up to the end of the plan was added."""
+    def check_end(self, plan: SegmentPlan) -> None:
+        """Raise BadRecord unless the chunks end at the plan's end."""
         reached = plan.base + self._edges[-1]
         if reached != plan.following:
             raise BadRecord(
@@ -283,7 +279,7 @@ class _Builder:
             )
 
     def finish(self) -> None:
-        """Seal, end of data, summary, footer."""
+        """Write the seal, the end of data, the summary and the footer."""
         seal_record = _mcap.encode(self._seal())
         self._metadata.append(MetadataIndex(self._at, len(seal_record), SEAL_METADATA))
         self._write(seal_record)
@@ -291,7 +287,7 @@ class _Builder:
         self._write_summary()
 
     def _seal(self) -> Metadata:
-        return _mcap.own_metadata(
+        return _mcap.metadata_with_crc(
             SEAL_METADATA,
             {
                 "chunk_edges": ",".join(map(str, self._edges)),
@@ -337,6 +333,6 @@ class _Builder:
 
 
 def file_sha256(path: Path) -> str:
-    """The hash a following segment carries of this one."""
+    """SHA-256 of a file, as the next segment carries it."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

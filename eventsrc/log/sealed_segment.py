@@ -1,10 +1,8 @@
-"""A sealed segment, known from its summary and its seal: they name every chunk, its first offset
-and its channels, so nothing before the wanted event is read.
+"""Read a sealed segment through its summary and seal, and check all of its bytes.
 
-Is every byte of a sealed segment what was sealed?
-
-The CRC in DataEnd covers everything before it, the CRC in the footer the summary and the footer,
-and the magic ends the file; so there is no byte that nothing checks.
+Summary and seal name every chunk with its first offset and channels, so nothing before a wanted
+event is read. `check_sealed` compares every byte with a checksum: the CRC in DataEnd covers all
+before it, the CRC in the footer the summary and the footer, and the magic ends the file.
 """
 
 import hashlib
@@ -33,11 +31,13 @@ from .segment import ChunkRef, SegmentFile
 
 SEAL_METADATA = "mapfold.seal"
 _MAX_CHUNKS = 1 << 16
-"""In one segment: a chunk is a mebibyte or a single event, and a segment is full at 64 MiB."""
+"""In one segment: a chunk is 1 MiB or a single event, and a segment is full at 64 MiB."""
+_BLOCK = 1024 * 1024
+_DATA_END_BYTES = _mcap.FRAME.size + 4
 
 
 class SealedFile(SegmentFile):
-    """An immutable segment, known from its summary."""
+    """A sealed segment, opened by reading its summary. Raises LogDamaged if that is unreadable."""
 
     def __init__(self, path: Path, base: Offset) -> None:
         super().__init__(path, base)
@@ -55,7 +55,7 @@ class SealedFile(SegmentFile):
             raise
 
     def channels_of(self, body: bytes) -> dict[int, Channel]:  # noqa: ARG002
-        """The same for all chunks, from the summary."""
+        """All channels, from the summary."""
         return self.channels
 
     def _read_summary(self) -> None:
@@ -72,15 +72,15 @@ class SealedFile(SegmentFile):
         summary = os.pread(self._fd, length, footer.summary_start)
         if zlib.crc32(tail[: _mcap.FOOTER_BYTES - 4], zlib.crc32(summary)) != footer.summary_crc:
             raise BadRecord("the summary does not match its CRC")
-        self._take(summary, size)
+        self._parse_summary(summary, size)
 
-    def _take(self, summary: bytes, size: int) -> None:
+    def _parse_summary(self, summary: bytes, size: int) -> None:
         indexes: list[tuple[int, int, frozenset[int]]] = []
         statistics, seal = None, None
         definitions = 0
         for opcode, content in _mcap.records(summary):
             if opcode == Opcode.CHUNK_INDEX:
-                indexes.append(_place(_mcap.decode_as(ChunkIndex, content), size))
+                indexes.append(_chunk_position(_mcap.decode_as(ChunkIndex, content), size))
                 if len(indexes) > _MAX_CHUNKS:
                     raise BadRecord(f"an index of more than {_MAX_CHUNKS:,} chunks")
             elif opcode == Opcode.CHANNEL:
@@ -101,7 +101,7 @@ class SealedFile(SegmentFile):
         self.statistics, self.seal = statistics, seal
         self.first_stamp_ns = int(seal["first_stamp_ns"])
         self.last_stamp_ns = int(seal["last_stamp_ns"])
-        self._take_chunks(indexes)
+        self._set_chunks(indexes)
 
     def _metadata(self, index: MetadataIndex, size: int) -> dict[str, str]:
         if index.length > _mcap.MAX_DEFINITIONS_BYTES or index.offset + index.length > size:
@@ -110,7 +110,7 @@ class SealedFile(SegmentFile):
         content = record[_mcap.FRAME.size :]
         return _mcap.checked_metadata(_mcap.decode_as(Metadata, content))
 
-    def _take_chunks(self, indexes: list[tuple[int, int, frozenset[int]]]) -> None:
+    def _set_chunks(self, indexes: list[tuple[int, int, frozenset[int]]]) -> None:
         edges = sealed_edges(self.seal["chunk_edges"], self.base)
         if len(edges) != len(indexes) + 1:
             raise BadRecord("the seal does not fit the index")
@@ -124,16 +124,16 @@ class SealedFile(SegmentFile):
 
 
 def sealed_edges(text: str, base: Offset) -> list[Offset]:
-    """The offsets at which the chunks of a segment begin and the last one ends, from its seal.
-    Raises ValueError."""
+    """Offsets at which the chunks of a segment begin and the last one ends, from its seal. Raises
+    ValueError."""
     edges = [Offset(base + int(number)) for number in text.split(",")]
     if edges[0] != base or any(one >= other for one, other in pairwise(edges)):
         raise BadRecord("the seal names chunks in no order")
     return edges
 
 
-def _place(index: ChunkIndex, size: int) -> tuple[int, int, frozenset[int]]:
-    """Where a chunk stands and how long it is, and its channels."""
+def _chunk_position(index: ChunkIndex, size: int) -> tuple[int, int, frozenset[int]]:
+    """Position, length and channels of a chunk. Raises BadRecord if it is not in the file."""
     position, length = index.chunk_start_offset, index.chunk_length
     if position + length > size:
         raise BadRecord(
@@ -142,20 +142,16 @@ def _place(index: ChunkIndex, size: int) -> tuple[int, int, frozenset[int]]:
     return position, length, frozenset(index.message_index_offsets)
 
 
-_BLOCK = 1024 * 1024
-_DATA_END_BYTES = _mcap.FRAME.size + 4
-
-
 @dataclass(frozen=True, slots=True)
 class FileCheck:
-    """``sha256`` of the whole file; ``fault`` is None when every checksum holds."""
+    """``sha256`` of the whole file; ``fault`` is None when every checksum is right."""
 
     sha256: str
     fault: str | None
 
 
 def check_sealed(path: Path) -> FileCheck:
-    """Read the whole file, a block at a time."""
+    """Compare the whole file with its checksums, a block at a time."""
     try:
         return _check(path)
     except OSError as error:  # a bad sector
@@ -168,7 +164,7 @@ def _check(path: Path) -> FileCheck:
         tail = os.pread(file.fileno(), _mcap.TAIL_BYTES, max(0, size - _mcap.TAIL_BYTES))
         summary_start, fault = _summary_start(tail, size)
         if fault is not None:
-            return FileCheck("", fault)  # it is not what was sealed, whatever its hash
+            return FileCheck("", fault)  # damaged, so its hash does not matter
         data_end_at = summary_start - _DATA_END_BYTES
         sha256 = hashlib.sha256()
         crc = 0

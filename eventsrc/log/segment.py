@@ -142,7 +142,7 @@ def _events(
     versions = {id_: envelope_version(channel) for id_, channel in channels.items()}
     base: int = segment.base
     expected: int = chunk.first
-    for channel_id, sequence, log_ns, publish_ns, at, stop in _mcap.walk(body):
+    for channel_id, sequence, log_ns, publish_ns, at, stop in _mcap.iter_messages(body):
         offset = base + sequence
         if offset != expected:
             raise BadRecord(f"offset {offset} stands in place of {expected}")

@@ -7,11 +7,11 @@ from pathlib import Path
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc.log.durable_files import _BLOCK, FileBytes
+from eventsrc.log.file_bytes import BLOCK_BYTES, FileBytes
 
 PATTERN = b"\x80\x00\x00z"
 HOLE = 1 << 16
-EDGES = (0, HOLE, _BLOCK, _BLOCK + HOLE, 2 * _BLOCK, 2 * _BLOCK + 3 * HOLE)
+EDGES = (0, HOLE, BLOCK_BYTES, BLOCK_BYTES + HOLE, 2 * BLOCK_BYTES, 2 * BLOCK_BYTES + 3 * HOLE)
 PLACES = st.builds(lambda edge, by: max(0, edge + by), st.sampled_from(EDGES), st.integers(-6, 6))
 
 

@@ -1,0 +1,134 @@
+"""Read the bytes of a file that may be huge, sparse, or on a failing disk.
+
+Only as much is read as is asked for, in blocks, so memory does not grow with the file; searches
+skip the holes of a sparse file. The file is not mapped, because a bad sector under a mapping kills
+the process.
+"""
+
+import errno
+import os
+from pathlib import Path
+from types import TracebackType
+
+BLOCK_BYTES = 1024 * 1024
+_SECTOR = 64 * 1024
+_OVERLAP = 64
+"""Bytes of the next block that each block includes, to find a pattern across the border."""
+
+
+class FileBytes:
+    """The current content of an open file from byte ``start`` on, used like `bytes`. Sectors that
+    the disk cannot read are zeros, which no checksum accepts as data."""
+
+    def __init__(self, fd: int, start: int = 0) -> None:
+        self._fd = os.dup(fd)
+        self._start = start
+        self._size = max(0, os.fstat(self._fd).st_size - start)
+        self._block_at = -1
+        self._block = b""
+
+    @classmethod
+    def of(cls, path: Path) -> "FileBytes":
+        """The bytes of the whole file at ``path``. Raises OSError."""
+        fd = os.open(path, os.O_RDONLY)
+        try:
+            return cls(fd)
+        finally:
+            os.close(fd)
+
+    def __len__(self) -> int:
+        return self._size
+
+    def __getitem__(self, part: slice) -> bytes:
+        at, stop, step = part.indices(self._size)
+        if step != 1:
+            raise ValueError("slices of a file have no step")
+        return self._read(at, max(0, stop - at))
+
+    def startswith(self, prefix: bytes, at: int = 0) -> bool:
+        """Whether ``prefix`` is at byte ``at``."""
+        return self[at : at + len(prefix)] == prefix
+
+    def find(self, pattern: bytes, start: int = 0, end: int | None = None) -> int:
+        """As `bytes.find`, for a short ``pattern`` that does not begin with a zero byte: holes are
+        not searched."""
+        end = self._size if end is None else min(end, self._size)
+        at = max(start, 0)
+        while at + len(pattern) <= end:
+            if not self._in_block(at):
+                at = self._data_from(at)
+                self._load(at)
+            block = self._block_at
+            stop = min(block + BLOCK_BYTES + len(pattern) - 1, end)
+            found = self._block.find(pattern, at - block, stop - block)
+            if found >= 0:
+                return block + found
+            at = block + BLOCK_BYTES
+        return -1
+
+    def rfind(self, pattern: bytes, start: int = 0, end: int | None = None) -> int:
+        """As `bytes.rfind`, with the same restriction."""
+        stop = self._size if end is None else min(end, self._size)
+        while stop - len(pattern) >= start:
+            at = max(start, stop - BLOCK_BYTES - len(pattern))
+            if self._data_from(at) < stop:
+                found = self[at:stop].rfind(pattern)
+                if found >= 0:
+                    return at + found
+            if at == start:
+                break
+            stop = at + len(pattern) - 1
+        return -1
+
+    def _in_block(self, at: int) -> bool:
+        return self._block_at >= 0 and 0 <= at - self._block_at < BLOCK_BYTES
+
+    def _load(self, at: int) -> None:
+        self._block_at = at - at % BLOCK_BYTES
+        length = min(BLOCK_BYTES + _OVERLAP, self._size - self._block_at)
+        self._block = self._pread(self._block_at, length)
+
+    def _data_from(self, at: int) -> int:
+        """The first byte from ``at`` on that is not in a hole, or the end."""
+        try:
+            return min(os.lseek(self._fd, self._start + at, os.SEEK_DATA) - self._start, self._size)
+        except OSError as error:
+            return self._size if error.errno == errno.ENXIO else at  # others: no holes supported
+
+    def _read(self, at: int, length: int) -> bytes:
+        if length > BLOCK_BYTES:
+            return self._pread(at, length)
+        if not self._in_block(at):
+            self._load(at)
+        start = at - self._block_at
+        data = self._block[start : start + length]
+        rest = length - len(data)
+        return data + self._pread(at + len(data), rest) if rest else data
+
+    def _pread(self, at: int, length: int) -> bytes:
+        try:
+            return os.pread(self._fd, length, self._start + at)
+        except OSError:
+            sectors = range(at, at + length, _SECTOR)
+            return b"".join(self._sector(s, min(_SECTOR, at + length - s)) for s in sectors)
+
+    def _sector(self, at: int, length: int) -> bytes:
+        try:
+            return os.pread(self._fd, length, self._start + at)
+        except OSError:
+            return bytes(length)
+
+    def close(self) -> None:
+        """Close the file."""
+        os.close(self._fd)
+
+    def __enter__(self) -> "FileBytes":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
+        self.close()
