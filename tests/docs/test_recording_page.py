@@ -55,5 +55,5 @@ def test_the_configuration_is_one_that_zenoh_reads(endpoint: str, tmp_path: Path
 def test_the_numbers_on_the_page_are_those_in_the_code() -> None:
     assert f"{DEFAULT_QUEUE_SIZE:,} messages" in PAGE
     assert f"or {DEFAULT_QUEUE_BYTES >> 20} MB" in PAGE
-    assert f"at most {WINDOW:,} envelopes under way" in PAGE
+    assert f"at most {WINDOW:,} unacknowledged envelopes" in PAGE
     assert f"{DEFAULT_SPOOL_BYTES >> 30} GiB unless" in PAGE
