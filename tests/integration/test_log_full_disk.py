@@ -1,4 +1,4 @@
-"""A disk that takes no more: one clear line, and everything synced stays readable.
+"""A full disk: one clear error, and everything synced stays readable.
 
 RLIMIT_FSIZE makes writes fail in the middle of a record, as a full disk does. It holds for a whole
 process, so each case runs in one of its own.
@@ -43,7 +43,7 @@ except LogError as error:
 
 @pytest.mark.parametrize("fsync", ["always", "1ms", "50ms"])
 @pytest.mark.parametrize("limit", [20_000, 20_500, 1_000_000])
-def test_what_was_synced_stays(log_path: Path, limit: int, fsync: str) -> None:
+def test_synced_events_stay(log_path: Path, limit: int, fsync: str) -> None:
     program = FILL.format(limit=limit, fsync=fsync)
     done = subprocess.run(
         [sys.executable, "-c", program, str(log_path)],
@@ -67,7 +67,7 @@ def test_what_was_synced_stays(log_path: Path, limit: int, fsync: str) -> None:
     assert [e.payload for e in read_log(log_path)][-1] == b"after"
 
 
-def test_a_seal_that_fails_costs_nothing(log_path: Path) -> None:
+def test_a_failed_seal_loses_nothing(log_path: Path) -> None:
     """Compressed, the segment is larger than the limit: the active file stays and is read."""
     program = """
 import random, resource, sys
@@ -103,7 +103,7 @@ except LogError as error:
     assert not list(log_path.glob("*.active"))
 
 
-def test_a_folder_that_may_not_be_written_is_one_line(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made_is_a_one_line_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(LogError, match="Not a directory"):
         LogWriter(tmp_path / "file" / "log")

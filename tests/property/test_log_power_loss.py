@@ -1,5 +1,5 @@
-"""Power may fail after any call to the system: whatever a disk may then hold, every event that had
-been called recorded is read back, none is made up, and the log is written on."""
+"""A power cut after any system call: whatever the disk may then hold, all recorded events are read
+back, none is made up, and the log can be appended to."""
 
 import shutil
 from collections.abc import Callable, Iterator
@@ -72,9 +72,7 @@ LIVES: dict[str, Callable[[Tracer], None]] = {
 
 
 @pytest.mark.parametrize("name", LIVES)
-def test_what_was_promised_is_there_after_any_power_cut(
-    name: str, tracer: Tracer, quick_path: Path
-) -> None:
+def test_recorded_events_survive_any_power_cut(name: str, tracer: Tracer, quick_path: Path) -> None:
     LIVES[name](tracer)
     assert survive(tracer.end(), quick_path / "log") > 40
 
@@ -108,7 +106,7 @@ def check(log: Path, files: dict[str, bytes], promised: int, place: str) -> None
     shutil.rmtree(log)
 
 
-def test_without_its_syncs_a_log_does_not_survive(tracer: Tracer, quick_path: Path) -> None:
+def test_without_syncs_recorded_events_are_lost(tracer: Tracer, quick_path: Path) -> None:
     """The test above can fail: take the syncs of files away, or those of the folder."""
     one_life(tracer, ALWAYS)
     for ignored in ("sync", "sync folder", "sync parent"):
@@ -117,7 +115,7 @@ def test_without_its_syncs_a_log_does_not_survive(tracer: Tracer, quick_path: Pa
             survive(calls[:60], quick_path / ignored)
 
 
-def test_calls_are_noted_in_order(tracer: Tracer) -> None:
+def test_the_tracer_notes_calls_in_order(tracer: Tracer) -> None:
     with LogWriter(tracer.folder, fsync=ALWAYS) as writer:
         append(tracer, writer, 1)
     names = [call.name.split(" ")[0] for call in tracer.calls if "lock" not in call.name]

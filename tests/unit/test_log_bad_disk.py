@@ -1,4 +1,4 @@
-"""A disk that gives errors instead of bytes is rot like any other."""
+"""Read errors of the disk are handled like damaged bytes."""
 
 import os
 from pathlib import Path

@@ -41,7 +41,7 @@ def new(*payloads: bytes) -> list[NewEvent]:
     return [NewEvent(KEY, payload, 10 + n, n) for n, payload in enumerate(payloads)]
 
 
-def test_fsync_as_people_write_it() -> None:
+def test_parse_fsync() -> None:
     assert parse_fsync("always") == ALWAYS
     assert parse_fsync("never") == NEVER
     assert parse_fsync("50ms") == GROUP_COMMIT
@@ -75,7 +75,7 @@ def syncs(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         (BY_HAND, 0, 0),
     ],
 )
-def test_a_policy_decides_when(
+def test_commits_and_syncs_of_each_policy(
     log_path: Path, syncs: list[int], policy: FsyncPolicy, durable: int, synced: int
 ) -> None:
     with LogWriter(log_path, fsync=policy) as writer:
@@ -103,7 +103,7 @@ def test_time_makes_a_commit_due_without_another_event(log_path: Path) -> None:
 @pytest.mark.parametrize(
     "limits", [{"rotate_bytes": 1}, {"rotate_events": 1}, {"rotate_seconds": 0.0}]
 )
-def test_each_limit_rotates(log_path: Path, limits: dict[str, Any]) -> None:
+def test_each_limit_causes_a_rotation(log_path: Path, limits: dict[str, Any]) -> None:
     with LogWriter(log_path, fsync=ALWAYS, **limits) as writer:
         for _ in range(3):
             writer.append(KEY, b"x")
@@ -154,10 +154,10 @@ def test_recording_and_reading_go_on_while_segments_are_sealed(
     assert not list(log_path.glob("*.active"))
 
 
-def test_a_segment_that_is_sealed_between_two_looks_is_seen(
+def test_a_segment_sealed_while_a_reader_lists_the_folder_is_found(
     log_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The reader asks for one name and then the other, and sealing exchanges them in between."""
+    """The reader checks one name and then the other; sealing renames the file in between."""
     real_seal: Callable[..., str] = seal
     begun, may_seal = threading.Event(), threading.Event()
 
@@ -213,10 +213,10 @@ def test_a_disk_that_fails_to_sync_ends_the_writer(
         assert again.next_offset == 1
 
 
-def test_nothing_is_written_behind_what_an_interrupt_cut_short(
+def test_after_an_interrupted_write_the_writer_refuses_further_work(
     log_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whoever caught Ctrl-C and went on would write where no reader comes to."""
+    """Readers stop at the torn chunk and would not see what is written behind it."""
     writer = LogWriter(log_path, fsync=BY_HAND)
     writer.append(KEY, b"0")
     writer.sync()

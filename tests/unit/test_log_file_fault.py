@@ -67,9 +67,7 @@ def write(writer: LogWriter, numbers: range) -> None:
 
 
 @pytest.mark.parametrize("tamper", TAKEN)
-def test_what_comes_after_is_recorded_behind_it_in_a_new_file(
-    log_path: Path, tamper: Tamper
-) -> None:
+def test_recording_goes_on_in_a_new_file(log_path: Path, tamper: Tamper) -> None:
     writer = LogWriter(log_path, fsync=BY_HAND)
     write(writer, range(BEFORE))
     old = growing(log_path)
@@ -87,10 +85,9 @@ def test_what_comes_after_is_recorded_behind_it_in_a_new_file(
 
 
 @pytest.mark.parametrize("tamper", TAKEN)
-def test_no_offset_is_given_twice_whenever_the_writer_dies(
+def test_no_offset_is_used_twice_if_the_writer_dies_after_making_the_new_file(
     log_path: Path, tamper: Tamper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Here right after the new file was made, before anything stands in it."""
     writer = LogWriter(log_path, fsync=BY_HAND)
     write(writer, range(BEFORE))
     tamper(growing(log_path))
@@ -113,7 +110,7 @@ def test_no_offset_is_given_twice_whenever_the_writer_dies(
 
 
 @pytest.mark.parametrize("tamper", [delete, empty])
-def test_recovery_puts_losses_in_the_place_of_what_is_gone(log_path: Path, tamper: Tamper) -> None:
+def test_recovery_replaces_lost_events_by_loss_events(log_path: Path, tamper: Tamper) -> None:
     writer = LogWriter(log_path, fsync=BY_HAND)
     write(writer, range(BEFORE))
     tamper(growing(log_path))
@@ -128,8 +125,7 @@ def test_recovery_puts_losses_in_the_place_of_what_is_gone(log_path: Path, tampe
     assert not {"gap", "chain", "crc"} & {finding.kind for finding in verify_log(log_path).findings}
 
 
-def test_the_new_file_has_a_mark_seed_of_its_own(log_path: Path) -> None:
-    """By which its marks are read, while it grows, and which nobody learns from the old file."""
+def test_the_new_file_has_another_mark_seed(log_path: Path) -> None:
     writer = LogWriter(log_path, fsync=BY_HAND)
     write(writer, range(BEFORE))
     old = growing(log_path)
@@ -146,7 +142,7 @@ def test_the_new_file_has_a_mark_seed_of_its_own(log_path: Path) -> None:
         writer.close()
 
 
-def test_what_was_not_cut_off_is_read(log_path: Path) -> None:
+def test_events_before_the_cut_are_read(log_path: Path) -> None:
     writer = LogWriter(log_path, fsync=BY_HAND)
     write(writer, range(BEFORE))
     cut_in_the_middle(growing(log_path))
@@ -170,7 +166,7 @@ def test_a_file_that_is_put_back_under_its_name_makes_the_log_whole(log_path: Pa
     assert [event.payload for event in read_log(log_path)] == [b"%d" % n for n in range(6)]
 
 
-def test_what_stands_there_now_is_never_written_over(log_path: Path) -> None:
+def test_a_file_that_replaced_the_segment_is_never_overwritten(log_path: Path) -> None:
     """Nothing was recorded in the file yet, so the new one has its name."""
     writer = LogWriter(log_path, fsync=BY_HAND)
     path = growing(log_path)
@@ -202,7 +198,7 @@ def test_bytes_that_another_program_appends_cost_no_event(log_path: Path) -> Non
 
 
 @pytest.mark.parametrize("moment", ["before the write", "during the sync"])
-def test_a_cut_at_any_moment_is_seen_before_the_group_counts(
+def test_a_cut_during_a_commit_is_noticed_before_the_group_counts(
     log_path: Path, moment: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     writer = LogWriter(log_path, fsync=BY_HAND)
@@ -228,8 +224,8 @@ def test_a_cut_at_any_moment_is_seen_before_the_group_counts(
     assert [event.payload for event in read_log(log_path, BEFORE)] == [b"3", b"4", b"5"]
 
 
-def test_events_taken_before_the_file_was_given_up_keep_their_offsets(log_path: Path) -> None:
-    """They were numbered from the start of the old file."""
+def test_events_waiting_when_the_file_is_given_up_keep_their_offsets(log_path: Path) -> None:
+    """Their sequence numbers counted from the start of the old file."""
     writer = LogWriter(log_path, fsync=BY_HAND)
     write(writer, range(BEFORE))
     empty(growing(log_path))
@@ -243,8 +239,8 @@ def test_events_taken_before_the_file_was_given_up_keep_their_offsets(log_path: 
     assert [(e.offset, e.payload) for e in events] == [(n, b"%d" % n) for n in range(BEFORE, 12)]
 
 
-def test_the_new_file_is_one_that_other_programs_read(log_path: Path) -> None:
-    """It holds the schemas that the old file had, too."""
+def test_other_programs_can_read_the_new_file(log_path: Path) -> None:
+    """It also holds the schemas of the old file."""
     writer = LogWriter(log_path, fsync=BY_HAND)
     write(writer, range(BEFORE))
     delete(growing(log_path))
@@ -261,7 +257,7 @@ def test_the_new_file_is_one_that_other_programs_read(log_path: Path) -> None:
     ]
 
 
-def test_rotation_goes_on_behind_a_file_that_was_given_up(log_path: Path) -> None:
+def test_rotation_goes_on_after_a_file_was_given_up(log_path: Path) -> None:
     writer = LogWriter(log_path, fsync=BY_HAND, rotate_events=4)
     for number in range(12):
         write(writer, range(number, number + 1))

@@ -1,4 +1,4 @@
-"""What a killed writer left is finished before the next one begins, and sealed behind its back."""
+"""Segments that a killed writer left are finished at the next start and sealed in background."""
 
 import threading
 from pathlib import Path
@@ -43,7 +43,7 @@ def payloads(path: Path) -> list[bytes]:
     return [event.payload for event in read_log(path)]
 
 
-def test_a_writer_does_not_wait_for_what_its_predecessor_left_unsealed(
+def test_a_writer_does_not_wait_for_the_sealing_of_left_over_segments(
     log_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     killed(log_path, 8, rotate_events=3)
@@ -59,7 +59,7 @@ def test_a_writer_does_not_wait_for_what_its_predecessor_left_unsealed(
     assert {f.kind for f in verify_log(log_path).findings} == {"schema"}
 
 
-def test_killed_again_before_anything_was_sealed_loses_nothing(
+def test_a_second_kill_before_sealing_loses_nothing(
     log_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     killed(log_path, 5, rotate_events=2)
@@ -104,7 +104,7 @@ def test_a_chunk_without_its_mark_is_kept_and_shown_before_it_is_sealed(
         held.may_begin.set()
 
 
-def test_where_a_mark_has_rotted_all_is_sealed_at_once(
+def test_after_a_damaged_mark_all_left_over_segments_are_sealed_at_once(
     log_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     killed(log_path, 5, rotate_events=3)
@@ -124,8 +124,8 @@ def test_where_a_mark_has_rotted_all_is_sealed_at_once(
     assert {f.kind for f in verify_log(log_path).findings} == {"schema"}
 
 
-def test_rot_in_a_finished_segment_keeps_no_recorder_from_starting(log_path: Path) -> None:
-    """It is found when that is sealed, and nothing behind it is sealed then; nor is it lost."""
+def test_a_writer_starts_despite_damage_in_a_finished_segment(log_path: Path) -> None:
+    """Sealing finds it and seals nothing behind it; nothing behind it is lost."""
     killed(log_path, 5, rotate_events=2)
     active = segment_path(log_path, 0, ACTIVE)
     data = bytearray(active.read_bytes())
@@ -142,7 +142,7 @@ def test_rot_in_a_finished_segment_keeps_no_recorder_from_starting(log_path: Pat
     assert kept == [b"1", b"2", b"3", b"4", b"5"]
 
 
-def test_rot_in_the_last_segment_is_not_passed_over(log_path: Path) -> None:
+def test_a_writer_refuses_to_start_on_damage_in_the_last_segment(log_path: Path) -> None:
     killed(log_path, 5, rotate_events=100)
     active = segment_path(log_path, 0, ACTIVE)
     data = bytearray(active.read_bytes())

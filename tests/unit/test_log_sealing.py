@@ -1,4 +1,4 @@
-"""Sealing that fails is told at once, costs nothing, and is tried again."""
+"""Failed seals are reported at once, lose nothing, and are tried again."""
 
 import errno
 import os
@@ -32,7 +32,7 @@ class Disk:
 
 
 def segments(path: Path, count: int) -> Sealer:
-    """Finished segments of one event each, and who seals them."""
+    """Finished segments of one event each, and a sealer for them."""
     writer = LogWriter(path, fsync=ALWAYS, rotate_events=1)
     writer._sealer.submit = lambda *_, **__: None  # type: ignore[method-assign]
     for number in range(count):
@@ -41,7 +41,7 @@ def segments(path: Path, count: int) -> Sealer:
     return Sealer(path, writer.log_id, "")
 
 
-def test_a_disk_that_was_full_for_a_while_is_tried_again(
+def test_sealing_is_tried_again_after_a_full_disk(
     log_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sealer = segments(log_path, 3)
@@ -64,9 +64,7 @@ def test_a_disk_that_was_full_for_a_while_is_tried_again(
     assert {f.kind for f in verify_log(log_path).findings} == {"schema"}
 
 
-def test_a_segment_that_waited_goes_before_the_next_one(
-    log_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_segments_are_sealed_in_order(log_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     disk = Disk(monkeypatch)
     with LogWriter(log_path, fsync=ALWAYS, rotate_events=1) as writer:
         writer.append(KEY, b"0")
@@ -78,7 +76,7 @@ def test_a_segment_that_waited_goes_before_the_next_one(
     assert [e.payload for e in read_log(log_path)] == [b"0", b"1"]
 
 
-def test_a_folder_that_cannot_be_synced_is_tried_again(
+def test_sealing_is_tried_again_after_a_failed_folder_sync(
     log_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sealer = segments(log_path, 2)
@@ -98,8 +96,8 @@ def test_a_folder_that_cannot_be_synced_is_tried_again(
     assert {f.kind for f in verify_log(log_path).findings} == {"schema"}
 
 
-def test_a_segment_that_contradicts_itself_is_told_and_kept(log_path: Path) -> None:
-    """Its CRC holds, so only who takes it apart can tell."""
+def test_an_inconsistent_segment_is_reported_and_kept(log_path: Path) -> None:
+    """Its CRC is right; only parsing it finds the error."""
     sealer = segments(log_path, 2)
     sealer = Sealer(log_path, LogReader(log_path).log_id, "")
     active = segment_path(log_path, 0, ACTIVE)
@@ -117,7 +115,7 @@ def test_a_segment_that_contradicts_itself_is_told_and_kept(log_path: Path) -> N
 
 
 @pytest.mark.parametrize("at", [3, -10], ids=["chunk head", "commit mark"])
-def test_what_hides_behind_a_rotten_frame_is_not_sealed_away(log_path: Path, at: int) -> None:
+def test_events_behind_a_damaged_frame_are_not_dropped_by_sealing(log_path: Path, at: int) -> None:
     """Readers see nothing behind it, so a sealed segment of what they see would be all there is."""
     writer = LogWriter(log_path, fsync=ALWAYS)
     writer._sealer.submit = lambda *_, **__: None  # type: ignore[method-assign]
@@ -138,7 +136,7 @@ def test_what_hides_behind_a_rotten_frame_is_not_sealed_away(log_path: Path, at:
     assert kept == ([b"0", b"2", b"3"] if at > 0 else [b"0", b"1", b"2", b"3"])
 
 
-def test_a_segment_that_was_deleted_before_it_was_sealed_is_told(log_path: Path) -> None:
+def test_a_segment_deleted_before_it_was_sealed_is_reported(log_path: Path) -> None:
     writer = LogWriter(log_path, fsync=ALWAYS)
     writer.append(KEY, b"0")
     segment_path(log_path, 0, ACTIVE).unlink()
@@ -155,7 +153,7 @@ def with_a_cut_message(data: bytes) -> bytes:
     return data[:at] + made + body + data[at + head.length :]
 
 
-def test_a_full_disk_is_no_question_of_rights(
+def test_the_advice_for_a_full_disk_is_to_free_space(
     log_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*_: object) -> None:

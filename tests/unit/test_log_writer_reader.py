@@ -1,4 +1,4 @@
-"""What goes into a log comes out of it: bytes, times, keys and offsets."""
+"""Append events and read them back: bytes, times, keys and offsets; the lock; log info."""
 
 import fcntl
 import json
@@ -18,7 +18,7 @@ from tests.fixtures_log import BY_HAND, KEY, envelope, read_log, write_log
 ODD_PAYLOADS = [b"", b"\x00", b"\xff\xfe not utf-8", "ε🙂".encode(), b"x" * 100_000]
 
 
-def test_payloads_times_and_keys_come_back_as_they_went_in(log_path: Path) -> None:
+def test_payloads_times_and_keys_are_read_back_unchanged(log_path: Path) -> None:
     with LogWriter(log_path) as writer:
         for index, payload in enumerate(ODD_PAYLOADS):
             key = f"robot/{index % 2}/ε"
@@ -75,7 +75,7 @@ def test_an_empty_log_is_a_log(log_path: Path) -> None:
             assert (reader.log_id, reader.next_offset, list(reader.read())) == (log_id, 0, [])
 
 
-def test_a_second_writer_is_told_who_holds_the_log(log_path: Path) -> None:
+def test_a_second_writer_is_refused_with_the_name_of_the_holder(log_path: Path) -> None:
     with LogWriter(log_path, clock=lambda: 0), pytest.raises(LogBusy) as caught:
         LogWriter(log_path)
     message = str(caught.value)
@@ -85,7 +85,7 @@ def test_a_second_writer_is_told_who_holds_the_log(log_path: Path) -> None:
     LogWriter(log_path).close()
 
 
-def test_a_deleted_lock_file_lets_nobody_in(log_path: Path) -> None:
+def test_a_deleted_lock_file_does_not_release_the_log(log_path: Path) -> None:
     with LogWriter(log_path) as writer:
         writer.append(KEY, b"0")
         writer.sync()
@@ -98,7 +98,7 @@ def test_a_deleted_lock_file_lets_nobody_in(log_path: Path) -> None:
     LogWriter(log_path).close()
 
 
-def test_who_only_looks_keeps_no_writer_out(
+def test_asking_whether_a_log_is_held_keeps_no_writer_out(
     log_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """`log verify` asks whether a log is held, and holds it while it does."""
@@ -124,7 +124,7 @@ def test_no_log_and_not_a_log_are_named(tmp_path: Path) -> None:
         LogWriter(tmp_path)
 
 
-def test_a_place_that_cannot_be_looked_at_is_one_line(tmp_path: Path) -> None:
+def test_an_unreadable_folder_is_a_one_line_error(tmp_path: Path) -> None:
     for use in (LogReader, LogWriter, verify_log):
         with pytest.raises(LogError, match=r"File name too long; check (its|the folder's) rights"):
             use(tmp_path / ("x" * 300))
