@@ -1,4 +1,4 @@
-"""The ledger of a log: what a log lacks, from its events or from a saved ledger and the rest."""
+"""The gap ledger of a log, folded from all its events or continued from a saved ledger."""
 
 import shutil
 from collections.abc import Iterator
@@ -61,20 +61,20 @@ def _ledger(log: Path) -> GapLedger:
         return ledger_of(reader, now_ns=0)
 
 
-def test_how_much_there_is_to_read(log: Path) -> None:
+def test_unread_events_are_those_behind_the_saved_ledger(log: Path) -> None:
     with LogReader(log) as reader:
         assert unread_events(reader) == 12
         _save(log)
         assert unread_events(reader) == 5
 
 
-def test_what_a_log_lacks_is_read_from_its_events(log: Path) -> None:
+def test_the_ledger_is_folded_from_the_events(log: Path) -> None:
     ledger = _ledger(log)
     assert list(ledger.gaps()) == [Gap("run-a", 2, 4), Gap("run-a", 6, 6), Gap("run-a", 8, 8)]
     assert ledger.flush() == [Gap("run-a", 6, 6), Gap("run-a", 8, 8)], "2–4 is reported already"
 
 
-def test_log_info_counts_what_was_reported_less_what_came_late(log: Path) -> None:
+def test_log_info_counts_reported_losses_less_late_keyframes(log: Path) -> None:
     assert log_info(log).lost == 3 + 7 + 1
     with LogWriter(log) as writer:
         for k in (3, 2, 6, 3):
@@ -101,7 +101,7 @@ def _holds(ledger: GapLedger, run_id: str, keyframe_id: int) -> bool:
     )
 
 
-def test_a_saved_ledger_is_gone_on_from(log: Path) -> None:
+def test_folding_continues_from_a_saved_ledger(log: Path) -> None:
     _save(log)
     ledger = _ledger(log)
     assert _holds(ledger, "from-the-cache", 1)
@@ -110,7 +110,7 @@ def test_a_saved_ledger_is_gone_on_from(log: Path) -> None:
 
 
 @pytest.mark.parametrize("spoil", ["other log", "longer than the log", "torn"])
-def test_a_saved_ledger_that_cannot_be_believed_is_not(log: Path, spoil: str) -> None:
+def test_an_unusable_saved_ledger_is_ignored(log: Path, spoil: str) -> None:
     if spoil == "other log":
         _save(log, log_id="0" * 32)
     elif spoil == "longer than the log":
@@ -162,9 +162,7 @@ def _saved(log: Path) -> GapLedger:
 
 
 @pytest.mark.parametrize("copies", ["kept", "deleted"])
-def test_no_recovery_leaves_a_ledger_that_knows_more_than_the_log(
-    long_log: Path, copies: str
-) -> None:
+def test_recovery_leaves_no_ledger_of_lost_events(long_log: Path, copies: str) -> None:
     for lost, offset in enumerate((1, 2, 9), start=1):
         _saved(long_log)
         _rot_the_event(long_log, offset)
@@ -177,7 +175,7 @@ def test_no_recovery_leaves_a_ledger_that_knows_more_than_the_log(
 
 
 @pytest.mark.parametrize(("base", "missing"), [(0, 0), (4, 4)])
-def test_a_segment_that_is_gone_takes_the_saved_ledger_with_it(
+def test_a_missing_segment_invalidates_the_saved_ledger(
     long_log: Path, base: int, missing: int
 ) -> None:
     _saved(long_log)
@@ -192,7 +190,7 @@ def test_a_segment_that_is_gone_takes_the_saved_ledger_with_it(
     assert not _holds(ledger, "run-a", base)
 
 
-def test_recovery_deletes_the_saved_ledger_before_it_replaces_anything(
+def test_recovery_deletes_the_saved_ledger_first(
     long_log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _saved(long_log)
@@ -210,9 +208,7 @@ def test_recovery_deletes_the_saved_ledger_before_it_replaces_anything(
 
 
 @pytest.mark.parametrize("base", [0, 4, 8])
-def test_another_segment_in_the_place_of_one_is_noticed_without_recovery(
-    long_log: Path, base: int
-) -> None:
+def test_a_replaced_segment_invalidates_the_saved_ledger(long_log: Path, base: int) -> None:
     """As when a folder is put together again from copies."""
     _saved(long_log)
     saved = (long_log / LEDGER).read_bytes()
@@ -222,7 +218,7 @@ def test_another_segment_in_the_place_of_one_is_noticed_without_recovery(
     assert not _holds(_ledger(long_log), "run-a", base + 1)
 
 
-def test_a_power_cut_that_took_unsynced_events_takes_their_ledger(tmp_path: Path) -> None:
+def test_a_power_cut_of_unsynced_events_invalidates_their_ledger(tmp_path: Path) -> None:
     """Under --fsync never a log may come back shorter, and grow again by other events."""
     log, copy = tmp_path / "log", tmp_path / "copy"
     with LogWriter(log, fsync=NEVER) as writer:
@@ -242,7 +238,7 @@ def test_a_power_cut_that_took_unsynced_events_takes_their_ledger(tmp_path: Path
         assert list(_ledger(copy).gaps()) == [Gap("run-a", 3, 6)]
 
 
-def test_sealing_leaves_the_saved_ledger_as_good_as_it_was(tmp_path: Path) -> None:
+def test_sealing_keeps_the_saved_ledger_valid(tmp_path: Path) -> None:
     log = tmp_path / "log"
     with LogWriter(log, fsync=BY_HAND) as writer:
         append_payload(writer, KEY, payload(envelope(1)))
@@ -255,7 +251,7 @@ def test_sealing_leaves_the_saved_ledger_as_good_as_it_was(tmp_path: Path) -> No
         assert unread_events(reader) == 1
 
 
-def test_saving_and_going_on_equals_reading_everything(log: Path) -> None:
+def test_continuing_from_a_save_equals_reading_everything(log: Path) -> None:
     whole = _ledger(log)
     with LogReader(log) as reader:
         half = GapLedger()
@@ -294,7 +290,7 @@ class Counted:
         return self.read, ledger
 
 
-def test_a_start_that_is_killed_while_it_reads_the_log_is_gone_on_from(
+def test_a_killed_first_reading_is_continued(
     long_log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = _ledger(long_log).state()
@@ -311,7 +307,7 @@ def test_a_start_that_is_killed_while_it_reads_the_log_is_gone_on_from(
     assert counted.keep(long_log)[0] == 0
 
 
-def test_that_the_cache_cannot_be_written_is_no_error(tmp_path: Path) -> None:
+def test_an_unwritable_cache_is_no_error(tmp_path: Path) -> None:
     (tmp_path / f"{LEDGER}.new").mkdir()
     save_ledger(tmp_path, "id", 0, GapLedger())
     assert not (tmp_path / LEDGER).exists()

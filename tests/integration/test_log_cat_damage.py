@@ -1,5 +1,5 @@
-"""`mapfold log cat` of a log with rot in the middle: stop there, or go on and name it, but a range
-that the rot is not in is read as if it were not there."""
+"""`mapfold log cat` of a log with rot in the middle: it stops there, or reports it and continues; a
+range without the rot is not affected."""
 
 from pathlib import Path
 
@@ -82,7 +82,7 @@ def test_a_range_around_the_damage(run: Commands) -> None:
 
 
 @pytest.mark.parametrize("to", ["r1:250", "r1:150", "r1:1000"])
-def test_what_is_before_the_damage_is_shown_on_the_way_to_a_keyframe(
+def test_events_before_the_damage_are_shown_when_to_is_a_keyframe_behind_it(
     run: Commands, to: str
 ) -> None:
     said = run("log", "cat", "L", "--from", "98", "--to", to, code=1)
@@ -92,7 +92,7 @@ def test_what_is_before_the_damage_is_shown_on_the_way_to_a_keyframe(
 
 
 @pytest.mark.parametrize("to", ["r1:25", at(25), "end", "r1:99"])
-def test_what_is_before_rot_at_the_end_of_a_growing_segment_is_shown(
+def test_events_before_rot_at_the_end_of_a_growing_segment_are_shown(
     tmp_path: Path, to: str
 ) -> None:
     log = tmp_path / "L"

@@ -89,7 +89,7 @@ def test_the_original_is_kept_where_no_file_can_have_two_names(
     assert segment(run).read_bytes() == rotten
 
 
-def test_a_writer_refuses_a_rotten_growing_segment_and_says_what_to_do(run: Commands) -> None:
+def test_a_writer_refuses_a_rotten_growing_segment_and_names_recover(run: Commands) -> None:
     active = segment(run).with_name(segment(run).name + ".active")
     active.write_bytes(growing(run.folder / "other", PAYLOADS[:2]))
     segment(run).unlink()

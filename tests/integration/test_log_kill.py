@@ -1,4 +1,4 @@
-"""kill -9 at random moments: nothing acknowledged is lost, nothing stands twice.
+"""kill -9 at random moments: no acknowledged event is lost or recorded twice.
 
 `scripts/chaos_log` does the same for as long as one likes. `mapfold record` is killed in
 `tests/chaos/test_recorder_kills.py`.

@@ -79,7 +79,7 @@ def test_a_tail_of_another_process(log_path: Path) -> None:
             process.kill()
 
 
-def test_a_tail_goes_on_through_a_restart(log_path: Path) -> None:
+def test_a_tail_continues_across_a_restart(log_path: Path) -> None:
     with LogWriter(log_path) as writer:
         writer.append(KEY, b"0")
     with tail(log_path) as got:
@@ -99,7 +99,7 @@ def test_unsynced_events_are_not_shown(log_path: Path) -> None:
         assert next_event(got).payload == b"waiting"
 
 
-def test_a_tail_stops_at_what_it_cannot_read(log_path: Path) -> None:
+def test_a_tail_stops_at_unreadable_events(log_path: Path) -> None:
     stop = threading.Event()
     writer = LogWriter(log_path, fsync=BY_HAND)
     writer.append(KEY, b"good")
@@ -122,9 +122,7 @@ def test_a_tail_stops_at_what_it_cannot_read(log_path: Path) -> None:
 
 @pytest.mark.parametrize("at", [3, -10], ids=["chunk head", "commit mark"])
 @pytest.mark.parametrize("behind", ["same segment", "next segment"])
-def test_a_tail_does_not_wait_for_ever_for_what_has_rotted(
-    log_path: Path, at: int, behind: str
-) -> None:
+def test_a_waiting_tail_detects_rot(log_path: Path, at: int, behind: str) -> None:
     stop = threading.Event()
     rotate_events = 2 if behind == "next segment" else 100
     writer = LogWriter(log_path, fsync=BY_HAND, rotate_events=rotate_events)

@@ -16,7 +16,7 @@ def _missing(recorded: set[int]) -> set[int]:
 
 
 @given(steps)
-def test_missing_is_what_lies_between_and_was_never_recorded(
+def test_missing_are_unrecorded_ids_between_recorded_ones(
     steps: list[tuple[str, int, int]],
 ) -> None:
     ledger = GapLedger(SETTLE_NS)
@@ -63,7 +63,7 @@ def test_every_missing_keyframe_is_reported_once_when_it_has_settled(
     st.lists(st.one_of(st.integers(0, 20), st.tuples(st.integers(0, 30)))),
     st.integers(0, 20),
 )
-def test_what_a_publisher_said_is_missing_until_it_comes(
+def test_announced_keyframes_are_missing_until_recorded(
     steps: list[int | tuple[int]], late: int
 ) -> None:
     """A bare number is recorded, one in a tuple is said to be the last that was sent."""
@@ -96,7 +96,7 @@ def test_what_a_publisher_said_is_missing_until_it_comes(
 
 
 @given(steps, st.integers(0, 20))
-def test_restored_it_goes_on_as_if_nothing_had_been(
+def test_a_restored_ledger_continues_like_the_original(
     steps: list[tuple[str, int, int]], at: int
 ) -> None:
     whole, half = GapLedger(SETTLE_NS), GapLedger(SETTLE_NS)
@@ -118,7 +118,7 @@ def test_restored_it_goes_on_as_if_nothing_had_been(
     st.lists(st.tuples(st.integers(0, 30), st.integers(0, 10))),
     st.lists(st.integers(0, 30)),
 )
-def test_what_was_reported_stays_so_until_a_keyframe_closes_it(
+def test_reported_gaps_stay_reported_until_closed(
     before: list[int], told: list[tuple[int, int]], late: list[int]
 ) -> None:
     ledger = GapLedger(SETTLE_NS)

@@ -1,4 +1,4 @@
-"""Cut it anywhere, flip any byte: what was synced is read back or named, and never made up."""
+"""An active segment cut at any byte or with any byte flipped: synced events are read or reported."""
 
 import contextlib
 import shutil
@@ -55,7 +55,7 @@ def test_a_cut_at_any_byte_leaves_a_prefix_with_everything_synced(quick_path: Pa
         shutil.rmtree(log)
 
 
-def test_any_flip_in_an_active_segment_is_named(quick_path: Path) -> None:
+def test_any_flip_in_an_active_segment_is_reported(quick_path: Path) -> None:
     file, events, durable_at = make_active(quick_path / "log")
     data = bytearray(file.read_bytes())
     everything = set(range(len(events)))

@@ -88,7 +88,7 @@ def test_a_sealed_segment_of_another_log_over_the_growing_one(quick_path: Path) 
 
 @pytest.mark.parametrize(("one", "other"), [(0, 3), (3, 6), (6, 12), (0, 12)])
 @pytest.mark.parametrize("growing", [False, True])
-def test_exchanged_names_are_found_refused_and_exchanged_back(
+def test_exchanged_names_are_detected_and_corrected(
     quick_path: Path, one: int, other: int, growing: bool
 ) -> None:
     log = quick_path / "log"
@@ -121,7 +121,7 @@ def test_exchanged_names_are_found_refused_and_exchanged_back(
 
 
 @pytest.mark.parametrize("steps", range(7))
-def test_an_exchange_that_is_interrupted_goes_on(
+def test_an_interrupted_renaming_is_finished(
     quick_path: Path, steps: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = quick_path / "log"
@@ -164,7 +164,7 @@ def test_the_same_segment_under_two_names(quick_path: Path) -> None:
 
 
 @pytest.mark.parametrize("base", [0, 3, 12])
-def test_an_older_copy_out_of_a_backup_does_not_win(quick_path: Path, base: int) -> None:
+def test_an_older_backup_copy_is_set_aside(quick_path: Path, base: int) -> None:
     """A segment as it was when it held fewer events, under the name of a growing one."""
     log = quick_path / "log"
     payloads = make(log, "a")
@@ -179,7 +179,7 @@ def test_an_older_copy_out_of_a_backup_does_not_win(quick_path: Path, base: int)
 
 
 @pytest.mark.parametrize("tail_gone", [False, True])
-def test_a_backup_that_overlaps(quick_path: Path, tail_gone: bool) -> None:
+def test_events_only_in_an_overlapping_backup_are_kept(quick_path: Path, tail_gone: bool) -> None:
     """The same events in other segments: what only the backup holds is kept, at its offsets."""
     log = quick_path / "log"
     payloads = make(log, "a")
@@ -216,7 +216,9 @@ def by_hand(log_id: str, base: int, messages: list[tuple[int, bytes]]) -> bytes:
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_any_mix_of_names_keeps_every_event_at_its_offset(quick_path: Path, seed: int) -> None:
+def test_any_permutation_of_names_keeps_every_event_at_its_offset(
+    quick_path: Path, seed: int
+) -> None:
     chance = random.Random(seed)
     log = quick_path / "log"
     payloads = make(log, "a")
@@ -247,7 +249,7 @@ def test_any_mix_of_names_keeps_every_event_at_its_offset(quick_path: Path, seed
     assert not recover_log(log).findings
 
 
-def test_two_logs_half_and_half_are_left_alone(quick_path: Path) -> None:
+def test_segments_of_two_logs_in_equal_number_are_not_touched(quick_path: Path) -> None:
     make(quick_path / "a", "a", events=2 * EACH)
     make(quick_path / "b", "b", events=2 * EACH)
     log = quick_path / "a"
@@ -258,7 +260,7 @@ def test_two_logs_half_and_half_are_left_alone(quick_path: Path) -> None:
     assert files(log) == before
 
 
-def test_losses_without_end_are_asked_about(tmp_path: Path) -> None:
+def test_very_many_losses_need_confirmation(tmp_path: Path) -> None:
     """A segment whose head names a base far behind everything else."""
     run = Commands.in_folder(tmp_path)
     log = tmp_path / "L"

@@ -1,5 +1,5 @@
 """Segments that other MCAP programs have rewritten: recovery keeps at least what the mcap package's
-own reader reads, at its offsets, or says that `mapfold import` takes it."""
+own reader reads, at its offsets, or names `mapfold import`."""
 
 import json
 import random
@@ -47,7 +47,7 @@ WAYS: dict[str, Callable[[Path], None]] = {
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("which", [0, 1, 2])
-def test_a_rewritten_segment_is_kept_whole(log: Path, way: str, which: int) -> None:
+def test_every_event_of_a_rewritten_segment_is_kept(log: Path, way: str, which: int) -> None:
     whole = read_log(log)
     path = segment_path(log, which * EACH, SEALED)
     WAYS[way](path)
@@ -62,7 +62,7 @@ def test_a_rewritten_segment_is_kept_whole(log: Path, way: str, which: int) -> N
 
 
 @pytest.mark.parametrize("which", [0, 1, 2])
-def test_of_a_filtered_segment_with_its_metadata_what_is_there_is_kept(
+def test_the_events_left_in_a_filtered_segment_with_metadata_are_kept(
     log: Path, which: int
 ) -> None:
     whole = read_log(log)
@@ -79,7 +79,7 @@ def test_of_a_filtered_segment_with_its_metadata_what_is_there_is_kept(
             assert event.key == LOSS_KEY
 
 
-def test_messages_that_would_stand_in_the_next_segment_do_not_put_it_aside(log: Path) -> None:
+def test_messages_numbered_into_the_next_segment_are_left_out(log: Path) -> None:
     """Any number can stand in a message that another program has written."""
     whole = read_log(log)
     path = segment_path(log, EACH, SEALED)
@@ -92,7 +92,7 @@ def test_messages_that_would_stand_in_the_next_segment_do_not_put_it_aside(log: 
 
 
 @pytest.mark.parametrize("seed", range(30))
-def test_whatever_the_plain_reader_reads_is_kept(log: Path, seed: int) -> None:
+def test_every_event_the_mcap_reader_reads_is_kept(log: Path, seed: int) -> None:
     chance = random.Random(seed)
     which = chance.randrange(COUNT)
     path = segment_path(log, which * EACH, SEALED)
@@ -116,7 +116,7 @@ def test_whatever_the_plain_reader_reads_is_kept(log: Path, seed: int) -> None:
 
 
 @pytest.mark.parametrize("profile", ["mapfold", ""])
-def test_without_metadata_import_is_named_and_works(log: Path, profile: str) -> None:
+def test_without_metadata_the_error_names_import_which_works(log: Path, profile: str) -> None:
     """As `mcap filter` leaves it out. Nothing tells which offsets the messages had."""
     run = Commands.in_folder(log.parent)
     path = segment_path(log, EACH, SEALED)
@@ -135,7 +135,7 @@ def test_without_metadata_import_is_named_and_works(log: Path, profile: str) -> 
     assert json.loads(run("log", "info", "log", "--json").out)["events"] == EVENTS + there
 
 
-def test_a_folder_with_nothing_else_is_not_recovered_to_nothing(log: Path) -> None:
+def test_a_folder_of_foreign_files_only_is_not_changed(log: Path) -> None:
     run = Commands.in_folder(log.parent)
     for base in (EACH, 2 * EACH):
         segment_path(log, base, SEALED).unlink()

@@ -1,4 +1,4 @@
-"""A saved ledger that is not as it was saved is never believed, and nothing in it can do harm."""
+"""A saved gap ledger that was changed is not used, and nothing in it can do harm."""
 
 import contextlib
 import json
@@ -54,9 +54,7 @@ def right(log: Path) -> tuple[RunState, ...]:
 
 
 @given(data=st.data())
-def test_any_change_of_its_bytes_leaves_the_ledger_what_it_is(
-    log: Path, data: st.DataObject
-) -> None:
+def test_any_changed_byte_leaves_the_ledger_equal(log: Path, data: st.DataObject) -> None:
     saved = bytearray((log / LEDGER).read_bytes())
     for _ in range(data.draw(st.integers(1, 3))):
         at = data.draw(st.integers(0, len(saved)))
@@ -74,7 +72,7 @@ RUNS = st.lists(
 
 
 @given(runs=RUNS | JUNK, next_offset=JUNK, fields=st.dictionaries(st.text(max_size=3), JUNK))
-def test_content_that_is_forged_with_a_right_checksum_ends_nothing(
+def test_forged_content_with_a_right_checksum_does_no_harm(
     log: Path, runs: Any, next_offset: Any, fields: dict[str, Any]
 ) -> None:
     """Whoever may write there can make a ledger that could be; but never one that could not."""
@@ -103,7 +101,7 @@ def test_content_that_is_forged_with_a_right_checksum_ends_nothing(
         [["3", 4, False]],
     ],
 )
-def test_holes_that_cannot_be_are_counted_again(log: Path, holes: list[Any]) -> None:
+def test_inconsistent_holes_are_counted_again(log: Path, holes: list[Any]) -> None:
     good = json.loads((log / LEDGER).read_bytes())["ledger"]
     ((run_id, first, last, _),) = good["runs"]
     forged = {**good, "runs": [[run_id, first, last, holes]]}
@@ -171,7 +169,7 @@ def _as_many_wrong_values(path: Path) -> None:
         _as_many_wrong_values,
     ],
 )
-def test_whatever_stands_there_is_told_and_counted_again(
+def test_any_unusable_file_is_reported_and_the_log_counted_again(
     log: Path, tmp_path: Path, make: Any
 ) -> None:
     copy = tmp_path / "log"
@@ -189,7 +187,7 @@ def test_whatever_stands_there_is_told_and_counted_again(
     assert (copy / "saved").read_bytes() == (log / LEDGER).read_bytes()
 
 
-def test_saving_writes_through_no_link(log: Path, tmp_path: Path) -> None:
+def test_saving_follows_no_link(log: Path, tmp_path: Path) -> None:
     copy, other = tmp_path / "log", tmp_path / "other"
     shutil.copytree(log, copy)
     other.write_bytes(b"precious")
@@ -204,14 +202,14 @@ def test_saving_writes_through_no_link(log: Path, tmp_path: Path) -> None:
 @given(
     seen=st.lists(st.tuples(st.sampled_from(["a", "b"]), st.integers(-20, 20)), max_size=30),
 )
-def test_every_ledger_that_comes_of_events_is_sound(seen: list[tuple[str, int]]) -> None:
+def test_every_ledger_folded_from_events_is_consistent(seen: list[tuple[str, int]]) -> None:
     ledger = GapLedger()
     for run_id, keyframe_id in seen:
         ledger.record(run_id, keyframe_id, 0)
     assert is_consistent(ledger.state(), len(seen))
 
 
-def test_a_ledger_that_would_be_too_large_to_read_is_not_left_behind(
+def test_a_ledger_over_the_size_limit_is_not_saved(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     copy = tmp_path / "log"

@@ -1,5 +1,5 @@
-"""A sealed segment with any one byte changed: verify names it or no event has changed, reading
-never makes anything up, and recovery keeps every chunk that is whole at its own offsets."""
+"""A sealed segment with any one byte changed: verify reports it or no event has changed, reading
+invents no event, and recovery keeps every good chunk at its offsets."""
 
 import contextlib
 import json
@@ -41,13 +41,13 @@ def sealed(quick_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, lis
     return next(log.glob("*.mcap")), read_log(log)
 
 
-def test_a_whole_segment_has_no_findings(sealed: tuple[Path, list[Event]]) -> None:
+def test_an_undamaged_segment_has_no_findings(sealed: tuple[Path, list[Event]]) -> None:
     verified = verify_log(sealed[0].parent)
     assert verified.findings == ()
     assert (verified.events, verified.segments) == (EVENTS, 1)
 
 
-def test_every_flip_is_found_and_never_read_as_data(sealed: tuple[Path, list[Event]]) -> None:
+def test_every_flip_is_found_and_never_read(sealed: tuple[Path, list[Event]]) -> None:
     file, events = sealed
     data = bytearray(file.read_bytes())
     for at in range(len(data)):
@@ -69,7 +69,7 @@ def test_every_flip_is_found_and_never_read_as_data(sealed: tuple[Path, list[Eve
         data[at] ^= 0x20
 
 
-def test_recovery_keeps_every_whole_chunk_at_its_offsets(sealed: tuple[Path, list[Event]]) -> None:
+def test_recovery_keeps_every_good_chunk_at_its_offsets(sealed: tuple[Path, list[Event]]) -> None:
     file, events = sealed
     log = file.parent
     original = file.read_bytes()
@@ -97,7 +97,7 @@ def test_recovery_keeps_every_whole_chunk_at_its_offsets(sealed: tuple[Path, lis
         (log / segment.kept_copy).unlink()
 
 
-def test_a_sealed_segment_that_is_cut_at_any_byte_is_told_and_recovered(
+def test_a_sealed_segment_cut_at_any_byte_is_reported_and_recovered(
     sealed: tuple[Path, list[Event]],
 ) -> None:
     segment, written = sealed
@@ -136,7 +136,7 @@ def test_a_missing_segment_becomes_losses(quick_path: Path) -> None:
         assert writer.next_offset == EVENTS
 
 
-def test_a_missing_first_segment_is_named(quick_path: Path) -> None:
+def test_a_missing_first_segment_is_reported(quick_path: Path) -> None:
     log = quick_path / "log"
     with LogWriter(log, rotate_events=2, fsync=BY_HAND) as writer:
         for index in range(4):
@@ -172,7 +172,7 @@ def test_recovering_a_log_without_events_leaves_one(quick_path: Path) -> None:
         assert (writer.log_id, writer.next_offset) == (log_id, 0)
 
 
-def test_recovering_a_log_of_which_nothing_is_left_leaves_an_empty_one(
+def test_recovering_a_log_without_readable_events_leaves_an_empty_one(
     sealed: tuple[Path, list[Event]],
 ) -> None:
     file, _ = sealed
@@ -188,7 +188,7 @@ def test_recovering_a_log_of_which_nothing_is_left_leaves_an_empty_one(
         assert (writer.log_id, writer.next_offset) == (log_id, 0)
 
 
-def test_what_is_lost_has_the_times_of_its_neighbours(quick_path: Path) -> None:
+def test_losses_have_the_times_of_their_neighbours(quick_path: Path) -> None:
     log = quick_path / "log"
     with LogWriter(log, rotate_events=2, fsync=BY_HAND) as writer:
         for index in range(8):
@@ -220,7 +220,7 @@ def test_a_loss_in_a_segment_has_the_times_of_the_event_before_it(
 
 @pytest.mark.parametrize("rotate_events", [2, 1000])
 @pytest.mark.parametrize("still_open", [True, False])
-def test_our_own_events_do_not_stretch_the_time_a_log_was_stamped(
+def test_system_events_do_not_change_the_bounds_of_stamps(
     quick_path: Path, rotate_events: int, still_open: bool
 ) -> None:
     log = quick_path / "log"
@@ -236,7 +236,7 @@ def test_our_own_events_do_not_stretch_the_time_a_log_was_stamped(
     assert (log_info(log).first_stamp_ns, log_info(log).last_stamp_ns) == (20, 50)
 
 
-def test_a_log_of_nothing_but_our_own_events_has_no_stamps(quick_path: Path) -> None:
+def test_a_log_of_system_events_only_has_no_stamps(quick_path: Path) -> None:
     with LogWriter(quick_path / "log") as writer:
         writer.append(LOSS_KEY, b"{}")
     info = log_info(quick_path / "log")
@@ -244,7 +244,7 @@ def test_a_log_of_nothing_but_our_own_events_has_no_stamps(quick_path: Path) -> 
     assert info.first_logged_ns is not None
 
 
-def test_the_chain_notices_a_segment_put_in_anothers_place(quick_path: Path) -> None:
+def test_the_hash_chain_detects_a_replaced_segment(quick_path: Path) -> None:
     for name in ("a", "b"):
         with LogWriter(quick_path / name, rotate_events=1, fsync=BY_HAND) as writer:
             for index in range(3):
@@ -258,7 +258,7 @@ def test_the_chain_notices_a_segment_put_in_anothers_place(quick_path: Path) -> 
 
 
 @pytest.mark.parametrize("which", [0, 2, 4])
-def test_a_segment_of_another_log_is_not_read_as_one_of_this(quick_path: Path, which: int) -> None:
+def test_a_segment_of_another_log_is_not_read(quick_path: Path, which: int) -> None:
     for name in "ab":
         payloads = [f"{name}{number}".encode() for number in range(6)]
         write_log(quick_path / name, payloads, fsync=ALWAYS, rotate_events=2)
@@ -284,7 +284,7 @@ def test_a_segment_of_another_log_is_not_read_as_one_of_this(quick_path: Path, w
     assert [e.offset for e in read_log(log)] == list(range(4 if which == 4 else 6))
 
 
-def test_verify_tells_what_no_checksum_knows(quick_path: Path) -> None:
+def test_verify_reports_findings_in_events(quick_path: Path) -> None:
     log = quick_path / "log"
     loss = {"publisher": "r", "first": 2, "last": 4, "count": 3, "cause": "keyframe_gap"}
     with LogWriter(log) as writer:
@@ -328,7 +328,7 @@ def test_a_late_keyframe_closes_its_gap(quick_path: Path) -> None:
     assert verify_log(log).findings == ()
 
 
-def test_a_gap_is_told_by_the_reports_that_are_still_open(quick_path: Path) -> None:
+def test_a_gap_is_reported_with_the_offsets_of_its_open_reports(quick_path: Path) -> None:
     log = quick_path / "log"
     with LogWriter(log) as writer:
         for keyframe_id in (1, 4, 6, 10):
@@ -363,7 +363,7 @@ DAY = 24 * 3600 * 10**9
     ],
     ids=["late", "reversed", "a day", "back", "late and back", "backwards", "set", "set twice"],
 )
-def test_stamps_are_odd_by_the_numbers_of_their_keyframes(
+def test_stamps_are_compared_in_the_order_of_keyframe_ids(
     quick_path: Path, keyframes: list[tuple[int, int]], odd: list[tuple[int, int, int]]
 ) -> None:
     with LogWriter(quick_path / "log") as writer:

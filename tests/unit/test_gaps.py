@@ -20,7 +20,7 @@ def test_a_run_in_order_lacks_nothing() -> None:
     assert (ledger.highest("run-a"), ledger.highest("run-b")) == (42, None)
 
 
-def test_what_lies_between_is_missing() -> None:
+def test_ids_between_recorded_ones_are_missing() -> None:
     ledger = _ledger(1, 5, 9)
     assert list(ledger.gaps()) == [Gap("run-a", 2, 4), Gap("run-a", 6, 8)]
     assert ledger.missing == 6
@@ -35,7 +35,7 @@ def test_a_gap_is_reported_once_and_only_when_it_has_settled() -> None:
     assert list(ledger.gaps()) == [Gap("run-a", 2, 2)], "reported is not closed"
 
 
-def test_a_late_keyframe_in_time_is_no_gap() -> None:
+def test_a_keyframe_within_the_settle_time_is_no_gap() -> None:
     ledger = _ledger(1, 3, at_ns=100)
     ledger.record("run-a", 2, 105)
     assert ledger.due(1_000) == []
@@ -51,7 +51,7 @@ def test_a_late_keyframe_closes_a_reported_gap() -> None:
     assert ledger.flush() == []
 
 
-def test_a_keyframe_in_the_middle_cuts_a_hole_in_two_of_the_same_age() -> None:
+def test_a_keyframe_in_the_middle_splits_a_hole_and_keeps_its_age() -> None:
     ledger = _ledger(1, 9, at_ns=100)
     ledger.record("run-a", 5, 109)
     assert ledger.due(110) == [Gap("run-a", 2, 4), Gap("run-a", 6, 8)]
@@ -72,14 +72,14 @@ def test_an_id_below_the_first_opens_a_hole_up_to_it() -> None:
     assert list(ledger.gaps()) == [Gap("run-a", 8, 9)]
 
 
-def test_runs_are_counted_apart() -> None:
+def test_runs_are_counted_separately() -> None:
     ledger = _ledger(1, 2)
     ledger.record("run-b", 7, 0)
     ledger.record("run-b", 9, 0)
     assert list(ledger.gaps()) == [Gap("run-b", 8, 8)]
 
 
-def test_twice_is_a_duplicate_and_no_loss() -> None:
+def test_a_keyframe_recorded_twice_is_a_duplicate() -> None:
     ledger = _ledger(1, 2, 3, 2, 3, 1)
     assert ledger.duplicates == 3
     assert ledger.missing == 0
@@ -92,7 +92,7 @@ def test_what_an_earlier_recorder_reported_is_not_reported_again() -> None:
     assert ledger.flush() == [Gap("run-a", 6, 6)]
 
 
-def test_what_a_publisher_has_sent_and_is_not_recorded_is_missing_once_that_has_settled() -> None:
+def test_announced_keyframes_are_missing_after_the_settle_time() -> None:
     ledger = _ledger(1, 2, at_ns=100)
     ledger.expect("run-a", 5, 101)
     ledger.record("run-a", 4, 105)
@@ -106,7 +106,7 @@ def test_what_a_publisher_has_sent_and_is_not_recorded_is_missing_once_that_has_
     assert list(ledger.gaps()) == [Gap("run-a", 3, 3)], "it may come late like any other"
 
 
-def test_what_was_said_at_the_last_moment_or_of_an_unknown_run_is_no_gap() -> None:
+def test_young_announcements_and_those_of_unknown_runs_are_no_gap() -> None:
     ledger = _ledger(1, at_ns=100)
     ledger.expect("run-b", 7, 100)
     assert ledger.due(110) == []
@@ -116,14 +116,14 @@ def test_what_was_said_at_the_last_moment_or_of_an_unknown_run_is_no_gap() -> No
     assert (ledger.missing, ledger.highest("run-b")) == (0, None)
 
 
-def test_each_statement_adds_what_is_new_in_it() -> None:
+def test_each_announcement_adds_only_new_keyframes() -> None:
     ledger = _ledger(1)
     for last in (3, 2, 6):
         ledger.expect("run-a", last, 0)
     assert ledger.due(SETTLE_NS) == [Gap("run-a", 2, 3), Gap("run-a", 4, 6)]
 
 
-def test_a_gap_that_is_closed_or_a_run_that_is_forgotten_is_not_missing() -> None:
+def test_closed_gaps_and_forgotten_runs_are_not_missing() -> None:
     ledger = _ledger(1, 5, 7)
     ledger.close(Gap("run-a", 2, 4))
     ledger.close(Gap("run-b", 2, 4))
@@ -145,12 +145,12 @@ def test_a_gap_holds_at_least_one_keyframe() -> None:
         Gap("run-a", 3, 2)
 
 
-def test_a_jump_of_the_whole_range_costs_nothing() -> None:
+def test_a_jump_over_the_whole_range_is_cheap() -> None:
     ledger = _ledger(-(2**63), 2**63 - 1)
     assert ledger.missing == 2**64 - 2
 
 
-def test_a_loss_events_word_can_be_taken_for_a_gap() -> None:
+def test_a_gap_can_be_added_from_a_loss_event() -> None:
     ledger = GapLedger(SETTLE_NS)
     ledger.add_reported(Gap("run-a", 2, 4), now_ns=0)
     ledger.add_reported(Gap("run-a", 8, 2**62), now_ns=0)
@@ -161,7 +161,7 @@ def test_a_loss_events_word_can_be_taken_for_a_gap() -> None:
     assert ledger.missing_reported() == 2 + 2**62 - 8
 
 
-def test_loss_events_that_follow_one_another_tell_of_the_end_of_a_run() -> None:
+def test_adjacent_loss_events_extend_a_run() -> None:
     ledger = _ledger(1)
     for gap in (Gap("run-a", 2, 3), Gap("run-a", 4, 6)):
         ledger.add_reported(gap, now_ns=0)

@@ -6,7 +6,7 @@ import sys
 import eventsrc.log
 
 
-def test_all_is_sorted_and_there() -> None:
+def test_all_names_are_sorted_and_exist() -> None:
     names = eventsrc.log.__all__
     constants = [n for n in names if n.isupper()]
     classes = [n for n in names if n[0].isupper() and not n.isupper()]

@@ -32,7 +32,7 @@ def log(log_path: Path) -> Path:
     return log_path
 
 
-def test_large_events_come_back_whole_and_one_by_one(log: Path) -> None:
+def test_large_events_are_read_back_one_chunk_at_a_time(log: Path) -> None:
     assert max(CHUNK_BYTES, GROUP_BYTES) < SIZE
     events = read_log(log)
     assert [event.offset for event in events] == list(range(2 * COUNT))
@@ -43,7 +43,7 @@ def test_large_events_come_back_whole_and_one_by_one(log: Path) -> None:
         assert alone == events[2 * number + 1]
 
 
-def test_large_events_are_sealed_soundly(log: Path) -> None:
+def test_large_events_are_sealed_and_verified(log: Path) -> None:
     files = sorted(log.glob("*.mcap"))
     assert len(files) == 2
     assert not list(log.glob("*.active"))

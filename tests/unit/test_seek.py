@@ -1,4 +1,4 @@
-"""Points in a log mean what DESIGN section 8 says."""
+"""Points in a log: offsets, times, keyframes and the end, by the rules of DESIGN section 8."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -55,7 +55,7 @@ def test_points(reader: LogReader, text: str, count: int, start: int) -> None:
 @pytest.mark.parametrize(
     "text", ["7", "-1", "a:4", "a:7", "b:1", "soon", "", ":", "a:", ":1", "²", "1970-13-01"]
 )
-def test_what_is_not_there_is_named(reader: LogReader, text: str) -> None:
+def test_a_point_that_is_not_in_the_log_is_an_error(reader: LogReader, text: str) -> None:
     for ask in (resolve, resolve_start):
         with pytest.raises(MisuseError) as caught:
             ask(reader, text)
@@ -74,9 +74,7 @@ def test_what_is_not_there_is_named(reader: LogReader, text: str) -> None:
         ("b:007", "b:007: {} has no such keyframe; `mapfold log cat {}` lists what it has"),
     ],
 )
-def test_what_is_not_there_is_named_as_it_was_written(
-    reader: LogReader, text: str, says: str
-) -> None:
+def test_the_error_quotes_the_point_as_written(reader: LogReader, text: str, says: str) -> None:
     with pytest.raises(MisuseError) as caught:
         resolve(reader, text)
     assert says.replace("{}", str(reader.path)) in str(caught.value)
@@ -85,7 +83,7 @@ def test_what_is_not_there_is_named_as_it_was_written(
 @pytest.mark.parametrize(
     ("second", "told"), [(9, None), (10, None), (15, "of the 5 events"), (20, "of the 6 events")]
 )
-def test_later_events_in_a_range_up_to_a_time_are_told(
+def test_later_events_in_a_range_up_to_a_time_are_reported(
     reader: LogReader, second: int, told: str | None
 ) -> None:
     lines: list[str] = []
@@ -125,7 +123,7 @@ def ours(log_path: Path) -> Iterator[LogReader]:
         ("2001-09-09T01:46:40Z", 7, 7),
     ],
 )
-def test_our_own_events_do_not_say_where_a_time_is(
+def test_the_stamps_of_system_events_are_ignored(
     ours: LogReader, time: str, count: int, start: int
 ) -> None:
     assert resolve(ours, time) == count
@@ -155,7 +153,7 @@ def rotten(log_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[LogReade
 
 
 @pytest.mark.parametrize(("second", "count"), [(0, 1), (1, 2), (2, 6), (4, 6), (6, 7), (20, 9)])
-def test_damage_is_in_a_range_that_ends_at_a_time_only_if_it_stands_inside(
+def test_a_range_up_to_a_time_includes_damage_only_inside_it(
     rotten: LogReader, second: int, count: int
 ) -> None:
     assert resolve(rotten, _at(second)) == count
@@ -163,7 +161,7 @@ def test_damage_is_in_a_range_that_ends_at_a_time_only_if_it_stands_inside(
         resolve(rotten, text)
 
 
-def test_damage_on_the_way_stops_the_search_or_is_named(rotten: LogReader) -> None:
+def test_damage_stops_the_search_or_is_reported(rotten: LogReader) -> None:
     assert resolve_start(rotten, _at(2)) == 2
     for text in (_at(3), _at(7), "run:7"):
         with pytest.raises(LogDamaged, match="offsets 3 to 5 cannot be read"):
@@ -175,7 +173,7 @@ def test_damage_on_the_way_stops_the_search_or_is_named(rotten: LogReader) -> No
     assert [(gap.first, gap.last) for gap in met] == [(3, 5)] * 5
 
 
-def test_rot_in_the_growing_segment_is_met_by_a_range_that_it_ends(log_path: Path) -> None:
+def test_rot_at_the_end_of_the_growing_segment_is_reported(log_path: Path) -> None:
     with LogWriter(log_path, fsync=BY_HAND) as writer, LogReader(log_path) as reader:
         for second in range(9):
             writer.append(KEY, envelope(second), stamp_ns=second * SECOND)

@@ -1,5 +1,5 @@
-"""Witnesses of the format that are not our writer: bytes put together by hand, and the mcap
-package's own readers."""
+"""The file format, checked independently of our writer: with bytes laid out by hand and with the
+readers of the mcap package."""
 
 import json
 import struct
@@ -182,7 +182,7 @@ def test_a_stream_reader_checks_every_crc(sealed: Path) -> None:
         assert kinds[-1] == "Footer"
 
 
-def test_an_mcap_file_of_others_is_no_segment(log_path: Path) -> None:
+def test_a_foreign_mcap_file_is_no_segment(log_path: Path) -> None:
     log_path.mkdir()
     (log_path / NAME).write_bytes(MAGIC + record(0x01, text("ros2") + text("x")) + b"\x0f" * 200)
     with pytest.raises(NotALog, match="mapfold import"):

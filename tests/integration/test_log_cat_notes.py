@@ -1,5 +1,5 @@
-"""`mapfold log cat` and `state` say what their readers would wonder about: events of other times
-inside a range by times, and keys that no event has."""
+"""Notes of `mapfold log cat` and `state`: events of other times inside a range between times, and
+keys without events."""
 
 import pytest
 
@@ -41,13 +41,13 @@ def test_events_of_other_times_are_counted(run: Commands) -> None:
     assert "5 events of these are stamped before" in run("log", "cat", "L", "--from", at(100)).err
 
 
-def test_ranges_that_hold_what_they_name_are_not_talked_about(run: Commands) -> None:
+def test_exact_ranges_get_no_note(run: Commands) -> None:
     for bounds in (("--to", "new:3"), ("--from", "old:2"), ("--from", "3", "--to", "7"), ()):
         assert run("log", "cat", "L", *bounds).err == ""
     assert run("log", "cat", "L", "--to", at(104), "--key", "mapfold/loss").err == ""
 
 
-def test_a_map_of_a_time_says_what_is_later_in_it(run: Commands) -> None:
+def test_a_map_at_a_time_reports_later_events_in_it(run: Commands) -> None:
     said = run("state", "L", "--at", at(2), "--digest")
     (line,) = said.err.splitlines()
     assert line.startswith(f"L: of the 9 events up to {at(2)}, 5 are stamped later: stamps run")
@@ -62,7 +62,7 @@ def test_a_map_of_a_time_says_what_is_later_in_it(run: Commands) -> None:
         assert "5 are stamped later" in run(*command, at(2)).err
 
 
-def test_a_key_that_no_event_has_is_said_with_those_there_are(run: Commands) -> None:
+def test_an_unknown_key_is_reported_with_the_known_ones(run: Commands) -> None:
     said = run("log", "cat", "L", "--key", "nokey", "--key", KEY)
     assert len(said.out.splitlines()) == 10
     assert said.err == f"L: no event has the key 'nokey'; there are mapfold/loss, {KEY}\n"

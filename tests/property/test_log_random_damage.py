@@ -1,7 +1,7 @@
 """A log of several segments, one of them growing, damaged in several places and ways at once.
 
-Reading never makes anything up and repeats nothing, starting a writer and recovering take nothing
-away that could be read, and a recovered log is whole.
+Reading invents and repeats no event, starting a writer and recovering lose no readable event, and a
+recovered log has no damage.
 """
 
 import contextlib
@@ -54,7 +54,7 @@ def readable(log: Path) -> dict[int, bytes]:
 
 
 @pytest.mark.parametrize("seed", range(60))
-def test_nothing_is_made_up_and_nothing_that_can_be_read_is_lost(
+def test_no_event_is_invented_and_no_readable_event_is_lost(
     whole: Path, quick_path: Path, seed: int
 ) -> None:
     log = quick_path / "log"
