@@ -1,4 +1,4 @@
-"""An active segment cut at any byte or with any byte flipped: synced events are read back or named."""
+"""An active segment cut at any byte or with any byte flipped: synced events are read or named."""
 
 import contextlib
 import shutil
