@@ -2,12 +2,13 @@
 
 import json
 import os
-import subprocess
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from tests import prefork
 
 PROGRAM = Path(sys.executable).with_name("mapfold")
 TIMEOUT_S = 120
@@ -48,15 +49,13 @@ class Commands:
 
     def __call__(self, *args: str | Path, stdin: bytes | None = None, code: int | None = 0) -> Said:
         """Run ``mapfold *args``; with ``code`` given, anything else it exits with is a failure."""
-        done = subprocess.run(
+        done = prefork.run(
+            "projections.cli:main",
             [str(PROGRAM), *map(str, args)],
+            env=self.env,
             cwd=self.folder,
-            env=dict(self.env),
-            input=stdin,
-            stdin=subprocess.DEVNULL if stdin is None else None,
-            capture_output=True,
+            stdin=stdin,
             timeout=TIMEOUT_S,
-            check=False,
         )
         said = Said(done.returncode, done.stdout.decode(), done.stderr.decode())
         assert "Traceback" not in said.err, said.err

@@ -1,0 +1,15 @@
+"""How much the tests try: less by default, everything under ``scripts/test_slow``."""
+
+import os
+
+THOROUGH = os.environ.get("MAPFOLD_TEST_THOROUGH") == "1"
+
+
+def examples(number: int) -> int:
+    """Hypothesis examples of a test: ``number`` when thorough, else a fifth of it."""
+    return number if THOROUGH else -(-number // 5)
+
+
+def stride(quick: int) -> int:
+    """Step of a loop over every byte or statement: 1 when thorough, else ``quick``."""
+    return 1 if THOROUGH else quick
