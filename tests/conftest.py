@@ -1,9 +1,14 @@
 """Fixtures every test may use; those of one subsystem live in ``tests/fixtures_*.py``."""
 
+from pathlib import Path
+
+import pytest
 from hypothesis import settings
 
+from tests.thorough import examples
+
 # How long an example takes says how busy the machine is; benchmarks measure speed.
-settings.register_profile("mapfold", deadline=None)
+settings.register_profile("mapfold", deadline=None, max_examples=examples(100))
 settings.load_profile("mapfold")
 
 pytest_plugins = [
@@ -12,3 +17,21 @@ pytest_plugins = [
     "tests.fixtures_tls",
     "tests.fixtures_zenoh",
 ]
+
+UNIT = Path(__file__).parent / "unit"
+NETWORK = {"pg_server", "endpoint", "connected", "start", "start_code"}
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """With ``-m unit`` do not even import the other tests; None leaves it to pytest."""
+    other = collection_path.parent == UNIT.parent and collection_path != UNIT
+    return True if other and config.option.markexpr == "unit" else None
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests of tests/unit that are quick and need neither a database nor a network."""
+    for item in items:
+        slow = item.get_closest_marker("slow") is not None
+        network = NETWORK & set(getattr(item, "fixturenames", ()))
+        if UNIT in item.path.parents and not slow and not network:
+            item.add_marker(pytest.mark.unit)

@@ -1,4 +1,4 @@
-"""One embedded server per test session (and xdist worker); a fresh database for each test."""
+"""One embedded server and one template for a whole test run; a fresh database for each test."""
 
 import os
 import shutil
@@ -15,8 +15,13 @@ from psycopg import sql
 from projections.database.connection import Targets, connect, ensure_extension
 from projections.database.embedded import EmbeddedServer
 
-_TEMPLATE = f"mapfold_template_{os.getpid()}"
+_TEMPLATE = "mapfold_test_template"
 _numbers = count()
+
+# Not pytest's own temporary folder: each new session takes its permissions back to 0700, under the
+# feet of a server that runs as another user. The workers of a run inherit the variable.
+_RUN = os.environ.setdefault("MAPFOLD_TEST_RUN", str(os.getpid()))
+_HOME = Path(tempfile.gettempdir()) / f"mapfold-test-{_RUN}"
 
 
 class OtherServer(EmbeddedServer):
@@ -38,33 +43,36 @@ def _url_with_database(url: str, database: str) -> str:
 
 @pytest.fixture(scope="session")
 def pg_server() -> Iterator[EmbeddedServer]:
-    """A running server of this session's own, stopped and removed at its end."""
+    """A running server of this test run's own, shared by its workers; the last one stops it."""
     if "MAPFOLD_TEST_DB" in os.environ:
         yield OtherServer(os.environ["MAPFOLD_TEST_DB"])
         return
-    # Not pytest's own temporary folder: each new session takes its permissions back to 0700, under
-    # the feet of a server that runs as another user.
-    home = Path(tempfile.mkdtemp(prefix="mapfold-test-"))
-    server = EmbeddedServer(home)
-    try:
-        server.start()
+    with EmbeddedServer(_HOME) as server:
         with connect(server.url, autocommit=True) as connection:
             # These tests kill the server, never the machine; without it a database is dropped fast.
             connection.execute("ALTER SYSTEM SET fsync = off")
             connection.execute("SELECT pg_reload_conf()")
         yield server
-    finally:
-        server.stop()
-        shutil.rmtree(home, ignore_errors=True)
+
+
+def pytest_sessionfinish() -> None:
+    """Remove the server's folder at the end of the run, when all workers have left it."""
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        shutil.rmtree(_HOME, ignore_errors=True)
 
 
 @pytest.fixture(scope="session")
 def _template(pg_server: EmbeddedServer) -> str:
+    """A database with both extensions, made by the first worker that needs it."""
     with connect(pg_server.url, autocommit=True) as connection:
-        connection.execute(sql.SQL("CREATE DATABASE {}").format(sql.Identifier(_TEMPLATE)))
-    with connect(pg_server.url_of(_TEMPLATE), autocommit=True) as connection:
-        ensure_extension(connection, "age")
-        ensure_extension(connection, "vector")
+        connection.execute("SELECT pg_advisory_lock(hashtext(%s))", [_TEMPLATE])
+        found = connection.execute("SELECT FROM pg_database WHERE datname = %s", [_TEMPLATE])
+        if found.fetchone() is None:
+            name = sql.Identifier(_TEMPLATE)
+            connection.execute(sql.SQL("CREATE DATABASE {}").format(name))
+            with connect(pg_server.url_of(_TEMPLATE), autocommit=True) as inside:
+                ensure_extension(inside, "age")
+                ensure_extension(inside, "vector")
     return _TEMPLATE
 
 
@@ -82,6 +90,14 @@ def _fresh_database(server: EmbeddedServer, template: str) -> str:
 def _drop_database(server: EmbeddedServer, name: str) -> None:
     with connect(server.url, autocommit=True) as connection:
         connection.execute(sql.SQL("DROP DATABASE {} WITH (FORCE)").format(sql.Identifier(name)))
+
+
+@pytest.fixture
+def server_roles(pg_server: EmbeddedServer) -> Iterator[None]:
+    """Keep other workers' tests from making roles, which belong to the whole server."""
+    with connect(pg_server.url, autocommit=True) as connection:
+        connection.execute("SELECT pg_advisory_lock(hashtext('roles'))")
+        yield
 
 
 @pytest.fixture

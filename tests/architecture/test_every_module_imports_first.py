@@ -6,14 +6,26 @@ from pathlib import Path
 
 import pytest
 
+from tests.thorough import stride
+
 ROOT = Path(__file__).parents[2]
 
 # Each import happens in a fork of a process that has loaded the outside libraries and none of ours.
 FORKS = """
-import importlib, os, sys, traceback
-for library in ("numpy", "pydantic", "psycopg", "psycopg_pool", "zenoh", "mcap.reader", "typer",
-                "rich.progress", "fastapi", "matplotlib.figure", "prometheus_client"):
-    importlib.import_module(library)
+import contextlib, gc, importlib, os, sys, traceback
+read, write = os.pipe()
+if os.fork() == 0:  # finds out which outside modules all of ours load
+    for name in sys.argv[1:]:
+        importlib.import_module(name)
+    ours = ("eventsrc", "projections", "__main__")
+    os.write(write, " ".join(m for m in sys.modules if not m.startswith(ours)).encode())
+    os._exit(0)
+os.close(write)
+for name in os.fdopen(read).read().split():
+    with contextlib.suppress(ImportError):  # names that exist only once their parent has made them
+        importlib.import_module(name)
+gc.collect()
+gc.disable()
 failed = []
 for name in sys.argv[1:]:
     child = os.fork()
@@ -31,7 +43,8 @@ sys.exit(" ".join(failed) or 0)
 
 
 def _modules(package: str) -> list[str]:
-    files = sorted((ROOT / package).rglob("*.py"))
+    """Modules, packages first: there an import of one starts that of many."""
+    files = sorted((ROOT / package).rglob("*.py"), key=lambda f: (f.name != "__init__.py", f))
     names = [".".join(file.relative_to(ROOT).with_suffix("").parts) for file in files]
     return [name.removesuffix(".__init__") for name in names if not name.endswith("__main__")]
 
@@ -40,7 +53,9 @@ def _modules(package: str) -> list[str]:
 def test_every_module_imports_first(package: str) -> None:
     modules = _modules(package)
     assert len(modules) > 30
+    packages = sum((ROOT / name.replace(".", "/")).is_dir() for name in modules)
+    chosen = [*modules[:packages], *modules[packages :: stride(5)]]
     done = subprocess.run(
-        [sys.executable, "-c", FORKS, *modules], cwd=ROOT, capture_output=True, text=True
+        [sys.executable, "-c", FORKS, *chosen], cwd=ROOT, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,5 @@
-"""Run as a program: kill a tail at its n-th step, let another finish, for every n there is.
+"""Run as a program: kill a tail at its n-th step, let another finish, for every n there is
+when the tests are thorough, else for every fifth.
 
 A step is a statement about to be sent, a transaction about to end, or one that has just ended. Each
 round forks a child that tails and kills itself (SIGKILL) at step n, then tails to the end without
@@ -20,6 +21,7 @@ from projections.database import rebuild, tail
 from projections.database.connection import Targets
 from projections.settings import Settings
 from tests.rows import all_rows
+from tests.thorough import stride
 
 SETTINGS = Settings()
 FROM = 8
@@ -85,7 +87,7 @@ def main() -> None:
             wrong.append(step)
         if not killed:
             break
-        step += 1
+        step += stride(5)
     sys.stdout.write(json.dumps({"steps": step, "wrong": wrong}) + "\n")
 
 

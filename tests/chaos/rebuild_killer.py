@@ -15,13 +15,14 @@ from projections.database import rebuild
 from projections.database.connection import Targets
 from tests.chaos.crash_driver import SETTINGS, Bomb
 from tests.rows import all_rows
+from tests.thorough import stride
 
 Rows: TypeAlias = tuple[Any, Any]
 """Of the graph, and of the vectors."""
 
 OLD = 12
-STRIDE = 7
-"""Prime, so that kills are spread over kinds of statements that come in groups."""
+STRIDE = 7 * stride(3)
+"""Odd, so that kills are spread over kinds of statements that come in groups."""
 
 
 def killed_at(step: int, log: Path, targets: Targets) -> bool:

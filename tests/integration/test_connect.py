@@ -137,6 +137,7 @@ def test_an_extension_the_server_does_not_have(bare_pg_url: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.usefixtures("server_roles")
 def test_a_user_who_may_not_create_extensions(pg_server: EmbeddedServer, bare_pg_url: str) -> None:
     with connect(bare_pg_url, autocommit=True) as connection:
         connection.execute("DROP ROLE IF EXISTS nobody_special")

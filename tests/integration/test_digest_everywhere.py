@@ -14,6 +14,7 @@ import pytest
 
 from tests.envelopes import detection, envelope, payload
 from tests.shared_data import shared_run
+from tests.thorough import stride
 
 KERNELS = ("Prescott", "Nehalem", "Haswell", "SkylakeX", "Zen")
 PLACES = [(kernel, "1", "0") for kernel in KERNELS] + [
@@ -33,6 +34,7 @@ from projections.model.fold import READ_AHEAD, fold_events
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 from projections.model.view import MapView
+from tests.thorough import stride
 
 settings = Settings(eps_m=0.75, min_samples=8)
 fold, view, vectors = SemanticMap(settings), MapView(settings), []
@@ -90,6 +92,7 @@ def test_one_digest_on_every_kernel_thread_count_and_hash_seed(run: str, tmp_pat
     payloads = _synthetic_run() if run == "synthetic" else shared_run(run)
     lines = tmp_path / "run.jsonl"
     lines.write_bytes(b"\n".join(payloads))
-    results = {place: _fold_in(*place, lines) for place in PLACES}
+    chosen = PLACES[:: stride(3)]
+    results = {place: _fold_in(*place, lines) for place in chosen}
     assert len({digest for digest, _ in results.values()}) == 1, results
     assert len({product for _, product in results.values()}) > 1, "all kernels are one here"

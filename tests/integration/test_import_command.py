@@ -93,4 +93,4 @@ def test_info_and_cat(run: Commands) -> None:
     assert set(shown[0]) == {"offset", "logged_ns", "stamp_ns", "key", "payload"}
     assert len(run("log", "cat", "a", "--from", "3").out.splitlines()) == 2
     assert run("log", "cat", "a", "--key", "absent").out == ""
-    assert "behind" in run("log", "cat", "a", "--from", "3", "--to", "1", code=2).err
+    assert "after" in run("log", "cat", "a", "--from", "3", "--to", "1", code=2).err

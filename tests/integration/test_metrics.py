@@ -95,7 +95,7 @@ def test_the_record_command_serves_metrics(
     port = int(line.rsplit(":", 1)[1].removesuffix("/metrics"))
     recorder.wait_for("recording")
     publish("tb/detections", payload(envelope(1)).decode(), "bad")
-    recorder.wait_for("rejected 1 payloads")
+    recorder.wait_for("rejected 1 payload")
     scraped = scrape(port)
     assert scraped["mapfold_recorder_recorded_total"] == 1
     assert scraped["mapfold_recorder_rejected_total"] == 1

@@ -17,6 +17,8 @@ from projections.settings import Settings
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows
 
+pytestmark = pytest.mark.usefixtures("server_roles")
+
 SETTINGS = Settings()
 ROLES = ("a_reader", "a_writer", "mapfold_writer", "mapfold_reader")
 

@@ -25,6 +25,8 @@ from tests.logs import walk, write_log
 from tests.rows import all_rows
 from tests.servers import server_to_kill
 
+pytestmark = pytest.mark.usefixtures("server_roles")
+
 SETTINGS = Settings()
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "projections.md"
 TIMEOUTS = (

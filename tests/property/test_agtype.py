@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from projections.database import graph_render as agtype
 from projections.database.loader import CopyLoader, InsertLoader, Loader
+from tests.thorough import examples
 
 ODD = ["\\", "\\\\n", '"', "'", "\t", "\\.", "\\N", "$$", "\u2028", "\x7f", "\x85", "😀"]
 finite = st.floats(allow_nan=False, allow_infinity=False)
@@ -42,7 +43,7 @@ def trip(connection: psycopg.Connection, loader: Loader, texts: list[str]) -> li
 
 
 @settings(
-    max_examples=150,
+    max_examples=examples(150),
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )

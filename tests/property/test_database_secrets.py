@@ -19,6 +19,7 @@ from projections.database.status import projection_status
 from projections.settings import Settings
 from tests.commands import Commands
 from tests.logs import walk, write_log
+from tests.thorough import examples
 
 SECRET = "Zq7SECRETx"
 PARTS = st.sampled_from(
@@ -90,7 +91,7 @@ def public(url: str) -> bool:
     return any(SECRET in str(said.get(name)) for name in ("host", "port", "dbname", "user"))
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=examples(400), deadline=None)
 @given(GIVEN)
 @example(KNOWN[0])
 @example(KNOWN[1])

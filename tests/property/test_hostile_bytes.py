@@ -26,6 +26,7 @@ from eventsrc.log.format import (
 )
 from eventsrc.system_events import LOSS_KEY
 from tests.fixtures_log import BY_HAND, KEY, MEMORY_DISK, read_log
+from tests.thorough import examples
 
 SYNCED = 3
 """Commits that are complete before the one that is damaged."""
@@ -120,7 +121,7 @@ def folder() -> Iterator[Path]:
         yield Path(name)
 
 
-QUICK = settings(max_examples=150, deadline=None)
+QUICK = settings(max_examples=examples(150), deadline=None)
 
 
 def in_folder() -> tempfile.TemporaryDirectory[str]:

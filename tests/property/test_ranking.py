@@ -12,6 +12,7 @@ from projections.relocalize import Answer, Candidates, Crop, rank
 from tests.relocalization.buildings import Building, Keyframe
 from tests.relocalization.drives import drive
 from tests.relocalization.rooms import RoomMap, crops_of
+from tests.thorough import examples
 
 SEEDS = (20, 21)
 
@@ -33,7 +34,7 @@ def place_rank(answer: Answer, room: str) -> float:
 
 
 @given(st.sampled_from(SEEDS), st.data())
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 def test_the_order_of_crops_does_not_matter(seed: int, data: st.DataObject) -> None:
     keyframe = data.draw(st.sampled_from(other_session(seed)))
     crops = crops_of(keyframe)[:4]
@@ -45,7 +46,7 @@ def test_the_order_of_crops_does_not_matter(seed: int, data: st.DataObject) -> N
 
 
 @given(st.sampled_from(SEEDS), st.data())
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 def test_asking_twice_gives_the_same_answer_to_the_last_bit(seed: int, data: st.DataObject) -> None:
     crops = crops_of(data.draw(st.sampled_from(other_session(seed))))
     mapped = room_map(seed)

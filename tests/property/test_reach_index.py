@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from projections.reducers.core_index import NEIGHBOUR_CELLS, cell_side_um
 from projections.reducers.reach_index import ReachIndex, from_side
+from tests.thorough import examples
 
 EPS_UM = 1_500_000
 EPS = st.sampled_from([0, 1, 2, 3, 5, 7, 13, 50, 1000, 1_500_000, 10**9])
@@ -27,7 +28,7 @@ def queries(draw: st.DrawFn) -> tuple[int, list[tuple[int, int]], list[tuple[int
     return eps, points, outside
 
 
-@settings(max_examples=400)
+@settings(max_examples=examples(400))
 @given(queries())
 def test_a_reach_index_answers_as_a_scan_of_all_points(query) -> None:
     eps, points, outside = query
@@ -57,7 +58,7 @@ def _meeting(a: tuple[int, int], c: tuple[int, int], eps: int) -> Decimal:
     return Decimal(c[0] - eps) if across > c[1] else along
 
 
-@settings(max_examples=1000)
+@settings(max_examples=examples(1000))
 @given(st.data(), st.sampled_from([3, 5, 7, 13, 50, 1000, 1_500_000]))
 def test_a_centre_is_hidden_when_its_neighbours_meet_before_it_begins(data, eps: int) -> None:
     last = cell_side_um(eps) - 1

@@ -24,9 +24,12 @@ from projections.model.fold import fold_log
 from projections.model.view import MapView
 from projections.settings import Settings
 from tests.fixtures_timetravel import walks, write_log
+from tests.thorough import examples
 
 RULES = Settings(eps_m=0.7, min_samples=3, fusion_radius_m=2.0)
-slow = settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.too_slow])
+slow = settings(
+    deadline=None, max_examples=examples(60), suppress_health_check=[HealthCheck.too_slow]
+)
 
 
 @contextmanager
@@ -136,7 +139,7 @@ class CallableCount(int):
         return self.names.count(name)
 
 
-@settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.too_slow])
+@settings(deadline=None, max_examples=examples(30), suppress_health_check=[HealthCheck.too_slow])
 @given(walks(most=20), st.sampled_from(EXPRESSIONS), st.data())
 def test_bisect_and_scan_equal_a_linear_search(
     documents: list[dict[str, Any]], expression: str, data: st.DataObject

@@ -14,11 +14,12 @@ from projections.model.fold import fold_log
 from projections.model.snapshot_cache import SnapshotCache
 from projections.settings import Settings
 from tests.fixtures_timetravel import walks, write_log
+from tests.thorough import examples
 
 RULES = Settings(eps_m=0.7, min_samples=3, fusion_radius_m=2.0)
 
 
-@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.too_slow])
+@settings(deadline=None, max_examples=examples(40), suppress_health_check=[HealthCheck.too_slow])
 @given(walks(most=24), st.data())
 def test_at_is_the_same_whatever_snapshots_are_left(
     documents: list[dict[str, Any]], data: st.DataObject

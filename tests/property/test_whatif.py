@@ -15,6 +15,7 @@ from projections.model.view import MapView
 from projections.settings import Settings
 from tests.envelopes import envelope
 from tests.fixtures_timetravel import walks, write_log
+from tests.thorough import examples
 
 BASE = Settings(eps_m=0.7, min_samples=3, fusion_radius_m=2.0)
 OTHERS = st.lists(
@@ -46,7 +47,7 @@ def parting(first: list[Any], second: list[Any]) -> int | None:
     )
 
 
-@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.too_slow])
+@settings(deadline=None, max_examples=examples(40), suppress_health_check=[HealthCheck.too_slow])
 @given(walks(most=20), OTHERS)
 def test_whatif_equals_separate_folds(
     documents: list[dict[str, Any]], others: list[Settings]
@@ -70,7 +71,7 @@ def test_whatif_equals_separate_folds(
             assert parted == expected
 
 
-@settings(deadline=None, max_examples=20, suppress_health_check=[HealthCheck.too_slow])
+@settings(deadline=None, max_examples=examples(20), suppress_health_check=[HealthCheck.too_slow])
 @given(walks(most=20))
 def test_equal_settings_change_nothing(documents: list[dict[str, Any]]) -> None:
     with tempfile.TemporaryDirectory() as folder:

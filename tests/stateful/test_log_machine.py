@@ -25,6 +25,7 @@ from eventsrc.log import Event, FsyncPolicy, LogReader, LogWriter, follow, recov
 from eventsrc.log.mcap_records import MARK_BYTES
 from eventsrc.log_info import log_info
 from tests.fixtures_log import BY_HAND, MEMORY_DISK
+from tests.thorough import examples
 
 KEYS = ["tb/detections", "other/key", "mapfold/loss"]
 PAYLOADS = st.binary(max_size=40)
@@ -204,7 +205,7 @@ class LogMachine(RuleBasedStateMachine):
 
 
 LogMachine.TestCase.settings = settings(
-    max_examples=100,
+    max_examples=examples(100),
     stateful_step_count=40,
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow],

@@ -11,6 +11,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 from eventsrc.errors import SpoolFull
 from eventsrc.robot.acks import Ack, Refusal, Refusals, payload_sha256
 from eventsrc.robot.spool import Refused, Spool, Spooled
+from tests.thorough import examples
 
 MAX_BYTES = 60
 runs = st.sampled_from(["run-a", "run-b"])
@@ -116,4 +117,4 @@ class SpoolMachine(RuleBasedStateMachine):
 
 
 TestSpool = SpoolMachine.TestCase
-TestSpool.settings = settings(max_examples=30, stateful_step_count=30, deadline=None)
+TestSpool.settings = settings(max_examples=examples(30), stateful_step_count=30, deadline=None)

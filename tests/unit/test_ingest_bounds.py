@@ -26,7 +26,7 @@ from eventsrc.log import LogWriter
 from eventsrc.ingest import MAX_JSON_VALUES
 
 resource.setrlimit(resource.RLIMIT_CPU, (int(sys.argv[2]), int(sys.argv[2])))
-SIZE = 16 * 1024 * 1024
+SIZE = int(sys.argv[3]) << 20
 HEAD = b'{"run_id":"e","keyframe_id":1,"timestamp":1,"detections":'
 VALID = b'{"class":"a","confidence":1,"bbox":[0,0,0,0]}'
 
@@ -82,9 +82,10 @@ with LogWriter(Path(sys.argv[1])) as log:
 """
 
 
-def test_a_large_message_of_any_content_costs_little(tmp_path: Path) -> None:
+@pytest.mark.parametrize("mib", [1, pytest.param(16, marks=pytest.mark.slow)])
+def test_a_large_message_of_any_content_costs_little(tmp_path: Path, mib: int) -> None:
     done = subprocess.run(
-        [sys.executable, "-c", HOSTILE, str(tmp_path / "log"), str(CPU_S)],
+        [sys.executable, "-c", HOSTILE, str(tmp_path / "log"), str(CPU_S), str(mib)],
         capture_output=True,
         text=True,
         check=False,

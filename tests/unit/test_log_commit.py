@@ -31,6 +31,7 @@ from eventsrc.log.durable_files import FsyncPolicy
 from eventsrc.log.seal import SegmentPlan, seal
 from eventsrc.log_info import log_info
 from tests.fixtures_log import BY_HAND, KEY, read_log
+from tests.thorough import examples
 
 TIMEOUT_S = 30
 FOUR = FsyncPolicy(interval_ns=10**18, max_events=4)
@@ -263,7 +264,7 @@ def test_with_fsync_always_each_append_is_synced_and_visible(log_path: Path) -> 
                 assert reader.next_offset == number
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=examples(30), deadline=None)
 @given(
     batches=st.lists(st.lists(st.binary(max_size=20), max_size=30), max_size=8),
     policy=st.sampled_from([ALWAYS, FOUR, GROUP_COMMIT, BY_HAND]),
