@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from eventsrc.envelope import FIRST_OFFSET
 from eventsrc.log import LogReader
 from projections.database.labels import COUNT_KEYS, LABELS, TABLE
 from projections.database.live_fold import LiveFold, batches
@@ -27,7 +28,7 @@ def followed(log: Path, size: int, start: int = 0) -> tuple[LiveFold, MemoryTabl
     live: LiveSink[MemoryTables] = sink
     assert not live.ensure(tables)
     with LogReader(log) as reader:
-        for batch in batches(reader.read(0), size, [start]):
+        for batch in batches(reader.read(FIRST_OFFSET), size, [start]):
             assert not any(fold.feed(batch))
             changes = fold.tracker.drain()
             if batch[0].offset >= start:
@@ -44,7 +45,7 @@ def rebuilt(log: Path, size: int, tables: MemoryTables) -> tuple[LiveFold, dict[
     shadow = sink.shadow()
     shadow.create(tables)
     with LogReader(log) as reader:
-        for batch in batches(reader.read(0), size):
+        for batch in batches(reader.read(FIRST_OFFSET), size):
             assert not any(fold.feed(batch))
             shadow.load(fold.tracker.drain(), fold.view)(tables)
     rows = shadow.finish(fold.view)(tables)
