@@ -49,8 +49,8 @@ MAX_DETECTIONS = 10_000
 """Bound of the detections in one envelope; with embeddings of 512 numbers, 16 MiB hold 6,000."""
 
 
-_TEXT = StringConstraints(max_length=MAX_ID_LENGTH, pattern=r"^[^\x00-\x1f\x7f-\x9f]+$")
-Text = Annotated[str, _TEXT]
+TEXT = StringConstraints(max_length=MAX_ID_LENGTH, pattern=r"^[^\x00-\x1f\x7f-\x9f]+$")
+Text = Annotated[str, TEXT]
 """An id or a name: 1 to 256 characters, none of them a control character (category Cc)."""
 
 
@@ -67,8 +67,8 @@ def describe_error(error: ErrorDetails) -> str:
     return f"has the control character U+{ord(char):04X} at index {at}"
 
 
-_INT64 = Field(ge=-(2**63), lt=2**63)
-Int64 = Annotated[int, _INT64]
+INT64 = Field(ge=-(2**63), lt=2**63)
+Int64 = Annotated[int, INT64]
 Position = Annotated[float, Field(ge=-MAX_POSITION_M, le=MAX_POSITION_M)]
 
 
@@ -119,7 +119,7 @@ class Detection(_Model):
     ``embedding_dim`` little-endian float32.
     """
 
-    det_id: Annotated[DetId, _TEXT] | None = None
+    det_id: Annotated[DetId, TEXT] | None = None
     class_name: Text = Field(alias="class")
     confidence: float
     bbox: tuple[float, float, float, float]
@@ -135,8 +135,8 @@ class Envelope(_Model):
     metres and ``map_yaw`` radians in the map frame; all three are None when the robot has no pose.
     """
 
-    run_id: Annotated[RunId, _TEXT]
-    keyframe_id: Annotated[KeyframeId, _INT64]
+    run_id: Annotated[RunId, TEXT]
+    keyframe_id: Annotated[KeyframeId, INT64]
     timestamp: Annotated[float, Field(ge=0.0, le=MAX_TIMESTAMP_S)]
     map_x: Position | None = None
     map_y: Position | None = None

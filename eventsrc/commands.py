@@ -1,0 +1,222 @@
+"""Commands: what a person or a SLAM back end knows better than the log, as events on
+``mapfold/command``.
+
+A command is appended like any event and never changed. What it names, it names by things of the
+log that every fold knows: keyframes and det_ids, never by the id of a place or an object, which
+another fold may give to something else. `projections.corrections` compiles commands to what the
+fold obeys; docs/corrections.md describes them.
+"""
+
+import math
+from typing import Annotated, Literal, TypeAlias
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+
+from .envelope import INT64, TEXT, DetId, KeyframeId, Offset, Position, RunId, Text, describe_error
+
+MAX_REASON = 2_000
+MAX_NAMED = 100_000
+"""Keyframes or det_ids in one command."""
+MAX_COMMAND_BYTES = 16 * 1024 * 1024
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(
+        strict=True, frozen=True, extra="forbid", allow_inf_nan=False, populate_by_name=True
+    )
+
+
+class Anchor(_Model):
+    """A keyframe that stands for the place it belongs to; a place's own is its founder."""
+
+    run_id: Annotated[RunId, TEXT]
+    keyframe_id: Annotated[KeyframeId, INT64]
+
+
+class _Command(_Model):
+    """What every command has. ``command_id`` is unique in the log."""
+
+    command_id: Text
+    issued_by: Text
+    reason: Annotated[str, Field(max_length=MAX_REASON)] = ""
+
+
+DetIds: TypeAlias = Annotated[
+    tuple[Annotated[DetId, TEXT], ...], Field(min_length=1, max_length=MAX_NAMED)
+]
+Pair: TypeAlias = tuple[Anchor, Anchor]
+DetPair: TypeAlias = tuple[Annotated[DetId, TEXT], Annotated[DetId, TEXT]]
+
+
+class NamePlace(_Command):
+    """The place of ``place`` is called ``name``."""
+
+    kind: Literal["name-place"] = "name-place"
+    place: Anchor
+    name: Text
+
+
+class KeepApart(_Command):
+    """The places of the two anchors are never one."""
+
+    kind: Literal["keep-apart"] = "keep-apart"
+    places: Pair
+
+
+class UndoMerge(_Command):
+    """The places that the merge at ``merge_offset`` made one are never one."""
+
+    kind: Literal["undo-merge"] = "undo-merge"
+    merge_offset: Annotated[Offset, INT64]
+    places: Annotated[tuple[Anchor, ...], Field(min_length=2, max_length=1000)]
+
+
+class Join(_Command):
+    """The places of the two anchors are one, though no chain of poses joins them."""
+
+    kind: Literal["join"] = "join"
+    places: Pair
+
+
+class SameObject(_Command):
+    """The Objects of two detections are one."""
+
+    kind: Literal["same-object"] = "same-object"
+    det_ids: DetPair
+
+
+class DifferentObjects(_Command):
+    """The Objects of two detections are never one."""
+
+    kind: Literal["different-objects"] = "different-objects"
+    det_ids: DetPair
+
+
+class DropObject(_Command):
+    """A phantom: the observations it had when the command was given are left out of the map."""
+
+    kind: Literal["drop-object"] = "drop-object"
+    det_ids: DetIds
+
+
+class DropDetection(_Command):
+    """Detections that are left out of the map; the log keeps them."""
+
+    kind: Literal["drop-detection"] = "drop-detection"
+    det_ids: DetIds
+
+
+class ForgetRun(_Command):
+    """A run that is left out of every fold."""
+
+    kind: Literal["forget-run"] = "forget-run"
+    run_id: Annotated[RunId, TEXT]
+
+
+class ForgetKeyframes(_Command):
+    """Keyframes ``first`` to ``last`` of a run, both included, are left out of every fold."""
+
+    kind: Literal["forget-keyframes"] = "forget-keyframes"
+    run_id: Annotated[RunId, TEXT]
+    first: Annotated[KeyframeId, INT64]
+    last: Annotated[KeyframeId, INT64]
+
+
+class CorrectedPose(_Model):
+    """A keyframe's corrected pose: metres and radians in the map frame."""
+
+    keyframe_id: Annotated[KeyframeId, INT64]
+    x: Position
+    y: Position
+    yaw: float
+
+
+class RigidTransform(_Model):
+    """x' = cos·x − sin·y + dx, y' = sin·x + cos·y + dy, yaw' = yaw + dyaw.
+
+    Metres and radians. Cosine and sine are part of the command: a fold that worked them out could
+    differ in the last bit from machine to machine.
+    """
+
+    dx: Position
+    dy: Position
+    dyaw: float
+    cos: Annotated[float, Field(ge=-1.0, le=1.0)]
+    sin: Annotated[float, Field(ge=-1.0, le=1.0)]
+
+    @classmethod
+    def of(cls, dx: float, dy: float, dyaw: float) -> "RigidTransform":
+        """The transform with its cosine and sine worked out."""
+        return cls(dx=dx, dy=dy, dyaw=dyaw, cos=math.cos(dyaw), sin=math.sin(dyaw))
+
+
+class CorrectPoses(_Command):
+    """Corrected poses of a run: a pose for each of some keyframes, or one rigid transform of all
+    its keyframes, of ``first`` to ``last`` where these are given (both included)."""
+
+    kind: Literal["correct-poses"] = "correct-poses"
+    run_id: Annotated[RunId, TEXT]
+    poses: Annotated[tuple[CorrectedPose, ...], Field(max_length=1_000_000)] = ()
+    transform: RigidTransform | None = None
+    first: Annotated[KeyframeId, INT64] | None = None
+    last: Annotated[KeyframeId, INT64] | None = None
+
+    @model_validator(mode="after")
+    def _check_one(self) -> "CorrectPoses":
+        if bool(self.poses) == (self.transform is not None):
+            raise ValueError("give either poses or a transform")
+        return self
+
+
+class UseSettings(_Command):
+    """The map's settings from here on; ``settings`` as `projections.settings` reads them."""
+
+    kind: Literal["use-settings"] = "use-settings"
+    settings: dict[str, object]
+
+
+class Undo(_Command):
+    """As if the command ``undone`` had never been given. Undoing an undo restores it."""
+
+    kind: Literal["undo"] = "undo"
+    undone: Text
+
+
+Command: TypeAlias = (
+    NamePlace
+    | KeepApart
+    | UndoMerge
+    | Join
+    | SameObject
+    | DifferentObjects
+    | DropObject
+    | DropDetection
+    | ForgetRun
+    | ForgetKeyframes
+    | CorrectPoses
+    | UseSettings
+    | Undo
+)
+KINDS: tuple[str, ...] = tuple(c.model_fields["kind"].default for c in Command.__args__)
+_ADAPTER: TypeAdapter[Command] = TypeAdapter(Annotated[Command, Field(discriminator="kind")])
+
+
+class InvalidCommand(ValueError):
+    """A payload that is no command; the message names the field, its value and the rule."""
+
+
+def parse_command(payload: bytes) -> Command:
+    """A command from its JSON. Raises InvalidCommand."""
+    if len(payload) > MAX_COMMAND_BYTES:
+        raise InvalidCommand(f"it has {len(payload):,} bytes, more than {MAX_COMMAND_BYTES:,}")
+    try:
+        return _ADAPTER.validate_json(payload)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(map(str, first["loc"])) or "the command"
+        raise InvalidCommand(f"{field}: {describe_error(first)}") from None
+
+
+def encode_command(command: Command) -> bytes:
+    """A command's JSON, as it is logged."""
+    return command.model_dump_json(exclude_none=True).encode()

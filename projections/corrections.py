@@ -1,0 +1,255 @@
+"""Corrections: the commands of a log compiled to one value that the fold obeys.
+
+**The map at W is the fold of the events before W under the commands recorded before V**, V being W
+unless asked otherwise. A command is retroactive: it changes how earlier events are folded, as if it
+had always been known, but only from the offset where it was recorded.
+
+1.  A command is in force unless a later one in force undoes it.
+2.  Of a ``keep-apart`` and a ``join`` of the same two anchors the later one counts; so too for
+    ``different-objects`` and ``same-object`` of the same two det_ids.
+3.  Pose corrections of a keyframe apply in the order of the commands.
+4.  Of two names of one place, and of two ``use-settings``, the later one counts.
+
+`Corrections` has a fingerprint, which with that of the settings is part of a map's identity.
+"""
+
+import hashlib
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import msgspec
+
+from eventsrc.commands import (
+    Anchor,
+    Command,
+    CorrectPoses,
+    DifferentObjects,
+    DropDetection,
+    DropObject,
+    ForgetKeyframes,
+    ForgetRun,
+    Join,
+    KeepApart,
+    NamePlace,
+    RigidTransform,
+    SameObject,
+    Undo,
+    UndoMerge,
+    UseSettings,
+)
+from eventsrc.envelope import DetId, Envelope, KeyframeId, Offset, RunId
+from eventsrc.ingest import Accepted
+
+from .settings import Settings
+
+
+class Keyframe(NamedTuple):
+    """A keyframe by what the log calls it."""
+
+    run_id: RunId
+    keyframe_id: KeyframeId
+
+
+class PlaceName(NamedTuple):
+    """The place of ``anchor`` is called ``name``, by the command at ``offset``."""
+
+    anchor: Keyframe
+    name: str
+    offset: Offset
+
+
+class RecordedCommand(NamedTuple):
+    """A command and the offset of its event."""
+
+    offset: Offset
+    command: Command
+
+
+class PoseCorrection(NamedTuple):
+    """One command's correction of a run's poses: ``poses`` by keyframe, or ``transform`` of the
+    keyframes from ``first`` to ``last``, None for no bound."""
+
+    poses: dict[KeyframeId, tuple[float, float, float]]
+    transform: RigidTransform | None
+    first: KeyframeId | None
+    last: KeyframeId | None
+
+    def apply(
+        self, keyframe_id: KeyframeId, pose: tuple[float, float, float]
+    ) -> tuple[float, float, float]:
+        """A keyframe's corrected pose: metres, metres, radians."""
+        if self.transform is None:
+            return self.poses.get(keyframe_id, pose)
+        if self.first is not None and keyframe_id < self.first:
+            return pose
+        if self.last is not None and keyframe_id > self.last:
+            return pose
+        t, (x, y, yaw) = self.transform, pose
+        return (t.cos * x - t.sin * y + t.dx, t.sin * x + t.cos * y + t.dy, yaw + t.dyaw)
+
+
+class Corrections(msgspec.Struct, frozen=True, eq=False):
+    """What the fold obeys; `compile_corrections` makes it. Pairs are in ascending order.
+
+    ``settings`` are those of the log, None if it names none. ``in_force`` are the commands that
+    were not undone or replaced, in the order of the log.
+    """
+
+    in_force: tuple[RecordedCommand, ...] = ()
+    forgotten_runs: frozenset[RunId] = frozenset()
+    forgotten_ranges: dict[RunId, tuple[tuple[KeyframeId, KeyframeId], ...]] = {}
+    dropped: frozenset[DetId] = frozenset()
+    poses: dict[RunId, tuple[PoseCorrection, ...]] = {}
+    apart: tuple[tuple[Keyframe, Keyframe], ...] = ()
+    joined: tuple[tuple[Keyframe, Keyframe], ...] = ()
+    different: tuple[tuple[DetId, DetId], ...] = ()
+    same: tuple[tuple[DetId, DetId], ...] = ()
+    names: tuple[PlaceName, ...] = ()
+    settings: Settings | None = None
+
+    def fingerprint(self) -> str:
+        """16 hex digits that are equal for equal corrections; empty if there are none that change
+        the fold. The log's settings are not part of it: they have a fingerprint of their own."""
+        rows = self._canonical()
+        if not any(rows):
+            return ""
+        return hashlib.sha256(msgspec.json.encode(rows)).hexdigest()[:16]
+
+    def without_names(self) -> "Corrections":
+        """The same without names of places, which change no place."""
+        return msgspec.structs.replace(self, names=())
+
+    def is_forgotten(self, run_id: RunId, keyframe_id: KeyframeId) -> bool:
+        """Whether a keyframe is left out of the fold."""
+        ranges = self.forgotten_ranges.get(run_id, ())
+        return run_id in self.forgotten_runs or any(a <= keyframe_id <= b for a, b in ranges)
+
+    def pose(self, envelope: Envelope) -> tuple[float, float, float] | None:
+        """The envelope's corrected pose, metres and radians; None if it has none."""
+        x, y, yaw = envelope.map_x, envelope.map_y, envelope.map_yaw
+        if x is None or y is None or yaw is None:
+            pose = None
+            for correction in self.poses.get(envelope.run_id, ()):
+                pose = correction.poses.get(envelope.keyframe_id, pose)
+            return pose
+        pose = (x, y, yaw)
+        for correction in self.poses.get(envelope.run_id, ()):
+            pose = correction.apply(envelope.keyframe_id, pose)
+        return pose
+
+    def kept(self, accepted: Accepted) -> list[int]:
+        """Indices of an envelope's detections that are in the map."""
+        dropped = self.dropped
+        return [i for i, det_id in enumerate(accepted.det_ids) if det_id not in dropped]
+
+    def _canonical(self) -> list[object]:
+        return [
+            sorted(self.forgotten_runs),
+            sorted(self.forgotten_ranges.items()),
+            sorted(self.dropped),
+            [
+                (
+                    run,
+                    [(sorted(c.poses.items()), _numbers(c.transform), c.first, c.last) for c in cs],
+                )
+                for run, cs in sorted(self.poses.items())
+            ],
+            sorted(self.apart),
+            sorted(self.joined),
+            sorted(self.different),
+            sorted(self.same),
+            sorted((n.anchor, n.name, n.offset) for n in self.names),
+        ]
+
+
+NO_CORRECTIONS = Corrections()
+
+
+def map_fingerprint(settings: Settings, corrections: Corrections) -> str:
+    """16 hex digits that are equal for maps of the same settings and corrections."""
+    own = corrections.fingerprint()
+    if not own:
+        return settings.fingerprint()
+    return hashlib.sha256(f"{settings.fingerprint()} {own}".encode()).hexdigest()[:16]
+
+
+def commands_in_force(commands: Iterable[RecordedCommand]) -> list[RecordedCommand]:
+    """Those that no later command in force undoes (rule 1), in order; undos are not among them."""
+    undone: set[str] = set()
+    kept: list[RecordedCommand] = []
+    for recorded in reversed(list(commands)):
+        command = recorded.command
+        if command.command_id in undone:
+            continue
+        if isinstance(command, Undo):
+            undone.add(command.undone)
+        else:
+            kept.append(recorded)
+    return kept[::-1]
+
+
+def compile_corrections(commands: Iterable[RecordedCommand]) -> Corrections:
+    """The corrections of a log's commands, given in the order of the log."""
+    in_force = commands_in_force(commands)
+    runs: set[RunId] = set()
+    ranges: dict[RunId, list[tuple[KeyframeId, KeyframeId]]] = {}
+    dropped: set[DetId] = set()
+    poses: dict[RunId, list[PoseCorrection]] = {}
+    places: dict[tuple[Keyframe, Keyframe], bool] = {}
+    objects: dict[tuple[DetId, DetId], bool] = {}
+    names: list[PlaceName] = []
+    settings: Settings | None = None
+    for offset, command in in_force:
+        match command:
+            case NamePlace():
+                names.append(PlaceName(_keyframe(command.place), command.name, offset))
+            case KeepApart() | UndoMerge():
+                places.update(dict.fromkeys(_pairs(command.places), False))
+            case Join():
+                places.update(dict.fromkeys(_pairs(command.places), True))
+            case SameObject() | DifferentObjects():
+                first, second = sorted(command.det_ids)
+                objects[first, second] = isinstance(command, SameObject)
+            case DropObject() | DropDetection():
+                dropped.update(command.det_ids)
+            case ForgetRun():
+                runs.add(command.run_id)
+            case ForgetKeyframes():
+                ranges.setdefault(command.run_id, []).append((command.first, command.last))
+            case CorrectPoses():
+                by_keyframe = {p.keyframe_id: (p.x, p.y, p.yaw) for p in command.poses}
+                correction = PoseCorrection(
+                    by_keyframe, command.transform, command.first, command.last
+                )
+                poses.setdefault(command.run_id, []).append(correction)
+            case UseSettings():
+                settings = Settings.from_document(command.settings)
+            case Undo():
+                pass
+    return Corrections(
+        in_force=tuple(in_force),
+        forgotten_runs=frozenset(runs),
+        forgotten_ranges={run: tuple(sorted(set(rs))) for run, rs in ranges.items()},
+        dropped=frozenset(dropped),
+        poses={run: tuple(cs) for run, cs in poses.items()},
+        apart=tuple(sorted(pair for pair, is_joined in places.items() if not is_joined)),
+        joined=tuple(sorted(pair for pair, is_joined in places.items() if is_joined)),
+        different=tuple(sorted(pair for pair, is_same in objects.items() if not is_same)),
+        same=tuple(sorted(pair for pair, is_same in objects.items() if is_same)),
+        names=tuple(names),
+        settings=settings,
+    )
+
+
+def _keyframe(anchor: Anchor) -> Keyframe:
+    return Keyframe(anchor.run_id, anchor.keyframe_id)
+
+
+def _pairs(anchors: tuple[Anchor, ...]) -> list[tuple[Keyframe, Keyframe]]:
+    """Every two different anchors, the smaller one first."""
+    keyframes = sorted({_keyframe(anchor) for anchor in anchors})
+    return [(a, b) for i, a in enumerate(keyframes) for b in keyframes[i + 1 :]]
+
+
+def _numbers(transform: RigidTransform | None) -> tuple[float, ...] | None:
+    return None if transform is None else tuple(transform.model_dump().values())

@@ -1,0 +1,152 @@
+"""Commands compiled to corrections: undo, replacement, fingerprints."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from eventsrc.commands import (
+    KINDS,
+    Anchor,
+    Command,
+    CorrectedPose,
+    CorrectPoses,
+    DropDetection,
+    ForgetRun,
+    InvalidCommand,
+    Join,
+    KeepApart,
+    NamePlace,
+    RigidTransform,
+    Undo,
+    UndoMerge,
+    UseSettings,
+    encode_command,
+    parse_command,
+)
+from eventsrc.envelope import DetId, KeyframeId, Offset, RunId
+from projections.corrections import (
+    NO_CORRECTIONS,
+    Keyframe,
+    RecordedCommand,
+    compile_corrections,
+    map_fingerprint,
+)
+from projections.settings import Settings
+
+A, B, C = (Anchor(run_id=RunId("r"), keyframe_id=KeyframeId(k)) for k in (1, 2, 3))
+KEY = [Keyframe(RunId("r"), KeyframeId(k)) for k in (1, 2, 3)]
+
+
+def recorded(*commands: Command) -> list[RecordedCommand]:
+    return [RecordedCommand(Offset(10 + n), command) for n, command in enumerate(commands)]
+
+
+def head(number: int) -> dict[str, str]:
+    return {"command_id": f"c{number}", "issued_by": "ann@lab"}
+
+
+def moved_to(x: float) -> CorrectedPose:
+    return CorrectedPose(keyframe_id=KeyframeId(1), x=x, y=0.0, yaw=0.0)
+
+
+EVERY: list[Command] = [
+    NamePlace(**head(0), place=A, name="kitchen"),
+    KeepApart(**head(1), places=(A, B)),
+    UndoMerge(**head(2), merge_offset=Offset(7), places=(A, B, C)),
+    Join(**head(3), places=(B, C)),
+    DropDetection(**head(4), det_ids=(DetId("d"),)),
+    ForgetRun(**head(5), run_id=RunId("r"), reason="a test drive"),
+    CorrectPoses(
+        **head(6),
+        run_id=RunId("r"),
+        poses=(moved_to(1.0),),
+    ),
+    CorrectPoses(**head(7), run_id=RunId("r"), transform=RigidTransform.of(0.3, 0.0, 0.1)),
+    UseSettings(**head(8), settings={"eps_m": 1.0}),
+    Undo(**head(9), undone="c1"),
+]
+
+
+@pytest.mark.parametrize("command", EVERY, ids=lambda c: c.kind)
+def test_a_command_is_read_as_it_was_written(command: Command) -> None:
+    assert parse_command(encode_command(command)) == command
+    assert command.kind in KINDS
+
+
+@pytest.mark.parametrize(
+    ("payload", "says"),
+    [
+        (b"{", "Invalid JSON"),
+        (b"{}", "Unable to extract tag"),
+        (b'{"kind":"sing"}', "does not match any of the expected tags"),
+        (b'{"kind":"forget-run","command_id":"c","issued_by":"a","run_id":""}', "is empty"),
+        (b'{"kind":"forget-run","command_id":"c","issued_by":"a","run_id":"r","x":1}', "x: Extra"),
+        (b'{"kind":"correct-poses","command_id":"c","issued_by":"a","run_id":"r"}', "either poses"),
+    ],
+)
+def test_what_is_no_command_is_refused_with_its_field(payload: bytes, says: str) -> None:
+    with pytest.raises(InvalidCommand, match=says):
+        parse_command(payload)
+
+
+def test_no_commands_are_no_corrections() -> None:
+    nothing = compile_corrections([])
+    assert nothing.fingerprint() == NO_CORRECTIONS.fingerprint() == ""
+    assert map_fingerprint(Settings(), nothing) == Settings().fingerprint()
+
+
+def test_an_undone_command_is_as_if_it_had_never_been_given() -> None:
+    apart = KeepApart(**head(0), places=(A, B))
+    undo, again = Undo(**head(1), undone="c0"), Undo(**head(2), undone="c1")
+    assert compile_corrections(recorded(apart, undo)).fingerprint() == ""
+    assert compile_corrections(recorded(apart, undo, again)).apart == ((KEY[0], KEY[1]),)
+
+
+def test_of_keep_apart_and_join_the_later_counts() -> None:
+    commands = [KeepApart(**head(0), places=(B, A)), Join(**head(1), places=(A, B))]
+    corrections = compile_corrections(recorded(*commands))
+    assert (corrections.apart, corrections.joined) == ((), ((KEY[0], KEY[1]),))
+    turned = compile_corrections(recorded(*commands[::-1]))
+    assert (turned.apart, turned.joined) == (((KEY[0], KEY[1]),), ())
+
+
+def test_an_undone_merge_keeps_every_two_of_its_places_apart() -> None:
+    undone = UndoMerge(**head(0), merge_offset=Offset(7), places=(C, A, B))
+    assert len(compile_corrections(recorded(undone)).apart) == 3
+
+
+def test_pose_corrections_apply_in_the_order_of_the_commands() -> None:
+    fixed = CorrectPoses(
+        **head(0),
+        run_id=RunId("r"),
+        poses=(moved_to(4.0),),
+    )
+    moved = CorrectPoses(
+        **head(1),
+        run_id=RunId("r"),
+        transform=RigidTransform.of(1.0, 0.0, 0.0),
+        first=KeyframeId(1),
+    )
+    for commands, x in (((fixed, moved), 5.0), ((moved, fixed), 4.0)):
+        pose = (0.0, 0.0, 0.0)
+        for correction in compile_corrections(recorded(*commands)).poses[RunId("r")]:
+            pose = correction.apply(KeyframeId(1), pose)
+        assert pose[0] == x
+
+
+@given(st.permutations(EVERY[:9]))
+def test_any_commands_and_their_undos_are_no_corrections(commands: list[Command]) -> None:
+    undos = [
+        Undo(command_id=f"u{n}", issued_by="ann@lab", undone=command.command_id)
+        for n, command in enumerate(commands)
+    ]
+    corrections = compile_corrections(recorded(*commands, *undos))
+    assert (corrections.fingerprint(), corrections.settings, corrections.in_force) == ("", None, ())
+
+
+@given(st.permutations([EVERY[n] for n in (0, 1, 4, 5, 8)]))
+def test_the_order_of_independent_commands_does_not_matter(commands: list[Command]) -> None:
+    # Names carry the offset of their command, so it is kept here.
+    events = [RecordedCommand(Offset(EVERY.index(command)), command) for command in commands]
+    expected = compile_corrections([RecordedCommand(Offset(n), EVERY[n]) for n in (0, 1, 4, 5, 8)])
+    assert compile_corrections(events).fingerprint() == expected.fingerprint()
