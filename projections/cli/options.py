@@ -18,6 +18,7 @@ from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 from eventsrc.log.seek import resolve
 from eventsrc.transport.config import DEFAULT_ENDPOINT, ZenohOptions
+from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.errors import QuestionError, SettingsError
 from projections.settings import Settings
 
@@ -56,9 +57,16 @@ SettingsOption = Annotated[
 ]
 
 
-def settings_from(file: Path | None, assignments: list[str] | None) -> Settings:
-    """The settings a command runs with. Raises SettingsError naming file and field."""
-    settings = Settings() if file is None else _settings_of_file(file)
+def settings_from(
+    file: Path | None, assignments: list[str] | None, corrections: Corrections = NO_CORRECTIONS
+) -> Settings:
+    """The settings a command runs with: those of ``--settings``, else those that the log names
+    (``use-settings``), else the defaults; ``--set`` changes them.
+
+    Raises SettingsError naming file and field.
+    """
+    logged = corrections.settings or Settings()
+    settings = logged if file is None else _settings_of_file(file)
     return settings.with_assignments(assignments or ())
 
 
@@ -73,7 +81,12 @@ def _settings_of_file(file: Path) -> Settings:
         raise SettingsError(f"--settings {file}: not JSON: {error}") from None
 
 
-def past_settings(log: Path | None, file: Path | None, assignments: list[str] | None) -> Settings:
+def past_settings(
+    log: Path | None,
+    file: Path | None,
+    assignments: list[str] | None,
+    corrections: Corrections = NO_CORRECTIONS,
+) -> Settings:
     """The settings to fold ``log`` with, for a question to a past map.
 
     Raises MisuseError when there are settings but no log: the live map keeps its own.
@@ -83,7 +96,7 @@ def past_settings(log: Path | None, file: Path | None, assignments: list[str] | 
             "--set and --settings are for folding a log, and the live map keeps the settings it was"
             " made with; give --log LOG too, or run mapfold replay with them"
         )
-    return settings_from(file, assignments)
+    return settings_from(file, assignments, corrections)
 
 
 def say_defaults(settings: Settings) -> None:
