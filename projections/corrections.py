@@ -119,6 +119,19 @@ class Corrections(msgspec.Struct, frozen=True, eq=False):
         """The same without names of places, which change no place."""
         return msgspec.structs.replace(self, names=())
 
+    def differs_in_names_only(self, other: "Corrections") -> bool:
+        """Whether the two fold a log to the same map but for names of places."""
+        return self is other or (
+            self.forgotten_runs == other.forgotten_runs
+            and self.forgotten_ranges == other.forgotten_ranges
+            and self.dropped == other.dropped
+            and self.poses == other.poses
+            and self.apart == other.apart
+            and self.joined == other.joined
+            and self.different == other.different
+            and self.same == other.same
+        )
+
     def is_forgotten(self, run_id: RunId, keyframe_id: KeyframeId) -> bool:
         """Whether a keyframe is left out of the fold."""
         ranges = self.forgotten_ranges.get(run_id, ())
@@ -127,14 +140,12 @@ class Corrections(msgspec.Struct, frozen=True, eq=False):
     def pose(self, envelope: Envelope) -> tuple[float, float, float] | None:
         """The envelope's corrected pose, metres and radians; None if it has none."""
         x, y, yaw = envelope.map_x, envelope.map_y, envelope.map_yaw
-        if x is None or y is None or yaw is None:
-            pose = None
-            for correction in self.poses.get(envelope.run_id, ()):
-                pose = correction.poses.get(envelope.keyframe_id, pose)
-            return pose
-        pose = (x, y, yaw)
+        pose = None if x is None or y is None or yaw is None else (x, y, yaw)
         for correction in self.poses.get(envelope.run_id, ()):
-            pose = correction.apply(envelope.keyframe_id, pose)
+            if pose is None:
+                pose = correction.poses.get(envelope.keyframe_id)
+            else:
+                pose = correction.apply(envelope.keyframe_id, pose)
         return pose
 
     def kept(self, accepted: Accepted) -> list[int]:

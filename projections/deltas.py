@@ -14,9 +14,9 @@ exact; `projections.exact` says why and where the bounds are. Timestamps are the
 seconds.
 
 The deltas of one event come in this order: RunSeen, KeyframeAdded, ObservationAdded …, then places
-(PlaceFormed, PlacesMerged, KeyframePlaced, PlaceChanged), landmarks (ObjectFound / ObjectSeen),
-located-in (ObjectMoved), adjacency (PlacesLinked). A delta names only things that deltas before it
-have introduced.
+(PlaceFormed, PlacesMerged, MergeRefused, KeyframePlaced, PlaceChanged, PlaceNamed), landmarks
+(ObjectFound / ObjectSeen, ObjectsMerged), located-in (ObjectMoved), adjacency (PlacesLinked). A
+delta names only things that deltas before it have introduced.
 
 Deltas are frozen msgspec structs: a fold makes some ten a keyframe, and a struct takes a third of
 the time of a frozen dataclass to make. ``gc=False`` keeps them out of the garbage collector, which
@@ -36,7 +36,7 @@ KeyframeOrdinal = NewType("KeyframeOrdinal", int)
 ObservationOrdinal = NewType("ObservationOrdinal", int)
 PlaceOrdinal = NewType("PlaceOrdinal", int)
 ObjectOrdinal = NewType("ObjectOrdinal", int)
-SkipKind: TypeAlias = Literal["duplicate", "conflict", "det_id_reused"]
+SkipKind: TypeAlias = Literal["duplicate", "conflict", "det_id_reused", "forgotten", "dropped"]
 """Why an envelope, or an observation of it, is left out of the map; see `EventSkipped`."""
 UnitVector: TypeAlias = NDArray[np.int32]
 """A unit vector as multiples of 2⁻²⁰, int32 of shape (dim,); see `projections.exact`."""
@@ -106,12 +106,13 @@ class ObservationAdded(msgspec.Struct, frozen=True, eq=False, gc=False):
 
 
 class EventSkipped(msgspec.Struct, frozen=True, gc=False):
-    """An envelope that changes nothing: a duplicate, a conflict, or a det_id used before.
+    """An envelope, or a detection of it, that changes nothing.
 
     ``kind`` is ``duplicate`` (same keyframe, same content), ``conflict`` (same keyframe, other
-    content: the first one stands) or ``det_id_reused`` (an observation of a new keyframe whose
-    det_id an earlier keyframe has: that observation is left out, the rest of the keyframe is
-    folded).
+    content: the first one stands), ``forgotten`` (a correction leaves the keyframe out),
+    ``det_id_reused`` (an observation of a new keyframe whose det_id an earlier keyframe has) or
+    ``dropped`` (a correction leaves the detection out). The last two are of one detection,
+    ``det_id``; the rest of the keyframe is folded.
     """
 
     offset: Offset
@@ -148,7 +149,8 @@ class PlacesMerged(msgspec.Struct, frozen=True, gc=False):
     No KeyframePlaced is emitted for them: who keeps members must move them all. ``bridge`` is the
     keyframe whose arrival did it, ``links`` the pairs of core points that join the parts, one pair
     for each absorbed place. ``survivor_count`` and ``absorbed_counts`` are members before
-    the merge.
+    the merge. ``joined`` are those absorbed by a ``join`` command; their link is of the command's
+    two anchors, at whatever distance.
     """
 
     offset: Offset
@@ -158,6 +160,34 @@ class PlacesMerged(msgspec.Struct, frozen=True, gc=False):
     links: tuple[Link, ...]
     survivor_count: int
     absorbed_counts: tuple[int, ...]
+    joined: tuple[PlaceOrdinal, ...] = ()
+
+
+class MergeRefused(msgspec.Struct, frozen=True, gc=False):
+    """Two places touched and stay two, because a correction keeps them apart.
+
+    ``link`` is the pair of core points that would have joined them (of anchors, where a ``join``
+    is refused), ``bridge`` the keyframe whose arrival did it, ``apart`` the anchors that are kept
+    apart, of ``a`` and of ``b``. ``a`` was founded before ``b``. There is one for each pair of
+    places, however often they touch.
+    """
+
+    offset: Offset
+    a: PlaceOrdinal
+    b: PlaceOrdinal
+    bridge: KeyframeOrdinal
+    link: Link
+    apart: tuple[KeyframeOrdinal, KeyframeOrdinal]
+
+
+class PlaceNamed(msgspec.Struct, frozen=True, gc=False):
+    """A place has a name, or (None) has none any more. ``command`` is the offset of the command
+    that gives it, None if there is none."""
+
+    offset: Offset
+    place: PlaceOrdinal
+    name: str | None
+    command: Offset | None = None
 
 
 class KeyframePlaced(msgspec.Struct, frozen=True, gc=False):
@@ -210,6 +240,23 @@ class ObjectSeen(msgspec.Struct, frozen=True, gc=False):
     last_seen: float
 
 
+class ObjectsMerged(msgspec.Struct, frozen=True, gc=False):
+    """Two Objects became one by a ``same-object`` command; the survivor's new values.
+
+    All observations of ``absorbed`` belong to ``survivor`` from now on. No ObjectSeen is emitted
+    for them: who keeps observations must move them all.
+    """
+
+    offset: Offset
+    survivor: ObjectOrdinal
+    absorbed: ObjectOrdinal
+    obs_count: int
+    sum_x_um: int
+    sum_y_um: int
+    first_seen: float
+    last_seen: float
+
+
 class ObjectMoved(msgspec.Struct, frozen=True, gc=False):
     """An Object is located in another place than before, or in none (None)."""
 
@@ -237,10 +284,13 @@ Delta: TypeAlias = (
     | EventSkipped
     | PlaceFormed
     | PlacesMerged
+    | MergeRefused
     | KeyframePlaced
     | PlaceChanged
+    | PlaceNamed
     | ObjectFound
     | ObjectSeen
+    | ObjectsMerged
     | ObjectMoved
     | PlacesLinked
 )

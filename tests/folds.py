@@ -10,6 +10,7 @@ import numpy as np
 from sklearn.cluster import DBSCAN
 
 from eventsrc.ingest import Accepted, ingest
+from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.deltas import Delta
 from projections.exact import Neighbourhood
 from projections.model.view import MapView
@@ -38,12 +39,16 @@ class Folded:
 
     @classmethod
     def start(
-        cls, settings: Settings | None = None, neighbourhood: Neighbourhood | None = None
+        cls,
+        settings: Settings | None = None,
+        neighbourhood: Neighbourhood | None = None,
+        corrections: Corrections = NO_CORRECTIONS,
     ) -> "Folded":
         """Nothing folded yet."""
         named = None if neighbourhood is None else neighbourhood.name
         settings = (settings or Settings()).model_copy(update={"neighbourhood": named})
-        return cls(SemanticMap(settings, neighbourhood), MapView(settings), [])
+        semantic_map = SemanticMap(settings, neighbourhood, corrections)
+        return cls(semantic_map, MapView(settings, corrections=corrections), [])
 
     def extend(self, documents: Iterable[dict[str, Any]]) -> "Folded":
         """Fold these too."""
@@ -145,7 +150,7 @@ def recounted_adjacency(view: MapView) -> dict[tuple[int, int], int]:
 def recounted_locations(view: MapView) -> list[int | None]:
     """Each Object's place, from the labels of the keyframes that saw it."""
     located: list[int | None] = []
-    for found in view.objects:
+    for found in view.objects.values():
         votes = Counter(
             place
             for i in found.observations

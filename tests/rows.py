@@ -117,7 +117,7 @@ def _expect_landmarks(view: MapView, rows: dict[str, list[tuple[Any, ...]]]) -> 
             rows["OBSERVES"].append(
                 (gid("OBSERVES", n), *ends, {"similarity": o.similarity_q40 / Q40})
             )
-    for obj in view.objects:
+    for obj in view.objects.values():
         n = obj.ordinal + 1
         properties = {
             "object_id": obj.object_id,

@@ -17,7 +17,8 @@ from typing import Final
 
 from projections.deltas import PlaceOrdinal
 from projections.exact import Q40, UM_PER_M
-from projections.model.view import KeyframeRecord, MapView
+from projections.model.records import KeyframeRecord
+from projections.model.view import MapView
 
 from .labels import LABELS, Label, adjacency_number, graphid_base
 
@@ -49,7 +50,7 @@ BASE: Final = {label: graphid_base(label) + 1 for label in LABELS}
 def expected_rows(view: MapView, label: Label) -> Iterator[Row]:
     """All rows that the table of a label must hold, by graphid."""
     keyframes, observations = range(len(view.keyframes)), range(len(view.observations))
-    objects = range(len(view.objects))
+    objects = sorted(view.objects)
     rows: dict[Label, Callable[[], Iterator[Row]]] = {
         "Run": lambda: run_rows(view, range(len(view.runs))),
         "Keyframe": lambda: keyframe_rows(view, keyframes),
@@ -116,7 +117,7 @@ def object_rows(view: MapView, objects: Iterable[int]) -> Iterator[VertexRow]:
     """Objects."""
     base = BASE["Object"]
     for i in objects:
-        o = view.objects[i]
+        o = view.all_objects[i]
         properties = (
             f'{{"object_id": {text(o.object_id)}, "class_name": {text(o.class_name)},'
             f' "mean_x": {o.mean_x!r}, "mean_y": {o.mean_y!r}, "obs_count": {o.obs_count},'
@@ -172,7 +173,7 @@ def observes_rows(view: MapView, observations: Iterable[int]) -> Iterator[EdgeRo
 def located_in_rows(view: MapView, objects: Iterable[int]) -> Iterator[EdgeRow]:
     """Edges from objects that are in a place to it."""
     for o in objects:
-        place = view.objects[o].place
+        place = view.all_objects[o].place
         if place is not None:
             yield BASE["LOCATED_IN"] + o, BASE["Object"] + o, BASE["Place"] + place, _NONE
 

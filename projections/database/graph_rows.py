@@ -77,7 +77,7 @@ def changed_rows(changes: BatchChanges, view: MapView) -> GraphRows:
     """What to insert, upsert and delete after a batch."""
     upserted: dict[Label, list[Any]] = {
         "Run": list(run_rows(view, changes.runs)),
-        "Object": list(object_rows(view, changes.objects)),
+        "Object": list(object_rows(view, filter(view.objects.__contains__, changes.objects))),
         "Place": list(place_rows(view, filter(view.places.__contains__, changes.places))),
         "LOCATED_IN": list(located_in_rows(view, changes.located)),
         "IN_PLACE": list(in_place_rows(view, changes.placed)),
@@ -86,7 +86,7 @@ def changed_rows(changes: BatchChanges, view: MapView) -> GraphRows:
     deleted: dict[Label, list[int]] = {
         "Place": [BASE["Place"] + p for p in changes.places if p not in view.places],
         "LOCATED_IN": [
-            BASE["LOCATED_IN"] + o for o in changes.located if view.objects[o].place is None
+            BASE["LOCATED_IN"] + o for o in changes.located if view.all_objects[o].place is None
         ],
         "ADJACENT_TO": [
             graphid_base("ADJACENT_TO") + adjacency_number(a, b)

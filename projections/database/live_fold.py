@@ -4,6 +4,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 
 from eventsrc.envelope import Offset
 from eventsrc.log import Event
+from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.errors import FoldError
 from projections.model.changes import ChangeTracker
 from projections.model.fold import READ_AHEAD, fold_events
@@ -16,12 +17,16 @@ class LiveFold:
     """The fold's state, its view without embeddings, and the tracker of the view's changes."""
 
     def __init__(
-        self, settings: Settings, start: tuple[SemanticMap, MapView] | None = None
+        self,
+        settings: Settings,
+        start: tuple[SemanticMap, MapView] | None = None,
+        *,
+        corrections: Corrections = NO_CORRECTIONS,
     ) -> None:
         """``start`` is a snapshot's, to go on from; by default nothing is folded yet."""
         self.map, self.view = start or (
-            SemanticMap(settings),
-            MapView(settings, keep_embeddings=False),
+            SemanticMap(settings, corrections=corrections),
+            MapView(settings, keep_embeddings=False, corrections=corrections),
         )
         self.tracker = ChangeTracker(self.view)
 
@@ -44,6 +49,13 @@ class LiveFold:
                 yield error
                 self.skip(events[start].offset)
                 start += 1
+
+    def use_names(self, offset: Offset, corrections: Corrections) -> None:
+        """Take over the names of ``corrections``, which the event at ``offset`` changed in nothing
+        else. The event must have been fed or skipped. Raises ValueError."""
+        deltas = self.map.use_names(offset, corrections)
+        self.view.corrections = corrections
+        self.tracker.apply_names(deltas)
 
     def skip(self, offset: Offset) -> None:
         """Pass over an event that is left out."""

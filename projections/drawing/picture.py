@@ -80,7 +80,7 @@ def compose(
 
 def _numbers(view: MapView, min_observations: int) -> str:
     counts, settings = view.counts(), view.settings
-    shown = sum(found.obs_count >= min_observations for found in view.objects)
+    shown = sum(found.obs_count >= min_observations for found in view.objects.values())
     return (
         f"{counted(counts['keyframes'], 'keyframe')} ({counts['noise']} in no place)  ·  "
         f"{counted(counts['places'], 'place')}  ·  "

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 from eventsrc.envelope import RunId
 from eventsrc.sim import House
-from projections.model.view import KeyframeRecord, MapView, ObjectRecord
+from projections.model.records import KeyframeRecord, ObjectRecord
+from projections.model.view import MapView
 
 _NEAR_M = 1.0
 
@@ -88,7 +89,7 @@ class ObjectGroup:
 def object_groups(view: MapView, min_observations: int) -> list[ObjectGroup]:
     """The objects seen at least that often, by place and class; most seen first."""
     grouped: dict[tuple[int | None, str], list[list[ObjectRecord]]] = defaultdict(list)
-    for found in view.objects:
+    for found in view.objects.values():
         if found.obs_count >= min_observations:
             _add_to_group(grouped[found.place, found.class_name], found)
     groups = [

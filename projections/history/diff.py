@@ -153,7 +153,7 @@ def _keyframe_rows(view: MapView, ids: list[str]) -> Iterable[KeyframeRow]:
 
 def _object_rows(view: MapView, ids: list[str]) -> Iterable[ObjectRow]:
     observations = view.observations
-    for o in view.objects:
+    for o in view.objects.values():
         yield ObjectRow(
             o.object_id,
             o.class_name,

@@ -32,14 +32,14 @@ from projections.deltas import (
     PlacesMerged,
     RunSeen,
 )
-from projections.model.view import (
+from projections.model.records import (
     KeyframeRecord,
-    MapView,
     ObjectRecord,
     ObservationRecord,
     PlaceRecord,
     RunRecord,
 )
+from projections.model.view import MapView
 from projections.reducers import packed
 from projections.reducers.survivors import PlaceSurvivors
 from projections.settings import Settings
@@ -239,18 +239,19 @@ def view_at(history: History, latest: MapView, end: Offset, settings: Settings) 
     (observations, poses) is shared with it; places, objects and the place of a keyframe are made
     anew, so that changing one view does not change another.
     """
-    view = MapView(settings, keep_embeddings=latest.keep_embeddings)
+    view = MapView(settings, keep_embeddings=latest.keep_embeddings, corrections=latest.corrections)
     view.all_places = _places(history, end)
     view.survivors = _survivors(history, end)
     absorbed_by = view.survivors.absorbed_by
     view.places = {p.ordinal: p for p in view.all_places if p.ordinal not in absorbed_by}
     view.keyframes = _keyframes(history, latest, view.survivors, end)
     view.observations = _observations(history, latest, end)
-    view.objects = _objects(history, end)
+    view.all_objects = _objects(history, end)
+    view.objects = {o.ordinal: o for o in view.all_objects}
     view.runs = _runs(history, view.keyframes, end)
     view.adjacency = _adjacency(history, end)
     for skipped in history.skipped[: count_before(history.skipped, end)]:
-        view.skipped[skipped.kind] += 1
+        view.skipped[skipped.kind] = view.skipped.get(skipped.kind, 0) + 1
     view.advance(end)
     return view
 

@@ -98,7 +98,7 @@ def fold_result(view: MapView, history: History, truth: Truth | None, seconds: f
         counts=view.counts(),
         merges=len(history.merges),
         places=tuple(view.place_id(keyframe.place) for keyframe in view.keyframes),
-        objects=tuple(None if n < 0 else view.objects[n].object_id for n in fused),
+        objects=tuple(None if n < 0 else view.all_objects[n].object_id for n in fused),
         posed=array("q", (k.ordinal for k in view.keyframes if k.pose is not None)),
         placed_offsets=history.placed_offsets,
         placed_in=array("q", (-1 if p < 0 else numbers[p] for p in history.placed_in)),

@@ -17,9 +17,12 @@ from projections.deltas import (
     ObjectMoved,
     ObjectOrdinal,
     ObjectSeen,
+    ObjectsMerged,
     ObservationAdded,
+    ObservationOrdinal,
     PlaceChanged,
     PlaceFormed,
+    PlaceNamed,
     PlaceOrdinal,
     PlacesLinked,
     PlacesMerged,
@@ -39,8 +42,9 @@ class BatchChanges:
     """What a batch added or changed, as ordinals in ascending order; `MapView` has the values.
 
     ``keyframes`` and ``observations`` are new. They never change later, except for the place of a
-    keyframe: ``placed`` are the keyframes that joined a place or whose place was absorbed.
-    ``runs``, ``objects`` and ``places`` are new or changed; a place that is not in
+    keyframe and the object of an observation: ``placed`` are the keyframes that joined a place or
+    whose place was absorbed, ``reassigned`` the observations whose object was absorbed. ``runs``,
+    ``objects`` and ``places`` are new or changed; one that is not in `MapView.objects` or
     `MapView.places` any more was absorbed. ``located`` are objects that moved to another place or
     out of one. ``links`` are pairs of places whose shared transitions changed; one that is not in
     `MapView.adjacency` any more is gone. ``embedded`` is in the order of the observations.
@@ -55,6 +59,7 @@ class BatchChanges:
     located: list[ObjectOrdinal]
     placed: list[KeyframeOrdinal]
     links: list[tuple[PlaceOrdinal, PlaceOrdinal]]
+    reassigned: list[ObservationOrdinal]
 
 
 class ChangeTracker:
@@ -75,6 +80,12 @@ class ChangeTracker:
                 collect(self, delta)
         self.view.apply_event(offset, deltas)
 
+    def apply_names(self, deltas: Sequence[PlaceNamed]) -> None:
+        """Apply the deltas of `SemanticMap.use_names`, which are of no event's fold."""
+        for delta in deltas:
+            self._places.add(delta.place)
+            self.view.apply(delta)
+
     @property
     def added(self) -> int:
         """How many keyframes and observations are new since the last `drain`."""
@@ -93,6 +104,7 @@ class ChangeTracker:
             sorted(self._located),
             sorted(self._placed),
             sorted(self._links),
+            sorted(self._reassigned),
         )
         self._start()
         return changes
@@ -107,6 +119,7 @@ class ChangeTracker:
         self._located: set[ObjectOrdinal] = set()
         self._placed: set[KeyframeOrdinal] = set()
         self._links: set[tuple[PlaceOrdinal, PlaceOrdinal]] = set()
+        self._reassigned: set[ObservationOrdinal] = set()
 
     def _places_merged(self, delta: PlacesMerged) -> None:
         self._places.add(delta.survivor)
@@ -115,14 +128,21 @@ class ChangeTracker:
             # Before the view applies it: afterwards they are members of the survivor.
             self._placed.update(self.view.all_places[place].unordered_members)
 
+    def _objects_merged(self, delta: ObjectsMerged) -> None:
+        self._objects.update((delta.survivor, delta.absorbed))
+        # Before the view applies it, as above.
+        self._reassigned.update(self.view.all_objects[delta.absorbed].observations)
+
     # Of the class, not bound to the tracker; `MapView` says why.
     _COLLECTORS: ClassVar[dict[type, Callable[["ChangeTracker", Any], None]]] = {
         RunSeen: lambda self, d: self._runs.add(d.run),
         ObjectFound: lambda self, d: self._objects.add(d.object),
         ObjectSeen: lambda self, d: self._objects.add(d.object),
+        ObjectsMerged: _objects_merged,
         ObjectMoved: lambda self, d: self._located.add(d.object),
         PlaceFormed: lambda self, d: self._places.add(d.place),
         PlaceChanged: lambda self, d: self._places.add(d.place),
+        PlaceNamed: lambda self, d: self._places.add(d.place),
         KeyframePlaced: lambda self, d: self._placed.add(d.keyframe),
         PlacesMerged: _places_merged,
         PlacesLinked: lambda self, d: self._links.add((d.a, d.b)),

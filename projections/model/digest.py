@@ -3,7 +3,8 @@
 The canonical form is the sections of `_SECTIONS` in their order, one line for each thing by
 ordinal, each line a JSON array. Integers are exact, a float is written as the shortest decimal that
 names it, an embedding enters by its checksum. Settings and the number of events are not part of it:
-the same map reached another way has the same digest.
+the same map reached another way has the same digest. Under corrections there are two more sections:
+the places' names, and the corrections' fingerprint.
 """
 
 import hashlib
@@ -27,6 +28,9 @@ def map_digest(view: MapView) -> str:
         remaining = lines(view)
         while chunk := "".join(islice(remaining, _LINES_AT_ONCE)):
             digest.update(chunk.encode("ascii"))
+    if own := view.corrections.fingerprint():
+        names = [_line((p.ordinal, p.name)) for p in view.places.values() if p.name is not None]
+        digest.update(f"names\n{''.join(names)}corrections\n{_line(own)}".encode())
     return digest.hexdigest()
 
 
@@ -62,7 +66,7 @@ def _observations(view: MapView) -> Iterator[str]:
 
 
 def _objects(view: MapView) -> Iterator[str]:
-    for o in view.objects:
+    for o in view.objects.values():
         yield (
             f"[{_text(o.object_id)},{_text(o.class_name)},{o.obs_count},{o.sum_x_um},{o.sum_y_um},"
             f"{o.first_seen!r},{o.last_seen!r},{_number(o.place)}]\n"

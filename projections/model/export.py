@@ -65,7 +65,7 @@ def _objects(view: MapView) -> list[dict[str, Any]]:
             "last_seen": o.last_seen,
             "det_ids": [view.observations[i].det_id for i in o.observations],
         }
-        for o in view.objects
+        for o in view.objects.values()
     ]
 
 
@@ -117,7 +117,7 @@ def _place_lines(view: MapView) -> list[str]:
         neighbours[a].append(f"{view.place_id(b)} ×{transitions}")
         neighbours[b].append(f"{view.place_id(a)} ×{transitions}")
     objects = dict.fromkeys(view.places, 0)
-    for record in view.objects:
+    for record in view.objects.values():
         if record.place is not None:
             objects[record.place] += 1
     width = max(len(place.place_id) for place in view.places.values())

@@ -12,6 +12,7 @@ from eventsrc.ingest import Accepted, Rejected
 from eventsrc.log import Event, LogReader
 from eventsrc.system_events import is_system_key
 from eventsrc.upcast import read_envelopes
+from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.deltas import Delta
 from projections.errors import FoldError
 from projections.exact import Neighbourhood, Units, unit_vectors
@@ -99,10 +100,11 @@ def fold_log(
     *,
     keep_embeddings: bool = True,
     neighbourhood: Neighbourhood | None = None,
+    corrections: Corrections = NO_CORRECTIONS,
 ) -> tuple[SemanticMap, MapView]:
     """Fold the first ``until`` events of a log, all of them for None."""
-    semantic_map = SemanticMap(settings, neighbourhood)
-    view = MapView(settings, keep_embeddings=keep_embeddings)
+    semantic_map = SemanticMap(settings, neighbourhood, corrections)
+    view = MapView(settings, keep_embeddings=keep_embeddings, corrections=corrections)
     _fold_into(reader, semantic_map, view, until)
     return semantic_map, view
 
@@ -114,6 +116,7 @@ def fold_log_cached(
     *,
     note: Callable[[str], None] = lambda _: None,
     neighbourhood: Neighbourhood | None = None,
+    corrections: Corrections = NO_CORRECTIONS,
 ) -> tuple[SemanticMap, MapView]:
     """`fold_log` without embeddings, from the nearest snapshot beside the log.
 
@@ -121,10 +124,12 @@ def fold_log_cached(
     of snapshots that could not be used or kept; the result is the same.
     """
     end = reader.next_offset if until is None else min(until, reader.next_offset)
-    cache = SnapshotCache(reader.path, reader.log_id, settings, note, neighbourhood)
+    cache = SnapshotCache(
+        reader.path, reader.log_id, settings, note, neighbourhood, corrections=corrections
+    )
     semantic_map, view = cache.latest(end) or (
-        SemanticMap(settings, neighbourhood),
-        MapView(settings, keep_embeddings=False),
+        SemanticMap(settings, neighbourhood, corrections),
+        MapView(settings, keep_embeddings=False, corrections=corrections),
     )
     start = semantic_map.next_offset
     _fold_into(reader, semantic_map, view, end)

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from eventsrc.log import same_but_sealed
+from projections.corrections import NO_CORRECTIONS, Corrections, map_fingerprint
 from projections.deltas import (
     KeyframeOrdinal,
     ObjectOrdinal,
@@ -30,7 +31,8 @@ from projections.reducers import State, part, prefixed
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 
-from .view import KeyframeRecord, MapView, ObjectRecord, ObservationRecord, PlaceRecord, RunRecord
+from .records import KeyframeRecord, ObjectRecord, ObservationRecord, PlaceRecord, RunRecord
+from .view import MapView
 
 MAGIC = b"mapfold snapshot 1\n"
 _TYPES = frozenset({"<i4", "<i8", "<f8", "|u1", "<u4", "|i1"})
@@ -109,9 +111,10 @@ def dump_view(view: MapView) -> State:
         **_dump_observations(view),
         "objects": [
             [o.object_id, o.class_name, o.obs_count, o.sum_x_um, o.sum_y_um, o.place]
-            for o in view.objects
+            for o in view.all_objects
         ],
-        "object_times": _floats([(o.first_seen, o.last_seen) for o in view.objects], 2),
+        "object_times": _floats([(o.first_seen, o.last_seen) for o in view.all_objects], 2),
+        "absorbed_objects": sorted(view.object_survivors.absorbed_by.items()),
         "places": [
             [
                 p.place_id,
@@ -228,16 +231,20 @@ def _load_observations(view: MapView, state: State) -> None:
         observer.observations = [*observer.observations, ordinal]
         if fused != _NONE:
             record.object, record.similarity_q40 = fused, q40
-            view.objects[fused].observations.append(ordinal)
+            view.all_objects[fused].observations.append(ordinal)
 
 
 def _load_objects(view: MapView, state: State) -> None:
     rows = zip(state["objects"], state["object_times"].tolist(), strict=True)
     for i, ((object_id, name, count, x_um, y_um, place), (first, last)) in enumerate(rows):
         ordinal = ObjectOrdinal(i)
-        view.objects.append(
+        view.all_objects.append(
             ObjectRecord(ordinal, object_id, name, count, x_um, y_um, first, last, place)
         )
+    for absorbed, survivor in state.get("absorbed_objects", ()):
+        view.object_survivors.merge(survivor, (absorbed,))
+    absorbed_by = view.object_survivors.absorbed_by
+    view.objects = {o.ordinal: o for o in view.all_objects if o.ordinal not in absorbed_by}
 
 
 def _load_places(view: MapView, rows: list[list[Any]]) -> None:
@@ -254,6 +261,12 @@ FOLD_VERSION = 2
 """Raise it with every change of the reducers after which the same log gives another map."""
 
 
+def snapshot_fingerprint(settings: Settings, corrections: Corrections) -> str:
+    """16 hex digits that are equal for maps whose snapshots are interchangeable: those that differ
+    in names of places only."""
+    return map_fingerprint(settings, corrections.without_names())
+
+
 class SnapshotRefused(ValueError):
     """A snapshot cannot be used here; the message says why."""
 
@@ -263,13 +276,14 @@ def snapshot(
 ) -> bytes:
     """The bytes of a map and its view without embeddings, as of ``semantic_map.next_offset``.
 
-    ``segments`` is the `eventsrc.log.segment_signatures` of the events they were folded from.
+    ``segments`` is the `eventsrc.log.segment_signatures` of the events they were folded from. Names
+    of places are not in it: `restore` gives them anew, so it is good under other names, too.
     """
     about = {
         "fold_version": FOLD_VERSION,
         "log_id": log_id,
         "segments": list(segments),
-        "fingerprint": semantic_map.settings.fingerprint(),
+        "fingerprint": snapshot_fingerprint(semantic_map.settings, semantic_map.corrections),
         "offset": semantic_map.next_offset,
     }
     return pack(
@@ -285,21 +299,25 @@ def restore(
     log_id: str,
     neighbourhood: Neighbourhood | None = None,
     signatures_at: Callable[[int], Sequence[str]] = lambda _: (),
+    *,
+    corrections: Corrections = NO_CORRECTIONS,
 ) -> tuple[SemanticMap, MapView]:
     """The map and the view of a `snapshot`.
 
     ``signatures_at`` gives the log's `eventsrc.log.segment_signatures` up to an offset, as it is
     now. Raises SnapshotRefused, and what ``signatures_at`` raises.
     """
-    semantic_map = SemanticMap(settings, neighbourhood)
-    view = MapView(settings, keep_embeddings=False)
+    semantic_map = SemanticMap(settings, neighbourhood, corrections)
+    view = MapView(settings, keep_embeddings=False, corrections=corrections)
     try:
         state = unpack(data)
         about = part("about", state)
-        _check_identity(about, settings, log_id)
+        _check_identity(about, snapshot_fingerprint(settings, corrections), log_id)
         _check_signatures(about["segments"], signatures_at(about["offset"]))
         semantic_map.load(part("map", state))
         load_view(view, part("view", state))
+        for delta in semantic_map.use_names(semantic_map.next_offset, corrections):
+            view.apply(delta)
     except (MalformedSnapshot, zlib.error) as error:
         raise SnapshotRefused(str(error)) from None
     except SnapshotRefused:
@@ -309,13 +327,13 @@ def restore(
     return semantic_map, view
 
 
-def _check_identity(about: dict[str, Any], settings: Settings, log_id: str) -> None:
+def _check_identity(about: dict[str, Any], fingerprint: str, log_id: str) -> None:
     if about["fold_version"] != FOLD_VERSION:
         raise SnapshotRefused(f"it is of fold version {about['fold_version']}, not {FOLD_VERSION}")
     if about["log_id"] != log_id:
         raise SnapshotRefused(f"it is of the log {about['log_id']}, not of {log_id}")
-    if about["fingerprint"] != settings.fingerprint():
-        raise SnapshotRefused("it was made with other settings")
+    if about["fingerprint"] != fingerprint:
+        raise SnapshotRefused("it was made with other settings or under other corrections")
 
 
 def _check_signatures(before: Sequence[str], now: Sequence[str]) -> None:

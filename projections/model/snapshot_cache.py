@@ -2,8 +2,8 @@
 
 Files appear whole (written beside, then renamed) and are never changed. A failure of the cache is
 reported as a note and makes the fold slower, but never fails it. A snapshot of events that the log
-has lost since, by recovery or deletion, is not used. For each set of settings a few snapshots are
-kept: the newest, and others spread out below it.
+has lost since, by recovery or deletion, is not used. For each set of settings and corrections a
+few snapshots are kept: the newest, and others spread out below it.
 """
 
 import os
@@ -14,11 +14,12 @@ from pathlib import Path
 
 from eventsrc.envelope import Offset
 from eventsrc.log import segment_signatures
+from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.exact import Neighbourhood
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 
-from .snapshot import SnapshotRefused, restore, snapshot
+from .snapshot import SnapshotRefused, restore, snapshot, snapshot_fingerprint
 from .view import MapView
 
 Note = Callable[[str], None]
@@ -27,7 +28,8 @@ _MAX_KEPT = 6
 
 
 class SnapshotCache:
-    """Snapshots of one log under one set of settings; ``note`` is told of those not usable."""
+    """Snapshots of one log under one set of settings and corrections; ``note`` is told of those not
+    usable. Other names of places need no other snapshots."""
 
     def __init__(
         self,
@@ -36,11 +38,15 @@ class SnapshotCache:
         settings: Settings,
         note: Note,
         neighbourhood: Neighbourhood | None = None,
+        *,
+        corrections: Corrections = NO_CORRECTIONS,
     ) -> None:
         self.folder = log.with_name(f"{log.name}.snapshots")
         self._signatures = partial(segment_signatures, log)
         self._log_id = log_id
         self._settings = settings
+        self._corrections = corrections
+        self._fingerprint = snapshot_fingerprint(settings, corrections)
         self._note = note
         self._neighbourhood = neighbourhood
         self._unusable: set[Path] = set()
@@ -52,7 +58,7 @@ class SnapshotCache:
         except OSError:  # none yet, or not ours to read
             return []
         found = [m for name in names if (m := _NAME.fullmatch(name))]
-        return sorted(Offset(int(m[2])) for m in found if m[1] == self._settings.fingerprint())
+        return sorted(Offset(int(m[2])) for m in found if m[1] == self._fingerprint)
 
     def latest(self, until: Offset) -> tuple[SemanticMap, MapView] | None:
         """The fold and view of the usable snapshot with the highest offset ≤ ``until``."""
@@ -61,7 +67,12 @@ class SnapshotCache:
             try:
                 data = path.read_bytes()
                 found = restore(
-                    data, self._settings, self._log_id, self._neighbourhood, self._signatures
+                    data,
+                    self._settings,
+                    self._log_id,
+                    self._neighbourhood,
+                    self._signatures,
+                    corrections=self._corrections,
                 )
             except (OSError, SnapshotRefused) as error:
                 self._note(f"{path}: this snapshot is not used: {error}; it is safe to delete")
@@ -88,7 +99,7 @@ class SnapshotCache:
             self._note(f"{path}: no snapshot was kept: {error.strerror}")
 
     def _path(self, offset: Offset) -> Path:
-        return self.folder / f"{self._settings.fingerprint()}-{offset:020d}.map"
+        return self.folder / f"{self._fingerprint}-{offset:020d}.map"
 
     def _thin_out(self) -> None:
         """While there are too many, delete the one whose neighbours are closest together."""

@@ -1,181 +1,74 @@
-"""The map as data, built from deltas alone: `MapView` and its records.
+"""The map as data, built from deltas alone.
 
 A view knows no reducer: the same deltas, from a live fold, from a log or from a test's hand, give
 the same view. Applying a delta twice does no harm. A merge moves the smaller member list into the
 larger one and leaves keyframes with the place they joined; `KeyframeRecord.place` looks its
 survivor up, so a merge costs little however many keyframes move.
-
-Records are written by `MapView.apply` only. ``ordinal`` numbers the things of a kind in the order
-in which the fold met or founded them. Positions are integer micrometres (``_um``) and exact; ``_m``
-and ``_x``/``_y`` values are metres, correctly rounded. Times are robot seconds.
 """
 
 import zlib
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from eventsrc.envelope import FIRST_OFFSET, DetId, KeyframeId, Offset, RunId
+from eventsrc.envelope import FIRST_OFFSET, Offset
+from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.deltas import (
     Delta,
     EventSkipped,
     KeyframeAdded,
-    KeyframeOrdinal,
     KeyframePlaced,
+    MergeRefused,
     ObjectFound,
     ObjectMoved,
     ObjectOrdinal,
     ObjectSeen,
+    ObjectsMerged,
     ObservationAdded,
-    ObservationOrdinal,
     PlaceChanged,
     PlaceFormed,
+    PlaceNamed,
     PlaceOrdinal,
     PlacesLinked,
     PlacesMerged,
-    Pose,
-    RunOrdinal,
     RunSeen,
     SkipKind,
-    UnitVector,
 )
-from projections.exact import mean_m
-from projections.reducers.survivors import PlaceSurvivors
+from projections.reducers.survivors import ObjectSurvivors, PlaceSurvivors
 from projections.settings import Settings
 
+from .records import KeyframeRecord, ObjectRecord, ObservationRecord, PlaceRecord, RunRecord
 
-@dataclass(slots=True, eq=False)
-class RunRecord:
-    """One run. ``started_at`` is the earliest keyframe timestamp of it so far."""
-
-    ordinal: RunOrdinal
-    run_id: RunId
-    started_at: float
-    keyframe_count: int = 0
-
-
-@dataclass(slots=True, eq=False)
-class PlaceRecord:
-    """A region of the building. ``founder`` is its first core keyframe.
-
-    `MapView.places` lists those that were not absorbed.
-    """
-
-    ordinal: PlaceOrdinal
-    place_id: str
-    founder: KeyframeOrdinal
-    founded_offset: Offset
-    keyframe_count: int = 0
-    sum_x_um: int = 0
-    sum_y_um: int = 0
-    unordered_members: list[KeyframeOrdinal] = field(default_factory=list)
-
-    @property
-    def members(self) -> list[KeyframeOrdinal]:
-        """Ordinals of its keyframes, ascending; a new list each time."""
-        return sorted(self.unordered_members)
-
-    @property
-    def centroid_x(self) -> float:
-        """Metres; the mean of its members."""
-        return mean_m(self.sum_x_um, self.keyframe_count)
-
-    @property
-    def centroid_y(self) -> float:
-        """Metres; the mean of its members."""
-        return mean_m(self.sum_y_um, self.keyframe_count)
-
-
-@dataclass(slots=True, eq=False)
-class KeyframeRecord:
-    """One keyframe. ``offset`` is its event's; ``pose`` is None when the robot had none.
-
-    ``joined`` is the place it joined, as of then; ``survivors`` are the view's.
-    """
-
-    ordinal: KeyframeOrdinal
-    offset: Offset
-    run: RunOrdinal
-    run_id: RunId
-    keyframe_id: KeyframeId
-    timestamp: float
-    pose: Pose | None
-    survivors: PlaceSurvivors
-    observations: list[ObservationOrdinal] | tuple[()] = ()
-    joined: PlaceOrdinal | None = None
-
-    @property
-    def place(self) -> PlaceOrdinal | None:
-        """The place it belongs to now; None for noise or without a pose."""
-        return None if self.joined is None else self.survivors.find(self.joined)
-
-
-@dataclass(slots=True, eq=False)
-class ObservationRecord:
-    """One detection. ``object`` and ``similarity_q40`` are None when it was not fused.
-
-    ``embedding`` is None when there is none, when it is of a foreign space, or when the view was
-    made with ``keep_embeddings=False``; ``embedding_crc`` is there even then.
-    """
-
-    ordinal: ObservationOrdinal
-    keyframe: KeyframeOrdinal
-    det_id: DetId
-    class_name: str
-    confidence: float
-    bbox: tuple[float, float, float, float]
-    embedding_model: str | None
-    embedding: UnitVector | None
-    embedding_crc: int | None
-    foreign_space: bool
-    object: ObjectOrdinal | None = None
-    similarity_q40: int | None = None
-
-
-@dataclass(slots=True, eq=False)
-class ObjectRecord:
-    """A landmark. ``observations`` are ordinals in the order in which they were fused."""
-
-    ordinal: ObjectOrdinal
-    object_id: str
-    class_name: str
-    obs_count: int = 0
-    sum_x_um: int = 0
-    sum_y_um: int = 0
-    first_seen: float = 0.0
-    last_seen: float = 0.0
-    place: PlaceOrdinal | None = None
-    observations: list[ObservationOrdinal] = field(default_factory=list)
-
-    @property
-    def mean_x(self) -> float:
-        """Metres; the mean of the positions the robot observed it from."""
-        return mean_m(self.sum_x_um, self.obs_count)
-
-    @property
-    def mean_y(self) -> float:
-        """Metres; the mean of the positions the robot observed it from."""
-        return mean_m(self.sum_y_um, self.obs_count)
+_BY_CORRECTION: tuple[SkipKind, ...] = ("forgotten", "dropped")
 
 
 class MapView:
     """A whole map state. Read its attributes; change it by `apply` and `advance` only.
 
-    ``runs``, ``keyframes``, ``observations`` and ``objects`` are lists indexed by ordinal.
-    ``places`` are those not absorbed, by ordinal, ascending; ``all_places`` also the absorbed, and
-    ``survivors`` what these are part of now.
+    ``runs``, ``keyframes`` and ``observations`` are lists indexed by ordinal. ``places`` are those
+    not absorbed, by ordinal, ascending; ``all_places`` also the absorbed, and ``survivors`` what
+    these are part of now. So are ``objects``, ``all_objects`` and ``object_survivors``.
     ``adjacency`` maps (a, b), a founded before b, to shared transitions above 0; `edges` sorts it.
-    ``next_offset`` is the number of events that went into the view.
+    ``next_offset`` is the number of events that went into the view; ``corrections`` are those they
+    were folded under.
     """
 
-    def __init__(self, settings: Settings, *, keep_embeddings: bool = True) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        *,
+        keep_embeddings: bool = True,
+        corrections: Corrections = NO_CORRECTIONS,
+    ) -> None:
         self.settings = settings
+        self.corrections = corrections
         self.keep_embeddings = keep_embeddings
         self.next_offset = FIRST_OFFSET
         self.runs: list[RunRecord] = []
         self.keyframes: list[KeyframeRecord] = []
         self.observations: list[ObservationRecord] = []
-        self.objects: list[ObjectRecord] = []
+        self.all_objects: list[ObjectRecord] = []
+        self.objects: dict[ObjectOrdinal, ObjectRecord] = {}
+        self.object_survivors = ObjectSurvivors()
         self.all_places: list[PlaceRecord] = []
         self.places: dict[PlaceOrdinal, PlaceRecord] = {}
         self.survivors = PlaceSurvivors()
@@ -253,7 +146,7 @@ class MapView:
 
     def _event_skipped(self, delta: EventSkipped) -> None:
         if delta.offset >= self.next_offset:
-            self.skipped[delta.kind] += 1
+            self.skipped[delta.kind] = self.skipped.get(delta.kind, 0) + 1
 
     def _place_formed(self, delta: PlaceFormed) -> None:
         if delta.place < len(self.all_places):
@@ -288,12 +181,21 @@ class MapView:
         place.sum_x_um = delta.sum_x_um
         place.sum_y_um = delta.sum_y_um
 
+    def _place_named(self, delta: PlaceNamed) -> None:
+        place = self.all_places[delta.place]
+        place.name, place.name_offset = delta.name, delta.command
+
+    def _merge_refused(self, delta: MergeRefused) -> None:
+        """The places stay as they are."""
+
     def _object_found(self, delta: ObjectFound) -> None:
-        if delta.object == len(self.objects):
-            self.objects.append(ObjectRecord(delta.object, delta.object_id, delta.class_name))
+        if delta.object == len(self.all_objects):
+            found = ObjectRecord(delta.object, delta.object_id, delta.class_name)
+            self.all_objects.append(found)
+            self.objects[delta.object] = found
 
     def _object_seen(self, delta: ObjectSeen) -> None:
-        found = self.objects[delta.object]
+        found = self.all_objects[delta.object]
         observation = self.observations[delta.observation]
         if observation.object is None:
             observation.object = delta.object
@@ -305,8 +207,23 @@ class MapView:
         found.first_seen = delta.first_seen
         found.last_seen = delta.last_seen
 
+    def _objects_merged(self, delta: ObjectsMerged) -> None:
+        survivor = self.all_objects[delta.survivor]
+        absorbed = self.objects.pop(delta.absorbed, None)
+        if absorbed is not None:
+            for observation in absorbed.observations:
+                self.observations[observation].object = delta.survivor
+            survivor.observations = sorted(survivor.observations + absorbed.observations)
+            absorbed.observations = []
+            self.object_survivors.merge(delta.survivor, (delta.absorbed,))
+        survivor.obs_count = delta.obs_count
+        survivor.sum_x_um = delta.sum_x_um
+        survivor.sum_y_um = delta.sum_y_um
+        survivor.first_seen = delta.first_seen
+        survivor.last_seen = delta.last_seen
+
     def _object_moved(self, delta: ObjectMoved) -> None:
-        self.objects[delta.object].place = delta.place
+        self.all_objects[delta.object].place = delta.place
 
     def _places_linked(self, delta: PlacesLinked) -> None:
         if delta.shared_transitions:
@@ -323,16 +240,20 @@ class MapView:
         EventSkipped: _event_skipped,
         PlaceFormed: _place_formed,
         PlacesMerged: _places_merged,
+        MergeRefused: _merge_refused,
         KeyframePlaced: _keyframe_placed,
         PlaceChanged: _place_changed,
+        PlaceNamed: _place_named,
         ObjectFound: _object_found,
         ObjectSeen: _object_seen,
+        ObjectsMerged: _objects_merged,
         ObjectMoved: _object_moved,
         PlacesLinked: _places_linked,
     }
 
     def counts(self) -> dict[str, int]:
-        """How many of everything; the last seven are the graph's edges by label."""
+        """How many of everything; the seven in capitals are the graph's edges by label. What
+        corrections leave out is counted at the end, where there is any."""
         posed = sum(k.pose is not None for k in self.keyframes)
         placed = sum(p.keyframe_count for p in self.places.values())
         return {
@@ -353,7 +274,7 @@ class MapView:
             "HAS_POSE": posed,
             "HAS_OBSERVATION": len(self.observations),
             "OBSERVES": sum(o.object is not None for o in self.observations),
-            "LOCATED_IN": sum(o.place is not None for o in self.objects),
+            "LOCATED_IN": sum(o.place is not None for o in self.objects.values()),
             "IN_PLACE": placed,
             "ADJACENT_TO": len(self.adjacency),
-        }
+        } | {kind: self.skipped[kind] for kind in _BY_CORRECTION if kind in self.skipped}

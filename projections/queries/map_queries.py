@@ -80,7 +80,7 @@ class FoldedMap:
     def count_objects(self, class_name: str) -> dict[int, int]:
         """Number of Objects of a class, by Place ordinal; only Places that have one."""
         counts: dict[int, int] = {}
-        for thing in self._view.objects:
+        for thing in self._view.objects.values():
             if thing.class_name == class_name and thing.place is not None:
                 counts[thing.place] = counts.get(thing.place, 0) + 1
         return counts
@@ -88,7 +88,11 @@ class FoldedMap:
     def find_object(self, object_id: str) -> dict[str, Any] | None:
         """An Object with its place_id."""
         return next(
-            (self._document(o.ordinal) for o in self._view.objects if o.object_id == object_id),
+            (
+                self._document(o.ordinal)
+                for o in self._view.objects.values()
+                if o.object_id == object_id
+            ),
             None,
         )
 
@@ -96,12 +100,12 @@ class FoldedMap:
         """The Objects of a Place."""
         return [
             self._document(o.ordinal)
-            for o in self._view.objects
+            for o in self._view.objects.values()
             if self._view.place_id(o.place) == place_id
         ]
 
     def _document(self, ordinal: int) -> dict[str, Any]:
-        thing = self._view.objects[ordinal]
+        thing = self._view.all_objects[ordinal]
         return {
             "object_id": thing.object_id,
             "class_name": thing.class_name,

@@ -21,6 +21,7 @@ Rule 6 is the only freedom DBSCAN leaves; core points and their partition are un
 """
 
 import math
+from bisect import bisect_left
 from collections.abc import Iterator, MutableSequence
 
 import numpy as np
@@ -106,6 +107,12 @@ class Places:
         """The point's current place; None for noise."""
         joined = self.joined[point]
         return None if joined == _NOISE else self.survivors.find(joined)
+
+    def place_of(self, keyframe: KeyframeOrdinal) -> PlaceOrdinal | None:
+        """A keyframe's current place; None for noise, or without a pose."""
+        point = bisect_left(self.keyframes, keyframe)
+        is_there = point < len(self.keyframes) and self.keyframes[point] == keyframe
+        return self.label(point) if is_there else None
 
     def dump(self) -> State:
         """Everything, for a snapshot."""

@@ -2,14 +2,15 @@
 
 Per keyframe, in this order (DESIGN section 5):
 
+0.  Corrections leave it out, leave detections of it out, or change its pose.
 1.  A keyframe folded before changes nothing: it is a duplicate, or a conflict if its content
     differs; the first one stands.
 2.  The run, the keyframe and its observations are added. An observation whose det_id an earlier
     keyframe has is left out and reported.
 3.  With a pose, the keyframe goes to places, and its observations in the map's embedding space go
     to landmarks. A keyframe without a pose is only kept.
-4.  Located-in and adjacency are told what places and landmarks changed, in order, and give the
-    deltas that follow from it.
+4.  Names of places, located-in and adjacency are told what places and landmarks changed, in order,
+    and give the deltas that follow from it.
 
 The fold has no clock, chance, disk, network or database. The same events give the same deltas.
 """
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 
 from eventsrc.envelope import FIRST_OFFSET, DetId, Offset, RunId
 from eventsrc.ingest import Accepted
+from projections.corrections import NO_CORRECTIONS, Corrections, Keyframe
 from projections.deltas import (
     Delta,
     EventSkipped,
@@ -32,6 +34,7 @@ from projections.deltas import (
     KeyframePlaced,
     ObservationAdded,
     ObservationOrdinal,
+    PlaceNamed,
     PlaceOrdinal,
     PlacesMerged,
     Pose,
@@ -46,9 +49,11 @@ from projections.settings import Settings
 
 from .adjacency import Adjacency
 from .core_index import CoreIndex
+from .edited_events import edit_event, edits_events
 from .folded_ids import FoldedIds, content_digest
 from .landmarks import Landmarks
 from .located_in import LocatedIn
+from .place_names import PlaceNames
 from .places import Places
 from .rule_index import RuleCoreIndex
 
@@ -97,9 +102,18 @@ class SemanticMap:
     fingerprint (a snapshot, a checkpoint) is of that rule and no other. Raises SettingsError.
     """
 
-    def __init__(self, settings: Settings, neighbourhood: Neighbourhood | None = None) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        neighbourhood: Neighbourhood | None = None,
+        corrections: Corrections = NO_CORRECTIONS,
+    ) -> None:
         _check_named(settings, neighbourhood)
         self.settings = settings
+        self.corrections = corrections
+        self._edits_events = edits_events(corrections)
+        self.names = PlaceNames(corrections.names)
+        self._anchors = self._all_anchors()
         self.next_offset = FIRST_OFFSET
         self.folded_ids = FoldedIds()
         self.space = Space(settings)
@@ -122,8 +136,17 @@ class SemanticMap:
     ) -> list[Delta]:
         """Fold one envelope; what it changed, in the order `projections.deltas` states.
 
-        ``units`` is ``unit_vectors(accepted.vectors)`` for a caller who made it beforehand.
+        ``units`` is ``unit_vectors(accepted.vectors)`` for a caller who made it beforehand. Raises
+        FoldError where a correction cannot be applied; the map is as before the event then.
         """
+        dropped: tuple[DetId, ...] = ()
+        if self._edits_events:
+            edited = edit_event(self.corrections, offset, accepted, units)
+            if edited is None:
+                self.next_offset = Offset(offset + 1)
+                run_id, keyframe_id = accepted.envelope.run_id, accepted.envelope.keyframe_id
+                return [EventSkipped(offset, "forgotten", run_id, keyframe_id)]
+            accepted, units, dropped = edited
         self.next_offset = Offset(offset + 1)
         envelope, folded_ids = accepted.envelope, self.folded_ids
         digest = content_digest(accepted)
@@ -138,6 +161,8 @@ class SemanticMap:
         if is_news:
             deltas.append(RunSeen(offset, run, envelope.run_id, envelope.timestamp))
         keyframe = folded_ids.add_keyframe(run, envelope.keyframe_id, offset, digest)
+        if self._anchors:
+            self._add_anchor(keyframe, Keyframe(envelope.run_id, envelope.keyframe_id))
         pose = _pose(accepted)
         deltas.append(
             KeyframeAdded(
@@ -152,6 +177,9 @@ class SemanticMap:
         )
         if units is None:
             units = unit_vectors(accepted.vectors)
+        if dropped:
+            run_id, keyframe_id = envelope.run_id, envelope.keyframe_id
+            deltas += [EventSkipped(offset, "dropped", run_id, keyframe_id, d) for d in dropped]
         fusible = self._observe(offset, keyframe, accepted, units, deltas)
         if pose is not None:
             place = self._place(offset, keyframe, run, envelope.run_id, pose, deltas)
@@ -160,8 +188,27 @@ class SemanticMap:
             deltas += self.adjacency.collect_changes(offset)
         return deltas
 
+    def use_names(self, offset: Offset, corrections: Corrections) -> list[PlaceNamed]:
+        """Replace the names of places, as if they had been known from the start; what changes.
+
+        In everything else ``corrections`` must be those of the map: ValueError if they are not.
+        """
+        if not corrections.differs_in_names_only(self.corrections):
+            raise ValueError("these corrections differ in more than names; fold the log anew")
+        older, self.names = self.names, PlaceNames(corrections.names)
+        self.corrections = corrections
+        self._anchors = self._all_anchors()
+        for anchor in self.names.newest:
+            keyframe = self.folded_ids.find(*anchor)
+            if keyframe is not None:
+                self.names.add_anchor(keyframe, anchor)
+                place = self.places.place_of(keyframe)
+                if place is not None:
+                    self.names.give(keyframe, place)
+        return self.names.changes_from(older, offset)
+
     def dump(self) -> State:
-        """Everything but the settings, for a snapshot."""
+        """Everything but the settings, the corrections and names, for a snapshot."""
         space = self.space
         own = {
             "next_offset": self.next_offset,
@@ -172,7 +219,8 @@ class SemanticMap:
         return reduce(or_, parts, own)
 
     def load(self, state: State) -> None:
-        """Take over what `dump` gave, into a map that has folded nothing yet."""
+        """Take over what `dump` gave, into a map that has folded nothing yet; `use_names` gives the
+        names."""
         self.next_offset = state["next_offset"]
         self.observation_count = state["observation_count"]
         if state["space"] is not None:
@@ -188,6 +236,13 @@ class SemanticMap:
             ("located_in", self.located_in),
             ("adjacency", self.adjacency),
         )
+
+    def _all_anchors(self) -> frozenset[Keyframe]:
+        return frozenset(self.names.newest)
+
+    def _add_anchor(self, keyframe: KeyframeOrdinal, anchor: Keyframe) -> None:
+        if anchor in self._anchors:
+            self.names.add_anchor(keyframe, anchor)
 
     def _observe(
         self,
@@ -257,9 +312,10 @@ class SemanticMap:
     ) -> PlaceOrdinal | None:
         """Run places and tell located-in and adjacency; the keyframe's own place."""
         folded_ids, place = self.folded_ids, None
-        for delta in self.places.fold(
+        changes = self.places.fold(
             offset, keyframe, run, run_id, pose.x_um, pose.y_um, pose.yaw_rad
-        ):
+        )
+        for delta in changes:
             deltas.append(delta)
             if type(delta) is KeyframePlaced:
                 placed = delta.keyframe
@@ -273,6 +329,8 @@ class SemanticMap:
             elif type(delta) is PlacesMerged:
                 self.located_in.places_merged(delta.survivor, delta.absorbed)
                 self.adjacency.places_merged(delta.survivor, delta.absorbed)
+        if self.names.names:
+            deltas += self.names.fold(offset, changes)
         return place
 
     def _fuse(

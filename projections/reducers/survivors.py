@@ -1,33 +1,48 @@
-"""Which place lives on after merges: union-find with path halving."""
+"""Which place or Object lives on after merges: union-find with path halving."""
 
 from collections.abc import Iterable
+from typing import Generic, TypeVar
 
-from projections.deltas import PlaceOrdinal
+from projections.deltas import ObjectOrdinal, PlaceOrdinal
+
+_Ordinal = TypeVar("_Ordinal", bound=int)
 
 
-class PlaceSurvivors:
-    """Absorbed places and their survivors; `merge` is called for every merge, in order.
+class Survivors(Generic[_Ordinal]):
+    """Absorbed things and their survivors; `merge` is called for every merge, in order.
 
-    ``absorbed_by`` maps each absorbed place to one that took it over, which may have been absorbed
+    ``absorbed_by`` maps each absorbed thing to one that took it over, which may have been absorbed
     itself; `find` shortens these chains.
     """
 
     __slots__ = ("absorbed_by",)
 
     def __init__(self) -> None:
-        self.absorbed_by: dict[PlaceOrdinal, PlaceOrdinal] = {}
+        self.absorbed_by: dict[_Ordinal, _Ordinal] = {}
 
-    def merge(self, survivor: PlaceOrdinal, absorbed: Iterable[PlaceOrdinal]) -> None:
+    def merge(self, survivor: _Ordinal, absorbed: Iterable[_Ordinal]) -> None:
         """``absorbed`` are parts of ``survivor`` from now on."""
-        for place in absorbed:
-            self.absorbed_by[place] = survivor
+        for each in absorbed:
+            self.absorbed_by[each] = survivor
 
-    def find(self, place: PlaceOrdinal) -> PlaceOrdinal:
-        """The place that stands for ``place`` now; itself unless it was absorbed."""
+    def find(self, each: _Ordinal) -> _Ordinal:
+        """What stands for ``each`` now; itself unless it was absorbed."""
         absorbed_by = self.absorbed_by
-        while (parent := absorbed_by.get(place)) is not None:
+        while (parent := absorbed_by.get(each)) is not None:
             grandparent = absorbed_by.get(parent)
             if grandparent is None:
                 return parent
-            absorbed_by[place] = place = grandparent
-        return place
+            absorbed_by[each] = each = grandparent
+        return each
+
+
+class PlaceSurvivors(Survivors[PlaceOrdinal]):
+    """Of places."""
+
+    __slots__ = ()
+
+
+class ObjectSurvivors(Survivors[ObjectOrdinal]):
+    """Of Objects."""
+
+    __slots__ = ()

@@ -44,7 +44,7 @@ def test_live_answers_equal_those_of_the_folded_map(
     with connect(one_database.graph_url, autocommit=True) as connection:
         prepare_graph(connection)
         live = LiveMap(connection)
-        for thing in view.objects:
+        for thing in view.objects.values():
             ours, theirs = where_is(live, thing.object_id), where_is(folded, thing.object_id)
             assert list(ours.items()) == list(theirs.items())  # the order of the columns too
         places = [p.place_id for p in view.places.values()]
@@ -54,7 +54,7 @@ def test_live_answers_equal_those_of_the_folded_map(
                 [*o.items()] for o in objects_of(folded, place)
             ]
             assert path_between(live, places[0], place) == path_between(folded, places[0], place)
-            for name in sorted({o.class_name for o in view.objects}):
+            for name in sorted({o.class_name for o in view.objects.values()}):
                 assert places_holding(live, name, place, 1) == places_holding(
                     folded, name, place, 1
                 )

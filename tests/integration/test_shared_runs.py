@@ -42,7 +42,7 @@ def test_with_finer_settings_the_house_has_eleven_places() -> None:
 def test_real_runs_equal_their_recounts(names: tuple[str, ...]) -> None:
     view = _fold(*names, eps_m=0.75, min_samples=8)
     assert view.adjacency == recounted_adjacency(view)
-    assert [found.place for found in view.objects] == recounted_locations(view)
+    assert [found.place for found in view.objects.values()] == recounted_locations(view)
     assert {
         p.ordinal: (p.keyframe_count, p.sum_x_um, p.sum_y_um) for p in view.places.values()
     } == recounted_places(view)

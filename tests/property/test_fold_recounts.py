@@ -63,7 +63,7 @@ def test_the_view_equals_a_recount_after_every_event(documents: list[dict[str, A
     for document in documents:
         view = folded.extend([document]).view
         assert view.adjacency == recounted_adjacency(view)
-        assert [found.place for found in view.objects] == recounted_locations(view)
+        assert [found.place for found in view.objects.values()] == recounted_locations(view)
         counted = recounted_places(view)
         assert {
             p.ordinal: (p.keyframe_count, p.sum_x_um, p.sum_y_um) for p in view.places.values()
@@ -83,9 +83,10 @@ def test_the_view_from_deltas_is_the_reducers_own_state(documents: list[dict[str
         for o in folded.map.landmarks.objects
     ]
     assert own == [
-        (o.obs_count, o.sum_x_um, o.sum_y_um, o.first_seen, o.last_seen) for o in view.objects
+        (o.obs_count, o.sum_x_um, o.sum_y_um, o.first_seen, o.last_seen)
+        for o in view.objects.values()
     ]
-    assert folded.map.located_in.located == [o.place for o in view.objects]
+    assert folded.map.located_in.located == [o.place for o in view.objects.values()]
     edges = {
         (a, b): n for a, row in folded.map.adjacency.edges.items() for b, n in row.items() if a < b
     }

@@ -116,7 +116,9 @@ def slow_search(opened: Timeline, expression: str, start: int, end: int) -> int 
             "keyframe_count": CallableCount(
                 counts["keyframes"], [k.run_id for k in view.keyframes]
             ),
-            "object_count": CallableCount(counts["objects"], [o.class_name for o in view.objects]),
+            "object_count": CallableCount(
+                counts["objects"], [o.class_name for o in view.objects.values()]
+            ),
         }
         return bool(eval(expression, {"__builtins__": {}}, names))
 

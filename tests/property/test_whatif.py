@@ -35,7 +35,7 @@ def groups(view: MapView) -> tuple[set[frozenset[int]], set[frozenset[int]]]:
     """The places as sets of keyframes and the objects as sets of observations."""
     return (
         {frozenset(place.members) for place in view.places.values()},
-        {frozenset(found.observations) for found in view.objects},
+        {frozenset(found.observations) for found in view.objects.values()},
     )
 
 

@@ -36,7 +36,7 @@ def by_encoder(view: MapView) -> str:
                 o.object_id, o.class_name, o.obs_count, o.sum_x_um, o.sum_y_um, o.first_seen,
                 o.last_seen, o.place,
             )
-            for o in view.objects
+            for o in view.objects.values()
         ],
         "places": [
             (p.ordinal, p.place_id, p.founder, p.keyframe_count, p.sum_x_um, p.sum_y_um)

@@ -39,7 +39,7 @@ def corridor(tmp_path: Path) -> Iterator[Timeline]:
 
 def test_a_merge_with_its_chain_objects_and_edges(corridor: Timeline) -> None:
     (merge,) = corridor.merges()
-    (cup,) = corridor.at().objects
+    (cup,) = corridor.at().objects.values()
     document = merge_document(corridor.history, merge)
     links, chains = document.pop("links"), document.pop("chains")
     assert document == {
@@ -109,7 +109,7 @@ def test_why_at_an_earlier_offset(corridor: Timeline) -> None:
 
 
 def test_why_of_an_object(corridor: Timeline) -> None:
-    (cup,) = corridor.at().objects
+    (cup,) = corridor.at().objects.values()
     story = corridor.why(cup.object_id)
     assert story.summary == (
         "a cup seen 2 times, each at least 1.00 like it, on average from (5.00, 0.00); in run-a_p0"

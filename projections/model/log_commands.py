@@ -1,0 +1,40 @@
+"""The commands of a log, and the corrections that they make.
+
+Commands are read by key: of sealed segments only the chunks that hold one, by their index. An event
+on ``mapfold/command`` that is no command is an error that names its offset: leaving it out would
+give another map than its author asked for.
+"""
+
+from eventsrc.commands import InvalidCommand, UseSettings, parse_command
+from eventsrc.envelope import FIRST_OFFSET, Offset
+from eventsrc.log import Event, LogReader
+from eventsrc.system_events import COMMAND_KEY
+from projections.corrections import Corrections, RecordedCommand, compile_corrections
+from projections.errors import FoldError, SettingsError
+from projections.settings import Settings
+
+
+def read_command(event: Event) -> RecordedCommand:
+    """The command of an event on ``mapfold/command``. Raises FoldError."""
+    try:
+        command = parse_command(event.payload)
+        if isinstance(command, UseSettings):
+            Settings.from_document(command.settings)
+    except (InvalidCommand, SettingsError) as error:
+        raise FoldError(
+            event.offset,
+            f"it is on {COMMAND_KEY}, but no command that this version knows: {error}",
+        ) from None
+    return RecordedCommand(event.offset, command)
+
+
+def read_commands(reader: LogReader, until: Offset | None = None) -> list[RecordedCommand]:
+    """The commands before ``until``, all for None, in order. Raises FoldError, LogDamaged."""
+    events = reader.read(FIRST_OFFSET, until, keys=(COMMAND_KEY,))
+    return [read_command(event) for event in events]
+
+
+def read_corrections(reader: LogReader, known_at: Offset | None = None) -> Corrections:
+    """The corrections of the commands before ``known_at``, of all for None. Raises FoldError,
+    LogDamaged."""
+    return compile_corrections(read_commands(reader, known_at))

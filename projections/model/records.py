@@ -1,0 +1,141 @@
+"""The records of a `MapView`: its runs, keyframes, observations, places and Objects.
+
+Records are written by `MapView.apply` only. ``ordinal`` numbers the things of a kind in the order
+in which the fold met or founded them. Positions are integer micrometres (``_um``) and exact; ``_m``
+and ``_x``/``_y`` values are metres, correctly rounded. Times are robot seconds.
+"""
+
+from dataclasses import dataclass, field
+
+from eventsrc.envelope import DetId, KeyframeId, Offset, RunId
+from projections.deltas import (
+    KeyframeOrdinal,
+    ObjectOrdinal,
+    ObservationOrdinal,
+    PlaceOrdinal,
+    Pose,
+    RunOrdinal,
+    UnitVector,
+)
+from projections.exact import mean_m
+from projections.reducers.survivors import PlaceSurvivors
+
+
+@dataclass(slots=True, eq=False)
+class RunRecord:
+    """One run. ``started_at`` is the earliest keyframe timestamp of it so far."""
+
+    ordinal: RunOrdinal
+    run_id: RunId
+    started_at: float
+    keyframe_count: int = 0
+
+
+@dataclass(slots=True, eq=False)
+class PlaceRecord:
+    """A region of the building. ``founder`` is its first core keyframe; ``name`` the name that the
+    command at ``name_offset`` gave it.
+
+    `MapView.places` lists those that were not absorbed.
+    """
+
+    ordinal: PlaceOrdinal
+    place_id: str
+    founder: KeyframeOrdinal
+    founded_offset: Offset
+    keyframe_count: int = 0
+    sum_x_um: int = 0
+    sum_y_um: int = 0
+    name: str | None = None
+    name_offset: Offset | None = None
+    unordered_members: list[KeyframeOrdinal] = field(default_factory=list)
+
+    @property
+    def members(self) -> list[KeyframeOrdinal]:
+        """Ordinals of its keyframes, ascending; a new list each time."""
+        return sorted(self.unordered_members)
+
+    @property
+    def centroid_x(self) -> float:
+        """Metres; the mean of its members."""
+        return mean_m(self.sum_x_um, self.keyframe_count)
+
+    @property
+    def centroid_y(self) -> float:
+        """Metres; the mean of its members."""
+        return mean_m(self.sum_y_um, self.keyframe_count)
+
+
+@dataclass(slots=True, eq=False)
+class KeyframeRecord:
+    """One keyframe. ``offset`` is its event's; ``pose`` is None when the robot had none.
+
+    ``joined`` is the place it joined, as of then; ``survivors`` are the view's.
+    """
+
+    ordinal: KeyframeOrdinal
+    offset: Offset
+    run: RunOrdinal
+    run_id: RunId
+    keyframe_id: KeyframeId
+    timestamp: float
+    pose: Pose | None
+    survivors: PlaceSurvivors
+    observations: list[ObservationOrdinal] | tuple[()] = ()
+    joined: PlaceOrdinal | None = None
+
+    @property
+    def place(self) -> PlaceOrdinal | None:
+        """The place it belongs to now; None for noise or without a pose."""
+        return None if self.joined is None else self.survivors.find(self.joined)
+
+
+@dataclass(slots=True, eq=False)
+class ObservationRecord:
+    """One detection. ``object`` and ``similarity_q40`` are None when it was not fused.
+
+    ``embedding`` is None when there is none, when it is of a foreign space, or when the view was
+    made with ``keep_embeddings=False``; ``embedding_crc`` is there even then.
+    """
+
+    ordinal: ObservationOrdinal
+    keyframe: KeyframeOrdinal
+    det_id: DetId
+    class_name: str
+    confidence: float
+    bbox: tuple[float, float, float, float]
+    embedding_model: str | None
+    embedding: UnitVector | None
+    embedding_crc: int | None
+    foreign_space: bool
+    object: ObjectOrdinal | None = None
+    similarity_q40: int | None = None
+
+
+@dataclass(slots=True, eq=False)
+class ObjectRecord:
+    """A landmark. ``observations`` are ordinals in the order in which they were fused.
+
+    `MapView.objects` lists those that were not absorbed.
+    """
+
+    ordinal: ObjectOrdinal
+    object_id: str
+    class_name: str
+    obs_count: int = 0
+    sum_x_um: int = 0
+    sum_y_um: int = 0
+    first_seen: float = 0.0
+    last_seen: float = 0.0
+    place: PlaceOrdinal | None = None
+    observations: list[ObservationOrdinal] = field(default_factory=list)
+
+    @property
+    def mean_x(self) -> float:
+        """Metres; the mean of the positions the robot observed it from."""
+        return mean_m(self.sum_x_um, self.obs_count)
+
+    @property
+    def mean_y(self) -> float:
+        """Metres; the mean of the positions the robot observed it from."""
+        return mean_m(self.sum_y_um, self.obs_count)

@@ -1,0 +1,73 @@
+"""Corrections of single events: an envelope as it would be, had the robot known better.
+
+An event is corrected before it is folded, so the map is that of a log with the corrected events:
+without forgotten keyframes, without dropped detections, with the corrected poses written in.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from eventsrc.envelope import MAX_POSITION_M, DetId, Offset
+from eventsrc.ingest import Accepted
+from projections.corrections import Corrections
+from projections.errors import FoldError
+from projections.exact import Units
+
+
+class EditedEvent(NamedTuple):
+    """A corrected envelope; ``dropped`` are the det_ids it has lost."""
+
+    accepted: Accepted
+    units: Sequence[Units | None] | None
+    dropped: tuple[DetId, ...]
+
+
+def edits_events(corrections: Corrections) -> bool:
+    """Whether `edit_event` can change any event."""
+    c = corrections
+    return bool(c.forgotten_runs or c.forgotten_ranges or c.dropped or c.poses)
+
+
+def edit_event(
+    corrections: Corrections,
+    offset: Offset,
+    accepted: Accepted,
+    units: Sequence[Units | None] | None,
+) -> EditedEvent | None:
+    """The corrected event; None if it is left out. ``units`` runs parallel to the detections.
+
+    Raises FoldError for a pose that a correction moves out of the map.
+    """
+    envelope, dropped = accepted.envelope, corrections.dropped
+    if corrections.is_forgotten(envelope.run_id, envelope.keyframe_id):
+        return None
+    gone: tuple[DetId, ...] = ()
+    if dropped and not dropped.isdisjoint(accepted.det_ids):
+        gone = tuple(det_id for det_id in accepted.det_ids if det_id in dropped)
+        kept = corrections.kept(accepted)
+        units = None if units is None else [units[i] for i in kept]
+        accepted = Accepted(
+            envelope.model_copy(update={"detections": tuple(envelope.detections[i] for i in kept)}),
+            tuple(accepted.det_ids[i] for i in kept),
+            tuple(accepted.vectors[i] for i in kept),
+        )
+    if envelope.run_id in corrections.poses:
+        accepted = _with_pose(corrections, offset, accepted)
+    return EditedEvent(accepted, units, gone)
+
+
+def _with_pose(corrections: Corrections, offset: Offset, accepted: Accepted) -> Accepted:
+    envelope = accepted.envelope
+    pose = corrections.pose(envelope)
+    if pose is None or pose == (envelope.map_x, envelope.map_y, envelope.map_yaw):
+        return accepted
+    x, y, yaw = pose
+    if not (abs(x) <= MAX_POSITION_M and abs(y) <= MAX_POSITION_M and math.isfinite(yaw)):
+        raise FoldError(
+            offset,
+            f"correct-poses moves keyframe {envelope.keyframe_id} of run {envelope.run_id!r} to "
+            f"x={x!r}, y={y!r}, yaw={yaw!r}, beyond ±{MAX_POSITION_M:,.0f} m; undo that command",
+        )
+    moved = envelope.model_copy(update={"map_x": x, "map_y": y, "map_yaw": yaw})
+    return Accepted(moved, accepted.det_ids, accepted.vectors)
