@@ -9,7 +9,7 @@ without a traceback, and exits with ``exit_code``.
     │   ├── LogNotFound             2  no log there
     │   ├── NotALog                 2  something else is there
     │   ├── LogBusy                 1  another writer holds it
-    │   └── LogDamaged              1  bytes of the log are torn or rotten
+    │   └── LogDamaged              1  recorded events cannot be read
     ├── InvalidEnvelope             1  a payload is not an envelope (carries a Rejection reason)
     └── TransportError              1  Zenoh cannot connect, listen or send
         └── SpoolError              1  a robot's spool cannot be used
@@ -52,7 +52,7 @@ class LogBusy(LogError):
 
 
 class LogDamaged(LogError):
-    """Bytes of the log are torn or rotten."""
+    """Recorded events cannot be read: bytes are damaged, or a segment is missing or foreign."""
 
 
 class InvalidEnvelope(MapfoldError):

@@ -36,8 +36,7 @@ class ActiveFile(SegmentFile):
             while self._read_commit():
                 pass
         except BadRecord:
-            # A chunk that is being written, or a torn end: nothing more is durable. Whether commits
-            # follow behind it is looked up by `rot`.
+            # A chunk that is being written, a torn end, or damage: `damaged_end` tells which.
             pass
         return self.next_offset
 
@@ -65,11 +64,12 @@ class ActiveFile(SegmentFile):
             return segment_path(self.path.parent, self.base, SEALED).exists()
         return now.st_ino != os.fstat(self._fd).st_ino
 
-    def rot(self) -> Unreadable | None:
-        """The durable events behind the last readable commit, None if there are none.
+    def damaged_end(self) -> Unreadable | None:
+        """The durable events after the last readable commit, None if there are none.
 
-        A crash damages only the end of the file, and no commit mark follows what was never synced.
-        So where a mark follows, bytes have rotted."""
+        No commit mark follows bytes that were never synced, such as a torn end. So where a mark
+        follows, recorded bytes are damaged.
+        """
         while self.position < self.size():
             with FileBytes(self._fd, self.position) as rest:
                 recorded_end = self._recorded_end_in(rest)

@@ -3,13 +3,12 @@
     magic · Header · Metadata "mapfold.segment" · ( chunk · commit mark )*
 
 One commit: write an uncompressed chunk, sync it, write its commit mark. Readers in other processes
-show a chunk only if its mark is there, so what they show is on the disk. The mark itself is not
-synced: it says nothing unless the bytes before it are there, and recovery, which runs while no
-writer does, keeps every chunk whose CRC is right, with or without a mark. Only the last mark of a
-segment is synced, before the next segment begins: without it a reader would find the next segment's
-events and not the ones before.
+yield a chunk only if it has a mark, so what they yield is on the disk. A mark is not synced, as a
+restart and a recovery keep every chunk whose CRC is right, with or without a mark. Only the last
+mark of a segment is synced, before the next segment begins: without it a reader would find the next
+segment's events and not the ones before.
 
-A commit that fails cuts the file back to the last good byte, and the segment refuses further work.
+A commit that fails cuts the file back to the last good byte, and the segment accepts no more.
 
 Events in a file that somebody has deleted, renamed, replaced or cut short must not count as
 recorded. So each commit checks before its write and again after its sync that the file under the
@@ -62,13 +61,14 @@ class ActiveSegment:
         self._log_id = log_id
         self._folder: Identity | None = None
         self._on_fault = on_fault
-        self._choose_file(base)
+        self._set_file(base)
         self._syncs = policy.syncs
         self._group = GroupBuilder(base, policy)
         self._failure: str | None = None
         self._fd = -1
 
-    def _choose_file(self, base: Offset) -> None:
+    def _set_file(self, base: Offset) -> None:
+        """Set the base offset, and the path and mark seed of the file to `create`."""
         self.base = base
         self.path = segment_path(self._log, base, ACTIVE)
         self._mark_seed = secrets.randbits(32)
@@ -134,14 +134,17 @@ class ActiveSegment:
             self._fail(InterruptedError(errno.EINTR, "interrupted"))
             raise
         if problem is not None:
-            raise self.refuse(
+            raise self.disable(
                 f"{self.path} {problem.text}, and the file before it had to be given up as well: "
                 f"offsets from {group.first} on are not recorded. Keep other programs away from "
                 f"{self._log} and start again"
             )
 
     def _write(self, group: Group) -> Problem | None:
-        """None when the group is on the disk, else what is wrong with the file."""
+        """Write and sync a group, which makes its events durable (with ``--fsync never``: written).
+
+        Returns None, or what is wrong with the file; the group must then go into a new one.
+        """
         problem = find_problem(self._fd, self.path, self.size)
         if problem is not None:
             return problem
@@ -162,7 +165,7 @@ class ActiveSegment:
 
     def _cut_off_group(self, head: bytes, end: int) -> None:
         """Remove the group just appended to a file that is given up: the next file will hold it.
-        If the file had been cut short before, the group is at its end all the same."""
+        The group is at the end of the file, even of one that was cut short before."""
         size = os.fstat(self._fd).st_size
         start = size - (end - self.size)
         if start >= 0 and os.pread(self._fd, len(head), start) == head:
@@ -176,17 +179,17 @@ class ActiveSegment:
         fault = FileFault(self.path, self.base, first, problem.text, not problem.whole)
         try:
             if self._folder != identity_of(self._log):
-                raise self.refuse(
+                raise self.disable(
                     f"{fault}; {self._log} is another folder than it was. Put the right one back "
                     "and start again"
                 )
             self.close()
             if first == self.base or not is_readable_segment(self.path, self._head_size):
                 quarantine(self.path)
-            self._choose_file(first)
+            self._set_file(first)
             self.create()
         except OSError as error:
-            raise self.refuse(
+            raise self.disable(
                 f"{fault}; no new segment at offset {first}: {error.strerror or error}. Offsets "
                 f"from there on are not recorded. Check that {self._log} is there and its disk has "
                 "room, then start again"
@@ -206,7 +209,7 @@ class ActiveSegment:
             raise LogError(self._failure)
 
     def _fail(self, error: OSError) -> LogError:
-        """Cut off what is half written and refuse further work. After a failed sync nobody knows
+        """Cut off what is half written and `disable` the segment. After a failed sync it is unknown
         which pages are on the disk, and after a full disk the next write fails as well."""
         message = (
             f"{self.path}: {error.strerror or error}: {self.waiting} events from offset "
@@ -218,9 +221,9 @@ class ActiveSegment:
                 os.ftruncate(self._fd, self.size)
         except OSError as cut_error:
             message += f" (the torn end stays: {cut_error.strerror}; recovery ignores it)"
-        return self.refuse(message)
+        return self.disable(message)
 
-    def refuse(self, message: str) -> LogError:
+    def disable(self, message: str) -> LogError:
         """Make every further `add`, `due` and `commit` raise ``message``; returns the error."""
         self._failure = message
         return LogError(message)

@@ -71,13 +71,13 @@ class LogReader:
         if the log is gone."""
         if not self.path.exists():
             raise LogNotFound(f"the log at {self.path} is gone; check the path")
-        stop = _raise_at_gap(self.path)
-        self._report_rot(FIRST_OFFSET, stop)
+        report = _raise_at_gap(self.path)
+        self._report_damaged_end(FIRST_OFFSET, report)
         segments = list_growing(self.path)
         known = self.refresh()  # after listing the folder: a writer may be active
         for newest in segments[-1:]:
             if newest.base > known:
-                stop(
+                report(
                     Unreadable(known, Offset(newest.base - 1), f"missing before {newest.path.name}")
                 )
 
@@ -128,13 +128,13 @@ class LogReader:
                 report(Unreadable(at, Offset(segment_end - 1), f"missing after {entry.path.name}"))
                 at = segment_end
         if end is None or end > known:
-            self._report_rot(start, report)
+            self._report_damaged_end(start, report)
 
-    def _report_rot(self, start: Offset, report: OnGap) -> None:
-        """Report recorded events that the growing segment no longer shows."""
-        rot = self._last.rot() if isinstance(self._last, ActiveFile) else None
-        if rot is not None and rot.last >= start:
-            report(rot)
+    def _report_damaged_end(self, start: Offset, report: OnGap) -> None:
+        """Report recorded events at the end of the growing segment that cannot be read any more."""
+        gap = self._last.damaged_end() if isinstance(self._last, ActiveFile) else None
+        if gap is not None and gap.last >= start:
+            report(gap)
 
     def _entries_from(self, start: Offset) -> Iterator[tuple[SegmentPath, Offset]]:
         """Each segment from the one that holds ``start``, with the base of the next one."""
@@ -242,13 +242,13 @@ def _open_segment(log: Path, entry: SegmentPath) -> OpenSegment:
 
 
 def _raise_at_gap(log: Path) -> OnGap:
-    def stop(gap: Unreadable) -> None:
+    def report(gap: Unreadable) -> None:
         raise LogDamaged(
             f"{log}: offsets {gap.first} to {gap.last} cannot be read: {gap.reason}; "
             f"run `mapfold log verify {log}`"
         )
 
-    return stop
+    return report
 
 
 def _wanted_channels(segment: OpenSegment, keys: Collection[str] | None) -> set[int] | None:

@@ -88,10 +88,12 @@ class RecoveryReport:
 def recover_log(
     log: Path, *, max_losses: int = DEFAULT_MAX_LOSSES, clock: Clock = system_clock
 ) -> RecoveryReport:
-    """Recover a log. Raises LogNotFound, NotALog, LogBusy, LogDamaged when its segments belong to
-    two logs in equal number or one was made by another program, TooManyLosses when more than
-    ``max_losses`` events would be added that the damaged bytes cannot have held, or LogError when
-    the disk refuses."""
+    """Recover a log.
+
+    Raises LogNotFound, NotALog or LogBusy; LogDamaged when its segments belong to two logs in equal
+    number or one was made by another program; TooManyLosses when more than ``max_losses`` events
+    would be added that the damaged bytes cannot have held; LogError when the disk fails.
+    """
     if not (log.is_dir() and half_renamed(log)):
         segments_of(log)
     try:
@@ -99,7 +101,7 @@ def recover_log(
             return _Recovery(log, max_losses).run()
     except OSError as error:
         raise LogError(
-            f"{log}: {error.strerror or error}; nothing was replaced by less than it held. "
+            f"{log}: {error.strerror or error}; no event that could be read was removed. "
             "Free space or fix the disk, then recover again"
         ) from error
 
@@ -186,7 +188,11 @@ class _Recovery:
         self._losses_left -= max(0, losses - _damaged_bytes(segment, scan) // MESSAGE_HEAD)
         if self._losses_left >= 0 and losses <= _MOST_IN_A_SEGMENT:
             return
-        evidence = f"{following.path.name} begins there" if following else "its end says so"
+        evidence = (
+            f"{following.path.name} begins there"
+            if following
+            else "according to the offsets in the file"
+        )
         way_out = (
             f"If that is right, run `mapfold log recover {self._log} --yes`; else move the file "
             "that is wrong out of the log"

@@ -1,8 +1,8 @@
 """Clean up a log that its last writer did not finish, when the next writer opens it.
 
 Half-made files are deleted, and every left-over active segment keeps all events whose CRC is right,
-synced or not. A torn end is what a crash leaves: it was never recorded, and is cut off. Damage
-elsewhere is rot: the writer refuses to start and names `mapfold log recover`, for a person to run.
+synced or not. A torn end, left by a crash, was never recorded and is cut off. Damage elsewhere is
+damage to recorded bytes: the writer does not start, and its error names `mapfold log recover`.
 
 Sealing takes up to a second a segment, and a restarted recorder must accept events at once. So a
 left-over segment is only *finished* here: its torn end is cut off, and a last chunk without a
@@ -141,7 +141,7 @@ def _scan_leftover(segment: SegmentPath, reach: Offset | None) -> _Leftover:
         return finished
     scan = scan_active(segment.path, segment.base)
     scan.add_gap_until(reach or segment.base)
-    _refuse_rot(segment.path, scan)
+    _refuse_damage(segment.path, scan)
     if scan.rewritten:
         raise LogDamaged(
             f"{segment.path}: another program has rewritten it; "
@@ -169,7 +169,7 @@ def _finished(segment: SegmentPath, reach: Offset) -> _Leftover | None:
     return _Leftover(segment, scan, len(file.chunks), file.position)
 
 
-def _refuse_rot(path: Path, scan: Scan) -> None:
+def _refuse_damage(path: Path, scan: Scan) -> None:
     if scan.gaps:
         first, last = scan.gaps[0]
         raise LogDamaged(

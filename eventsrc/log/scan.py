@@ -4,9 +4,9 @@ The file is a row of chunks and commit marks. A chunk is good if its CRC holds a
 numbers continue. Where no good chunk is, `resync` says where reading can go on. Then:
 
 * Bytes at the end that no good chunk and no commit mark follow are *torn*: a write that a crash cut
-  short. They were never synced, so nobody was told that they are recorded.
-* Everything else that cannot be read is *rot*: a mark or a chunk behind it proves that it was
-  synced. Its offsets are known from its neighbours and reported as a gap.
+  short. They were never synced, so their events were never recorded.
+* Everything else that cannot be read is damage to recorded bytes (*rot*): a mark or a chunk after
+  it proves that it was synced. Its offsets are known from its neighbours and reported as a gap.
 """
 
 import os

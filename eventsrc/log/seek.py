@@ -12,9 +12,9 @@ includes every event of that time or earlier, wherever it is in the log.
 
 mapfold's own events are stamped when they were written, and the stamps of unreadable events are
 unknown. Both count as stamped like the robots' event before them, and at the start of the log as
-earlier than all. So damage is inside a range that ends at a time if the event before it is, or any
-event behind it; whoever reads that range meets the damage. Only damage at the end of a growing
-segment, with no readable event behind it, is reported here.
+earlier than all. A range that ends at a time includes a damaged stretch if it includes the event
+before it or any event after it. Reading the range then raises LogDamaged. Only damage at the end of
+a growing segment, with no readable event after it, is reported here.
 """
 
 import re
@@ -52,9 +52,9 @@ def resolve(
 ) -> Offset:
     """The number of events before the point ``text``; MisuseError if the log has no such point.
 
-    ``note`` gets a line if events stamped later than a given time are included. Damage before a
-    keyframe is found, and rot at the end of a growing segment if the range goes up to there, raise
-    LogDamaged or are reported to ``on_gap``.
+    ``note`` gets a line if events stamped later than a given time are included. Raises LogDamaged,
+    or calls ``on_gap``, for damage before the keyframe that is looked for, and for damage at the
+    end of a growing segment if the range reaches it.
     """
     if text == "end":
         return _at_end(reader, on_gap)
@@ -100,7 +100,7 @@ def resolve_start(reader: LogReader, text: str, *, on_gap: OnGap | None = None) 
     """The offset of the first event from the point ``text`` on: for a keyframe its own event, for a
     time the robots' first event stamped then or later.
 
-    Damage before a keyframe or a time is found raises LogDamaged, or is reported to ``on_gap``.
+    Raises LogDamaged, or calls ``on_gap``, for damage before that event.
     """
     time_ns = time_of(text)
     if time_ns is not None:
@@ -177,8 +177,7 @@ def _at_keyframe(
 def _events_mentioning(
     reader: LogReader, keyframe_id: KeyframeId, on_gap: OnGap | None
 ) -> Iterator[Event]:
-    """Events whose text contains that keyframe id: parsing all of them would take 20 times as
-    long."""
+    """Events whose text contains that keyframe id. Parsing all events takes 20 times as long."""
     for event in reader.read(on_gap=on_gap):
         if not is_system_key(event.key) and any(
             int(m[1]) == keyframe_id for m in _KEYFRAME.finditer(event.payload)

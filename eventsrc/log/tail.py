@@ -4,8 +4,8 @@ Polls the commit marks of the file: while nothing comes, one `pread` of some 80 
 `stat` for the next segment every 5 ms. That costs one to two percent of a core (58 to 86 µs a poll,
 most of it waking up), needs nothing from the platform, and works across processes.
 
-A chunk that rots before it was read looks like one that is being written. So a waiting tail checks
-once a second whether recorded events follow behind it.
+A chunk damaged before it was read looks like one that is being written. So a waiting tail checks
+once a second whether recorded events follow it.
 """
 
 import threading
@@ -19,7 +19,7 @@ from .reader import LogReader
 
 POLL_S = 0.005
 _CHECK_EVERY = 200
-"""Idle polls: one second of them."""
+"""Idle polls between two checks: one second."""
 
 
 def follow(

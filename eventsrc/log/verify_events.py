@@ -136,7 +136,7 @@ class Finding:
     schema     an event the fold cannot read
     duplicate  a keyframe that stands more than once (the fold takes the first)
     time       a clock that ran backwards, or was set while a robot drove
-    loss       what the log says never came and did not come late either, or was lost to rot
+    loss       what the log says never came and did not come late either, or was lost to damage
     """
 
     kind: Kind

@@ -2,8 +2,8 @@
 
 An event has an offset when `append` returns and is *recorded* when `durable_offset` has passed it.
 At most one commit group is not synced at any time. A writer belongs to one thread. After an error
-it accepts nothing more: what is synced stays, what was waiting never counted as recorded, and the
-next writer goes on behind the last good event.
+it accepts no more events: synced events stay, waiting ones were never recorded, and the next writer
+continues after the last good event.
 """
 
 import contextlib
@@ -33,8 +33,8 @@ ROTATE_BYTES = 64 * 1024 * 1024
 ROTATE_EVENTS = 1_000_000
 ROTATE_SECONDS = 3600.0
 ROTATE_CHANNELS = 4_096
-"""A segment keeps its channels in memory and writes them again when it is sealed, and MCAP allows
-65,535 of them. A publisher that invents keys causes more segments."""
+"""Channels (keys and versions) after which a new segment begins. A segment keeps its channels in
+memory and writes them again when it is sealed; MCAP allows 65,535."""
 _MAX_NS = 2**63
 
 
@@ -192,14 +192,14 @@ class LogWriter:
         )
 
     def _rotate(self) -> None:
-        """Begin the next segment. Raises LogError; the writer then refuses further work."""
+        """Begin the next segment. Raises LogError; the writer then accepts no more events."""
         finished = self._active
         following = self._new_segment(finished.next_offset)
         try:
             finished.finish()
             following.create()
         except OSError as error:
-            raise finished.refuse(
+            raise finished.disable(
                 f"{self.path}: no new segment at offset {following.base}: "
                 f"{error.strerror or error}; every event before it is safe. "
                 "Free space or fix the disk, then start again"

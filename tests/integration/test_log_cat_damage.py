@@ -1,5 +1,5 @@
-"""`mapfold log cat` of a log with rot in the middle: it stops there, or reports it and continues; a
-range without the rot is not affected."""
+"""`mapfold log cat` of a log with damage in the middle: it stops there, or reports it and
+continues; a range without the damage is not affected."""
 
 from pathlib import Path
 

@@ -122,7 +122,7 @@ def test_a_tail_stops_at_unreadable_events(log_path: Path) -> None:
 
 @pytest.mark.parametrize("at", [3, -10], ids=["chunk head", "commit mark"])
 @pytest.mark.parametrize("behind", ["same segment", "next segment"])
-def test_a_waiting_tail_detects_rot(log_path: Path, at: int, behind: str) -> None:
+def test_a_waiting_tail_detects_damage(log_path: Path, at: int, behind: str) -> None:
     stop = threading.Event()
     rotate_events = 2 if behind == "next segment" else 100
     writer = LogWriter(log_path, fsync=BY_HAND, rotate_events=rotate_events)
