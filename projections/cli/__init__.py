@@ -33,7 +33,7 @@ COMMANDS: "Mapping[str, str]" = {
     "why": "projections.cli.time_travel",
     "diff": "projections.cli.time_travel",
     "bisect": "projections.cli.time_travel",
-    "whatif": "projections.cli.time_travel",
+    "whatif": "projections.cli.whatif",
 }
 """The module of each command, in the order of ``--help``; commands of one module are adjacent."""
 

@@ -9,10 +9,20 @@ from eventsrc.envelope import FIRST_OFFSET
 from eventsrc.log import LogReader
 from eventsrc.text import counted
 from projections.model.fold import fold_events
+from projections.model.log_commands import read_corrections
 from projections.model.view import MapView
 from projections.reducers.semantic_map import SemanticMap
 
-from .options import SetOption, SettingsOption, W, check_picture, point, settings_from
+from .options import (
+    KnownAtOption,
+    SetOption,
+    SettingsOption,
+    W,
+    check_picture,
+    known_point,
+    point,
+    settings_from,
+)
 from .terminal import say
 
 
@@ -35,6 +45,7 @@ def draw(
     merges: Annotated[
         bool, typer.Option("--merges", help="Mark the keyframes that merged places.")
     ] = False,
+    known_at: KnownAtOption = None,
     set_: SetOption = None,
     settings_file: SettingsOption = None,
 ) -> None:
@@ -48,11 +59,14 @@ def draw(
     from projections.drawing.picture import bridges_of, fold_with_merges
 
     check_picture(out)
-    settings = settings_from(settings_file, set_)
-    view = MapView(settings, keep_embeddings=False)
+    settings_from(settings_file, set_)  # a bad value is an error before the log is opened
     with LogReader(log) as reader:
-        events = reader.read(FIRST_OFFSET, point(reader, at))
-        merged = fold_with_merges(fold_events(events, SemanticMap(settings)), view)
+        end = point(reader, at)
+        corrections = read_corrections(reader, known_point(reader, known_at, end))
+        settings = settings_from(settings_file, set_, corrections)
+        view = MapView(settings, keep_embeddings=False, corrections=corrections)
+        fold = SemanticMap(settings, corrections=corrections)
+        merged = fold_with_merges(fold_events(reader.read(FIRST_OFFSET, end), fold), view)
     draw_map(
         view,
         out,

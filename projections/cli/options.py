@@ -43,6 +43,21 @@ def point(reader: LogReader, text: str) -> Offset:
     return resolve(reader, text, note=say)
 
 
+KnownAtOption = Annotated[
+    str | None,
+    typer.Option(
+        "--known-at",
+        metavar="V",
+        help="Under the commands recorded before here [default: where the map ends].",
+    ),
+]
+
+
+def known_point(reader: LogReader, text: str | None, end: Offset) -> Offset:
+    """The point of ``--known-at``; the map's own ``end`` without it."""
+    return end if text is None else point(reader, text)
+
+
 # Settings of the fold
 
 SetOption = Annotated[
@@ -53,7 +68,11 @@ SetOption = Annotated[
 ]
 SettingsOption = Annotated[
     Path | None,
-    typer.Option("--settings", metavar="FILE", help="JSON object of settings; --set goes on top."),
+    typer.Option(
+        "--settings",
+        metavar="FILE",
+        help="JSON object of settings instead of those that the log names; --set goes on top.",
+    ),
 ]
 
 

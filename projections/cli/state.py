@@ -10,8 +10,18 @@ from eventsrc.log import LogReader
 from projections.model.digest import map_digest
 from projections.model.export import state_document, state_text
 from projections.model.fold import fold_log_cached
+from projections.model.log_commands import read_corrections
 
-from .options import JsonOption, SetOption, SettingsOption, W, point, settings_from
+from .options import (
+    JsonOption,
+    KnownAtOption,
+    SetOption,
+    SettingsOption,
+    W,
+    known_point,
+    point,
+    settings_from,
+)
 from .terminal import display, emit, say
 
 
@@ -21,6 +31,7 @@ def state(
         str,
         typer.Option("--at", metavar="W", help=f"Fold to here: {W}."),
     ] = "end",
+    known_at: KnownAtOption = None,
     json_: JsonOption = False,
     digest: Annotated[bool, typer.Option("--digest", help="Print only the digest.")] = False,
     set_: SetOption = None,
@@ -32,16 +43,20 @@ def state(
     """
     if json_ and digest:
         raise MisuseError("--json and --digest together: --json prints the digest too")
-    settings = settings_from(settings_file, set_)
+    settings_from(settings_file, set_)  # a bad value is an error before the log is opened
     with LogReader(log) as reader:
-        _, view = fold_log_cached(reader, settings, point(reader, at), note=say)
+        end = point(reader, at)
+        known = known_point(reader, known_at, end)
+        corrections = read_corrections(reader, known)
+        settings = settings_from(settings_file, set_, corrections)
+        _, view = fold_log_cached(reader, settings, end, note=say, corrections=corrections)
     hexdigits = map_digest(view)
     if json_:
-        emit(state_document(view, hexdigits))
+        emit(state_document(view, hexdigits, known))
     elif digest:
         display(f"{hexdigits}\n")
     else:
-        display(state_text(view, hexdigits))
+        display(state_text(view, hexdigits, known))
 
 
 def register(app: typer.Typer) -> None:

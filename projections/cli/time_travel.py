@@ -1,4 +1,4 @@
-"""`mapfold merges`, `why`, `diff`, `bisect` and `whatif`: why a map is what it is."""
+"""`mapfold merges`, `why`, `diff` and `bisect`: why a map is what it is."""
 
 import contextlib
 from collections.abc import Iterator
@@ -10,30 +10,31 @@ import typer
 
 from eventsrc.envelope import Offset
 from eventsrc.errors import MisuseError
-from eventsrc.log import LogReader
-from eventsrc.text import counted
-from projections.evaluate.truth import read_truth
-from projections.history import Explanation, Expression, ExpressionError, Timeline
+from projections.corrections import NO_CORRECTIONS, Corrections
+from projections.history import Explanation, Expression, ExpressionError, KnownHistory, Timeline
 from projections.history.condition_functions import functions_help
-from projections.history.merges import merge_document
+from projections.history.merges import merge_document, object_merge_document, refusal_document
 from projections.history.records import Merge
 from projections.history.rendering import (
     difference_text,
     explanation_text,
     merge_text,
     merges_text,
+    object_merges_text,
+    refusals_text,
     search_text,
-    whatif_text,
 )
-from projections.history.whatif import Alternative, WhatIf, alternatives, assigned, what_if
+from projections.settings import Settings
 
 from .options import (
     JsonOption,
+    KnownAtOption,
     LogArgument,
     SetOption,
     SettingsOption,
     W,
     check_picture,
+    known_point,
     point,
     settings_from,
 )
@@ -48,8 +49,13 @@ AtOption = Annotated[str, typer.Option("--at", metavar="W", help=f"Look from her
 
 @contextlib.contextmanager
 def _timeline(log: Path, settings_file: Path | None, sets: list[str] | None) -> Iterator[Timeline]:
-    """The log's timeline under the settings of the command line, with a progress bar."""
-    settings = settings_from(settings_file, sets)
+    """The log's timeline under the settings of the command line or the log, with a progress
+    bar."""
+
+    def settings(corrections: Corrections) -> Settings:
+        return settings_from(settings_file, sets, corrections)
+
+    settings(NO_CORRECTIONS)  # a bad value is an error before the log is opened
     with Bar() as bar, Timeline(log, settings, progress=bar.show_fold) as timeline:
         yield timeline
 
@@ -74,6 +80,14 @@ def merges(
             help="The picture of --draw: .png, .svg or .pdf [default: merge.png].",
         ),
     ] = None,
+    refused: Annotated[
+        bool,
+        typer.Option("--refused", help="Instead the merges that a command refused, and which."),
+    ] = False,
+    objects: Annotated[
+        bool, typer.Option("--objects", help="Instead the objects that a command made one.")
+    ] = False,
+    known_at: KnownAtOption = None,
     json_: JsonOption = False,
     set_: SetOption = None,
     settings_file: SettingsOption = None,
@@ -83,6 +97,8 @@ def merges(
     When, by which keyframe, which place survived, which were absorbed, and what moved to the
     survivor.
     """
+    if refused + objects + (show is not None or draw is not None) > 1:
+        raise MisuseError("--refused and --objects are tables of their own; give one alone")
     if draw is None and out is not None:
         raise MisuseError(f"--out {out} is for the picture of --draw N; give --draw too")
     picture = out or Path("merge.png")
@@ -90,24 +106,47 @@ def merges(
         check_picture(picture)
     with _timeline(log, settings_file, set_) as timeline:
         end = point(timeline.reader, at)
-        found = timeline.merges(end)
+        known = timeline.knowing(known_point(timeline.reader, known_at, end))
+        if refused:
+            _show_refusals(known, end, json_=json_)
+            return
+        if objects:
+            _show_object_merges(known, end, json_=json_)
+            return
+        found = known.merges(end)
         if draw is not None:
-            _draw_merge(timeline, _numbered(found, draw), picture)
+            _draw_merge(known, _numbered(found, draw), picture)
         if show is not None:
             found = [_numbered(found, show)]
         if json_:
-            emit([merge_document(timeline.history, merge) for merge in found])
+            emit([merge_document(known.history, merge) for merge in found])
         elif show is not None:
-            display(merge_text(timeline.history, found[0]))
+            display(merge_text(known.history, found[0]))
         else:
-            display(merges_text(timeline.history, found, end))
+            display(merges_text(known.history, found, end))
 
 
-def _draw_merge(timeline: Timeline, merge: Merge, out: Path) -> None:
+def _show_refusals(known: KnownHistory, end: Offset, *, json_: bool) -> None:
+    found = known.refusals(end)
+    if json_:
+        emit([refusal_document(known.history, refusal) for refusal in found])
+    else:
+        display(refusals_text(known.history, found))
+
+
+def _show_object_merges(known: KnownHistory, end: Offset, *, json_: bool) -> None:
+    found = known.object_merges(end)
+    if json_:
+        emit([object_merge_document(known.history, merge) for merge in found])
+    else:
+        display(object_merges_text(known.history, found))
+
+
+def _draw_merge(known: KnownHistory, merge: Merge, out: Path) -> None:
     # Here and not above: matplotlib takes longer to import than most commands take to run.
     from projections.history.picture import draw_merge
 
-    draw_merge(timeline, merge, out)
+    draw_merge(known, merge, out)
     say(f"wrote {out}: merge {merge.number}, before and after")
 
 
@@ -125,8 +164,13 @@ def why(
     thing: Annotated[
         str | None,
         typer.Argument(
-            metavar="PLACE_ID|OBJECT_ID", help="A place, also an absorbed one; an object."
+            metavar="PLACE|OBJECT_ID|RUN:KF",
+            help="A place by its id, also an absorbed one, or by its name; an object; a keyframe.",
         ),
+    ] = None,
+    other: Annotated[
+        str | None,
+        typer.Argument(metavar="RUN:KF", help="After a keyframe another one: as --same of both."),
     ] = None,
     same: Annotated[
         tuple[str, str] | None,
@@ -137,15 +181,22 @@ def why(
         ),
     ] = None,
     at: AtOption = "end",
+    known_at: KnownAtOption = None,
     json_: JsonOption = False,
     set_: SetOption = None,
     settings_file: SettingsOption = None,
 ) -> None:
-    """Why a place or an object is what it is, event by event."""
+    """Why a place or an object is what it is, event by event.
+
+    Commands that named, joined, kept apart or moved something of it are named too.
+    """
     if (thing is None) == (same is None):
         raise MisuseError("give one of PLACE_ID, OBJECT_ID and --same RUN:KEYFRAME RUN:KEYFRAME")
+    pair = (thing, other) if thing is not None and other is not None else same
     with _timeline(log, settings_file, set_) as timeline:
-        found = _explanation(timeline, thing, same, point(timeline.reader, at))
+        end = point(timeline.reader, at)
+        known = timeline.knowing(known_point(timeline.reader, known_at, end))
+        found = _explanation(known, thing, pair, end)
     if json_:
         emit(found.document())
     else:
@@ -153,17 +204,25 @@ def why(
 
 
 def _explanation(
-    timeline: Timeline, thing: str | None, same: tuple[str, str] | None, end: Offset
+    known: KnownHistory, thing: str | None, pair: tuple[str, str] | None, end: Offset
 ) -> Explanation:
-    if same is not None:
-        return timeline.why_same(*same, end)
-    return timeline.why(thing or "", end)
+    if pair is not None:
+        return known.why_same(*pair, end)
+    return known.why(thing or "", end)
 
 
 def diff(
     log: LogArgument,
     first: Annotated[str, typer.Argument(metavar="W1", help=f"From here: {W}.")],
     second: Annotated[str, typer.Argument(metavar="W2", help="To here: the same.")] = "end",
+    known_at: Annotated[
+        str | None,
+        typer.Option(
+            "--known-at",
+            metavar="V",
+            help="Both maps under the commands before here [default: each under those before it].",
+        ),
+    ] = None,
     json_: JsonOption = False,
     all_: AllOption = False,
     set_: SetOption = None,
@@ -171,10 +230,13 @@ def diff(
 ) -> None:
     """What changed from one moment of the map to another.
 
-    Keyframes, places, objects and adjacency.
+    Keyframes, places, objects and adjacency, and the commands recorded in between.
     """
     with _timeline(log, settings_file, set_) as timeline:
-        found = timeline.diff(point(timeline.reader, first), point(timeline.reader, second))
+        reader = timeline.reader
+        span = point(reader, first), point(reader, second)
+        known = None if known_at is None else point(reader, known_at)
+        found = timeline.diff(*span, known_at=known)
     if json_:
         emit(found.document())
     else:
@@ -205,6 +267,7 @@ def bisect(
         bool,
         typer.Option("--scan", help="List every turn to true and to false, not only the first."),
     ] = False,
+    known_at: KnownAtOption = None,
     json_: JsonOption = False,
     all_: AllOption = False,
     set_: SetOption = None,
@@ -213,7 +276,8 @@ def bisect(
     with _columns_shown(), _timeline(log, settings_file, set_) as timeline:
         asked = Expression(expression)
         span = point(timeline.reader, start), point(timeline.reader, end)
-        found = timeline.bisect(asked, *span, scan=scan)
+        known = timeline.knowing(known_point(timeline.reader, known_at, span[1]))
+        found = known.bisect(asked, *span, scan=scan)
     if json_:
         emit(found.document())
     else:
@@ -230,109 +294,9 @@ def _columns_shown() -> Iterator[None]:
         raise
 
 
-def whatif(
-    log: LogArgument,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="NAME=VALUE",
-            help="Change a setting; all --set make one alternative, and hold for all of a --grid.",
-        ),
-    ] = None,
-    try_: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--try",
-            metavar="'NAME=VALUE …'",
-            help="One alternative of its own; give it several times for several.",
-        ),
-    ] = None,
-    grid: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--grid",
-            metavar="NAME=VALUE,…",
-            help="Every combination of these values, with those of other --grid.",
-        ),
-    ] = None,
-    base: Annotated[
-        str,
-        typer.Option(
-            metavar="'NAME=VALUE …'", help="Compare with these settings instead of the defaults."
-        ),
-    ] = "",
-    at: AtOption = "end",
-    truth: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--truth", metavar="FILE", help="Score places and objects against this ground truth."
-        ),
-    ] = None,
-    json_: JsonOption = False,
-    all_: AllOption = False,
-    picture: Annotated[
-        Path | None,
-        typer.Option(
-            "--picture", metavar="FILE", help="Draw the maps side by side (.png, .svg, .pdf)."
-        ),
-    ] = None,
-    processes: Annotated[
-        int | None,
-        typer.Option(metavar="N", min=1, help="Fold in this many processes [default: processors]."),
-    ] = None,
-    settings_file: SettingsOption = None,
-) -> None:
-    """What the map would be under other settings.
-
-    Places, noise, merges and objects under each, and how the maps differ. ARI is the adjusted Rand
-    index against the base: 1 is the same partition of keyframes into places or observations into
-    objects, 0 no better than chance, and so is any difference from a base of one single place. With
-    --truth, V is the V-measure against rooms and instances: 1 is perfect.
-    """
-    common = assigned(settings_from(settings_file, None), base, "--base")
-    others = alternatives(common, set_ or (), try_ or (), grid or ())
-    check_picture(picture)
-    if not others:
-        raise MisuseError("nothing to try; give --set eps_m=1.0, --try or --grid eps_m=0.5,1.0")
-    scored = read_truth(truth) if truth else None
-    with LogReader(log) as reader:
-        end = point(reader, at)
-    with Bar() as bar:
-        found = what_if(
-            log, common, others, end,
-            truth=scored, processes=processes, progress=bar.show_fold,
-            keep_views=picture is not None,
-        )  # fmt: skip
-    from .evaluate import warn_of_no_truth  # here: it imports all of re-localisation
-
-    warn_of_no_truth(log, found.base.result.scores)
-    if picture is not None:
-        _draw_maps(found, picture)
-    if json_:
-        emit(found.document())
-    else:
-        display(whatif_text(found, most=None if all_ else MOST_LINES))
-
-
-def _draw_maps(found: WhatIf, out: Path) -> None:
-    # Here and not above: matplotlib takes longer to import than most commands take to run.
-    from projections.history.picture import draw_maps
-
-    maps = [(_title(each), each.result.view) for each in found.all]
-    draw_maps([(title, view) for title, view in maps if view is not None], out)
-    say(f"wrote {out}: {counted(len(maps), 'map')}")
-
-
-def _title(each: Alternative) -> str:
-    counts = each.result.counts
-    return f"{each.name}: {counted(counts['places'], 'place')}, {counts['noise']} noise"
-
-
 def register(app: typer.Typer) -> None:
     """Add these commands to the program."""
     app.command()(merges)
     app.command()(why)
     app.command()(diff)
     app.command(help=_BISECT_HELP)(bisect)
-    app.command()(whatif)

@@ -1,17 +1,19 @@
 """Time travel: past maps, why the map is what it is, and what it would be under other settings.
 
-`Timeline` answers for one log under one setting: the map at any offset, every merge and its cause,
-the explanation of a place or an object, the difference of two maps, and the event that made a
-condition true. `what_if` folds the log under other settings and compares.
+`Timeline` answers for one log: the map at any offset under the commands known at another, every
+merge and its cause, the explanation of a place or an object, the difference of two maps, and the
+event that made a condition true. `what_if` folds the log under other settings, or without one of
+its commands, and compares.
 """
 
 from .bisect import Search, Turn
 from .conditions import Expression, ExpressionError
 from .diff import Difference
 from .explanation import Entry, Explanation
+from .known import KnownHistory, Progress
 from .names import NoSuchThing
 from .records import Cause
-from .timeline import Progress, Timeline
+from .timeline import Timeline
 from .whatif import WhatIf, what_if
 
 __all__ = [
@@ -21,6 +23,7 @@ __all__ = [
     "Explanation",
     "Expression",
     "ExpressionError",
+    "KnownHistory",
     "NoSuchThing",
     "Progress",
     "Search",

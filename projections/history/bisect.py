@@ -19,7 +19,7 @@ from .condition_functions import Direction, Names, Value
 from .conditions import Expression
 from .history import NEVER, History
 from .names import id_of_place, keyframe_ordinal
-from .records import Cause, count_before
+from .records import Cause, PlaceHistory
 
 
 class CountIndex:
@@ -37,6 +37,18 @@ class CountIndex:
         for each in history.objects:
             self.objects_of[each.found.class_name].append(each.found.offset)
         self.objects = _sorted(each.found.offset for each in history.objects)
+        self.fused_of: defaultdict[str, array[int]] = defaultdict(lambda: array("q"))
+        for merge in history.object_merges:
+            self.fused_of[history.objects[merge.absorbed].found.class_name].append(merge.offset)
+        self.fused = _sorted(merge.offset for merge in history.object_merges)
+        self.refused = _sorted(refusal.cause.offset for refusal in history.refusals)
+        self.places_called: defaultdict[str, list[PlaceHistory]] = defaultdict(list)
+        for named in history.corrections.names:
+            self.places_called[named.name] = []
+        for place in history.places:
+            for name in dict.fromkeys(named.name for named in place.names):
+                if name is not None:
+                    self.places_called[name].append(place)
 
 
 def _sorted(offsets: Iterable[int]) -> "array[int]":
@@ -51,6 +63,11 @@ class HistoryFacts:
         self._index = index
         self.end = end
 
+    @property
+    def objects_merge(self) -> bool:
+        """Whether commands make two objects one, so that counts of objects may fall."""
+        return bool(self._history.object_merges)
+
     def place_count(self) -> int:
         return self._count(self._index.formed) - self._count(self._index.absorbed)
 
@@ -64,8 +81,10 @@ class HistoryFacts:
 
     def object_count(self, class_name: str | None = None) -> int:
         if class_name is None:
-            return self._count(self._index.objects)
-        return self._count(self._index.objects_of.get(class_name, ()))
+            return self._count(self._index.objects) - self._count(self._index.fused)
+        return self._count(self._index.objects_of.get(class_name, ())) - self._count(
+            self._index.fused_of.get(class_name, ())
+        )
 
     def place_of(self, keyframe: str) -> str | None:
         ordinal = keyframe_ordinal(self._history, keyframe)
@@ -75,15 +94,16 @@ class HistoryFacts:
 
     def located_in(self, object_id: str) -> str | None:
         ordinal = self._history.object_ordinals.get(object_id)
-        if ordinal is None:
+        if ordinal is None or not self._history.objects[ordinal].stands(self.end):
             return None
         return id_of_place(self._history, self._history.objects[ordinal].place(self.end))
 
     def sightings(self, object_id: str) -> int:
         ordinal = self._history.object_ordinals.get(object_id)
-        if ordinal is None:
+        if ordinal is None or not self._history.objects[ordinal].stands(self.end):
             return 0
-        return count_before(self._history.objects[ordinal].sightings, self.end)
+        values = self._history.objects[ordinal].values(self.end)
+        return 0 if values is None else values.obs_count
 
     def size(self, place_id: str) -> int:
         ordinal = self._history.place_ordinals.get(place_id)
@@ -105,6 +125,21 @@ class HistoryFacts:
         merge = self._history.places[ordinal].absorbed_by
         return merge is not None and merge.cause.offset < self.end
 
+    def name(self, place_id: str) -> str | None:
+        ordinal = self._history.place_ordinals.get(place_id)
+        if ordinal is None or not self._history.places[ordinal].stands(self.end):
+            return None
+        return self._history.places[ordinal].name(self.end)
+
+    def place_called(self, name: str) -> str | None:
+        for place in self._index.places_called.get(name, ()):
+            if place.stands(self.end) and place.name(self.end) == name:
+                return place.place_id
+        return None
+
+    def refused_count(self) -> int:
+        return self._count(self._index.refused)
+
     def names(self, kind: Names) -> Iterable[str]:
         """The names of all things of a kind in the whole history."""
         match kind:
@@ -118,6 +153,8 @@ class HistoryFacts:
                 return self._index.objects_of.keys()
             case Names.RUN:
                 return self._index.keyframes_of.keys()
+            case Names.NAME:
+                return self._index.places_called.keys()
 
     def _count(self, offsets: "array[int] | tuple[()]") -> int:
         return bisect_left(offsets, self.end)
@@ -196,6 +233,7 @@ class Searcher:
         """The first turn to true by an event in ``start`` … ``end`` − 1; with ``scan``, all."""
         holds = self._holds(start), self._holds(end)
         rising = self._expression.direction in (Direction.RISING, Direction.STEADY)
+        rising = rising and not self._facts.objects_merge
         if scan or not rising:
             turns = list(self._scan(start, end, holds[0], stop=not scan))
         else:

@@ -28,6 +28,7 @@ class Names(Enum):
     OBJECT = "object"
     CLASS = "class"
     RUN = "run"
+    NAME = "name"
 
 
 class Direction(Enum):
@@ -88,6 +89,15 @@ class Facts(Protocol):
 
     def merged(self, place_id: str) -> bool:
         """Whether a place was absorbed by another."""
+
+    def name(self, place_id: str) -> str | None:
+        """What a place is called; None once it was absorbed."""
+
+    def place_called(self, name: str) -> str | None:
+        """The place that stands and is called so, of several the one founded first."""
+
+    def refused_count(self) -> int:
+        """Merges that a command refused."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,6 +187,29 @@ _ALL = (
         Type.BOOLEAN,
         lambda f, p: f.merged(p),
         "a place was absorbed",
+        rises=True,
+    ),
+    Function("name", (_PLACE,), Type.TEXT, lambda f, p: f.name(p), "what a place is called"),
+    Function(
+        "named",
+        (Names.NAME,),
+        Type.BOOLEAN,
+        lambda f, n: f.place_called(n) is not None,
+        "a place is called so",
+    ),
+    Function(
+        "place_called",
+        (Names.NAME,),
+        Type.TEXT,
+        lambda f, n: f.place_called(n),
+        "the place that is called so",
+    ),
+    Function(
+        "refused_count",
+        (),
+        Type.NUMBER,
+        lambda f: f.refused_count(),
+        "merges that a command refused",
         rises=True,
     ),
 )

@@ -1,15 +1,18 @@
 """The difference between two maps; applied to the first it gives the second.
 
-Maps are compared as rows by id, not by ordinal, so that maps of two logs or two settings can be
-compared too.
+Maps are compared as rows by id, not by ordinal, so that maps of two logs or two settings, or under
+other commands, can be compared too.
 """
 
 import math
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeAlias, TypeVar
 
 from eventsrc.envelope import Offset, RunId
+from projections.corrections import RecordedCommand
+from projections.model.command_text import command_document
+from projections.model.digest import map_digest
 from projections.model.view import MapView
 
 from .records import Cause
@@ -17,12 +20,13 @@ from .records import Cause
 
 @dataclass(frozen=True, slots=True)
 class PlaceRow:
-    """A place that is not absorbed; its centroid in metres."""
+    """A place that is not absorbed; its centroid in metres, its name if it has one."""
 
     place_id: str
     centroid_x: float
     centroid_y: float
     keyframe_count: int
+    name: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +119,7 @@ def rows_of(view: MapView) -> MapRows:
         places=_by(
             place_key,
             (
-                PlaceRow(p.place_id, p.centroid_x, p.centroid_y, p.keyframe_count)
+                PlaceRow(p.place_id, p.centroid_x, p.centroid_y, p.keyframe_count, p.name)
                 for p in view.places.values()
             ),
         ),
@@ -171,7 +175,7 @@ class Difference:
     """The difference of the map after ``start`` events and that after ``end``.
 
     ``absorbed`` gives, by id of an absorbed place, the surviving place and the cause; it is empty
-    when ``end`` < ``start``.
+    when ``end`` < ``start``. ``commands`` are those that one of the maps knows and the other not.
     """
 
     start: Offset
@@ -183,6 +187,7 @@ class Difference:
     objects: Changes[str, ObjectRow]
     edges: Changes[tuple[str, str], EdgeRow]
     absorbed: dict[str, tuple[str, Cause]]
+    commands: tuple[RecordedCommand, ...] = ()
 
     @property
     def same(self) -> bool:
@@ -210,6 +215,7 @@ class Difference:
             "objects": _objects(self.objects),
             "keyframes": _keyframes(self.keyframes),
             "adjacency": _edges(self.edges),
+            **({"commands": list(map(command_document, self.commands))} if self.commands else {}),
         }
 
     def _places(self) -> dict[str, Any]:
@@ -232,25 +238,24 @@ class Difference:
 
 
 def difference_of(
-    start: Offset,
-    end: Offset,
-    rows: tuple[MapRows, MapRows],
-    digests: tuple[str, str],
-    counts: tuple[dict[str, int], dict[str, int]],
+    first: MapView,
+    second: MapView,
     absorbed: dict[str, tuple[str, Cause]],
+    commands: Sequence[RecordedCommand],
 ) -> Difference:
-    """The difference of two maps given as rows."""
-    before, after = rows
+    """The difference of two maps."""
+    before, after = rows_of(first), rows_of(second)
     return Difference(
-        start=start,
-        end=end,
-        digests=digests,
-        counts=counts,
+        start=first.next_offset,
+        end=second.next_offset,
+        digests=(map_digest(first), map_digest(second)),
+        counts=(first.counts(), second.counts()),
         keyframes=changes(before.keyframes, after.keyframes),
         places=changes(before.places, after.places),
         objects=changes(before.objects, after.objects),
         edges=changes(before.edges, after.edges),
         absorbed=absorbed,
+        commands=tuple(commands),
     )
 
 
@@ -270,6 +275,7 @@ def _place(row: PlaceRow) -> dict[str, Any]:
         "centroid_x": row.centroid_x,
         "centroid_y": row.centroid_y,
         "keyframe_count": row.keyframe_count,
+        **({} if row.name is None else {"name": row.name}),
     }
 
 

@@ -1,19 +1,19 @@
 """Why a place or an object is what it is: what happened to it, event by event."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
-from eventsrc.envelope import Offset
+from eventsrc.envelope import DetId, Offset
 from eventsrc.text import counted
-from projections.deltas import PlaceOrdinal, Pose
+from projections.deltas import ObjectSeen, ObservationOrdinal, PlaceOrdinal, Pose
 from projections.exact import Q40, mean_m
 
 from .history import History
 from .merges import merge_reason
-from .names import id_of_place, keyframe_name, place_name
-from .records import Cause, Merge, ObjectHistory, PlaceHistory, count_before, last_before
+from .names import id_of_place, keyframe_name, place_name, place_title
+from .records import Cause, Merge, ObjectHistory, PlaceHistory, count_before
 
 MOST_FOUNDERS = 6
 """Founding members that are named; one event may place many keyframes."""
@@ -56,6 +56,12 @@ class Explanation:
         }
 
 
+def with_entries(found: Explanation, entries: Sequence[Entry]) -> Explanation:
+    """The explanation with more entries, each at its offset."""
+    both = sorted((*found.entries, *entries), key=lambda entry: entry.cause.offset)
+    return replace(found, entries=tuple(both))
+
+
 def explain_place(history: History, record: PlaceHistory, end: Offset) -> Explanation:
     """What happened to a place in the events below ``end``."""
     entries = sorted(
@@ -69,7 +75,11 @@ def explain_place(history: History, record: PlaceHistory, end: Offset) -> Explan
         subject=record.place_id,
         summary=describe(history, record, end),
         entries=tuple(entries),
-        facts={"stands": stands, "absorbed_by": _absorbed_by_document(history, record, end)},
+        facts={
+            "stands": stands,
+            "absorbed_by": _absorbed_by_document(history, record, end),
+            **({} if (name := record.name(end)) is None else {"name": name}),
+        },
     )
 
 
@@ -162,17 +172,18 @@ def _standing_place_summary(history: History, record: PlaceHistory, end: Offset)
         _objects_text(history, record.formed.place, end),
         _neighbours_text(history, record.formed.place, end),
     ]
+    if (name := record.name(end)) is not None:
+        parts.insert(0, f'called "{name}"')
     if (change := record.change(end)) is not None:
         x, y = (mean_m(s, change.keyframe_count) for s in (change.sum_x_um, change.sum_y_um))
-        parts.insert(0, f"{counted(change.keyframe_count, 'keyframe')} around ({x:.2f}, {y:.2f})")
+        size = f"{counted(change.keyframe_count, 'keyframe')} around ({x:.2f}, {y:.2f})"
+        parts.insert(0 if name is None else 1, size)
     return "; ".join(parts)
 
 
 def _objects_text(history: History, place: PlaceOrdinal, end: Offset) -> str:
     classes = Counter(
-        o.found.class_name
-        for o in history.objects
-        if o.found.offset < end and o.place(end) == place
+        o.found.class_name for o in history.objects if o.stands(end) and o.place(end) == place
     )
     if not classes:
         return "no objects"
@@ -192,21 +203,20 @@ def _neighbours_text(history: History, place: PlaceOrdinal, end: Offset) -> str:
     if not found:
         return "next to no other place"
     found.sort(key=lambda item: (-item[0], item[1]))
-    return "next to " + ", ".join(f"{place_name(history, p)} ({n}×)" for n, p in found)
+    return "next to " + ", ".join(f"{place_title(history, p, end)} ({n}×)" for n, p in found)
 
 
 def explain_object(
-    history: History, det_ids: Sequence[str], record: ObjectHistory, end: Offset
+    history: History,
+    det_id: Callable[[ObservationOrdinal], DetId],
+    record: ObjectHistory,
+    end: Offset,
 ) -> Explanation:
-    """What happened to an object in the events below ``end``.
-
-    ``det_ids`` are the detections of its sightings, parallel to ``record.sightings``.
-    """
+    """What happened to an object in the events below ``end``; ``det_id`` names an observation."""
     entries = sorted(
-        (e for e in _object_entries(history, det_ids, record) if e.cause.offset < end),
+        (e for e in _object_entries(history, det_id, record) if e.cause.offset < end),
         key=lambda entry: entry.cause.offset,
     )
-    seen = count_before(record.sightings, end)
     return Explanation(
         kind="object",
         subject=record.object_id,
@@ -215,38 +225,59 @@ def explain_object(
         facts={
             "class_name": record.found.class_name,
             "place_id": id_of_place(history, record.place(end)),
-            "det_ids": det_ids[:seen],
+            "det_ids": [det_id(seen.observation) for seen in sightings_of(history, record, end)],
         },
     )
 
 
+def sightings_of(history: History, record: ObjectHistory, end: Offset) -> list[ObjectSeen]:
+    """The sightings of an object and of those that it absorbed in the events below ``end``."""
+    found = record.sightings[: count_before(record.sightings, end)]
+    for merge in record.merges[: count_before(record.merges, end)]:
+        found += sightings_of(history, history.objects[merge.absorbed], end)
+    return sorted(found, key=lambda seen: seen.observation)
+
+
 def _object_summary(history: History, record: ObjectHistory, end: Offset) -> str:
-    last = last_before(record.sightings, end)
+    last = record.values(end)
     if last is None:
         return "not seen yet"
+    merge = record.absorbed_by
+    if merge is not None and merge.offset < end:
+        survivor = history.objects[merge.survivor].object_id
+        return f"fused into {survivor} at offset {merge.offset:,} ({merge.cause.when})"
     x, y = mean_m(last.sum_x_um, last.obs_count), mean_m(last.sum_y_um, last.obs_count)
-    sightings = record.sightings[: count_before(record.sightings, end)]
+    sightings = sightings_of(history, record, end)
     least = min(seen.similarity_q40 for seen in sightings) / Q40
     similar = f", each at least {least:.2f} like it" if last.obs_count > 1 else ""
     return (
         f"a {record.found.class_name} seen {counted(last.obs_count, 'time')}{similar}, "
-        f"on average from ({x:.2f}, {y:.2f}); in {place_name(history, record.place(end))}"
+        f"on average from ({x:.2f}, {y:.2f}); in {place_title(history, record.place(end), end)}"
     )
 
 
 def _object_entries(
-    history: History, det_ids: Sequence[str], record: ObjectHistory
+    history: History, det_id: Callable[[ObservationOrdinal], DetId], record: ObjectHistory
 ) -> Iterator[Entry]:
     pose = history.keyframes[history.keyframe_count(Offset(record.found.offset + 1)) - 1].pose
+    first = det_id(record.sightings[0].observation)
     yield Entry(
         record.cause,
         "found",
-        f"found: {det_ids[0]}, seen from {position_text(pose)}, "
+        f"found: {first}, seen from {position_text(pose)}, "
         f"was like no {record.found.class_name} near it",
-        {"det_id": det_ids[0]},
+        {"det_id": first},
     )
     yield from _sightings(history, record)
     yield from _moves(history, record)
+    for merge in record.merges:
+        absorbed = history.objects[merge.absorbed].object_id
+        text = f"{absorbed} was fused into it by a command"
+        yield Entry(merge.cause, "fused", text, {"object_id": absorbed})
+    if (ended := record.absorbed_by) is not None:
+        survivor = history.objects[ended.survivor].object_id
+        text = f"fused into {survivor} by a command"
+        yield Entry(ended.cause, "ended", text, {"object_id": survivor})
 
 
 def _sightings(history: History, record: ObjectHistory) -> Iterator[Entry]:

@@ -1,7 +1,7 @@
 """The history of a map: what happened to every place and object, and by which event.
 
 `History` is fed the deltas of each event, in order. `merges`, `why`, `bisect` and a map at any
-offset (`view_at`) are read from it without folding again. It holds no embeddings. The place of a
+offset (`past_view`) are read from it without folding again. It holds no embeddings. The place of a
 keyframe is found through the chain of absorptions (`History.place_at`), so a merge costs nothing
 per member.
 
@@ -15,33 +15,28 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from eventsrc.envelope import FIRST_OFFSET, KeyframeId, Offset, RunId
+from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.deltas import (
     Delta,
     EventSkipped,
     KeyframeAdded,
     KeyframeOrdinal,
     KeyframePlaced,
+    MergeRefused,
     ObjectFound,
     ObjectMoved,
     ObjectOrdinal,
     ObjectSeen,
+    ObjectsMerged,
     PlaceChanged,
     PlaceFormed,
+    PlaceNamed,
     PlaceOrdinal,
     PlacesLinked,
     PlacesMerged,
     RunSeen,
 )
-from projections.model.records import (
-    KeyframeRecord,
-    ObjectRecord,
-    ObservationRecord,
-    PlaceRecord,
-    RunRecord,
-)
-from projections.model.view import MapView
 from projections.reducers import packed
-from projections.reducers.survivors import PlaceSurvivors
 from projections.settings import Settings
 
 from .neighbours import Neighbours
@@ -50,9 +45,10 @@ from .records import (
     EdgeChange,
     Merge,
     ObjectHistory,
+    ObjectMerge,
     PlaceHistory,
+    Refusal,
     cause_of,
-    count_before,
     last_before,
 )
 
@@ -73,10 +69,12 @@ class History:
 
     By keyframe ordinal: ``keyframe_offsets`` is the event that added it, ``placed_offsets`` the
     event that placed it (`NEVER` for noise) and ``placed_in`` the place it joined then.
+    ``corrections`` are those that the deltas were folded under.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, corrections: Corrections = NO_CORRECTIONS) -> None:
         self.settings = settings
+        self.corrections = corrections
         self.next_offset = FIRST_OFFSET
         self.keyframes: list[KeyframeAdded] = []
         self.keyframe_offsets = array("q")
@@ -85,6 +83,8 @@ class History:
         self.places: list[PlaceHistory] = []
         self.objects: list[ObjectHistory] = []
         self.merges: list[Merge] = []
+        self.refusals: list[Refusal] = []
+        self.object_merges: list[ObjectMerge] = []
         self.runs: list[list[RunSeen]] = []
         self.skipped: list[EventSkipped] = []
         self.edges: dict[tuple[PlaceOrdinal, PlaceOrdinal], list[PlacesLinked]] = {}
@@ -136,6 +136,12 @@ class History:
             place = merge.survivor
         return place
 
+    def object_survivor(self, found: ObjectOrdinal, end: Offset) -> ObjectOrdinal:
+        """The object that ``found`` is part of after the events below ``end``."""
+        while (merge := self.objects[found].absorbed_by) is not None and merge.offset < end:
+            found = merge.survivor
+        return found
+
     def keyframe_count(self, end: Offset) -> int:
         """Keyframes added by the events below ``end``."""
         return bisect_left(self.keyframe_offsets, end)
@@ -179,6 +185,19 @@ class History:
     def _place_changed(self, delta: PlaceChanged, _: Cause) -> None:
         self.places[delta.place].changes.append(delta)
 
+    def _place_named(self, delta: PlaceNamed, _: Cause) -> None:
+        self.places[delta.place].names.append(delta)
+
+    def _merge_refused(self, delta: MergeRefused, cause: Cause) -> None:
+        refused = Refusal(cause, delta.a, delta.b, delta.bridge, delta.link, delta.apart)
+        self.refusals.append(refused)
+
+    def _objects_merged(self, delta: ObjectsMerged, cause: Cause) -> None:
+        merge = ObjectMerge(cause, delta)
+        self.object_merges.append(merge)
+        self.objects[delta.survivor].merges.append(merge)
+        self.objects[delta.absorbed].absorbed_by = merge
+
     def _object_found(self, delta: ObjectFound, cause: Cause) -> None:
         self.object_ordinals[delta.object_id] = delta.object
         self.objects.append(ObjectHistory(delta, cause))
@@ -194,6 +213,9 @@ class History:
         PlaceFormed: _place_formed,
         KeyframePlaced: _keyframe_placed,
         PlaceChanged: _place_changed,
+        PlaceNamed: _place_named,
+        MergeRefused: _merge_refused,
+        ObjectsMerged: _objects_merged,
         ObjectFound: _object_found,
         ObjectSeen: _object_seen,
     }
@@ -225,137 +247,9 @@ class History:
             links=delta.links,
             objects=tuple(move.object for move in moves if move.before in delta.absorbed),
             edges=tuple(link for link in links if link.a in places or link.b in places),
+            joined=delta.joined,
         )
         self.merges.append(merge)
         self.places[delta.survivor].merges.append(merge)
         for place in delta.absorbed:
             self.places[place].absorbed_by = merge
-
-
-def view_at(history: History, latest: MapView, end: Offset, settings: Settings) -> MapView:
-    """The `MapView` that applying every delta below ``end`` makes, without folding.
-
-    ``latest`` is a view of at least as many events. What never changes after its event
-    (observations, poses) is shared with it; places, objects and the place of a keyframe are made
-    anew, so that changing one view does not change another.
-    """
-    view = MapView(settings, keep_embeddings=latest.keep_embeddings, corrections=latest.corrections)
-    view.all_places = _places(history, end)
-    view.survivors = _survivors(history, end)
-    absorbed_by = view.survivors.absorbed_by
-    view.places = {p.ordinal: p for p in view.all_places if p.ordinal not in absorbed_by}
-    view.keyframes = _keyframes(history, latest, view.survivors, end)
-    view.observations = _observations(history, latest, end)
-    view.all_objects = _objects(history, end)
-    view.objects = {o.ordinal: o for o in view.all_objects}
-    view.runs = _runs(history, view.keyframes, end)
-    view.adjacency = _adjacency(history, end)
-    for skipped in history.skipped[: count_before(history.skipped, end)]:
-        view.skipped[skipped.kind] = view.skipped.get(skipped.kind, 0) + 1
-    view.advance(end)
-    return view
-
-
-def _places(history: History, end: Offset) -> list[PlaceRecord]:
-    count = bisect_left(history.places, end, key=lambda p: p.formed.offset)
-    records = []
-    for place in history.places[:count]:
-        formed = place.formed
-        record = PlaceRecord(formed.place, formed.place_id, formed.founder, formed.offset)
-        record.unordered_members = [
-            d.keyframe for d in place.joined[: count_before(place.joined, end)]
-        ]
-        if (change := place.change(end)) is not None:
-            record.keyframe_count = change.keyframe_count
-            record.sum_x_um, record.sum_y_um = change.sum_x_um, change.sum_y_um
-        records.append(record)
-    _apply_merges(history, records, end)
-    return records
-
-
-def _apply_merges(history: History, records: list[PlaceRecord], end: Offset) -> None:
-    """Move members to the survivors, in the order of the merges."""
-    for merge in history.merges:
-        if merge.cause.offset >= end:
-            return
-        survivor = records[merge.survivor]
-        for place in merge.absorbed:
-            absorbed = records[place]
-            survivor.unordered_members += absorbed.unordered_members
-            absorbed.unordered_members = []
-
-
-def _survivors(history: History, end: Offset) -> PlaceSurvivors:
-    survivors = PlaceSurvivors()
-    for merge in history.merges:
-        if merge.cause.offset < end:
-            survivors.merge(merge.survivor, merge.absorbed)
-    return survivors
-
-
-def _keyframes(
-    history: History, latest: MapView, survivors: PlaceSurvivors, end: Offset
-) -> list[KeyframeRecord]:
-    count = history.keyframe_count(end)
-    return [
-        KeyframeRecord(
-            k.ordinal,
-            k.offset,
-            k.run,
-            k.run_id,
-            k.keyframe_id,
-            k.timestamp,
-            k.pose,
-            survivors,
-            k.observations,
-            place if placed < end else None,
-        )
-        for k, placed, place in zip(
-            latest.keyframes[:count], history.placed_offsets, history.placed_in, strict=False
-        )
-    ]
-
-
-def _observations(history: History, latest: MapView, end: Offset) -> list[ObservationRecord]:
-    keyframes = history.keyframe_count(end)
-    return latest.observations[
-        : bisect_left(latest.observations, keyframes, key=lambda o: o.keyframe)
-    ]
-
-
-def _objects(history: History, end: Offset) -> list[ObjectRecord]:
-    count = bisect_left(history.objects, end, key=lambda o: o.found.offset)
-    return [_object(each, end) for each in history.objects[:count]]
-
-
-def _object(history: ObjectHistory, end: Offset) -> ObjectRecord:
-    found, seen = history.found, history.sightings[: count_before(history.sightings, end)]
-    record = ObjectRecord(found.object, found.object_id, found.class_name)
-    record.observations = [delta.observation for delta in seen]
-    if seen:
-        last = seen[-1]
-        record.obs_count = last.obs_count
-        record.sum_x_um, record.sum_y_um = last.sum_x_um, last.sum_y_um
-        record.first_seen, record.last_seen = last.first_seen, last.last_seen
-    record.place = history.place(end)
-    return record
-
-
-def _runs(history: History, keyframes: list[KeyframeRecord], end: Offset) -> list[RunRecord]:
-    records = []
-    for seen in history.runs:
-        last = last_before(seen, end)
-        if last is not None:
-            records.append(RunRecord(last.run, last.run_id, last.started_at))
-    for keyframe in keyframes:
-        records[keyframe.run].keyframe_count += 1
-    return records
-
-
-def _adjacency(history: History, end: Offset) -> dict[tuple[PlaceOrdinal, PlaceOrdinal], int]:
-    found = ((pair, last_before(linked, end)) for pair, linked in history.edges.items())
-    return {
-        pair: last.shared_transitions
-        for pair, last in found
-        if last is not None and last.shared_transitions
-    }

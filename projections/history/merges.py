@@ -7,7 +7,8 @@ one place, over points that this event made core, to an old core point of the ot
 such path is the chain.
 
 When an event joins several places, the chains form a tree: each further place is joined to one that
-is joined already.
+is joined already. A place that a ``join`` command brought has no chain: the two keyframes that the
+command names are the reason.
 """
 
 from collections import deque
@@ -17,11 +18,13 @@ from itertools import pairwise
 from typing import Any
 
 from eventsrc.envelope import Offset
+from projections.corrections import RecordedCommand
 from projections.deltas import KeyframeOrdinal, Link, PlaceOrdinal
+from projections.model.command_text import command_document, command_on, command_title
 
 from .history import History
-from .names import keyframe_name, place_name
-from .records import EdgeChange, Merge
+from .names import keyframe_name, log_name, place_name
+from .records import EdgeChange, Merge, ObjectMerge, Refusal
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +49,8 @@ class Chain:
 def chains_of(history: History, merge: Merge) -> list[Chain]:
     """A chain for each absorbed place, in the order of joining, shortest first.
 
-    Empty when another rule than distance merged the places.
+    None for a place that a command joined, and none at all when another rule than distance merged
+    the places.
     """
     made = history.neighbours.made_core(merge.bridge, merge.cause.offset)
     contacts = {keyframe: _contacts(history, merge, keyframe) for keyframe in made}
@@ -54,10 +58,15 @@ def chains_of(history: History, merge: Merge) -> list[Chain]:
     while remaining:
         chain = _shortest(history, merge, contacts, joined, remaining)
         if chain is None:
-            break
-        chains.append(chain)
-        joined.add(chain.absorbed)
-        remaining.remove(chain.absorbed)
+            commanded = next((place for place in merge.joined if place in remaining), None)
+            if commanded is None:
+                break
+            absorbed = commanded
+        else:
+            chains.append(chain)
+            absorbed = chain.absorbed
+        joined.add(absorbed)
+        remaining.remove(absorbed)
     return chains
 
 
@@ -125,16 +134,73 @@ def merge_reason(history: History, merge: Merge) -> str:
     """The bridging keyframe, the core points it made, and the chain to each absorbed place."""
     if merge.cause.kind != "keyframe":
         return merge.cause.name
+    commanded = "; ".join(_join_text(history, link) for link in join_links(merge))
     chains = chains_of(history, merge)
     bridge = keyframe_name(history, merge.bridge)
     if not chains:
+        if commanded:
+            return commanded
         links = "; ".join(_link_text(history, link) for link in merge.links)
         return f"{bridge} bridged them: {links}"
     made = dict.fromkeys(point for chain in chains for point in chain.made_core)
     names = ["itself" if k == merge.bridge else keyframe_name(history, k) for k in made]
     what = "a core point" if len(made) == 1 else "core points"
     joins = "; ".join(chain_text(history, chain) for chain in chains)
-    return f"{bridge} made {_enumerated(names)} {what}: {joins}"
+    also = f"; {commanded}" if commanded else ""
+    return f"{bridge} made {_enumerated(names)} {what}: {joins}{also}"
+
+
+def join_links(merge: Merge) -> list[Link]:
+    """The links of the places that a command joined, one for each: the keyframes that it names."""
+    return [
+        link
+        for place, link in zip(merge.absorbed, merge.links, strict=True)
+        if place in merge.joined
+    ]
+
+
+def _join_text(history: History, link: Link) -> str:
+    core, neighbour = keyframe_name(history, link.core), keyframe_name(history, link.neighbour)
+    distance = f"{link.distance_um / 1e6:.3f} m apart"
+    found = _command(history, (link.core, link.neighbour), joins=True)
+    return f"{core} and {neighbour}, {distance}, joined by {_title(found)}"
+
+
+def _command(
+    history: History, pair: tuple[KeyframeOrdinal, KeyframeOrdinal], *, joins: bool
+) -> RecordedCommand | None:
+    """The command that joins two keyframes, or keeps them apart."""
+    first, second = (log_name(history, keyframe) for keyframe in pair)
+    return command_on(history.corrections, first, second, joins=joins)
+
+
+def _title(recorded: RecordedCommand | None) -> str:
+    return "a command" if recorded is None else command_title(recorded.command)
+
+
+def _document(recorded: RecordedCommand | None) -> dict[str, Any] | None:
+    return None if recorded is None else command_document(recorded)
+
+
+def refusal_reason(history: History, refusal: Refusal) -> str:
+    """The core points that would have joined two places, and the command that keeps them apart."""
+    return f"{_link_text(history, refusal.link)}; kept apart by {refuser(history, refusal)}"
+
+
+def refuser(history: History, refusal: Refusal) -> str:
+    """The command that refused a merge: kind, id, author and reason."""
+    return _title(_command(history, refusal.apart, joins=False))
+
+
+def refusal_document(history: History, refusal: Refusal) -> dict[str, Any]:
+    """One refused merge as JSON; ``run_id`` and ``keyframe_id`` name the bridging keyframe."""
+    return {
+        **refusal.cause.document(),
+        "places": [place_name(history, place) for place in (refusal.a, refusal.b)],
+        "link": link_document(history, refusal.link),
+        "apart": [keyframe_name(history, k) for k in refusal.apart],
+        "command": _document(_command(history, refusal.apart, joins=False)),
+    }
 
 
 def _enumerated(names: Sequence[str]) -> str:
@@ -181,6 +247,7 @@ def chain_document(history: History, chain: Chain) -> dict[str, Any]:
 def merge_document(history: History, merge: Merge) -> dict[str, Any]:
     """One merge as JSON; ``run_id`` and ``keyframe_id`` name the bridging keyframe."""
     bridge = history.keyframes[merge.bridge]
+    joined = {"joined": [_joined_document(history, link) for link in join_links(merge)]}
     return {
         **merge.cause.document(),
         "run_id": bridge.run_id,
@@ -194,6 +261,23 @@ def merge_document(history: History, merge: Merge) -> dict[str, Any]:
         "chains": [chain_document(history, chain) for chain in chains_of(history, merge)],
         "objects": [history.objects[number].object_id for number in merge.objects],
         "edges": [_edge_document(history, edge) for edge in merge.edges],
+        **(joined if merge.joined else {}),
+    }
+
+
+def _joined_document(history: History, link: Link) -> dict[str, Any]:
+    command = _document(_command(history, (link.core, link.neighbour), joins=True))
+    return {**link_document(history, link), "command": command}
+
+
+def object_merge_document(history: History, merge: ObjectMerge) -> dict[str, Any]:
+    """One merge of objects as JSON."""
+    survivor, absorbed = (history.objects[n].found for n in (merge.survivor, merge.absorbed))
+    return {
+        **merge.cause.document(),
+        "class_name": survivor.class_name,
+        "survivor": survivor.object_id,
+        "absorbed": absorbed.object_id,
     }
 
 

@@ -8,8 +8,9 @@ import difflib
 import re
 from collections.abc import Iterable
 
-from eventsrc.envelope import KeyframeId, RunId
+from eventsrc.envelope import KeyframeId, Offset, RunId
 from eventsrc.errors import MisuseError
+from projections.corrections import Keyframe
 from projections.deltas import KeyframeOrdinal, PlaceOrdinal
 
 from .history import History
@@ -36,6 +37,12 @@ def keyframe_name(history: History, keyframe: KeyframeOrdinal) -> str:
     return f"{added.run_id}:{added.keyframe_id}"
 
 
+def log_name(history: History, keyframe: KeyframeOrdinal) -> Keyframe:
+    """Run and keyframe id, by which commands name it."""
+    added = history.keyframes[keyframe]
+    return Keyframe(added.run_id, added.keyframe_id)
+
+
 def id_of_place(history: History, place: PlaceOrdinal | None) -> str | None:
     """The place's id; None for no place."""
     return None if place is None else history.places[place].place_id
@@ -44,6 +51,12 @@ def id_of_place(history: History, place: PlaceOrdinal | None) -> str | None:
 def place_name(history: History, place: PlaceOrdinal | None) -> str:
     """The place's id, or ``no place``."""
     return id_of_place(history, place) or "no place"
+
+
+def place_title(history: History, place: PlaceOrdinal | None, end: Offset) -> str:
+    """``run_p3``, or ``run_p3 "kitchen"`` where it has a name after ``end`` events."""
+    name = None if place is None else history.places[place].name(end)
+    return place_name(history, place) + ("" if name is None else f' "{name}"')
 
 
 def keyframe_ordinal(history: History, text: str) -> KeyframeOrdinal | None:
@@ -67,12 +80,20 @@ def find_keyframe(history: History, text: str) -> KeyframeOrdinal:
     return ordinal
 
 
-def find_place(history: History, text: str) -> PlaceHistory:
-    """The place of this id, standing or absorbed. Raises NoSuchThing."""
+def find_place(history: History, text: str, end: Offset) -> PlaceHistory:
+    """The place of this id, standing or absorbed, or the one that is called so after ``end``
+    events. Raises NoSuchThing, and MisuseError for a name that several places have."""
     ordinal = history.place_ordinals.get(text)
-    if ordinal is None:
-        raise NoSuchThing("place", text, history.place_ordinals)
-    return history.places[ordinal]
+    if ordinal is not None:
+        return history.places[ordinal]
+    called = [p for p in history.places if p.names and p.stands(end) and p.name(end) == text]
+    if len(called) > 1:
+        ids = ", ".join(place.place_id for place in called)
+        raise MisuseError(f"{text!r} is the name of several places; give one of {ids}")
+    if not called:
+        names = [n.name for p in history.places for n in p.names if n.name is not None]
+        raise NoSuchThing("place", text, [*history.place_ordinals, *dict.fromkeys(names)])
+    return called[0]
 
 
 def find_object(history: History, text: str) -> ObjectHistory:

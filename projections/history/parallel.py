@@ -1,12 +1,12 @@
-"""Fold one log under several settings in parallel processes.
+"""Fold one log under several rules in parallel processes.
 
-Each process reads and validates the log once for all of its settings. Few events are folded in this
-process, since starting one takes longer.
+Rules are settings and corrections. Each process reads and validates the log once for all of its
+rules. Few events are folded in this process, since starting one takes longer.
 
-A `FoldResult` is small enough to send between processes, and comparable: keyframes and observations
-have the same ordinals under any settings, since the log alone decides them. Places and objects do
-not, so places are numbered here by the event that founded them and then by their first member, and
-two folds have the same numbers until they differ.
+A `FoldResult` is small enough to send between processes, and comparable: a keyframe is known by its
+event, an observation by its event and det_id; which of them are in the map depends on the
+corrections. Places are numbered here by the event that founded them and then by their first member,
+and two folds have the same numbers until they differ.
 """
 
 import multiprocessing
@@ -24,12 +24,16 @@ from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from eventsrc.envelope import FIRST_OFFSET, Offset
+from eventsrc.envelope import FIRST_OFFSET, DetId, Offset
 from eventsrc.errors import MapfoldError
 from eventsrc.log import Event, LogReader
+from projections.corrections import NO_CORRECTIONS, Corrections, map_fingerprint
 from projections.deltas import (
     KeyframeAdded,
     KeyframePlaced,
+    ObjectFound,
+    ObjectSeen,
+    ObjectsMerged,
     PlaceFormed,
     PlacesMerged,
 )
@@ -42,8 +46,8 @@ from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 
 from .history import History
+from .known import Progress
 from .records import PlaceHistory
-from .timeline import Progress
 
 Offsets: TypeAlias = "array[int]"
 
@@ -52,20 +56,37 @@ MIN_PARALLEL_EVENTS = 20_000
 _POLL_S = 0.2
 _PLACE_DELTAS = frozenset({KeyframeAdded, PlaceFormed, KeyframePlaced, PlacesMerged})
 """The deltas that `fold_result` needs from a history; the rest is in the view."""
+_OBJECT_DELTAS = frozenset({ObjectFound, ObjectSeen, ObjectsMerged})
+"""Needed too where a command makes two objects one."""
 
 _done: "Synchronized[int] | None" = None
 """In a worker process: the number of events that all workers have folded."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Rules:
+    """What a log is folded under."""
+
+    settings: Settings
+    corrections: Corrections = NO_CORRECTIONS
+
+    @property
+    def key(self) -> str:
+        """Equal for rules that give the same map."""
+        return map_fingerprint(self.settings, self.corrections)
+
+
 @dataclass(frozen=True, slots=True)
 class FoldResult:
-    """The map of a log under one setting, and how it was built.
+    """The map of a log under some rules, and how it was built.
 
     ``places`` are place ids by keyframe, ``objects`` object ids by observation, None for none;
-    ``posed`` are the ordinals of keyframes with a pose. By keyframe, ``placed_offsets`` is the
-    event that placed it and ``placed_in`` the number of the place it joined; ``merged`` are the
-    merges as (offset, absorbed, survivor); by observation, ``fused_into`` is its object (-1 for
-    none) and ``observation_offsets`` its event. ``seconds`` is the time of the fold.
+    ``posed`` are the ordinals of keyframes with a pose. By keyframe, ``keyframe_offsets`` is its
+    event, ``placed_offsets`` the event that placed it and ``placed_in`` the number of the place it
+    joined; ``merged`` are the merges as (offset, absorbed, survivor). By observation,
+    ``fused_into`` is its first object (-1 for none), ``observation_offsets`` its event and
+    ``det_ids`` its det_id; ``fused_later`` are the merges of objects as (offset, absorbed,
+    survivor). ``names`` are the names of places by id. ``seconds`` is the time of the fold.
     """
 
     settings: Settings
@@ -75,11 +96,15 @@ class FoldResult:
     places: tuple[str | None, ...]
     objects: tuple[str | None, ...]
     posed: Offsets
+    keyframe_offsets: Offsets
     placed_offsets: Offsets
     placed_in: Offsets
     merged: tuple[tuple[int, int, int], ...]
     fused_into: Offsets
     observation_offsets: Offsets
+    det_ids: tuple[DetId, ...]
+    fused_later: tuple[tuple[int, int, int], ...]
+    names: dict[str, str]
     scores: dict[str, dict[str, Any]] | None
     """``places`` and ``objects`` against the truth (`projections.evaluate.scores`)."""
     seconds: float
@@ -91,6 +116,10 @@ def fold_result(view: MapView, history: History, truth: Truth | None, seconds: f
     """The result of a fold that took ``seconds``."""
     numbers = _place_numbers(history.places)
     fused = array("q", (-1 if o.object is None else o.object for o in view.observations))
+    founded = array("q", fused)  # its object before any merge of objects
+    for each in history.objects:
+        for seen in each.sightings:
+            founded[seen.observation] = each.found.object
     offsets = history.keyframe_offsets
     return FoldResult(
         settings=view.settings,
@@ -100,6 +129,7 @@ def fold_result(view: MapView, history: History, truth: Truth | None, seconds: f
         places=tuple(view.place_id(keyframe.place) for keyframe in view.keyframes),
         objects=tuple(None if n < 0 else view.all_objects[n].object_id for n in fused),
         posed=array("q", (k.ordinal for k in view.keyframes if k.pose is not None)),
+        keyframe_offsets=offsets,
         placed_offsets=history.placed_offsets,
         placed_in=array("q", (-1 if p < 0 else numbers[p] for p in history.placed_in)),
         merged=tuple(
@@ -107,8 +137,13 @@ def fold_result(view: MapView, history: History, truth: Truth | None, seconds: f
             for merge in history.merges
             for place in merge.absorbed
         ),
-        fused_into=fused,
+        fused_into=founded,
         observation_offsets=array("q", (offsets[o.keyframe] for o in view.observations)),
+        det_ids=tuple(o.det_id for o in view.observations),
+        fused_later=tuple(
+            (merge.offset, merge.absorbed, merge.survivor) for merge in history.object_merges
+        ),
+        names={p.place_id: p.name for p in view.places.values() if p.name is not None},
         scores=None if truth is None else _scores(view, truth),
         seconds=seconds,
     )
@@ -134,7 +169,7 @@ def _place_numbers(places: Sequence[PlaceHistory]) -> list[int]:
 
 def fold_all(
     log: Path,
-    settings: Sequence[Settings],
+    rules: Sequence[Rules],
     end: Offset,
     *,
     truth: Truth | None = None,
@@ -142,30 +177,30 @@ def fold_all(
     progress: Progress | None = None,
     keep_views: bool = False,
 ) -> list[FoldResult]:
-    """The results of the first ``end`` events under each of ``settings``, in their order.
+    """The results of the first ``end`` events under each of ``rules``, in their order.
 
     With ``keep_views`` each has its map too, without embeddings. Raises FoldError at an event that
     cannot be folded.
     """
-    workers = min(processes or _processors(), len(settings))
-    if workers <= 1 or (processes is None and end * len(settings) < MIN_PARALLEL_EVENTS):
-        return fold_in_this_process(log, settings, end, truth, progress, keep_views=keep_views)
-    shares = [list(settings[index::workers]) for index in range(workers)]
+    workers = min(processes or _processors(), len(rules))
+    if workers <= 1 or (processes is None and end * len(rules) < MIN_PARALLEL_EVENTS):
+        return fold_in_this_process(log, rules, end, truth, progress, keep_views=keep_views)
+    shares = [list(rules[index::workers]) for index in range(workers)]
     results = _in_processes(log, shares, end, truth, progress, keep_views=keep_views)
-    return [results[index % workers][index // workers] for index in range(len(settings))]
+    return [results[index % workers][index // workers] for index in range(len(rules))]
 
 
 def fold_in_this_process(
     log: Path,
-    settings: Sequence[Settings],
+    rules: Sequence[Rules],
     end: Offset,
     truth: Truth | None = None,
     progress: Progress | None = None,
     *,
     keep_views: bool = False,
 ) -> list[FoldResult]:
-    """As `fold_all`, in this process: one pass over the log for all of ``settings``."""
-    folds = [_Fold(each) for each in settings]
+    """As `fold_all`, in this process: one pass over the log for all of ``rules``."""
+    folds = [_Fold(each) for each in rules]
     with LogReader(log) as reader:
         events = reader.read(FIRST_OFFSET, end)
         with gc_paused():
@@ -177,18 +212,20 @@ def fold_in_this_process(
 
 
 class _Fold:
-    """The fold under one setting, and the time it took."""
+    """The fold under some rules, and the time it took."""
 
-    def __init__(self, settings: Settings) -> None:
-        self.map = SemanticMap(settings)
-        self.view = MapView(settings, keep_embeddings=False)
-        self.history = History(settings)
+    def __init__(self, rules: Rules) -> None:
+        settings, corrections = rules.settings, rules.corrections
+        self.map = SemanticMap(settings, corrections=corrections)
+        self.view = MapView(settings, keep_embeddings=False, corrections=corrections)
+        self.history = History(settings, corrections)
         self.seconds = 0.0
+        self._needed = _PLACE_DELTAS | _OBJECT_DELTAS if corrections.same else _PLACE_DELTAS
 
     def fold(self, read: ParsedEvent) -> None:
         offset, deltas = read.offset, fold_parsed(read, self.map)
         self.view.apply_event(offset, deltas)
-        self.history.apply(offset, [delta for delta in deltas if type(delta) in _PLACE_DELTAS])
+        self.history.apply(offset, [delta for delta in deltas if type(delta) in self._needed])
 
     def result(self, truth: Truth | None, *, keep_view: bool) -> FoldResult:
         result = fold_result(self.view, self.history, truth, self.seconds)
@@ -207,7 +244,7 @@ def _fold_chunk(chunk: Sequence[Event], folds: Sequence[_Fold]) -> None:
 
 def _in_processes(
     log: Path,
-    shares: list[list[Settings]],
+    shares: list[list[Rules]],
     end: Offset,
     truth: Truth | None,
     progress: Progress | None,
@@ -254,7 +291,7 @@ def _start_worker(done: "Synchronized[int]") -> None:
 
 
 def _fold_share(
-    log: Path, settings: list[Settings], end: Offset, truth: Truth | None, keep_views: bool
+    log: Path, rules: list[Rules], end: Offset, truth: Truth | None, keep_views: bool
 ) -> list[FoldResult]:
     reported = 0
 
@@ -265,7 +302,7 @@ def _fold_share(
                 _done.value += folded - reported
         reported = folded
 
-    return fold_in_this_process(log, settings, end, truth, report, keep_views=keep_views)
+    return fold_in_this_process(log, rules, end, truth, report, keep_views=keep_views)
 
 
 def _report_progress(

@@ -18,10 +18,10 @@ from projections.drawing.canvas import HALO, Bounds, Canvas, check_suffix
 from projections.drawing.overlays import draw_place_names
 from projections.model.view import MapView
 
+from .known import KnownHistory
 from .merges import chains_of, merge_reason
-from .names import keyframe_name, place_name
+from .names import keyframe_name, place_title
 from .records import Merge
-from .timeline import Timeline
 
 _PANEL_IN = 6.5
 _SMALL_PANEL_IN = 4.2
@@ -35,22 +35,23 @@ _AROUND_EPS = 4.0
 """The least margin around the core points of a merge, in ε."""
 
 
-def draw_merge(timeline: Timeline, merge: Merge, out: Path) -> None:
+def draw_merge(known: KnownHistory, merge: Merge, out: Path) -> None:
     """Draw the surroundings of a merge before and after it, side by side, to ``out``.
 
     Both show the bridging keyframe, its ε circle and the chain of core points. Raises MisuseError
     when ``out`` is not the name of a picture or cannot be written.
     """
-    before, after = timeline.at(merge.cause.offset), timeline.at(Offset(merge.cause.offset + 1))
-    bounds = _bounds_of_merge(timeline, merge)
+    before, after = known.at(merge.cause.offset), known.at(Offset(merge.cause.offset + 1))
+    bounds = _bounds_of_merge(known, merge)
     figure, panels = _panels(2, bounds, (2, _PANEL_IN), _HEADER_IN)
     for panel, view, when in zip(panels, (before, after), ("before", "after"), strict=True):
         _draw_map(panel, view)
-        _draw_chains(panel, timeline, merge)
-        names = [place_name(timeline.history, place) for place in merge.places]
+        _draw_chains(panel, known, merge)
+        at = view.next_offset
+        names = [place_title(known.history, place, at) for place in merge.places]
         shown = " and ".join(names) if when == "before" else names[0]
         panel.axes.set_title(f"--at {view.next_offset}, {when}: {shown}", fontsize=10)
-    history = timeline.history
+    history = known.history
     header = f"merge {merge.number}, {merge.cause.when}: {merge_reason(history, merge)}"
     figure.suptitle(f"{header}\n{_LEGEND}", fontsize=9.5)
     _save(figure, out)
@@ -101,11 +102,11 @@ def _draw_map(panel: Canvas, view: MapView) -> None:
     panel.axes.set_aspect("equal")
 
 
-def _draw_chains(panel: Canvas, timeline: Timeline, merge: Merge) -> None:
+def _draw_chains(panel: Canvas, known: KnownHistory, merge: Merge) -> None:
     """The bridge with its ε circle and neighbours, and the chains of core points."""
-    history, end = timeline.history, Offset(merge.cause.offset + 1)
+    history, end = known.history, Offset(merge.cause.offset + 1)
     x, y = map(float, history.neighbours.positions([merge.bridge])[0])
-    circle = Circle((x, y), timeline.settings.eps_m, fill=False, lw=1.2, ls="--", zorder=12)
+    circle = Circle((x, y), known.settings.eps_m, fill=False, lw=1.2, ls="--", zorder=12)
     circle.set_edgecolor(palette.BRIDGE)
     panel.axes.add_patch(circle)
     near = history.neighbours.positions(history.neighbours.of(merge.bridge, end))
@@ -122,14 +123,14 @@ def _draw_chains(panel: Canvas, timeline: Timeline, merge: Merge) -> None:
     )  # fmt: skip
 
 
-def _bounds_of_merge(timeline: Timeline, merge: Merge) -> Bounds:
+def _bounds_of_merge(known: KnownHistory, merge: Merge) -> Bounds:
     """A square around the bridge and the core points that join the places."""
-    history = timeline.history
+    history = known.history
     points = [merge.bridge, *(k for chain in chains_of(history, merge) for k in chain.points)]
     spots = history.neighbours.positions(points)
     (x0, y0), (x1, y1) = spots.min(axis=0), spots.max(axis=0)
     x, y = float(x0 + x1) / 2, float(y0 + y1) / 2
-    half = float(max(x1 - x0, y1 - y0)) / 2 + _AROUND_EPS * timeline.settings.eps_m
+    half = float(max(x1 - x0, y1 - y0)) / 2 + _AROUND_EPS * known.settings.eps_m
     return x - half, y - half, x + half, y + half
 
 

@@ -3,9 +3,9 @@
 Keyframes, places and objects are ordinals here, as in the deltas; ids are put in where text or JSON
 is made. No record is removed: an absorbed place keeps its history and the merge that ended it.
 
-Every record has a `Cause`: the event that made it happen. Today that is always a keyframe. An
-operator's command on ``mapfold/command`` will be one more kind with a text of its own; only this
-module looks at the kind, so explanations, diffs and the merge table need no change for it.
+Every record has a `Cause`: the event that made it happen, which is a keyframe. An entry of an
+explanation may have a command on ``mapfold/command`` as its cause: the command changes how earlier
+and later keyframes are folded, so its offset is where it was recorded, not where its effect shows.
 """
 
 from bisect import bisect_left
@@ -26,8 +26,10 @@ from projections.deltas import (
     ObjectMoved,
     ObjectOrdinal,
     ObjectSeen,
+    ObjectsMerged,
     PlaceChanged,
     PlaceFormed,
+    PlaceNamed,
     PlaceOrdinal,
 )
 
@@ -38,8 +40,8 @@ CauseKind = Literal["keyframe", "command"]
 class Cause:
     """The event at ``offset`` and what it was.
 
-    ``time_s`` is the robot's time in seconds, ``run_id`` and ``keyframe_id`` name the keyframe; all
-    three are None for a cause that is not a keyframe. ``what`` is then its text.
+    ``time_s`` is the robot's time in seconds, for a command that of its event. ``run_id`` and
+    ``keyframe_id`` name the keyframe; for a command both are None, and ``what`` is its text.
     """
 
     offset: Offset
@@ -111,8 +113,9 @@ class Merge:
     """A merge of places, with the objects and edges it moved.
 
     ``number`` counts merges from 1. Sizes are members before the merge; ``absorbed`` and
-    ``absorbed_sizes`` are parallel. ``objects`` are those that the event moved out of an absorbed
-    place. ``edges`` are all adjacency changes of the event that touch the places.
+    ``absorbed_sizes`` are parallel. ``joined`` are the absorbed that came by a ``join`` command.
+    ``objects`` are those that the event moved out of an absorbed place. ``edges`` are all adjacency
+    changes of the event that touch the places.
     """
 
     number: int
@@ -125,11 +128,48 @@ class Merge:
     links: tuple[Link, ...]
     objects: tuple[ObjectOrdinal, ...]
     edges: tuple[EdgeChange, ...]
+    joined: tuple[PlaceOrdinal, ...] = ()
 
     @property
     def places(self) -> tuple[PlaceOrdinal, ...]:
         """The survivor first, then the absorbed places."""
         return (self.survivor, *self.absorbed)
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """A merge of places ``a`` and ``b`` that a command refused; ``a`` was founded first.
+
+    ``link`` are the core points that would have joined them. ``apart`` are the keyframes that the
+    command names: one in each place.
+    """
+
+    cause: Cause
+    a: PlaceOrdinal
+    b: PlaceOrdinal
+    bridge: KeyframeOrdinal
+    link: Link
+    apart: tuple[KeyframeOrdinal, KeyframeOrdinal]
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectMerge:
+    """Two objects became one, by a command. ``values`` are the survivor's since."""
+
+    cause: Cause
+    values: ObjectsMerged
+
+    @property
+    def offset(self) -> Offset:
+        return self.cause.offset
+
+    @property
+    def survivor(self) -> ObjectOrdinal:
+        return self.values.survivor
+
+    @property
+    def absorbed(self) -> ObjectOrdinal:
+        return self.values.absorbed
 
 
 @dataclass(slots=True)
@@ -141,6 +181,7 @@ class PlaceHistory:
     joined: list[KeyframePlaced] = field(default_factory=list)
     """Keyframes that joined it, without those of absorbed places."""
     changes: list[PlaceChanged] = field(default_factory=list)
+    names: list[PlaceNamed] = field(default_factory=list)
     merges: list[Merge] = field(default_factory=list)
     """Merges it survived."""
     absorbed_by: Merge | None = None
@@ -160,6 +201,11 @@ class PlaceHistory:
         """Its size and sums after the events below ``end``."""
         return last_before(self.changes, end)
 
+    def name(self, end: Offset) -> str | None:
+        """What it is called after the events below ``end``; None without a name."""
+        named = last_before(self.names, end)
+        return None if named is None else named.name
+
 
 @dataclass(slots=True)
 class ObjectHistory:
@@ -169,6 +215,10 @@ class ObjectHistory:
     cause: Cause
     sightings: list[ObjectSeen] = field(default_factory=list)
     moves: list[ObjectMoved] = field(default_factory=list)
+    merges: list[ObjectMerge] = field(default_factory=list)
+    """Merges it survived."""
+    absorbed_by: ObjectMerge | None = None
+    """The merge that ended it."""
 
     @property
     def object_id(self) -> str:
@@ -178,6 +228,19 @@ class ObjectHistory:
         """The place it is located in after the events below ``end``."""
         moved = last_before(self.moves, end)
         return None if moved is None else moved.place
+
+    def stands(self, end: Offset) -> bool:
+        """Whether it is found and not absorbed after the events below ``end``."""
+        return self.found.offset < end and (
+            self.absorbed_by is None or self.absorbed_by.offset >= end
+        )
+
+    def values(self, end: Offset) -> ObjectSeen | ObjectsMerged | None:
+        """Its count, sums and times after the events below ``end``."""
+        seen, merged = last_before(self.sightings, end), last_before(self.merges, end)
+        if seen is None or merged is None or seen.obs_count > merged.values.obs_count:
+            return seen
+        return merged.values
 
 
 class _HasOffset(Protocol):

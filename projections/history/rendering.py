@@ -1,4 +1,4 @@
-"""Text output of `mapfold diff`, `merges`, `bisect`, `why` and `whatif`."""
+"""Text output of `mapfold diff`, `merges`, `bisect` and `why`."""
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -6,16 +6,15 @@ from dataclasses import dataclass
 from eventsrc.envelope import Offset
 from eventsrc.text import counted
 from projections.deltas import PlaceOrdinal
-from projections.model.partitions import Regrouping
+from projections.model.command_text import command_title
 
 from .bisect import Search, Turn
 from .diff import Difference, ObjectRow, PlaceRow, object_shift_m, place_shift_m
 from .explanation import Explanation
 from .history import History
-from .merges import merge_reason
-from .names import keyframe_name, place_name
-from .records import EdgeChange, Merge
-from .whatif import Alternative, WhatIf
+from .merges import merge_reason, refuser
+from .names import keyframe_name, place_name, place_title
+from .records import EdgeChange, Merge, ObjectMerge, Refusal
 
 
 def table(
@@ -58,6 +57,10 @@ def _difference_lines(diff: Difference, most: int | None) -> Iterator[str]:
         yield f"the same map at {diff.start:,} and {diff.end:,}: digest {first[:16]}"
         return
     yield f"from {diff.start:,} to {diff.end:,}: digest {first[:16]} → {second[:16]}"
+    if diff.commands:
+        yield f"commands   {len(diff.commands):,} that one of the maps does not know"
+        lines = [f"{c.offset:,}  {command_title(c.command)}" for c in diff.commands]
+        yield from (f"  {line}" for line in shortened(lines, most, _HINT))
     yield f"keyframes  {_keyframes(diff)}"
     for title, summary, groups in (_places(diff), _objects(diff), _edges(diff)):
         yield f"{title:<11}{summary}"
@@ -91,7 +94,7 @@ def _places(diff: Difference) -> tuple[str, str, list[list[str]]]:
     ]
     groups = [
         [f"+ {_place_row_text(row)}" for row in found.added],
-        [f"- {row.place_id}{_into(diff, row)}" for row in found.removed],
+        [f"- {_title(row)}{_into(diff, row)}" for row in found.removed],
         [f"~ {_place_change(before, after)}" for before, after in found.changed],
     ]
     return "places", _counts_text(parts), groups
@@ -103,7 +106,11 @@ def _size(row: PlaceRow) -> str:
 
 def _place_row_text(row: PlaceRow) -> str:
     x, y = row.centroid_x, row.centroid_y
-    return f"{row.place_id}: {_size(row)} around ({x:.2f}, {y:.2f})"
+    return f"{_title(row)}: {_size(row)} around ({x:.2f}, {y:.2f})"
+
+
+def _title(row: PlaceRow) -> str:
+    return row.place_id if row.name is None else f'{row.place_id} "{row.name}"'
 
 
 def _into(diff: Difference, row: PlaceRow) -> str:
@@ -116,7 +123,16 @@ def _into(diff: Difference, row: PlaceRow) -> str:
 def _place_change(before: PlaceRow, after: PlaceRow) -> str:
     moved = place_shift_m(before, after)
     shift = f", centre moved {moved:.2f} m" if moved >= _MOVED_M else ""
-    return f"{after.place_id}: {before.keyframe_count:,} → {_size(after)}{shift}"
+    size = f"{before.keyframe_count:,} → {_size(after)}{shift}"
+    if before.name == after.name:
+        return f"{_title(after)}: {size}"
+    named = f"{_quoted(before.name)} → {_quoted(after.name)}"
+    unchanged = before.keyframe_count == after.keyframe_count and not shift
+    return f"{after.place_id}: {named if unchanged else f'{named}, {size}'}"
+
+
+def _quoted(name: str | None) -> str:
+    return "no name" if name is None else f'"{name}"'
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,6 +210,8 @@ _MERGES_HEADER = (
     "objects",
     "edges",
 )
+_REFUSALS_HEADER = ("offset", "time", "bridge", "places", "distance", "refused by")
+_OBJECTS_HEADER = ("offset", "time", "keyframe", "survivor", "absorbed", "class")
 MOST_THINGS = 12
 """Objects and edges of one merge that the text lists."""
 
@@ -207,16 +225,55 @@ def merges_text(history: History, merges: Sequence[Merge], end: Offset) -> str:
     return table(_MERGES_HEADER, rows, right=("#", "offset", "objects", "edges"))
 
 
+def refusals_text(history: History, refusals: Sequence[Refusal]) -> str:
+    """The table of refused merges, or that there are none."""
+    if not refusals:
+        return "no merge was refused\n"
+    rows = [
+        (
+            f"{refusal.cause.offset:,}",
+            refusal.cause.when,
+            keyframe_name(history, refusal.bridge),
+            ", ".join(
+                place_title(history, place, refusal.cause.offset)
+                for place in (refusal.a, refusal.b)
+            ),
+            f"{refusal.link.distance_um / 1e6:.3f} m",
+            refuser(history, refusal),
+        )
+        for refusal in refusals
+    ]
+    return table(_REFUSALS_HEADER, rows, right=("offset", "distance"))
+
+
+def object_merges_text(history: History, merges: Sequence[ObjectMerge]) -> str:
+    """The table of merges of objects, or that there are none."""
+    if not merges:
+        return "no merges of objects\n"
+    rows = [
+        (
+            f"{merge.cause.offset:,}",
+            merge.cause.when,
+            merge.cause.name,
+            history.objects[merge.survivor].object_id,
+            history.objects[merge.absorbed].object_id,
+            history.objects[merge.survivor].found.class_name,
+        )
+        for merge in merges
+    ]
+    return table(_OBJECTS_HEADER, rows, right=("offset",))
+
+
 def merge_text(history: History, merge: Merge) -> str:
     """One merge: its reason, its places, and the objects and edges it moved."""
     cause, after = merge.cause, merge.cause.offset + 1
     lines = [
         f"merge {merge.number} at offset {cause.offset:,} ({cause.when}), shows from --at {after}",
         f"because   {merge_reason(history, merge)}",
-        f"survivor  {_place(history, merge.survivor, merge.survivor_size)}",
+        f"survivor  {_place(history, merge, merge.survivor, merge.survivor_size)}",
     ]
     for place, size in zip(merge.absorbed, merge.absorbed_sizes, strict=True):
-        lines.append(f"absorbed  {_place(history, place, size)}")
+        lines.append(f"absorbed  {_place(history, merge, place, size)}")
     objects = [history.objects[number] for number in merge.objects]
     named = [f"object    {o.object_id} ({o.found.class_name})" for o in objects]
     lines += shortened(named, MOST_THINGS, "--json lists all")
@@ -227,22 +284,28 @@ def merge_text(history: History, merge: Merge) -> str:
 
 
 def merge_row(history: History, merge: Merge) -> tuple[str, ...]:
-    """One row of the table of `merges_text`."""
+    """One row of the table of `merges_text`; names are those before the merge."""
+    before = merge.cause.offset
     return (
         str(merge.number),
         f"{merge.cause.offset:,}",
         merge.cause.when,
         keyframe_name(history, merge.bridge),
-        place_name(history, merge.survivor),
-        ", ".join(place_name(history, place) for place in merge.absorbed),
+        place_title(history, merge.survivor, before),
+        ", ".join(
+            place_title(history, place, before) + (" (joined)" if place in merge.joined else "")
+            for place in merge.absorbed
+        ),
         " + ".join(str(size) for size in (merge.survivor_size, *merge.absorbed_sizes)),
         str(len(merge.objects)),
         str(len(merge.edges)),
     )
 
 
-def _place(history: History, place: PlaceOrdinal, size: int) -> str:
-    return f"{place_name(history, place)}, {counted(size, 'keyframe')}"
+def _place(history: History, merge: Merge, place: PlaceOrdinal, size: int) -> str:
+    joined = ", joined by a command" if place in merge.joined else ""
+    title = place_title(history, place, merge.cause.offset)
+    return f"{title}, {counted(size, 'keyframe')}{joined}"
 
 
 def _edge_text(history: History, edge: EdgeChange) -> str:
@@ -308,80 +371,3 @@ def explanation_text(found: Explanation) -> str:
         time = entry.cause.when
         lines.append(f"  {entry.cause.offset:>{width},}  {time}  {entry.text}")
     return "".join(f"{line}\n" for line in lines)
-
-
-_HEADER = ("settings", "places", "noise", "merges", "objects", "places ARI", "objects ARI")
-_TRUTH_HEADER = ("rooms V", "instances V")
-_WHATIF_HINT = "--json lists all"
-
-
-def whatif_text(found: WhatIf, *, most: int | None) -> str:
-    """The table of settings, then up to ``most`` places per setting that split or joined."""
-    truth = found.base.result.scores is not None
-    header = (*_HEADER, *_TRUTH_HEADER) if truth else _HEADER
-    rows = [_row(each, truth=truth) for each in found.all]
-    lines = [line for each in found.alternatives for line in _differences(each, most)]
-    return table(header, rows, right=header[1:]) + "".join(f"{x}\n" for x in lines)
-
-
-def _row(each: Alternative, *, truth: bool) -> tuple[str, ...]:
-    counts = each.result.counts
-    row = (
-        each.name,
-        f"{counts['places']:,}",
-        f"{counts['noise']:,}",
-        f"{each.result.merges:,}",
-        f"{counts['objects']:,}",
-        f"{float(each.places.adjusted_rand):.3f}",
-        f"{float(each.objects.adjusted_rand):.3f}",
-    )
-    return (*row, *_scores(each)) if truth else row
-
-
-def _scores(each: Alternative) -> tuple[str, ...]:
-    scores = each.result.scores or {}
-    return tuple(
-        f"{scores[table]['v_measure']:.3f}" if scores[table][scored] else "-"
-        for table, scored in (("places", "keyframes"), ("objects", "observations"))
-    )
-
-
-def _differences(each: Alternative, most: int | None) -> Iterator[str]:
-    yield ""
-    yield f"{each.name}: {_first_differences(each)}"
-    splits = [f"  {_split(found)}" for found in each.places.splits]
-    joins = [f"  {_join(found)}" for found in each.places.joins]
-    yield from shortened([*splits, *joins], most, _WHATIF_HINT)
-
-
-def _first_differences(each: Alternative) -> str:
-    if each.places_part_at is None and each.objects_part_at is None:
-        return "the same map, event by event"
-    return "; ".join(
-        _first_difference(what, offset, same=compared.same)
-        for what, offset, compared in (
-            ("places", each.places_part_at, each.places),
-            ("objects", each.objects_part_at, each.objects),
-        )
-    )
-
-
-def _first_difference(what: str, offset: Offset | None, *, same: bool) -> str:
-    if offset is None:
-        return f"{what} are the same"
-    return f"{what} differ from offset {offset:,} on" + (
-        ", and are the same at the end" if same else ""
-    )
-
-
-def _split(found: Regrouping) -> str:
-    return f"{found.group} splits into {_pieces(found)}"
-
-
-def _join(found: Regrouping) -> str:
-    return f"{found.group} joins {_pieces(found)}"
-
-
-def _pieces(found: Regrouping) -> str:
-    shown = [f"{p.group or 'noise'} ({p.count:,})" for p in found.pieces]
-    return ", ".join(shown[:8]) + (f" and {len(shown) - 8} more" if len(shown) > 8 else "")

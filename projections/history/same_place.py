@@ -12,7 +12,7 @@ from projections.deltas import KeyframeOrdinal
 from .explanation import Entry, Explanation, position_text
 from .history import NEVER, History
 from .merges import merge_reason
-from .names import id_of_place, keyframe_name, place_name
+from .names import id_of_place, keyframe_name, place_name, place_title
 from .records import Merge
 
 
@@ -107,7 +107,7 @@ def _same_place_summary(
 ) -> str:
     if since is not None:
         cause = history.cause_at(since)
-        now = place_name(history, history.place_at(first, end))
+        now = place_title(history, history.place_at(first, end), end)
         return f"in one place since offset {since:,} ({cause.title}); it is {now} now"
     return "not in one place: " + "; ".join(
         _place_of_keyframe(history, k, end) for k in (first, second)
@@ -121,4 +121,5 @@ def _place_of_keyframe(history: History, keyframe: KeyframeOrdinal, end: Offset)
     if history.keyframes[keyframe].pose is None:
         return f"{name} has no pose"
     place = history.place_at(keyframe, end)
-    return f"{name} is noise" if place is None else f"{name} is in {place_name(history, place)}"
+    where = "noise" if place is None else f"in {place_title(history, place, end)}"
+    return f"{name} is {where}"

@@ -1,7 +1,9 @@
-"""The maps of one log under one setting at every offset, and why they are as they are.
+"""The maps of one log at every offset, and why they are as they are.
 
-A timeline folds its log once, at the first question, and keeps the history; after that every
-question is a look-up. An event at offset o, and a merge it causes, shows in ``at(o + 1)``.
+**The map at W is the fold of the events before W under the commands recorded before V**, V being
+``known_at``: W itself unless asked otherwise, and for a question about a span its end. A timeline
+folds its log once for each knowledge that it is asked under; without commands in the log that is
+once in all.
 """
 
 from collections.abc import Callable, Iterator
@@ -11,53 +13,52 @@ from typing import TypeAlias
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
 from eventsrc.text import counted
+from projections.corrections import Corrections, RecordedCommand, compile_corrections
 from projections.errors import LogPointError
-from projections.model.digest import map_digest
-from projections.model.fold import READ_AHEAD, FoldedEvent, fold_events, fold_log_cached, gc_paused
-from projections.model.snapshot_cache import SnapshotCache
+from projections.model.fold import FoldedEvent
+from projections.model.log_commands import read_commands
 from projections.model.view import MapView
-from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 
-from .bisect import CountIndex, HistoryFacts, Search, Searcher
+from .bisect import HistoryFacts, Search
 from .conditions import Expression
-from .diff import Difference, difference_of, rows_of
-from .explanation import Explanation, explain_object, explain_place
-from .history import History, view_at
-from .names import NoSuchThing, find_keyframe, find_object, find_place, place_name
+from .diff import Difference, difference_of
+from .explanation import Explanation
+from .history import History
+from .known import KnownHistory, Progress
+from .names import place_name
 from .records import Cause, Merge
-from .same_place import explain_same_place
 
-Progress: TypeAlias = Callable[[int, int], None]
-"""Called with (events folded, events in all) from time to time."""
+SettingsChoice: TypeAlias = Callable[[Corrections], Settings]
+"""The settings to fold with under some corrections, which may hold the log's own."""
 
-_PROGRESS_EVERY = 500
+_MOST_HISTORIES = 4
+"""Histories that are kept; each may take as much memory as the map."""
 
 
 class Timeline:
     """A context manager over a log. An ``end`` means the map after that many events.
 
-    ``progress`` is called while events are folded, ``note`` with a line about each snapshot that
-    could not be used.
+    ``settings`` are those of every fold, or a function of what is known; by default those that the
+    log names. ``progress`` is called while events are folded, ``note`` with a line about each
+    snapshot that could not be used.
     """
 
     def __init__(
         self,
         log: Path,
-        settings: Settings | None = None,
+        settings: Settings | SettingsChoice | None = None,
         *,
         progress: Progress | None = None,
         note: Callable[[str], None] = lambda _: None,
     ) -> None:
-        self.settings = settings or Settings()
+        self._settings = settings
         self.reader = LogReader(log)
         self._progress = progress
         self._note = note
-        self._snapshot_tried = False
-        self._map = SemanticMap(self.settings)
-        self._latest = MapView(self.settings, keep_embeddings=False)
-        self._history = History(self.settings)
-        self._index: CountIndex | None = None
+        self._read: list[RecordedCommand] | None = None
+        self._compiled: dict[int, Corrections] = {}
+        self._histories: dict[tuple[str, tuple[Offset, ...]], KnownHistory] = {}
 
     def __enter__(self) -> "Timeline":
         return self
@@ -72,84 +73,102 @@ class Timeline:
 
     def refresh(self) -> Offset:
         """Include events recorded since; returns the new `end`."""
+        self._read = None
+        self._compiled.clear()
         return self.reader.refresh()
+
+    def commands(
+        self, start: Offset = FIRST_OFFSET, end: Offset | None = None
+    ) -> list[RecordedCommand]:
+        """The commands recorded from ``start`` to before ``end``, undone ones too."""
+        if self._read is None:
+            self._read = read_commands(self.reader)
+        last = self.end if end is None else end
+        return [recorded for recorded in self._read if start <= recorded.offset < last]
+
+    def corrections(self, known_at: Offset | None = None) -> Corrections:
+        """What the commands before ``known_at`` compile to; all of them for None."""
+        commands = self.commands(end=self._checked(known_at))
+        if len(commands) not in self._compiled:
+            self._compiled[len(commands)] = compile_corrections(commands)
+        return self._compiled[len(commands)]
+
+    def knowing(self, known_at: Offset | None = None) -> KnownHistory:
+        """The history under the commands before ``known_at``, all of them for None.
+
+        The same commands in force give the same history.
+        """
+        corrections = self.corrections(known_at)
+        settings = self._settings_under(corrections)
+        # By the commands in force, not by what they compile to: `why` names every one.
+        key = settings.fingerprint(), tuple(command.offset for command in corrections.in_force)
+        found = self._histories.pop(key, None) or KnownHistory(
+            self.reader, settings, corrections, progress=self._progress, note=self._note
+        )
+        self._histories[key] = found  # the last one asked is the last one to go
+        for old in list(self._histories)[:-_MOST_HISTORIES]:
+            del self._histories[old]
+        return found
+
+    @property
+    def settings(self) -> Settings:
+        """The settings under all that is known."""
+        return self._settings_under(self.corrections())
 
     @property
     def history(self) -> History:
-        """The history up to `end`; folds new events first. Raises FoldError at a bad event."""
-        if self._history.next_offset < self.end:
-            self._index = None
-            with gc_paused():
-                self._fold_to(self.end)
-        return self._history
+        """The history up to `end` under all that is known."""
+        return self.knowing().history
 
-    def at(self, end: Offset | None = None) -> MapView:
-        """The map after the first ``end`` events, all of them for None; the caller may change it.
-
-        Its observations carry no embeddings, only their checksums. The first call folds from the
-        nearest snapshot beside the log, if there is one; a later call folds the history, from then
-        on it is a look-up.
-        """
-        wanted = self._end(end)
-        if self._history.next_offset < wanted and not self._snapshot_tried:
-            self._snapshot_tried = True
-            if (view := self._from_snapshot(wanted)) is not None:
-                return view
-        history = self.history
-        with gc_paused():
-            return view_at(history, self._latest, wanted, self.settings)
+    def at(self, end: Offset | None = None, *, known_at: Offset | None = None) -> MapView:
+        """The map after the first ``end`` events, all of them for None; see `KnownHistory.at`."""
+        return self._known(end, known_at).at(end)
 
     def deltas(
-        self, start: Offset = FIRST_OFFSET, end: Offset | None = None
+        self,
+        start: Offset = FIRST_OFFSET,
+        end: Offset | None = None,
+        *,
+        known_at: Offset | None = None,
     ) -> Iterator[FoldedEvent]:
-        """The deltas of each event from ``start`` to before ``end``, by a separate fold from the
-        nearest snapshot."""
-        found = self._snapshots().latest(self._end(start))
-        semantic_map = SemanticMap(self.settings) if found is None else found[0]
-        events = self.reader.read(semantic_map.next_offset, self._end(end))
-        folded = fold_events(events, semantic_map, ahead=READ_AHEAD)
-        return (event for event in folded if event.offset >= start)
+        """The deltas of each event from ``start`` to before ``end``."""
+        return self._known(end, known_at).deltas(start, end)
 
-    def merges(self, end: Offset | None = None) -> list[Merge]:
+    def merges(self, end: Offset | None = None, *, known_at: Offset | None = None) -> list[Merge]:
         """Every merge of places by the first ``end`` events, in order."""
-        before = self._end(end)
-        return [merge for merge in self.history.merges if merge.cause.offset < before]
+        return self._known(end, known_at).merges(end)
 
-    def why(self, thing: str, end: Offset | None = None) -> Explanation:
+    def why(
+        self, thing: str, end: Offset | None = None, *, known_at: Offset | None = None
+    ) -> Explanation:
         """What happened to a place or an object; raises NoSuchThing with the nearest names."""
-        history = self.history
-        if thing in history.object_ordinals:
-            found = find_object(history, thing)
-            det_ids = [self._latest.observations[s.observation].det_id for s in found.sightings]
-            return explain_object(history, det_ids, found, self._end(end))
-        if thing not in history.place_ordinals and thing.startswith("obj-"):
-            raise NoSuchThing("object", thing, history.object_ordinals)
-        return explain_place(history, find_place(history, thing), self._end(end))
+        return self._known(end, known_at).why(thing, end)
 
-    def why_same(self, first: str, second: str, end: Offset | None = None) -> Explanation:
+    def why_same(
+        self,
+        first: str,
+        second: str,
+        end: Offset | None = None,
+        *,
+        known_at: Offset | None = None,
+    ) -> Explanation:
         """Since when, and by which merges, two keyframes (``run:keyframe``) are in one place."""
-        a, b = (find_keyframe(self.history, text) for text in (first, second))
-        return explain_same_place(self.history, a, b, self._end(end))
+        return self._known(end, known_at).why_same(first, second, end)
 
-    def diff(self, start: Offset, end: Offset | None = None) -> Difference:
-        """The difference between the maps after ``start`` and after ``end`` events."""
-        last = self._end(end)
-        before, after = self.at(start), self.at(last)
-        return difference_of(
-            start,
-            last,
-            (rows_of(before), rows_of(after)),
-            (map_digest(before), map_digest(after)),
-            (before.counts(), after.counts()),
-            self._absorbed(start, last),
-        )
+    def diff(
+        self, start: Offset, end: Offset | None = None, *, known_at: Offset | None = None
+    ) -> Difference:
+        """The difference between the maps after ``start`` and after ``end`` events, each under the
+        commands before it, or both under those before ``known_at``."""
+        last = self._checked(end)
+        known = [at if known_at is None else known_at for at in (self._checked(start), last)]
+        before, after = self.knowing(known[0]).at(start), self.knowing(known[1]).at(last)
+        absorbed = self._absorbed(before, last, known[1]) if start <= last else {}
+        return difference_of(before, after, absorbed, self.commands(min(known), max(known)))
 
-    def facts(self, end: Offset | None = None) -> HistoryFacts:
+    def facts(self, end: Offset | None = None, *, known_at: Offset | None = None) -> HistoryFacts:
         """The map after ``end`` events, for evaluating conditions."""
-        history = self.history
-        if self._index is None:
-            self._index = CountIndex(history)
-        return HistoryFacts(history, self._index, self._end(end))
+        return self._known(end, known_at).facts(end)
 
     def bisect(
         self,
@@ -158,19 +177,26 @@ class Timeline:
         end: Offset | None = None,
         *,
         scan: bool = False,
+        known_at: Offset | None = None,
     ) -> Search:
         """The first event from ``start`` on that made a condition true; with ``scan``, all turns.
 
         Raises ExpressionError for a text that cannot be read or names what is not in the log.
         """
-        asked = Expression(expression) if isinstance(expression, str) else expression
-        facts = self.facts(end)
-        if self._end(start) > facts.end:
-            raise LogPointError(f"from {start} to {facts.end} nothing happens; swap them")
-        self._check_names(asked, facts)
-        return Searcher(asked, facts, self.history.cause_at).search(start, facts.end, scan=scan)
+        return self._known(end, known_at).bisect(expression, start, end, scan=scan)
 
-    def _end(self, end: Offset | None) -> Offset:
+    def _known(self, end: Offset | None, known_at: Offset | None) -> KnownHistory:
+        return self.knowing(self._checked(end) if known_at is None else known_at)
+
+    def _settings_under(self, corrections: Corrections) -> Settings:
+        if self._settings is None:
+            return corrections.settings or Settings()
+        return (
+            self._settings if isinstance(self._settings, Settings) else self._settings(corrections)
+        )
+
+    def _checked(self, end: Offset | None) -> Offset:
+        """``end``, the end of the log for None. Raises LogPointError for one beyond the log."""
         if end is None:
             return self.end
         if not 0 <= end <= self.end:
@@ -180,39 +206,19 @@ class Timeline:
             )
         return end
 
-    def _fold_to(self, end: Offset) -> None:
-        events = self.reader.read(self._history.next_offset, end)
-        for folded in fold_events(events, self._map, ahead=READ_AHEAD):
-            self._latest.apply_event(folded.offset, folded.deltas)
-            self._history.apply(folded.offset, folded.deltas)
-            if self._progress and folded.offset % _PROGRESS_EVERY == 0:
-                self._progress(folded.offset, end)
-        if self._progress:
-            self._progress(end, end)
-
-    def _from_snapshot(self, end: Offset) -> MapView | None:
-        """The map at ``end`` from the nearest snapshot; None when there is none below."""
-        if not any(offset <= end for offset in self._snapshots().offsets()):
-            return None
-        return fold_log_cached(self.reader, self.settings, end, note=self._note)[1]
-
-    def _snapshots(self) -> SnapshotCache:
-        return SnapshotCache(self.reader.path, self.reader.log_id, self.settings, self._note)
-
-    def _check_names(self, expression: Expression, facts: HistoryFacts) -> None:
-        """Raises ExpressionError for a name that is not in the log: a condition on it would never
-        hold."""
-        for mention in expression.mentions():
-            names = facts.names(mention.kind)
-            if mention.text not in names:
-                error = NoSuchThing(mention.kind.value, mention.text, names)
-                raise expression.error_at(mention.column, str(error))
-
-    def _absorbed(self, start: Offset, end: Offset) -> dict[str, tuple[str, Cause]]:
-        history = self.history
+    def _absorbed(
+        self, before: MapView, end: Offset, known_at: Offset
+    ) -> dict[str, tuple[str, Cause]]:
+        """By id of a place of ``before`` the one that it is part of after ``end`` events, and the
+        cause. A command may have made that merge earlier than the map before, so all are looked
+        at; a place is the same in both if its founder is."""
+        history = self.knowing(known_at).history
+        founders = {p.place_id: before.keyframes[p.founder].offset for p in before.places.values()}
         return {
             place_name(history, place): (place_name(history, merge.survivor), merge.cause)
             for merge in history.merges
-            if start <= merge.cause.offset < end
+            if merge.cause.offset < end
             for place in merge.absorbed
+            if founders.get(place_name(history, place))
+            == history.keyframes[history.places[place].formed.founder].offset
         }

@@ -1,19 +1,23 @@
-"""The maps of one log under other settings, compared with the map under base settings."""
+"""The maps of one log under other settings or without a command, compared with the base's map."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from eventsrc.envelope import Offset
+from projections.corrections import Corrections, RecordedCommand, compile_corrections
 from projections.errors import SettingsError
 from projections.evaluate.truth import Truth
+from projections.model.command_text import command_document, command_name
 from projections.model.partitions import PartitionComparison, Regrouping, compare_partitions
 from projections.settings import Settings
 
-from .parallel import FoldResult, fold_all
-from .timeline import Progress
+from .history import NEVER
+from .known import Progress
+from .names import NoSuchThing
+from .parallel import FoldResult, Rules, fold_all
 
 MOST_ALTERNATIVES = 200
 
@@ -39,6 +43,17 @@ def alternatives(
     if axes:
         found += [common.with_assignments(each, "--grid") for each in product(*axes)]
     return list(dict.fromkeys(found))
+
+
+def without_command(
+    commands: Sequence[RecordedCommand], command_id: str
+) -> tuple[RecordedCommand, Corrections]:
+    """The command of this id, and the corrections of the others. Raises NoSuchThing."""
+    for recorded in commands:
+        if recorded.command.command_id == command_id:
+            others = [each for each in commands if each is not recorded]
+            return recorded, compile_corrections(others)
+    raise NoSuchThing("command", command_id, [c.command.command_id for c in commands])
 
 
 def assigned(settings: Settings, text: str, option: str) -> Settings:
@@ -72,7 +87,8 @@ class Alternative:
     """One alternative compared with the base.
 
     ``places_part_at`` and ``objects_part_at`` are the offsets of the first event after which the
-    places or objects of the two folds differ, None for never.
+    places or objects of the two folds differ, None for never. ``renamed`` gives, by id, the names
+    of places in the base and here, where they differ. ``without`` is the command left out.
     """
 
     name: str
@@ -81,20 +97,26 @@ class Alternative:
     objects: PartitionComparison
     places_part_at: Offset | None
     objects_part_at: Offset | None
+    renamed: dict[str, tuple[str | None, str | None]]
+    without: RecordedCommand | None = None
 
     @property
     def same(self) -> bool:
-        """Whether the map is the base's."""
+        """Whether the places and objects are the base's."""
         return self.places.same and self.objects.same
 
 
 @dataclass(frozen=True, slots=True)
 class WhatIf:
-    """The base first, then its alternatives; all of the first ``end`` events of one log."""
+    """The base first, then its alternatives; all of the first ``end`` events of one log.
+
+    ``corrections`` is the fingerprint of the base's, empty without any.
+    """
 
     end: Offset
     base: Alternative
     alternatives: tuple[Alternative, ...]
+    corrections: str = ""
 
     @property
     def all(self) -> tuple[Alternative, ...]:
@@ -107,15 +129,46 @@ class WhatIf:
         return {
             "events": self.end,
             "settings": base.model_dump(),
+            **({"corrections": self.corrections} if self.corrections else {}),
             "base": _document(self.base, base),
             "alternatives": [_document(each, base) for each in self.alternatives],
         }
 
 
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One alternative to try: its name and rules, and the command that it leaves out."""
+
+    name: str
+    rules: Rules
+    without: RecordedCommand | None = None
+
+
+def setting_trials(base: Rules, others: Sequence[Settings]) -> list[Trial]:
+    """A trial for each of other settings, under the base's corrections."""
+    return [
+        Trial(settings_name(base.settings, each), Rules(each, base.corrections)) for each in others
+    ]
+
+
+def command_trials(
+    commands: Sequence[RecordedCommand],
+    command_ids: Sequence[str],
+    settings: Callable[[Corrections], Settings],
+) -> list[Trial]:
+    """A trial for each of some commands that is left out. Raises NoSuchThing."""
+    trials = []
+    for command_id in dict.fromkeys(command_ids):
+        recorded, corrections = without_command(commands, command_id)
+        rules = Rules(settings(corrections), corrections)
+        trials.append(Trial(f"without {command_name(recorded.command)}", rules, recorded))
+    return trials
+
+
 def what_if(
     log: Path,
-    base: Settings,
-    others: Sequence[Settings],
+    base: Rules | Settings,
+    others: Sequence[Trial | Settings],
     end: Offset,
     *,
     truth: Truth | None = None,
@@ -125,54 +178,95 @@ def what_if(
 ) -> WhatIf:
     """Fold the first ``end`` events of a log under ``base`` and ``others``, and compare.
 
-    Equal settings are folded once. With ``keep_views`` each result has its map too.
+    Equal rules are folded once. With ``keep_views`` each result has its map too.
     """
-    wanted = list(dict.fromkeys((base, *others)))
+    rules = base if isinstance(base, Rules) else Rules(base)
+    trials = [
+        setting_trials(rules, [each])[0] if isinstance(each, Settings) else each for each in others
+    ]
+    wanted = {each.key: each for each in (rules, *(trial.rules for trial in trials))}
     folded = fold_all(
-        log, wanted, end,
+        log, list(wanted.values()), end,
         truth=truth, processes=processes, progress=progress, keep_views=keep_views,
     )  # fmt: skip
     results = dict(zip(wanted, folded, strict=True))
-    first = results[base]
-    changed = base != Settings()
-    base_name = f"base: {settings_name(Settings(), base) if changed else 'defaults'}"
+    first = results[rules.key]
+    changed = rules.settings != Settings()
+    name = settings_name(Settings(), rules.settings) if changed else "defaults"
     return WhatIf(
         end=end,
-        base=_compare(first, first, base_name),
-        alternatives=tuple(
-            _compare(first, results[each], settings_name(base, each)) for each in others
-        ),
+        base=_compare(first, first, Trial(f"base: {name}", rules)),
+        alternatives=tuple(_compare(first, results[trial.rules.key], trial) for trial in trials),
+        corrections=rules.corrections.fingerprint(),
     )
 
 
-def _compare(base: FoldResult, other: FoldResult, name: str) -> Alternative:
-    posed = base.posed
+def _compare(base: FoldResult, other: FoldResult, trial: Trial) -> Alternative:
     return Alternative(
-        name=name,
+        name=trial.name,
         result=other,
-        places=compare_partitions(
-            [base.places[k] for k in posed], [other.places[k] for k in posed]
+        places=compare_partitions(*_aligned(_posed_places(base), _posed_places(other))),
+        objects=compare_partitions(
+            *_aligned(*(_by_observation(each, each.objects) for each in (base, other)))
         ),
-        objects=compare_partitions(base.objects, other.objects),
         places_part_at=_places_part_at(base, other),
         objects_part_at=_objects_part_at(base, other),
+        renamed={
+            place: (base.names.get(place), other.names.get(place))
+            for place in sorted(base.names.keys() | other.names.keys())
+            if base.names.get(place) != other.names.get(place)
+        },
+        without=trial.without,
     )
+
+
+_K = TypeVar("_K", bound=Hashable)
+_V = TypeVar("_V")
+
+
+def _aligned(first: dict[_K, _V], second: dict[_K, _V]) -> tuple[list[_V | None], list[_V | None]]:
+    """The values of two folds by the same keys: those of the first, then those only in the second.
+    A thing that a fold leaves out has None there."""
+    keys = dict.fromkeys([*first, *second])
+    return [first.get(key) for key in keys], [second.get(key) for key in keys]
+
+
+def _posed_places(result: FoldResult) -> dict[int, str | None]:
+    """The place of each keyframe with a pose, by the keyframe's event."""
+    return {result.keyframe_offsets[k]: result.places[k] for k in result.posed}
+
+
+def _by_observation(result: FoldResult, values: Iterable[_V]) -> dict[tuple[int, str], _V]:
+    """Values of observations, by event and det_id."""
+    keys = zip(result.observation_offsets, result.det_ids, strict=True)
+    return dict(zip(keys, values, strict=True))
+
+
+_NOWHERE = (NEVER, -1)
+
+
+def _placings(result: FoldResult) -> dict[int, tuple[int, int]]:
+    """By a keyframe's event the event that placed it, and the number of the place."""
+    placings = zip(result.placed_offsets, result.placed_in, strict=True)
+    return dict(zip(result.keyframe_offsets, placings, strict=True))
 
 
 def _places_part_at(first: FoldResult, second: FoldResult) -> Offset | None:
     """The first event after which the places of two folds of one log differ; None for never."""
-    placings = zip(
-        first.placed_offsets, first.placed_in, second.placed_offsets, second.placed_in, strict=True
-    )
-    differ = [min(o1, o2) for o1, p1, o2, p2 in placings if (o1, p1) != (o2, p2)]
+    one, other = _placings(first), _placings(second)
+    pairs = [(one.get(k, _NOWHERE), other.get(k, _NOWHERE)) for k in one.keys() | other.keys()]
+    differ = [min(a[0], b[0]) for a, b in pairs if a != b]
     differ += [offset for offset, _, _ in set(first.merged) ^ set(second.merged)]
     return Offset(min(differ)) if differ else None
 
 
 def _objects_part_at(first: FoldResult, second: FoldResult) -> Offset | None:
     """The first event after which the objects of two folds of one log differ; None for never."""
-    pairs = zip(first.fused_into, second.fused_into, first.observation_offsets, strict=True)
-    return next((Offset(offset) for a, b, offset in pairs if a != b), None)
+    one, other = (_by_observation(each, each.fused_into) for each in (first, second))
+    keys = one.keys() | other.keys()
+    differ = [key[0] for key in keys if one.get(key, -1) != other.get(key, -1)]
+    differ += [offset for offset, _, _ in set(first.fused_later) ^ set(second.fused_later)]
+    return Offset(min(differ)) if differ else None
 
 
 def _document(each: Alternative, base: Settings) -> dict[str, Any]:
@@ -195,7 +289,16 @@ def _document(each: Alternative, base: Settings) -> dict[str, Any]:
         "objects_joined": len(each.objects.joins),
         "truth": result.scores,
         "fold_seconds": round(result.seconds, 3),
+        **({} if each.without is None else {"without": command_document(each.without)}),
+        **({"renamed": _renamed(each)} if each.renamed else {}),
     }
+
+
+def _renamed(each: Alternative) -> list[dict[str, str | None]]:
+    return [
+        {"place_id": place, "base": before, "name": after}
+        for place, (before, after) in each.renamed.items()
+    ]
 
 
 def _regrouping(found: Regrouping) -> dict[str, Any]:

@@ -2,15 +2,20 @@
 
 from typing import Any
 
+from eventsrc.envelope import Offset
 from eventsrc.text import counted
 from projections.deltas import PlaceOrdinal
 from projections.settings import Settings
 
+from .command_text import command_document
 from .view import MapView
 
 
-def state_document(view: MapView, digest: str) -> dict[str, Any]:
-    """The JSON document. Every list is ordered by ordinal."""
+def state_document(view: MapView, digest: str, known_at: Offset | None = None) -> dict[str, Any]:
+    """The JSON document. Every list is ordered by ordinal.
+
+    ``known_at`` is the point before which commands were known, by default the map's own.
+    """
     return {
         "offset": view.next_offset,
         "settings": view.settings.model_dump(),
@@ -23,6 +28,21 @@ def state_document(view: MapView, digest: str) -> dict[str, Any]:
             {"a": view.place_id(a), "b": view.place_id(b), "shared_transitions": transitions}
             for a, b, transitions in view.edges()
         ],
+        **_corrections(view, known_at),
+    }
+
+
+def _corrections(view: MapView, known_at: Offset | None) -> dict[str, Any]:
+    """The commands in force; nothing where there are none."""
+    corrections = view.corrections
+    if not corrections.in_force:
+        return {}
+    return {
+        "corrections": {
+            "known_at": view.next_offset if known_at is None else known_at,
+            "fingerprint": corrections.fingerprint(),
+            "commands": [command_document(recorded) for recorded in corrections.in_force],
+        }
     }
 
 
@@ -47,6 +67,7 @@ def _places(view: MapView) -> list[dict[str, Any]]:
             "centroid_x": p.centroid_x,
             "centroid_y": p.centroid_y,
             "keyframe_count": p.keyframe_count,
+            **({} if p.name is None else {"name": p.name}),
         }
         for p in view.places.values()
     ]
@@ -72,13 +93,16 @@ def _objects(view: MapView) -> list[dict[str, Any]]:
 _MAX_PLACES = 40
 
 
-def state_text(view: MapView, digest: str) -> str:
+def state_text(view: MapView, digest: str, known_at: Offset | None = None) -> str:
     """Counts, settings, digest and the first 40 places, for people; ends in a newline."""
     lines = [
         f"after {counted(view.next_offset, 'event')}: {_counts(view)}",
         f"settings {_settings(view.settings)}",
         f"digest   {digest}",
     ]
+    if in_force := view.corrections.in_force:
+        known = view.next_offset if known_at is None else known_at
+        lines.append(f"commands {len(in_force):,} in force, of those before {known:,}")
     lines += _place_lines(view)
     return "\n".join(lines) + "\n"
 
@@ -93,10 +117,16 @@ def _counts(view: MapView) -> str:
         "conflicts": "{} with other content ignored",
         "det_ids_reused": "{} left out for a det_id used before",
         "foreign_embeddings": "{} of another embedding space",
+        "forgotten": "{} forgotten",
+        "dropped": "{} dropped",
     }
-    things = {"det_ids_reused": "observation", "foreign_embeddings": "observation"}
+    things = {
+        "det_ids_reused": "observation",
+        "foreign_embeddings": "observation",
+        "dropped": "detection",
+    }
     for key, phrase in rare.items():
-        if counts[key]:
+        if counts.get(key):
             text += ", " + phrase.format(counted(counts[key], things.get(key, "keyframe")))
     return text
 
@@ -120,12 +150,16 @@ def _place_lines(view: MapView) -> list[str]:
     for record in view.objects.values():
         if record.place is not None:
             objects[record.place] += 1
+    shown = list(view.places.items())[:_MAX_PLACES]
     width = max(len(place.place_id) for place in view.places.values())
-    lines = [f"{'place':<{width}}  keyframes  objects  centroid (m)        next to"]
-    for ordinal, place in list(view.places.items())[:_MAX_PLACES]:
+    name_width = max((len(place.name) for _, place in shown if place.name is not None), default=0)
+    named = f"  {'name':<{max(name_width, 4)}}" if name_width else ""
+    lines = [f"{'place':<{width}}{named}  keyframes  objects  centroid (m)        next to"]
+    for ordinal, place in shown:
         centroid = f"({place.centroid_x:.2f}, {place.centroid_y:.2f})"
+        name = f"  {place.name or '':<{max(name_width, 4)}}" if name_width else ""
         lines.append(
-            f"{place.place_id:<{width}}  {place.keyframe_count:>9}  {objects[ordinal]:>7}  "
+            f"{place.place_id:<{width}}{name}  {place.keyframe_count:>9}  {objects[ordinal]:>7}  "
             f"{centroid:<18}  {', '.join(neighbours[ordinal])}".rstrip()
         )
     if len(view.places) > _MAX_PLACES:

@@ -43,7 +43,7 @@ def test_one_keyframe_merges_three_places(tmp_path: Path) -> None:
             ["1", "2", "9", "8", "7"],
         ]
         assert [(chain.joined, chain.absorbed) for chain in chains] == [(0, 1), (0, 2)]
-        draw_merge(opened, merge, tmp_path / "hub.png")
+        draw_merge(opened.knowing(), merge, tmp_path / "hub.png")
         assert (tmp_path / "hub.png").stat().st_size > 10_000
 
 
@@ -71,4 +71,4 @@ def test_the_bridging_keyframe_may_be_no_part_of_the_chain(tmp_path: Path) -> No
 
 def test_pictures_have_one_of_three_suffixes(tmp_path: Path) -> None:
     with drive(tmp_path, [*ARMS, (0, 0)]) as opened, pytest.raises(MisuseError, match="a picture"):
-        draw_merge(opened, opened.merges()[0], tmp_path / "hub.gif")
+        draw_merge(opened.knowing(), opened.merges()[0], tmp_path / "hub.gif")

@@ -1,0 +1,215 @@
+"""The commands that are about a place, an object or two keyframes, as entries of an explanation.
+
+A command names keyframes and det_ids. It is about a place if a keyframe that it names is in that
+place, and about an object if a detection that it names is one of the object's.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+from eventsrc.commands import (
+    Anchor,
+    CorrectPoses,
+    DifferentObjects,
+    Join,
+    KeepApart,
+    NamePlace,
+    SameObject,
+    UndoMerge,
+)
+from eventsrc.envelope import Offset
+from eventsrc.log import LogReader
+from eventsrc.text import counted
+from projections.corrections import Keyframe, RecordedCommand
+from projections.deltas import KeyframeOrdinal, PlaceOrdinal
+from projections.model.command_text import command_document, command_name, said
+
+from .explanation import Entry
+from .history import History
+from .merges import refusal_reason
+from .names import log_name, place_name
+from .records import Cause, PlaceHistory, Refusal
+
+_NS = 1e9
+
+
+class CommandTeller:
+    """Entries for recorded commands, with the times of their events."""
+
+    def __init__(self, reader: LogReader) -> None:
+        self._reader = reader
+        self._causes: dict[Offset, Cause] = {}
+
+    def cause(self, recorded: RecordedCommand) -> Cause:
+        """The event of a command; its time is read from the log, once."""
+        offset = recorded.offset
+        if offset not in self._causes:
+            (event,) = self._reader.read(offset, Offset(offset + 1))
+            name = command_name(recorded.command)
+            self._causes[offset] = Cause(offset, "command", event.stamp_ns / _NS, what=name)
+        return self._causes[offset]
+
+    def entry(self, recorded: RecordedCommand, text: str, **facts: Any) -> Entry:
+        """An entry whose text says what the command does, who gave it, and why."""
+        command = recorded.command
+        told = {"command": command_document(recorded), **facts}
+        return Entry(self.cause(recorded), command.kind, f"{text}, {said(command)}", told)
+
+
+def place_commands(
+    teller: CommandTeller, history: History, record: PlaceHistory, end: Offset
+) -> list[Entry]:
+    """Commands that named, kept apart, joined or moved something of a place, and the merges of it
+    that they refused, after the events below ``end``."""
+    place, moment = record.formed.place, _last_moment(record, end)
+    entries = [
+        teller.entry(recorded, text)
+        for recorded in history.corrections.in_force
+        for text in _place_texts(history, recorded, place, moment)
+    ]
+    refused = (r for r in history.refusals if r.cause.offset < end and place in (r.a, r.b))
+    return [*entries, *(_refusal_entry(history, refusal, place) for refusal in refused)]
+
+
+def _last_moment(record: PlaceHistory, end: Offset) -> Offset:
+    """The last point up to ``end`` at which a place stood."""
+    merge = record.absorbed_by
+    return end if merge is None else min(end, merge.cause.offset)
+
+
+def _place_texts(
+    history: History, recorded: RecordedCommand, place: PlaceOrdinal, end: Offset
+) -> Iterator[str]:
+    """What a command says about a place as it is after ``end`` events."""
+    command = recorded.command
+    match command:
+        case NamePlace() if _place_of(history, command.place, end) == place:
+            replaced = history.places[place].name(end) != command.name
+            yield f'named "{command.name}"' + (", replaced by a later name" if replaced else "")
+        case KeepApart() | UndoMerge():
+            own, others = _divided(history, command.places, place, end)
+            if own:
+                replaced = not _some_pair(own, others, history.corrections.apart)
+                yield f"kept apart from {_named(history, others, end)}" + (
+                    ", replaced by a later join" if replaced else ""
+                )
+        case Join():
+            own, others = _divided(history, command.places, place, end)
+            if own:
+                pair = " and ".join(f"{a.run_id}:{a.keyframe_id}" for a in command.places)
+                replaced = not _some_pair(own, [*own, *others], history.corrections.joined)
+                yield f"joined {pair}" + (", replaced by a later keep-apart" if replaced else "")
+        case CorrectPoses():
+            moved = _moved(history, command, place, end)
+            if moved:
+                yield f"corrected the poses of {counted(moved, 'keyframe')} of it"
+
+
+def object_commands(teller: CommandTeller, history: History, det_ids: Iterable[str]) -> list[Entry]:
+    """Commands that fuse or keep apart detections of an object."""
+    own = set(det_ids)
+    entries = []
+    for recorded in history.corrections.in_force:
+        command = recorded.command
+        if isinstance(command, SameObject | DifferentObjects) and own & set(command.det_ids):
+            word = "fused" if isinstance(command, SameObject) else "kept apart"
+            entries.append(teller.entry(recorded, f"{word} {' and '.join(command.det_ids)}"))
+    return entries
+
+
+def same_place_commands(
+    teller: CommandTeller,
+    history: History,
+    keyframes: tuple[KeyframeOrdinal, KeyframeOrdinal],
+    end: Offset,
+) -> list[Entry]:
+    """Commands that join the places of two keyframes or keep them apart, and the merges of the two
+    places that they refused, after the events below ``end``."""
+    first, second = (history.place_at(k, end) for k in keyframes)
+    asked = {log_name(history, k) for k in keyframes}
+    entries = []
+    for recorded in history.corrections.in_force:
+        command = recorded.command
+        if not isinstance(command, KeepApart | UndoMerge | Join):
+            continue
+        names = {_keyframe(anchor) for anchor in command.places}
+        places = {_place_of(history, anchor, end) for anchor in command.places} - {None}
+        if isinstance(command, Join):
+            if asked <= names or (first == second and places == {first}):
+                entries.append(teller.entry(recorded, "joins them"))
+        elif asked <= names or (first != second and {first, second} <= places):
+            entries.append(teller.entry(recorded, "keeps them apart"))
+    return entries + [
+        _refusal_entry(history, refusal, None)
+        for refusal in history.refusals
+        if refusal.cause.offset < end and {refusal.a, refusal.b} == {first, second}
+    ]
+
+
+def _refusal_entry(history: History, refusal: Refusal, place: PlaceOrdinal | None) -> Entry:
+    if place is None:
+        what = f"merge of {place_name(history, refusal.a)} and {place_name(history, refusal.b)}"
+    else:
+        other = refusal.b if place == refusal.a else refusal.a
+        what = f"merge with {place_name(history, other)}"
+    return Entry(
+        refusal.cause,
+        "refused",
+        f"{what} refused; {refusal_reason(history, refusal)}",
+        {"places": [place_name(history, p) for p in (refusal.a, refusal.b)]},
+    )
+
+
+def _keyframe(anchor: Anchor) -> Keyframe:
+    return Keyframe(anchor.run_id, anchor.keyframe_id)
+
+
+def _place_of(history: History, anchor: Anchor, end: Offset) -> PlaceOrdinal | None:
+    ordinal = history.keyframe_ordinals.get((anchor.run_id, anchor.keyframe_id))
+    return None if ordinal is None else history.place_at(ordinal, end)
+
+
+def _divided(
+    history: History, anchors: Sequence[Anchor], place: PlaceOrdinal, end: Offset
+) -> tuple[list[Anchor], list[Anchor]]:
+    """The anchors in a place, and the others."""
+    own = [anchor for anchor in anchors if _place_of(history, anchor, end) == place]
+    return own, [anchor for anchor in anchors if anchor not in own]
+
+
+def _some_pair(
+    own: Sequence[Anchor],
+    others: Sequence[Anchor],
+    pairs: tuple[tuple[Keyframe, Keyframe], ...],
+) -> bool:
+    """Whether a pair of an own anchor and another is among the pairs in force."""
+    first, second = ({_keyframe(anchor) for anchor in anchors} for anchors in (own, others))
+    return any((a in first and b in second) or (b in first and a in second) for a, b in pairs)
+
+
+def _named(history: History, anchors: Sequence[Anchor], end: Offset) -> str:
+    """The places of anchors, or the keyframes that are in none."""
+    named = (
+        f"{anchor.run_id}:{anchor.keyframe_id}"
+        if (place := _place_of(history, anchor, end)) is None
+        else place_name(history, place)
+        for anchor in anchors
+    )
+    return ", ".join(dict.fromkeys(named)) or "itself"
+
+
+def _moved(history: History, command: CorrectPoses, place: PlaceOrdinal, end: Offset) -> int:
+    """How many keyframes of a place have a pose that the command corrects."""
+    given = {pose.keyframe_id for pose in command.poses}
+    first, last = command.first, command.last
+    return sum(
+        k.run_id == command.run_id
+        and (
+            k.keyframe_id in given
+            if command.transform is None
+            else (first is None or k.keyframe_id >= first)
+            and (last is None or k.keyframe_id <= last)
+        )
+        and history.place_at(k.keyframe, end) == place
+        for k in history.keyframes
+    )

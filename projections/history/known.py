@@ -1,0 +1,230 @@
+"""The history of one log under one knowledge: the commands before a point, and the settings.
+
+It folds the log once, at the first question that needs the history, and keeps what happened; after
+that every question is a look-up. An event at offset o, and a merge it causes, shows in
+``at(o + 1)``. A command shows in every map of a history that knows it.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import TypeAlias, TypeVar
+
+from eventsrc.envelope import FIRST_OFFSET, DetId, Offset
+from eventsrc.log import LogReader
+from eventsrc.text import counted
+from projections.corrections import Corrections
+from projections.deltas import ObservationOrdinal
+from projections.errors import LogPointError
+from projections.model.fold import READ_AHEAD, FoldedEvent, fold_events, fold_log_cached, gc_paused
+from projections.model.snapshot_cache import SnapshotCache
+from projections.model.view import MapView
+from projections.reducers.semantic_map import SemanticMap
+from projections.settings import Settings
+
+from .bisect import CountIndex, HistoryFacts, Search, Searcher
+from .command_entries import (
+    CommandTeller,
+    object_commands,
+    place_commands,
+    same_place_commands,
+)
+from .conditions import Expression
+from .explanation import Explanation, explain_object, explain_place, with_entries
+from .history import History
+from .names import NoSuchThing, find_keyframe, find_object, find_place
+from .past_view import view_at
+from .records import Merge, ObjectMerge, Refusal
+from .same_place import explain_same_place
+
+Progress: TypeAlias = Callable[[int, int], None]
+"""Called with (events folded, events in all) from time to time."""
+
+_PROGRESS_EVERY = 500
+_Caused = TypeVar("_Caused", Merge, Refusal, ObjectMerge)
+
+
+class KnownHistory:
+    """What happened to the map, under ``corrections``; an ``end`` is a number of events.
+
+    ``progress`` is called while events are folded, ``note`` with a line about each snapshot that
+    could not be used.
+    """
+
+    def __init__(
+        self,
+        reader: LogReader,
+        settings: Settings,
+        corrections: Corrections,
+        *,
+        progress: Progress | None = None,
+        note: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self.reader = reader
+        self.settings = settings
+        self.corrections = corrections
+        self._progress = progress
+        self._note = note
+        self._snapshot_tried = False
+        self._map = SemanticMap(settings, corrections=corrections)
+        self._latest = MapView(settings, keep_embeddings=False, corrections=corrections)
+        self._history = History(settings, corrections)
+        self._index: CountIndex | None = None
+        self._teller = CommandTeller(reader)
+
+    @property
+    def end(self) -> Offset:
+        """The number of events in the log as of opening or the timeline's last refresh."""
+        return self.reader.next_offset
+
+    @property
+    def history(self) -> History:
+        """The history up to `end`; folds new events first. Raises FoldError at a bad event."""
+        if self._history.next_offset < self.end:
+            self._index = None
+            with gc_paused():
+                self._fold_to(self.end)
+        return self._history
+
+    def at(self, end: Offset | None = None) -> MapView:
+        """The map after the first ``end`` events, all of them for None; the caller may change it.
+
+        Its observations carry no embeddings, only their checksums. The first call folds from the
+        nearest snapshot beside the log, if there is one; a later call folds the history, from then
+        on it is a look-up.
+        """
+        wanted = self.checked(end)
+        if self._history.next_offset < wanted and not self._snapshot_tried:
+            self._snapshot_tried = True
+            if (view := self._from_snapshot(wanted)) is not None:
+                return view
+        history = self.history
+        with gc_paused():
+            return view_at(history, self._latest, wanted)
+
+    def deltas(
+        self, start: Offset = FIRST_OFFSET, end: Offset | None = None
+    ) -> Iterator[FoldedEvent]:
+        """The deltas of each event from ``start`` to before ``end``, by a separate fold from the
+        nearest snapshot."""
+        found = self._snapshots().latest(self.checked(start))
+        fresh = SemanticMap(self.settings, corrections=self.corrections)
+        semantic_map = fresh if found is None else found[0]
+        events = self.reader.read(semantic_map.next_offset, self.checked(end))
+        folded = fold_events(events, semantic_map, ahead=READ_AHEAD)
+        return (event for event in folded if event.offset >= start)
+
+    def merges(self, end: Offset | None = None) -> list[Merge]:
+        """Every merge of places by the first ``end`` events, in order."""
+        return _before(self.history.merges, self.checked(end))
+
+    def refusals(self, end: Offset | None = None) -> list[Refusal]:
+        """Every merge that a command refused in the first ``end`` events, in order."""
+        return _before(self.history.refusals, self.checked(end))
+
+    def object_merges(self, end: Offset | None = None) -> list[ObjectMerge]:
+        """Every merge of objects by the first ``end`` events, in order."""
+        return _before(self.history.object_merges, self.checked(end))
+
+    def why(self, thing: str, end: Offset | None = None) -> Explanation:
+        """What happened to a place or an object, and which commands are about it.
+
+        ``thing`` is an id, or the name of a place. Raises NoSuchThing with the nearest names.
+        """
+        history, last = self.history, self.checked(end)
+        if thing in history.object_ordinals:
+            explained = explain_object(history, self._det_id, find_object(history, thing), last)
+            told = object_commands(self._teller, history, explained.facts["det_ids"])
+            return with_entries(explained, told)
+        if thing not in history.place_ordinals and thing.startswith("obj-"):
+            raise NoSuchThing("object", thing, history.object_ordinals)
+        place = find_place(history, thing, last)
+        told = place_commands(self._teller, history, place, last)
+        return with_entries(explain_place(history, place, last), told)
+
+    def why_same(self, first: str, second: str, end: Offset | None = None) -> Explanation:
+        """Since when, and by which merges, two keyframes (``run:keyframe``) are in one place; which
+        commands join them or keep them apart."""
+        history, last = self.history, self.checked(end)
+        a, b = (find_keyframe(history, text) for text in (first, second))
+        told = same_place_commands(self._teller, history, (a, b), last)
+        return with_entries(explain_same_place(history, a, b, last), told)
+
+    def facts(self, end: Offset | None = None) -> HistoryFacts:
+        """The map after ``end`` events, for evaluating conditions."""
+        history = self.history
+        if self._index is None:
+            self._index = CountIndex(history)
+        return HistoryFacts(history, self._index, self.checked(end))
+
+    def bisect(
+        self,
+        expression: Expression | str,
+        start: Offset = FIRST_OFFSET,
+        end: Offset | None = None,
+        *,
+        scan: bool = False,
+    ) -> Search:
+        """The first event from ``start`` on that made a condition true; with ``scan``, all turns.
+
+        Raises ExpressionError for a text that cannot be read or names what is not in the log.
+        """
+        asked = Expression(expression) if isinstance(expression, str) else expression
+        facts = self.facts(end)
+        if self.checked(start) > facts.end:
+            raise LogPointError(f"from {start} to {facts.end} nothing happens; swap them")
+        _check_names(asked, facts)
+        return Searcher(asked, facts, self.history.cause_at).search(start, facts.end, scan=scan)
+
+    def checked(self, end: Offset | None) -> Offset:
+        """``end``, the end of the log for None. Raises LogPointError for one beyond the log."""
+        if end is None:
+            return self.end
+        if not 0 <= end <= self.end:
+            raise LogPointError(
+                f"{end} is no point in {self.reader.path}, which holds "
+                f"{counted(self.end, 'event')}; give 0 to {self.end}"
+            )
+        return end
+
+    def _det_id(self, observation: ObservationOrdinal) -> DetId:
+        return self._latest.observations[observation].det_id
+
+    def _fold_to(self, end: Offset) -> None:
+        events = self.reader.read(self._history.next_offset, end)
+        for folded in fold_events(events, self._map, ahead=READ_AHEAD):
+            self._latest.apply_event(folded.offset, folded.deltas)
+            self._history.apply(folded.offset, folded.deltas)
+            if self._progress and folded.offset % _PROGRESS_EVERY == 0:
+                self._progress(folded.offset, end)
+        if self._progress:
+            self._progress(end, end)
+
+    def _from_snapshot(self, end: Offset) -> MapView | None:
+        """The map at ``end`` from the nearest snapshot; None when there is none below."""
+        if not any(offset <= end for offset in self._snapshots().offsets()):
+            return None
+        return fold_log_cached(
+            self.reader, self.settings, end, note=self._note, corrections=self.corrections
+        )[1]
+
+    def _snapshots(self) -> SnapshotCache:
+        return SnapshotCache(
+            self.reader.path,
+            self.reader.log_id,
+            self.settings,
+            self._note,
+            corrections=self.corrections,
+        )
+
+
+def _before(records: Sequence[_Caused], end: Offset) -> list[_Caused]:
+    return [record for record in records if record.cause.offset < end]
+
+
+def _check_names(expression: Expression, facts: HistoryFacts) -> None:
+    """Raises ExpressionError for a name that is not in the log: a condition on it would never
+    hold."""
+    for mention in expression.mentions():
+        names = facts.names(mention.kind)
+        if mention.text not in names:
+            error = NoSuchThing(mention.kind.value, mention.text, names)
+            raise expression.error_at(mention.column, str(error))
