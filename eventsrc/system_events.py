@@ -2,7 +2,7 @@
 
 ``mapfold/rejected``  a payload that is no valid envelope, with its bytes and the reason
 ``mapfold/loss``      a detected gap: publisher, first and last missing, cause
-``mapfold/command``   an operator's command (reserved; nothing writes it yet)
+``mapfold/command``   a command (`eventsrc.commands`), by `mapfold edit` or a recorder it asked
 
 The docstrings of the models are part of the JSON schema in every segment: do not change them.
 """

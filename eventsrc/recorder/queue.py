@@ -22,6 +22,8 @@ from eventsrc.robot.acks import SENT_SUFFIX
 from eventsrc.transport.config import MAX_KEY_BYTES
 from eventsrc.transport.session import Received, SequenceNumber
 
+from .edit_requests import MAX_EDITS_WAITING, EditRequest
+
 MAX_SOURCES: Final = 4_096
 _NUMBERS: Final = 2**32
 
@@ -120,7 +122,8 @@ class MessageQueue:
         self._max_wait_s = max_wait_s
         self._may_wait = True
         self._bytes = 0
-        self._messages: deque[Received] = deque()
+        self._messages: deque[Received | EditRequest] = deque()
+        self._edits = 0
         self._overflow: dict[str, int] = {}
         self._too_large: dict[str, int] = {}
         self._sequence_gaps = SequenceGaps()
@@ -151,6 +154,18 @@ class MessageQueue:
             if self._getting:
                 self._filled.notify()
 
+    def put_edit(self, request: EditRequest) -> bool:
+        """Add a command without waiting; False if there is no room for it."""
+        with self._lock:
+            full = self._closed or self._edits >= MAX_EDITS_WAITING or not self._fits(request)
+            if not full:
+                self._edits += 1
+                self._messages.append(request)
+                self._bytes += len(request.payload)
+                if self._getting:
+                    self._filled.notify()
+            return not full
+
     def put_heartbeat(self, number: SequenceNumber) -> None:
         """Note the last sequence number that a publisher has given."""
         with self._lock:
@@ -164,7 +179,7 @@ class MessageQueue:
             self.too_large += 1
             _count(self._too_large, key)
 
-    def get(self, limit: int, timeout_s: float) -> list[Received]:
+    def get(self, limit: int, timeout_s: float) -> list[Received | EditRequest]:
         """Remove up to ``limit`` messages in order, fewer if they are large; none if none came in
         time or the queue is closed."""
         with self._lock:
@@ -172,12 +187,13 @@ class MessageQueue:
                 self._getting = True
                 self._filled.wait(timeout_s)
                 self._getting = False
-            batch: list[Received] = []
+            batch: list[Received | EditRequest] = []
             size = 0
             while self._messages and len(batch) < limit and size < MAX_BATCH_BYTES:
                 message = self._messages.popleft()
                 batch.append(message)
                 size += len(message.payload)
+                self._edits -= isinstance(message, EditRequest)
             self._bytes -= size
             self._may_wait = self._may_wait or 2 * len(self._messages) <= self.size
             if self._putting:
@@ -221,7 +237,7 @@ class MessageQueue:
         """Number of messages in the queue."""
         return len(self._messages)
 
-    def _fits(self, message: Received) -> bool:
+    def _fits(self, message: Received | EditRequest) -> bool:
         if not self._messages:
             return True
         fits_in = self._bytes + len(message.payload) <= self._max_bytes

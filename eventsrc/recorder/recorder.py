@@ -11,8 +11,17 @@ from eventsrc.gaps import GapLedger
 from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES
 from eventsrc.log import LogWriter
 from eventsrc.robot.acks import ACK_PREFIX, MAX_SENT_BYTES, sent_key
-from eventsrc.transport.session import Received, SequenceNumber, Session, SizeLimit, check_keys
+from eventsrc.transport.session import (
+    Query,
+    Received,
+    SequenceNumber,
+    Session,
+    SizeLimit,
+    check_keys,
+)
 
+from .edit_requests import EditRequest, Edits, fault_of, refuse_query
+from .edits import edit_key
 from .queue import DEFAULT_QUEUE_SIZE, MessageQueue
 from .writer_thread import RecorderReport, WriterThread
 
@@ -29,7 +38,7 @@ class Recorder:
     It is subscribed when the constructor returns. ``ledger`` is the log's gap history
     (`eventsrc.gap_history`); without it, a gap between an earlier recorder's last keyframe and this
     one's first is not found, and no ledger is saved. Turn ``report_gaps`` off for robots that do
-    not count their keyframes by one.
+    not count their keyframes by one. With ``edits`` it takes commands too (`edits`).
     """
 
     def __init__(
@@ -43,6 +52,7 @@ class Recorder:
         ledger: GapLedger[RunId] | None = None,
         report_gaps: bool = True,
         max_payload_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES,
+        edits: Edits | None = None,
     ) -> None:
         check_keys(keys)
         self._session = session
@@ -55,6 +65,7 @@ class Recorder:
             max_events=max_events,
             report_gaps=report_gaps,
             max_payload_bytes=max_payload_bytes,
+            edits=edits,
         )
         limit = SizeLimit(
             _MAX_REJECTED * max(max_payload_bytes, DEFAULT_MAX_PAYLOAD_BYTES), self._count_too_large
@@ -70,6 +81,9 @@ class Recorder:
                 session.subscribe_heartbeats(key, self._queue.put_heartbeat),
             )
         ]
+        if edits is not None:
+            key = edit_key(writer.log_id)
+            self._subscriptions.append(session.queryable(key, self._receive_edit))
         session.confirm()
 
     def run(
@@ -118,6 +132,13 @@ class Recorder:
         # A recorder of `**` receives acks and refusals too, also its own. They are not data.
         if not message.key.startswith(ACK_PREFIX):
             self._queue.put(message)
+
+    def _receive_edit(self, query: Query) -> None:
+        fault = fault_of(query)
+        if fault is not None:
+            refuse_query(query, fault)
+        elif not self._queue.put_edit(EditRequest(query)):
+            refuse_query(query, "the recorder is busy or ending; try again in a moment")
 
     def _count_too_large(self, key: str, number: SequenceNumber | None) -> None:
         if not key.startswith(ACK_PREFIX):

@@ -15,6 +15,8 @@
   as unwritten: in the commit group, in the batch at hand, or in the queue.
 * Losses are recorded about once a second, not one by one, to spare an overloaded recorder.
 * `prepare_events` rejects messages under ``mapfold/``: they could forge a loss or a command.
+* A command that came as a query (`edit_requests`) is appended behind the messages of its batch and
+  synced at once. It is not counted as a message.
 """
 
 import itertools
@@ -47,6 +49,7 @@ from eventsrc.robot.acks import (
 from eventsrc.system_events import LOSS_KEY, Loss
 from eventsrc.transport.session import Received
 
+from .edit_requests import EditRequest, Edits
 from .queue import MessageQueue
 
 
@@ -185,9 +188,11 @@ class WriterThread:
         max_events: int | None,
         report_gaps: bool,
         max_payload_bytes: int,
+        edits: Edits | None = None,
     ) -> None:
         self._queue = queue
         self._writer = writer
+        self._edits = edits
         self._ledger: GapLedger[RunId] = GapLedger() if ledger is None else ledger
         self._saves_ledger = ledger is not None  # else it does not cover the whole log
         self._send_reply = send_reply
@@ -214,11 +219,13 @@ class WriterThread:
             self._sync()
             self._write_losses(self._ledger.flush(), self._queue.drain_missed(None))
             self._save()
-        except LogError:
+        except LogError as error:
             self._failed = True
+            self._process_synced()  # what was synced before the error
+            if self._edits is not None:
+                self._edits.fail(str(error))
             raise
-        finally:
-            self._process_synced()  # also what was synced before an error
+        self._process_synced()
 
     def report(self) -> RecorderReport:
         """The numbers now; may be called from any thread."""
@@ -253,12 +260,15 @@ class WriterThread:
         closed = self._queue.closed  # read first: what was put before closing is still recorded
         waiting = self._writer.durable_offset < self._writer.next_offset
         received = self._queue.get(limit, _COMMIT_POLL_S if waiting else _IDLE_S)
-        batch = [message for message in received if not message.key.endswith(SENT_SUFFIX)]
+        messages = [message for message in received if isinstance(message, Received)]
+        batch = [message for message in messages if not message.key.endswith(SENT_SUFFIX)]
         self._in_progress = len(batch)
-        for messages in _parts(batch):
-            self._append(messages)
-        if len(batch) < len(received):
-            self._hold_announcements(received)
+        for part in _parts(batch):
+            self._append(part)
+        if len(batch) < len(messages):
+            self._hold_announcements(messages)
+        if len(messages) < len(received):
+            self._append_edits(received)
         self._writer.commit_if_due()
         self._process_synced()
         now_ns = time.monotonic_ns()
@@ -282,6 +292,13 @@ class WriterThread:
         self._in_progress -= len(messages)
         self._writer.append_all([event for event, _ in prepared])
 
+    def _append_edits(self, received: list[Received | EditRequest]) -> None:
+        if self._edits is not None:
+            for request in received:
+                if isinstance(request, EditRequest):
+                    self._edits.append(request)
+            self._writer.sync()
+
     def _hold_announcements(self, received: list[Received]) -> None:
         """Keep announcements until everything appended so far is synced."""
         for message in received:
@@ -299,6 +316,8 @@ class WriterThread:
         now_ns = time.monotonic_ns()
         if self._unsynced and self._unsynced[0].offset < durable:
             self._acknowledge(durable, now_ns)
+        if self._edits is not None:
+            self._edits.settle(durable)
         while self._announcements and self._announcements[0].offset <= durable:
             sent = self._announcements.popleft().sent
             self._ledger.expect(sent.run_id, sent.last, now_ns)
@@ -328,6 +347,8 @@ class WriterThread:
         lost = [(fault.base, fault.following) for fault in faults if fault.lost_events]
         if not lost:
             return
+        if self._edits is not None:
+            self._edits.lose(lost)
         kept = [e for e in self._unsynced if not any(a <= e.offset < b for a, b in lost)]
         self._unsynced = deque(kept)
         if self._saves_ledger:

@@ -34,6 +34,8 @@ COMMANDS: "Mapping[str, str]" = {
     "diff": "projections.cli.time_travel",
     "bisect": "projections.cli.time_travel",
     "whatif": "projections.cli.whatif",
+    "edit": "projections.cli.edit",
+    "edits": "projections.cli.edits",
 }
 """The module of each command, in the order of ``--help``; commands of one module are adjacent."""
 

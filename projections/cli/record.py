@@ -15,8 +15,11 @@ from eventsrc.gaps import GapLedger
 from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES, MAX_PAYLOAD_BYTES
 from eventsrc.log import LogReader, LogWriter, parse_fsync
 from eventsrc.recorder import DEFAULT_KEYS, DEFAULT_QUEUE_SIZE, Recorder
+from eventsrc.recorder.edit_requests import Edits, KnownCommands
+from eventsrc.recorder.edits import EDIT_PREFIX
 from eventsrc.transport.config import parse_address
 from eventsrc.transport.session import check_keys, open_session
+from projections.edit.usable import check_command
 
 from .options import ConfigOption, ConnectOption, JsonOption, ListenOption, zenoh_options
 from .recorder_text import EVERY_S, RecorderSummary, say_restart, show_status
@@ -69,6 +72,14 @@ def record(
         str | None,
         typer.Option(metavar="PORT", help="Serve Prometheus metrics; PORT or HOST:PORT."),
     ] = None,
+    accept_edits: Annotated[
+        bool,
+        typer.Option(
+            "--accept-edits",
+            help="Take the commands of `mapfold edit`, from everybody who may query "
+            f"{EDIT_PREFIX}/ on this Zenoh network.",
+        ),
+    ] = False,
     json: JsonOption = False,
 ) -> None:
     """Record what robots publish over Zenoh, until Ctrl-C.
@@ -99,6 +110,7 @@ def record(
             ledger=_gap_history(log),
             report_gaps=gaps,
             max_payload_bytes=max_payload,
+            edits=_edits(log, writer) if accept_edits else None,
         )
         summary.watch(writer, recorder)
         with _metrics(address, recorder, log), show_status(log) as watch:
@@ -116,6 +128,18 @@ def _gap_history(log: Path) -> GapLedger[RunId] | None:
     except LogDamaged as error:
         say(f"recording without gap history: {error}")
         return None
+
+
+def _edits(log: Path, writer: LogWriter) -> Edits:
+    """What takes commands. If the log's own cannot be read, it refuses all."""
+    known: KnownCommands | str
+    try:
+        with LogReader(log) as reader:
+            known = KnownCommands.of(reader)
+    except LogDamaged as error:
+        say(f"recording without edits: {error}")
+        known = str(error)
+    return Edits(writer, known, check_command)
 
 
 @contextmanager

@@ -40,8 +40,10 @@ def _leaves(name: str, command: Any) -> Iterator[tuple[str, Any]]:
     if children is None:
         yield name, command
         return
+    arguments = [p for p in command.params if p.param_type_name == "argument"]
+    start = " ".join([name, *map(_usage, arguments)])
     for child_name, child in children.items():
-        yield from _leaves(f"{name} {child_name}", child)
+        yield from _leaves(f"{start} {child_name}", child)
 
 
 def page() -> str:

@@ -1,0 +1,141 @@
+"""The command ``correct-poses``: a trajectory file laid over a run, or a rigid transform."""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+from eventsrc.commands import MAX_COMMAND_BYTES, CorrectPoses, RigidTransform, encode_command
+from eventsrc.envelope import MAX_POSITION_M, KeyframeId
+from eventsrc.errors import MisuseError
+from eventsrc.text import counted
+
+from .conflicts import check_run_in_map
+from .current import CurrentMap
+from .make import Stamp, build, keyframes_of
+from .poses import Laid, RunKeyframe, lay
+from .trajectory import Trajectory
+
+_MOST_NAMED = 5
+
+
+class Span(NamedTuple):
+    """Keyframes from ``first`` to ``last``, both included; None for no bound."""
+
+    first: KeyframeId | None
+    last: KeyframeId | None
+
+    def has(self, keyframe_id: KeyframeId) -> bool:
+        """Whether a keyframe is in it."""
+        after = self.first is None or self.first <= keyframe_id
+        return after and (self.last is None or keyframe_id <= self.last)
+
+
+def by_trajectory(
+    current: CurrentMap,
+    stamp: Stamp,
+    run_id: str,
+    trajectory: Trajectory,
+    span: Span,
+    slack_s: float,
+    *,
+    ignore_missing: bool = False,
+    note: Callable[[str], None] = lambda _: None,
+) -> CorrectPoses:
+    """The poses of a file for the keyframes of a run. ``note`` is told which stay as they are."""
+    keyframes = _keyframes(current, run_id, span)
+    laid = lay(trajectory, keyframes, slack_s)
+    in_run = {k.keyframe_id for k in current.run(run_id)}
+    laid = laid._replace(unknown=tuple(p for p in laid.unknown if p.key not in in_run))
+    if laid.unknown and not ignore_missing:
+        _refuse_unknown(current, run_id, trajectory, laid)
+    if not laid.poses:
+        raise MisuseError(_nothing_laid(trajectory, keyframes, slack_s))
+    _note_left(note, run_id, trajectory, laid, slack_s)
+    command = build(CorrectPoses, stamp, run_id=run_id, poses=laid.poses)
+    size = len(encode_command(command))
+    if size > MAX_COMMAND_BYTES:
+        raise MisuseError(
+            f"{trajectory.name}: {counted(len(laid.poses), 'pose')} make a command of {size:,} "
+            f"bytes, more than {MAX_COMMAND_BYTES:,}; give it in parts with --from and --to"
+        )
+    return command
+
+
+def by_transform(
+    current: CurrentMap, stamp: Stamp, run_id: str, span: Span, dx: float, dy: float, dyaw: float
+) -> CorrectPoses:
+    """One rigid transform of the keyframes of a run."""
+    for name, value in (("--dx", dx), ("--dy", dy), ("--dyaw", dyaw)):
+        if not math.isfinite(value) or abs(value) > MAX_POSITION_M:
+            raise MisuseError(f"{name} {value}: not between ±{MAX_POSITION_M:,.0f}")
+    if not (dx or dy or dyaw):
+        raise MisuseError("--dx, --dy and --dyaw are all 0: nothing would move")
+    _keyframes(current, run_id, span)
+    return build(
+        CorrectPoses,
+        stamp,
+        run_id=run_id,
+        transform=RigidTransform.of(dx, dy, dyaw),
+        first=span.first,
+        last=span.last,
+    )
+
+
+def _keyframes(current: CurrentMap, run_id: str, span: Span) -> list[RunKeyframe]:
+    if span.first is not None and span.last is not None and span.last < span.first:
+        raise MisuseError(f"--from {span.first} is more than --to {span.last}; swap them")
+    check_run_in_map(current, run_id)
+    found = [
+        RunKeyframe(k.keyframe_id, k.timestamp)
+        for k in current.run(run_id)
+        if span.has(k.keyframe_id)
+    ]
+    if not found:
+        raise MisuseError(
+            f"no keyframe of {run_id} between --from and --to; {keyframes_of(current, run_id)}"
+        )
+    return found
+
+
+def _refuse_unknown(current: CurrentMap, run_id: str, trajectory: Trajectory, laid: Laid) -> None:
+    first = min(laid.unknown, key=lambda pose: pose.line)
+    count = len(laid.unknown)
+    more = f" (and {count - 1:,} more such lines)" if count > 1 else ""
+    raise MisuseError(
+        f"{trajectory.name}, line {first.line}: {run_id} has no keyframe {first.key!r}{more}; "
+        f"{keyframes_of(current, run_id)}; --ignore-missing takes the poses of the others"
+    )
+
+
+def _nothing_laid(trajectory: Trajectory, keyframes: list[RunKeyframe], slack_s: float) -> str:
+    first, last = trajectory.poses[0].key, trajectory.poses[-1].key
+    if trajectory.by == "keyframe":
+        return f"{trajectory.name}: none of its keyframes, {first!r} to {last!r}, is in the run"
+    stamps = [k.timestamp for k in keyframes]
+    return (
+        f"{trajectory.name}: its stamps, {first!r} to {last!r} s, are not those of the run's "
+        f"keyframes, {min(stamps)!r} to {max(stamps)!r} s (--slack {slack_s:g} s); stamps must be "
+        "of the robot's clock"
+    )
+
+
+def _note_left(
+    note: Callable[[str], None], run_id: str, trajectory: Trajectory, laid: Laid, slack_s: float
+) -> None:
+    if trajectory.is_open:
+        note(f"{trajectory.name}: its last line has no line end; if it was cut, so is a number")
+    if laid.left:
+        names = ", ".join(f"{run_id}:{k}" for k in laid.left[:_MOST_NAMED])
+        count = len(laid.left)
+        more = f" and {count - _MOST_NAMED:,} more" if count > _MOST_NAMED else ""
+        why = (
+            "not in the file"
+            if trajectory.by == "keyframe"
+            else f"more than --slack {slack_s:g} s outside its stamps"
+        )
+        note(f"{counted(count, 'keyframe')} left without correction, {why}: {names}{more}")
+    if laid.widest_s > 0.0:
+        note(f"poses interpolated over up to {laid.widest_s:.3g} s between two of the file")
+    if laid.unknown:
+        count = len(laid.unknown)
+        note(f"{counted(count, 'pose')} not used: {run_id} has no such keyframe")

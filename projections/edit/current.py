@@ -1,0 +1,201 @@
+"""The map of a log as it is now, with its corrections, and what is called what in it."""
+
+from collections.abc import Callable, Iterator
+from functools import cached_property
+
+from eventsrc.envelope import FIRST_OFFSET, DetId, KeyframeId, Offset, RunId
+from eventsrc.errors import MisuseError
+from eventsrc.log import Event, LogReader
+from eventsrc.system_events import COMMAND_KEY
+from projections.corrections import (
+    Corrections,
+    Keyframe,
+    RecordedCommand,
+    compile_corrections,
+)
+from projections.deltas import PlaceOrdinal, PlacesMerged
+from projections.history import NoSuchThing
+from projections.model.fold import READ_AHEAD, fold_events, fold_log_cached, gc_paused
+from projections.model.log_commands import read_commands
+from projections.model.records import KeyframeRecord, ObjectRecord, ObservationRecord
+from projections.model.view import MapView
+from projections.reducers.landmarks import object_id
+from projections.reducers.semantic_map import SemanticMap
+from projections.settings import Settings
+
+SettingsOf = Callable[[Corrections], Settings]
+"""The settings of the map, given the log's corrections."""
+
+
+class CurrentMap:
+    """A log, the commands in it, and the map that it is folded to under ``settings_of`` these.
+
+    With ``until`` it is the log as of its first ``until`` events. ``note`` is told of snapshots
+    that could not be used.
+    """
+
+    def __init__(
+        self,
+        reader: LogReader,
+        settings_of: SettingsOf,
+        *,
+        until: Offset | None = None,
+        note: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self.reader = reader
+        self.settings_of = settings_of
+        self.end = reader.next_offset if until is None else until
+        self.commands = read_commands(reader, self.end)
+        self.corrections = compile_corrections(self.commands)
+        self.settings = settings_of(self.corrections)
+        self._note = note
+        self._view: MapView | None = None
+
+    @property
+    def known_at(self) -> Offset:
+        """The offset behind the last command."""
+        return Offset(self.commands[-1].offset + 1) if self.commands else FIRST_OFFSET
+
+    def command_events(self) -> Iterator[Event]:
+        """The events of the commands, in order."""
+        return self.reader.read(FIRST_OFFSET, self.end, keys={COMMAND_KEY})
+
+    def find_command(self, command_id: str) -> RecordedCommand | None:
+        """The command with this id, whether undone or not."""
+        return next((c for c in self.commands if c.command.command_id == command_id), None)
+
+    def fold(self, corrections: Corrections, settings: Settings) -> MapView:
+        """The map under other corrections or settings."""
+        return fold_log_cached(
+            self.reader, settings, self.end, note=self._note, corrections=corrections
+        )[1]
+
+    @property
+    def view(self) -> MapView:
+        """The map; folded at the first use."""
+        if self._view is None:
+            self._view = self.fold(self.corrections, self.settings)
+        return self._view
+
+    def set_view(self, view: MapView) -> None:
+        """Take ``view`` for the map instead of folding it."""
+        self._view = view
+
+    @cached_property
+    def merges(self) -> list[PlacesMerged]:
+        """Every merge of places, in order; from a fold of the whole log."""
+        semantic_map = SemanticMap(self.settings, corrections=self.corrections)
+        view = MapView(self.settings, keep_embeddings=False, corrections=self.corrections)
+        merges: list[PlacesMerged] = []
+        events = self.reader.read(FIRST_OFFSET, self.end)
+        with gc_paused():
+            for folded in fold_events(events, semantic_map, ahead=READ_AHEAD):
+                view.apply_event(folded.offset, folded.deltas)
+                merges += [d for d in folded.deltas if isinstance(d, PlacesMerged)]
+        self._view = self._view or view
+        return merges
+
+    @cached_property
+    def keyframes(self) -> dict[Keyframe, KeyframeRecord]:
+        """The keyframes of the map."""
+        return {Keyframe(k.run_id, k.keyframe_id): k for k in self.view.keyframes}
+
+    @cached_property
+    def observations(self) -> dict[DetId, ObservationRecord]:
+        """The observations of the map."""
+        return {o.det_id: o for o in self.view.observations}
+
+    @cached_property
+    def _objects(self) -> dict[str, ObjectRecord]:
+        """Those of the map, and the absorbed."""
+        return {o.object_id: o for o in self.view.all_objects}
+
+    def run(self, run_id: str) -> list[KeyframeRecord]:
+        """The keyframes of a run. Raises NoSuchThing with the runs there are."""
+        view = self.view
+        number = next((r.ordinal for r in view.runs if r.run_id == run_id), None)
+        if number is None:
+            raise NoSuchThing("run", run_id, (r.run_id for r in view.runs))
+        return [k for k in view.keyframes if k.run == number]
+
+    def place_of(self, keyframe: Keyframe) -> PlaceOrdinal | None:
+        """The place that a keyframe is in now; None for none, or if it is not in the map."""
+        record = self.keyframes.get(keyframe)
+        return None if record is None else record.place
+
+    def original_place_of(self, keyframe: Keyframe) -> PlaceOrdinal | None:
+        """The place that a keyframe was put into first, which may be absorbed now."""
+        record = self.keyframes.get(keyframe)
+        return None if record is None else record.joined
+
+    def founder(self, place: PlaceOrdinal) -> Keyframe:
+        """The keyframe that founded a place."""
+        record = self.view.keyframes[self.view.all_places[place].founder]
+        return Keyframe(record.run_id, record.keyframe_id)
+
+    def find_place(self, text: str) -> Keyframe:
+        """The founding keyframe of a place: given as a place id, also of an absorbed one, or as
+        ``run:keyframe``, which means the place that this keyframe was put into first.
+
+        Raises NoSuchThing, or MisuseError for a keyframe in no place.
+        """
+        view = self.view
+        for place in view.all_places:
+            if place.place_id == text:
+                return self.founder(place.ordinal)
+        run_id, colon, number = text.rpartition(":")
+        if not colon or all(run.run_id != run_id for run in view.runs):
+            raise NoSuchThing("place", text, (p.place_id for p in view.all_places))
+        keyframe = _keyframe(run_id, number)
+        if keyframe is None or keyframe not in self.keyframes:
+            names = (f"{run_id}:{k.keyframe_id}" for k in self.run(run_id))
+            raise NoSuchThing("keyframe", text, names)
+        original = self.original_place_of(keyframe)
+        if original is None:
+            why = "has no pose" if self.keyframes[keyframe].pose is None else "is noise"
+            raise MisuseError(
+                f"keyframe {text} is in no place, because it {why}; name a place or a keyframe in "
+                "one (`mapfold state LOG` lists the places)"
+            )
+        return self.founder(original)
+
+    def place_name(self, keyframe: Keyframe) -> str:
+        """The id of the place that a keyframe is in now, or ``no place``."""
+        return self.view.place_id(self.place_of(keyframe)) or "no place"
+
+    def find_observation(self, text: str) -> ObservationRecord:
+        """The founding observation of an object, given by the object's id, also of an absorbed one;
+        or an observation by its det_id. Raises NoSuchThing, or MisuseError for an observation
+        without an object."""
+        if text in self._objects:
+            founding = (o for o in self.view.observations if object_id(o.det_id) == text)
+            return next(founding)
+        observation = self.observations.get(DetId(text))
+        if observation is None:
+            raise self._no_object(text)
+        if observation.object is None:
+            raise MisuseError(
+                f"observation {text!r} is of no object: it has no embedding or no pose; "
+                "name an object, or an observation that is of one"
+            )
+        return observation
+
+    def find_object(self, text: str) -> ObjectRecord:
+        """The object of this id, for an absorbed one the object that it is part of now. Raises
+        NoSuchThing."""
+        found = self._objects.get(text)
+        if found is None:
+            raise self._no_object(text)
+        return self.view.objects[self.view.object_survivors.find(found.ordinal)]
+
+    def _no_object(self, text: str) -> NoSuchThing:
+        if text.startswith("obj-") or not self.observations:
+            return NoSuchThing("object", text, (o.object_id for o in self.view.objects.values()))
+        return NoSuchThing("observation", text, self.observations)
+
+
+def _keyframe(run_id: str, number: str) -> Keyframe | None:
+    try:
+        return Keyframe(RunId(run_id), KeyframeId(int(number)))
+    except ValueError:
+        return None

@@ -1,0 +1,189 @@
+"""What a command changes in the map of the events before it: counts, and the whole difference."""
+
+import json
+import os
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+from eventsrc.commands import Command
+from eventsrc.envelope import Offset
+from eventsrc.text import counted
+from projections.corrections import (
+    Corrections,
+    RecordedCommand,
+    compile_corrections,
+    map_fingerprint,
+)
+from projections.deltas import PlaceOrdinal
+from projections.history.diff import Difference, difference_of, rows_of
+from projections.model.view import MapView
+
+from .current import CurrentMap
+
+_CACHE = "effects.json"
+_VERSION = 1
+"""Of the effects in it; a fold that gives another map of the same log needs another."""
+_MAX_CACHE_BYTES = 16 * 1024 * 1024
+
+
+class Effect(NamedTuple):
+    """How many places, objects and keyframes are new, gone or changed."""
+
+    places: int
+    objects: int
+    keyframes: int
+
+    @property
+    def none(self) -> bool:
+        """Whether nothing changed."""
+        return not any(self)
+
+    def document(self) -> dict[str, Any]:
+        """JSON."""
+        return self._asdict()
+
+    def __str__(self) -> str:
+        """``3 places, 1 object, 12 keyframes``."""
+        named = zip(self, ("place", "object", "keyframe"), strict=True)
+        return ", ".join(counted(number, what) for number, what in named)
+
+
+class Change:
+    """A map, and the map that it becomes when its log has other commands.
+
+    Folds only what it must: names of places alone need no fold.
+    """
+
+    def __init__(self, current: CurrentMap, commands: Sequence[RecordedCommand]) -> None:
+        self.current = current
+        self.corrections = compile_corrections(commands)
+        self.settings = current.settings_of(self.corrections)
+        self._after: MapView | None = None
+
+    @classmethod
+    def by(cls, current: CurrentMap, command: Command) -> "Change":
+        """The change by one more command."""
+        return cls(current, [*current.commands, RecordedCommand(current.end, command)])
+
+    @property
+    def identity(self) -> str:
+        """Equal for equal changes of one log."""
+        before = map_fingerprint(self.current.settings, self.current.corrections)
+        return f"{self.current.end} {before} {map_fingerprint(self.settings, self.corrections)}"
+
+    @property
+    def after(self) -> MapView:
+        """The map under the other commands."""
+        if self._after is None:
+            current = self.current
+            same = self._same_fold(current.corrections, self.corrections)
+            self._after = current.view if same else current.fold(self.corrections, self.settings)
+        return self._after
+
+    @property
+    def known_after(self) -> MapView | None:
+        """The map under the other commands, if it is folded already."""
+        return self._after
+
+    def _same_fold(self, first: Corrections, second: Corrections) -> bool:
+        same_settings = self.settings == self.current.settings
+        return same_settings and first.fingerprint() == second.fingerprint()
+
+    def effect(self) -> Effect:
+        """How much changes."""
+        before = self.current.corrections
+        if self._same_fold(before.without_names(), self.corrections.without_names()):
+            names = [_names(self.current, c) for c in (before, self.corrections)]
+            return Effect(len(_differing(*names)), 0, 0)
+        return effect_of(self.current.view, self.after)
+
+    def difference(self) -> Difference:
+        """All that changes."""
+        return difference_of(self.current.view, self.after, {}, ())
+
+
+def effect_of(before: MapView, after: MapView) -> Effect:
+    """How much differs between two maps of the same events."""
+    first, second = rows_of(before), rows_of(after)
+    return Effect(
+        len(_differing(first.places, second.places)),
+        len(_differing(first.objects, second.objects)),
+        len(_differing(first.keyframes, second.keyframes)),
+    )
+
+
+def _names(current: CurrentMap, corrections: Corrections) -> dict[PlaceOrdinal, str]:
+    """Places by ordinal, and their names; the later name counts."""
+    placed = ((current.place_of(named.anchor), named.name) for named in corrections.names)
+    return {place: name for place, name in placed if place is not None}
+
+
+def _differing(first: dict[Any, Any], second: dict[Any, Any]) -> set[Any]:
+    """The keys whose values differ or are in one of the two only."""
+    return {key for key in {**first, **second} if first.get(key) != second.get(key)}
+
+
+class EffectCache:
+    """Effects that were worked out before: ``<log>.snapshots/effects.json``, safe to delete."""
+
+    def __init__(self, current: CurrentMap) -> None:
+        log = current.reader.path
+        self._log_id = current.reader.log_id
+        self._path = log.with_name(f"{log.name}.snapshots") / _CACHE
+        self._effects = self._read()
+
+    def get(self, change: Change) -> Effect | None:
+        """The effect of a change, if it is known."""
+        return self._effects.get(change.identity)
+
+    def put(self, change: Change, effect: Effect) -> None:
+        """Keep an effect. A cache that cannot be written is left as it is."""
+        self._effects = {**self._read(), change.identity: effect}
+        document = {"version": _VERSION, "log_id": self._log_id, "effects": self._effects}
+        beside = self._path.with_suffix(f".{os.getpid()}.part")
+        try:
+            self._path.parent.mkdir(exist_ok=True)
+            beside.write_text(json.dumps(document), "utf-8")
+            beside.replace(self._path)
+        except OSError:
+            beside.unlink(missing_ok=True)
+
+    def _read(self) -> dict[str, Effect]:
+        """What is kept; nothing if the file is of another log or was not written by this code."""
+        try:
+            if self._path.stat().st_size > _MAX_CACHE_BYTES:
+                return {}
+            document = json.loads(self._path.read_text("utf-8"))
+            if (document["version"], document["log_id"]) != (_VERSION, self._log_id):
+                return {}
+            return {str(key): Effect(*map(int, row)) for key, row in document["effects"].items()}
+        except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+            return {}
+
+
+def effects_of(
+    current: CurrentMap, known_only: bool
+) -> list[tuple[RecordedCommand, Effect | None]]:
+    """Every command of a log with its effect on the map of the events before it.
+
+    With ``known_only`` nothing is folded, and effects not in the cache are None.
+    """
+    cache = EffectCache(current)
+    at = partial(CurrentMap, current.reader, current.settings_of)
+    found: list[tuple[RecordedCommand, Effect | None]] = []
+    before: MapView | None = None
+    follows = Offset(-1)
+    for recorded in current.commands:
+        then = at(until=recorded.offset)
+        if before is not None and recorded.offset == follows:
+            then.set_view(before)  # only commands in between, which change nothing by themselves
+        change = Change.by(then, recorded.command)
+        effect = cache.get(change)
+        before = None
+        if effect is None and not known_only:
+            effect = change.effect()
+            cache.put(change, effect)
+            before, follows = change.known_after, Offset(recorded.offset + 1)
+        found.append((recorded, effect))
+    return found

@@ -1,0 +1,125 @@
+"""The list of a log's commands, as text and as JSON."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from eventsrc.commands import (
+    Command,
+    CorrectPoses,
+    DifferentObjects,
+    DropDetection,
+    DropObject,
+    ForgetKeyframes,
+    ForgetRun,
+    Join,
+    KeepApart,
+    NamePlace,
+    SameObject,
+    Undo,
+    UndoMerge,
+    UseSettings,
+)
+from eventsrc.envelope import Offset
+from eventsrc.text import counted, visible
+from projections.corrections import RecordedCommand
+from projections.history.records import iso_time
+from projections.history.rendering import table
+from projections.settings import Settings
+
+from .effect import Effect
+from .make import undone_by
+
+Found = Sequence[tuple[RecordedCommand, Effect | None]]
+
+
+def what(command: Command) -> str:
+    """What a command is about, in short."""
+    match command:
+        case NamePlace():
+            return f"{_name(command.place)} is {command.name}"
+        case KeepApart() | Join():
+            return " and ".join(map(_name, command.places))
+        case UndoMerge():
+            return f"at {command.merge_offset}: {' and '.join(map(_name, command.places))}"
+        case SameObject() | DifferentObjects():
+            return " and ".join(command.det_ids)
+        case DropObject() | DropDetection():
+            more = len(command.det_ids) - 1
+            return command.det_ids[0] + (f" and {more:,} more" if more else "")
+        case ForgetRun():
+            return command.run_id
+        case ForgetKeyframes():
+            return f"{command.run_id}:{command.first}..{command.last}"
+        case CorrectPoses():
+            return f"{command.run_id}: {_poses(command)}"
+        case UseSettings():
+            plain = Settings().model_dump()
+            changed = [f"{k}={v}" for k, v in command.settings.items() if plain.get(k) != v]
+            return ", ".join(changed) or "the defaults"
+        case Undo():
+            return command.undone
+
+
+def _name(anchor: Any) -> str:
+    return f"{anchor.run_id}:{anchor.keyframe_id}"
+
+
+def _poses(command: CorrectPoses) -> str:
+    if command.transform is None:
+        return counted(len(command.poses), "pose")
+    t = command.transform
+    span = ""
+    if command.first is not None or command.last is not None:
+        first = "" if command.first is None else command.first
+        span = f" of {first}..{'' if command.last is None else command.last}"
+    return f"dx={t.dx:g} dy={t.dy:g} dyaw={t.dyaw:g}{span}"
+
+
+def edits_text(found: Found, times: Mapping[Offset, int]) -> str:
+    """A table of the commands, two lines for each, and what to do next."""
+    if not found:
+        return "no command in this log; `mapfold edit LOG` gives one\n"
+    undone = undone_by([recorded for recorded, _ in found])
+    rows = []
+    for (offset, command), effect in found:
+        by = undone.get(command.command_id)
+        state = "" if by is None else f"undone by {visible(by.command.command_id)}"
+        rows.append(
+            [
+                str(offset),
+                iso_time(times[offset] / 1e9),
+                visible(command.issued_by),
+                f"{command.kind} {visible(what(command))}",
+                "not worked out" if effect is None else str(effect),
+                visible(command.command_id),
+                state,
+                visible(command.reason),
+            ]
+        )
+    header = ("offset", "time", "by", "command", "changed", "command id", "undone", "reason")
+    text = table(header, rows, right={"offset"})
+    if any(effect is None for _, effect in found):
+        text += "--effects works out what the others changed\n"
+    return text
+
+
+def edits_document(found: Found, times: Mapping[Offset, int]) -> list[dict[str, Any]]:
+    """JSON: an object for each command, in order of offset."""
+    undone = undone_by([recorded for recorded, _ in found])
+    return [
+        {
+            "offset": offset,
+            "time": iso_time(times[offset] / 1e9),
+            "command_id": command.command_id,
+            "kind": command.kind,
+            "issued_by": command.issued_by,
+            "reason": command.reason,
+            "what": what(command),
+            "effect": None if effect is None else effect.document(),
+            "undone": command.command_id in undone,
+            "undone_by": undone[command.command_id].command.command_id
+            if command.command_id in undone
+            else None,
+        }
+        for (offset, command), effect in found
+    ]

@@ -1,0 +1,238 @@
+"""The commands, made from what a person typed and the map as it is.
+
+Each function takes the current map, the `Stamp` of the command and its arguments, and returns the
+command. It raises MisuseError when something is not there (with what is there), when another
+command stands in the way, or when the map would stay as it is.
+"""
+
+import re
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeVar
+
+from pydantic import ValidationError
+
+from eventsrc.commands import (
+    Anchor,
+    Command,
+    DifferentObjects,
+    DropDetection,
+    DropObject,
+    ForgetKeyframes,
+    ForgetRun,
+    Join,
+    KeepApart,
+    NamePlace,
+    SameObject,
+    Undo,
+    UndoMerge,
+    UseSettings,
+)
+from eventsrc.envelope import DetId, KeyframeId, RunId, describe_error
+from eventsrc.errors import MisuseError
+from eventsrc.text import counted, visible
+from projections.corrections import Keyframe, RecordedCommand
+from projections.history import NoSuchThing
+from projections.settings import Settings
+
+from .conflicts import (
+    EditRefused,
+    check_apart,
+    check_different,
+    check_join,
+    check_not_dropped,
+    check_run_in_map,
+    check_same,
+    describe,
+    forgetting,
+)
+from .current import CurrentMap
+from .merged import merged_at
+
+_C = TypeVar("_C", bound=Command)
+
+
+class Stamp(NamedTuple):
+    """Who gives a command and why; ``command_id`` is unique in a log."""
+
+    command_id: str
+    issued_by: str
+    reason: str
+
+
+def build(model: type[_C], stamp: Stamp, **fields: Any) -> _C:
+    """A command of this model. Raises MisuseError that names the field that is wrong."""
+    try:
+        return model(**stamp._asdict(), **fields)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(map(str, first["loc"])) or "the command"
+        raise MisuseError(f"{_OPTIONS.get(field, field)} {describe_error(first)}") from None
+
+
+_OPTIONS = {"command_id": "--command-id", "issued_by": "--issued-by", "reason": "--reason"}
+
+
+def name_place(current: CurrentMap, stamp: Stamp, place: str, name: str) -> NamePlace:
+    """The place is called ``name``."""
+    anchor = current.find_place(place)
+    number = current.place_of(anchor)
+    if number is not None and current.view.all_places[number].name == name:
+        raise EditRefused(f"{current.place_name(anchor)} is called {name!r} already")
+    return build(NamePlace, stamp, place=_anchor(anchor), name=name)
+
+
+def keep_apart(current: CurrentMap, stamp: Stamp, first: str, second: str) -> KeepApart:
+    """The two places are never one."""
+    pair = _two_places(current, first, second)
+    if tuple(sorted(pair)) in current.corrections.apart:
+        raise EditRefused(f"{first} and {second} are kept apart already")
+    check_apart(current, pair)
+    return build(KeepApart, stamp, places=(_anchor(pair[0]), _anchor(pair[1])))
+
+
+def undo_merge(current: CurrentMap, stamp: Stamp, offset: int) -> UndoMerge:
+    """The places that the merge at ``offset`` made one are never one."""
+    anchors = merged_at(current, offset)
+    check_apart(current, anchors)
+    return build(
+        UndoMerge, stamp, merge_offset=offset, places=tuple(_anchor(each) for each in anchors)
+    )
+
+
+def join(current: CurrentMap, stamp: Stamp, first: str, second: str) -> Join:
+    """The two places are one."""
+    pair = _two_places(current, first, second)
+    if current.place_of(pair[0]) == current.place_of(pair[1]):
+        raise EditRefused(
+            f"{first} and {second} are one place already, {current.place_name(pair[0])}"
+        )
+    check_join(current, *pair)
+    return build(Join, stamp, places=(_anchor(pair[0]), _anchor(pair[1])))
+
+
+def _two_places(current: CurrentMap, first: str, second: str) -> tuple[Keyframe, Keyframe]:
+    pair = current.find_place(first), current.find_place(second)
+    if pair[0] == pair[1]:
+        raise EditRefused(
+            f"{first} and {second} are the same place, founded as one by keyframe "
+            f"{pair[0].run_id}:{pair[0].keyframe_id}; name two that were founded apart "
+            "(`mapfold merges LOG` lists what became one)"
+        )
+    return pair
+
+
+def _anchor(keyframe: Keyframe) -> Anchor:
+    return Anchor(run_id=keyframe.run_id, keyframe_id=keyframe.keyframe_id)
+
+
+def same_object(current: CurrentMap, stamp: Stamp, first: str, second: str) -> SameObject:
+    """The two objects are one."""
+    one, other = current.find_observation(first), current.find_observation(second)
+    if one.object == other.object:
+        raise EditRefused(f"{first} and {second} are one object already")
+    check_same(current, one.det_id, other.det_id)
+    if one.class_name != other.class_name:
+        raise EditRefused(
+            f"{first} is a {one.class_name!r} and {second} a {other.class_name!r}; only objects of "
+            "one class can be one"
+        )
+    return build(SameObject, stamp, det_ids=(one.det_id, other.det_id))
+
+
+def different_objects(
+    current: CurrentMap, stamp: Stamp, first: str, second: str
+) -> DifferentObjects:
+    """The two objects are never one. Two observations of one object are named by their det_ids."""
+    one, other = current.find_observation(first), current.find_observation(second)
+    if one.det_id == other.det_id:
+        raise EditRefused(
+            f"{first} and {second} are the same observation; name two objects, or two of the "
+            "det_ids of one (`mapfold state LOG --json` has them)"
+        )
+    if tuple(sorted((one.det_id, other.det_id))) in current.corrections.different:
+        raise EditRefused(f"{first} and {second} are kept apart already")
+    check_different(current, one.det_id, other.det_id)
+    return build(DifferentObjects, stamp, det_ids=(one.det_id, other.det_id))
+
+
+def drop_object(current: CurrentMap, stamp: Stamp, thing: str) -> DropObject:
+    """The observations that an object has now are left out of the map."""
+    found = current.find_object(thing)
+    det_ids = tuple(current.view.observations[number].det_id for number in found.observations)
+    return build(DropObject, stamp, det_ids=det_ids)
+
+
+def drop_detection(current: CurrentMap, stamp: Stamp, det_ids: Sequence[str]) -> DropDetection:
+    """These detections are left out of the map."""
+    named = tuple(dict.fromkeys(map(DetId, det_ids)))
+    for det_id in named:
+        if det_id not in current.observations:
+            check_not_dropped(current, det_id)
+            raise NoSuchThing("observation", det_id, current.observations)
+    return build(DropDetection, stamp, det_ids=named)
+
+
+def forget_run(current: CurrentMap, stamp: Stamp, run_id: str) -> ForgetRun:
+    """The run is left out of every fold."""
+    check_run_in_map(current, run_id)
+    current.run(run_id)
+    return build(ForgetRun, stamp, run_id=run_id)
+
+
+_RANGE = re.compile(r"(-?\d{1,19})\.\.(-?\d{1,19})")
+
+
+def forget_keyframes(current: CurrentMap, stamp: Stamp, run_id: str, span: str) -> ForgetKeyframes:
+    """Keyframes ``A..B`` of a run, both included, are left out of every fold."""
+    found = _RANGE.fullmatch(span)
+    if found is None:
+        raise MisuseError(f"{span!r} is no range of keyframes; write it as 40..72")
+    first, last = KeyframeId(int(found[1])), KeyframeId(int(found[2]))
+    if last < first:
+        raise MisuseError(f"{span}: {first} is more than {last}; write it as {last}..{first}")
+    check_run_in_map(current, run_id)
+    keyframes = current.run(run_id)
+    if not any(first <= k.keyframe_id <= last for k in keyframes):
+        already = forgetting(current, RunId(run_id), first, last)
+        raise MisuseError(
+            f"no keyframe of {run_id} in {span}{already}; {keyframes_of(current, run_id)}"
+        )
+    return build(ForgetKeyframes, stamp, run_id=run_id, first=first, last=last)
+
+
+def keyframes_of(current: CurrentMap, run_id: str) -> str:
+    """``it has 912 keyframes, 1 to 912``."""
+    ids = [k.keyframe_id for k in current.run(run_id)]
+    return f"it has {counted(len(ids), 'keyframe')}, {min(ids)} to {max(ids)}"
+
+
+def use_settings(current: CurrentMap, stamp: Stamp, settings: Settings) -> UseSettings:
+    """The map has these settings from here on."""
+    if settings == (current.corrections.settings or Settings()):
+        raise EditRefused("these are the settings of the log already")
+    plain = settings.model_dump(exclude={"neighbourhood"})
+    return build(UseSettings, stamp, settings=plain)
+
+
+def undo(current: CurrentMap, stamp: Stamp, command_id: str) -> Undo:
+    """As if the command had never been given."""
+    found = current.find_command(command_id)
+    if found is None:
+        raise NoSuchThing("command", command_id, (c.command.command_id for c in current.commands))
+    by = undone_by(current.commands).get(command_id)
+    if by is not None:
+        raise EditRefused(
+            f"command {visible(command_id)} is undone already, by {describe(by)}; undo that to "
+            "restore it"
+        )
+    return build(Undo, stamp, undone=command_id)
+
+
+def undone_by(commands: Sequence[RecordedCommand]) -> dict[str, RecordedCommand]:
+    """The commands that are undone, by id, and the undo in force that does it."""
+    undone: dict[str, RecordedCommand] = {}
+    for recorded in reversed(commands):
+        command = recorded.command
+        if isinstance(command, Undo) and command.command_id not in undone:
+            undone.setdefault(command.undone, recorded)
+    return undone

@@ -1,0 +1,136 @@
+"""Recording a command: straight into the log, or by the recorder that holds it.
+
+The command is made from the map as it is. If a newer command is in the log by the time it would be
+appended, it is made again from the map as it is then.
+"""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from eventsrc.commands import Command, encode_command
+from eventsrc.envelope import Offset
+from eventsrc.errors import LogBusy, TransportError
+from eventsrc.log import LogReader, LogWriter
+from eventsrc.recorder.edits import NewerCommand, NoAnswer, send_command
+from eventsrc.system_events import COMMAND_KEY
+from eventsrc.text import visible
+from eventsrc.transport.session import Session
+from projections.model.log_commands import read_commands
+
+from .conflicts import EditRefused
+from .current import CurrentMap, SettingsOf
+from .make import Stamp
+from .usable import check_command
+
+MakeCommand = Callable[[CurrentMap, Stamp], Command]
+"""Makes the command from the map as it is. Raises MisuseError."""
+OpenSession = Callable[[], AbstractContextManager[Session]]
+TIMEOUT_S: Final = 10.0
+_TRIES: Final = 10
+
+
+class Made(NamedTuple):
+    """A command and the map that it was made from; ``offset`` is None if it is not recorded,
+    ``repeated`` if it was recorded by an earlier call."""
+
+    command: Command
+    current: CurrentMap
+    offset: Offset | None
+    repeated: bool = False
+
+
+def make_command(
+    reader: LogReader,
+    make: MakeCommand,
+    stamp: Stamp,
+    settings_of: SettingsOf,
+    note: Callable[[str], None],
+) -> Made:
+    """Make a command and record nothing. One that is in the log already is made as it was made
+    then. Raises MisuseError, also if the log has another command of this id."""
+    current = CurrentMap(reader, settings_of, note=note)
+    known = current.find_command(stamp.command_id)
+    if known is not None:
+        current = CurrentMap(reader, settings_of, until=known.offset, note=note)
+    command = make(current, stamp)
+    check_command(command)
+    if known is not None and known.command != command:
+        raise EditRefused(
+            f"--command-id {visible(stamp.command_id)} is that of another command, at offset "
+            f"{known.offset} (see `mapfold edits`); give another or none"
+        )
+    return Made(command, current, known.offset if known else None, repeated=known is not None)
+
+
+def record_command(
+    log: Path,
+    make: MakeCommand,
+    stamp: Stamp,
+    settings_of: SettingsOf,
+    open_session: OpenSession,
+    note: Callable[[str], None] = lambda _: None,
+) -> Made:
+    """Make a command and append it; returns when it is durable.
+
+    Raises MisuseError, LogError, TransportError, or LogBusy when the log is held by a writer that
+    takes no commands.
+    """
+    for _ in range(_TRIES):
+        with LogReader(log) as reader:
+            made = make_command(reader, make, stamp, settings_of, note)
+            if made.repeated:
+                return made
+            try:
+                return made._replace(offset=_append(log, made, open_session))
+            except NewerCommand as newer:
+                last = newer
+    raise last
+
+
+def _append(log: Path, made: Made, open_session: OpenSession) -> Offset:
+    try:
+        writer = LogWriter(log)
+    except LogBusy as busy:
+        return _send(log, made, open_session, str(busy))
+    with writer:
+        with LogReader(log) as reader:
+            commands = read_commands(reader)
+        if commands and commands[-1].offset >= made.current.known_at:
+            raise NewerCommand(commands[-1].offset)
+        offset = Offset(writer.append(COMMAND_KEY, encode_command(made.command)))
+        writer.sync()
+    return offset
+
+
+def _send(log: Path, made: Made, open_session: OpenSession, busy: str) -> Offset:
+    command, current = made.command, made.current
+    try:
+        with open_session() as session:
+            known_at = current.known_at
+            log_id = current.reader.log_id
+            return send_command(session, log_id, command, known_at, timeout_s=TIMEOUT_S).offset
+    except NoAnswer:
+        found = _find(log, command)  # the recorder may have ended between its sync and its reply
+        if found is not None:
+            return found
+        raise LogBusy(
+            f"{busy.partition(';')[0]}, and no recorder answers for it; start the recorder with "
+            "--accept-edits, or stop it and edit again; if it runs with --accept-edits, --connect "
+            f"must name its router. `--command-id {visible(command.command_id)}` makes sure that "
+            "the command is recorded once"
+        ) from None
+    except TransportError as error:
+        raise LogBusy(
+            f"{busy.partition(';')[0]}; a recorder takes commands over Zenoh, but {error}"
+        ) from None
+
+
+def _find(log: Path, command: Command) -> Offset | None:
+    with LogReader(log) as reader:
+        commands = read_commands(reader)
+    for recorded in commands:
+        if recorded.command == command:
+            return recorded.offset
+    return None
