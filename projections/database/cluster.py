@@ -34,6 +34,8 @@ from .server_user import (
 
 SUPERUSER: Final = "postgres"
 START_SECONDS: Final = 60
+STOP_SECONDS: Final = 300
+"""A stop writes everything to disk first; on a busy disk that has taken more than a minute."""
 MAX_SOCKET_PATH: Final = 107 if os.uname().sysname == "Linux" else 103
 SOCKET_NAME: Final = ".s.PGSQL.5432"
 LOG_NAME: Final = "server.log"
@@ -135,7 +137,7 @@ class Cluster:
             # A folder above may have been closed since the start; pg_ctl must still get in.
             let_server_user_enter(self.data, self.programs)
             self._run(
-                "pg_ctl", "stop", "--wait", "--timeout", str(START_SECONDS), "--mode", "fast",
+                "pg_ctl", "stop", "--wait", "--timeout", str(STOP_SECONDS), "--mode", "fast",
                 "--silent", "--pgdata", str(self.data),
             )  # fmt: skip
 
