@@ -2,7 +2,7 @@
 
 import sys
 from dataclasses import asdict
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -22,7 +22,7 @@ from .options import (
     SettingsOption,
     VectorDbOption,
     databases,
-    settings_from,
+    settings_of,
 )
 from .replay import OnlyOption, only_of
 from .terminal import display, emit, finish, say
@@ -93,16 +93,23 @@ def check(
     as_json: JsonOption = False,
 ) -> None:
     """Prove the databases equal to LOG at their checkpoints, row by row; exit 3 if they are not."""
-    settings = settings_from(settings_file, assignments)
+    settings = settings_of(settings_file, assignments)
     with databases(db, vector_db) as targets:
         reports = check_projections(log, targets, settings, only=only_of(only))
         wrong = [report for report in reports if report.differing]
         # A rebuild would drop the foreign tables in the graph.
         repaired = [report for report in wrong if repair and not report.foreign]
         for report in repaired:
-            rebuild(log, targets, settings, until=report.next_offset, only=report.sink)
+            rebuild(
+                log,
+                targets,
+                settings,
+                until=report.next_offset,
+                known_at=report.known_at,
+                only=report.sink,
+            )
     if as_json:
-        emit({"sinks": [asdict(r) for r in reports], "repaired": bool(repaired)})
+        emit({"sinks": [_document(r) for r in reports], "repaired": bool(repaired)})
     else:
         _print_check(reports)
         for report in repaired:
@@ -130,7 +137,7 @@ def retry_command(
     as_json: JsonOption = False,
 ) -> None:
     """Try parked events again: rebuild if all of them can be folded now, else say why not."""
-    settings = settings_from(settings_file, assignments)
+    settings = settings_of(settings_file, assignments)
     with databases(db, vector_db) as targets:
         reports = retry(log, targets, settings)
     if as_json:
@@ -141,6 +148,14 @@ def retry_command(
         for letter in report.still:
             display(f"  offset {letter.offset:,}: {letter.reason}")
     finish(findings=any(report.still for report in reports))
+
+
+def _document(report: CheckReport) -> dict[str, Any]:
+    """The report as JSON, with ``known_at`` only where it is not the checkpoint's own offset."""
+    document = asdict(report)
+    if report.known_at == report.next_offset:
+        del document["known_at"]
+    return document
 
 
 def _print_check(reports: list[CheckReport]) -> None:

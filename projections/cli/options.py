@@ -7,7 +7,8 @@ function that uses it: the imports of all of them take longer than most commands
 import contextlib
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -87,6 +88,14 @@ def settings_from(
     logged = corrections.settings or Settings()
     settings = logged if file is None else _settings_of_file(file)
     return settings.with_assignments(assignments or ())
+
+
+def settings_of(
+    file: Path | None, assignments: list[str] | None
+) -> Callable[[Corrections], Settings]:
+    """`settings_from` for corrections that are not known yet. Raises SettingsError at once."""
+    settings_from(file, assignments)
+    return partial(settings_from, file, assignments)
 
 
 def _settings_of_file(file: Path) -> Settings:

@@ -14,6 +14,7 @@ from projections.database import ForeignEmbedding, RebuildReport, rebuild
 from projections.database.loader import LoaderName
 from projections.database.origin import command_line
 from projections.database.sink import SinkName
+from projections.model.log_commands import read_corrections
 from projections.settings import Settings
 
 from .options import (
@@ -31,13 +32,20 @@ from .options import (
 from .terminal import Bar, emit, say
 
 
-def left_out(log: Path, settings: Settings, report: RebuildReport) -> str | None:
-    """What a replay left out of the map and what to do about it, in one line; None for nothing."""
-    told = "; ".join(_left_out_parts(log, settings, report))
+def left_out(
+    log: Path, settings: Settings, report: RebuildReport, logged: Settings | None = None
+) -> str | None:
+    """What a replay left out of the map and what to do about it, in one line; None for nothing.
+
+    ``logged`` are the settings that the log names.
+    """
+    told = "; ".join(_left_out_parts(log, settings, report, logged))
     return f"left out: {told}" if told else None
 
 
-def _left_out_parts(log: Path, settings: Settings, report: RebuildReport) -> Iterator[str]:
+def _left_out_parts(
+    log: Path, settings: Settings, report: RebuildReport, logged: Settings | None
+) -> Iterator[str]:
     counts = report.counts
     if counts["duplicates"]:
         yield f"{counted(counts['duplicates'], 'keyframe')} that came twice"
@@ -52,11 +60,15 @@ def _left_out_parts(log: Path, settings: Settings, report: RebuildReport) -> Ite
             " keyframe (leave det_id away, or make it unique)"
         )
     if report.foreign is not None:
-        yield _foreign_text(log, settings, report, report.foreign)
+        yield _foreign_text(log, settings, report, report.foreign, logged)
 
 
 def _foreign_text(
-    log: Path, settings: Settings, report: RebuildReport, first: ForeignEmbedding
+    log: Path,
+    settings: Settings,
+    report: RebuildReport,
+    first: ForeignEmbedding,
+    logged: Settings | None,
 ) -> str:
     many = counted(report.counts["foreign_embeddings"], "embedding")
     chosen = settings.embedding_model is not None or settings.embedding_dim is not None
@@ -66,7 +78,7 @@ def _foreign_text(
     else:
         wanted = _space_text(first.map_model or "an unnamed model", first.map_dim)
     came = _space_text(first.model or "an unnamed model", first.dim)
-    instead = command_line("replay", log, _settings_for(settings, first))
+    instead = command_line("replay", log, _settings_for(settings, first), logged=logged)
     return (
         f"{many} of another space: the map's are of {wanted}, {why}, but that of {first.det_id} at"
         f" offset {first.offset:,} is of {came}; to map that space instead run: {instead}"
@@ -137,9 +149,10 @@ def replay(
     as_json: JsonOption = False,
 ) -> None:
     """Rebuild the databases from LOG. Readers see the old map until the new one is whole."""
-    settings = settings_from(settings_file, assignments)
     with LogReader(log) as reader:
         end = point(reader, until)
+        corrections = read_corrections(reader, end)
+    settings = settings_from(settings_file, assignments, corrections)
     with databases(db, vector_db) as targets, Bar() as bar:
         report = rebuild(
             log,
@@ -154,10 +167,10 @@ def replay(
     if as_json:
         emit(asdict(report))
     else:
-        _print(log, settings, report)
+        _print(log, settings, report, corrections.settings)
 
 
-def _print(log: Path, settings: Settings, report: RebuildReport) -> None:
+def _print(log: Path, settings: Settings, report: RebuildReport, logged: Settings | None) -> None:
     rows = sum(report.rows.values())
     rate = report.events / report.total_s if report.total_s else 0.0
     say(
@@ -169,6 +182,6 @@ def _print(log: Path, settings: Settings, report: RebuildReport) -> None:
     say(", ".join(counted(counts[f"{word}s"], word) for word in words))
     if report.hnsw is not None:
         say(f"vector search: {report.hnsw.reason}")
-    missing = left_out(log, settings, report)
+    missing = left_out(log, settings, report, logged)
     if missing is not None:
         say(missing)

@@ -1,6 +1,7 @@
 """``mapfold status``: state of the log and the databases."""
 
 from dataclasses import asdict
+from typing import Any
 
 import typer
 
@@ -16,7 +17,7 @@ from .options import (
     SettingsOption,
     VectorDbOption,
     databases,
-    settings_from,
+    settings_of,
 )
 from .terminal import display, emit, finish, say
 
@@ -35,7 +36,7 @@ def status(
     as_json: JsonOption = False,
 ) -> None:
     """Offsets, lag, checkpoints, dead letters, rejected, losses, versions; exit 3 on findings."""
-    settings = settings_from(settings_file, assignments)
+    settings = settings_of(settings_file, assignments)
     info = log_info(log)
     with databases(db, vector_db) as targets:
         found = projection_status(log, targets, settings)
@@ -48,12 +49,20 @@ def status(
                     "rejected": info.rejected,
                     "lost": info.lost,
                 },
-                "sinks": {s.sink: asdict(s) for s in found.sinks},
+                "sinks": {s.sink: _document(s) for s in found.sinks},
             }
         )
     else:
         _print(info, found)
     finish(findings=not found.healthy or bool(info.rejected) or bool(info.lost))
+
+
+def _document(sink: SinkStatus) -> dict[str, Any]:
+    """The status as JSON, with a refold's progress only while there is one."""
+    document = asdict(sink)
+    if sink.refold_total is None:
+        del document["refold_done"], document["refold_total"]
+    return document
 
 
 def _print(info: LogInfo, found: Status) -> None:
@@ -86,4 +95,7 @@ def _sink_line(sink: SinkStatus) -> str:
     if sink.next_offset is None:
         return f"{sink.condition} · {sink.place}" + (f" · {versions}" if versions else "")
     lag = "" if sink.lag is None else f", {sink.lag:,} behind"
-    return f"{sink.condition} at offset {sink.next_offset:,}{lag} · {sink.place} · {versions}"
+    condition: str = sink.condition
+    if sink.refold_done is not None and sink.refold_total:
+        condition += f", {100 * sink.refold_done // sink.refold_total} %, old map"
+    return f"{condition} at offset {sink.next_offset:,}{lag} · {sink.place} · {versions}"

@@ -25,7 +25,7 @@ from .options import (
     SettingsOption,
     VectorDbOption,
     databases,
-    settings_from,
+    settings_of,
 )
 from .replay import LoaderOption, Loaders, OnlyOption, loader_of, only_of
 from .terminal import Bar, emit, finish, say, say_metrics
@@ -52,7 +52,7 @@ def tail_command(
     as_json: JsonOption = False,
 ) -> None:
     """Keep the databases live while LOG grows; what cannot be folded is parked and listed."""
-    settings = settings_from(settings_file, assignments)
+    settings = settings_of(settings_file, assignments)
     address = None if metrics is None else parse_address(metrics, "--metrics")
     progress = TailProgress()
     with LogReader(log) as reader:

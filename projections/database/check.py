@@ -37,9 +37,10 @@ from .connection import (
 )
 from .cypher import PARENTS
 from .graph_render import Row, expected_rows
+from .inputs import LogInputs, MapInputs, SettingsOf
 from .labels import GRAPH, LABELS, TABLE, VERTEX_LABELS
 from .live_fold import LiveFold, batches
-from .origin import command_line, refuse_mismatch, rows_dropped
+from .origin import command_for, refuse_mismatch, rows_dropped
 from .sink import Checkpoint, SinkName
 from .statements import statements
 from .vector_rows import VectorRow, new_rows
@@ -137,7 +138,8 @@ class Difference:
 class CheckReport:
     """One sink at its checkpoint. ``differences`` are the first of ``differing``.
 
-    ``foreign`` are the tables in the graph's schema that a rebuild would drop.
+    ``foreign`` are the tables in the graph's schema that a rebuild would drop. The corrections are
+    those of the commands before ``known_at``.
     """
 
     sink: SinkName
@@ -146,6 +148,7 @@ class CheckReport:
     differing: int
     differences: tuple[Difference, ...]
     foreign: tuple[ForeignTable, ...] = ()
+    known_at: Offset | None = None
 
     @property
     def sound(self) -> bool:
@@ -154,9 +157,13 @@ class CheckReport:
 
 
 def check(
-    log: Path, targets: Targets, settings: Settings, *, only: SinkName | None = None
+    log: Path,
+    targets: Targets,
+    settings: Settings | SettingsOf,
+    *,
+    only: SinkName | None = None,
 ) -> list[CheckReport]:
-    """Compare the sinks with the fold. Raises ProjectionMissing and ProjectionMismatch."""
+    """Compare the sinks with the fold, under the corrections that each one knows. Raises ProjectionMissing and ProjectionMismatch."""
     sinks: tuple[tuple[SinkName, str], ...] = (
         ("graph", targets.graph_url),
         ("vectors", targets.vector_url),
@@ -164,7 +171,7 @@ def check(
     return [_check_sink(log, sink, url, settings) for sink, url in sinks if only in (None, sink)]
 
 
-def _check_sink(log: Path, sink: SinkName, url: str, settings: Settings) -> CheckReport:
+def _check_sink(log: Path, sink: SinkName, url: str, settings: Settings | SettingsOf) -> CheckReport:
     comparison = _Comparison()
     with LogReader(log) as reader, connect(url, application="mapfold check") as connection:
         connection.isolation_level = IsolationLevel.REPEATABLE_READ
@@ -174,16 +181,19 @@ def _check_sink(log: Path, sink: SinkName, url: str, settings: Settings) -> Chec
             connection.commit()
             locked = _lock_tables(connection, sink)
             checkpoint = checkpoints.load(connection, sink)
+            reader.refresh()  # a tail may have moved the checkpoint since it was opened
+            known = LogInputs.read(reader, settings)
             if checkpoint is None:
                 raise ProjectionMissing(
                     f"{describe_target(url)}: {_NO_ROWS_TEXT[sink]} been projected there;"
-                    f" run: {command_line('replay', log, settings)}"
+                    f" run: {command_for('replay', log, known.latest)}"
                 )
             if not locked:
-                raise rows_dropped(checkpoint, sink, describe_target(url), log, settings)
-            refuse_mismatch(checkpoint, sink, describe_target(url), log, reader, settings)
+                raise rows_dropped(checkpoint, sink, describe_target(url), log, known.latest)
+            inputs = known.at(checkpoint.known_to)
+            refuse_mismatch(checkpoint, sink, describe_target(url), log, reader, inputs)
             compare = _compare_graph if sink == "graph" else _compare_vectors
-            compare(connection, reader, checkpoint, settings, comparison)
+            compare(connection, reader, checkpoint, inputs, comparison)
             foreign = foreign_tables(connection) if sink == "graph" else ()
     return CheckReport(
         sink,
@@ -192,6 +202,7 @@ def _check_sink(log: Path, sink: SinkName, url: str, settings: Settings) -> Chec
         comparison.differing,
         tuple(comparison.differences),
         foreign,
+        checkpoint.known_to,
     )
 
 
@@ -256,10 +267,10 @@ def _compare_graph(
     connection: Connection,
     reader: LogReader,
     checkpoint: Checkpoint,
-    settings: Settings,
+    inputs: MapInputs,
     comparison: _Comparison,
 ) -> None:
-    fold = LiveFold(settings)
+    fold = LiveFold(inputs.settings, corrections=inputs.corrections)
     for _ in _folded(fold, _events(connection, reader, checkpoint, "graph")):
         fold.tracker.drain()
     for label in LABELS:
@@ -278,10 +289,10 @@ def _compare_vectors(
     connection: Connection,
     reader: LogReader,
     checkpoint: Checkpoint,
-    settings: Settings,
+    inputs: MapInputs,
     comparison: _Comparison,
 ) -> None:
-    fold = LiveFold(settings)
+    fold = LiveFold(inputs.settings, corrections=inputs.corrections)
     events = _events(connection, reader, checkpoint, "vectors")
     expected = (
         _vector_row(row)

@@ -3,15 +3,17 @@
 import hashlib
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Final
 
-from eventsrc.envelope import Offset, RunId
+import psycopg
+
+from eventsrc.envelope import FIRST_OFFSET, Offset, RunId
 from eventsrc.log import Event
 from projections.errors import CheckpointMoved, DatabaseError, ProjectionBusy
-from projections.settings import Settings
 
 from .connection import Connection, describe_connection
+from .inputs import MapInputs
 from .labels import GRAPH, LABELS, TABLE
 from .sink import Checkpoint, SinkName
 from .statements import statements
@@ -86,9 +88,23 @@ def has_schema(connection: Connection) -> bool:
 
 
 def ensure_schema(connection: Connection) -> None:
-    """Create the schema ``mapfold`` and its tables if they are missing."""
+    """Create the schema ``mapfold`` and its tables, or the columns that an older version lacks."""
     if not has_schema(connection):
         connection.execute(statements("checkpoint")["create"])
+    elif connection.execute(statements("checkpoint")["lacks_columns"]).fetchone() is None:
+        _add_columns(connection)
+
+
+def _add_columns(connection: Connection) -> None:
+    try:
+        with connection.transaction():
+            connection.execute(statements("checkpoint")["add_columns"])
+    except psycopg.errors.InsufficientPrivilege:
+        raise DatabaseError(
+            f"{describe_connection(connection)}: mapfold.checkpoint was made by an older version,"
+            " and only its owner may change that; have the owner run mapfold replay, then start"
+            " again"
+        ) from None
 
 
 def load(connection: Connection, sink: SinkName) -> Checkpoint | None:
@@ -107,35 +123,41 @@ def rows_exist(connection: Connection, sink: SinkName) -> bool:
     return row is not None and bool(row[0])
 
 
-def create(connection: Connection, sink: SinkName, log_id: str, settings: Settings) -> None:
-    """Insert a checkpoint at offset 0, if there is none."""
-    connection.execute(
-        statements("checkpoint")["create_first"],
-        {
-            "sink": sink,
-            "log_id": log_id,
-            "fingerprint": settings.fingerprint(),
-            "settings": settings.model_dump_json(),
-        },
+def at_offset(
+    log_id: str, inputs: MapInputs, next_offset: Offset, last_event: str, digest: str | None = None
+) -> Checkpoint:
+    """The checkpoint of a map of ``inputs`` with ``next_offset`` events."""
+    return Checkpoint(
+        log_id,
+        inputs.fingerprint,
+        inputs.settings.model_dump_json(),
+        next_offset,
+        last_event,
+        digest,
+        inputs.known_at,
+        inputs.observed,
     )
 
 
+def create(connection: Connection, sink: SinkName, log_id: str, inputs: MapInputs) -> None:
+    """Insert a checkpoint at offset 0, if there is none."""
+    first = at_offset(log_id, inputs, FIRST_OFFSET, "")
+    connection.execute(statements("checkpoint")["create_first"], {"sink": sink, **asdict(first)})
+
+
 def advance(
-    connection: Connection, sink: SinkName, before: Checkpoint, next_offset: Offset, last_event: str
+    connection: Connection, sink: SinkName, before: Checkpoint, after: Checkpoint
 ) -> Checkpoint:
     """Move the checkpoint, in the transaction of the rows. Raises CheckpointMoved."""
     cursor = connection.execute(
         statements("checkpoint")["advance"],
         {
             "sink": sink,
-            "log_id": before.log_id,
-            "fingerprint": before.fingerprint,
+            **asdict(after),
             "expected": before.next_offset,
-            "next_offset": next_offset,
-            "last_event": last_event,
+            "expected_fingerprint": before.fingerprint,
         },
     )
-    after = Checkpoint(before.log_id, before.fingerprint, before.settings, next_offset, last_event)
     if cursor.fetchone() is not None:
         return after
     found = load(connection, sink)
@@ -149,18 +171,7 @@ def advance(
 
 def replace(connection: Connection, sink: SinkName, checkpoint: Checkpoint) -> None:
     """Write a rebuild's checkpoint and delete the dead letters."""
-    connection.execute(
-        statements("checkpoint")["replace"],
-        {
-            "sink": sink,
-            "log_id": checkpoint.log_id,
-            "fingerprint": checkpoint.fingerprint,
-            "settings": checkpoint.settings,
-            "next_offset": checkpoint.next_offset,
-            "last_event": checkpoint.last_event,
-            "digest": checkpoint.digest,
-        },
-    )
+    connection.execute(statements("checkpoint")["replace"], {"sink": sink, **asdict(checkpoint)})
     connection.execute(statements("checkpoint")["unpark"], {"sink": sink})
 
 
@@ -189,6 +200,20 @@ def parked(connection: Connection, sink: SinkName) -> list[DeadLetter]:
 def write_heartbeat(connection: Connection, sink: SinkName) -> None:
     """Record that the sink's tail is alive."""
     connection.execute(statements("checkpoint")["write_heartbeat"], {"sink": sink})
+
+
+def write_refold(
+    connection: Connection, sink: SinkName, done: int | None, total: int | None
+) -> None:
+    """Record that the sink's tail is alive, and how far its refold is; None for no refold."""
+    values = {"sink": sink, "done": done, "total": total}
+    connection.execute(statements("checkpoint")["write_refold"], values)
+
+
+def refold(connection: Connection, sink: SinkName) -> tuple[int, int] | None:
+    """How many of how many events a tail has refolded; None when it is not at it."""
+    row = connection.execute(statements("checkpoint")["refold"], {"sink": sink}).fetchone()
+    return None if row is None or row[0] is None or row[1] is None else (row[0], row[1])
 
 
 def ages(connection: Connection, sink: SinkName) -> tuple[float, float | None]:

@@ -1,10 +1,11 @@
-"""Check that a projection was made from this log with these settings; what to run if it was not."""
+"""Check that a projection was made from this log with these settings and corrections; what to run
+if it was not."""
 
 import json
 import shlex
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal, TypeAlias
 
 from pydantic import ValidationError
 
@@ -14,6 +15,7 @@ from projections.errors import ProjectionMismatch, ProjectionMissing
 from projections.settings import Settings
 
 from .checkpoints import event_hash
+from .inputs import MapInputs
 from .sink import Checkpoint, SinkName
 
 _WAS: Final[dict[SinkName, str]] = {"graph": "was", "vectors": "were"}
@@ -21,18 +23,29 @@ _NOT_AN_OPTION: Final = "neighbourhood"
 """The setting that ``--set`` does not take."""
 
 
-def command_line(name: str, log: Path, settings: Settings, *options: str) -> str:
-    """``mapfold NAME LOG`` with ``options``, and ``--set`` for all that is not the default."""
-    " default."
-    default = Settings().model_dump()
+Fault: TypeAlias = Literal["log", "settings", "corrections"]
+"""What of a projection's origin is another than it should be."""
+
+
+def command_line(
+    name: str, log: Path, settings: Settings, *options: str, logged: Settings | None = None
+) -> str:
+    """``mapfold NAME LOG`` with ``options``, and ``--set`` for all that the command would not take
+    by itself: from the log, whose settings are ``logged``, or the defaults."""
+    default = (logged or Settings()).model_dump()
     changed = [key for key, value in settings.model_dump().items() if value != default[key]]
     words = ["mapfold", name, shlex.quote(str(log)), *options, *_options(settings, changed)]
     return " ".join(words)
 
 
-def replay_advice(log: Path, settings: Settings) -> str:
-    """What to do about a projection that does not match the log or the settings."""
-    return f"to make the map anew run: {command_line('replay', log, settings)}"
+def command_for(name: str, log: Path, inputs: MapInputs, *options: str) -> str:
+    """`command_line` that makes the map of ``inputs``."""
+    return command_line(name, log, inputs.settings, *options, logged=inputs.logged)
+
+
+def replay_advice(log: Path, inputs: MapInputs) -> str:
+    """What to do about a projection that does not match the log, the settings or corrections."""
+    return f"to make the map anew run: {command_for('replay', log, inputs)}"
 
 
 def _settings_differences(before: str, settings: Settings) -> list[str]:
@@ -72,33 +85,62 @@ def _changed_names(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     return [name for name in sorted(old.keys() | new.keys()) if old.get(name) != new.get(name)]
 
 
-def refuse_other_origin(
-    found: Checkpoint, sink: SinkName, where: str, log_id: str, settings: Settings, advice: str
-) -> None:
-    """Raise ProjectionMismatch when a checkpoint was made from another log or other settings."""
+def origin_fault(found: Checkpoint, log_id: str, inputs: MapInputs) -> Fault | None:
+    """What of a checkpoint's origin is not ``log_id`` or ``inputs``; None when all of it is."""
     if found.log_id != log_id:
+        return "log"
+    if found.fingerprint == inputs.fingerprint:
+        return None
+    return "corrections" if found.settings == inputs.settings.model_dump_json() else "settings"
+
+
+def refuse_other_origin(
+    found: Checkpoint, sink: SinkName, where: str, log_id: str, inputs: MapInputs, advice: str
+) -> None:
+    """Raise ProjectionMismatch when a checkpoint was made from another log, with other settings or
+    under other corrections."""
+    fault = origin_fault(found, log_id, inputs)
+    if fault == "log":
         raise ProjectionMismatch(
             f"{where}: the {sink} there {_WAS[sink]} made from log {found.log_id}, not from"
             f" {log_id}; {advice}"
         )
-    if found.fingerprint != settings.fingerprint():
-        options = _options_to_match(found.settings, settings)
+    if fault == "corrections" and not _is_of_another_version(found, inputs):
+        raise ProjectionMismatch(
+            f"{where}: the {sink} there {_WAS[sink]} made under other corrections than the log's"
+            f" commands before offset {found.known_to:,} give; {advice}"
+        )
+    if fault is not None:
+        options = _options_to_match(found.settings, inputs.settings)
         raise ProjectionMismatch(
             f"{where}: the {sink} there {_WAS[sink]} made with other settings"
-            f" ({', '.join(_settings_differences(found.settings, settings))});"
+            f" ({', '.join(_settings_differences(found.settings, inputs.settings))});"
             f"{f' to go on with them add {options};' if options else ''} {advice}"
         )
 
 
+def _is_of_another_version(found: Checkpoint, inputs: MapInputs) -> bool:
+    """Neither the log nor the checkpoint has corrections, and yet the fingerprints differ."""
+    return found.known_at is None and not inputs.corrections.fingerprint()
+
+
 def refuse_mismatch(
-    found: Checkpoint, sink: SinkName, where: str, log: Path, reader: LogReader, settings: Settings
+    found: Checkpoint, sink: SinkName, where: str, log: Path, reader: LogReader, inputs: MapInputs
 ) -> None:
-    """Raise ProjectionMismatch unless ``found`` was made from this log, as it is, and ``settings``.
+    """Raise ProjectionMismatch unless ``found`` was made from this log, as it is, and ``inputs``,
+    which are as of the checkpoint's `Checkpoint.known_to`.
 
     ``where`` names the database in the message.
     """
-    advice = replay_advice(log, settings)
-    refuse_other_origin(found, sink, where, reader.log_id, settings, advice)
+    advice = replay_advice(log, inputs)
+    refuse_other_origin(found, sink, where, reader.log_id, inputs, advice)
+    refuse_other_events(found, sink, where, log, reader, advice)
+
+
+def refuse_other_events(
+    found: Checkpoint, sink: SinkName, where: str, log: Path, reader: LogReader, advice: str
+) -> None:
+    """Raise ProjectionMismatch unless the log still has the events of a checkpoint."""
     if found.next_offset > reader.next_offset:
         raise ProjectionMismatch(
             f"{where}: {found.next_offset:,} events are in the {sink} there, but {log} has only"
@@ -113,10 +155,10 @@ def refuse_mismatch(
 
 
 def rows_dropped(
-    found: Checkpoint, sink: SinkName, where: str, log: Path, settings: Settings
+    found: Checkpoint, sink: SinkName, where: str, log: Path, inputs: MapInputs
 ) -> ProjectionMissing:
     """The error for a checkpoint whose graph or table was dropped."""
     return ProjectionMissing(
         f"{where}: the checkpoint of the {sink} has {found.next_offset:,} events, but their"
-        f" tables were dropped; {replay_advice(log, settings)}"
+        f" tables were dropped; {replay_advice(log, inputs)}"
     )

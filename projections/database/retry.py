@@ -18,6 +18,7 @@ from projections.settings import Settings
 from . import checkpoints
 from .checkpoints import DeadLetter
 from .connection import Targets, connect, database_errors, describe_target
+from .inputs import LogInputs, SettingsOf
 from .origin import refuse_mismatch
 from .rebuild import rebuild
 from .sink import SinkName
@@ -33,7 +34,7 @@ class RetryReport:
     rebuilt: bool
 
 
-def retry(log: Path, targets: Targets, settings: Settings) -> list[RetryReport]:
+def retry(log: Path, targets: Targets, settings: Settings | SettingsOf) -> list[RetryReport]:
     """Retry the parked events of both sinks. Raises ProjectionMismatch."""
     sinks: tuple[tuple[SinkName, str], ...] = (
         ("graph", targets.graph_url),
@@ -43,7 +44,7 @@ def retry(log: Path, targets: Targets, settings: Settings) -> list[RetryReport]:
 
 
 def _retry(
-    log: Path, targets: Targets, settings: Settings, sink: SinkName, url: str
+    log: Path, targets: Targets, settings: Settings | SettingsOf, sink: SinkName, url: str
 ) -> RetryReport:
     opened = connect(url, application="mapfold retry")
     with LogReader(log) as reader, opened as connection, database_errors(url):
@@ -51,10 +52,18 @@ def _retry(
         checkpoint = checkpoints.load(connection, sink)
         if checkpoint is None or not letters:
             return RetryReport(sink, 0, (), rebuilt=False)
-        refuse_mismatch(checkpoint, sink, describe_target(url), log, reader, settings)
+        inputs = LogInputs.read(reader, settings).at(checkpoint.known_to)
+        refuse_mismatch(checkpoint, sink, describe_target(url), log, reader, inputs)
         still = tuple(_still_rejected(reader, letters))
     if not still:
-        rebuild(log, targets, settings, until=checkpoint.next_offset, only=sink)
+        rebuild(
+            log,
+            targets,
+            settings,
+            until=checkpoint.next_offset,
+            known_at=checkpoint.known_to,
+            only=sink,
+        )
     return RetryReport(sink, len(letters), still, rebuilt=not still)
 
 

@@ -40,9 +40,11 @@ Conn = TypeVar("Conn", contravariant=True)
 class Checkpoint:
     """How far a sink is, and what it was made from.
 
-    ``next_offset`` events of the log ``log_id`` are in, folded with ``settings`` (canonical JSON;
-    ``fingerprint`` is their hash). ``last_event`` is `event_hash` of the last of them, "" for none:
-    it tells a log that was cut and continued differently. ``digest`` is the map's, when known.
+    ``next_offset`` events of the log ``log_id`` are in, folded with ``settings`` (canonical JSON)
+    under the corrections of the commands before ``known_at``; ``fingerprint`` is of both.
+    ``last_event`` is `event_hash` of the last event, "" for none: it tells a log that was cut and
+    continued differently. ``digest`` is the map's, when known. ``observed`` is as in
+    `inputs.MapInputs`. Checkpoints of older versions have neither ``known_at`` nor ``observed``.
     """
 
     log_id: str
@@ -51,6 +53,13 @@ class Checkpoint:
     next_offset: Offset
     last_event: str
     digest: str | None = None
+    known_at: Offset | None = None
+    observed: str | None = None
+
+    @property
+    def known_to(self) -> Offset:
+        """``known_at``, for older versions ``next_offset``."""
+        return self.next_offset if self.known_at is None else self.known_at
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,9 +1,10 @@
 """State of the databases compared with a log: lag, writer, dead letters, versions.
 
 A sink is *following* while a live tail writes it, with every event or still catching up; *stalled*
-when its tail has had no heartbeat for ``STALLED_S``; *rebuilding* while a replay writes it. Without
-a writer it is *idle* when it has every event and *behind* when not. It is *other* when it was made
-from another log or with other settings.
+when its tail has had no heartbeat for ``STALLED_S``; *refolding* while its tail makes the map anew
+because of a command; *rebuilding* while a replay writes it. Without a writer it is *idle* when it
+has every event and *behind* when not. It is *other* when it was made from another log, with other
+settings or under other corrections than the commands that it knows.
 """
 
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from typing import Final, Literal
 from eventsrc.envelope import Offset
 from eventsrc.log import LogReader
 from projections.errors import DatabaseError, ProjectionMismatch
+from eventsrc.text import counted
 from projections.settings import Settings
 
 from . import checkpoints
@@ -27,14 +29,23 @@ from .connection import (
     extension_version,
 )
 from .cypher import unwanted_writers
-from .origin import command_line, refuse_other_origin, replay_advice
+from .inputs import LogInputs, SettingsOf
+from .origin import command_for, refuse_other_origin, replay_advice
 from .sink import Checkpoint, SinkName
 
 STALLED_S: Final = 20.0
 """A live tail's heartbeat comes every 5 s."""
 
 Condition = Literal[
-    "missing", "other", "idle", "following", "rebuilding", "stalled", "behind", "unreachable"
+    "missing",
+    "other",
+    "idle",
+    "following",
+    "refolding",
+    "rebuilding",
+    "stalled",
+    "behind",
+    "unreachable",
 ]
 
 
@@ -43,7 +54,8 @@ class SinkStatus:
     """One sink. Ages are seconds; ``note`` explains ``other`` and ``unreachable``.
 
     ``lag`` is None when it was made from another log, or a longer one. ``unwanted_writers`` are
-    roles without the privilege to write that Apache AGE lets write nevertheless.
+    roles without the privilege to write that Apache AGE lets write nevertheless. ``refold_done`` of
+    ``refold_total`` events are refolded.
     """
 
     sink: SinkName
@@ -59,6 +71,8 @@ class SinkStatus:
     dead_letters: tuple[DeadLetter, ...] = ()
     versions: dict[str, str] | None = None
     unwanted_writers: tuple[str, ...] = ()
+    refold_done: int | None = None
+    refold_total: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,61 +86,71 @@ class Status:
     @property
     def healthy(self) -> bool:
         """True unless a sink is not up to date, has parked events or can be written by readers."""
-        good = ("idle", "following", "rebuilding")
+        good = ("idle", "following", "refolding", "rebuilding")
         return all(
             s.condition in good and not s.dead_letters and not s.unwanted_writers
             for s in self.sinks
         )
 
 
-def projection_status(log: Path, targets: Targets, settings: Settings) -> Status:
-    """State of both sinks. A database that cannot be reached is a finding, not an error."""
-    with LogReader(log) as reader:
-        log_id, end = reader.log_id, reader.next_offset
+def projection_status(log: Path, targets: Targets, settings: Settings | SettingsOf) -> Status:
+    """State of both sinks. A database that cannot be reached is a finding, not an error.
+
+    Raises FoldError for a command in the log that cannot be read.
+    """
     sinks: tuple[tuple[SinkName, str], ...] = (
         ("graph", targets.graph_url),
         ("vectors", targets.vector_url),
     )
-    found = tuple(_reachable_status(sink, url, log, log_id, end, settings) for sink, url in sinks)
-    return Status(log_id, end, found)
+    with LogReader(log) as reader:
+        found = tuple(_reachable_status(sink, url, reader, settings) for sink, url in sinks)
+        return Status(reader.log_id, reader.next_offset, found)
 
 
 def _reachable_status(
-    sink: SinkName, url: str, log: Path, log_id: str, end: Offset, settings: Settings
+    sink: SinkName, url: str, reader: LogReader, settings: Settings | SettingsOf
 ) -> SinkStatus:
     try:
         opened = connect(url, application="mapfold status", autocommit=True)
         with opened as connection, database_errors(url):
-            return _sink_status(connection, sink, log, log_id, end, settings)
+            return _sink_status(connection, sink, reader, settings)
     except DatabaseError as error:
         return SinkStatus(sink, describe_target(url), "unreachable", note=str(error))
 
 
 def _sink_status(
-    connection: Connection, sink: SinkName, log: Path, log_id: str, end: Offset, settings: Settings
+    connection: Connection, sink: SinkName, reader: LogReader, settings: Settings | SettingsOf
 ) -> SinkStatus:
     where = describe_connection(connection)
     versions = _versions(connection)
     found = checkpoints.load(connection, sink)
     writer = checkpoints.writer(connection, sink)
+    # After the checkpoint, which otherwise could know a command that we do not.
+    end = reader.refresh()
+    inputs = LogInputs.read(reader, settings)
     if found is None and writer is not None:
         return SinkStatus(sink, where, _working(writer), writer=writer, versions=versions)
     if found is None:
-        advice = f"nothing has been projected there; run: {command_line('replay', log, settings)}"
+        replay = command_for("replay", reader.path, inputs.latest)
+        advice = f"nothing has been projected there; run: {replay}"
         return SinkStatus(sink, where, "missing", note=advice, versions=versions)
     if not checkpoints.rows_exist(connection, sink):
         dropped = f"the tables of its {found.next_offset:,} events were dropped"
-        advice = f"{dropped}; {replay_advice(log, settings)}"
+        advice = f"{dropped}; {replay_advice(reader.path, inputs.latest)}"
         return SinkStatus(sink, where, "missing", note=advice, versions=versions)
     moved, heartbeat = checkpoints.ages(connection, sink)
-    condition, note = _condition(found, sink, where, log, log_id, end, settings, writer, heartbeat)
+    refolded = checkpoints.refold(connection, sink)
+    working = _Writer(writer, heartbeat, refolded is not None)
+    condition, note = _condition(found, sink, where, reader, inputs, working)
+    done, total = refolded if refolded and condition == "refolding" else (None, None)
+    is_of_log = found.log_id == reader.log_id and found.next_offset <= end
     return SinkStatus(
         sink,
         where,
         condition,
         note,
         found.next_offset,
-        end - found.next_offset if found.log_id == log_id and found.next_offset <= end else None,
+        end - found.next_offset if is_of_log else None,
         round(moved, 3),
         None if heartbeat is None else round(heartbeat, 3),
         writer,
@@ -134,34 +158,49 @@ def _sink_status(
         tuple(checkpoints.parked(connection, sink)),
         versions,
         tuple(unwanted_writers(connection)) if sink == "graph" else (),
+        done,
+        total,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Writer:
+    """Who holds a sink's lock, None for nobody; seconds since its tail's heartbeat."""
+
+    name: str | None
+    heartbeat: float | None
+    refolds: bool
 
 
 def _condition(
     found: Checkpoint,
     sink: SinkName,
     where: str,
-    log: Path,
-    log_id: str,
-    end: Offset,
-    settings: Settings,
-    writer: str | None,
-    heartbeat: float | None,
+    reader: LogReader,
+    inputs: LogInputs,
+    writer: _Writer,
 ) -> tuple[Condition, str | None]:
-    advice = replay_advice(log, settings)
+    advice, end = replay_advice(reader.path, inputs.latest), reader.next_offset
     try:
-        refuse_other_origin(found, sink, where, log_id, settings, advice)
+        refuse_other_origin(found, sink, where, reader.log_id, inputs.at(found.known_to), advice)
     except ProjectionMismatch as error:
         return "other", str(error)
     if found.next_offset > end:
         return "other", f"the log has only {end:,} events; {advice}"
-    if writer == "mapfold tail" and (heartbeat is None or heartbeat > STALLED_S):
+    if writer.name == "mapfold tail" and (writer.heartbeat is None or writer.heartbeat > STALLED_S):
         return "stalled", "a tail holds it but sends no heartbeat; look at that process"
-    if writer is not None:
-        return _working(writer), None
-    if found.next_offset == end:
+    if writer.name == "mapfold tail" and writer.refolds:
+        return "refolding", None
+    if writer.name is not None:
+        return _working(writer.name), None
+    unknown = inputs.since(found.known_to)
+    if found.next_offset == end and not unknown:
         return "idle", None
-    return "behind", f"nobody writes it; run: {command_line('tail', log, settings)}"
+    note = f"nobody writes it; run: {command_for('tail', reader.path, inputs.latest)}"
+    if unknown:
+        commands, last = counted(len(unknown), "command"), unknown[-1].offset
+        note = f"{commands} came since, the last at offset {last:,}; {note}"
+    return "behind", note
 
 
 def _working(writer: str) -> Literal["following", "rebuilding"]:

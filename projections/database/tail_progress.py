@@ -16,13 +16,15 @@ from .checkpoints import DeadLetter
 
 @dataclass(slots=True)
 class TailReport:
-    """What a tail did so far: batches and events written, its offset, what it parked."""
+    """What a tail did so far: batches and events written, its offset, what it parked, and how
+    often it made the map anew because of commands."""
 
     next_offset: Offset = FIRST_OFFSET
     events: int = 0
     batches: int = 0
     restarts: int = 0
     parked: list[DeadLetter] = field(default_factory=list)
+    refolds: int = 0
 
 
 class TailProgress:

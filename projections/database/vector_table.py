@@ -85,6 +85,12 @@ def is_owner(connection: Connection) -> bool:
     return row is None or bool(row[0])
 
 
+def has_hnsw(connection: Connection) -> bool:
+    """Whether the readers' table has the index of `build_hnsw`."""
+    row = connection.execute(statements("vectors")["has_hnsw"]).fetchone()
+    return row is not None and bool(row[0])
+
+
 def count(connection: Connection, schema: str) -> int:
     """Rows."""
     row = _execute(connection, "count", schema).fetchone()

@@ -20,7 +20,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final, TypeAlias
 
-from eventsrc.envelope import Offset
 from projections.errors import (
     CheckpointMoved,
     DatabaseError,
@@ -87,8 +86,7 @@ class SinkBatch:
     write: PreparedWrite[Connection]
     letters: tuple[DeadLetter, ...]
     before: Checkpoint
-    next_offset: Offset
-    last_event: str
+    after: Checkpoint
 
 
 @dataclass(slots=True)
@@ -149,9 +147,7 @@ class Writer:
                 for letter in part.letters:
                     checkpoints.park(connection, part.sink.name, letter)
             return [
-                checkpoints.advance(
-                    connection, part.sink.name, part.before, part.next_offset, part.last_event
-                )
+                checkpoints.advance(connection, part.sink.name, part.before, part.after)
                 for part in batch
             ]
 
@@ -182,7 +178,7 @@ class Writer:
 
     def _committed(self, batch: list[SinkBatch], found: FoundCheckpoints) -> list[Checkpoint]:
         """The checkpoints of a batch that was committed, in its order."""
-        ends = {part.sink.name: part.next_offset for part in batch}
+        ends = {part.sink.name: part.after.next_offset for part in batch}
         for sink in self.store.sinks:
             before, now = self.checkpoints[sink.name], found[sink.name]
             if now is None or now.next_offset < before.next_offset:

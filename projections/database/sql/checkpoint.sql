@@ -11,13 +11,17 @@ COMMENT ON SCHEMA mapfold IS 'mapfold: progress of the projections; made and rem
 CREATE TABLE mapfold.checkpoint (
     sink         text PRIMARY KEY CHECK (sink IN ('graph', 'vectors')),
     log_id       text NOT NULL,
-    fingerprint  text NOT NULL,           -- of the settings
+    fingerprint  text NOT NULL,           -- of the settings and the corrections
     settings     text NOT NULL,           -- canonical JSON, to say what differs
     next_offset  bigint NOT NULL CHECK (next_offset >= 0),
     last_event   text NOT NULL,           -- hash of the event at next_offset - 1, '' for none
     digest       text,                    -- of the whole map, when a rebuild computed it
     moved_at     timestamptz NOT NULL DEFAULT now(),
-    heartbeat_at timestamptz              -- when a tail last said that it lives
+    heartbeat_at timestamptz,             -- when a tail last said that it lives
+    known_at     bigint,                  -- the corrections are those of the commands before it
+    observed     text,                    -- fingerprint of what the observations depend on
+    refold_done  bigint,                  -- events that a tail's refold has folded …
+    refold_total bigint                   -- … of so many; null when there is none
 );
 CREATE TABLE mapfold.dead_letter (
     sink       text NOT NULL,
@@ -29,41 +33,64 @@ CREATE TABLE mapfold.dead_letter (
     PRIMARY KEY (sink, log_offset)
 );
 
+-- name: lacks_columns
+-- No row when the table was made before there were corrections.
+SELECT 1 FROM pg_attribute
+WHERE attrelid = 'mapfold.checkpoint'::regclass AND attname = 'refold_total'
+
+-- name: add_columns
+ALTER TABLE mapfold.checkpoint
+    ADD COLUMN IF NOT EXISTS known_at bigint, ADD COLUMN IF NOT EXISTS observed text,
+    ADD COLUMN IF NOT EXISTS refold_done bigint, ADD COLUMN IF NOT EXISTS refold_total bigint
+
 -- name: load
-SELECT log_id, fingerprint, settings, next_offset, last_event, digest
-FROM mapfold.checkpoint WHERE sink = %(sink)s
+-- By name through JSON, as a reader may meet a table that an older version made.
+SELECT c.log_id, c.fingerprint, c.settings, c.next_offset, c.last_event, c.digest,
+       (to_jsonb(c) ->> 'known_at')::bigint, to_jsonb(c) ->> 'observed'
+FROM mapfold.checkpoint c WHERE c.sink = %(sink)s
 
 -- name: rows_exist
 SELECT to_regclass(%(table)s) IS NOT NULL
 
 -- name: create_first
 -- The first checkpoint, of one tail only if two start at once.
-INSERT INTO mapfold.checkpoint (sink, log_id, fingerprint, settings, next_offset, last_event)
-VALUES (%(sink)s, %(log_id)s, %(fingerprint)s, %(settings)s, 0, '')
+INSERT INTO mapfold.checkpoint
+    (sink, log_id, fingerprint, settings, next_offset, last_event, known_at, observed)
+VALUES (%(sink)s, %(log_id)s, %(fingerprint)s, %(settings)s, 0, '', %(known_at)s, %(observed)s)
 ON CONFLICT (sink) DO NOTHING
 
 -- name: advance
--- Compare-and-set: moves only from the offset, log and settings that the caller expects.
+-- Compare-and-set: moves only from the offset, log, settings and corrections that the caller expects.
 UPDATE mapfold.checkpoint
 SET next_offset = %(next_offset)s, last_event = %(last_event)s, digest = NULL,
+    fingerprint = %(fingerprint)s, known_at = %(known_at)s, observed = %(observed)s,
     moved_at = now(), heartbeat_at = now()
 WHERE sink = %(sink)s AND next_offset = %(expected)s
-  AND log_id = %(log_id)s AND fingerprint = %(fingerprint)s
+  AND log_id = %(log_id)s AND fingerprint = %(expected_fingerprint)s
 RETURNING next_offset
 
 -- name: replace
 -- A rebuild overwrites whatever was there.
 INSERT INTO mapfold.checkpoint
-    (sink, log_id, fingerprint, settings, next_offset, last_event, digest)
+    (sink, log_id, fingerprint, settings, next_offset, last_event, digest, known_at, observed)
 VALUES (%(sink)s, %(log_id)s, %(fingerprint)s, %(settings)s, %(next_offset)s, %(last_event)s,
-        %(digest)s)
+        %(digest)s, %(known_at)s, %(observed)s)
 ON CONFLICT (sink) DO UPDATE
 SET log_id = EXCLUDED.log_id, fingerprint = EXCLUDED.fingerprint, settings = EXCLUDED.settings,
     next_offset = EXCLUDED.next_offset, last_event = EXCLUDED.last_event,
-    digest = EXCLUDED.digest, moved_at = now(), heartbeat_at = NULL
+    digest = EXCLUDED.digest, known_at = EXCLUDED.known_at, observed = EXCLUDED.observed,
+    moved_at = now(), heartbeat_at = NULL, refold_done = NULL, refold_total = NULL
 
 -- name: write_heartbeat
 UPDATE mapfold.checkpoint SET heartbeat_at = now() WHERE sink = %(sink)s
+
+-- name: write_refold
+UPDATE mapfold.checkpoint
+SET heartbeat_at = now(), refold_done = %(done)s, refold_total = %(total)s WHERE sink = %(sink)s
+
+-- name: refold
+SELECT (to_jsonb(c) ->> 'refold_done')::bigint, (to_jsonb(c) ->> 'refold_total')::bigint
+FROM mapfold.checkpoint c WHERE c.sink = %(sink)s
 
 -- name: ages
 SELECT extract(epoch FROM now() - moved_at)::float8, extract(epoch FROM now() - heartbeat_at)::float8
@@ -93,3 +120,7 @@ SELECT a.pid, coalesce(nullif(a.application_name, ''), 'unknown')
 FROM pg_locks l JOIN pg_stat_activity a USING (pid)
 WHERE l.locktype = 'advisory' AND l.granted AND l.classid = 1835102310 AND l.objid = %(number)s
   AND l.database = (SELECT oid FROM pg_database WHERE datname = current_database())
+
+-- name: may_create
+-- Whether this role may make the shadows of a refold.
+SELECT has_database_privilege(current_database(), 'CREATE')

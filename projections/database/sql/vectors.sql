@@ -93,3 +93,11 @@ SELECT nspname FROM pg_extension JOIN pg_namespace n ON n.oid = extnamespace WHE
 SELECT (SELECT count(*) FROM public.detection_embeddings), a.atttypmod
 FROM pg_attribute a
 WHERE a.attrelid = 'public.detection_embeddings'::regclass AND a.attname = 'embedding'
+
+-- name: has_hnsw
+-- Whether the readers' table has the index for vector search.
+SELECT EXISTS (
+    SELECT 1 FROM pg_index i JOIN pg_class c ON c.oid = i.indexrelid
+    JOIN pg_am a ON a.oid = c.relam
+    WHERE i.indrelid = to_regclass('public.detection_embeddings') AND a.amname = 'hnsw'
+)

@@ -1,0 +1,168 @@
+"""Refold: a tail makes the map anew under other corrections while readers use the old one.
+
+It is a rebuild (`shadows`) over the tail's own connections and locks, with three differences. It
+goes on until it has all events that came meanwhile. An event that cannot be folded is parked, as
+a tail does. And it looks for commands that are recorded while it is at work: those that only name
+places join it; another one restarts it once. After that it goes through, so that commands that
+keep coming cannot keep the map from changing, and the next refold begins.
+
+The checkpoint says which commands the new map knows, in the transaction of the swap. Whatever ends
+a refold, a command that no map knows yet makes the next tail refold.
+"""
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+from eventsrc.envelope import FIRST_OFFSET, Offset
+from eventsrc.log import Event, LogReader
+from projections.errors import MapfoldError
+from projections.model.fold import gc_paused
+
+from .checkpoints import DeadLetter, dead_letter
+from .connection import Connection, database_errors
+from .inputs import LogInputs, MapInputs, commands_between
+from .kept_rows import KeptVectors
+from .live_fold import LiveFold, batches
+from .refold_progress import RefoldProgress
+from .shadows import FoldedLog, ShadowOf, ShadowWriter, drop_replaced, stream, swap_in_new_map
+from .sink import Checkpoint, Shadow, SinkName
+from .statements import statements
+from .stores import DatabaseSink, Store
+from .vector_table import has_hnsw
+
+TICK_EVENTS: Final = 256
+LOOK_S: Final = 0.5
+"""Between two looks for commands that came meanwhile."""
+
+
+class CommandsCame(Exception):
+    """Commands that change more than names were recorded during a refold."""
+
+
+class RefoldStopped(Exception):
+    """The tail was stopped during a refold; the old map stays."""
+
+
+@dataclass(slots=True)
+class Refold:
+    """One refold. ``found`` are the checkpoints of the old map, ``parked`` its dead letters.
+
+    With ``goes_through`` commands that come meanwhile are left to the next one.
+    """
+
+    stores: Sequence[Store]
+    reader: LogReader
+    inputs: LogInputs
+    found: dict[SinkName, Checkpoint]
+    parked: bool
+    stop: threading.Event
+    goes_through: bool
+    on_progress: Callable[[int, int], None]
+    base: MapInputs = field(init=False)
+    _letters: list[DeadLetter] = field(default_factory=list)
+    _looked_at: float = 0.0
+
+    def run(self) -> FoldedLog:
+        """Make the map anew and swap it in. Raises CommandsCame and RefoldStopped."""
+        self.base = self.inputs.latest
+        folded: list[FoldedLog] = []
+
+        def fold_into(writers: Sequence[ShadowWriter]) -> FoldedLog:
+            folded.append(self._fold(writers, progress))
+            return folded[0]
+
+        indexed = self._swaps_indexed_vectors()
+        with gc_paused(), RefoldProgress(self.stores) as progress:
+            swap_in_new_map(
+                self.stores,
+                self.reader.log_id,
+                fold_into,
+                lambda _: None,
+                shadow_of=self._shadow_of(),
+                while_swapping=progress.held(),
+            )
+            drop_replaced(self.stores, lambda _: None, hnsw=indexed)
+        return folded[0]
+
+    def _fold(self, writers: Sequence[ShadowWriter], progress: RefoldProgress) -> FoldedLog:
+        fold = LiveFold(self.base.settings, corrections=self.base.corrections)
+        last: Event | None = None
+        at, end = FIRST_OFFSET, self.inputs.end
+        with LogReader(self.reader.path) as events:
+            while at < end:
+                for batch in batches(events.read(at, end), TICK_EVENTS):
+                    self._feed(fold, batch)
+                    last = batch[-1]
+                    stream(fold, writers)
+                    progress.tell(last.offset + 1, end)
+                    self.on_progress(last.offset + 1, end)
+                    if time.monotonic() - self._looked_at > LOOK_S:
+                        self._look()
+                at, end = end, self._look()
+                events.refresh()
+        return FoldedLog(fold, last, self._named(fold, last), tuple(self._letters))
+
+    def _feed(self, fold: LiveFold, batch: list[Event]) -> None:
+        if self.stop.is_set():
+            raise RefoldStopped
+        for event, error in zip(batch, fold.feed(batch), strict=True):
+            if error is not None:
+                self._letters.append(dead_letter(event, error.reason))
+
+    def _look(self) -> Offset:
+        """Find the commands that came since; the log's end now."""
+        self._looked_at = time.monotonic()
+        start, end = self.inputs.end, self.reader.refresh()
+        self.inputs.extend(commands_between(self.reader, start, end), end)
+        if not self.goes_through and not self.base.differs_only_in_names(self.inputs.latest):
+            raise CommandsCame
+        return end
+
+    def _named(self, fold: LiveFold, last: Event | None) -> MapInputs:
+        """The inputs of the map, after names that came meanwhile."""
+        latest = self.inputs.latest
+        if last is None or not self.base.differs_only_in_names(latest):
+            return self.base
+        fold.use_names(last.offset, latest.corrections)
+        return latest
+
+    def _shadow_of(self) -> ShadowOf:
+        def shadow_of(sink: DatabaseSink) -> Shadow[Connection]:
+            if self._keeps(sink.name):
+                return KeptVectors(sink, self.found[sink.name].next_offset)
+            return sink.shadow()
+
+        return shadow_of
+
+    def _keeps(self, sink: SinkName) -> bool:
+        """Whether the new map has the same rows of this sink.
+
+        Parked events are tried again, and one that can be folded now would move all later rows.
+        """
+        found = self.found[sink]
+        observed = found.fingerprint if found.observed is None else found.observed
+        return sink == "vectors" and observed == self.base.observed and not self.parked
+
+    def _swaps_indexed_vectors(self) -> bool:
+        return any(
+            has_hnsw(store.connection)
+            for store in self.stores
+            for sink in store.sinks
+            if sink.name == "vectors" and not self._keeps("vectors")
+        )
+
+
+def refuse_if_not_allowed(stores: Sequence[Store], advice: str) -> None:
+    """Raise MapfoldError when this role may not make the tables of a refold."""
+    for store in stores:
+        with database_errors(store.url):
+            row = store.connection.execute(statements("checkpoint")["may_create"]).fetchone()
+        if row is None or not row[0]:
+            raise MapfoldError(
+                f"{store.place}: the log has commands that the map there does not know yet, and"
+                " this role may not make the tables of a new one; have their owner make it, then"
+                f" start again; {advice}"
+            )

@@ -1,0 +1,322 @@
+"""One pass of a tail, from the checkpoints to the end of the log; `tail` says how it goes."""
+
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import takewhile
+from pathlib import Path
+from typing import Final, TypeAlias
+
+from eventsrc.envelope import Offset
+from eventsrc.log import Event, LogReader, follow
+from eventsrc.system_events import COMMAND_KEY
+from projections.errors import FoldError, ProjectionMismatch
+from projections.model.fold import SNAPSHOT_MIN_EVENTS
+from projections.model.log_commands import read_command
+from projections.model.snapshot_cache import SnapshotCache
+from projections.settings import Settings
+
+from . import checkpoints
+from .checkpoints import DeadLetter, dead_letter, event_hash
+from .connection import Targets, database_errors, describe_target
+from .inputs import LogInputs, MapInputs, SettingsOf
+from .live_fold import LiveFold, batches
+from .loader import LoaderName
+from .origin import (
+    origin_fault,
+    refuse_mismatch,
+    refuse_other_events,
+    replay_advice,
+    rows_dropped,
+)
+from .refold import CommandsCame, Refold, RefoldStopped, refuse_if_not_allowed
+from .sink import Checkpoint, SinkName
+from .stores import Only, Store, open_stores
+from .tail_progress import TailProgress, TailReport
+from .writer import AWAY, Backoff, LostCommits, OnTrouble, SinkBatch, Writer
+
+HEARTBEAT_S: Final = 5.0
+
+OnBatch: TypeAlias = Callable[[TailReport], None]
+OnRefold: TypeAlias = Callable[[int, int], None]
+Note: TypeAlias = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class TailPlan:
+    """The arguments of `tail`."""
+
+    log: Path
+    targets: Targets
+    settings: Settings | SettingsOf
+    once: bool
+    stop: threading.Event
+    patience_s: float | None
+    batch_events: int
+    on_fold: Callable[[int], None]
+    on_batch: OnBatch
+    on_trouble: OnTrouble
+    on_refold: OnRefold
+    note: Note
+    progress: TailProgress
+
+
+@dataclass(slots=True)
+class TailPass:
+    """From the checkpoints to the end of the log, or for as long as it grows.
+
+    Call `run`. ``current`` is what the map is made with now. ``parked`` has all dead letters by
+    offset, ``letters`` those that are to be written with the next batch.
+    """
+
+    plan: TailPlan
+    stores: list[Store]
+    report: TailReport
+    inputs: LogInputs
+    current: MapInputs
+    checkpoints: dict[SinkName, Checkpoint] = field(default_factory=dict)
+    parked: dict[Offset, DeadLetter] = field(default_factory=dict)
+    letters: list[DeadLetter] = field(default_factory=list)
+    began: bool = False
+
+    def run(self, reader: LogReader) -> None:
+        """Follow the log, and refold when commands make it necessary.
+
+        Raises LostCommits, CheckpointMoved, ProjectionMismatch.
+        """
+        fold, restarts = None, 0
+        while True:
+            is_current = self._begin(reader)
+            self.began = True
+            if is_current:
+                if self._follow(reader, fold):
+                    return
+                fold, restarts = None, 0
+            else:
+                fold = None  # free the old one first
+                try:
+                    fold = self._refold(reader, goes_through=restarts > 0)
+                    restarts = 0
+                except CommandsCame:
+                    restarts += 1
+                except RefoldStopped:
+                    return
+
+    def _refold(self, reader: LogReader, *, goes_through: bool) -> LiveFold:
+        plan = self.plan
+        refuse_if_not_allowed(self.stores, replay_advice(plan.log, self.inputs.latest))
+        folded = Refold(
+            self.stores,
+            reader,
+            self.inputs,
+            self.checkpoints,
+            bool(self.parked),
+            plan.stop,
+            goes_through,
+            plan.on_refold,
+        ).run()
+        self.report.refolds += 1
+        self.report.parked += [x for x in folded.letters if x.offset not in self.parked]
+        return folded.fold
+
+    def _follow(self, reader: LogReader, folded: LiveFold | None) -> bool:
+        """Fold and write what comes; False when a command came that needs a refold.
+
+        ``folded`` is the fold that the databases were made with just now.
+        """
+        plan, current = self.plan, self.current
+        cache = SnapshotCache(
+            plan.log, reader.log_id, current.settings, plan.note, corrections=current.corrections
+        )
+        fold = folded or LiveFold(
+            current.settings,
+            cache.latest(self._latest_usable_snapshot()),
+            corrections=current.corrections,
+        )
+        start = fold.map.next_offset
+        writers = self._writers()
+        last_beat = time.monotonic()
+        plan.on_fold(start)
+        for batch in batches(
+            self._events(reader, start), plan.batch_events, self._checkpoint_offsets()
+        ):
+            if not self._knows(batch):
+                return False
+            last = self._fold(fold, batch)
+            if last is not None:
+                self._write(fold, writers, last)
+                plan.on_fold(Offset(last.offset + 1))
+            if time.monotonic() - last_beat > HEARTBEAT_S:
+                last_beat = time.monotonic()
+                for writer in writers:
+                    writer.write_heartbeat()
+            if plan.once and plan.stop.is_set():
+                break
+        if fold.map.next_offset - start >= SNAPSHOT_MIN_EVENTS and not self.parked:
+            cache.keep(fold.map, fold.view)
+        return True
+
+    def _knows(self, batch: Sequence[Event]) -> bool:
+        """Take note of the commands of a batch; False when they change more than names."""
+        commands = [
+            read_command(event)
+            for event in batch
+            if event.key == COMMAND_KEY and event.offset >= self.inputs.end
+        ]
+        if not commands:
+            return True
+        self.inputs.extend(commands, Offset(batch[-1].offset + 1))
+        return self.current.differs_only_in_names(self.inputs.latest)
+
+    def _events(self, reader: LogReader, start: Offset) -> Iterable[Event | None]:
+        if self.plan.once:
+            return reader.read(start, reader.next_offset)
+        return follow(self.plan.log, start, stop=self.plan.stop)
+
+    def _writers(self) -> list[Writer]:
+        plan = self.plan
+        return [
+            Writer(
+                store,
+                self.checkpoints,
+                plan.targets.restart_embedded,
+                plan.stop,
+                plan.on_trouble,
+                plan.patience_s,
+            )
+            for store in self.stores
+        ]
+
+    def _checkpoint_offsets(self) -> set[Offset]:
+        """Batches end there, so that a sink gets a batch as a whole or not at all."""
+        return {checkpoint.next_offset for checkpoint in self.checkpoints.values()}
+
+    def _latest_usable_snapshot(self) -> Offset:
+        """The highest offset of a snapshot to start from: below all checkpoints and parked events,
+        which another command may have folded."""
+        return min([c.next_offset for c in self.checkpoints.values()] + list(self.parked))
+
+    def _begin(self, reader: LogReader) -> bool:
+        """Create what is missing, read the checkpoints, refuse those that do not match.
+
+        False when the map does not know all commands, or not in the way that we read them.
+        """
+        plan = self.plan
+        reader.refresh()
+        self.inputs = LogInputs.read(reader, plan.settings)
+        parked: dict[Offset, DeadLetter] = {}
+        faults = False
+        for store in self.stores:
+            with database_errors(store.url), store.connection.transaction():
+                for sink in store.sinks:
+                    made = sink.ensure(store.connection)
+                    checkpoints.create(
+                        store.connection, sink.name, reader.log_id, self.inputs.latest
+                    )
+                    found = checkpoints.load(store.connection, sink.name)
+                    assert found is not None  # noqa: S101 - begun in this transaction
+                    faults |= self._refuse_mismatch(found, sink.name, store.place, reader)
+                    if made and found.next_offset:
+                        raise rows_dropped(
+                            found, sink.name, store.place, plan.log, self.inputs.latest
+                        )
+                    # Now, as with the lock held `status` takes the sink for followed.
+                    checkpoints.write_refold(store.connection, sink.name, None, None)
+                    self.checkpoints[sink.name] = found
+                    letters = checkpoints.parked(store.connection, sink.name)
+                    parked.update((letter.offset, letter) for letter in letters)
+        self.parked = parked
+        self.report.next_offset = min(c.next_offset for c in self.checkpoints.values())
+        self.plan.progress.update(self.report)
+        # Only the graph has names, so it decides which names the map has now.
+        first = self.checkpoints.get("graph") or next(iter(self.checkpoints.values()))
+        self.current = self.inputs.at(first.known_to)
+        return not faults and all(
+            self.current.differs_only_in_names(other)
+            for other in (
+                self.inputs.latest,
+                *(self.inputs.at(c.known_to) for c in self.checkpoints.values()),
+            )
+        )
+
+    def _refuse_mismatch(
+        self, found: Checkpoint, sink: SinkName, where: str, reader: LogReader
+    ) -> bool:
+        """Raise ProjectionMismatch for another log or settings; True for other corrections."""
+        log, inputs = self.plan.log, self.inputs.at(found.known_to)
+        if origin_fault(found, reader.log_id, inputs) != "corrections":
+            refuse_mismatch(found, sink, where, log, reader, inputs)
+            return False
+        advice = replay_advice(log, self.inputs.latest)
+        refuse_other_events(found, sink, where, log, reader, advice)
+        return True
+
+    def _advice(self) -> str:
+        return replay_advice(self.plan.log, self.current)
+
+    def _fold(self, fold: LiveFold, batch: list[Event]) -> Event | None:
+        """Fold a batch; returns its last event, None for an empty one."""
+        rest = batch
+        while rest:
+            stretch = list(takewhile(lambda event: event.offset not in self.parked, rest))
+            for event, error in zip(stretch, fold.feed(stretch), strict=True):
+                if error is not None:
+                    self._park(event, error)
+            rest = rest[len(stretch) :]
+            if rest:
+                # Parked by the other sink, which is ahead: leave it out of this one too.
+                self.letters.append(self.parked[rest[0].offset])
+                fold.skip(rest[0].offset)
+                rest = rest[1:]
+        return batch[-1] if batch else None
+
+    def _park(self, event: Event, error: FoldError) -> None:
+        if any(event.offset < c.next_offset for c in self.checkpoints.values()):
+            raise ProjectionMismatch(
+                f"{error}, but it is in the databases already: they were made by another version;"
+                f" {self._advice()}"
+            )
+        letter = dead_letter(event, error.reason)
+        self.parked[letter.offset] = letter
+        self.letters.append(letter)
+        self.report.parked.append(letter)
+
+    def _write(self, fold: LiveFold, writers: list[Writer], last: Event) -> None:
+        """Write a batch to the sinks that do not have it yet."""
+        next_offset = Offset(last.offset + 1)
+        self._use_names(fold, last.offset)
+        changes = fold.tracker.drain()
+        written = 0
+        for writer in writers:
+            parts = [
+                SinkBatch(
+                    sink,
+                    sink.prepare(changes, fold.view),
+                    tuple(self.letters),
+                    at,
+                    checkpoints.at_offset(at.log_id, self.current, next_offset, event_hash(last)),
+                )
+                for sink in writer.store.sinks
+                if (at := self.checkpoints[sink.name]).next_offset < next_offset
+            ]
+            if parts:
+                for part, after in zip(parts, writer.write(parts), strict=True):
+                    written = max(written, after.next_offset - part.before.next_offset)
+                    self.checkpoints[part.sink.name] = after
+        self.letters.clear()
+        if written:
+            self.report.events += written
+            self.report.batches += 1
+            self.report.next_offset = next_offset
+            self.plan.progress.update(self.report)
+            self.plan.on_batch(self.report)
+
+    def _use_names(self, fold: LiveFold, offset: Offset) -> None:
+        """Take over names that the commands up to ``offset`` give."""
+        known_at = Offset(max(self.current.known_at, offset + 1))
+        if not self.inputs.has_between(self.current.known_at, known_at):
+            self.current = self.current.known_to(known_at)
+            return
+        self.current = self.inputs.at(known_at)
+        fold.use_names(offset, self.current.corrections)
