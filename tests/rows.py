@@ -85,6 +85,8 @@ def expected_graph(view: MapView) -> dict[str, list[tuple[Any, ...]]]:
             "centroid_y": p.centroid_y,
             "keyframe_count": p.keyframe_count,
         }
+        if p.name is not None:
+            properties["name"] = p.name
         rows["Place"].append((gid("Place", p.ordinal + 1), properties))
     for a, b, shared in view.edges():
         ends = gid("Place", a + 1), gid("Place", b + 1)

@@ -163,7 +163,10 @@ def check(
     *,
     only: SinkName | None = None,
 ) -> list[CheckReport]:
-    """Compare the sinks with the fold, under the corrections that each one knows. Raises ProjectionMissing and ProjectionMismatch."""
+    """Compare the sinks with the fold, each under the corrections that it knows.
+
+    Raises ProjectionMissing and ProjectionMismatch.
+    """
     sinks: tuple[tuple[SinkName, str], ...] = (
         ("graph", targets.graph_url),
         ("vectors", targets.vector_url),
@@ -171,7 +174,9 @@ def check(
     return [_check_sink(log, sink, url, settings) for sink, url in sinks if only in (None, sink)]
 
 
-def _check_sink(log: Path, sink: SinkName, url: str, settings: Settings | SettingsOf) -> CheckReport:
+def _check_sink(
+    log: Path, sink: SinkName, url: str, settings: Settings | SettingsOf
+) -> CheckReport:
     comparison = _Comparison()
     with LogReader(log) as reader, connect(url, application="mapfold check") as connection:
         connection.isolation_level = IsolationLevel.REPEATABLE_READ

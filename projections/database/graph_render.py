@@ -127,13 +127,14 @@ def object_rows(view: MapView, objects: Iterable[int]) -> Iterator[VertexRow]:
 
 
 def place_rows(view: MapView, places: Iterable[int]) -> Iterator[VertexRow]:
-    """Places, also those that were absorbed."""
+    """Places, also those that were absorbed; only those that have a name have the property."""
     base = BASE["Place"]
     for i in places:
         p = view.all_places[i]
+        name = "" if p.name is None else f', "name": {text(p.name)}'
         properties = (
             f'{{"place_id": {text(p.place_id)}, "centroid_x": {number(p.centroid_x)},'
-            f' "centroid_y": {number(p.centroid_y)}, "keyframe_count": {p.keyframe_count}}}'
+            f' "centroid_y": {number(p.centroid_y)}, "keyframe_count": {p.keyframe_count}{name}}}'
         )
         yield base + i, properties
 

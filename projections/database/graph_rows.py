@@ -3,7 +3,8 @@
 Two kinds of rows. *Fixed* ones are written once, when their event is folded: Keyframe, Pose,
 Observation and the edges HAS_KEYFRAME, HAS_POSE, HAS_OBSERVATION, OBSERVES (an observation is fused
 by the event that adds it, or never). *Changing* ones can get other values later: Run, Object, Place
-and the edges LOCATED_IN, IN_PLACE, ADJACENT_TO.
+and the edges LOCATED_IN, IN_PLACE, ADJACENT_TO. Where corrections make two Objects one, OBSERVES is
+a changing one too.
 """
 
 from collections.abc import Sequence
@@ -44,17 +45,34 @@ CHANGING: Final[tuple[Label, ...]] = (
 
 @dataclass(frozen=True, slots=True)
 class GraphRows:
-    """Rows to insert (never seen before), to upsert, and graphids to delete, by label."""
+    """Rows to insert (never seen before), to upsert, and graphids to delete, by label.
+
+    ``replaced`` are rows to delete and insert anew, of labels that cannot be upserted.
+    """
 
     inserted: dict[Label, list[Any]]
     upserted: dict[Label, list[Any]]
     deleted: dict[Label, list[int]]
+    replaced: dict[Label, list[Any]]
 
 
 def fixed_rows(
     view: MapView, keyframes: Sequence[int], observations: Sequence[int]
 ) -> dict[Label, list[Any]]:
     """The rows of these keyframes and observations that can never change again."""
+    rows = _new_rows(view, keyframes, observations)
+    if _objects_may_merge(view):
+        rows.pop("OBSERVES", None)
+    return rows
+
+
+def _objects_may_merge(view: MapView) -> bool:
+    return bool(view.corrections.same)
+
+
+def _new_rows(
+    view: MapView, keyframes: Sequence[int], observations: Sequence[int]
+) -> dict[Label, list[Any]]:
     rows: dict[Label, list[Any]] = {
         "Keyframe": list(keyframe_rows(view, keyframes)),
         "Pose": list(pose_rows(view, keyframes)),
@@ -69,7 +87,8 @@ def fixed_rows(
 
 def changing_rows(view: MapView) -> dict[Label, list[Any]]:
     """All rows of the map that a later event may change."""
-    rows = {label: list(expected_rows(view, label)) for label in CHANGING}
+    labels = (*CHANGING, "OBSERVES") if _objects_may_merge(view) else CHANGING
+    rows = {label: list(expected_rows(view, label)) for label in labels}
     return {label: found for label, found in rows.items() if found}
 
 
@@ -79,23 +98,29 @@ def changed_rows(changes: BatchChanges, view: MapView) -> GraphRows:
         "Run": list(run_rows(view, changes.runs)),
         "Object": list(object_rows(view, filter(view.objects.__contains__, changes.objects))),
         "Place": list(place_rows(view, filter(view.places.__contains__, changes.places))),
-        "LOCATED_IN": list(located_in_rows(view, changes.located)),
+        "LOCATED_IN": list(
+            located_in_rows(view, filter(view.objects.__contains__, changes.located))
+        ),
         "IN_PLACE": list(in_place_rows(view, changes.placed)),
         "ADJACENT_TO": list(adjacent_to_rows(view, changes.links)),
     }
+    absorbed = [o for o in changes.objects if o not in view.objects]
+    nowhere = [o for o in changes.located if view.all_objects[o].place is None]
     deleted: dict[Label, list[int]] = {
         "Place": [BASE["Place"] + p for p in changes.places if p not in view.places],
-        "LOCATED_IN": [
-            BASE["LOCATED_IN"] + o for o in changes.located if view.all_objects[o].place is None
-        ],
+        "Object": [BASE["Object"] + o for o in absorbed],
+        "LOCATED_IN": [BASE["LOCATED_IN"] + o for o in sorted({*absorbed, *nowhere})],
         "ADJACENT_TO": [
             graphid_base("ADJACENT_TO") + adjacency_number(a, b)
             for a, b in changes.links
             if (a, b) not in view.adjacency
         ],
     }
+    earlier = [o for o in changes.reassigned if o not in changes.observations]
+    reassigned = list(observes_rows(view, earlier))
     return GraphRows(
-        fixed_rows(view, changes.keyframes, changes.observations),
+        _new_rows(view, changes.keyframes, changes.observations),
         {label: rows for label, rows in upserted.items() if rows},
         {label: ids for label, ids in deleted.items() if ids},
+        {"OBSERVES": reassigned} if reassigned else {},
     )

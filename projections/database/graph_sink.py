@@ -1,6 +1,6 @@
 """The sink that writes the map as an Apache AGE graph."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Final
 
@@ -68,11 +68,11 @@ class GraphSink:
         for label, upserted in rows.upserted.items():
             kind = "upsert_vertex" if label in VERTEX_LABELS else "upsert_edge"
             unnest_columns(kind, GRAPH, label, upserted)(connection)
+        for label, replaced in rows.replaced.items():
+            _delete(connection, label, [row[0] for row in replaced])
+            _new_rows(InsertLoader(), GRAPH, label, replaced)(connection)
         for label, ids in rows.deleted.items():
-            query = statements("graph")["delete"].format(
-                graph=sql.Identifier(GRAPH), label=sql.Identifier(label)
-            )
-            connection.execute(query, [[str(i) for i in ids]])
+            _delete(connection, label, ids)
 
     def drop_leftovers(self, connection: Connection) -> None:
         """Drop a replaced graph that a reader held on to; refuse a graph that is not ours.
@@ -148,6 +148,13 @@ class GraphShadow:
                 send(connection)
 
         return load
+
+
+def _delete(connection: Connection, label: Label, ids: Sequence[int]) -> None:
+    query = statements("graph")["delete"].format(
+        graph=sql.Identifier(GRAPH), label=sql.Identifier(label)
+    )
+    connection.execute(query, [[str(i) for i in ids]])
 
 
 def _new_rows(loader: Loader, graph: str, label: Label, rows: list[Any]) -> Load:

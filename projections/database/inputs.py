@@ -65,8 +65,9 @@ class MapInputs:
 
     def differs_only_in_names(self, other: "MapInputs") -> bool:
         """True when the map of ``other`` is this one but for names of places, or is this one."""
-        mine, theirs = self.corrections.without_names(), other.corrections.without_names()
-        return self.settings == other.settings and mine.fingerprint() == theirs.fingerprint()
+        return self.settings == other.settings and self.corrections.differs_in_names_only(
+            other.corrections
+        )
 
 
 @dataclass(slots=True)

@@ -107,6 +107,7 @@ class MemoryShadow:
 def _write_graph(tables: MemoryTables, rows: GraphRows) -> None:
     tables.add(rows.inserted)
     tables.add(rows.upserted)
+    tables.add(rows.replaced)
     for label, ids in rows.deleted.items():
         for i in ids:
             tables.graph[label].pop(i, None)

@@ -18,7 +18,7 @@ from typing import Final
 
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.log import Event, LogReader
-from projections.errors import MapfoldError
+from projections.errors import DatabaseError
 from projections.model.fold import gc_paused
 
 from .checkpoints import DeadLetter, dead_letter
@@ -156,12 +156,12 @@ class Refold:
 
 
 def refuse_if_not_allowed(stores: Sequence[Store], advice: str) -> None:
-    """Raise MapfoldError when this role may not make the tables of a refold."""
+    """Raise DatabaseError when this role may not make the tables of a refold."""
     for store in stores:
         with database_errors(store.url):
             row = store.connection.execute(statements("checkpoint")["may_create"]).fetchone()
         if row is None or not row[0]:
-            raise MapfoldError(
+            raise DatabaseError(
                 f"{store.place}: the log has commands that the map there does not know yet, and"
                 " this role may not make the tables of a new one; have their owner make it, then"
                 f" start again; {advice}"

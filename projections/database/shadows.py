@@ -89,9 +89,7 @@ def stream(fold: LiveFold, writers: Sequence[ShadowWriter]) -> None:
 
 
 @contextlib.contextmanager
-def _shadow_writers(
-    stores: Sequence[Store], shadow_of: ShadowOf
-) -> Iterator[list[ShadowWriter]]:
+def _shadow_writers(stores: Sequence[Store], shadow_of: ShadowOf) -> Iterator[list[ShadowWriter]]:
     """A thread for each store, which begins with creating the shadows."""
     with contextlib.ExitStack() as threads:
         writers = []

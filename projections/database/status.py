@@ -13,8 +13,8 @@ from typing import Final, Literal
 
 from eventsrc.envelope import Offset
 from eventsrc.log import LogReader
-from projections.errors import DatabaseError, ProjectionMismatch
 from eventsrc.text import counted
+from projections.errors import DatabaseError, ProjectionMismatch
 from projections.settings import Settings
 
 from . import checkpoints

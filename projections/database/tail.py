@@ -59,11 +59,12 @@ def tail(
 ) -> TailReport:
     """Follow ``log`` until ``stop`` is set, or with ``once`` only to its present end.
 
-    ``on_batch`` is called after each commit; ``on_fold`` is told how many events are folded and
-    written, at the start of a pass and after each batch of it; ``on_refold`` is told how many of how
-    many events a refold has folded; ``note`` is told of snapshots that could not be used or kept,
-    which costs time and nothing else. Raises ProjectionMismatch when the
-    databases were made from another log or with other settings, ProjectionBusy, CheckpointMoved.
+    ``settings`` may depend on the log's corrections. ``on_batch`` is called after each commit;
+    ``on_fold`` is told how many events are folded and written, at the start of a pass and after
+    each batch of it; ``on_refold`` is told how many of how many events a refold has folded;
+    ``note`` is told of snapshots that could not be used or kept, which costs time and nothing else.
+    Raises ProjectionMismatch when the databases were made from another log or with other settings,
+    ProjectionBusy, CheckpointMoved.
     """
     plan = TailPlan(
         log,

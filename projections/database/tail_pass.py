@@ -19,10 +19,9 @@ from projections.settings import Settings
 
 from . import checkpoints
 from .checkpoints import DeadLetter, dead_letter, event_hash
-from .connection import Targets, database_errors, describe_target
+from .connection import Targets, database_errors
 from .inputs import LogInputs, MapInputs, SettingsOf
 from .live_fold import LiveFold, batches
-from .loader import LoaderName
 from .origin import (
     origin_fault,
     refuse_mismatch,
@@ -32,9 +31,9 @@ from .origin import (
 )
 from .refold import CommandsCame, Refold, RefoldStopped, refuse_if_not_allowed
 from .sink import Checkpoint, SinkName
-from .stores import Only, Store, open_stores
+from .stores import Store
 from .tail_progress import TailProgress, TailReport
-from .writer import AWAY, Backoff, LostCommits, OnTrouble, SinkBatch, Writer
+from .writer import OnTrouble, SinkBatch, Writer
 
 HEARTBEAT_S: Final = 5.0
 

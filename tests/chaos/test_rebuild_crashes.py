@@ -46,7 +46,7 @@ def log(tmp_path: Path) -> Path:
 def in_small_streams(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the thread write while the fold goes on, also for a small log."""
     # The package's name for it is the function.
-    monkeypatch.setattr(sys.modules["projections.database.rebuild"], "STREAM_ROWS", 20)
+    monkeypatch.setattr(sys.modules["projections.database.shadows"], "STREAM_ROWS", 20)
     monkeypatch.setattr(sys.modules["projections.database.rebuild"], "TICK_EVENTS", 8)
 
 

@@ -108,7 +108,7 @@ def test_no_snapshot_after_a_parked_event_is_used(
 def test_a_tail_saves_a_snapshot_if_it_folded_much(
     log: Path, one_database: Targets, folded: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys.modules["projections.database.tail"], "SNAPSHOT_MIN_EVENTS", 50)
+    monkeypatch.setattr(sys.modules["projections.database.tail_pass"], "SNAPSHOT_MIN_EVENTS", 50)
     report = tail(log, one_database, SETTINGS, once=True)
     assert cache_of(log).offsets() == [report.next_offset]
     write_log(log, walk(10, run_id="run-d"))

@@ -1,0 +1,380 @@
+"""A tail that meets commands comes to the rows of a fresh replay, and names places at once."""
+
+import json
+import threading
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import psycopg
+import pytest
+
+from eventsrc.commands import Command, UseSettings
+from eventsrc.envelope import Offset
+from eventsrc.log import LogReader
+from projections.database import TailProgress, TailReport, rebuild, tail
+from projections.database.check import check
+from projections.database.connection import Targets
+from projections.database.statements import statements
+from projections.database.status import SinkStatus, projection_status
+from projections.errors import DatabaseError, FoldError, ProjectionMismatch
+from projections.model.digest import map_digest
+from projections.model.fold import fold_log
+from projections.model.log_commands import read_corrections
+from projections.settings import Settings
+from tests.commands_in_logs import (
+    append_command,
+    command,
+    forget_keyframes,
+    forget_run,
+    keep_apart,
+    name_place,
+    undo,
+)
+from tests.logs import append_raw, bridge, walk, write_log
+from tests.rows import all_rows, expected_graph, graph_rows
+
+SETTINGS = Settings()
+WAIT_S = 60.0
+LOG_LENGTH = 120
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    """Three rooms that the run b joins into one place, and a third run."""
+    documents = walk(60) + list(bridge()) + walk(40, seed=3, run_id="run-c")
+    return write_log(tmp_path / "log", documents)
+
+
+@pytest.fixture(params=["one_database", "two_databases"])
+def targets(request: pytest.FixtureRequest) -> Targets:
+    found: Targets = request.getfixturevalue(request.param)
+    return found
+
+
+def fresh_rows(log: Path, targets: Targets, **options: Any) -> Any:
+    """The rows of a replay, which must also be those that the view of a plain fold asks for."""
+    rebuild(log, targets, SETTINGS, **options)
+    with LogReader(log) as reader:
+        corrections = read_corrections(reader)
+        _, view = fold_log(reader, SETTINGS, corrections=corrections)
+    found = all_rows(targets)
+    assert parsed(found[0]) == expected_graph(view)
+    return found
+
+
+def parsed(graph: Any) -> dict[str, list[tuple[Any, ...]]]:
+    return {
+        label: [(*row[:-1], json.loads(row[-1])) for row in rows] for label, rows in graph.items()
+    }
+
+
+def digests(targets: Targets) -> set[str | None]:
+    found = set()
+    for url in {targets.graph_url, targets.vector_url}:
+        with psycopg.connect(url) as connection:
+            found.update(connection.execute("SELECT digest FROM mapfold.checkpoint").fetchall())
+    return {digest for (digest,) in found}
+
+
+def names(targets: Targets) -> dict[str, str]:
+    return {
+        properties["place_id"]: properties["name"]
+        for _, properties in parsed(graph_rows(targets.graph_url))["Place"]
+        if "name" in properties
+    }
+
+
+@contextmanager
+def tailing(
+    log: Path, targets: Targets, **options: Any
+) -> Iterator[tuple[TailProgress, "Future[TailReport]"]]:
+    """A live tail in a thread, stopped at the end."""
+    progress, stop = TailProgress(), threading.Event()
+    with ThreadPoolExecutor(1) as pool:
+        running = pool.submit(
+            tail, log, targets, options.pop("settings", SETTINGS), stop=stop, progress=progress,
+            **options,
+        )  # fmt: skip
+        try:
+            yield progress, running
+        finally:
+            stop.set()
+            running.result(WAIT_S)
+
+
+@pytest.mark.parametrize(
+    "commands",
+    [
+        pytest.param([forget_run("run-b")], id="forget-run"),
+        pytest.param([forget_keyframes(5, 40)], id="forget-keyframes"),
+        pytest.param([name_place(3, "kitchen")], id="name"),
+        pytest.param([keep_apart(0, 1), name_place(0, "hall")], id="keep-apart"),
+    ],
+)
+def test_commands_come_to_the_rows_of_a_fresh_replay(
+    log: Path, targets: Targets, third_database: Targets, commands: list[Command]
+) -> None:
+    tail(log, targets, SETTINGS, once=True)
+    before = all_rows(targets)
+    for given in commands:
+        append_command(log, given)
+    write_log(log, walk(10, seed=5, run_id="run-d"))
+    report = tail(log, targets, SETTINGS, once=True)
+    assert all_rows(targets) == fresh_rows(log, third_database)
+    assert report.refolds == (0 if commands[0].kind == "name-place" else 1)
+    assert tail(log, targets, SETTINGS, once=True).events == 0
+    assert [c.sound for c in check(log, targets, SETTINGS)] == [True, True]
+    for given in commands:
+        append_command(log, undo(given))
+    append_command(log, forget_run("run-d"))
+    tail(log, targets, SETTINGS, once=True)
+    assert all_rows(targets) == before
+
+
+def test_an_undone_command_gives_the_digest_of_before(log: Path, one_database: Targets) -> None:
+    rebuild(log, one_database, SETTINGS)
+    (digest,) = digests(one_database)
+    given = forget_run("run-b")
+    append_command(log, given)
+    tail(log, one_database, SETTINGS, once=True)
+    (other,) = digests(one_database)
+    append_command(log, undo(given))
+    tail(log, one_database, SETTINGS, once=True)
+    assert digests(one_database) == {digest} != {other}
+    with LogReader(log) as reader:
+        assert map_digest(fold_log(reader, SETTINGS)[1]) == digest
+
+
+def test_a_live_tail_names_places_and_refolds(
+    log: Path, targets: Targets, third_database: Targets
+) -> None:
+    with tailing(log, targets) as (progress, running):
+        assert progress.wait(Offset(LOG_LENGTH), WAIT_S)
+        at = append_command(log, name_place(3, "kitchen"))
+        assert progress.wait(Offset(at + 1), WAIT_S)
+        assert set(names(targets).values()) == {"kitchen"}
+        at = append_command(log, forget_run("run-b"))
+        assert progress.wait(Offset(at + 1), WAIT_S)
+        assert set(names(targets).values()) == {"kitchen"}
+        at = append_command(log, name_place(3, "hall"))
+        write_log(log, walk(10, seed=5, run_id="run-d"))
+        assert progress.wait(Offset(at + 11), WAIT_S)
+        assert set(names(targets).values()) == {"hall"}
+    assert running.result().refolds == 1
+    assert all_rows(targets) == fresh_rows(log, third_database)
+
+
+def test_a_fresh_tail_folds_under_the_commands_of_the_whole_log(
+    log: Path, targets: Targets, third_database: Targets
+) -> None:
+    append_command(log, forget_run("run-b"))
+    append_command(log, name_place(3, "kitchen"))
+    report = tail(log, targets, SETTINGS, once=True, batch_events=7)
+    assert report.refolds == 0
+    assert all_rows(targets) == fresh_rows(log, third_database)
+
+
+@pytest.mark.parametrize(
+    ("second", "refolds"),
+    [
+        pytest.param(name_place(3, "kitchen"), 1, id="a name joins"),
+        pytest.param(forget_keyframes(5, 40), 1, id="another one restarts it"),
+    ],
+)
+def test_a_command_during_a_refold_is_not_lost(
+    log: Path,
+    targets: Targets,
+    third_database: Targets,
+    monkeypatch: pytest.MonkeyPatch,
+    second: Command,
+    refolds: int,
+) -> None:
+    monkeypatch.setattr("projections.database.refold.TICK_EVENTS", 10)
+    monkeypatch.setattr("projections.database.refold.LOOK_S", 0.0)
+    tail(log, targets, SETTINGS, once=True)
+    append_command(log, forget_run("run-b"))
+    given: list[int] = []
+
+    def give_second(done: int, _: int) -> None:
+        if done >= 40 and not given:
+            given.append(append_command(log, second))
+
+    report = tail(log, targets, SETTINGS, once=True, on_refold=give_second)
+    assert report.refolds == refolds
+    assert all_rows(targets) == fresh_rows(log, third_database)
+
+
+def test_commands_that_keep_coming_do_not_keep_the_map_from_changing(
+    log: Path, one_database: Targets, third_database: Targets, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("projections.database.refold.TICK_EVENTS", 10)
+    monkeypatch.setattr("projections.database.refold.LOOK_S", 0.0)
+    tail(log, one_database, SETTINGS, once=True)
+    append_command(log, forget_run("run-b"))
+    seen: list[tuple[int, int]] = []
+    given: list[int] = []
+
+    def keep_coming(done: int, total: int) -> None:
+        seen.append((done, total))
+        if len(given) < 20 and done >= 20:
+            given.append(append_command(log, forget_keyframes(len(given), len(given))))
+
+    report = tail(log, one_database, SETTINGS, once=True, on_refold=keep_coming)
+    assert 1 <= report.refolds <= 3
+    assert len(given) == 20
+    assert all_rows(one_database) == fresh_rows(log, third_database)
+
+
+def oid(targets: Targets) -> Any:
+    with psycopg.connect(targets.vector_url) as connection:
+        return connection.execute("SELECT 'detection_embeddings'::regclass::oid").fetchone()
+
+
+def test_corrections_of_places_keep_the_vectors(
+    log: Path, targets: Targets, third_database: Targets
+) -> None:
+    tail(log, targets, SETTINGS, once=True)
+    table = oid(targets)
+    append_command(log, keep_apart(0, 1))
+    write_log(log, walk(10, seed=5, run_id="run-d"))
+    assert tail(log, targets, SETTINGS, once=True).refolds == 1
+    assert oid(targets) == table
+    assert all_rows(targets) == fresh_rows(log, third_database)
+    append_command(log, forget_run("run-b"))
+    tail(log, targets, SETTINGS, once=True)
+    assert oid(targets) != table
+
+
+def test_settings_of_the_log_are_used_and_changed(
+    log: Path, one_database: Targets, third_database: Targets
+) -> None:
+    def settings_of(corrections: Any) -> Settings:
+        return corrections.settings or Settings()
+
+    tail(log, one_database, settings_of, once=True)
+    append_command(log, command(UseSettings, settings={"eps_m": 0.5}))
+    assert tail(log, one_database, settings_of, once=True).refolds == 1
+    rebuild(log, third_database, Settings(eps_m=0.5))
+    assert all_rows(one_database) == all_rows(third_database)
+    status = projection_status(log, one_database, settings_of)
+    assert [s.condition for s in status.sinks] == ["idle", "idle"]
+    assert {s.condition for s in projection_status(log, one_database, SETTINGS).sinks} == {"other"}
+    with pytest.raises(ProjectionMismatch, match=r"eps_m=0.5 there, 1.5 here"):
+        tail(log, one_database, SETTINGS, once=True)
+
+
+def test_status_tells_how_far_a_refold_is(
+    log: Path, targets: Targets, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("projections.database.refold.TICK_EVENTS", 10)
+    monkeypatch.setattr("projections.database.refold_progress.BEAT_S", 0.01)
+    tail(log, targets, SETTINGS, once=True)
+    append_command(log, forget_run("run-b"))
+    seen: list[tuple[SinkStatus, ...]] = []
+
+    def look(done: int, total: int) -> None:
+        if done == 60:
+            shown = threading.Event()
+            while not shown.wait(0.02):
+                status = projection_status(log, targets, SETTINGS)
+                assert status.healthy
+                if all(s.refold_done == 60 for s in status.sinks):
+                    seen.append(status.sinks)
+                    shown.set()
+
+    before = projection_status(log, targets, SETTINGS)
+    assert [s.condition for s in before.sinks] == ["behind", "behind"]
+    assert "1 command came since, the last at offset 120" in str(before.sinks[0].note)
+    tail(log, targets, SETTINGS, once=True, on_refold=look)
+    ((graph, vectors),) = seen
+    assert (graph.condition, vectors.condition) == ("refolding", "refolding")
+    assert (graph.refold_total, graph.next_offset) == (LOG_LENGTH + 1, LOG_LENGTH)
+    after = projection_status(log, targets, SETTINGS)
+    assert [(s.condition, s.refold_done) for s in after.sinks] == [("idle", None)] * 2
+
+
+def test_a_projection_under_other_corrections_is_told_and_made_anew(
+    log: Path, one_database: Targets, pg: psycopg.Connection, third_database: Targets
+) -> None:
+    """Such as one that another version of mapfold has made of the same commands."""
+    append_command(log, forget_run("run-b"))
+    rebuild(log, one_database, SETTINGS)
+    pg.execute("UPDATE mapfold.checkpoint SET fingerprint = repeat('0', 16)")
+    status = projection_status(log, one_database, SETTINGS)
+    assert {s.condition for s in status.sinks} == {"other"}
+    assert "under other corrections" in str(status.sinks[0].note)
+    assert "settings" not in str(status.sinks[0].note)
+    with pytest.raises(ProjectionMismatch, match="under other corrections"):
+        check(log, one_database, SETTINGS)
+    assert tail(log, one_database, SETTINGS, once=True).refolds == 1
+    assert all_rows(one_database) == fresh_rows(log, third_database)
+
+
+def test_a_refold_parks_what_it_cannot_fold(
+    log: Path, targets: Targets, third_database: Targets
+) -> None:
+    append_raw(log, b"not an envelope")
+    tail(log, targets, SETTINGS, once=True)
+    append_command(log, forget_run("run-b"))
+    append_raw(log, b"nor is this")
+    report = tail(log, targets, SETTINGS, once=True)
+    assert [letter.offset for letter in report.parked] == [122]  # 120 was parked before
+    for sink in projection_status(log, targets, SETTINGS).sinks:
+        assert [letter.offset for letter in sink.dead_letters] == [120, 122]
+    tail(log, third_database, SETTINGS, once=True)
+    assert all_rows(targets) == all_rows(third_database)
+    assert [c.sound for c in check(log, targets, SETTINGS)] == [True, True]
+
+
+def test_a_command_that_cannot_be_read_stops_the_tail_and_changes_nothing(
+    log: Path, one_database: Targets
+) -> None:
+    tail(log, one_database, SETTINGS, once=True)
+    before = all_rows(one_database)
+    append_raw(log, b'{"kind": "tidy-up"}', key="mapfold/command")
+    for refused in (tail, rebuild):
+        with pytest.raises(FoldError, match="event at offset 120 cannot be folded"):
+            refused(log, one_database, SETTINGS)  # type: ignore[operator]
+    assert all_rows(one_database) == before
+
+
+def test_a_stopped_refold_leaves_the_old_map(
+    log: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch, third_database: Targets
+) -> None:
+    monkeypatch.setattr("projections.database.refold.TICK_EVENTS", 10)
+    tail(log, one_database, SETTINGS, once=True)
+    before = all_rows(one_database)
+    append_command(log, forget_run("run-b"))
+    stop = threading.Event()
+    report = tail(log, one_database, SETTINGS, stop=stop, on_refold=lambda *_: stop.set())
+    assert report.refolds == 0
+    assert all_rows(one_database) == before
+    tail(log, one_database, SETTINGS, once=True)
+    assert all_rows(one_database) == fresh_rows(log, third_database)
+
+
+def test_checkpoints_of_an_older_version_are_used(
+    log: Path, one_database: Targets, pg: psycopg.Connection, third_database: Targets
+) -> None:
+    rebuild(log, one_database, SETTINGS)
+    for column in ("known_at", "observed", "refold_done", "refold_total"):
+        pg.execute(f"ALTER TABLE mapfold.checkpoint DROP COLUMN {column}")  # type: ignore[arg-type]
+    status = projection_status(log, one_database, SETTINGS)
+    assert [s.condition for s in status.sinks] == ["idle", "idle"]
+    assert [c.sound for c in check(log, one_database, SETTINGS)] == [True, True]
+    append_command(log, forget_run("run-b"))
+    assert tail(log, one_database, SETTINGS, once=True).refolds == 1
+    assert all_rows(one_database) == fresh_rows(log, third_database)
+
+
+def test_a_role_that_may_not_make_tables_is_told_who_can(
+    log: Path, one_database: Targets, pg: psycopg.Connection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tail(log, one_database, SETTINGS, once=True)
+    append_command(log, forget_run("run-b"))
+    monkeypatch.setitem(statements("checkpoint"), "may_create", psycopg.sql.SQL("SELECT false"))
+    with pytest.raises(DatabaseError, match=r"have their owner make it.*mapfold replay"):
+        tail(log, one_database, SETTINGS, once=True)
