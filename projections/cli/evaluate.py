@@ -20,7 +20,7 @@ from .options import (
     W,
     camera_from,
     check_picture,
-    settings_from,
+    settings_of,
 )
 from .relocalize import method_from
 from .terminal import display, emit, say
@@ -84,7 +84,7 @@ def evaluate(
         map_log,
         query_logs or [],
         read_truth(truth_files or []),
-        settings_from(settings_file, set_),
+        settings_of(settings_file, set_),
         until=until,
         method=method_from(method),
         camera=camera_from(hfov, image),

@@ -11,6 +11,7 @@ from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 from projections.database.connection import connect
 from projections.model.fold import fold_log
+from projections.model.log_commands import read_corrections
 from projections.queries.map_queries import (
     FoldedMap,
     LiveMap,
@@ -22,7 +23,6 @@ from projections.queries.map_queries import (
     where_is,
 )
 from projections.queries.relocalize import CandidateReader, prepare_graph
-from projections.settings import Settings
 
 from .options import (
     DbOption,
@@ -75,7 +75,7 @@ def where(
     json_: JsonOption = False,
 ) -> None:
     """Where an object is, or was at a point of the log."""
-    with _map_source(db, log, at, past_settings(log, settings_file, set_)) as source:
+    with _map_source(db, log, at, settings_file, set_) as source:
         _print(where_is(source, object_id), json_)
 
 
@@ -89,7 +89,7 @@ def contents(
     json_: JsonOption = False,
 ) -> None:
     """The objects located in a place."""
-    with _map_source(db, log, at, past_settings(log, settings_file, set_)) as source:
+    with _map_source(db, log, at, settings_file, set_) as source:
         _print(objects_of(source, place_id), json_)
 
 
@@ -108,7 +108,7 @@ def holding(
 
     Near is at most --hops steps away, each from a place to one next to it.
     """
-    with _map_source(db, log, at, past_settings(log, settings_file, set_)) as source:
+    with _map_source(db, log, at, settings_file, set_) as source:
         _print(places_holding(source, class_name, start, hops), json_)
 
 
@@ -123,21 +123,29 @@ def path(
     json_: JsonOption = False,
 ) -> None:
     """The places on the way from one place to another."""
-    with _map_source(db, log, at, past_settings(log, settings_file, set_)) as source:
+    with _map_source(db, log, at, settings_file, set_) as source:
         _print(path_between(source, start, goal), json_)
 
 
 @contextlib.contextmanager
 def _map_source(
-    db: str | None, log: Path | None, at: str | None, settings: Settings
+    db: str | None,
+    log: Path | None,
+    at: str | None,
+    settings_file: Path | None,
+    assignments: list[str] | None,
 ) -> Iterator[MapSource]:
-    """The live graph, or the log folded to a point with ``settings``."""
+    """The live graph, or the log folded to a point with its settings and corrections."""
     if log is not None:
         with LogReader(log) as reader:
-            _, view = fold_log(reader, settings, point(reader, at or "end"))
+            end = point(reader, at or "end")
+            corrections = read_corrections(reader, end)
+            settings = past_settings(log, settings_file, assignments, corrections)
+            _, view = fold_log(reader, settings, end, corrections=corrections)
         say_defaults(settings)
         yield FoldedMap(view)
         return
+    past_settings(log, settings_file, assignments)  # refuses them
     if at is not None:
         raise MisuseError("--at asks a past map, which only the log knows; give --log LOG too")
     with (

@@ -7,6 +7,8 @@ from typing import Annotated, cast, get_args
 import typer
 
 from eventsrc.errors import MisuseError
+from eventsrc.log import LogReader
+from projections.model.log_commands import read_corrections
 from projections.queries.relocalize import relocalize as ask_databases
 from projections.relocalize import UNKNOWN_BELOW, Answer, Method, RankedPlace, rank, search_log
 
@@ -23,6 +25,7 @@ from .options import (
     camera_from,
     databases,
     past_settings,
+    point,
     question_from,
     say_defaults,
 )
@@ -58,12 +61,16 @@ def relocalize(
     how, camera, crops = method_from(method), camera_from(hfov, image), question_from(query)
     if as_of is not None and log is None:
         raise MisuseError("--as-of asks a past map, which only the log knows; give --log LOG too")
-    settings = past_settings(log, settings_file, set_)
     if log is None:
+        past_settings(log, settings_file, set_)
         with databases(db, vector_db) as targets:
             answer = ask_databases(targets, crops, top=top, method=how, camera=camera)
     else:
-        candidates = search_log(log, as_of or "end", settings, crops, note=say)
+        with LogReader(log) as reader:
+            end = point(reader, as_of or "end")
+            corrections = read_corrections(reader, end)
+        settings = past_settings(log, settings_file, set_, corrections)
+        candidates = search_log(log, str(end), settings, crops, corrections=corrections)
         answer = rank(crops, candidates, top=top, method=how, camera=camera)
         say_defaults(settings)
     _print_answer(answer, json_)
@@ -99,7 +106,12 @@ def _first_line(answer: Answer) -> str:
         return f"unknown: nothing in the map looks like these crops ({confidence})"
     if answer.unknown:
         return f"unknown: {confidence} is below {UNKNOWN_BELOW}; the likeliest places would be"
-    return f"{answer.places[0].place_id} ({confidence})"
+    return f"{_place_text(answer.places[0])} ({confidence})"
+
+
+def _place_text(place: RankedPlace) -> str:
+    """A Place's id, and beside it its name if it has one."""
+    return place.place_id if place.name is None else f"{place.place_id} “{place.name}”"
 
 
 def _pose_line(answer: Answer) -> str:
@@ -112,7 +124,7 @@ def _pose_line(answer: Answer) -> str:
 
 def _place_lines(number: int, place: RankedPlace) -> list[str]:
     centroid = f"({place.centroid_x:.2f}, {place.centroid_y:.2f}) m"
-    lines = [f"{number}. {place.place_id}  score {place.score:.3f}  centroid {centroid}"]
+    lines = [f"{number}. {_place_text(place)}  score {place.score:.3f}  centroid {centroid}"]
     lines += [
         f"   {e.similarity:.3f}  {e.class_name}  {e.object_id or 'no object'}  {e.det_id}"
         for e in place.evidence

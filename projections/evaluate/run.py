@@ -13,7 +13,9 @@ from typing import Any
 
 from eventsrc.log import LogReader
 from eventsrc.log.seek import Note, resolve
+from projections.corrections import Corrections
 from projections.model.fold import fold_log
+from projections.model.log_commands import read_corrections
 from projections.model.view import MapView
 from projections.relocalize import DEFAULT_CAMERA, Camera, Method
 from projections.settings import Settings
@@ -46,7 +48,7 @@ def evaluate(
     map_log: Path,
     query_logs: Sequence[Path],
     truth: Truth,
-    settings: Settings,
+    settings: Settings | Callable[[Corrections], Settings],
     *,
     until: str = "end",
     method: Method = "joint",
@@ -54,13 +56,18 @@ def evaluate(
     seed: int = DEFAULT_SEED,
     note: Note | None = None,
 ) -> Evaluation:
-    """Score the map of ``map_log`` (folded to ``until``) and questions from ``query_logs``.
+    """Score the map of ``map_log`` (folded to ``until`` under its corrections) and questions from
+    ``query_logs``. ``settings`` may depend on the log's corrections.
 
     ``note`` is told what the user should know about ``until`` (`eventsrc.log.seek.resolve`).
     Deterministic but for ``latency_ms``, which is of exact search in memory plus the ranking.
     """
     with LogReader(map_log) as reader:
-        _, view = fold_log(reader, settings, resolve(reader, until, note=note))
+        end = resolve(reader, until, note=note)
+        corrections = read_corrections(reader, end)
+        if not isinstance(settings, Settings):
+            settings = settings(corrections)
+        _, view = fold_log(reader, settings, end, corrections=corrections)
     keyframes = list(read_keyframes(query_logs))
     if query_logs:
         check_truth(keyframes, truth)

@@ -31,6 +31,7 @@ def read_place_graph(connection: Connection) -> PlaceGraph:
                 place["centroid_x"],
                 place["centroid_y"],
                 place["keyframe_count"],
+                place.get("name"),
             )
         )
     edges = [
@@ -41,7 +42,10 @@ def read_place_graph(connection: Connection) -> PlaceGraph:
 
 
 def read_object(connection: Connection, object_id: str) -> dict[str, Any] | None:
-    """An Object with its ``place_id`` (None for none); None if there is no such Object."""
+    """An Object with its ``place_id`` (None for none); None if there is no such Object.
+
+    ``place_name`` is there if the Place has a name.
+    """
     rows = _rows(connection, "object", id=text(object_id))
     return _object_document(rows[0]) if rows else None
 
@@ -66,8 +70,9 @@ def _read_square(connection: Connection, kind: str, x: float, y: float, r: float
 
 
 def _object_document(row: tuple[str, str | None]) -> dict[str, Any]:
-    place_id = None if row[1] is None else json.loads(row[1])["place_id"]
-    return {**json.loads(row[0]), "place_id": place_id}
+    place = {"place_id": None} if row[1] is None else json.loads(row[1])
+    document = {**json.loads(row[0]), "place_id": place["place_id"]}
+    return document | ({"place_name": place["name"]} if "name" in place else {})
 
 
 def _ordinal(graphid: str) -> int:

@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from typing import Any, Protocol
 
 from projections.database.connection import Connection
+from projections.deltas import PlaceOrdinal
 from projections.errors import QuestionError
 from projections.model.view import MapView
-from projections.relocalize import Candidates, Crop
+from projections.relocalize import CandidatePlace, Candidates, Crop
 
 from .graph_reads import read_object, read_object_counts, read_objects_of_place, read_place_graph
-from .place_graph import PlaceGraph
+from .place_graph import PlaceGraph, PlaceNode
 
 _OBJECT_FIELDS = (
     "object_id",
@@ -23,8 +24,10 @@ _OBJECT_FIELDS = (
     "first_seen",
     "last_seen",
     "place_id",
+    "place_name",
 )
-"""The fields of an Object in their order; agtype has its own order."""
+"""The fields of an Object in their order; agtype has its own order. Only an Object in a Place that
+has a name has the last one."""
 
 
 class MapSource(Protocol):
@@ -115,11 +118,20 @@ class FoldedMap:
             "first_seen": thing.first_seen,
             "last_seen": thing.last_seen,
             "place_id": self._view.place_id(thing.place),
-        }
+        } | self._place_name(thing.place)
+
+    def _place_name(self, place: PlaceOrdinal | None) -> dict[str, str]:
+        name = None if place is None else self._view.all_places[place].name
+        return {} if name is None else {"place_name": name}
 
 
 def _ordered(thing: dict[str, Any]) -> dict[str, Any]:
-    return {name: thing[name] for name in _OBJECT_FIELDS}
+    return {name: thing[name] for name in _OBJECT_FIELDS if name in thing}
+
+
+def _named(place: PlaceNode | CandidatePlace | None, key: str = "name") -> dict[str, str]:
+    """A Place's name under ``key``, nothing if it has none."""
+    return {} if place is None or place.name is None else {key: place.name}
 
 
 def where_is(source: MapSource, object_id: str) -> dict[str, Any]:
@@ -148,6 +160,7 @@ def places_holding(
     order = sorted((p for p in within if p in counts), key=lambda p: (within[p], p))
     return [
         {"place_id": graph.places[p].place_id, "hops": within[p], "objects": counts[p]}
+        | _named(graph.places[p])
         for p in order
     ]
 
@@ -163,6 +176,7 @@ def path_between(source: MapSource, start: str, goal: str) -> list[dict[str, Any
             "centroid_y": graph.places[p].y,
             "shared_transitions": None if i == 0 else graph.shared(way[i - 1], p),
         }
+        | _named(graph.places[p])
         for i, p in enumerate(way)
     ]
 
@@ -178,14 +192,15 @@ def similar_objects(
                 continue
             earlier = best.get(match.object_id)
             if earlier is None or match.similarity > earlier["similarity"]:
+                place = (
+                    None if match.object_place is None else candidates.places[match.object_place]
+                )
                 best[match.object_id] = {
                     "object_id": match.object_id,
                     "class_name": match.class_name,
                     "similarity": match.similarity,
                     "det_id": match.det_id,
-                    "place_id": None
-                    if match.object_place is None
-                    else candidates.places[match.object_place].place_id,
-                }
+                    "place_id": None if place is None else place.place_id,
+                } | _named(place, "place_name")
     ordered = sorted(best.values(), key=lambda o: (-o["similarity"], o["object_id"]))
     return ordered[:top]

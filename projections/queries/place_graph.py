@@ -14,13 +14,15 @@ from projections.model.view import MapView
 
 @dataclass(frozen=True, slots=True)
 class PlaceNode:
-    """A Place; ``ordinal`` is its founding order, the centroid is in metres."""
+    """A Place; ``ordinal`` is its founding order, the centroid is in metres. ``name`` is None where
+    nobody named it."""
 
     ordinal: int
     place_id: str
     x: float
     y: float
     keyframe_count: int
+    name: str | None = None
 
 
 class PlaceGraph:
@@ -37,7 +39,7 @@ class PlaceGraph:
     def of_view(cls, view: MapView) -> "PlaceGraph":
         """The graph of a folded map."""
         nodes = [
-            PlaceNode(p.ordinal, p.place_id, p.centroid_x, p.centroid_y, p.keyframe_count)
+            PlaceNode(p.ordinal, p.place_id, p.centroid_x, p.centroid_y, p.keyframe_count, p.name)
             for p in view.places.values()
         ]
         return cls(nodes, view.edges())

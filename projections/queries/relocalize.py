@@ -236,7 +236,7 @@ def _spot(
     if ordinal not in places:
         place = _properties(properties)
         places[ordinal] = CandidatePlace(
-            place["place_id"], place["centroid_x"], place["centroid_y"]
+            place["place_id"], place["centroid_x"], place["centroid_y"], place.get("name")
         )
     return ordinal
 

@@ -19,6 +19,7 @@ from eventsrc.envelope import RunId
 from eventsrc.log import LogReader
 from eventsrc.log.seek import Note, resolve
 from eventsrc.text import counted
+from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.deltas import ObservationOrdinal, PlaceOrdinal
 from projections.errors import QuestionError
 from projections.exact import Q40, quantise
@@ -58,11 +59,12 @@ class Match:
 
 @dataclass(frozen=True, slots=True)
 class CandidatePlace:
-    """A Place that a match belongs to: id and centroid in metres."""
+    """A Place that a match belongs to: id, centroid in metres, name if it has one."""
 
     place_id: str
     x: float
     y: float
+    name: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,13 +82,16 @@ def search_log(
     crops: Sequence[Crop],
     *,
     note: Note | None = None,
+    corrections: Corrections = NO_CORRECTIONS,
 ) -> Candidates:
     """Candidates from the map as of ``point`` of a log: offset, ISO time, run:keyframe or end.
 
     ``note`` is told what the user should know about ``point`` (`eventsrc.log.seek.resolve`).
     """
     with LogReader(log) as reader:
-        _, view = fold_log(reader, settings, resolve(reader, point, note=note))
+        _, view = fold_log(
+            reader, settings, resolve(reader, point, note=note), corrections=corrections
+        )
     return ExactIndex(view).search(crops)
 
 
@@ -100,7 +105,9 @@ class ExactIndex:
         vectors = [view.observations[ordinal].embedding for ordinal in rows]
         self._matrix = np.array(vectors, dtype=np.float64)
         self.places = {
-            place.ordinal: CandidatePlace(place.place_id, place.centroid_x, place.centroid_y)
+            place.ordinal: CandidatePlace(
+                place.place_id, place.centroid_x, place.centroid_y, place.name
+            )
             for place in view.places.values()
         }
         self.model = next(

@@ -47,6 +47,7 @@ class RankedPlace:
     """A Place and its score: the share of the poses' weight that lies in it.
 
     With the plain method the score is the sum of similarities. The centroid is in metres.
+    ``name`` is None where nobody named the Place.
     """
 
     place_id: str
@@ -54,6 +55,14 @@ class RankedPlace:
     centroid_x: float
     centroid_y: float
     evidence: tuple[Evidence, ...]
+    name: str | None = None
+
+    def document(self) -> dict[str, Any]:
+        """As JSON; only a Place that has a name has that key."""
+        document = asdict(self) | {"evidence": [asdict(evidence) for evidence in self.evidence]}
+        if self.name is None:
+            del document["name"]
+        return document
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,10 +94,7 @@ class Answer:
     def document(self) -> dict[str, Any]:
         """The answer as JSON, in the shape of ``relocalize --json``."""
         return {
-            "places": [
-                asdict(place) | {"evidence": [asdict(evidence) for evidence in place.evidence]}
-                for place in self.places
-            ],
+            "places": [place.document() for place in self.places],
             "pose": None if self.pose is None else asdict(self.pose),
             "confidence": self.confidence,
             "unknown": self.unknown,
@@ -159,7 +165,9 @@ def _ranked_places(
     for ordinal in order:
         place = candidates.places[ordinal]
         evidence = _evidence(candidates.matches, ordinal)
-        ranked.append(RankedPlace(place.place_id, scores[ordinal], place.x, place.y, evidence))
+        ranked.append(
+            RankedPlace(place.place_id, scores[ordinal], place.x, place.y, evidence, place.name)
+        )
     return tuple(ranked)
 
 
