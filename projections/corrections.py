@@ -5,8 +5,9 @@ unless asked otherwise. A command is retroactive: it changes how earlier events 
 had always been known, but only from the offset where it was recorded.
 
 1.  A command is in force unless a later one in force undoes it.
-2.  Of a ``keep-apart`` and a ``join`` of the same two anchors the later one counts; so too for
-    ``different-objects`` and ``same-object`` of the same two det_ids.
+2.  ``join`` is transitive: of anchors joined in a chain all are one, and what is kept apart from
+    one is kept apart from them all. A ``keep-apart`` or ``join`` that contradicts later ones does
+    not count. So too for ``different-objects`` and ``same-object`` of det_ids.
 3.  Pose corrections of a keyframe apply in the order of the commands.
 4.  Of two names of one place, and of two ``use-settings``, the later one counts.
 
@@ -40,6 +41,7 @@ from eventsrc.commands import (
 from eventsrc.envelope import DetId, Envelope, KeyframeId, Offset, RunId
 from eventsrc.ingest import Accepted
 
+from .pair_groups import without_contradictions
 from .settings import Settings
 
 
@@ -185,10 +187,16 @@ def map_fingerprint(settings: Settings, corrections: Corrections) -> str:
 
 
 def commands_in_force(commands: Iterable[RecordedCommand]) -> list[RecordedCommand]:
-    """Those that no later command in force undoes (rule 1), in order; undos are not among them."""
+    """Those that no later command in force undoes (rule 1), in order; undos are not among them.
+
+    Of commands with one command_id the first counts: the others are the same one, sent again.
+    """
     undone: set[str] = set()
     kept: list[RecordedCommand] = []
-    for recorded in reversed(list(commands)):
+    by_id: dict[str, RecordedCommand] = {}
+    for recorded in commands:
+        by_id.setdefault(recorded.command.command_id, recorded)
+    for recorded in reversed(by_id.values()):
         command = recorded.command
         if command.command_id in undone:
             continue
@@ -206,8 +214,8 @@ def compile_corrections(commands: Iterable[RecordedCommand]) -> Corrections:
     ranges: dict[RunId, list[tuple[KeyframeId, KeyframeId]]] = {}
     dropped: set[DetId] = set()
     poses: dict[RunId, list[PoseCorrection]] = {}
-    places: dict[tuple[Keyframe, Keyframe], bool] = {}
-    objects: dict[tuple[DetId, DetId], bool] = {}
+    places: list[tuple[tuple[Keyframe, Keyframe], bool]] = []
+    objects: list[tuple[tuple[DetId, DetId], bool]] = []
     names: list[PlaceName] = []
     settings: Settings | None = None
     for offset, command in in_force:
@@ -215,12 +223,12 @@ def compile_corrections(commands: Iterable[RecordedCommand]) -> Corrections:
             case NamePlace():
                 names.append(PlaceName(_keyframe(command.place), command.name, offset))
             case KeepApart() | UndoMerge():
-                places.update(dict.fromkeys(_pairs(command.places), False))
+                places += [(pair, False) for pair in _pairs(command.places)]
             case Join():
-                places.update(dict.fromkeys(_pairs(command.places), True))
+                places += [(pair, True) for pair in _pairs(command.places)]
             case SameObject() | DifferentObjects():
                 first, second = sorted(command.det_ids)
-                objects[first, second] = isinstance(command, SameObject)
+                objects.append(((first, second), isinstance(command, SameObject)))
             case DropObject() | DropDetection():
                 dropped.update(command.det_ids)
             case ForgetRun():
@@ -237,16 +245,18 @@ def compile_corrections(commands: Iterable[RecordedCommand]) -> Corrections:
                 settings = Settings.from_document(command.settings)
             case Undo():
                 pass
+    joined, apart = without_contradictions(places)
+    same, different = without_contradictions(objects)
     return Corrections(
         in_force=tuple(in_force),
         forgotten_runs=frozenset(runs),
         forgotten_ranges={run: tuple(sorted(set(rs))) for run, rs in ranges.items()},
         dropped=frozenset(dropped),
         poses={run: tuple(cs) for run, cs in poses.items()},
-        apart=tuple(sorted(pair for pair, is_joined in places.items() if not is_joined)),
-        joined=tuple(sorted(pair for pair, is_joined in places.items() if is_joined)),
-        different=tuple(sorted(pair for pair, is_same in objects.items() if not is_same)),
-        same=tuple(sorted(pair for pair, is_same in objects.items() if is_same)),
+        apart=tuple(apart),
+        joined=tuple(joined),
+        different=tuple(different),
+        same=tuple(same),
         names=tuple(names),
         settings=settings,
     )

@@ -138,6 +138,14 @@ class CoreIndex:
         """True when the two are within ε."""
         return self.squared_distance(a, b) <= self._eps2
 
+    def first_core(self, core: int) -> int:
+        """The first core point of a core point's cell, which stands for the cell."""
+        return self._cell_of(core).core
+
+    def put_first(self, core: int) -> None:
+        """Let a core point stand for its cell."""
+        self._cell_of(core).core = core
+
     def cores_around(self, point: int) -> list[tuple[int, Cell | None]]:
         """(the first core point, the cell) of each cell whose cluster may be in reach.
 

@@ -23,6 +23,7 @@ Rule 6 is the only freedom DBSCAN leaves; core points and their partition are un
 import math
 from bisect import bisect_left
 from collections.abc import Iterator, MutableSequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,8 +45,16 @@ from .core_index import CoreIndex
 from .rule_index import RuleCoreIndex
 from .survivors import PlaceSurvivors
 
-_NOISE = PlaceOrdinal(-1)
+NOISE = PlaceOrdinal(-1)
 """What the packed array of places holds for a point in none."""
+
+
+class Part(NamedTuple):
+    """Fresh core points that are of one place, ascending, and the places with an older core point
+    in their reach, each with one pair of core points: (a fresh one, one of the place)."""
+
+    cores: list[int]
+    touched: dict[PlaceOrdinal, tuple[int, int]]
 
 
 class Places:
@@ -77,22 +86,26 @@ class Places:
         yaw: float,
     ) -> list[Delta]:
         """Add a keyframe with a pose; what it changed, in the order of the delta contract."""
-        point = len(self.joined)
-        self.joined.append(_NOISE)
-        self.keyframes.append(keyframe)
-        self.runs.append(run)
-        self.run_ids[run] = run_id
-        deltas: list[Delta] = []
+        point = self._add_point(keyframe, run, run_id)
         fresh = self.core_index.insert(x_um, y_um, yaw)
         if fresh == [point] and (older := self.core_index.enclosing_core(point)) is not None:
             place = self.survivors.find(self.joined[older])
             self._join(point, place)
             return [KeyframePlaced(offset, keyframe, place), self._place_changed(offset, place)]
-        joining = self._cluster(offset, point, fresh, deltas) if fresh else {}
-        if point not in joining:
-            earliest = self._earliest_in_reach(point)
-            if earliest is not None:
-                joining[point] = earliest
+        return self._fold_changes(offset, point, fresh)
+
+    def _add_point(self, keyframe: KeyframeOrdinal, run: RunOrdinal, run_id: RunId) -> int:
+        """Number a new point, which is in no place yet."""
+        self.joined.append(NOISE)
+        self.keyframes.append(keyframe)
+        self.runs.append(run)
+        self.run_ids[run] = run_id
+        return len(self.joined) - 1
+
+    def _fold_changes(self, offset: Offset, newcomer: int, fresh: list[int]) -> list[Delta]:
+        """What a new point that made ``fresh`` core points changes."""
+        deltas: list[Delta] = []
+        joining = self._joining(offset, newcomer, fresh, deltas)
         find = self.survivors.find
         changed = [d.survivor for d in deltas if type(d) is PlacesMerged]
         for joiner in sorted(joining):
@@ -106,11 +119,11 @@ class Places:
     def label(self, point: int) -> PlaceOrdinal | None:
         """The point's current place; None for noise."""
         joined = self.joined[point]
-        return None if joined == _NOISE else self.survivors.find(joined)
+        return None if joined == NOISE else self.survivors.find(joined)
 
     def place_of(self, keyframe: KeyframeOrdinal) -> PlaceOrdinal | None:
         """A keyframe's current place; None for noise, or without a pose."""
-        point = bisect_left(self.keyframes, keyframe)
+        point = self._point_of(keyframe)
         is_there = point < len(self.keyframes) and self.keyframes[point] == keyframe
         return self.label(point) if is_there else None
 
@@ -144,6 +157,21 @@ class Places:
         self.sums_y_um = state["sums_y_um"]
         self.core_index.load(part("crowd", state))
 
+    def _point_of(self, keyframe: KeyframeOrdinal) -> int:
+        """A keyframe's point; of one without a pose, that of the next."""
+        return bisect_left(self.keyframes, keyframe)
+
+    def _joining(
+        self, offset: Offset, newcomer: int, fresh: list[int], deltas: list[Delta]
+    ) -> dict[int, PlaceOrdinal]:
+        """Change places and append the deltas; by point, the place that it joins."""
+        joining = self._cluster(offset, newcomer, fresh, deltas) if fresh else {}
+        if newcomer not in joining:
+            earliest = self._earliest_in_reach(newcomer)
+            if earliest is not None:
+                joining[newcomer] = earliest
+        return joining
+
     def _cluster(
         self, offset: Offset, newcomer: int, fresh: list[int], deltas: list[Delta]
     ) -> dict[int, PlaceOrdinal]:
@@ -152,8 +180,7 @@ class Places:
         Appends the deltas; returns, by point, the place that it joins.
         """
         joining: dict[int, PlaceOrdinal] = {}
-        for group in self._connected_groups(newcomer, fresh):
-            touched = self._places_touched(group, fresh)
+        for group, touched in self._parts(newcomer, fresh):
             if not touched:
                 place = self._form_place(offset, group[0], deltas)
             else:
@@ -161,16 +188,21 @@ class Places:
                 if len(touched) > 1:
                     deltas.append(self._merge(offset, newcomer, place, touched))
             for core in group:
-                if self.joined[core] == _NOISE:
+                if self.joined[core] == NOISE:
                     joining[core] = place
                 for other in self.core_index.non_core_around(core):
-                    if self.joined[other] == _NOISE and other != newcomer:
+                    if self.joined[other] == NOISE and other != newcomer:
                         earlier = self.survivors.find(joining.get(other, place))
                         joining[other] = min(place, earlier)
         for core in fresh:  # for `_earliest_in_reach`, should the newcomer not be core
-            if self.joined[core] == _NOISE:
+            if self.joined[core] == NOISE:
                 self.joined[core] = joining[core]
         return joining
+
+    def _parts(self, newcomer: int, fresh: list[int]) -> Iterator[Part]:
+        """The connected groups of fresh core points; each sees what was merged for the last."""
+        for group in self._connected_groups(newcomer, fresh):
+            yield Part(group, self._places_touched(group, fresh))
 
     def _connected_groups(self, newcomer: int, fresh: list[int]) -> Iterator[list[int]]:
         """The fresh core points in connected groups, each ascending, ordered by their earliest."""
@@ -197,10 +229,10 @@ class Places:
         touched: dict[PlaceOrdinal, tuple[int, int]] = {}
         index, joined, find = self.core_index, self.joined, self.survivors.find
         for core in group:
-            own = _NOISE
+            own = NOISE
             for first, cell in index.cores_around(core):
                 place = joined[first]
-                if place == _NOISE or first in fresh:
+                if place == NOISE or first in fresh:
                     continue
                 place = find(place)
                 if cell is None:

@@ -67,6 +67,13 @@ class RuleCoreIndex:
             and self._rule.holds(self._poses[a], self._poses[b])
         )
 
+    def first_core(self, core: int) -> int:
+        """The core point itself: under a rule, a cell is no cluster."""
+        return core
+
+    def put_first(self, core: int) -> None:
+        """Does nothing; see `first_core`."""
+
     def cores_around(self, point: int) -> Iterator[tuple[int, None]]:
         """Each core point among the point's neighbours; see `CoreIndex.cores_around`."""
         return ((other, None) for other in self._neighbours(point) if self.is_core(other))

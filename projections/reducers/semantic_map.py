@@ -44,10 +44,12 @@ from projections.deltas import (
 )
 from projections.errors import SettingsError
 from projections.exact import Neighbourhood, Units, metres_to_um, unit_vectors
+from projections.pair_groups import PairGroups
 from projections.reducers import State, part, prefixed
 from projections.settings import Settings
 
 from .adjacency import Adjacency
+from .constrained_places import ConstrainedPlaces
 from .core_index import CoreIndex
 from .edited_events import edit_event, edits_events
 from .folded_ids import FoldedIds, content_digest
@@ -117,11 +119,16 @@ class SemanticMap:
         self.next_offset = FIRST_OFFSET
         self.folded_ids = FoldedIds()
         self.space = Space(settings)
-        self.places = Places(
+        core_index = (
             CoreIndex(metres_to_um(settings.eps_m), settings.min_samples)
             if neighbourhood is None
             else RuleCoreIndex(neighbourhood, settings.min_samples)
         )
+        self._anchored = None
+        if corrections.joined or corrections.apart:
+            groups = PairGroups(corrections.joined, corrections.apart)
+            self._anchored = ConstrainedPlaces(core_index, groups)
+        self.places = self._anchored or Places(core_index)
         self.landmarks = Landmarks(settings.fusion_radius_m, settings.fusion_similarity)
         self.located_in = LocatedIn()
         self.adjacency = Adjacency()
@@ -238,11 +245,14 @@ class SemanticMap:
         )
 
     def _all_anchors(self) -> frozenset[Keyframe]:
-        return frozenset(self.names.newest)
+        pairs = (*self.corrections.apart, *self.corrections.joined)
+        return frozenset(self.names.newest).union(*pairs)
 
     def _add_anchor(self, keyframe: KeyframeOrdinal, anchor: Keyframe) -> None:
         if anchor in self._anchors:
             self.names.add_anchor(keyframe, anchor)
+            if self._anchored is not None:
+                self._anchored.add_anchor(keyframe, anchor)
 
     def _observe(
         self,
