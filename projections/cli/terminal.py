@@ -11,10 +11,8 @@ from typing import Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from eventsrc.text import visible_json, visible_lines
-from eventsrc.transport.config import is_loopback
 
 EXIT_FAILED = 1
 EXIT_FINDINGS = 3
@@ -37,6 +35,8 @@ def display(text: str) -> None:
 
 def say_metrics(address: tuple[str, int], port: int) -> None:
     """Say where the metrics of ``--metrics`` are served, and warn when others can read them."""
+    from eventsrc.transport.config import is_loopback
+
     say(f"metrics on http://{address[0]}:{port}/metrics")
     if not is_loopback(address[0]):
         say(
@@ -70,12 +70,14 @@ class Bar:
     """A progress bar with rate and time left; prints nothing when stderr is not a terminal."""
 
     def __init__(self) -> None:
-        self._progress = Progress(
-            TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]}"),
-            TimeRemainingColumn(),
+        from rich import progress  # here: importing it takes a tenth of a short command
+
+        self._progress = progress.Progress(
+            progress.TextColumn("{task.description}", markup=False),
+            progress.BarColumn(),
+            progress.MofNCompleteColumn(),
+            progress.TextColumn("{task.fields[rate]}"),
+            progress.TimeRemainingColumn(),
             console=people,
             transient=True,
             disable=not people.is_terminal,
