@@ -1,4 +1,4 @@
-"""The envelope: one keyframe's message as it came over Zenoh (DESIGN section 3).
+"""The envelope: one keyframe's message as it came over Zenoh.
 
 The models define a *valid* envelope. They are strict: an int is not a string, NaN is not a number.
 Unknown fields need only be JSON; they are ignored here, and the log keeps them, since it stores the

@@ -1,4 +1,4 @@
-"""Validate the bytes of an envelope: `Accepted`, or `Rejected` with the reason (DESIGN section 3).
+"""Validate the bytes of an envelope: `Accepted`, or `Rejected` with the reason.
 
 No I/O. The recorder, the importer and the fold all use it, so a log holds nothing under a robot's
 key that the fold cannot read. The caller writes a rejected payload, with its bytes, to the

@@ -9,7 +9,7 @@ current one and validates it like a new one.
         or pose, so the event around it supplies them: the run is ``unnamed:<key>``, the keyframe id
         is the event's offset, the time is the event's stamp, and there is no pose. So it becomes
         observations without a place. ``class_name`` became ``class``.
-    2   the envelope of DESIGN section 3.
+    2   the envelope of `eventsrc.envelope`.
 
 To change the envelope: raise ENVELOPE_VERSION, add the upcaster from the version before to
 ``UPCASTERS``, and a log of that version to the tests. Never change a released upcaster.

@@ -1,8 +1,9 @@
 """The whole fold once more, as slow and plain as can be: an oracle for `SemanticMap`.
 
-It shares no line with what it checks: it reads documents, not the door's envelopes; it computes in
-fractions and Python integers; after every keyframe it counts all anew. Only the rules of DESIGN 3
-and 5 are the same, and the words of `projections.model.digest`, which it writes by itself.
+It shares no code with what it checks: it reads JSON documents, not validated envelopes; it computes
+in fractions and Python integers; after every keyframe it counts all anew. Only the rules are the
+same (docstrings in `projections.reducers`), and the text of `projections.model.digest`, which it
+writes by itself.
 """
 
 import base64

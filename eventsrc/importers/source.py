@@ -7,8 +7,13 @@ from typing import Protocol
 
 @dataclass(frozen=True, slots=True)
 class ImportedMessage:
-    """A message of a source, with what is None if the source does not say: its ``key``,
-    ``logged_ns`` (when the source received it) and ``stamp_ns`` (when it was published)."""
+    """A message of a source. ``key``, ``logged_ns`` and ``stamp_ns`` are None if it has none.
+
+    ``payload`` is one JSON envelope (`eventsrc.envelope`; example and limits: docs/recording.md);
+    any other payload is kept as rejected. ``logged_ns`` is when the source received it.
+    ``stamp_ns`` is used for system events of another mapfold log only: the event of an envelope is
+    stamped with the envelope's own time.
+    """
 
     payload: bytes
     key: str | None = None
@@ -26,7 +31,8 @@ class Source(Protocol):
     """Number of the message that `messages` yielded last."""
     size_bytes: int | None
     skipped: int
-    """Messages skipped because their channel is not declared as JSON."""
+    """Messages not yielded because they are in a format that is not read, such as MCAP channels
+    that are not declared as JSON."""
 
     def messages(self) -> Iterator[ImportedMessage]:
         """The messages in order."""

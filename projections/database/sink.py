@@ -16,11 +16,13 @@ databases (`stores.DatabaseSink`) does both. The runner (`rebuild`) calls, in th
 6. `RebuildSink.drop_replaced`, outside a transaction
 
 ``Conn`` is what the sink writes through: a psycopg connection for the databases, `MemoryTables` for
-memory. It is in a transaction but for 1 and 6. Methods that take the view do not take it, so that
-the fold can go on while a thread calls what they returned.
+memory. It is in a transaction, except in steps 1 and 6. A method that gets the view gets no
+connection: it returns a function that gets one, so that the fold can go on while a thread calls
+that function.
 
 Each event's changes reach a sink once. Ordinals are the same in every fold of a log: a sink that
 computes its ids from them has the same rows after a tail and a rebuild, and never looks an id up.
+docs/architecture.md ("Where to add") lists the other files that name each sink.
 """
 
 from collections.abc import Callable, Mapping
@@ -32,7 +34,7 @@ from projections.model.changes import BatchChanges
 from projections.model.view import MapView
 
 SinkName: TypeAlias = Literal["graph", "vectors"]
-"""Under which checkpoints and locks in the databases know a sink."""
+"""The ``name`` of a sink of the databases: the key of its checkpoint, dead letters and locks."""
 Conn = TypeVar("Conn", contravariant=True)
 
 
@@ -78,9 +80,9 @@ class LiveSink(Protocol[Conn]):
     """A sink that follows the log."""
 
     def ensure(self, connection: Conn) -> bool:
-        """Create what is written to if it is missing; True then.
+        """Create what rows are written to, if it is missing; returns whether it was.
 
-        Raises DatabaseError when something has its name that mapfold did not make.
+        Raises DatabaseError when something that mapfold did not make has its name.
         """
 
     def prepare(self, changes: BatchChanges, view: MapView) -> PreparedWrite[Conn]:
@@ -88,7 +90,7 @@ class LiveSink(Protocol[Conn]):
 
 
 class Shadow(Protocol[Conn]):
-    """New rows beside those that readers see. It is made for one rebuild, which may fail."""
+    """The new rows of one rebuild, beside those that readers see."""
 
     def create(self, connection: Conn) -> None:
         """Create it, empty."""
@@ -120,7 +122,7 @@ class RebuildSink(Protocol[Conn]):
         """A shadow, not created yet."""
 
     def drop_replaced(self, connection: Conn) -> None:
-        """Have what was replaced dropped, now or once its last reader is gone.
+        """Drop what was replaced, now or once its last reader is gone.
 
-        It may close the connection and leave the server at work.
+        May close the connection while the server still drops.
         """

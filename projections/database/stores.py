@@ -33,7 +33,7 @@ class DatabaseSink(LiveSink[Connection], RebuildSink[Connection], Protocol):
 
     @property
     def name(self) -> SinkName:
-        """Under which the checkpoint and the locks know it."""
+        """The key of its checkpoint, dead letters and locks."""
 
 
 @dataclass(slots=True)

@@ -1,5 +1,7 @@
 """After a swap: wait for the last readers of the replaced tables, then have the server drop them.
 
+The swap itself is `graph_schema.swap_in`, and for vectors `vector_table.set_aside` and `move_in`.
+
 A reader may have resolved a name just before the swap without holding a lock yet. Its transaction
 began before the swap was committed, so it is enough to wait for all transactions of this database
 that are older than now, as CREATE INDEX CONCURRENTLY does.

@@ -1,4 +1,4 @@
-"""What ``mapfold state`` prints: the map as a JSON document (DESIGN section 8) or as text."""
+"""What ``mapfold state`` prints: the map as a JSON document or as text."""
 
 from typing import Any
 

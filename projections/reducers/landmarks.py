@@ -1,6 +1,6 @@
 """Landmarks: repeated observations fused into Objects.
 
-The rules (DESIGN section 5), for an observation of class C made from the pose (x, y):
+The rules, for an observation of class C made from the pose (x, y):
 
 1.  Candidates are Objects of class C whose mean position is within ``fusion_radius_m`` of (x, y),
     inclusive, and whose mean embedding has at least ``fusion_similarity`` cosine with the

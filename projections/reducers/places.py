@@ -1,6 +1,6 @@
 """Places: online DBSCAN that equals batch DBSCAN after every keyframe.
 
-The rules (Ester et al. 1996, 1998; DESIGN section 5):
+The rules (Ester et al. 1996, 1998; docs/places.md):
 
 1.  Two poses are neighbours within ε, inclusive; a pose is its own neighbour. A pose with at least
     ``min_samples`` neighbours is *core*. Core points that are neighbours are of one place.

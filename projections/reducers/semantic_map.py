@@ -1,6 +1,6 @@
 """The fold: one envelope in, its deltas out. Runs the reducers and passes deltas between them.
 
-Per keyframe, in this order (DESIGN section 5):
+Per keyframe, in this order:
 
 0.  Corrections leave it out, leave detections of it out, or change its pose.
 1.  A keyframe folded before changes nothing: it is a duplicate, or a conflict if its content

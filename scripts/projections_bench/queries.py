@@ -1,4 +1,4 @@
-"""The two queries of DESIGN section 6 at 300,000 observations."""
+"""The two queries of docs/projections.md at 300,000 observations."""
 
 import json
 import statistics

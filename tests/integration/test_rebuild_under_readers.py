@@ -1,4 +1,4 @@
-"""Readers run the queries of DESIGN section 6 in a loop while maps are rebuilt under them."""
+"""Readers run the two queries of docs/projections.md in a loop while maps are rebuilt."""
 
 import sys
 import threading

@@ -1,4 +1,4 @@
-"""The trial runs fold to what is known about them (DESIGN section 11)."""
+"""The trial runs fold to what is known about them."""
 
 import pytest
 

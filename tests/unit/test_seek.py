@@ -1,4 +1,4 @@
-"""Points in a log: offsets, times, keyframes and the end, by the rules of DESIGN section 8."""
+"""Points in a log: offsets, times, keyframes and the end."""
 
 from collections.abc import Iterator
 from pathlib import Path

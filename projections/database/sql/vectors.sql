@@ -1,4 +1,4 @@
--- The table of searchable detections (DESIGN section 6). `{schema}` is public for what readers see
+-- The table of searchable detections (docs/projections.md). `{schema}` is public for what readers see
 -- and mapfold for a rebuild's shadow; `{vector}` is the type, wherever the extension put it.
 
 -- name: create
