@@ -119,16 +119,17 @@ SHORT_TIMEOUTS: Final = "SET LOCAL lock_timeout = '200ms'; SET LOCAL statement_t
 readers in turn: both sinks together stay below a second."""
 NO_TIMEOUTS: Final = "SET LOCAL lock_timeout = 0; SET LOCAL statement_timeout = 0"
 PAUSE_S: Final = 0.02
-PATIENCE_S: Final = 120.0
+LOCK_TIMEOUT_S: Final = 120.0
+"""How long to try to lock what is replaced."""
 
 
 def lock_readers(writers: Sequence[ShadowWriter]) -> None:
-    """Lock what the shadows will replace. Raises DatabaseError after `PATIENCE_S`."""
-    deadline = time.monotonic() + PATIENCE_S
+    """Lock what the shadows will replace. Raises DatabaseError after `LOCK_TIMEOUT_S`."""
+    deadline = time.monotonic() + LOCK_TIMEOUT_S
     while (store := _store_with_readers(writers)) is not None:
         if time.monotonic() > deadline:
             raise DatabaseError(
-                f"{store.place}: readers kept the map locked for {PATIENCE_S:.0f} s; end their"
+                f"{store.place}: readers kept the map locked for {LOCK_TIMEOUT_S:.0f} s; end their"
                 " transactions, then run the rebuild again"
             )
         time.sleep(PAUSE_S)

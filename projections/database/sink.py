@@ -1,12 +1,13 @@
 """The port between the fold and what the map is written to.
 
-A sink that follows a log implements `LiveSink`. For each batch of events the runner (`tail`) calls
-`prepare` with the ids that the batch changed and the view, opens a transaction, calls ``send`` of
-the prepared write, moves the sink's checkpoint and commits: both are written or none. After a lost
-connection it calls `ensure` and, if the batch was not committed, the same ``send`` again.
+A sink that follows a log implements `LiveSink`. For each batch of events `tail_pass` calls
+`prepare` with the ids that the batch changed and the view; `writer` opens a transaction, calls
+``send`` of the prepared write, moves the sink's checkpoint and commits: both are written or none.
+After a lost connection it calls `ensure` and, if the batch was not committed, the same ``send``
+again.
 
 A sink that can also be rebuilt from the start of a log implements `RebuildSink`; a sink of the
-databases (`stores.DatabaseSink`) does both. The runner (`rebuild`) calls, in this order:
+databases (`stores.DatabaseSink`) does both. `shadows` calls, in this order:
 
 1. `RebuildSink.drop_leftovers`, outside a transaction; then it opens the one transaction of 2 to 5
 2. `Shadow.create`

@@ -36,7 +36,7 @@ from .writer import AWAY, Backoff, LostCommits, OnTrouble
 
 BATCH_EVENTS: Final = 500
 """At most this many events in one transaction: about half a second of work when behind."""
-ONCE_PATIENCE_S: Final = 60.0
+ONCE_TIMEOUT_S: Final = 60.0
 """How long `tail` with ``once`` waits for a database that is away."""
 
 
@@ -72,7 +72,7 @@ def tail(
         settings,
         once,
         stop or threading.Event(),
-        ONCE_PATIENCE_S if once else None,
+        ONCE_TIMEOUT_S if once else None,
         batch_events,
         on_fold,
         on_batch,

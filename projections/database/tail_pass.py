@@ -130,7 +130,7 @@ class TailPass:
         )
         fold = folded or LiveFold(
             current.settings,
-            cache.latest(self._latest_usable_snapshot()),
+            cache.latest(self._snapshot_limit()),
             corrections=current.corrections,
         )
         start = fold.map.next_offset
@@ -191,9 +191,9 @@ class TailPass:
         """Batches end there, so that a sink gets a batch as a whole or not at all."""
         return {checkpoint.next_offset for checkpoint in self.checkpoints.values()}
 
-    def _latest_usable_snapshot(self) -> Offset:
-        """The highest offset of a snapshot to start from: below all checkpoints and parked events,
-        which another command may have folded."""
+    def _snapshot_limit(self) -> Offset:
+        """The highest offset a snapshot to start from may have: the lowest checkpoint or parked
+        event. A later snapshot, kept by another command, may have folded the parked event."""
         return min([c.next_offset for c in self.checkpoints.values()] + list(self.parked))
 
     def _begin(self, reader: LogReader) -> bool:
@@ -214,13 +214,13 @@ class TailPass:
                         store.connection, sink.name, reader.log_id, self.inputs.latest
                     )
                     found = checkpoints.load(store.connection, sink.name)
-                    assert found is not None  # noqa: S101 - begun in this transaction
+                    assert found is not None  # noqa: S101 - created in this transaction
                     faults |= self._refuse_mismatch(found, sink.name, store.place, reader)
                     if made and found.next_offset:
                         raise rows_dropped(
                             found, sink.name, store.place, plan.log, self.inputs.latest
                         )
-                    # Now, as with the lock held `status` takes the sink for followed.
+                    # Now, as `status` reports a sink as followed while its lock is held.
                     checkpoints.write_refold(store.connection, sink.name, None, None)
                     self.checkpoints[sink.name] = found
                     letters = checkpoints.parked(store.connection, sink.name)

@@ -2,7 +2,7 @@
 
 A lost connection is noticed when it is used. Then the server is restarted if it is the embedded
 one, else waited for, and the question is asked once more on a new connection; so a restart of the
-database costs no answer. After ``PATIENCE_S`` of an outage questions fail at once.
+database costs no answer. After ``OUTAGE_TIMEOUT_S`` of an outage questions fail at once.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ from projections.errors import DatabaseUnavailable, ProjectionMissing
 from projections.queries.relocalize import fetch, prepare_graph, prepare_vectors
 from projections.relocalize import Candidates, Crop
 
-PATIENCE_S: Final = 10.0
+OUTAGE_TIMEOUT_S: Final = 10.0
 """Questions in the first seconds of an outage wait for its end, later ones fail at once."""
 
 
@@ -47,7 +47,7 @@ class Outage:
         """An attempt failed."""
         with self._lock:
             if self._until is None:
-                self._until = self._now() + PATIENCE_S
+                self._until = self._now() + OUTAGE_TIMEOUT_S
                 self._tell(f"{error}; trying again")
 
     def end(self) -> None:

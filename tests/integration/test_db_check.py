@@ -180,7 +180,7 @@ def test_a_rebuild_beside_a_check_makes_no_difference(
     log: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch, sink: SinkName
 ) -> None:
     """To the check's snapshot the tables of such a rebuild would be empty."""
-    monkeypatch.setattr(sys.modules["projections.database.shadows"], "PATIENCE_S", 0.3)
+    monkeypatch.setattr(sys.modules["projections.database.shadows"], "LOCK_TIMEOUT_S", 0.3)
     rebuild(log, one_database, SETTINGS)
     load = checkpoints.load
 

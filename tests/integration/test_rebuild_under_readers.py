@@ -220,7 +220,7 @@ def test_between_swap_and_commit_a_reader_waits_at_its_first_table(
 def test_a_reader_that_keeps_its_lock_stops_the_swap_with_a_message(
     tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys.modules["projections.database.shadows"], "PATIENCE_S", 0.3)
+    monkeypatch.setattr(sys.modules["projections.database.shadows"], "LOCK_TIMEOUT_S", 0.3)
     log = write_log(tmp_path / "log", walk(60))
     rebuild(log, one_database, SETTINGS, until=30)
     old = all_rows(one_database)

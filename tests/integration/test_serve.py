@@ -342,7 +342,7 @@ class TestKilledServer:
     def test_questions_wait_for_another_server_at_first_and_fail_at_once_later(
         self, server: EmbeddedServer, queue: FairQueue, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("projections.serve.pools.PATIENCE_S", 0.5)
+        monkeypatch.setattr("projections.serve.pools.OUTAGE_TIMEOUT_S", 0.5)
         told: list[str] = []
         with Pools(Targets(server.url, server.url), 4, told.append) as pools:
             answerer = Answerer(pools, per_second=10_000.0)
