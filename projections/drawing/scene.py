@@ -13,6 +13,8 @@ from projections.model.records import KeyframeRecord, ObjectRecord
 from projections.model.view import MapView
 
 _NEAR_M = 1.0
+_MOST_LETTERS = 24
+"""Of a place's name; longer ones are cut."""
 
 Line = tuple[float, float, float, float]
 Box = tuple[float, float, float, float]
@@ -111,13 +113,27 @@ def _add_to_group(clumps: list[list[ObjectRecord]], found: ObjectRecord) -> None
 
 
 def place_names(view: MapView) -> dict[int, str]:
-    """A short name of each place, also absorbed ones: p3, or run_p3 where two runs have a p3."""
+    """What to write on each place, also absorbed ones: the name that a command gave it, else its
+    short id: p3, or run_p3 where two runs have a p3. Of places with one name each has its id too.
+    """
     short = {p.ordinal: p.place_id.rpartition("_")[2] for p in view.all_places}
     used = Counter(short.values())
-    return {
+    ids: dict[int, str] = {
         ordinal: name if used[name] == 1 else view.all_places[ordinal].place_id
         for ordinal, name in short.items()
     }
+    given: dict[int, str] = {
+        p.ordinal: _cut(p.name) for p in view.places.values() if p.name is not None
+    }
+    shared = Counter([*given.values(), *ids.values()])
+    return ids | {
+        ordinal: name if shared[name] == 1 else f"{name} ({ids[ordinal]})"
+        for ordinal, name in given.items()
+    }
+
+
+def _cut(name: str) -> str:
+    return name if len(name) <= _MOST_LETTERS else f"{name[: _MOST_LETTERS - 1]}…"
 
 
 def spot_of(keyframe: KeyframeRecord) -> tuple[float, float] | None:

@@ -32,17 +32,20 @@ class Regrouping:
 @dataclass(frozen=True, slots=True)
 class PartitionComparison:
     """``splits`` are groups of the first that fall apart in the second; ``joins`` are groups of the
-    second made of several of the first. Pieces come largest first."""
+    second made of several of the first. Pieces come largest first. ``grouped_once`` counts the
+    things that are in a group of one partition and in none of the other."""
 
     things: int
     adjusted_rand: Fraction
     splits: tuple[Regrouping, ...]
     joins: tuple[Regrouping, ...]
+    grouped_once: int
 
     @property
     def same(self) -> bool:
-        """Equal up to the groups' names."""
-        return self.adjusted_rand == 1 and not self.splits and not self.joins
+        """Equal up to the groups' names: the same things are grouped, in the same way."""
+        regrouped = self.splits or self.joins or self.grouped_once
+        return self.adjusted_rand == 1 and not regrouped
 
 
 def compare_partitions(
@@ -56,6 +59,7 @@ def compare_partitions(
         adjusted_rand=adjusted_rand(pairs),
         splits=_regroupings(pairs),
         joins=_regroupings(flipped),
+        grouped_once=sum(n for (a, b), n in pairs.items() if (a is None) is not (b is None)),
     )
 
 

@@ -26,13 +26,17 @@ def test_the_index_is_scikit_learns(pairs: list[tuple[str | None, str | None]]) 
 
 
 @given(labellings)
-def test_same_means_every_pair_agrees(pairs: list[tuple[str | None, str | None]]) -> None:
+def test_same_means_every_pair_agrees_and_the_same_things_are_grouped(
+    pairs: list[tuple[str | None, str | None]],
+) -> None:
     first, second = _noise_alone([a for a, _ in pairs]), _noise_alone([b for _, b in pairs])
     agree = all(
         (first[i] == first[j]) == (second[i] == second[j])
         for i, j in combinations(range(len(pairs)), 2)
     )
-    assert compare_partitions([a for a, _ in pairs], [b for _, b in pairs]).same is agree
+    grouped = all((a is None) == (b is None) for a, b in pairs)
+    found = compare_partitions([a for a, _ in pairs], [b for _, b in pairs])
+    assert found.same is (agree and grouped)
 
 
 @given(labellings)

@@ -67,6 +67,29 @@ def test_names_of_places_carry_the_run_where_two_runs_have_the_same() -> None:
     assert {"p0", "run_p1", "other_p1"} <= set(texts)
 
 
+def test_a_place_with_a_name_shows_it_instead_of_its_id() -> None:
+    view = _two_places()
+    view.apply(d.PlaceNamed(10, 0, "Ann's kitchen", 10))
+    texts = set(_texts(compose(view, "", Floor())))
+    assert {"Ann's kitchen", "p1"} <= texts
+    assert "p0" not in texts
+
+
+def test_places_that_share_a_name_show_their_ids_too() -> None:
+    view = _two_places()
+    view.apply(d.PlaceNamed(10, 0, "office", 10))
+    view.apply(d.PlaceNamed(10, 1, "office", 11))
+    assert {"office (p0)", "office (p1)"} <= set(_texts(compose(view, "", Floor())))
+    view.apply(d.PlaceNamed(10, 1, "p0", 12))  # one is called as another's id is
+    assert {"office", "p0 (p1)"} <= set(_texts(compose(view, "", Floor())))
+
+
+def test_a_long_name_is_cut() -> None:
+    view = _two_places()
+    view.apply(d.PlaceNamed(10, 0, "the room behind the second kitchen", 10))
+    assert "the room behind the sec…" in _texts(compose(view, "", Floor()))
+
+
 def test_objects_of_one_class_far_apart_keep_labels_of_their_own() -> None:
     view = _two_places()
     box = (0.0, 0.0, 1.0, 1.0)
