@@ -9,7 +9,6 @@ import typer
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 from projections.model.log_commands import read_corrections
-from projections.queries.relocalize import relocalize as ask_databases
 from projections.relocalize import UNKNOWN_BELOW, Answer, Method, RankedPlace, rank, search_log
 
 from .options import (
@@ -64,6 +63,9 @@ def relocalize(
     if log is None:
         past_settings(log, settings_file, set_)
         with databases(db, vector_db) as targets:
+            # Here: `evaluate` and `whatif` import this module and ask no database.
+            from projections.queries.relocalize import relocalize as ask_databases
+
             answer = ask_databases(targets, crops, top=top, method=how, camera=camera)
     else:
         with LogReader(log) as reader:
