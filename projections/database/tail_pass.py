@@ -1,8 +1,9 @@
 """One pass of a tail, from the checkpoints to the end of the log; `tail` says how it goes."""
 
+import contextlib
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import takewhile
 from pathlib import Path
@@ -33,7 +34,7 @@ from .refold import CommandsCame, Refold, RefoldStopped, refuse_if_not_allowed
 from .sink import Checkpoint, SinkName
 from .stores import Store
 from .tail_progress import TailProgress, TailReport
-from .writer import OnTrouble, SinkBatch, Writer
+from .writer import AWAY, LostCommits, OnTrouble, SinkBatch, Writer
 
 HEARTBEAT_S: Final = 5.0
 
@@ -86,7 +87,8 @@ class TailPass:
         """
         fold, restarts = None, 0
         while True:
-            is_current = self._begin(reader)
+            with self._lost_connections():
+                is_current = self._begin(reader)
             self.began = True
             if is_current:
                 if self._follow(reader, fold):
@@ -95,12 +97,25 @@ class TailPass:
             else:
                 fold = None  # free the old one first
                 try:
-                    fold = self._refold(reader, goes_through=restarts > 0)
+                    with self._lost_connections():
+                        fold = self._refold(reader, goes_through=restarts > 0)
                     restarts = 0
                 except CommandsCame:
                     restarts += 1
                 except RefoldStopped:
                     return
+
+    @contextlib.contextmanager
+    def _lost_connections(self) -> Iterator[None]:
+        """Raise LostCommits when a database goes away: the next pass begins at the checkpoints. At
+        the beginning of the first pass it is an error."""
+        try:
+            yield
+        except AWAY as error:
+            if not self.began:
+                raise
+            self.plan.on_trouble(str(error))
+            raise LostCommits from error
 
     def _refold(self, reader: LogReader, *, goes_through: bool) -> LiveFold:
         plan = self.plan
