@@ -80,6 +80,7 @@ def test_readers_see_one_map_or_the_other_and_never_an_error(
                 for query in queries:
                     allowed[query].add(single_answer(connection, query))
             allowed["service"].add(ask())
+        assert len(allowed["service"]) == 2
         readers = [Reader(lambda: connect_for_cypher(url), query, True) for query in queries]
         asker = Asker(ask)
         progress, stop = TailProgress(), threading.Event()
