@@ -131,7 +131,7 @@ def _absorbed_others(history: History, merge: Merge) -> Entry:
     return Entry(
         merge.cause,
         "absorbed",
-        f"absorbed {parts}, having {merge.survivor_size:,} itself; {merge_reason(history, merge)}",
+        f"absorbed {parts}; it had {merge.survivor_size:,} before; {merge_reason(history, merge)}",
         {"merge": merge.number, "places": [place_name(history, p) for p in merge.absorbed]},
     )
 
@@ -142,8 +142,8 @@ def _absorbed_by(history: History, record: PlaceHistory, merge: Merge) -> Entry:
     return Entry(
         merge.cause,
         "ended",
-        f"absorbed by {survivor} ({counted(merge.survivor_size, 'keyframe')}), having {size:,} "
-        f"itself; {merge_reason(history, merge)}",
+        f"absorbed by {survivor} ({counted(merge.survivor_size, 'keyframe')}); this place had "
+        f"{size:,}; {merge_reason(history, merge)}",
         {"merge": merge.number, "survivor": survivor, "keyframe_count": size},
     )
 
@@ -249,9 +249,9 @@ def _object_summary(history: History, record: ObjectHistory, end: Offset) -> str
     x, y = mean_m(last.sum_x_um, last.obs_count), mean_m(last.sum_y_um, last.obs_count)
     sightings = sightings_of(history, record, end)
     least = min(seen.similarity_q40 for seen in sightings) / Q40
-    similar = f", each at least {least:.2f} like it" if last.obs_count > 1 else ""
+    similar = f" (similarity at least {least:.2f})" if last.obs_count > 1 else ""
     return (
-        f"a {record.found.class_name} seen {counted(last.obs_count, 'time')}{similar}, "
+        f"a {record.found.class_name}, seen {counted(last.obs_count, 'time')}{similar}, "
         f"on average from ({x:.2f}, {y:.2f}); in {place_title(history, record.place(end), end)}"
     )
 
@@ -264,8 +264,8 @@ def _object_entries(
     yield Entry(
         record.cause,
         "found",
-        f"found: {first}, seen from {position_text(pose)}, "
-        f"was like no {record.found.class_name} near it",
+        f"new object: {first}, seen from {position_text(pose)}, "
+        f"matched no {record.found.class_name} nearby",
         {"det_id": first},
     )
     yield from _sightings(history, record)

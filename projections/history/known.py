@@ -170,7 +170,7 @@ class KnownHistory:
         asked = Expression(expression) if isinstance(expression, str) else expression
         facts = self.facts(end)
         if self.checked(start) > facts.end:
-            raise LogPointError(f"from {start} to {facts.end} nothing happens; swap them")
+            raise LogPointError(f"the start ({start}) is after the end ({facts.end}); swap them")
         _check_names(asked, facts)
         return Searcher(asked, facts, self.history.cause_at).search(start, facts.end, scan=scan)
 

@@ -1,26 +1,26 @@
 """Finds a point of a dense cell within ε of a point beyond one of its sides, in O(log n), exactly.
 
-A cell that a robot visits for a year holds ten thousand points, and a keyframe in the cell across a
-wall needs this answer. Seen from the left of the cell, a point of it covers what lies between its
-ε-circle's left arc and the cell's far side. The left boundaries of two such regions have one point
+A cell that a robot visits for a year holds ten thousand points, and a keyframe in a nearby cell
+needs this answer. Seen from the left of the cell, each point of it covers a region between the left
+arc of its ε-circle and the cell's far side. The left boundaries of two such regions have one point
 in common (the slope of the lower centre's arc is the greater one everywhere): their arcs cross, or
 one arc meets the edge of the other's region. So along the envelope of all regions the centres
-ascend and each owns one interval of heights. A new centre is kept if it owns something, and evicts
-the neighbours that own nothing any more; a query finds the owner of its height by bisection and
-compares one distance (the "unit-spherical emptiness checking with line separation" of Gan and Tao
-2015).
+ascend, and each is on it for one interval of heights. A new centre is kept if it has an interval,
+and removes the neighbours that have none any more; a query finds the centre at its height by
+bisection and compares one distance (the "unit-spherical emptiness checking with line separation" of
+Gan and Tao 2015).
 
-Everything is integer: where two arcs cross involves a root, so "is it before t?" is decided by
-comparing signs, then squares.
+All arithmetic is on integers. The height where two arcs cross has a square root in it; to compare
+it with another height, signs are compared, then squares.
 
-The index is written for the side "left": its axes are (across, along) = (x, y). `from_side` maps
-the other three sides to it.
+A SidePoint is (along, across) a side. Seen from the left, along (the height) is y and across is x;
+`from_side` maps the other three sides to this one.
 """
 
 from bisect import bisect_left
 
 SidePoint = tuple[int, int]
-"""A point as (along, across) one side of a cell: across grows into the cell."""
+"""(along, across) a side of a cell, in micrometres; across grows into the cell."""
 
 
 def from_side(side: int, x: int, y: int) -> SidePoint:

@@ -1,23 +1,23 @@
 """Landmarks: positions of things in the map that look like a crop, triangulated from its matches.
 
 Matches of one crop show one thing or look-alikes of it, so they share one size (pixel metres, see
-`camera`), and with a size every observation alone gives a point: bearing and depth from its pose.
-The right size is the one under which observations from different poses agree on points; it is
-searched on a grid (`_common_depth`). Points that agree within their errors are one landmark
+`camera`). Given a size, each observation alone gives a point: bearing and depth from its pose. The
+right size is the one under which observations from different poses agree on points; it is searched
+on a grid (`_common_depth`). Points that agree within their errors are one landmark
 (`cluster_points`). Wrong fusions and split Objects do no harm, because only observations are used.
 
 A point's error is large along its ray, because the box's height is noisy, and small across it: a
-bearing is good to about a degree. So two chairs half a metre apart are told apart from the side,
-where a circle around every point would merge them into one landmark that fits neither. A landmark's
-position is the mean weighted by information (the inverse of those errors); three views along one
-ray leave the range open, two that cross do not. An error in the shared size moves all points
-outward together: by ``slide``, metres per unit of log size.
+bearing is good to about a degree. So two chairs half a metre apart can be separated from the side;
+with circular errors they would merge into one landmark that fits neither. A landmark's position is
+the mean of its points weighted by information (the inverse covariance): views along one ray leave
+the range uncertain, views that cross do not. An error in the shared size moves all points outward
+together: by ``slide``, metres per unit of log size.
 
-Each landmark carries a table: how well its members' similarities fit, for a robot that looks at it
-from each direction (`_similarity_table`). From the side that was seen before a crop must be more
-similar than from behind; a look-alike fits a little worse from everywhere.
+Each landmark has a table: how well its members' similarities fit a robot that looks at it from each
+direction (`_similarity_table`). From a side that was seen before, a crop must be more similar than
+from behind; a look-alike fits a little worse from every direction.
 
-No BLAS, and no order but the candidates': the same candidates give the same landmarks.
+No BLAS, and results depend on no order but the candidates'.
 """
 
 import math
@@ -48,7 +48,7 @@ MAX_LANDMARKS: Final = 8
 _NEAREST_M, _FARTHEST_M = 0.5, 6.0
 _DEPTHS: Final = np.exp(np.linspace(np.log(0.5), np.log(6.5), 20))
 _FOR_DEPTH: Final = 40
-"""The most similar matches suffice to find the size; all pairs of them are compared."""
+"""How many of the most similar matches are used to find the size; all pairs are compared."""
 _AGREE_M: Final = 0.3
 _CUT_WEIGHT: Final = 0.2
 _MIN_RANGE_M: Final = 0.3
@@ -59,8 +59,8 @@ _MIN_WEIGHT: Final = 0.05
 class LandmarkHypothesis:
     """A thing in the map that may be the crop. ``members`` index the crop's posed matches.
 
-    ``spread`` (covariance xx, xy, yy in m²) and ``slide`` (metres per unit of log size) say how
-    unsure its position is. ``table`` (DIRECTIONS,) is a log-likelihood.
+    ``spread`` (covariance xx, xy, yy in m²) and ``slide`` (metres per unit of log size) are the
+    errors of its position. ``table`` (DIRECTIONS,) is a log-likelihood.
     """
 
     x: float
@@ -92,7 +92,7 @@ class CropEvidence:
 def crop_evidence(
     crops: Sequence[Crop], matches: Sequence[Sequence[Match]], camera: Camera, model: Model
 ) -> tuple[CropEvidence, ...]:
-    """Evidence of the crops that have a relevant match with a pose; maybe none."""
+    """The evidence of each crop that has a relevant match with a pose."""
     shifts, found = session_shifts(matches, model), []
     for crop, row in zip(crops, matches, strict=True):
         relevant = [
@@ -151,7 +151,8 @@ def _find_landmarks(
 
 
 def _rays(poses: Floats, boxes: Views) -> tuple[Floats, float]:
-    """Per observation the vector to its thing, were the median height at a depth of 1 m."""
+    """(n, 2) vectors from pose to thing, for a box of median height at a depth of 1 m, and that
+    height in pixels."""
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     median_px = float(np.median(boxes.height_px))
     relative = median_px / boxes.height_px
@@ -161,10 +162,8 @@ def _rays(poses: Floats, boxes: Views) -> tuple[Floats, float]:
 
 
 def _common_depth(poses: Floats, rays: Floats, weight: Floats, model: Model) -> tuple[float, float]:
-    """The depth of the median height under which points from different poses agree best.
-
-    With it the standard error of its logarithm, the score taken for a log-likelihood.
-    """
+    """The depth of a box of median height under which points from different poses agree best, and
+    the standard error of its logarithm, with the score taken as a log-likelihood."""
     dp = poses[:, None, :2] - poses[None, :, :2]
     dr = rays[:, None] - rays[None]
     pp, pr, rr = (dp * dp).sum(2), (dp * dr).sum(2), (dr * dr).sum(2)
@@ -247,7 +246,8 @@ def points_of(origin: Floats, ray: Floats, cut: Flags, sigma_size: float, model:
 
 
 def cluster_points(points: Points, weight: Floats, most: int, model: Model) -> list[Indices]:
-    """Grouped around the densest point, then around the densest of the rest, and so on."""
+    """Indices of the points of each cluster: around the densest point, then around the densest of
+    the rest, and so on, at most ``most`` clusters."""
     near = np.exp(-0.5 * _chi_squared(points, points.xy[:, None, :]))
     free = np.ones(len(weight), dtype=bool)
     found: list[Indices] = []
@@ -273,7 +273,7 @@ class Position:
 
 
 def estimate_position(points: Points, model: Model) -> Position:
-    """The position of the thing that all ``points`` show, outliers counting little."""
+    """The position of the thing that all ``points`` show; outliers have little weight."""
     centre = np.array(_weighted_mean(points, np.ones(len(points.xy))))
     weight = np.maximum(np.exp(-0.5 * _chi_squared(points, centre)), _MIN_WEIGHT)
     sxx, sxy, syy, x, y, ray_x, ray_y = (points.moments * weight).sum(1).tolist()

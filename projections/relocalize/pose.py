@@ -1,26 +1,26 @@
 """Poses: propose where the robot may be, score each against the crops, and choose.
 
-Proposed are poses from which a landmark's observations were made; with a box, the circle around a
-landmark at the crop's range, facing so that the box lies where it does; with two boxes, the one
-pose that puts two landmarks where two crops show them (resection: a rigid fit of two points).
+Proposed are the poses from which a landmark's observations were made; for a crop with a box, poses
+on the circle around a landmark at the crop's range, turned so that the landmark is at the box's
+bearing; for two crops with boxes, the pose that puts two landmarks where the crops show them
+(resection: a rigid fit of two points).
 
 The score is a log-likelihood ratio against 'none of this is in the map'. Crops are independent
 evidence given the pose, so their logs add. Each crop is explained by its best landmark, or by none
 at a fixed price, so one unknown or wrong crop does not outvote the others. For a landmark three
-things count: the table of similarities at the direction from which the pose looks at it, bearing
-and depth of the box against where the pose would see it, and whether it was ever seen from about
-there (walls are not in the map, but what was seen from where is). Last, the robot is where robots
-have driven.
+things count: its table of similarities at the direction from which the pose looks at it; bearing
+and depth of the box against where the pose would see it; and how far the pose is from the nearest
+one that saw it, which stands in for walls, as they are not in the map. A prior favours poses near
+those of the matches: robots have driven there.
 
-Poses are proposed unevenly, so each is weighed by its likelihood divided by how many others lie
-within 0.3 m of it. The answer is the pose with the least expected error, errors above 3 m counting
-as 3 m (a median, not a mean: between two look-alike spots stands nothing), moved to the mean of
-what lies within 1 m of it.
+Poses are proposed unevenly, so each weighs its likelihood divided by how many lie within 0.3 m of
+it. The answer is the pose with the least expected error, errors above 3 m counting as 3 m (like a
+median; a mean could lie between two look-alike spots), moved to the mean of the poses within 1 m.
 
 The confidence is a logistic model on a few features of these weights: the probability that the pose
-is within 1.5 m (the default ε) of the truth, counting a robot that is somewhere the map does not
-know as never right. Its weights come from `scripts/fit_confidence`, which fits them on generated
-buildings; the runs reported in docs/relocalization.md were not used.
+is within 1.5 m (the default ε) of the truth. A robot outside the mapped area counts as never right.
+Its weights come from `scripts/fit_confidence`, which fits them on generated buildings; the runs
+reported in docs/relocalization.md were not used.
 """
 
 import math
@@ -42,7 +42,7 @@ _TURN: Final = 2.0 * np.pi
 _CIRCLE: Final = np.arange(24) * (_TURN / 24)
 _POSES_OF_LANDMARK: Final = 12
 _MAX_MISFIT_M: Final = 1.0
-"""Two landmarks whose distance differs by more from the crops' are not the pair seen."""
+"""Two landmarks are paired with two crops only if their distances differ by at most this."""
 _STEPS: Final = np.array(
     [(x, y, yaw) for x in (-0.2, 0.0, 0.2) for y in (-0.2, 0.0, 0.2) for yaw in (-0.07, 0.0, 0.07)]
 )
@@ -50,16 +50,17 @@ _REFINED: Final = 16
 _KEPT: Final = 200
 _MIN_FIT: Final = -30.0
 _USUAL_DET: Final = (0.15 * 0.08) ** 2
-"""The error ellipse of log depth and bearing against which a landmark is vague or sharp."""
+"""The usual determinant of the covariance of log depth and bearing: a landmark with a larger one
+scores less (`Model.vague`)."""
 _DENSITY_RADIUS_M: Final = 0.3
 _MAX_ERROR_M: Final = 3.0
 _NEAR_M: Final = 1.0
 _MIN_YAW_AGREEMENT: Final = 0.8
 
 WEIGHTS: Final[tuple[float, ...]] = (-6.144, 0.159, 0.105, 0.740, 4.466, -0.776)
-"""Of the confidence: intercept, then one for each of `Posterior.features`."""
+"""Weights of the confidence: intercept, then one for each of `Posterior.features`."""
 _MAX_FEATURE: Final = 7.0
-"""A crop explains no more than this, so that one lucky feature does not decide alone."""
+"""Upper limit of the first three features, so that none decides alone."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -301,7 +302,7 @@ def _choose(poses: Floats, total: Floats, shares: Floats, crops: int) -> Posteri
 
 
 def _mean_yaw(yaws: Floats, weights: Floats) -> float | None:
-    """The circular mean in (-π, π], None when the yaws point everywhere."""
+    """The circular mean in (-π, π], None when the yaws disagree."""
     sin, cos = float((np.sin(yaws) * weights).sum()), float((np.cos(yaws) * weights).sum())
     return math.atan2(sin, cos) if math.hypot(sin, cos) >= _MIN_YAW_AGREEMENT else None
 

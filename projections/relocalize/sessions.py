@@ -1,15 +1,15 @@
-"""Session shifts: cosines within one session are higher than between two; made comparable here.
+"""Session shifts: how much higher cosines are within one session than between two, subtracted.
 
-Light, lens and clutter of a session are in every embedding of it, so a crop is more similar to what
-its own session has mapped than the similarity model expects of anything. A map may hold a part of
-the lost robot's own session beside other runs. Each run therefore has a shift of its own: if the
-shift of one were taken off the matches of all runs, the others would look as if seen from behind.
+Light, lens and clutter of a session are in all of its embeddings, so a crop is more similar to what
+its own session has mapped than the similarity model expects. A map may hold a part of the lost
+robot's own session beside other runs. Each run therefore has a shift of its own: with the shift of
+one subtracted from all, the other runs' matches would look as if seen from behind.
 
-A shift shows where the crop's own side was mapped, because then cosines are higher than any between
-two sessions (`session_shifts`). Where the own session saw a thing only from behind, they are as
-high as another session's from in front, and whether the run is of the own session stays open: for a
-landmark that several runs have seen, each run is taken to be of the own session or not, whichever
-fits that landmark better (`apply_remaining_shifts`).
+A shift can be measured where the side that the crop shows was mapped: cosines are then higher than
+any between two sessions (`session_shifts`). Where the own session saw a thing only from behind, its
+cosines are as high as another session's from in front, so it stays open which run is of the own
+session: for a landmark that several runs have seen, each run is taken to be of the own session or
+not, whichever fits that landmark better (`apply_remaining_shifts`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,11 +26,11 @@ _THIRD = 2
 
 
 def session_shifts(matches: Sequence[Sequence[Match]], model: Model) -> dict[str, float]:
-    """By how much the cosines against each run are seen to be higher than usual; mostly 0.
+    """By run, how much higher than usual its cosines are; mostly 0.
 
-    Measured on a crop's third best match in the run, not the best: a crop that *is* in the map says
-    nothing about others. A run with fewer matches of every crop has no shift; what is too similar
-    then counts as a good match and no more (`Model.usual_best`).
+    Measured on a crop's third best match in the run, not the best, which is too similar if the very
+    crop is in the map. A run with fewer matches of every crop has shift 0; similarities above
+    `Model.usual_best` then count as that.
     """
     thirds: dict[str, float] = {}
     for row in matches:
@@ -61,7 +61,7 @@ def _subtract(match: Match, shift: float) -> Match:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RemainingShifts:
-    """Of n matches each one's run number, and the part of a session's shift not yet subtracted."""
+    """For n matches: run numbers, and the parts of a session's shift not yet subtracted."""
 
     run: NDArray[np.intp]
     shift: Floats
@@ -85,7 +85,7 @@ def remaining_shifts(
 def apply_remaining_shifts(
     error: Floats, remaining: RemainingShifts, model: Model
 ) -> tuple[Floats, Floats]:
-    """Subtract the remaining shift of each run where one landmark's similarities fit better so.
+    """Subtract the remaining shift of a run where one landmark's similarities then fit better.
 
     ``error`` of shape (directions, n) is similarity less the expected one. For each direction a run
     counts as of the own session where that fits better by more than ``session_price``; matches of

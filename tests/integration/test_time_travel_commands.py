@@ -250,7 +250,10 @@ def test_a_wrong_picture_name_is_an_error_before_the_fold(
         (("why", "log", "--same", "run-a:1", "run-a:99"), "near it: run-a:8, run-a:7"),
         (("diff", "log", "run-z:1", "end"), "run-z:1: log has no such keyframe"),
         (("bisect", "log", "merged('run-a_p9')", *RULES), "column 8: no place 'run-a_p9'"),
-        (("bisect", "log", "place_count > 0", "--from", "5", "--to", "3"), "from 5 to 3 nothing"),
+        (
+            ("bisect", "log", "place_count > 0", "--from", "5", "--to", "3"),
+            "the start (5) is after the end (3)",
+        ),
         (("whatif", "log"), "nothing to try"),
         (("whatif", "log", "--set", "eps=1"), "no setting 'eps'"),
         (("whatif", "log", "--set", "eps_m=1", "--truth", "none.jsonl"), "--truth none.jsonl"),

@@ -88,7 +88,7 @@ def test_why_of_a_standing_place(corridor: Timeline) -> None:
         "members run-a:1, run-a:2, run-a:3"
     )
     assert story.entries[1].text == (
-        "absorbed run-a_p1 (3 keyframes), having 3 itself; "
+        "absorbed run-a_p1 (3 keyframes); it had 3 before; "
         "run-a:9 made run-a:3, itself and run-a:6 core points: run-a:2 (run-a_p0) –1.000 m– "
         "run-a:3 –1.000 m– run-a:9 –1.000 m– run-a:6 –1.000 m– run-a:5 (run-a_p1)"
     )
@@ -112,10 +112,10 @@ def test_why_of_an_object(corridor: Timeline) -> None:
     (cup,) = corridor.at().objects.values()
     story = corridor.why(cup.object_id)
     assert story.summary == (
-        "a cup seen 2 times, each at least 1.00 like it, on average from (5.00, 0.00); in run-a_p0"
+        "a cup, seen 2 times (similarity at least 1.00), on average from (5.00, 0.00); in run-a_p0"
     )
     assert [(e.cause.offset, e.text) for e in story.entries] == [
-        (4, "found: the-cup, seen from (5.00, 0.00), was like no cup near it"),
+        (4, "new object: the-cup, seen from (5.00, 0.00), matched no cup nearby"),
         (5, "located in run-a_p1"),
         (8, "located in run-a_p0, which absorbed run-a_p1"),
     ]
