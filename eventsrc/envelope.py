@@ -61,8 +61,9 @@ def describe_error(error: ErrorDetails) -> str:
     text: str = error["input"]
     if not text:
         return "is empty"
-    if len(text) > MAX_ID_LENGTH:
-        return f"is {len(text)} characters long, more than {MAX_ID_LENGTH}"
+    most = error.get("ctx", {}).get("max_length", MAX_ID_LENGTH)
+    if len(text) > most:
+        return f"is {len(text)} characters long, more than {most}"
     at, char = next((i, c) for i, c in enumerate(text) if unicodedata.category(c) == "Cc")
     return f"has the control character U+{ord(char):04X} at index {at}"
 

@@ -9,15 +9,13 @@ from eventsrc.commands import (
     DropObject,
     ForgetKeyframes,
     ForgetRun,
-    Join,
-    KeepApart,
     SameObject,
-    UndoMerge,
 )
 from eventsrc.envelope import DetId, KeyframeId, RunId
 from eventsrc.errors import MisuseError
 from eventsrc.text import visible
 from projections.corrections import Keyframe, RecordedCommand
+from projections.model.command_text import command_on
 
 from .current import CurrentMap
 
@@ -61,7 +59,7 @@ def check_join(current: CurrentMap, first: Keyframe, second: Keyframe) -> None:
     wanted = {current.place_of(first), current.place_of(second)}
     for pair in current.corrections.apart:
         if {*pair} == {first, second} or {current.place_of(k) for k in pair} == wanted:
-            found = _command_on(current, pair, (KeepApart, UndoMerge))
+            found = command_on(current.corrections, *pair, joins=False)
             if found is not None:
                 raise refusal("these places are kept apart", found, current.reader.path)
 
@@ -81,23 +79,9 @@ def _joining(current: CurrentMap, first: Keyframe, second: Keyframe) -> Recorded
         for a, b in current.corrections.joined:
             for near, far in ((spot(a), spot(b)), (spot(b), spot(a))):
                 if near == at and far not in reached:
-                    reached[far] = reached[at] or _command_on(current, (a, b), (Join,))
+                    reached[far] = reached[at] or command_on(current.corrections, a, b, joins=True)
                     frontier.append(far)
     return reached.get(spot(second))
-
-
-def _command_on(
-    current: CurrentMap, pair: tuple[Keyframe, Keyframe], kinds: tuple[type[Command], ...]
-) -> RecordedCommand | None:
-    """The last command in force of these kinds that names both anchors."""
-
-    def names_both(command: Command) -> bool:
-        if not isinstance(command, KeepApart | UndoMerge | Join):
-            return False
-        named = {Keyframe(a.run_id, a.keyframe_id) for a in command.places}
-        return isinstance(command, kinds) and named.issuperset(pair)
-
-    return _last(current, names_both)
 
 
 def check_same(current: CurrentMap, first: DetId, second: DetId) -> None:

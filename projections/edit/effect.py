@@ -1,5 +1,6 @@
 """What a command changes in the map of the events before it: counts, and the whole difference."""
 
+import contextlib
 import json
 import os
 from collections.abc import Sequence
@@ -147,7 +148,8 @@ class EffectCache:
             beside.write_text(json.dumps(document), "utf-8")
             beside.replace(self._path)
         except OSError:
-            beside.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                beside.unlink(missing_ok=True)
 
     def _read(self) -> dict[str, Effect]:
         """What is kept; nothing if the file is of another log or was not written by this code."""

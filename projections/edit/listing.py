@@ -24,6 +24,7 @@ from eventsrc.text import counted, visible
 from projections.corrections import RecordedCommand
 from projections.history.records import iso_time
 from projections.history.rendering import table
+from projections.model.command_text import command_document
 from projections.settings import Settings
 
 from .effect import Effect
@@ -108,18 +109,15 @@ def edits_document(found: Found, times: Mapping[Offset, int]) -> list[dict[str, 
     undone = undone_by([recorded for recorded, _ in found])
     return [
         {
-            "offset": offset,
-            "time": iso_time(times[offset] / 1e9),
-            "command_id": command.command_id,
-            "kind": command.kind,
-            "issued_by": command.issued_by,
-            "reason": command.reason,
-            "what": what(command),
+            **command_document(recorded),
+            "time": iso_time(times[recorded.offset] / 1e9),
+            "what": what(recorded.command),
             "effect": None if effect is None else effect.document(),
-            "undone": command.command_id in undone,
-            "undone_by": undone[command.command_id].command.command_id
-            if command.command_id in undone
-            else None,
+            "undone_by": _id_of(undone.get(recorded.command.command_id)),
         }
-        for (offset, command), effect in found
+        for recorded, effect in found
     ]
+
+
+def _id_of(recorded: RecordedCommand | None) -> str | None:
+    return None if recorded is None else recorded.command.command_id
