@@ -1,6 +1,7 @@
 """Commands that stand in the way of a new one: contradictions, and repetitions."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Hashable, Iterable
+from typing import TypeVar
 
 from eventsrc.commands import (
     Command,
@@ -48,66 +49,70 @@ def check_apart(current: CurrentMap, anchors: Iterable[Keyframe]) -> None:
     """Raises EditRefused if two of the anchors are joined by commands."""
     named = list(anchors)
     for i, first in enumerate(named):
+        reached = _made_one(current.corrections.joined, first)
         for second in named[i + 1 :]:
-            found = _joining(current, first, second)
-            if found is not None:
-                raise refusal("these places are joined", found, current.reader.path)
+            if (pair := reached.get(second)) is not None:
+                found = command_on(current.corrections, *pair, joins=True)
+                _refuse("these places are joined", found, current)
 
 
 def check_join(current: CurrentMap, first: Keyframe, second: Keyframe) -> None:
-    """Raises EditRefused if the places hold anchors that are kept apart."""
-    wanted = {current.place_of(first), current.place_of(second)}
-    for pair in current.corrections.apart:
-        if {*pair} == {first, second} or {current.place_of(k) for k in pair} == wanted:
-            found = command_on(current.corrections, *pair, joins=False)
-            if found is not None:
-                raise refusal("these places are kept apart", found, current.reader.path)
+    """Raises EditRefused if the places, or what is joined to them, are kept apart."""
+    corrections = current.corrections
+    places = {current.place_of(first), current.place_of(second)}
+    groups = [_made_one(corrections.joined, anchor).keys() for anchor in (first, second)]
+    for pair in corrections.apart:
+        if _between(pair, *groups) or {current.place_of(k) for k in pair} == places:
+            found = command_on(corrections, *pair, joins=False)
+            _refuse("these places are kept apart", found, current)
 
 
-def _joining(current: CurrentMap, first: Keyframe, second: Keyframe) -> RecordedCommand | None:
-    """The first join on a way of joins from one anchor to another; keyframes that were put into one
-    place first are one step."""
+_T = TypeVar("_T", bound=Hashable)
 
-    def spot(keyframe: Keyframe) -> object:
-        place = current.original_place_of(keyframe)
-        return keyframe if place is None else place
 
-    reached: dict[object, RecordedCommand | None] = {spot(first): None}
-    frontier = [spot(first)]
+def _made_one(pairs: Iterable[tuple[_T, _T]], start: _T) -> dict[_T, tuple[_T, _T] | None]:
+    """What is one with ``start`` by these pairs, each with the first pair on the way to it."""
+    pairs = list(pairs)
+    reached: dict[_T, tuple[_T, _T] | None] = {start: None}
+    frontier = [start]
     while frontier:
         at = frontier.pop()
-        for a, b in current.corrections.joined:
-            for near, far in ((spot(a), spot(b)), (spot(b), spot(a))):
+        for pair in pairs:
+            for near, far in (pair, pair[::-1]):
                 if near == at and far not in reached:
-                    reached[far] = reached[at] or command_on(current.corrections, a, b, joins=True)
+                    reached[far] = reached[at] or pair
                     frontier.append(far)
-    return reached.get(spot(second))
+    return reached
+
+
+def _between(pair: tuple[_T, _T], one: Collection[_T], other: Collection[_T]) -> bool:
+    a, b = pair
+    return (a in one and b in other) or (b in one and a in other)
+
+
+def _refuse(what: str, found: RecordedCommand | None, current: CurrentMap) -> None:
+    if found is not None:
+        raise refusal(what, found, current.reader.path)
 
 
 def check_same(current: CurrentMap, first: DetId, second: DetId) -> None:
-    """Raises EditRefused if the two observations are of objects that are kept apart."""
-    wanted = {_object(current, first), _object(current, second)}
-    for pair in current.corrections.different:
-        if {*pair} == {first, second} or {_object(current, d) for d in pair} == wanted:
+    """Raises EditRefused if the objects of two observations, or what is one with them by commands,
+    are kept apart."""
+    corrections = current.corrections
+    objects = {_object(current, first), _object(current, second)}
+    groups = [_made_one(corrections.same, det_id).keys() for det_id in (first, second)]
+    for pair in corrections.different:
+        if _between(pair, *groups) or {_object(current, d) for d in pair} == objects:
             found = _objects_command(current, DifferentObjects, pair)
-            if found is not None:
-                raise refusal("these objects are kept apart", found, current.reader.path)
+            _refuse("these objects are kept apart", found, current)
 
 
 def check_different(current: CurrentMap, first: DetId, second: DetId) -> None:
     """Raises EditRefused if the two observations are made one by commands."""
-    reached, frontier = {first}, [first]
-    by: RecordedCommand | None = None
-    while frontier:
-        at = frontier.pop()
-        for pair in current.corrections.same:
-            if at in pair:
-                by = by or _objects_command(current, SameObject, pair)
-                more = {*pair} - reached
-                reached |= more
-                frontier += more
-    if second in reached and by is not None:
-        raise refusal("these objects are made one", by, current.reader.path)
+    pair = _made_one(current.corrections.same, first).get(second)
+    if pair is not None:
+        found = _objects_command(current, SameObject, pair)
+        _refuse("these objects are made one", found, current)
 
 
 def _objects_command(

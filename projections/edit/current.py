@@ -123,19 +123,14 @@ class CurrentMap:
         record = self.keyframes.get(keyframe)
         return None if record is None else record.place
 
-    def original_place_of(self, keyframe: Keyframe) -> PlaceOrdinal | None:
-        """The place that a keyframe was put into first, which may be absorbed now."""
-        record = self.keyframes.get(keyframe)
-        return None if record is None else record.joined
-
     def founder(self, place: PlaceOrdinal) -> Keyframe:
         """The keyframe that founded a place."""
         record = self.view.keyframes[self.view.all_places[place].founder]
         return Keyframe(record.run_id, record.keyframe_id)
 
     def find_place(self, text: str) -> Keyframe:
-        """The founding keyframe of a place: given as a place id, also of an absorbed one, or as
-        ``run:keyframe``, which means the place that this keyframe was put into first.
+        """The keyframe that stands for a place: of a place id, also of an absorbed one, that which
+        founded it; of ``run:keyframe``, for the place that it is in, this keyframe.
 
         Raises NoSuchThing, or MisuseError for a keyframe in no place.
         """
@@ -150,14 +145,13 @@ class CurrentMap:
         if keyframe is None or keyframe not in self.keyframes:
             names = (f"{run_id}:{k.keyframe_id}" for k in self.run(run_id))
             raise NoSuchThing("keyframe", text, names)
-        original = self.original_place_of(keyframe)
-        if original is None:
+        if self.place_of(keyframe) is None:
             why = "has no pose" if self.keyframes[keyframe].pose is None else "is noise"
             raise MisuseError(
                 f"keyframe {text} is in no place, because it {why}; name a place or a keyframe in "
                 "one (`mapfold state LOG` lists the places)"
             )
-        return self.founder(original)
+        return keyframe
 
     def place_name(self, keyframe: Keyframe) -> str:
         """The id of the place that a keyframe is in now, or ``no place``."""

@@ -114,8 +114,7 @@ def _two_places(current: CurrentMap, first: str, second: str) -> tuple[Keyframe,
     pair = current.find_place(first), current.find_place(second)
     if pair[0] == pair[1]:
         raise EditRefused(
-            f"{first} and {second} are the same place, founded as one by keyframe "
-            f"{pair[0].run_id}:{pair[0].keyframe_id}; name two that were founded apart "
+            f"{first} and {second} are the same place; name two, or two keyframes of it "
             "(`mapfold merges LOG` lists what became one)"
         )
     return pair

@@ -32,7 +32,7 @@ from projections.edit import make as by
 from projections.edit.correct_poses import Span, by_trajectory, by_transform
 from projections.edit.trajectory import Trajectory, TrajectoryPose, read_trajectory
 from projections.settings import Settings
-from tests.corrected_logs import FAR, LEFT, MERGE, RIGHT, give, make, write_rooms
+from tests.corrected_logs import FAR, LEFT, MERGE, RIGHT, append, give, make, write_rooms
 
 CUP_LEFT, CUP_RIGHT, LAMP = "obj-2237cc2f33929b56", "obj-dc4cb3fc37c4dc9a", "obj-36156c6b0fcc3c5d"
 ALL = Span(None, None)
@@ -56,9 +56,13 @@ WHO: dict[str, Any] = {"command_id": "new", "issued_by": "me@here", "reason": "w
     [
         (by.name_place, (LEFT, "hall"), NamePlace(place=IN_LEFT, name="hall", **WHO)),
         (by.name_place, (RIGHT, "bath 🛁"), NamePlace(place=IN_RIGHT, name="bath 🛁", **WHO)),
-        (by.name_place, ("run-b:3", "x"), NamePlace(place=IN_FAR, name="x", **WHO)),
+        (by.name_place, ("run-b:3", "x"), NamePlace(place=_anchor("run-b", 3), name="x", **WHO)),
         (by.keep_apart, (LEFT, RIGHT), KeepApart(places=(IN_LEFT, IN_RIGHT), **WHO)),
-        (by.keep_apart, (FAR, "run-a:9"), KeepApart(places=(IN_FAR, IN_RIGHT), **WHO)),
+        (
+            by.keep_apart,
+            ("run-a:1", "run-a:9"),
+            KeepApart(places=(_anchor("run-a", 1), _anchor("run-a", 9)), **WHO),
+        ),
         (
             by.undo_merge,
             (MERGE,),
@@ -111,8 +115,8 @@ def test_it_names_things_of_the_log(
         (by.name_place, (LEFT, "a\x1b[2J"), "name has the control character U+001B at index 1"),
         (by.name_place, (LEFT, "x" * 257), "name is 257 characters long"),
         (by.name_place, (LEFT, "\ud800"), "name"),
-        (by.keep_apart, (LEFT, LEFT), "are the same place, founded as one by keyframe run-a:0"),
-        (by.keep_apart, ("run-a:1", "run-a:3"), "are the same place"),
+        (by.keep_apart, (LEFT, LEFT), "are the same place; name two"),
+        (by.keep_apart, ("run-a:0", LEFT), "are the same place"),
         (by.undo_merge, (MERGE - 1,), f"at offset 19; 1 event merged places, at {MERGE}"),
         (by.undo_merge, (-1,), "nothing merged at offset -1"),
         (by.undo_merge, (10**30,), "nothing merged at offset 1000"),
@@ -219,14 +223,18 @@ def test_a_command_that_stands_in_the_way_is_named(
         make(log, then[0], *then[1])
 
 
-def test_what_several_joins_made_one_is_not_kept_apart(log: Path) -> None:
-    """run-b is joined to the right room, which is one place with the left by itself: that may be
-    undone, and then it is the join alone that stands in the way."""
+def test_what_a_chain_of_commands_says_stands_in_the_way_too(log: Path) -> None:
     give(log, by.join, FAR, RIGHT, command_id="first")
-    with pytest.raises(MisuseError, match="command first"):
-        make(log, by.keep_apart, FAR, RIGHT)
-    make(log, by.keep_apart, FAR, LEFT)
-    make(log, by.keep_apart, LEFT, RIGHT)
+    by_another_fold = Join(
+        command_id="second", issued_by="me@here", places=(IN_FAR, _anchor("run-a", 3))
+    )
+    append(log, by_another_fold)
+    with pytest.raises(MisuseError, match="joined by command first"):
+        make(log, by.keep_apart, RIGHT, "run-a:3")
+    give(log, by.undo, "second", command_id="third")
+    give(log, by.keep_apart, RIGHT, "run-a:3", command_id="fourth")
+    with pytest.raises(MisuseError, match="kept apart by command fourth"):
+        make(log, by.join, FAR, "run-a:3")
 
 
 def test_undo_names_a_command_that_is_not_undone_yet(log: Path) -> None:
