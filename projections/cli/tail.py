@@ -89,7 +89,7 @@ def _metrics(address: tuple[str, int] | None, progress: TailProgress, log: Path)
         yield
         return
     # Imported only when used.
-    from projections.database.tail_progress import serving_tail_metrics
+    from projections.database.tail_metrics import serving_tail_metrics
 
     with serving_tail_metrics(address, progress, log) as port:
         say_metrics(address, port)

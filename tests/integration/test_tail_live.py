@@ -16,7 +16,7 @@ from projections.database import RebuildProgress, TailProgress, TailReport, rebu
 from projections.database.connection import Targets
 from projections.database.retry import retry
 from projections.database.status import projection_status
-from projections.database.tail_progress import serving_tail_metrics
+from projections.database.tail_metrics import serving_tail_metrics
 from projections.errors import ProjectionBusy, ProjectionMismatch
 from projections.settings import Settings
 from tests.envelopes import envelope, payload
