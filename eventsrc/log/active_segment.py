@@ -110,7 +110,7 @@ class ActiveSegment:
         return self._group.add(events, start)
 
     def due(self) -> bool:
-        """Whether the policy wants a commit now."""
+        """Whether a commit is due by the fsync policy."""
         self._check()
         return self._group.due()
 

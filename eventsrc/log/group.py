@@ -140,7 +140,7 @@ class GroupBuilder:
         return key_channel(len(self._channels) + 1, schema, key, version)
 
     def due(self) -> bool:
-        """Whether the policy wants a commit now."""
+        """Whether a commit is due by the fsync policy."""
         return self.waiting > 0 and (
             self.waiting >= self._max_events
             or self._bytes >= self._max_bytes

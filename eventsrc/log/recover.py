@@ -3,8 +3,8 @@
 Nothing is changed in place. A damaged segment is written anew, synced and renamed; an original in
 which something recorded is damaged is kept as ``….damaged`` for a person to look at. A torn end
 that was never synced is cut off, as on any restart. Lost offsets become loss events (see
-`rebuild_segment`). A rewritten segment notes the hash by which its successor knows the original, so
-that the hash chain holds. A saved gap ledger is deleted first: it may count events that are lost.
+`rebuild_segment`). A rewritten segment also holds the hash that its successor has of the original,
+so that the hash chain holds. A saved gap ledger is deleted first: it may count lost events.
 """
 
 import uuid
@@ -281,7 +281,7 @@ def _damaged_bytes(segment: SegmentPath | None, scan: Scan) -> int:
 
 
 def _replaced_hash(following: SegmentPath | None) -> dict[str, str]:
-    """Metadata with the hash by which the next segment knows the one before it, if readable."""
+    """Metadata with the hash that the next segment has of the one before it, if readable."""
     if following is None:
         return {}
     try:

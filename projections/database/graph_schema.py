@@ -35,7 +35,7 @@ _MARK: Final = "mapfold"
 
 
 def exists(connection: Connection, graph: str) -> bool:
-    """Whether a graph of ours has this name. Raises DatabaseError when it is somebody else's."""
+    """Whether a graph of ours has this name. Raises DatabaseError when it is not ours."""
     row = connection.execute(statements("graph")["state"], {"graph": graph}).fetchone()
     if row is None:
         return False

@@ -97,7 +97,7 @@ class MemoryShadow:
         return finish
 
     def lock_readers(self, connection: MemoryTables) -> None:
-        """Nothing to do: nobody reads in the middle of `swap_in`."""
+        """Nothing to do: `swap_in` has no concurrent readers."""
 
     def swap_in(self, connection: MemoryTables) -> None:
         """Replace the tables' rows."""

@@ -165,7 +165,7 @@ def _sink_status(
 
 @dataclass(frozen=True, slots=True)
 class _Writer:
-    """Who holds a sink's lock, None for nobody; seconds since its tail's heartbeat."""
+    """Who holds a sink's lock, None if it is free; seconds since its tail's heartbeat."""
 
     name: str | None
     heartbeat: float | None

@@ -51,7 +51,7 @@ def vector_type(connection: Connection) -> sql.Identifier:
 
 
 def dimension(connection: Connection) -> int | None:
-    """Declared dimension of the readers' table; None without one. Refuses somebody else's."""
+    """Declared dimension of the readers' table, or None. Raises DatabaseError if it is not ours."""
     row = connection.execute(
         statements("vectors")["state"], {"table": f"{READERS}.{TABLE}"}
     ).fetchone()
@@ -127,7 +127,7 @@ def move_in(connection: Connection) -> None:
 
 
 def has_old(connection: Connection) -> bool:
-    """Whether there is a replaced table. Refuses somebody else's schema of that name."""
+    """Whether there is a replaced table. Raises DatabaseError if the schema is not ours."""
     row = connection.execute(statements("vectors")["old_state"]).fetchone()
     if row is not None and not str(row[0]).startswith(_MARK):
         raise DatabaseError(

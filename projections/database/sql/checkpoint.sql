@@ -2,7 +2,7 @@
 -- 'graph' or 'vectors'.
 
 -- name: schema_owner
--- No row when there is no such schema, else its comment ('' for none), by which we know ours.
+-- No row when there is no such schema, else its comment ('' for none), which marks ours.
 SELECT coalesce(obj_description(oid, 'pg_namespace'), '') FROM pg_namespace WHERE nspname = 'mapfold'
 
 -- name: create
