@@ -22,7 +22,7 @@ from eventsrc.log import LogReader
 from eventsrc.text import counted
 from projections.corrections import Keyframe, RecordedCommand
 from projections.deltas import KeyframeOrdinal, PlaceOrdinal
-from projections.model.command_text import command_document, command_name, said
+from projections.model.command_text import command_document, command_name, command_title
 
 from .explanation import Entry
 from .history import History
@@ -50,10 +50,11 @@ class CommandTeller:
         return self._causes[offset]
 
     def entry(self, recorded: RecordedCommand, text: str, **facts: Any) -> Entry:
-        """An entry whose text says what the command does, who gave it, and why."""
+        """An entry whose text says what the command did, which it is, who gave it, and why."""
         command = recorded.command
         told = {"command": command_document(recorded), **facts}
-        return Entry(self.cause(recorded), command.kind, f"{text}, {said(command)}", told)
+        by = f"{text} by {command_title(command)}"
+        return Entry(self.cause(recorded), command.kind, by, told)
 
 
 def place_commands(
@@ -85,24 +86,24 @@ def _place_texts(
     match command:
         case NamePlace() if _place_of(history, command.place, end) == place:
             replaced = history.places[place].name(end) != command.name
-            yield f'named "{command.name}"' + (", replaced by a later name" if replaced else "")
+            yield f'named "{command.name}"' + (" until a later name," if replaced else "")
         case KeepApart() | UndoMerge():
             own, others = _divided(history, command.places, place, end)
             if own:
                 replaced = not _some_pair(own, others, history.corrections.apart)
                 yield f"kept apart from {_named(history, others, end)}" + (
-                    ", replaced by a later join" if replaced else ""
+                    " until a later join," if replaced else ""
                 )
         case Join():
             own, others = _divided(history, command.places, place, end)
             if own:
                 pair = " and ".join(f"{a.run_id}:{a.keyframe_id}" for a in command.places)
                 replaced = not _some_pair(own, [*own, *others], history.corrections.joined)
-                yield f"joined {pair}" + (", replaced by a later keep-apart" if replaced else "")
+                yield f"joined {pair}" + (" until a later keep-apart," if replaced else "")
         case CorrectPoses():
             moved = _moved(history, command, place, end)
             if moved:
-                yield f"corrected the poses of {counted(moved, 'keyframe')} of it"
+                yield f"{counted(moved, 'keyframe')} of it moved"
 
 
 def object_commands(teller: CommandTeller, history: History, det_ids: Iterable[str]) -> list[Entry]:
@@ -136,9 +137,9 @@ def same_place_commands(
         places = {_place_of(history, anchor, end) for anchor in command.places} - {None}
         if isinstance(command, Join):
             if asked <= names or (first == second and places == {first}):
-                entries.append(teller.entry(recorded, "joins them"))
+                entries.append(teller.entry(recorded, "joined"))
         elif asked <= names or (first != second and {first, second} <= places):
-            entries.append(teller.entry(recorded, "keeps them apart"))
+            entries.append(teller.entry(recorded, "kept apart"))
     return entries + [
         _refusal_entry(history, refusal, None)
         for refusal in history.refusals

@@ -101,8 +101,8 @@ def _founding(history: History, record: PlaceHistory) -> Entry:
     return Entry(
         record.cause,
         "founded",
-        f"founded: {keyframe_name(history, founder)} at {where} became the first core point; "
-        f"members {named}{more}",
+        f"founded: {keyframe_name(history, founder)} at {where} became the first core point"
+        + (f"; members {named}{more}" if first else ""),
         {
             "founder": keyframe_name(history, founder),
             "members": [keyframe_name(history, k) for k in first],

@@ -58,7 +58,7 @@ def _difference_lines(diff: Difference, most: int | None) -> Iterator[str]:
         return
     yield f"from {diff.start:,} to {diff.end:,}: digest {first[:16]} → {second[:16]}"
     if diff.commands:
-        yield f"commands   {len(diff.commands):,} that one of the maps does not know"
+        yield f"commands   {len(diff.commands):,} in between"
         lines = [f"{c.offset:,}  {command_title(c.command)}" for c in diff.commands]
         yield from (f"  {line}" for line in shortened(lines, most, _HINT))
     yield f"keyframes  {_keyframes(diff)}"

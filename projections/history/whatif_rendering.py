@@ -19,7 +19,7 @@ def whatif_text(found: WhatIf, *, most: int | None) -> str:
     truth = found.base.result.scores is not None
     header = (*_HEADER, *_TRUTH_HEADER) if truth else _HEADER
     rows = [_row(each, truth=truth) for each in found.all]
-    lines = [line for each in found.alternatives for line in _differences(each, most)]
+    lines = [line for each in found.alternatives for line in _differences(found, each, most)]
     return table(header, rows, right=header[1:]) + "".join(f"{x}\n" for x in lines)
 
 
@@ -45,15 +45,16 @@ def _scores(each: Alternative) -> tuple[str, ...]:
     )
 
 
-def _differences(each: Alternative, most: int | None) -> Iterator[str]:
+def _differences(found: WhatIf, each: Alternative, most: int | None) -> Iterator[str]:
     yield ""
-    yield f"{each.name}: {_first_differences(each)}"
+    same_digest = each.result.digest == found.base.result.digest
+    yield f"{each.name}: {_first_differences(each, same_digest=same_digest)}"
     if each.without is not None:
         yield f"  left out: {command_title(each.without.command)}"
     for place, (before, after) in each.renamed.items():
         yield f"  {place}: {_quoted(before)} in the base, {_quoted(after)} here"
-    splits = [f"  {_split(found)}" for found in each.places.splits]
-    joins = [f"  {_join(found)}" for found in each.places.joins]
+    splits = [f"  {_split(group)}" for group in each.places.splits]
+    joins = [f"  {_join(group)}" for group in each.places.joins]
     yield from shortened([*splits, *joins], most, _WHATIF_HINT)
 
 
@@ -61,9 +62,10 @@ def _quoted(name: str | None) -> str:
     return "no name" if name is None else f'"{name}"'
 
 
-def _first_differences(each: Alternative) -> str:
+def _first_differences(each: Alternative, *, same_digest: bool) -> str:
     if each.places_part_at is None and each.objects_part_at is None:
-        return "the same map, event by event"
+        same = "map" if same_digest else "places and objects"
+        return f"the same {same}, event by event"
     return "; ".join(
         _first_difference(what, offset, same=compared.same)
         for what, offset, compared in (

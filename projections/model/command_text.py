@@ -11,14 +11,10 @@ def command_name(command: Command) -> str:
     return f"{command.kind} {command.command_id}"
 
 
-def said(command: Command) -> str:
-    """``by ann@lab: one room``: who gave it, and the reason if there is one."""
-    return f"by {command.issued_by}" + (f": {command.reason}" if command.reason else "")
-
-
 def command_title(command: Command) -> str:
-    """Kind, id, author and reason."""
-    return f"{command_name(command)} {said(command)}"
+    """``keep-apart c17 (ann@lab: two rooms)``: kind, id, author and the reason if there is one."""
+    said = f"{command.issued_by}: {command.reason}" if command.reason else command.issued_by
+    return f"{command_name(command)} ({said})"
 
 
 def command_document(recorded: RecordedCommand) -> dict[str, Any]:
