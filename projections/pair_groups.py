@@ -4,7 +4,7 @@ Being one is transitive: where a and b are one and b and c are one, so are a and
 apart from a is kept apart from them all.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable
 from typing import Generic, TypeVar
 
 _Thing = TypeVar("_Thing", bound=tuple[object, ...] | str)
@@ -39,9 +39,7 @@ class PairGroups(Generic[_Thing]):
             against.setdefault(other, set()).add(one)
         self.against = {group: frozenset(others) for group, others in against.items()}
 
-    def conflicts(
-        self, groups: Iterable[int], others: Mapping[int, object]
-    ) -> list[tuple[int, int]]:
+    def conflicts(self, groups: Iterable[int], others: Container[int]) -> list[tuple[int, int]]:
         """The pairs of a group of ``groups`` and one of ``others`` that are kept apart."""
         return [
             (group, other)

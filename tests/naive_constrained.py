@@ -5,7 +5,7 @@ from itertools import combinations
 
 import numpy as np
 
-Pairs = Iterable[tuple[int, int]]
+Pairs = Iterable[tuple[Hashable, Hashable]]
 
 
 class NaiveConstrainedPlaces:
@@ -14,14 +14,20 @@ class NaiveConstrainedPlaces:
     ``labels``, ``founders`` and ``cores`` are as in `tests.folds.NaivePlaces`; ``refused`` are the
     pairs of places reported so far, ``had_effect`` whether a pair has changed anything. The points
     of a cell, as ``cell_of`` gives it, are all of one place; ``joined`` and ``apart`` are pairs of
-    points.
+    points, or of what ``name_of`` calls them.
     """
 
     def __init__(
-        self, min_samples: int, cell_of: Callable[[int], Hashable], joined: Pairs, apart: Pairs
+        self,
+        min_samples: int,
+        cell_of: Callable[[int], Hashable],
+        joined: Pairs,
+        apart: Pairs,
+        name_of: Callable[[int], Hashable] = lambda point: point,
     ) -> None:
         self.min_samples = min_samples
         self.cell_of = cell_of
+        self.name_of = name_of
         self.joined, apart = list(joined), list(apart)
         self.anchors = {point for pair in (*self.joined, *apart) for point in pair}
         self.enemies = {
@@ -34,18 +40,18 @@ class NaiveConstrainedPlaces:
         self.cores: set[int] = set()
         self.founders: list[int] = []
         self.cell_places: dict[Hashable, int] = {}
-        self.inside: list[set[int]] = []  # of each place, its anchors
+        self.inside: list[set[Hashable]] = []  # of each place, its anchors
         self.refused: set[tuple[int, int]] = set()
         self.had_effect = False
 
-    def group(self, anchor: int) -> set[int]:
+    def group(self, anchor: Hashable) -> set[Hashable]:
         """All anchors that are joined with one, itself included."""
         found = {anchor}
         while more := {x for pair in self.joined if found & set(pair) for x in pair} - found:
             found |= more
         return found
 
-    def conflict(self, one: set[int], other: set[int]) -> bool:
+    def conflict(self, one: set[Hashable], other: set[Hashable]) -> bool:
         """Whether two sets of anchors may not come together."""
         found = any(frozenset((a, b)) in self.enemies for a in one for b in other)
         self.had_effect |= found
@@ -61,17 +67,18 @@ class NaiveConstrainedPlaces:
         )
         self.cores = {int(core) for core in self.cores}
         fresh = sorted(self.cores - older)
-        entered = {p for p in fresh if p in self.anchors and self.labels[p] is None}
+        entered = {p for p in fresh if self._is_anchor(p) and self.labels[p] is None}
         self._take_in(fresh, are_near)
         for point in sorted(set(range(n)) - self.cores):
             if self.labels[point] is None:
                 near = {self.cell_places[self.cell_of(c)] for c in self.cores if are_near[point][c]}
-                if point in self.anchors:
-                    near = {p for p in near if not self.conflict({point}, self.inside[p])}
+                if self._is_anchor(point):
+                    own = {self.name_of(point)}
+                    near = {p for p in near if not self.conflict(own, self.inside[p])}
                 if near:
                     self.labels[point] = min(near)
-                    if point in self.anchors:
-                        self.inside[min(near)].add(point)
+                    if self._is_anchor(point):
+                        self.inside[min(near)].add(self.name_of(point))
                         entered.add(point)
         for anchor in sorted(entered):
             self._join(anchor)
@@ -90,8 +97,8 @@ class NaiveConstrainedPlaces:
         sets = {unit: {unit} for unit in units.values()}
         inside = {u: set(self.inside[u[1]]) if u[0] == 0 else set() for u in units.values()}
         for point in fresh:
-            if point in self.anchors and self.labels[point] is None:
-                inside[units[self.cell_of(point)]].add(point)
+            if self._is_anchor(point) and self.labels[point] is None:
+                inside[units[self.cell_of(point)]].add(self.name_of(point))
         links = sorted(
             (*sorted((units[one], units[other])),)
             for one, other in combinations(cells, 2)
@@ -133,8 +140,8 @@ class NaiveConstrainedPlaces:
         for point in fresh:
             if self.labels[point] is None:
                 self.labels[point] = self.cell_places[self.cell_of(point)]
-                if point in self.anchors:
-                    self.inside[self.labels[point]].add(point)
+                if self._is_anchor(point):
+                    self.inside[self.labels[point]].add(self.name_of(point))
         for pair in refused:
             a, b = sorted(place_of.get(unit, unit[1]) for unit in pair)
             self.refused.add((a, b))
@@ -148,10 +155,13 @@ class NaiveConstrainedPlaces:
             self.inside[place] |= self.inside[other]
             self.inside[other] = set()
 
+    def _is_anchor(self, point: int) -> bool:
+        return self.name_of(point) in self.anchors
+
     def _join(self, anchor: int) -> None:
         for other in range(len(self.founders)):
             place = self.labels[anchor]
-            if other == place or not self.inside[other] & self.group(anchor):
+            if other == place or not self.inside[other] & self.group(self.name_of(anchor)):
                 continue
             if self.conflict(self.inside[place], self.inside[other]):
                 self.refused.add((min(place, other), max(place, other)))

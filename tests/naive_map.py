@@ -162,13 +162,16 @@ class NaiveMap:
             "objects": self._object_rows(labels),
             "places": self._place_rows(labels),
             "adjacency": self._adjacency_rows(labels),
-        }
+        } | self._more_sections(labels)
         text = "mapfold map 1\n"
         for name, rows in sections.items():
             text += f"{name}\n" + "".join(
                 json.dumps(row, separators=(",", ":")) + "\n" for row in rows
             )
         return hashlib.sha256(text.encode()).hexdigest()
+
+    def _more_sections(self, labels: list[int | None]) -> dict[str, list[Any]]:
+        return {}
 
     def _keyframe_rows(self, labels: list[int | None]) -> list[Any]:
         runs = list(self.runs)

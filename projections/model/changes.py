@@ -46,8 +46,9 @@ class BatchChanges:
     whose place was absorbed, ``reassigned`` the observations whose object was absorbed. ``runs``,
     ``objects`` and ``places`` are new or changed; one that is not in `MapView.objects` or
     `MapView.places` any more was absorbed. ``located`` are objects that moved to another place or
-    out of one. ``links`` are pairs of places whose shared transitions changed; one that is not in
-    `MapView.adjacency` any more is gone. ``embedded`` is in the order of the observations.
+    out of one, absorbed ones among them. ``links`` are pairs of places whose shared transitions
+    changed; one that is not in `MapView.adjacency` any more is gone. ``embedded`` is in the order
+    of the observations.
     """
 
     keyframes: range
@@ -130,6 +131,7 @@ class ChangeTracker:
 
     def _objects_merged(self, delta: ObjectsMerged) -> None:
         self._objects.update((delta.survivor, delta.absorbed))
+        self._located.add(delta.absorbed)
         # Before the view applies it, as above.
         self._reassigned.update(self.view.all_objects[delta.absorbed].observations)
 

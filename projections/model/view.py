@@ -214,7 +214,7 @@ class MapView:
             for observation in absorbed.observations:
                 self.observations[observation].object = delta.survivor
             survivor.observations = sorted(survivor.observations + absorbed.observations)
-            absorbed.observations = []
+            absorbed.observations, absorbed.place = [], None
             self.object_survivors.merge(delta.survivor, (delta.absorbed,))
         survivor.obs_count = delta.obs_count
         survivor.sum_x_um = delta.sum_x_um

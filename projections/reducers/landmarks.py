@@ -23,6 +23,7 @@ look-up finds all candidates however large the map is.
 
 import hashlib
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,7 +41,8 @@ Bucket = tuple[str, int, int]
 @dataclass(slots=True, eq=False)
 class ObjectSums:
     """An Object's sums over its observations: of positions, µm, and of unit vectors, integers in
-    float64, shape (dim,). ``column`` and ``row`` are the grid cell of its mean position."""
+    float64, shape (dim,). ``column`` and ``row`` are the grid cell of its mean position;
+    ``other_classes`` those of members that a command made part of it."""
 
     class_name: str
     vector_sum: NDArray[np.float64]
@@ -52,6 +54,7 @@ class ObjectSums:
     last_seen: float
     column: int
     row: int
+    other_classes: tuple[str, ...] = ()
 
 
 def object_id(det_id: DetId) -> str:
@@ -79,13 +82,21 @@ class Landmarks:
         timestamp: float,
         x_um: int,
         y_um: int,
+        candidates: Sequence[ObjectOrdinal] | None = None,
+        otherwise: ObjectOrdinal | None = None,
     ) -> list[ObjectFound | ObjectSeen]:
-        """Fuse one observation. ``vector`` and ``norm2`` are of its unit vector, `exact.Units`."""
+        """Fuse one observation. ``vector`` and ``norm2`` are of its unit vector, `exact.Units`.
+
+        ``candidates`` are some of `candidates_at`, all by default; ``otherwise`` is the Object that
+        is taken if none of them will do, a new one by default.
+        """
         radius_um, objects = self._radius_um, self.objects
         column, row = x_um // radius_um, y_um // radius_um
         winner: ObjectOrdinal | None = None
         best_q40, best_dot = -math.inf, 0
-        for candidate in self._near.get((class_name, column, row), ()):
+        if candidates is None:
+            candidates = self._near.get((class_name, column, row), ())
+        for candidate in candidates:
             sums = objects[candidate]
             count = sums.count
             dx = sums.sum_x_um - x_um * count
@@ -101,6 +112,11 @@ class Landmarks:
             if q40 > best_q40 or (q40 == best_q40 and winner is not None and candidate < winner):
                 winner, best_q40, best_dot = candidate, q40, dot
         if winner is None or best_q40 < self._least_q40:
+            winner = otherwise
+            if winner is not None:
+                best_dot = long_dot(objects[winner].vector_sum, vector)
+                best_q40 = round(best_dot / math.sqrt(objects[winner].norm2 * norm2 or 1) * Q40)
+        if winner is None:
             sums = ObjectSums(
                 class_name, vector.copy(), norm2, 1, x_um, y_um, timestamp, timestamp, column, row
             )
@@ -115,6 +131,11 @@ class Landmarks:
         sums.norm2 += 2 * best_dot + norm2
         self._update(winner, sums, timestamp, x_um, y_um)
         return [_object_seen(offset, winner, observation, int(best_q40), sums)]
+
+    def candidates_at(self, class_name: str, x_um: int, y_um: int) -> Sequence[ObjectOrdinal]:
+        """The Objects of a class whose mean position may be within the radius."""
+        radius_um = self._radius_um
+        return self._near.get((class_name, x_um // radius_um, y_um // radius_um), ())
 
     def dump(self) -> State:
         """Everything, for a snapshot. The vectors' sums are one matrix, a row for each Object."""
@@ -169,8 +190,7 @@ class Landmarks:
         side = self._radius_um * sums.count
         column, row = sums.sum_x_um // side, sums.sum_y_um // side
         if (column, row) != (sums.column, sums.row):
-            for bucket in _buckets(sums):
-                self._near[bucket].remove(ordinal)
+            self._unlist(ordinal, sums)
             sums.column, sums.row = column, row
             self._list(ordinal, sums)
 
@@ -179,10 +199,17 @@ class Landmarks:
         for bucket in _buckets(sums):
             self._near.setdefault(bucket, []).append(ordinal)
 
+    def _unlist(self, ordinal: ObjectOrdinal, sums: ObjectSums) -> None:
+        for bucket in _buckets(sums):
+            self._near[bucket].remove(ordinal)
+
 
 def _buckets(sums: ObjectSums) -> list[Bucket]:
     return [
-        (sums.class_name, sums.column + dx, sums.row + dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)
+        (class_name, sums.column + dx, sums.row + dy)
+        for class_name in (sums.class_name, *sums.other_classes)
+        for dx in (-1, 0, 1)
+        for dy in (-1, 0, 1)
     ]
 
 

@@ -2,12 +2,14 @@
 
 One observation is one vote for the place of its keyframe, as labelled now; noise does not vote, and
 votes once it is promoted. Ties go to the place founded first. An Object none of whose observations
-has a place is nowhere.
+has a place is nowhere. The votes of an absorbed Object are its survivor's.
 """
 
 from eventsrc.envelope import Offset
 from projections.deltas import KeyframeOrdinal, ObjectMoved, ObjectOrdinal, PlaceOrdinal
 from projections.reducers import State
+
+from .survivors import ObjectSurvivors
 
 
 class LocatedIn:
@@ -20,6 +22,7 @@ class LocatedIn:
         self.voters: dict[PlaceOrdinal, dict[ObjectOrdinal, None]] = {}
         # keyframe without a place → Objects it saw
         self.waiting: dict[KeyframeOrdinal, list[ObjectOrdinal]] = {}
+        self.survivors = ObjectSurvivors()
         self._touched: dict[ObjectOrdinal, None] = {}
 
     def places_merged(self, survivor: PlaceOrdinal, absorbed: tuple[PlaceOrdinal, ...]) -> None:
@@ -33,10 +36,23 @@ class LocatedIn:
             if voters:
                 self.voters.setdefault(survivor, {}).update(voters)
 
+    def objects_merged(self, survivor: ObjectOrdinal, absorbed: ObjectOrdinal) -> None:
+        """The absorbed Object's votes, those to come too, are votes of the survivor now."""
+        self.survivors.merge(survivor, (absorbed,))
+        votes, others = self.votes[survivor], self.votes[absorbed]
+        self.votes[absorbed], self.located[absorbed] = {}, None
+        for place, count in others.items():
+            votes[place] = votes.get(place, 0) + count
+            del self.voters[place][absorbed]
+            self.voters[place][survivor] = None
+        self._touched.pop(absorbed, None)
+        if others:
+            self._touched[survivor] = None
+
     def keyframe_placed(self, keyframe: KeyframeOrdinal, place: PlaceOrdinal) -> None:
         """A keyframe that had no place has one: what it saw can vote."""
         for ordinal in self.waiting.pop(keyframe, ()):
-            self._vote(ordinal, place)
+            self._vote(self.survivors.find(ordinal), place)
 
     def object_seen(
         self, ordinal: ObjectOrdinal, keyframe: KeyframeOrdinal, place: PlaceOrdinal | None
@@ -68,7 +84,10 @@ class LocatedIn:
         return {
             "votes": [list(map(list, votes.items())) for votes in self.votes],
             "located": self.located,
-            "waiting": [[keyframe, ordinal] for keyframe, ordinal in self.waiting.items()],
+            "waiting": [
+                [keyframe, [*map(self.survivors.find, ordinals)]]
+                for keyframe, ordinals in self.waiting.items()
+            ],
         }
 
     def load(self, state: State) -> None:

@@ -32,6 +32,8 @@ from projections.deltas import (
     KeyframeAdded,
     KeyframeOrdinal,
     KeyframePlaced,
+    ObjectSeen,
+    ObjectsMerged,
     ObservationAdded,
     ObservationOrdinal,
     PlaceNamed,
@@ -49,47 +51,17 @@ from projections.reducers import State, part, prefixed
 from projections.settings import Settings
 
 from .adjacency import Adjacency
+from .constrained_landmarks import ConstrainedLandmarks
 from .constrained_places import ConstrainedPlaces
 from .core_index import CoreIndex
 from .edited_events import edit_event, edits_events
+from .embedding_space import Space
 from .folded_ids import FoldedIds, content_digest
 from .landmarks import Landmarks
 from .located_in import LocatedIn
 from .place_names import PlaceNames
 from .places import Places
 from .rule_index import RuleCoreIndex
-
-
-class Space:
-    """The map's embedding space, a model and a dimension; open until it is decided.
-
-    What the settings leave open is decided by the first embedded detection that agrees with them. A
-    vector of another space is *foreign*: it is counted, but neither fused nor searched. A detection
-    that names no model is of the unnamed model, which is a model like any other.
-    """
-
-    def __init__(self, settings: Settings) -> None:
-        self._wanted_model = settings.embedding_model
-        self._wanted_dim = settings.embedding_dim
-        self.is_decided = False
-        self.model: str | None = None
-        self.dim = 0
-
-    def decide(self, model: str | None, dim: int) -> None:
-        """Fix the space."""
-        self.is_decided, self.model, self.dim = True, model, dim
-
-    def has(self, model: str | None, dim: int) -> bool:
-        """True when a vector of this model and dimension is in the map; the first one decides."""
-        if model == self.model and dim == self.dim:
-            return True
-        if not self.is_decided:
-            if self._wanted_model not in (None, model) or self._wanted_dim not in (None, dim):
-                return False
-            self.decide(model, dim)
-            return True
-        return False
-
 
 FusibleObservation: TypeAlias = tuple[ObservationOrdinal, DetId, str, NDArray[np.float64], int]
 """Ordinal, det_id, class name, unit vector of the map's space, its squared norm."""
@@ -129,7 +101,12 @@ class SemanticMap:
             groups = PairGroups(corrections.joined, corrections.apart)
             self._anchored = ConstrainedPlaces(core_index, groups)
         self.places = self._anchored or Places(core_index)
-        self.landmarks = Landmarks(settings.fusion_radius_m, settings.fusion_similarity)
+        limits = settings.fusion_radius_m, settings.fusion_similarity
+        self._named_landmarks = None
+        if corrections.same or corrections.different:
+            named = PairGroups(corrections.same, corrections.different)
+            self._named_landmarks = ConstrainedLandmarks(*limits, named)
+        self.landmarks = self._named_landmarks or Landmarks(*limits)
         self.located_in = LocatedIn()
         self.adjacency = Adjacency()
         self.observation_count = 0
@@ -355,6 +332,16 @@ class SemanticMap:
     ) -> None:
         """Run landmarks and tell located-in."""
         x_um, y_um = pose.x_um, pose.y_um
+        if self._named_landmarks is not None:
+            for seen in fusible:
+                more = self._named_landmarks.fold_named(offset, *seen, timestamp, x_um, y_um)
+                deltas += more
+                for delta in more:
+                    if type(delta) is ObjectSeen:
+                        self.located_in.object_seen(delta.object, keyframe, place)
+                    elif type(delta) is ObjectsMerged:
+                        self.located_in.objects_merged(delta.survivor, delta.absorbed)
+            return
         for observation, det_id, class_name, vector, norm2 in fusible:
             fused = self.landmarks.fold(
                 offset, observation, det_id, class_name, vector, norm2, timestamp, x_um, y_um
