@@ -46,6 +46,7 @@ class _Common:
     issued_by: str | None
     command_id: str | None
     dry_run: bool
+    all_: bool
     json: bool
     connect: list[str] | None
     zenoh_config: Path | None
@@ -83,6 +84,10 @@ _COMMON: dict[str, tuple[Any, Any]] = {
         Annotated[
             bool, typer.Option("--dry-run", help="Print what would change and record nothing.")
         ],
+        False,
+    ),
+    "all_": (
+        Annotated[bool, typer.Option("--all", help="With --dry-run: name every thing.")],
         False,
     ),
     "json": (JsonOption, False),
@@ -173,7 +178,9 @@ def _show(made: Made, common: _Common) -> None:
             }
         )
         return
-    head, _, rest = difference_text(difference, most=_MOST_LINES).partition("\n")
+    head, _, rest = difference_text(
+        difference, most=None if common.all_ else _MOST_LINES
+    ).partition("\n")
     before, after = (digest[:16] for digest in difference.digests)
     if not difference.same:
         head = f"digest {before} → {after}"

@@ -16,7 +16,7 @@ from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES, MAX_PAYLOAD_BYTES
 from eventsrc.log import LogReader, LogWriter, parse_fsync
 from eventsrc.recorder import DEFAULT_KEYS, DEFAULT_QUEUE_SIZE, Recorder
 from eventsrc.recorder.edit_requests import Edits, KnownCommands
-from eventsrc.recorder.edits import EDIT_PREFIX
+from eventsrc.recorder.edits import EDIT_PREFIX, edit_key
 from eventsrc.transport.config import parse_address
 from eventsrc.transport.session import check_keys, open_session
 from projections.edit.usable import check_command
@@ -116,6 +116,8 @@ def record(
         with _metrics(address, recorder, log), show_status(log) as watch:
             named = ", ".join(keys)
             say(f"recording {named} to {log} from offset {writer.next_offset}; Ctrl-C ends it")
+            if accept_edits:
+                say(f"taking commands of `mapfold edit` on {edit_key(writer.log_id)}")
             recorder.run(stop, every_s=EVERY_S, watch=watch)
     summary.finish()
 

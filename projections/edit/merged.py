@@ -1,10 +1,11 @@
 """The places that a merge made one, by the keyframes that founded them."""
 
+from eventsrc.commands import UndoMerge
 from eventsrc.errors import MisuseError
 from eventsrc.text import counted
 from projections.corrections import Keyframe
 
-from .conflicts import EditRefused, refusal
+from .conflicts import EditRefused, describe, refusal
 from .current import CurrentMap
 
 _MOST_OFFSETS = 10
@@ -18,6 +19,7 @@ def merged_at(current: CurrentMap, offset: int) -> tuple[Keyframe, ...]:
     """
     found = [merge for merge in current.merges if merge.offset == offset]
     if not found:
+        _check_not_undone(current, offset)
         raise MisuseError(_nothing_merged(current, offset))
     by_themselves = [
         [merge.survivor, *(p for p in merge.absorbed if p not in merge.joined)] for merge in found
@@ -37,6 +39,13 @@ def merged_at(current: CurrentMap, offset: int) -> tuple[Keyframe, ...]:
             "`mapfold edit LOG keep-apart PLACE PLACE`"
         )
     return tuple(current.founder(place) for place in merged[0])
+
+
+def _check_not_undone(current: CurrentMap, offset: int) -> None:
+    for recorded in current.corrections.in_force:
+        command = recorded.command
+        if isinstance(command, UndoMerge) and command.merge_offset == offset:
+            raise EditRefused(f"the merge at {offset} is undone already, by {describe(recorded)}")
 
 
 def _nothing_merged(current: CurrentMap, offset: int) -> str:

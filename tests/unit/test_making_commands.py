@@ -164,6 +164,8 @@ Given = tuple[Callable[..., Command], tuple[Any, ...]]
         ((by.keep_apart, (FAR, RIGHT)), (by.join, (LEFT, FAR)), "these places are kept apart by"),
         ((by.join, (FAR, LEFT)), (by.keep_apart, (LEFT, FAR)), "these places are joined by"),
         ((by.keep_apart, (LEFT, FAR)), (by.keep_apart, (FAR, LEFT)), "are kept apart already"),
+        ((by.undo_merge, (MERGE,)), (by.undo_merge, (MERGE,)), "at 20 is undone already, by"),
+        ((by.undo_merge, (MERGE,)), (by.join, (LEFT, RIGHT)), "are kept apart by command first"),
         (
             (by.different_objects, (CUP_LEFT, CUP_RIGHT)),
             (by.same_object, (CUP_LEFT, CUP_RIGHT)),
