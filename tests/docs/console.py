@@ -13,6 +13,7 @@ line that is only ``…`` stands for any lines, a ``…`` within a line for any 
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -110,7 +111,7 @@ def matches(says: list[str], printed: list[str]) -> bool:
 def _furnish(folder: Path) -> None:
     """The sample log, and a scripts/demo that finds its virtual environment made already."""
     (folder / "logs").mkdir()
-    (folder / "logs" / "sample").symlink_to(ROOT / "logs" / "sample")
+    shutil.copytree(ROOT / "logs" / "sample", folder / "logs" / "sample")
     (folder / "scripts").mkdir()
     demo = folder / "scripts" / "demo"
     demo.write_text(_DEMO, "utf-8")

@@ -7,7 +7,7 @@ import pytest
 
 from tests.docs.console import ROOT, Command, matches, read, run
 
-DOCUMENTS = ("README.md", "docs/simulator.md", "docs/time-travel.md")
+DOCUMENTS = ("README.md", "docs/corrections.md", "docs/simulator.md", "docs/time-travel.md")
 
 
 @pytest.mark.parametrize("name", DOCUMENTS)
