@@ -19,6 +19,7 @@ from projections.database.labels import GRAPH, LABELS, TABLE
 from projections.deltas import PlacesMerged
 from projections.model.digest import map_digest
 from projections.model.fold import fold_events, fold_log
+from projections.model.log_commands import read_corrections
 from projections.model.view import MapView
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
@@ -73,14 +74,15 @@ class Folded:
 
 
 def fold_with_rooms(folder: DemoFolder, settings: Settings, run: SimulatedRun) -> Folded:
-    """Fold the folder's log, and note the rooms of every merge."""
+    """Fold the folder's log under its commands, and note the rooms of every merge."""
     started = time.monotonic()
     rooms = {line["keyframe_id"]: str(line["room"]) for line in run.truth}
-    view = MapView(settings)
     deltas: list[PlacesMerged] = []
     merges: list[RoomMerge] = []
     with LogReader(folder.log) as reader:
-        for event in fold_events(reader.read(), SemanticMap(settings)):
+        corrections = read_corrections(reader)
+        view = MapView(settings, corrections=corrections)
+        for event in fold_events(reader.read(), SemanticMap(settings, corrections=corrections)):
             for delta in event.deltas:
                 if isinstance(delta, PlacesMerged):
                     deltas.append(delta)

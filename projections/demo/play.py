@@ -1,4 +1,4 @@
-"""The demo's stages in order: record, replay, map, ask, draw; then commands to go on with.
+"""The demo's stages in order: record, replay, map, correct, ask, draw; then commands to go on with.
 
 House and runs are made before the clock starts: they stand for the world, not for mapfold.
 """
@@ -24,6 +24,7 @@ from projections.settings import Settings
 
 from . import report
 from .asking import ask_lost, place_rooms
+from .correcting import correct
 from .folder import DemoFolder, fresh_folder
 from .mapping import RoomMerge, fold_with_rooms, hash_tables, most_telling, places_with
 from .recording import record_run
@@ -76,23 +77,28 @@ def _play(options: DemoOptions, folder: DemoFolder, tell: Tell) -> dict[str, Any
             default_places = places_with(folder, Settings())
             clock.tell(report.tell_map(folded, Settings(), default_places))
             clock.tell(report.tell_merges(folded.merges))
+        with clock.stage("A person corrects the map"):
+            corrected = correct(folder, targets, SETTINGS, explorer, folded)
+            clock.tell(report.tell_corrected(corrected))
         with clock.stage("Run B is lost and asks"):
             lost = ask_lost(targets, lost_run, folder)
-            clock.tell(report.tell_lost(lost, place_rooms(folded.view, explorer)))
+            clock.tell(report.tell_lost(lost, place_rooms(corrected.folded.view, explorer)))
     with clock.stage("The map is drawn"):
         draw_map(
-            folded.view,
+            corrected.folded.view,
             folder.map,
             title=f"House {house.seed}: explored by {explorer.run_id}, {lost.run_id} lost in it",
             floor=floor_of(house),
             lost=lost.drawing,
-            bridges=bridges_of(folded.view, folded.deltas),
+            bridges=bridges_of(corrected.folded.view, corrected.folded.deltas),
         )
         clock.tell([f"   {folder.map}"])
     tell(f"{clock.total:.1f} s in all. Go on with it:")
     clock.tell(_next_commands(folder, most_telling(folded.merges), options.db, options.vector_db))
     return result_document(
-        DemoResult(options.seed, SETTINGS, recorded, followed, replayed, same_rows, folded, lost),
+        DemoResult(
+            options.seed, SETTINGS, recorded, followed, replayed, same_rows, folded, corrected, lost
+        ),
         clock.seconds,
         folder,
     )
@@ -150,6 +156,7 @@ def _next_commands(
     if merge is not None:
         yield f"   mapfold diff {log} {merge.offset} {merge.offset + 1} {settings}    # that merge"
         yield f"   mapfold merges {log} {settings}"
+    yield f"   mapfold edits {log} {settings}"
     yield f"   mapfold relocalize {_quoted(folder.question(1))}"
     yield f"   mapfold status {log} {settings}"
 

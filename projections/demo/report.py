@@ -14,6 +14,7 @@ from projections.relocalize import UNKNOWN_BELOW
 from projections.settings import Settings
 
 from .asking import NEAR_M, AskedQuestion, LostRun
+from .correcting import Corrected
 from .folder import DemoFolder
 from .mapping import Folded, Part, RoomMerge, most_telling
 from .recording import Followed, Recorded
@@ -101,6 +102,29 @@ def tell_merges(merges: tuple[RoomMerge, ...]) -> Iterator[str]:
     )
 
 
+def tell_corrected(corrected: Corrected) -> Iterator[str]:
+    """What was corrected, and the map under it."""
+    offsets = {recorded.command.kind: recorded.offset for recorded in corrected.commands}
+    places = counted(len(corrected.folded.view.places), "place")
+    if corrected.apart:
+        parts = " and ".join(map(_part, corrected.apart))
+        yield (
+            f"   that merge is undone by a command, event {offsets['undo-merge']} of the log: "
+            f"{places} now, among them"
+        )
+        yield f"   {parts};"
+    if (named := corrected.named) is not None:
+        yield (
+            f'   {_short(named.place_id)} is called "{named.room}" in graph, answers and picture, '
+            f"by another command, event {offsets['name-place']};"
+        )
+    digest = "the same digest as" if corrected.same_digest else "ANOTHER digest than"
+    yield (
+        f"   made anew from the log in {corrected.replayed.total_s:.2f} s, {digest} a fold "
+        f"without databases: {corrected.folded.digest[:8]}…"
+    )
+
+
 def tell_lost(lost: LostRun, rooms: dict[str, str]) -> Iterator[str]:
     """Run B's questions and the answers."""
     yield (
@@ -159,6 +183,7 @@ class DemoResult:
     replayed: RebuildReport
     same_rows: bool
     folded: Folded
+    corrected: Corrected
     lost: LostRun
 
     @property
@@ -166,7 +191,8 @@ class DemoResult:
         """Whether log and run, tail and replay, databases and fold agree."""
         recorded = self.recorded
         whole = recorded.intact and not recorded.rejected and not recorded.lost
-        return whole and self.same_rows and self.replayed.digest == self.folded.digest
+        same_digest = self.replayed.digest == self.folded.digest and self.corrected.same_digest
+        return whole and self.same_rows and same_digest
 
 
 def result_document(
@@ -197,6 +223,7 @@ def result_document(
             "fold_seconds": result.folded.seconds,
         },
         "merges": [asdict(merge) for merge in result.folded.merges],
+        "corrected": result.corrected.document(),
         "relocalize": _lost_document(result.lost),
         "seconds": {**seconds, "total": sum(seconds.values())},
         "files": {

@@ -16,9 +16,11 @@ import pytest
 
 from eventsrc.log import LogReader
 from eventsrc.sim import simulate_run
+from eventsrc.system_events import COMMAND_KEY
 from projections.cli.options import settings_from
 from projections.model.digest import map_digest
 from projections.model.fold import fold_log
+from projections.model.log_commands import read_corrections
 
 _COMMAND = [sys.executable, "-m", "projections.cli", "demo", "--speed", "300"]
 _DEADLINE_S = 120.0
@@ -56,7 +58,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Played]:
 def test_every_keyframe_went_through_the_router_into_the_log(played: Played) -> None:
     run = simulate_run()
     with LogReader(played.out / "log") as reader:
-        events = list(reader.read())
+        events = [event for event in reader.read() if event.key != COMMAND_KEY]
     assert [event.payload for event in events] == list(run.payloads)
     assert {event.key for event in events} == {"tb/detections"}
     record = played.numbers["record"]
@@ -70,7 +72,7 @@ def test_every_keyframe_went_through_the_router_into_the_log(played: Played) -> 
 def test_the_reported_map_is_the_fold_of_the_log(played: Played) -> None:
     settings = settings_from(played.out / "settings.json", None)
     with LogReader(played.out / "log") as reader:
-        _, view = fold_log(reader, settings)
+        _, view = fold_log(reader, settings)  # without the commands
     told = played.numbers["map"]
     counts = view.counts()
     assert {name: told[name] for name in ("keyframes", "places", "objects")} == {
@@ -103,6 +105,24 @@ def test_the_merges_are_where_the_number_of_places_falls(played: Played) -> None
             assert len(before.places) == merge["places_before"]
             assert merge["survivor"]["place_id"] in names_after
             assert not names_after & set(absorbed)
+
+
+def test_one_merge_is_undone_and_one_place_has_a_name(played: Played) -> None:
+    settings = settings_from(played.out / "settings.json", None)
+    with LogReader(played.out / "log") as reader:
+        corrections = read_corrections(reader)
+        _, before = fold_log(reader, settings)
+        _, after = fold_log(reader, settings, corrections=corrections)
+    told = played.numbers["corrected"]
+    assert [c["kind"] for c in told["commands"]] == ["undo-merge", "name-place"]
+    assert told["digest"] == map_digest(after) != map_digest(before)
+    assert told["places"] == len(after.places) == len(before.places) + 1
+    standing = {p.place_id: p for p in after.places.values()}
+    sizes = {part["place_id"]: part["keyframes"] for part in told["apart"]}
+    assert {place: standing[place].keyframe_count for place in sizes} == sizes
+    assert standing[told["named"]["place_id"]].name == told["named"]["room"]
+    assert [p.name for p in standing.values()].count(None) == len(standing) - 1
+    assert f'is called "{told["named"]["room"]}"' in "\n".join(played.story)
 
 
 def test_the_error_is_the_distance_to_where_the_robot_truly_was(played: Played) -> None:

@@ -1,12 +1,17 @@
 """The demo's report: the numbers of each stage, and what did not agree."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
+from eventsrc.commands import Anchor, NamePlace, UndoMerge
+from eventsrc.envelope import KeyframeId, Offset, RunId
+from projections.corrections import RecordedCommand
 from projections.database import RebuildReport
 from projections.database.labels import LABELS, TABLE
 from projections.demo import report
+from projections.demo.correcting import Corrected
 from projections.demo.mapping import Folded, Part, RoomMerge, most_telling
 from projections.demo.recording import Followed, Recorded
 from projections.demo.report import DemoResult
@@ -42,8 +47,25 @@ def _merge(offset: int, one: str, other: str, smaller: int) -> RoomMerge:
     return RoomMerge(offset, "sim-1-a", offset + 1, "hall", *parts, places_before=5)
 
 
+ANCHORS = tuple(Anchor(run_id=RunId("sim-1-a"), keyframe_id=KeyframeId(k)) for k in (3, 90))
+SAID = {"command_id": "c", "issued_by": "demo@mapfold"}
+UNDO_MERGE = UndoMerge(merge_offset=Offset(1234), places=ANCHORS, **SAID)
+NAME_PLACE = NamePlace(place=ANCHORS[1], name="dining room", **SAID)
+CORRECTED = Corrected(
+    (RecordedCommand(Offset(1300), UNDO_MERGE), RecordedCommand(Offset(1301), NAME_PLACE)),
+    Part("sim-1-a_p12", 120, "dining room"),
+    (Part("sim-1-a_p11", 345, "living room"), Part("sim-1-a_p12", 120, "dining room")),
+    FOLDED,
+    REPLAYED,
+    0.3,
+)
+
+
 def _result() -> DemoResult:
-    return DemoResult(1, Settings(), RECORDED, FOLLOWED, REPLAYED, True, FOLDED, lost=None)  # type: ignore[arg-type]
+    lost: Any = None
+    return DemoResult(
+        1, Settings(), RECORDED, FOLLOWED, REPLAYED, True, FOLDED, CORRECTED, lost=lost
+    )
 
 
 def test_a_merge_across_rooms_is_preferred_to_a_larger_one_within_a_room() -> None:
@@ -89,7 +111,21 @@ def test_a_demo_is_sound_only_if_everything_agrees() -> None:
     assert not replace(_result(), same_rows=False).sound
     assert not replace(_result(), recorded=replace(RECORDED, intact=False)).sound
     assert not replace(_result(), recorded=replace(RECORDED, lost=1)).sound
-    assert not replace(_result(), replayed=replace(REPLAYED, digest="0" * 64)).sound
+    other = replace(REPLAYED, digest="0" * 64)
+    assert not replace(_result(), replayed=other).sound
+    assert not replace(_result(), corrected=replace(CORRECTED, replayed=other)).sound
+
+
+def test_corrections_are_reported_as_far_as_there_are_any() -> None:
+    lines = "\n".join(report.tell_corrected(CORRECTED))
+    assert "p11 (345 keyframes, living room) and p12 (120 keyframes, dining room);" in lines
+    assert 'p12 is called "dining room"' in lines
+    assert "event 1300 of the log" in lines
+    assert "event 1301" in lines
+    without = replace(CORRECTED, commands=(), named=None, apart=())
+    assert len(list(report.tell_corrected(without))) == 1
+    other = replace(CORRECTED, replayed=replace(REPLAYED, digest="0" * 64))
+    assert "ANOTHER digest" in "\n".join(report.tell_corrected(other))
 
 
 def test_lines_fit_a_terminal() -> None:
@@ -99,6 +135,8 @@ def test_lines_fit_a_terminal() -> None:
         *report.tell_replay(REPLAYED, FOLDED, True),
         *report.tell_map(FOLDED, Settings(), 1),
         *report.tell_merges(merges),
+        *report.tell_corrected(CORRECTED),
+        *report.tell_corrected(replace(CORRECTED, replayed=replace(REPLAYED, digest="0" * 64))),
     ]
     assert max(map(len, lines)) <= 100
 
