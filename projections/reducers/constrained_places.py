@@ -37,6 +37,7 @@ from projections.corrections import Keyframe
 from projections.deltas import (
     Delta,
     KeyframeOrdinal,
+    KeyframePlaced,
     MergeRefused,
     PlaceOrdinal,
     PlacesMerged,
@@ -81,6 +82,9 @@ class ConstrainedPlaces(Places):
         self._anchors: dict[KeyframeOrdinal, int] = {}  # those that have come → group
         self._inside: dict[PlaceOrdinal, Anchors] = {}
         self._refused: set[tuple[PlaceOrdinal, PlaceOrdinal]] = set()
+        # Refused links by first core points of cells, both ways round: known to change nothing
+        # while the places are the same.
+        self._settled: set[tuple[int, int]] = set()
         # Of the event that is being folded:
         self._refusals: list[Refusal] = []
         self._undecided: list[int] = []  # anchors that are not core and could join a place
@@ -104,7 +108,11 @@ class ConstrainedPlaces(Places):
         """As `Places.fold`."""
         if keyframe not in self._anchors:
             return super().fold(offset, keyframe, run, run_id, x_um, y_um, yaw)
-        point = self._add_point(keyframe, run, run_id)
+        point = len(self.joined)
+        self.joined.append(NOISE)
+        self.keyframes.append(keyframe)
+        self.runs.append(run)
+        self.run_ids[run] = run_id
         return self._fold_changes(offset, point, self.core_index.insert(x_um, y_um, yaw))
 
     def dump(self) -> State:
@@ -124,6 +132,16 @@ class ConstrainedPlaces(Places):
                 self._enter(place, group, keyframe)
         self._refused = {(a, b) for a, b in state["refused"]}
 
+    def _fold_changes(self, offset: Offset, newcomer: int, fresh: list[int]) -> list[Delta]:
+        if self._settled and fresh == [newcomer] and not self._is_anchor(newcomer):
+            older = self.core_index.enclosing_core_beside(newcomer, self._settled)
+            if older is not None:
+                place = self.survivors.find(self.joined[older])
+                self._join(newcomer, place)
+                placed = KeyframePlaced(offset, self.keyframes[newcomer], place)
+                return [placed, self._place_changed(offset, place)]
+        return super()._fold_changes(offset, newcomer, fresh)
+
     def _joining(
         self, offset: Offset, newcomer: int, fresh: list[int], deltas: list[Delta]
     ) -> dict[int, PlaceOrdinal]:
@@ -139,6 +157,7 @@ class ConstrainedPlaces(Places):
             if free is not None:
                 joining[point] = entered[point] = free
                 self._enter_point(point, free)
+        self._settled.update(pair for r in self._refusals for pair in _both_ways(r.link))
         for link, apart in self._refusals:
             one, other = (self.survivors.find(self.joined[cell]) for cell in link[:2])
             self._refuse(offset, newcomer, (one, other), link[2:], apart, deltas)
@@ -171,6 +190,7 @@ class ConstrainedPlaces(Places):
         touched: dict[PlaceOrdinal, tuple[int, int]],
     ) -> PlacesMerged:
         delta = super()._merge(offset, newcomer, survivor, touched)
+        self._settled.clear()
         for place in delta.absorbed:
             for group, keyframe in self._inside.pop(place, {}).items():
                 self._enter(survivor, group, keyframe)
@@ -346,6 +366,10 @@ class ConstrainedPlaces(Places):
         """An anchor is in a place from now on."""
         inside = self._inside.setdefault(place, {})
         inside[group] = min(keyframe, inside.get(group, keyframe))
+
+
+def _both_ways(link: CellLink) -> tuple[tuple[int, int], tuple[int, int]]:
+    return (link.cell, link.near), (link.near, link.cell)
 
 
 class _Forest:

@@ -19,7 +19,7 @@ and for a sparse one by looking at its few core points.
 
 import math
 from array import array
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 
 import numpy as np
 
@@ -127,6 +127,21 @@ class CoreIndex:
             return None
         for near in cell.near:
             if near.non_core:
+                return None
+        return cell.core
+
+    def enclosing_core_beside(self, point: int, settled: Container[tuple[int, int]]) -> int | None:
+        """As `enclosing_core`, but other clusters may be near: out of the point's reach, or by
+        ``settled``, pairs of first core points of cells that will never be one cluster."""
+        cell = self._cell_of(point)
+        if cell.core in (point, _NO_POINT) or cell.non_core:
+            return None
+        for near in cell.near:
+            if near.non_core:
+                return None
+        for near in cell.unlinked:
+            is_open = near.core != _NO_POINT and (cell.core, near.core) not in settled
+            if is_open and self.core_in_reach(near, point) is not None:
                 return None
         return cell.core
 

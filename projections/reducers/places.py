@@ -86,21 +86,17 @@ class Places:
         yaw: float,
     ) -> list[Delta]:
         """Add a keyframe with a pose; what it changed, in the order of the delta contract."""
-        point = self._add_point(keyframe, run, run_id)
+        point = len(self.joined)
+        self.joined.append(NOISE)
+        self.keyframes.append(keyframe)
+        self.runs.append(run)
+        self.run_ids[run] = run_id
         fresh = self.core_index.insert(x_um, y_um, yaw)
         if fresh == [point] and (older := self.core_index.enclosing_core(point)) is not None:
             place = self.survivors.find(self.joined[older])
             self._join(point, place)
             return [KeyframePlaced(offset, keyframe, place), self._place_changed(offset, place)]
         return self._fold_changes(offset, point, fresh)
-
-    def _add_point(self, keyframe: KeyframeOrdinal, run: RunOrdinal, run_id: RunId) -> int:
-        """Number a new point, which is in no place yet."""
-        self.joined.append(NOISE)
-        self.keyframes.append(keyframe)
-        self.runs.append(run)
-        self.run_ids[run] = run_id
-        return len(self.joined) - 1
 
     def _fold_changes(self, offset: Offset, newcomer: int, fresh: list[int]) -> list[Delta]:
         """What a new point that made ``fresh`` core points changes."""

@@ -54,6 +54,10 @@ class RuleCoreIndex:
         """Never known under a rule; see `CoreIndex.enclosing_core`."""
         return
 
+    def enclosing_core_beside(self, point: int, settled: object) -> None:  # noqa: ARG002
+        """Never known under a rule; see `CoreIndex.enclosing_core_beside`."""
+        return
+
     def squared_distance(self, a: int, b: int) -> int:
         """The squared distance of two points, in µm²."""
         return (self.x[a] - self.x[b]) ** 2 + (self.y[a] - self.y[b]) ** 2
