@@ -22,10 +22,18 @@ from typing import Literal, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
+from eventsrc.commands import InvalidCommand, parse_command
 from eventsrc.envelope import ENVELOPE_VERSION, KeyframeId, Offset, RunId
 from eventsrc.gaps import Gap, GapLedger, gap_of
 from eventsrc.ingest import Accepted
-from eventsrc.system_events import LOSS_KEY, REJECTED_KEY, Loss, RejectedPayload, is_system_key
+from eventsrc.system_events import (
+    COMMAND_KEY,
+    LOSS_KEY,
+    REJECTED_KEY,
+    Loss,
+    RejectedPayload,
+    is_system_key,
+)
 from eventsrc.upcast import read_envelope
 
 from .event import Event
@@ -183,8 +191,17 @@ class EventFindings:
             self._check_loss(event)
         elif event.key == REJECTED_KEY:
             self._parse(RejectedPayload, event)
+        elif event.key == COMMAND_KEY:
+            self._check_command(event)
         elif not is_system_key(event.key):
             self._check_envelope(event)
+
+    def _check_command(self, event: Event) -> None:
+        try:
+            parse_command(event.payload)
+        except InvalidCommand as error:
+            what = f"{event.key} event cannot be read: {error}"
+            self._add("schema", what, event.offset, what)
 
     def _check_loss(self, event: Event) -> None:
         loss = self._parse(Loss, event)

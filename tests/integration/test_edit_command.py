@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 
 from eventsrc.commands import Command, NamePlace, parse_command
+from eventsrc.errors import LogDamaged
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.system_events import COMMAND_KEY
 from projections.edit.current import CurrentMap
@@ -25,6 +26,7 @@ from projections.model.log_commands import read_corrections
 from projections.settings import Settings
 from tests.commands import PROGRAM, Commands
 from tests.corrected_logs import EVENTS, FAR, LEFT, MERGE, RIGHT, write_rooms
+from tests.fixtures_log import flip, read_log
 from tests.fixtures_timetravel import write_damaged_log
 from tests.logs import walk
 
@@ -206,6 +208,40 @@ def test_a_damaged_log_is_left_as_it_is(tmp_path: Path) -> None:
     said = mapfold("edit", "log", "forget-run", "run-a", *WHY, code=1)
     assert "cannot be folded" in said.err
     assert _files(tmp_path / "log") == before
+
+
+@pytest.mark.parametrize("part", [2, 3])
+def test_a_log_with_a_flipped_bit_is_left_as_it_is(mapfold: Commands, part: int) -> None:
+    log = mapfold.folder / "log"
+    (segment,) = log.glob("*.mcap")
+    whole = segment.read_bytes()
+    compressed = whole.index(b"\x28\xb5\x2f\xfd")  # zstd's magic: the chunk with the events
+    flip(segment, compressed + (len(whole) - compressed) // (2 * part))
+    with pytest.raises(LogDamaged):
+        _commands(log)
+        read_log(log)
+    before = _files(log)
+    said = mapfold("edit", "log", "forget-run", "run-b", *WHY, code=1)
+    assert "mapfold log verify" in said.err
+    assert _files(log) == before
+
+
+def test_verify_finds_an_event_that_is_no_command(mapfold: Commands) -> None:
+    mapfold("edit", "log", "forget-run", "run-b", *WHY)
+    assert mapfold("log", "verify", "log").code == 0
+    with LogWriter(mapfold.folder / "log") as writer:
+        writer.append(COMMAND_KEY, b'{"kind": "forget-run"}')
+    said = mapfold("log", "verify", "log", code=None)
+    assert said.code != 0
+    assert "mapfold/command event cannot be read: forget-run.command_id" in said.out + said.err
+
+
+def test_an_import_does_not_bring_commands(mapfold: Commands) -> None:
+    mapfold("edit", "log", "forget-run", "run-b", *WHY)
+    said = mapfold("import", "other", "log", code=3)
+    assert "1 rejected" in said.out + said.err
+    assert _commands(mapfold.folder / "other") == []
+    assert mapfold("state", "other", "--json").json["counts"]["keyframes"] == EVENTS
 
 
 def test_an_event_that_is_no_command_stops_edits_with_its_offset(mapfold: Commands) -> None:
