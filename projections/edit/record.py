@@ -11,8 +11,9 @@ from typing import Final, NamedTuple
 
 from eventsrc.commands import Command, encode_command
 from eventsrc.envelope import Offset
-from eventsrc.errors import LogBusy, TransportError
+from eventsrc.errors import LogBusy, MapfoldError, TransportError
 from eventsrc.log import LogReader, LogWriter
+from eventsrc.log.lock import is_held
 from eventsrc.recorder.edits import NewerCommand, NoAnswer, send_command
 from eventsrc.system_events import COMMAND_KEY
 from eventsrc.text import visible
@@ -29,6 +30,10 @@ MakeCommand = Callable[[CurrentMap, Stamp], Command]
 OpenSession = Callable[[], AbstractContextManager[Session]]
 TIMEOUT_S: Final = 10.0
 _TRIES: Final = 10
+
+
+class _LogFree(Exception):
+    """The writer that held the log is gone."""
 
 
 class Made(NamedTuple):
@@ -85,7 +90,9 @@ def record_command(
             try:
                 return made._replace(offset=_append(log, made, open_session))
             except NewerCommand as newer:
-                last = newer
+                last: MapfoldError = newer
+            except _LogFree:
+                last = LogBusy(f"{log} is written by one writer after another; try again")
     raise last
 
 
@@ -115,6 +122,7 @@ def _send(log: Path, made: Made, open_session: OpenSession, busy: str) -> Offset
         found = _find(log, command)  # the recorder may have ended between its sync and its reply
         if found is not None:
             return found
+        _check_held(log)
         raise LogBusy(
             f"{busy.partition(';')[0]}, and no recorder answers for it; start the recorder with "
             "--accept-edits, or stop it and edit again; if it runs with --accept-edits, --connect "
@@ -122,9 +130,16 @@ def _send(log: Path, made: Made, open_session: OpenSession, busy: str) -> Offset
             "the command is recorded once"
         ) from None
     except TransportError as error:
+        _check_held(log)
         raise LogBusy(
             f"{busy.partition(';')[0]}; a recorder takes commands over Zenoh, but {error}"
         ) from None
+
+
+def _check_held(log: Path) -> None:
+    """Raises _LogFree if the writer was another `edit`, say, and has ended."""
+    if not is_held(log):
+        raise _LogFree
 
 
 def _find(log: Path, command: Command) -> Offset | None:
