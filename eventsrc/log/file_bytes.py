@@ -57,6 +57,8 @@ class FileBytes:
         while at + len(pattern) <= end:
             if not self._in_block(at):
                 at = self._data_from(at)
+                if at + len(pattern) > end:
+                    break
                 self._load(at)
             block = self._block_at
             stop = min(block + BLOCK_BYTES + len(pattern) - 1, end)

@@ -4,7 +4,7 @@ import os
 import tempfile
 from pathlib import Path
 
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from eventsrc.log.file_bytes import BLOCK_BYTES, FileBytes
@@ -24,6 +24,7 @@ PLACES = st.builds(lambda edge, by: max(0, edge + by), st.sampled_from(EDGES), s
     first=PLACES,
     last=PLACES,
 )
+@example([(BLOCK_BYTES, PATTERN)], 2 * BLOCK_BYTES, 0, 0, 1)  # all data is behind the end
 def test_it_is_like_bytes(
     pieces: list[tuple[int, bytes]], size: int, start: int, first: int, last: int
 ) -> None:
