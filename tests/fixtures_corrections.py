@@ -52,9 +52,18 @@ def write_mixed_log(path: Path, items: Iterable[dict[str, Any] | Command]) -> Pa
     return path
 
 
+PLACES = ("name", "apart", "join", "undo-merge")
+OBJECTS = ("same", "same", "different", "drop", "drop-object")
+EVENTS = ("forget", "forget-run", "poses", "transform", "settings")
+
+
 @st.composite
 def commands(
-    draw: st.DrawFn, keyframes: Sequence[tuple[str, int]], det_ids: Sequence[str], number: int
+    draw: st.DrawFn,
+    kinds: Sequence[str],
+    keyframes: Sequence[tuple[str, int]],
+    det_ids: Sequence[str],
+    number: int,
 ) -> Command:
     """A command on some keyframes and detections; of an undo the one undone is any earlier."""
     said = {"command_id": f"c{number}", "issued_by": "ann@lab", "reason": "seen with own eyes"}
@@ -66,11 +75,8 @@ def commands(
     def pair() -> tuple[DetId, DetId]:
         return DetId(draw(st.sampled_from(det_ids))), DetId(draw(st.sampled_from(det_ids)))
 
-    kinds = ["name", "name", "apart", "apart", "join", "undo-merge", "forget", "forget-run"]
-    kinds += ["poses", "transform", "settings"]
-    kinds += ["same", "different", "drop", "drop-object"] if det_ids else []
-    kinds += ["undo", "undo"] if number else []
-    match draw(st.sampled_from(kinds)):
+    possible = [kind for kind in kinds if det_ids or kind not in OBJECTS] or [*PLACES]
+    match draw(st.sampled_from([*possible, *(["undo"] if number else [])])):
         case "name":
             return NamePlace(place=one(), name=draw(st.sampled_from(["kitchen", "hall"])), **said)
         case "apart":
@@ -111,15 +117,17 @@ def commands(
 
 @st.composite
 def corrected_walks(draw: st.DrawFn, most: int = 40) -> list[dict[str, Any] | Command]:
-    """A walk with up to six commands somewhere in it, also before what they name."""
+    """A walk with up to eight commands somewhere in it, also before what they name: of some kinds
+    or of all."""
     items: list[dict[str, Any] | Command] = list(draw(walks(most)))
     named = [d for d in items if isinstance(d, dict) and "run_id" in d]
     keyframes = sorted({(d["run_id"], d["keyframe_id"]) for d in named})
     det_ids = sorted({seen["det_id"] for d in named for seen in d["detections"]})
     if not keyframes:
         return items
-    count = draw(st.integers(1, 6))
+    kinds = draw(st.sampled_from([PLACES, PLACES, OBJECTS, (*PLACES, *OBJECTS, *EVENTS)]))
+    count = draw(st.integers(1, 8))
     points = sorted(draw(st.integers(0, len(items))) for _ in range(count))
     for number, point in enumerate(points):
-        items.insert(point + number, draw(commands(keyframes, det_ids, number)))
+        items.insert(point + number, draw(commands(kinds, keyframes, det_ids, number)))
     return items

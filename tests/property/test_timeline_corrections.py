@@ -25,7 +25,7 @@ from projections.model.view import MapView
 from projections.settings import Settings
 from tests.fixtures_corrections import anchor, corrected_walks, write_mixed_log
 
-RULES = Settings(eps_m=0.7, min_samples=3, fusion_radius_m=2.0)
+RULES = Settings(eps_m=0.7, min_samples=3, fusion_radius_m=1.0)
 Items = list[dict[str, Any] | Command]
 slow = settings(deadline=None, max_examples=100, suppress_health_check=[HealthCheck.too_slow])
 

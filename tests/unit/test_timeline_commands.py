@@ -23,15 +23,13 @@ from eventsrc.commands import (
 from eventsrc.envelope import DetId, KeyframeId, Offset, RunId
 from eventsrc.errors import MisuseError
 from projections.history import NoSuchThing, Timeline
-from projections.history.merges import (
-    merge_document,
-    refusal_document,
-)
+from projections.history.merges import merge_document, object_merge_document, refusal_document
 from projections.history.parallel import Rules
 from projections.history.rendering import (
     difference_text,
     merge_text,
     merges_text,
+    object_merges_text,
     refusals_text,
 )
 from projections.history.whatif import command_trials, what_if
@@ -42,7 +40,8 @@ from tests.envelopes import detection, envelope
 from tests.fixtures_corrections import anchor, write_mixed_log
 
 CUP = detection("cup", [1.0, 0.0], det_id="the-cup")
-CUP_AGAIN = detection("cup", [0.0, 1.0], det_id="another-cup")
+OTHER_CUP = detection("cup", [0.0, 1.0], det_id="other-cup")
+CUP_AGAIN = detection("cup", [0.0, 1.0], det_id="cup-again")
 
 CORRIDOR = [
     envelope(1, 0.0),
@@ -52,7 +51,7 @@ CORRIDOR = [
     envelope(5, 5.0, detections=[CUP]),
     envelope(6, 4.0),  # run-a_p1 around 5.0, founded by run-a:5
     envelope(7, 9.0),  # noise
-    envelope(8, 3.0),  # makes 2.0, 3.0 and 4.0 core: everything but the noise is one place
+    envelope(8, 3.0, detections=[OTHER_CUP]),  # makes 2.0, 3.0 and 4.0 core
     envelope(9, 5.0, detections=[CUP_AGAIN]),
     envelope(10, 20.0),
     envelope(11, 21.0),
@@ -64,7 +63,7 @@ FIRST, SECOND, THIRD = anchor("run-a", 2), anchor("run-a", 5), anchor("run-a", 1
 UNDO_MERGE = UndoMerge(command_id="c1", merge_offset=Offset(7), places=(FIRST, SECOND), **SAID)
 JOIN = Join(command_id="c2", places=(FIRST, THIRD), **SAID)
 KITCHEN = NamePlace(command_id="c3", place=SECOND, name="kitchen", **SAID)
-ONE_CUP = SameObject(command_id="c4", det_ids=(DetId("the-cup"), DetId("another-cup")), **SAID)
+ONE_CUP = SameObject(command_id="c4", det_ids=(DetId("the-cup"), DetId("cup-again")), **SAID)
 BY = "(ann@lab: a door)"
 
 Open = Callable[..., Timeline]
@@ -231,6 +230,38 @@ def test_a_difference_finds_a_merge_that_a_later_command_made_earlier(corridor: 
     diff = corridor(JOIN).diff(12, 13)
     assert diff.absorbed["run-a_p2"][0] == "run-a_p0"
     assert diff.absorbed["run-a_p2"][1].offset == 11
+
+
+def test_objects_made_one(corridor: Open) -> None:
+    timeline = corridor(ONE_CUP)
+    known = timeline.knowing()
+    (merge,) = known.object_merges()
+    before, after = timeline.at(8, known_at=13), timeline.at(9, known_at=13)
+    assert (len(before.objects), len(after.objects)) == (2, 1)
+    assert [o.object for o in before.observations] == [0, 1]
+    assert [o.object for o in after.observations] == [0, 0, 0]
+    document = object_merge_document(known.history, merge)
+    assert document["offset"] == 8
+    assert document["class_name"] == "cup"
+    assert document["absorbed"] in object_merges_text(known.history, [merge])
+    story = timeline.why(document["survivor"])
+    assert story.facts["det_ids"] == ["the-cup", "other-cup", "cup-again"]
+    assert "seen 3 times" in story.summary
+    assert [e.what for e in story.entries][-2:] == ["fused", "same-object"]
+    assert story.entries[-1].text == f"fused the-cup and cup-again by same-object c4 {BY}"
+    ended = timeline.why(document["absorbed"])
+    assert ended.summary.startswith(f"fused into {document['survivor']} at offset 8")
+    assert [timeline.facts(Offset(end), known_at=Offset(13)).object_count() for end in (8, 9)] == [
+        2,
+        1,
+    ]
+    for condition, offset in (
+        ("object_count('cup') == 1 and keyframe_count > 7", 8),
+        ("object_count >= 2", 7),  # and false again after the next event
+    ):
+        found = timeline.bisect(condition).found
+        assert found is not None
+        assert found.cause.offset == offset
 
 
 def test_moved_keyframes_of_a_place_name_the_command(corridor: Open) -> None:
