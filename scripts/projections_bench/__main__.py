@@ -15,7 +15,7 @@ from pathlib import Path
 
 from projections.database.embedded import EmbeddedServer
 
-from . import floor, live, queries, whole
+from . import corrections, floor, live, queries, whole
 
 BENCHES: dict[str, Callable[[EmbeddedServer, Path, bool], None]] = {
     "rebuild": whole.against_naive,
@@ -24,6 +24,7 @@ BENCHES: dict[str, Callable[[EmbeddedServer, Path, bool], None]] = {
     "tail": live.sustained,
     "latency": live.latency,
     "queries": queries.both,
+    "corrections": corrections.corrections,
 }
 
 
