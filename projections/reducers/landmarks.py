@@ -19,6 +19,9 @@ opposite looks, has no direction; its cosine with anything is 0.
 
 Every Object is listed in the nine grid cells of side ``fusion_radius_m`` around its mean, so one
 look-up finds all candidates however large the map is.
+
+Under ``same-object`` and ``different-objects``, `projections.reducers.constrained_landmarks` adds
+rules.
 """
 
 import hashlib

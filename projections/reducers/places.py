@@ -18,6 +18,8 @@ The rules (Ester et al. 1996, 1998; docs/places.md):
     that place is absorbed. Without a core neighbour it is noise, which belongs to no place.
 
 Rule 6 is the only freedom DBSCAN leaves; core points and their partition are unique.
+
+Under ``keep-apart`` and ``join``, `projections.reducers.constrained_places` adds rules.
 """
 
 import math
