@@ -281,3 +281,73 @@ def test_an_event_that_cannot_be_folded_is_named(
     said = InProcess(tmp_path, capfd)(args[0], "log", *args[1:], code=1)
     assert said.err.startswith("mapfold: event at offset 2 cannot be folded: not JSON")
     assert len(said.err.splitlines()) == 1
+
+
+@pytest.fixture
+def corrected(mapfold: InProcess) -> InProcess:
+    """The same log, with commands: its settings (offset 8), that its merge is undone (9), and the
+    second place's name (10)."""
+    said = ("--issued-by", "ann@lab", "--reason", "a door")
+    for number, command in enumerate(
+        (("use-settings", *RULES), ("undo-merge", "7"), ("name-place", "run-a_p1", "kitchen"))
+    ):
+        mapfold("edit", "log", *command, *said, "--command-id", f"c{number}")
+    return mapfold
+
+
+def test_every_command_takes_what_is_known_where_its_map_ends(corrected: InProcess) -> None:
+    def places(*known: str) -> int:
+        return int(
+            corrected("state", "log", "--at", "8", *known, "--json").json["counts"]["places"]
+        )
+
+    assert [places(*RULES), places(*RULES, "--known-at", "end")] == [1, 2]
+    assert places("--known-at", "10") == places("--known-at", "11") == 2
+    document = corrected("state", "log", "--json").json
+    assert [p.get("name") for p in document["places"]] == [None, "kitchen"]
+    assert document["corrections"]["known_at"] == 11
+    assert [c["command_id"] for c in document["corrections"]["commands"]] == ["c0", "c1", "c2"]
+    assert len(corrected("merges", "log", "--json").json) == 0
+    assert len(corrected("merges", "log", "--known-at", "9", "--json").json) == 1
+    assert len(corrected("merges", "log", "--at", "9", "--json").json) == 1
+    (refused,) = corrected("merges", "log", "--refused", "--json").json
+    assert refused["command"]["command_id"] == "c1"
+    assert corrected("merges", "log", "--refused", "--at", "7", "--json").json == []
+    assert corrected("merges", "log", "--objects", "--json").json == []
+    assert corrected("why", "log", "kitchen", "--json").json["subject"] == "run-a_p1"
+    assert "no place" in corrected("why", "log", "kitchen", "--known-at", "9", code=2).err
+    same = corrected("why", "log", "run-a:1", "run-a:4", "--json").json
+    assert same == corrected("why", "log", "--same", "run-a:1", "run-a:4", "--json").json
+    assert [same["same"], same["entries"][-1]["command"]["command_id"]] == [False, "c1"]
+    early = corrected("why", "log", "run-a:1", "run-a:4", "--known-at", "9", "--json").json
+    assert early["same"]
+    turned = corrected("bisect", "log", "named('kitchen')", "--json").json
+    assert turned["found"]["offset"] == 5
+    diff = corrected("diff", "log", "9", "11", "--json").json
+    assert [c["command_id"] for c in diff["commands"]] == ["c1", "c2"]
+    assert corrected("diff", "log", "9", "11", "--known-at", "11", "--json").json["same"]
+    whatif = corrected("whatif", "log", "--without", "c1", "--without", "c0", "--json").json
+    assert whatif["settings"]["eps_m"] == 1.0
+    first, second = whatif["alternatives"]
+    assert first["places"] == 1
+    assert second["set"]["eps_m"] == 1.5
+    early = corrected("whatif", "log", "--set", "eps_m=1.1", "--known-at", "9", "--json").json
+    assert early["base"]["places"] == 1
+    corrected("draw", "log", "--known-at", "9", "--out", "map.png")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("whatif", "log", "--without", "c7"), "no command 'c7' in this log; near it: c2, c1, c0"),
+        (("merges", "log", "--refused", "--objects"), "tables of their own; give one alone"),
+        (("merges", "log", "--refused", "--show", "1"), "tables of their own; give one alone"),
+        (("merges", "log", "--known-at", "12"), "12 is beyond the end of log"),
+        (("why", "log", "run-a:1", "run-a:99"), "no keyframe 'run-a:99' in this log"),
+        (("bisect", "log", "named('kitchn')"), "no name 'kitchn' in this log; near it: kitchen"),
+    ],
+)
+def test_what_is_not_there_is_named(
+    corrected: InProcess, arguments: tuple[str, ...], says: str
+) -> None:
+    assert says in corrected(*arguments, code=2).err
