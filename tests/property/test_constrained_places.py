@@ -61,8 +61,8 @@ def worlds(draw: st.DrawFn) -> tuple[list[Point], Statements]:
 @pytest.mark.parametrize("least", [1, 2, 3, 4, 5])
 def test_many_worlds_equal_the_naive_rules(least: int) -> None:
     """Worlds where something is refused are one in two, and small ones take a millisecond."""
-    for seed in range(60):
-        check_plain_distance(*world_of(1000 * least + seed), least)
+    for seed in (315, *range(1000 * least, 1000 * least + 60)):
+        check_plain_distance(*world_of(seed), least)
 
 
 def anchor(point: int) -> Keyframe:

@@ -174,3 +174,17 @@ def test_any_commands_and_their_undos_give_the_map_without_commands(world: World
     folded = Folded.start(Settings(**raw), corrections=compiled([*commands, *undos]))
     plain = Folded.start(Settings(**raw)).extend(documents)
     assert map_digest(folded.extend(documents).view) == map_digest(plain.view)
+
+
+@given(world=corrected_worlds(), seed=st.integers(0, 2**32))
+def test_the_order_of_independent_commands_does_not_matter(world: World, seed: int) -> None:
+    raw, documents, commands = world
+    independent = [
+        c for c in commands if isinstance(c, (ForgetRun, ForgetKeyframes, DropDetection, KeepApart))
+    ]
+    shuffled = random.Random(seed).sample(independent, len(independent))
+    one, other = (
+        Folded.start(Settings(**raw), corrections=compiled(each)).extend(documents)
+        for each in (independent, shuffled)
+    )
+    assert map_digest(one.view) == map_digest(other.view)

@@ -9,11 +9,13 @@ from eventsrc.envelope import KeyframeId, Offset, RunId
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.system_events import COMMAND_KEY
 from projections.corrections import Corrections, RecordedCommand, compile_corrections
+from projections.database.live_fold import LiveFold
 from projections.deltas import PlaceNamed
 from projections.errors import FoldError
 from projections.model.digest import map_digest
 from projections.model.fold import fold_log, fold_log_cached
 from projections.model.log_commands import read_commands, read_corrections
+from projections.model.snapshot import SnapshotRefused, restore, snapshot
 from projections.settings import Settings
 from tests.envelopes import envelope, payload
 from tests.folds import Folded
@@ -114,3 +116,33 @@ def test_names_given_later_are_those_of_a_fold_that_knew_them() -> None:
     forgetful = compile_corrections([RecordedCommand(Offset(9), FORGET)])
     with pytest.raises(ValueError, match="more than names"):
         folded.map.use_names(Offset(9), forgetful)
+
+
+def test_a_live_fold_takes_names_over_and_reports_the_places_as_changed(tmp_path: Path) -> None:
+    log = write(tmp_path / "log", *keyframes("a", 0.0, 0.1, 0.2, 9.0, 9.1, 9.2))
+    fold = LiveFold(Settings())
+    with LogReader(log) as reader:
+        assert list(fold.feed(list(reader.read()))) == [None] * 6
+    fold.tracker.drain()
+    fold.skip(Offset(6))
+    fold.use_names(Offset(6), named(name("c1", 4, "bath")))
+    changes = fold.tracker.drain()
+    assert (changes.places, changes.placed, changes.objects) == ([1], [], [])
+    assert [p.name for p in fold.view.places.values()] == [None, "bath"]
+    again = LiveFold(Settings(), corrections=named(name("c1", 4, "bath")))
+    with LogReader(log) as reader:
+        assert list(again.feed(list(reader.read()))) == [None] * 6
+    assert map_digest(fold.view) == map_digest(again.view)
+
+
+def test_a_snapshot_is_good_under_other_names_and_not_under_other_corrections() -> None:
+    documents = [envelope(k, 0.2 * k, 0.0, run_id="a") for k in range(4)]
+    plain = Folded.start().extend(documents)
+    data = snapshot(plain.map, plain.view, "log")
+    corrections = named(name("c1", 2, "hall"))
+    restored = restore(data, Settings(), "log", corrections=corrections)[1]
+    whole = Folded.start(corrections=corrections).extend(documents)
+    assert map_digest(restored) == map_digest(whole.view)
+    forgetful = compile_corrections([RecordedCommand(Offset(9), FORGET)])
+    with pytest.raises(SnapshotRefused, match="other corrections"):
+        restore(data, Settings(), "log", corrections=forgetful)
