@@ -10,7 +10,6 @@ import typer
 
 from eventsrc.envelope import Offset
 from eventsrc.errors import MisuseError
-from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.history import Explanation, Expression, ExpressionError, KnownHistory, Timeline
 from projections.history.condition_functions import functions_help
 from projections.history.merges import merge_document, object_merge_document, refusal_document
@@ -24,7 +23,6 @@ from projections.history.rendering import (
     refusals_text,
     search_text,
 )
-from projections.settings import Settings
 
 from .options import (
     JsonOption,
@@ -36,7 +34,7 @@ from .options import (
     check_picture,
     known_point,
     point,
-    settings_from,
+    settings_of,
 )
 from .terminal import Bar, display, emit, say
 
@@ -51,11 +49,7 @@ AtOption = Annotated[str, typer.Option("--at", metavar="W", help=f"Look from her
 def _timeline(log: Path, settings_file: Path | None, sets: list[str] | None) -> Iterator[Timeline]:
     """The log's timeline under the settings of the command line or the log, with a progress
     bar."""
-
-    def settings(corrections: Corrections) -> Settings:
-        return settings_from(settings_file, sets, corrections)
-
-    settings(NO_CORRECTIONS)  # a bad value is an error before the log is opened
+    settings = settings_of(settings_file, sets)
     with Bar() as bar, Timeline(log, settings, progress=bar.show_fold) as timeline:
         yield timeline
 

@@ -32,7 +32,7 @@ from .options import (
     check_picture,
     known_point,
     point,
-    settings_from,
+    settings_of,
 )
 from .terminal import Bar, display, emit, say
 from .time_travel import MOST_LINES, AllOption, AtOption
@@ -108,8 +108,10 @@ def whatif(
     --truth, V is the V-measure against rooms and instances: 1 is perfect.
     """
 
+    logged = settings_of(settings_file, None)
+
     def settings(corrections: Corrections) -> Settings:
-        return assigned(settings_from(settings_file, None, corrections), base, "--base")
+        return assigned(logged(corrections), base, "--base")
 
     def others(settings: Settings) -> list[Settings]:
         return alternatives(settings, set_ or (), try_ or (), grid or ())

@@ -1,10 +1,10 @@
 """The maps of one log under other settings or without a command, compared with the base's map."""
 
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from eventsrc.envelope import Offset
 from projections.corrections import Corrections, RecordedCommand, compile_corrections
@@ -14,7 +14,7 @@ from projections.model.command_text import command_document, command_name
 from projections.model.partitions import PartitionComparison, Regrouping, compare_partitions
 from projections.settings import Settings
 
-from .history import NEVER
+from .aligned import aligned
 from .known import Progress
 from .names import NoSuchThing
 from .parallel import FoldResult, Rules, fold_all
@@ -202,13 +202,15 @@ def what_if(
 
 
 def _compare(base: FoldResult, other: FoldResult, trial: Trial) -> Alternative:
+    base, other = aligned(base, other)
+    posed = sorted({*base.posed, *other.posed})
     return Alternative(
         name=trial.name,
         result=other,
-        places=compare_partitions(*_aligned(_posed_places(base), _posed_places(other))),
-        objects=compare_partitions(
-            *_aligned(*(_by_observation(each, each.objects) for each in (base, other)))
+        places=compare_partitions(
+            [base.places[k] for k in posed], [other.places[k] for k in posed]
         ),
+        objects=compare_partitions(base.objects, other.objects),
         places_part_at=_places_part_at(base, other),
         objects_part_at=_objects_part_at(base, other),
         renamed={
@@ -220,53 +222,23 @@ def _compare(base: FoldResult, other: FoldResult, trial: Trial) -> Alternative:
     )
 
 
-_K = TypeVar("_K", bound=Hashable)
-_V = TypeVar("_V")
-
-
-def _aligned(first: dict[_K, _V], second: dict[_K, _V]) -> tuple[list[_V | None], list[_V | None]]:
-    """The values of two folds by the same keys: those of the first, then those only in the second.
-    A thing that a fold leaves out has None there."""
-    keys = dict.fromkeys([*first, *second])
-    return [first.get(key) for key in keys], [second.get(key) for key in keys]
-
-
-def _posed_places(result: FoldResult) -> dict[int, str | None]:
-    """The place of each keyframe with a pose, by the keyframe's event."""
-    return {result.keyframe_offsets[k]: result.places[k] for k in result.posed}
-
-
-def _by_observation(result: FoldResult, values: Iterable[_V]) -> dict[tuple[int, str], _V]:
-    """Values of observations, by event and det_id."""
-    keys = zip(result.observation_offsets, result.det_ids, strict=True)
-    return dict(zip(keys, values, strict=True))
-
-
-_NOWHERE = (NEVER, -1)
-
-
-def _placings(result: FoldResult) -> dict[int, tuple[int, int]]:
-    """By a keyframe's event the event that placed it, and the number of the place."""
-    placings = zip(result.placed_offsets, result.placed_in, strict=True)
-    return dict(zip(result.keyframe_offsets, placings, strict=True))
-
-
 def _places_part_at(first: FoldResult, second: FoldResult) -> Offset | None:
     """The first event after which the places of two folds of one log differ; None for never."""
-    one, other = _placings(first), _placings(second)
-    pairs = [(one.get(k, _NOWHERE), other.get(k, _NOWHERE)) for k in one.keys() | other.keys()]
-    differ = [min(a[0], b[0]) for a, b in pairs if a != b]
+    placings = zip(
+        first.placed_offsets, first.placed_in, second.placed_offsets, second.placed_in, strict=True
+    )
+    differ = [min(o1, o2) for o1, p1, o2, p2 in placings if (o1, p1) != (o2, p2)]
     differ += [offset for offset, _, _ in set(first.merged) ^ set(second.merged)]
     return Offset(min(differ)) if differ else None
 
 
 def _objects_part_at(first: FoldResult, second: FoldResult) -> Offset | None:
     """The first event after which the objects of two folds of one log differ; None for never."""
-    one, other = (_by_observation(each, each.fused_into) for each in (first, second))
-    keys = one.keys() | other.keys()
-    differ = [key[0] for key in keys if one.get(key, -1) != other.get(key, -1)]
+    pairs = zip(first.fused_into, second.fused_into, first.observation_offsets, strict=True)
+    differ = [next((offset for a, b, offset in pairs if a != b), None)]
     differ += [offset for offset, _, _ in set(first.fused_later) ^ set(second.fused_later)]
-    return Offset(min(differ)) if differ else None
+    offsets = [offset for offset in differ if offset is not None]
+    return Offset(min(offsets)) if offsets else None
 
 
 def _document(each: Alternative, base: Settings) -> dict[str, Any]:
