@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from types import FrameType
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -73,11 +73,12 @@ def tail_command(
             stop=stop,
             progress=progress,
             on_fold=_CatchUpBar(log, end, bar, once).show,
+            on_refold=_RefoldNote().tell,
             on_trouble=lambda what: _report_failure(what, progress),
             note=say,
         )
     if as_json:
-        emit(asdict(report))
+        emit(_document(report))
     else:
         _print(report)
     finish(findings=bool(report.parked))
@@ -120,12 +121,38 @@ class _CatchUpBar:
                 say(f"following {self._log} from offset {folded:,} on; Ctrl-C ends it")
 
 
+class _RefoldNote:
+    """One line for each refold that begins."""
+
+    def __init__(self) -> None:
+        self._done = 0
+
+    def tell(self, done: int, total: int) -> None:
+        """``done`` of ``total`` events are refolded."""
+        if self._done == 0 or done < self._done:
+            say(
+                f"a command changes earlier events: folding {counted(total, 'event')} again;"
+                " readers keep the old map until the new one is whole"
+            )
+        self._done = done
+
+
+def _document(report: TailReport) -> dict[str, Any]:
+    """The report as JSON, with ``refolds`` only where there were some."""
+    document = asdict(report)
+    if not report.refolds:
+        del document["refolds"]
+    return document
+
+
 def _print(report: TailReport) -> None:
     say(
         f"{counted(report.events, 'event')} written in {report.batches:,}"
         f" {'batch' if report.batches == 1 else 'batches'}; the databases are at offset"
         f" {report.next_offset:,}"
     )
+    if report.refolds:
+        say(f"made the map anew {counted(report.refolds, 'time')} because of commands")
     for letter in report.parked:
         say(f"parked: offset {letter.offset:,}: {letter.reason}")
 

@@ -10,8 +10,6 @@ from collections.abc import Iterator, Sequence
 from types import TracebackType
 from typing import Final, Self
 
-from projections.errors import DatabaseError
-
 from . import checkpoints
 from .connection import Connection, database_errors
 from .stores import Store
@@ -20,14 +18,14 @@ BEAT_S: Final = 1.0
 
 
 class RefoldProgress:
-    """A context manager around a refold of ``stores``. ``tell`` raises what the thread met."""
+    """A context manager around a refold of ``stores``. ``tell`` raises what the thread raised."""
 
     def __init__(self, stores: Sequence[Store]) -> None:
         self._stores = stores
         self._at: tuple[int, int] | tuple[None, None] = (0, 0)
         self._held = threading.Lock()
         self._ended = threading.Event()
-        self._failed: DatabaseError | None = None
+        self._failed: BaseException | None = None
         self._thread = threading.Thread(target=self._work, name="refold-progress", daemon=True)
         self._stack = contextlib.ExitStack()
         self._connections: list[tuple[Store, Connection]] = []
@@ -50,7 +48,7 @@ class RefoldProgress:
         self._stack.close()
 
     def tell(self, done: int, total: int) -> None:
-        """``done`` of ``total`` events are folded. Raises DatabaseError."""
+        """``done`` of ``total`` events are folded. Raises what the thread raised."""
         self._at = (done, total)
         if self._failed is not None:
             raise self._failed
@@ -68,7 +66,7 @@ class RefoldProgress:
             while not self._ended.wait(BEAT_S):
                 with self._held:
                     self._write()
-        except DatabaseError as error:
+        except BaseException as error:  # noqa: BLE001 - raised by `tell`
             self._failed = error
 
     def _write(self) -> None:

@@ -1,8 +1,9 @@
 """Memory, both loaders, one database and two databases: after any steps their rows are equal.
 
-The machine writes events (walks, merges, duplicates, conflicts, unreadable ones), tails in batches
-of any size, crashes tails at any statement, rebuilds to any offset, and compares. The memory
-sink gets each event once, in order; the databases get crashes, retries and rebuilds.
+The machine writes events (walks, merges, duplicates, conflicts, unreadable ones) and commands,
+tails in batches of any size, crashes tails at any statement, rebuilds to any offset, and compares.
+The memory sink gets each event once, in order, from the start again where a command changes more
+than names; the databases get crashes, retries, rebuilds and refolds.
 """
 
 import contextlib
@@ -26,6 +27,8 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
+from eventsrc.commands import Command
+from eventsrc.envelope import Offset
 from eventsrc.log import LogReader
 from projections.database import rebuild, tail
 from projections.database.connection import Targets, connect
@@ -33,7 +36,9 @@ from projections.database.live_fold import LiveFold
 from projections.database.loader import LoaderName
 from projections.database.memory_sink import MemorySink, MemoryTables
 from projections.errors import FoldError
+from projections.model.log_commands import read_corrections
 from projections.settings import Settings
+from tests.commands_in_logs import append_command, forget_keyframes, keep_apart, name_place, undo
 from tests.drops import wait_for_drops
 from tests.envelopes import envelope
 from tests.logs import append_raw, bridge, walk, write_log
@@ -76,6 +81,7 @@ class SinksAgree(RuleBasedStateMachine):
         self.log = write_log(self.folder / "log", walk(3, seed=99, run_id="first"))
         self.keyframes = {"run-a": 0, "run-b": 0}
         self.unreadable = False
+        self.given: list[Command] = []
         self.fold, self.memory = LiveFold(SETTINGS), MemoryTables()
         for name in self.targets:
             self._empty(self.targets[name])
@@ -112,6 +118,28 @@ class SinksAgree(RuleBasedStateMachine):
     def unreadable_event_comes(self) -> None:
         append_raw(self.log, b'{"run_id": "broken"}')
         self.unreadable = True
+
+    @rule(keyframe=st.integers(0, 20), name=st.sampled_from(["kitchen", "hall"]))
+    def place_is_named(self, keyframe: int, name: str) -> None:
+        self._give(name_place(keyframe, name))
+
+    @rule(first=st.integers(0, 20), count=st.integers(0, 8))
+    def keyframes_are_forgotten(self, first: int, count: int) -> None:
+        self._give(forget_keyframes(first, first + count))
+
+    @rule(first=st.integers(0, 20), second=st.integers(0, 20))
+    def places_are_kept_apart(self, first: int, second: int) -> None:
+        if first != second:
+            self._give(keep_apart(first, second))
+
+    @rule(index=st.integers(0, 20))
+    def command_is_undone(self, index: int) -> None:
+        if self.given:
+            self._give(undo(self.given[index % len(self.given)]))
+
+    def _give(self, given: Command) -> None:
+        self.given.append(given)
+        append_command(self.log, given)
 
     @rule(name=PLACES, size=st.integers(1, 20))
     def tail_catches_up(self, name: str, size: int) -> None:
@@ -182,9 +210,15 @@ class SinksAgree(RuleBasedStateMachine):
 
     def _memory_catches_up(self) -> None:
         with LogReader(self.log) as reader:
+            corrections = read_corrections(reader)
+            if not corrections.differs_in_names_only(self.fold.map.corrections):
+                self.fold = LiveFold(SETTINGS, corrections=corrections)
+                self.memory = MemoryTables()
             for event in reader.read(self.memory.next_offset):
                 for _ in self.fold.feed([event]):
                     pass
+        if self.fold.map.next_offset:
+            self.fold.use_names(Offset(self.fold.map.next_offset - 1), corrections)
         MemorySink().prepare(self.fold.tracker.drain(), self.fold.view).send(self.memory)
         self.memory.next_offset = self.fold.map.next_offset
 
