@@ -88,6 +88,7 @@ class SemanticMap:
         self._edits_events = edits_events(corrections)
         self.names = PlaceNames(corrections.names)
         self._anchors = self._all_anchors()
+        self._is_corrected = self._edits_events or bool(self._anchors)
         self.next_offset = FIRST_OFFSET
         self.folded_ids = FoldedIds()
         self.space = Space(settings)
@@ -124,7 +125,8 @@ class SemanticMap:
         FoldError where a correction cannot be applied; the map is as before the event then.
         """
         dropped: tuple[DetId, ...] = ()
-        if self._edits_events:
+        is_corrected = self._is_corrected
+        if is_corrected and self._edits_events:
             edited = edit_event(self.corrections, offset, accepted, units)
             if edited is None:
                 self.next_offset = Offset(offset + 1)
@@ -145,7 +147,7 @@ class SemanticMap:
         if is_news:
             deltas.append(RunSeen(offset, run, envelope.run_id, envelope.timestamp))
         keyframe = folded_ids.add_keyframe(run, envelope.keyframe_id, offset, digest)
-        if self._anchors:
+        if is_corrected and self._anchors:
             self._add_anchor(keyframe, Keyframe(envelope.run_id, envelope.keyframe_id))
         pose = _pose(accepted)
         deltas.append(
@@ -182,6 +184,7 @@ class SemanticMap:
         older, self.names = self.names, PlaceNames(corrections.names)
         self.corrections = corrections
         self._anchors = self._all_anchors()
+        self._is_corrected = self._edits_events or bool(self._anchors)
         for anchor in self.names.newest:
             keyframe = self.folded_ids.find(*anchor)
             if keyframe is not None:
@@ -316,7 +319,7 @@ class SemanticMap:
             elif type(delta) is PlacesMerged:
                 self.located_in.places_merged(delta.survivor, delta.absorbed)
                 self.adjacency.places_merged(delta.survivor, delta.absorbed)
-        if self.names.names:
+        if self._is_corrected and self.names.names:
             deltas += self.names.fold(offset, changes)
         return place
 
