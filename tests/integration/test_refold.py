@@ -14,6 +14,7 @@ import pytest
 from eventsrc.commands import Command, UseSettings
 from eventsrc.envelope import Offset
 from eventsrc.log import LogReader
+from projections.cli.status import _sink_line
 from projections.database import TailProgress, TailReport, rebuild, tail
 from projections.database.check import check
 from projections.database.connection import Targets
@@ -292,6 +293,7 @@ def test_status_tells_how_far_a_refold_is(
     ((graph, vectors),) = seen
     assert (graph.condition, vectors.condition) == ("refolding", "refolding")
     assert (graph.refold_total, graph.next_offset) == (LOG_LENGTH + 1, LOG_LENGTH)
+    assert _sink_line(graph).startswith("refolding, 49 %, old map at offset 120, 1 behind")
     after = projection_status(log, targets, SETTINGS)
     assert [(s.condition, s.refold_done) for s in after.sinks] == [("idle", None)] * 2
 

@@ -1,0 +1,107 @@
+"""A place's name is beside its id in every answer, of the live map and of a folded log alike."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from eventsrc.log import LogReader
+from projections.database import rebuild
+from projections.database.connection import Targets
+from projections.database.cypher import connect_for_cypher
+from projections.model.fold import fold_log
+from projections.model.log_commands import read_corrections
+from projections.queries.map_queries import (
+    FoldedMap,
+    LiveMap,
+    objects_of,
+    path_between,
+    places_holding,
+    similar_objects,
+    where_is,
+)
+from projections.queries.relocalize import CandidateReader, prepare_graph
+from projections.relocalize import ExactIndex, rank, read_crops
+from projections.serve import Answerer, Pools
+from projections.settings import Settings
+from tests.commands_in_logs import append_command, name_place
+from tests.logs import walk, write_log
+
+SETTINGS = Settings()
+NAME = 'Küche "1"'
+
+
+@pytest.fixture
+def documents() -> list[dict[str, Any]]:
+    return walk(120)
+
+
+@pytest.fixture
+def log(tmp_path: Path, documents: list[dict[str, Any]]) -> Path:
+    """Three rooms, of which one has a name."""
+    log = write_log(tmp_path / "log", documents)
+    append_command(log, name_place(3, NAME))
+    return log
+
+
+def test_queries_of_the_live_map_and_of_the_log_show_the_same_names(
+    log: Path, one_database: Targets
+) -> None:
+    rebuild(log, one_database, SETTINGS)
+    with LogReader(log) as reader:
+        _, view = fold_log(reader, SETTINGS, corrections=read_corrections(reader))
+    (named,) = (p for p in view.places.values() if p.name is not None)
+    other = next(p for p in view.places.values() if p.name is None)
+    inside = next(o for o in view.objects.values() if o.place == named.ordinal)
+    with connect_for_cypher(one_database.graph_url) as connection:
+        prepare_graph(connection)
+        live, folded = LiveMap(connection), FoldedMap(view)
+        answers = [
+            [
+                where_is(source, inside.object_id),
+                objects_of(source, named.place_id),
+                objects_of(source, other.place_id),
+                path_between(source, named.place_id, other.place_id),
+                places_holding(source, inside.class_name, named.place_id, 3),
+            ]
+            for source in (live, folded)
+        ]
+    assert answers[0] == answers[1]
+    where, in_named, in_other, path, holding = answers[0]
+    assert where["place_name"] == NAME  # type: ignore[call-overload]
+    assert {o["place_name"] for o in in_named} == {NAME}  # type: ignore[index]
+    assert in_other
+    assert all("place_name" not in o for o in in_other)
+    assert [step.get("name") for step in path] == [NAME, *[None] * (len(path) - 1)]  # type: ignore[attr-defined]
+    assert holding[0]["name"] == NAME  # type: ignore[index,call-overload]
+
+
+def test_answers_to_where_is_this_show_the_name(
+    log: Path, one_database: Targets, documents: list[dict[str, Any]]
+) -> None:
+    rebuild(log, one_database, SETTINGS)
+    with LogReader(log) as reader:
+        _, view = fold_log(reader, SETTINGS, corrections=read_corrections(reader))
+    seen = [d["detections"] for d in documents if d["detections"]]
+    question = next(s for s in seen if all("embedding" in d for d in s))
+    crops = read_crops({"crops": question})
+    with CandidateReader(one_database) as reader_of_candidates:
+        candidates = reader_of_candidates.candidates(crops)
+    answer = rank(crops, candidates, top=9).document()
+    folded = rank(crops, ExactIndex(view).search(crops), top=9).document()
+    assert [p.get("name") for p in answer["places"]] == [p.get("name") for p in folded["places"]]
+    names = {place["place_id"]: place.get("name") for place in answer["places"]}
+    expected = {p.place_id: p.name for p in view.places.values()}
+    assert names == {place_id: expected[place_id] for place_id in names}
+    assert NAME in names.values()
+    assert any("name" not in place for place in answer["places"])
+    similar = similar_objects(crops, candidates, 20)
+    assert NAME in {found.get("place_name") for found in similar}
+
+    with Pools(one_database, 1, lambda _: None) as pools:
+        answerer = Answerer(pools, per_second=100.0)
+        served = answerer.relocalize(json.dumps({"crops": question, "top": 9}).encode(), {})
+        assert served["places"] == answer["places"]
+        near = answerer.state("places", {"x": "6", "y": "0", "radius": "50"})["places"]
+    assert {place["place_id"]: place.get("name") for place in near} == expected

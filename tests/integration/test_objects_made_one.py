@@ -1,0 +1,77 @@
+"""Objects that a `same-object` command makes one: the absorbed vertex goes, its edges move."""
+
+from pathlib import Path
+
+import pytest
+
+from eventsrc.commands import SameObject
+from eventsrc.envelope import FIRST_OFFSET
+from eventsrc.log import LogReader
+from projections.corrections import Corrections
+from projections.database import rebuild, tail
+from projections.database.connection import Targets
+from projections.database.live_fold import LiveFold, batches
+from projections.database.memory_sink import MemorySink, MemoryTables
+from projections.model.fold import fold_log
+from projections.model.log_commands import read_corrections
+from projections.model.view import MapView
+from projections.settings import Settings
+from tests.commands_in_logs import append_command, command
+from tests.integration.test_refold import parsed
+from tests.logs import walk, write_log
+from tests.rows import all_rows, expected_graph
+
+SETTINGS = Settings()
+
+
+def fold(log: Path) -> tuple[MapView, Corrections]:
+    with LogReader(log) as reader:
+        corrections = read_corrections(reader)
+        return fold_log(reader, SETTINGS, corrections=corrections)[1], corrections
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    """The command is recorded before the robot sees the two Objects."""
+    documents = walk(80)
+    plain, _ = fold(write_log(tmp_path / "plain", documents))
+    pairs = (
+        (a, b)
+        for a in plain.objects.values()
+        for b in plain.objects.values()
+        if a.ordinal < b.ordinal and a.place is not None and b.place not in (None, a.place)
+    )
+    pair = max(pairs, key=lambda pair: pair[1].obs_count)
+    det_ids = tuple(plain.observations[thing.observations[-1]].det_id for thing in pair)
+    log = write_log(tmp_path / "log", [])
+    append_command(log, command(SameObject, det_ids=det_ids))
+    return write_log(log, documents)
+
+
+def test_live_rows_and_a_rebuild_are_what_the_view_says(
+    log: Path, one_database: Targets, third_database: Targets
+) -> None:
+    view, _ = fold(log)
+    assert len(view.objects) == len(view.all_objects) - 1
+    tail(log, one_database, SETTINGS, once=True, batch_events=7)
+    rebuild(log, third_database, SETTINGS)
+    rows = all_rows(one_database)
+    assert rows == all_rows(third_database)
+    assert parsed(rows[0]) == expected_graph(view)
+
+
+@pytest.mark.parametrize("size", [1, 7, 1_000])
+def test_batches_of_any_size_give_the_rows_of_a_rebuild(log: Path, size: int) -> None:
+    _, corrections = fold(log)
+    live, anew = MemoryTables(), MemoryTables()
+    following, folding = (LiveFold(SETTINGS, corrections=corrections) for _ in range(2))
+    sink, shadow = MemorySink(), MemorySink().shadow()
+    with LogReader(log) as reader:
+        for batch in batches(reader.read(FIRST_OFFSET), size):
+            assert not any(following.feed(batch))
+            sink.prepare(following.tracker.drain(), following.view).send(live)
+            assert not any(folding.feed(batch))
+            shadow.load(folding.tracker.drain(), folding.view)(anew)
+    shadow.finish(folding.view)(anew)
+    shadow.swap_in(anew)
+    assert live.graph == anew.graph
