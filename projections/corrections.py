@@ -15,8 +15,8 @@ had always been known, but only from the offset where it was recorded.
 """
 
 import hashlib
-from collections.abc import Iterable
-from typing import NamedTuple
+from collections.abc import Callable, Iterable
+from typing import NamedTuple, TypeAlias
 
 import msgspec
 
@@ -43,6 +43,9 @@ from eventsrc.ingest import Accepted
 
 from .pair_groups import without_contradictions
 from .settings import Settings
+
+Pose: TypeAlias = tuple[float, float, float]
+"""Metres, metres, radians."""
 
 
 class Keyframe(NamedTuple):
@@ -71,14 +74,16 @@ class PoseCorrection(NamedTuple):
     """One command's correction of a run's poses: ``poses`` by keyframe, or ``transform`` of the
     keyframes from ``first`` to ``last``, None for no bound."""
 
-    poses: dict[KeyframeId, tuple[float, float, float]]
+    poses: dict[KeyframeId, Pose]
     transform: RigidTransform | None
     first: KeyframeId | None
     last: KeyframeId | None
 
-    def apply(
-        self, keyframe_id: KeyframeId, pose: tuple[float, float, float]
-    ) -> tuple[float, float, float]:
+    def corrected(self, keyframe_id: KeyframeId, pose: Pose | None) -> Pose | None:
+        """A keyframe's pose after this; a transform gives none to one that has none."""
+        return self.poses.get(keyframe_id) if pose is None else self.apply(keyframe_id, pose)
+
+    def apply(self, keyframe_id: KeyframeId, pose: Pose) -> Pose:
         """A keyframe's corrected pose: metres, metres, radians."""
         if self.transform is None:
             return self.poses.get(keyframe_id, pose)
@@ -139,16 +144,26 @@ class Corrections(msgspec.Struct, frozen=True, eq=False):
         ranges = self.forgotten_ranges.get(run_id, ())
         return run_id in self.forgotten_runs or any(a <= keyframe_id <= b for a, b in ranges)
 
-    def pose(self, envelope: Envelope) -> tuple[float, float, float] | None:
+    def pose(self, envelope: Envelope) -> Pose | None:
         """The envelope's corrected pose, metres and radians; None if it has none."""
-        x, y, yaw = envelope.map_x, envelope.map_y, envelope.map_yaw
-        pose = None if x is None or y is None or yaw is None else (x, y, yaw)
+        pose = _logged_pose(envelope)
         for correction in self.poses.get(envelope.run_id, ()):
-            if pose is None:
-                pose = correction.poses.get(envelope.keyframe_id)
-            else:
-                pose = correction.apply(envelope.keyframe_id, pose)
+            pose = correction.corrected(envelope.keyframe_id, pose)
         return pose
+
+    def pose_command(self, envelope: Envelope, is_good: Callable[[Pose], bool]) -> RecordedCommand:
+        """The command that makes the envelope's corrected pose one that is not good: the last one
+        that does so to a pose that was good. Raises ValueError if the corrected pose is good."""
+        pose, good, found = _logged_pose(envelope), True, None
+        for recorded in self.in_force:
+            command = recorded.command
+            if isinstance(command, CorrectPoses) and command.run_id == envelope.run_id:
+                pose = _pose_correction(command).corrected(envelope.keyframe_id, pose)
+                was_good, good = good, pose is None or is_good(pose)
+                found = None if good else recorded if was_good else found
+        if found is None:
+            raise ValueError("the corrected pose is good")
+        return found
 
     def kept(self, accepted: Accepted) -> list[int]:
         """Indices of an envelope's detections that are in the map."""
@@ -236,11 +251,7 @@ def compile_corrections(commands: Iterable[RecordedCommand]) -> Corrections:
             case ForgetKeyframes():
                 ranges.setdefault(command.run_id, []).append((command.first, command.last))
             case CorrectPoses():
-                by_keyframe = {p.keyframe_id: (p.x, p.y, p.yaw) for p in command.poses}
-                correction = PoseCorrection(
-                    by_keyframe, command.transform, command.first, command.last
-                )
-                poses.setdefault(command.run_id, []).append(correction)
+                poses.setdefault(command.run_id, []).append(_pose_correction(command))
             case UseSettings():
                 settings = Settings.from_document(command.settings)
             case Undo():
@@ -264,6 +275,16 @@ def compile_corrections(commands: Iterable[RecordedCommand]) -> Corrections:
 
 def _keyframe(anchor: Anchor) -> Keyframe:
     return Keyframe(anchor.run_id, anchor.keyframe_id)
+
+
+def _logged_pose(envelope: Envelope) -> Pose | None:
+    x, y, yaw = envelope.map_x, envelope.map_y, envelope.map_yaw
+    return None if x is None or y is None or yaw is None else (x, y, yaw)
+
+
+def _pose_correction(command: CorrectPoses) -> PoseCorrection:
+    poses = {p.keyframe_id: (p.x, p.y, p.yaw) for p in command.poses}
+    return PoseCorrection(poses, command.transform, command.first, command.last)
 
 
 def _pairs(anchors: tuple[Anchor, ...]) -> list[tuple[Keyframe, Keyframe]]:

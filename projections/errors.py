@@ -5,6 +5,7 @@ MapfoldError
 ├── LogPointError               2  a point in the log does not exist
 ├── QuestionError               2  a question about the map cannot be asked as it is
 ├── FoldError                   1  an event cannot be folded; names its offset
+│   └── ImpossibleCommand       1  it could be, but for a command
 └── DatabaseError               1  a database cannot be used as asked
     ├── DatabaseUnavailable     1  no server answers, or it refused the connection
     ├── ExtensionMissing        1  the server lacks AGE or pgvector
@@ -48,6 +49,13 @@ class FoldError(MapfoldError):
     def __reduce__(self) -> tuple[type["FoldError"], tuple[int, str]]:
         """Pickle the arguments, not the message, so that it passes between processes."""
         return FoldError, (self.offset, self.reason)
+
+
+class ImpossibleCommand(FoldError):
+    """A command makes an event one that cannot be folded; without it the event can be."""
+
+    def __reduce__(self) -> tuple[type["ImpossibleCommand"], tuple[int, str]]:
+        return ImpossibleCommand, (self.offset, self.reason)
 
 
 class DatabaseError(MapfoldError):

@@ -1,10 +1,11 @@
 """Refold: a tail makes the map anew under other corrections while readers use the old one.
 
 It is a rebuild (`shadows`) over the tail's own connections and locks, with three differences. It
-goes on until it has all events that came meanwhile. An event that cannot be folded is parked, as
-a tail does. And it looks for commands that are recorded while it is at work: those that only name
-places join it; another one restarts it once. After that it goes through, so that commands that
-keep coming cannot keep the map from changing, and the next refold begins.
+goes on until it has all events that came meanwhile. An event that cannot be folded is parked, as a
+tail does; but one that only a command keeps from being folded ends the refold, and the old map
+stays. And it looks for commands that are recorded while it is at work: those that only name places
+join it; another one restarts it once. After that it goes through, so that commands that keep coming
+cannot keep the map from changing, and the next refold begins.
 
 The checkpoint says which commands the new map knows, in the transaction of the swap. Whatever ends
 a refold, a command that no map knows yet makes the next tail refold.
@@ -18,7 +19,7 @@ from typing import Final
 
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.log import Event, LogReader
-from projections.errors import DatabaseError
+from projections.errors import DatabaseError, ImpossibleCommand
 from projections.model.fold import gc_paused
 
 from .checkpoints import DeadLetter, dead_letter
@@ -66,7 +67,10 @@ class Refold:
     _looked_at: float = 0.0
 
     def run(self) -> FoldedLog:
-        """Make the map anew and swap it in. Raises CommandsCame and RefoldStopped."""
+        """Make the map anew and swap it in.
+
+        Raises CommandsCame, RefoldStopped, ImpossibleCommand.
+        """
         self.base = self.inputs.latest
         folded: list[FoldedLog] = []
 
@@ -109,6 +113,8 @@ class Refold:
         if self.stop.is_set():
             raise RefoldStopped
         for event, error in zip(batch, fold.feed(batch), strict=True):
+            if isinstance(error, ImpossibleCommand):
+                raise error
             if error is not None:
                 self._letters.append(dead_letter(event, error.reason))
 

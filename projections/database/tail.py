@@ -15,7 +15,8 @@ the rows remain what the fold says, until a rebuild tries them again.
 A command changes how earlier events are folded. One that only names places is applied at once, in
 the transaction that moves past it. Another one ends the following: a `refold` makes the map anew,
 and following goes on from there. At the start of a pass the checkpoints tell which commands the map
-knows, so none is lost.
+knows, so none is lost. Where a command moves a keyframe out of the map, the refold ends, the old
+map stays as it is, without what comes later, and the tail waits for another command.
 """
 
 import threading
@@ -62,7 +63,8 @@ def tail(
     ``settings`` may depend on the log's corrections. ``on_batch`` is called after each commit;
     ``on_fold`` is told how many events are folded and written, at the start of a pass and after
     each batch of it; ``on_refold`` is told how many of how many events a refold has folded;
-    ``note`` is told of snapshots that could not be used or kept, which costs time and nothing else.
+    ``note`` is told of snapshots that could not be used or kept, which costs time and nothing else,
+    and of a command that a refold cannot obey, which with ``once`` is raised (ImpossibleCommand).
     Raises ProjectionMismatch when the databases were made from another log or with other settings,
     ProjectionBusy, CheckpointMoved.
     """

@@ -12,7 +12,7 @@ from typing import Final, TypeAlias
 from eventsrc.envelope import Offset
 from eventsrc.log import Event, LogReader, follow
 from eventsrc.system_events import COMMAND_KEY
-from projections.errors import FoldError, ProjectionMismatch
+from projections.errors import FoldError, ImpossibleCommand, ProjectionMismatch
 from projections.model.fold import SNAPSHOT_MIN_EVENTS
 from projections.model.log_commands import read_command
 from projections.model.snapshot_cache import SnapshotCache
@@ -21,7 +21,7 @@ from projections.settings import Settings
 from . import checkpoints
 from .checkpoints import DeadLetter, dead_letter, event_hash
 from .connection import Targets, database_errors
-from .inputs import LogInputs, MapInputs, SettingsOf
+from .inputs import LogInputs, MapInputs, SettingsOf, commands_between
 from .live_fold import LiveFold, batches
 from .origin import (
     origin_fault,
@@ -83,7 +83,7 @@ class TailPass:
     def run(self, reader: LogReader) -> None:
         """Follow the log, and refold when commands make it necessary.
 
-        Raises LostCommits, CheckpointMoved, ProjectionMismatch.
+        Raises LostCommits, CheckpointMoved, ProjectionMismatch, ImpossibleCommand.
         """
         fold, restarts = None, 0
         while True:
@@ -95,7 +95,7 @@ class TailPass:
                     return
                 fold, restarts = None, 0
             else:
-                fold = None  # free the old one first
+                fold, known = None, self.inputs.end  # free the old one first
                 try:
                     with self._lost_connections():
                         fold = self._refold(reader, goes_through=restarts > 0)
@@ -104,6 +104,10 @@ class TailPass:
                     restarts += 1
                 except RefoldStopped:
                     return
+                except ImpossibleCommand as error:
+                    restarts = 0
+                    if not self._outwait(error, reader, known):
+                        return
 
     @contextlib.contextmanager
     def _lost_connections(self) -> Iterator[None]:
@@ -133,6 +137,28 @@ class TailPass:
         self.report.refolds += 1
         self.report.parked += [x for x in folded.letters if x.offset not in self.parked]
         return folded.fold
+
+    def _outwait(self, error: ImpossibleCommand, reader: LogReader, known: Offset) -> bool:
+        """Leave the old map as it is until a command at ``known`` or later is in the log; False
+        when stopped. With ``once`` it raises the error instead of waiting."""
+        plan = self.plan
+        with self._lost_connections():
+            self._begin(reader)  # which also ends the refold for `status`
+        if plan.once:
+            if not commands_between(reader, known, reader.next_offset):
+                raise error
+            return True
+        plan.progress.count_failure()
+        plan.note(f"mapfold: {error}; until another command comes the old map stays as it is")
+        writers, last_beat = self._writers(), time.monotonic()
+        for event in follow(plan.log, known, stop=plan.stop):
+            if event is not None and event.key == COMMAND_KEY:
+                return True
+            if time.monotonic() - last_beat > HEARTBEAT_S:
+                last_beat = time.monotonic()
+                for writer in writers:
+                    writer.write_heartbeat()
+        return False
 
     def _follow(self, reader: LogReader, folded: LiveFold | None) -> bool:
         """Fold and write what comes; False when a command came that needs a refold.

@@ -5,13 +5,15 @@ without forgotten keyframes, without dropped detections, with the corrected pose
 """
 
 import math
+import shlex
 from collections.abc import Sequence
 from typing import NamedTuple
 
 from eventsrc.envelope import MAX_POSITION_M, DetId, Offset
 from eventsrc.ingest import Accepted
+from eventsrc.text import visible
 from projections.corrections import Corrections
-from projections.errors import FoldError
+from projections.errors import ImpossibleCommand
 from projections.exact import Units
 
 
@@ -37,7 +39,7 @@ def edit_event(
 ) -> EditedEvent | None:
     """The corrected event; None if it is left out. ``units`` runs parallel to the detections.
 
-    Raises FoldError for a pose that a correction moves out of the map.
+    Raises ImpossibleCommand for a pose that a correction moves out of the map.
     """
     envelope, dropped = accepted.envelope, corrections.dropped
     if corrections.is_forgotten(envelope.run_id, envelope.keyframe_id):
@@ -63,11 +65,21 @@ def _with_pose(corrections: Corrections, offset: Offset, accepted: Accepted) -> 
     if pose is None or pose == (envelope.map_x, envelope.map_y, envelope.map_yaw):
         return accepted
     x, y, yaw = pose
-    if not (abs(x) <= MAX_POSITION_M and abs(y) <= MAX_POSITION_M and math.isfinite(yaw)):
-        raise FoldError(
+    if not is_in_bounds(pose):
+        by = corrections.pose_command(envelope, is_in_bounds)
+        command_id = visible(by.command.command_id)
+        raise ImpossibleCommand(
             offset,
-            f"correct-poses moves keyframe {envelope.keyframe_id} of run {envelope.run_id!r} to "
-            f"x={x!r}, y={y!r}, yaw={yaw!r}, beyond ±{MAX_POSITION_M:,.0f} m; undo that command",
+            f"correct-poses {command_id} at offset {by.offset} moves keyframe "
+            f"{envelope.keyframe_id} of run {envelope.run_id!r} to x={x!r}, y={y!r}, yaw={yaw!r}, "
+            f"beyond ±{MAX_POSITION_M:,.0f} m; take it back: "
+            f"mapfold edit LOG undo {shlex.quote(command_id)} --reason …",
         )
     moved = envelope.model_copy(update={"map_x": x, "map_y": y, "map_yaw": yaw})
     return Accepted(moved, accepted.det_ids, accepted.vectors)
+
+
+def is_in_bounds(pose: tuple[float, float, float]) -> bool:
+    """Whether a map has room for a pose."""
+    x, y, yaw = pose
+    return abs(x) <= MAX_POSITION_M and abs(y) <= MAX_POSITION_M and math.isfinite(yaw)

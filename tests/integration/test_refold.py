@@ -11,6 +11,7 @@ from typing import Any
 import psycopg
 import pytest
 
+from eventsrc import commands
 from eventsrc.commands import Command, UseSettings
 from eventsrc.envelope import Offset
 from eventsrc.log import LogReader
@@ -20,7 +21,7 @@ from projections.database.check import check
 from projections.database.connection import Targets
 from projections.database.statements import statements
 from projections.database.status import SinkStatus, projection_status
-from projections.errors import DatabaseError, FoldError, ProjectionMismatch
+from projections.errors import DatabaseError, FoldError, ImpossibleCommand, ProjectionMismatch
 from projections.model.digest import map_digest
 from projections.model.fold import fold_log
 from projections.model.log_commands import read_corrections
@@ -341,6 +342,62 @@ def test_a_command_that_cannot_be_read_stops_the_tail_and_changes_nothing(
         with pytest.raises(FoldError, match="event at offset 120 cannot be folded"):
             refused(log, one_database, SETTINGS)  # type: ignore[operator]
     assert all_rows(one_database) == before
+
+
+def beyond_the_map(run_id: str) -> Command:
+    """As a raw sender can give it; `mapfold edit` refuses it."""
+    return command(
+        commands.CorrectPoses,
+        run_id=run_id,
+        transform=commands.RigidTransform(cos=1.0, sin=0.0, dx=1e7, dy=1e7, dyaw=0.0),
+    )
+
+
+def test_a_command_that_no_fold_can_obey_leaves_the_old_map(log: Path, targets: Targets) -> None:
+    tail(log, targets, SETTINGS, once=True)
+    before = all_rows(targets)
+    bad = beyond_the_map("run-c")
+    at = append_command(log, bad)
+    says = (
+        rf"offset \d+ .*{bad.command_id} at offset {at} .*edit LOG undo {bad.command_id} --reason"
+    )
+    with pytest.raises(ImpossibleCommand, match=says):
+        tail(log, targets, SETTINGS, once=True)
+    assert all_rows(targets) == before
+    status = projection_status(log, targets, SETTINGS)
+    assert [(s.refold_done, s.dead_letters) for s in status.sinks] == [(None, ())] * 2
+    append_command(log, undo(bad))
+    assert tail(log, targets, SETTINGS, once=True).parked == []
+    assert all_rows(targets) == before
+
+
+def test_a_live_tail_tries_an_impossible_command_again_when_another_comes(
+    log: Path, targets: Targets, third_database: Targets
+) -> None:
+    notes: list[str] = []
+    noted = threading.Semaphore(0)
+
+    def note(text: str) -> None:
+        notes.append(text)
+        noted.release()
+
+    with tailing(log, targets, note=note) as (progress, running):
+        assert progress.wait(Offset(LOG_LENGTH), WAIT_S)
+        before = all_rows(targets)
+        bad = beyond_the_map("run-c")
+        append_command(log, bad)
+        assert noted.acquire(timeout=WAIT_S)
+        write_log(log, walk(4, seed=6, run_id="run-e"))
+        assert all_rows(targets) == before
+        append_command(log, forget_run("run-b"))
+        assert noted.acquire(timeout=WAIT_S)
+        assert all_rows(targets) == before
+        at = append_command(log, undo(bad))
+        assert progress.wait(Offset(at + 1), WAIT_S)
+    assert len(notes) == 2
+    assert bad.command_id in notes[0]
+    assert (running.result().refolds, running.result().parked) == (1, [])
+    assert all_rows(targets) == fresh_rows(log, third_database)
 
 
 def test_a_stopped_refold_leaves_the_old_map(

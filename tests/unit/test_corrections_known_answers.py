@@ -20,7 +20,7 @@ from eventsrc.commands import (
 from eventsrc.envelope import Offset
 from projections.corrections import Corrections, RecordedCommand, compile_corrections
 from projections.deltas import Link, MergeRefused, ObjectsMerged, PlacesMerged
-from projections.errors import FoldError
+from projections.errors import ImpossibleCommand
 from projections.model.changes import ChangeTracker
 from projections.reducers.landmarks import object_id
 from projections.settings import Settings
@@ -204,8 +204,14 @@ def test_a_pose_moved_out_of_the_map_is_an_error_that_changes_nothing() -> None:
     away = CorrectPoses(
         command_id="m", run_id="run-a", transform=RigidTransform.of(1e7, 0.0, 0.0), **HEAD
     )
-    folded = under(away)
-    with pytest.raises(FoldError, match=r"correct-poses moves keyframe 0 of run 'run-a'"):
+    back = CorrectPoses(
+        command_id="b", run_id="run-a", transform=RigidTransform.of(0.0, 2.0, 0.0), **HEAD
+    )
+    folded = under(back, away, back.model_copy(update={"command_id": "again"}))
+    says = (
+        r"correct-poses m at offset \d+ moves keyframe 0 of run 'run-a'.*edit LOG undo m --reason"
+    )
+    with pytest.raises(ImpossibleCommand, match=says):
         folded.extend([envelope(0, 1.0, 0.0)])
     assert folded.map.next_offset == 0
     assert len(folded.map.folded_ids.offsets) == 0
