@@ -26,6 +26,9 @@ from .envelope import INT64, TEXT, DetId, KeyframeId, Offset, Position, RunId, T
 MAX_REASON = 2_000
 MAX_NAMED = 100_000
 """Keyframes or det_ids in one command."""
+MAX_YAW_RAD = 10_000.0
+"""Bound of a corrected yaw and of a turn: a larger one is no angle but a mistake."""
+_MAX_ROTATION_ERROR = 1e-9
 MAX_COMMAND_BYTES = 16 * 1024 * 1024
 MAX_JSON_VALUES = 2_000_000
 """Bound of the values in a command, counted as commas and opening brackets."""
@@ -136,6 +139,15 @@ class ForgetKeyframes(_Command):
     first: Annotated[KeyframeId, INT64]
     last: Annotated[KeyframeId, INT64]
 
+    @model_validator(mode="after")
+    def _check_range(self) -> "ForgetKeyframes":
+        if self.last < self.first:
+            raise ValueError("first must not be more than last")
+        return self
+
+
+Yaw: TypeAlias = Annotated[float, Field(ge=-MAX_YAW_RAD, le=MAX_YAW_RAD)]
+
 
 class CorrectedPose(_Model):
     """A keyframe's corrected pose: metres and radians in the map frame."""
@@ -143,7 +155,7 @@ class CorrectedPose(_Model):
     keyframe_id: Annotated[KeyframeId, INT64]
     x: Position
     y: Position
-    yaw: float
+    yaw: Yaw
 
 
 class RigidTransform(_Model):
@@ -155,9 +167,18 @@ class RigidTransform(_Model):
 
     dx: Position
     dy: Position
-    dyaw: float
+    dyaw: Yaw
     cos: Annotated[float, Field(ge=-1.0, le=1.0)]
     sin: Annotated[float, Field(ge=-1.0, le=1.0)]
+
+    @model_validator(mode="after")
+    def _check_rotation(self) -> "RigidTransform":
+        cos, sin, most = self.cos, self.sin, _MAX_ROTATION_ERROR
+        if abs(cos * cos + sin * sin - 1.0) > most:
+            raise ValueError("cos² + sin² must be 1")
+        if abs(cos - math.cos(self.dyaw)) > most or abs(sin - math.sin(self.dyaw)) > most:
+            raise ValueError("cos and sin must be those of dyaw")
+        return self
 
     @classmethod
     def of(cls, dx: float, dy: float, dyaw: float) -> "RigidTransform":
@@ -180,6 +201,8 @@ class CorrectPoses(_Command):
     def _check_one(self) -> "CorrectPoses":
         if bool(self.poses) == (self.transform is not None):
             raise ValueError("give either poses or a transform")
+        if self.first is not None and self.last is not None and self.last < self.first:
+            raise ValueError("first must not be more than last")
         return self
 
 

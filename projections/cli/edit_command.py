@@ -18,8 +18,9 @@ from eventsrc.log import LogReader
 from eventsrc.text import visible
 from eventsrc.transport.session import open_session
 from projections.corrections import Corrections
-from projections.edit.effect import Change, EffectCache
+from projections.edit.effect import EffectCache
 from projections.edit.make import Stamp
+from projections.edit.outcome import void_text
 from projections.edit.record import Made, MakeCommand, make_command, record_command
 from projections.history.rendering import difference_text
 from projections.settings import Settings
@@ -166,8 +167,9 @@ def _edit(log: Path, make_: MakeCommand, common: _Common) -> None:
 
 def _show(made: Made, common: _Common) -> None:
     """Print what a command would change."""
-    change = Change.by(made.current, made.command)
-    difference, effect = change.difference(), change.effect()
+    difference = made.outcome.change.difference()
+    effect = made.outcome.effect or made.outcome.change.effect()
+    _say_void(made)
     if common.json:
         emit(
             {
@@ -189,28 +191,37 @@ def _show(made: Made, common: _Common) -> None:
 
 def _report(made: Made, common: _Common) -> None:
     """Print where a command is, and what it changed in the map it was made from."""
-    if made.offset is None:
-        raise AssertionError("a command that was recorded has an offset")
-    with LogReader(made.current.reader.path) as reader:
-        made.current.reader = reader
-        change = Change.by(made.current, made.command)
-        effect = change.effect()
-        if made.offset == made.current.end:
-            EffectCache(made.current).put(change, effect)
+    outcome = made.outcome
+    effect = outcome.effect
+    if effect is not None and made.offset == made.current.end:
+        EffectCache(made.current).put(outcome.change, effect)
+    _say_void(made)
     if common.json:
-        emit(
-            {
-                "offset": made.offset,
-                "command_id": made.command.command_id,
-                "repeated": made.repeated,
-                "effect": effect.document(),
-            }
-        )
+        document = {
+            "offset": made.offset,
+            "command_id": made.command.command_id,
+            "repeated": made.repeated,
+            "effect": None if effect is None else effect.document(),
+        }
+        if effect is None:
+            document["effect_unknown"] = outcome.unknown
+        emit(document)
         return
     when = "was recorded before" if made.repeated else "recorded"
-    changes = "changes nothing in the map as it is" if effect.none else f"changes {effect}"
+    if effect is None:
+        changes = f"its effect is not known: {visible(outcome.unknown)}"
+    elif effect.none:
+        changes = "changes nothing in the map as it is"
+    else:
+        changes = f"changes {effect}"
     command_id = visible(made.command.command_id)
     display(f"{made.command.kind} {when} at offset {made.offset}, command {command_id}; {changes}")
+
+
+def _say_void(made: Made) -> None:
+    """Say which commands have no effect any more."""
+    for recorded, why in made.outcome.void:
+        say(void_text(recorded, why))
 
 
 def _user() -> str:

@@ -4,7 +4,13 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-from eventsrc.commands import MAX_COMMAND_BYTES, CorrectPoses, RigidTransform, encode_command
+from eventsrc.commands import (
+    MAX_COMMAND_BYTES,
+    MAX_YAW_RAD,
+    CorrectPoses,
+    RigidTransform,
+    encode_command,
+)
 from eventsrc.envelope import MAX_POSITION_M, KeyframeId
 from eventsrc.errors import MisuseError
 from eventsrc.text import counted
@@ -65,9 +71,13 @@ def by_transform(
     current: CurrentMap, stamp: Stamp, run_id: str, span: Span, dx: float, dy: float, dyaw: float
 ) -> CorrectPoses:
     """One rigid transform of the keyframes of a run."""
-    for name, value in (("--dx", dx), ("--dy", dy), ("--dyaw", dyaw)):
-        if not math.isfinite(value) or abs(value) > MAX_POSITION_M:
-            raise MisuseError(f"{name} {value}: not between ±{MAX_POSITION_M:,.0f}")
+    for name, value, most in (
+        ("--dx", dx, MAX_POSITION_M),
+        ("--dy", dy, MAX_POSITION_M),
+        ("--dyaw", dyaw, MAX_YAW_RAD),
+    ):
+        if not math.isfinite(value) or abs(value) > most:
+            raise MisuseError(f"{name} {value}: not between ±{most:,.0f}")
     if not (dx or dy or dyaw):
         raise MisuseError("--dx, --dy and --dyaw are all 0: nothing would move")
     _keyframes(current, run_id, span)

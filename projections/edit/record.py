@@ -23,6 +23,7 @@ from projections.model.log_commands import read_commands
 from .conflicts import EditRefused
 from .current import CurrentMap, SettingsOf
 from .make import Stamp
+from .outcome import Outcome, outcome_of
 from .usable import check_command
 
 MakeCommand = Callable[[CurrentMap, Stamp], Command]
@@ -37,11 +38,12 @@ class _LogFree(Exception):
 
 
 class Made(NamedTuple):
-    """A command and the map that it was made from; ``offset`` is None if it is not recorded,
-    ``repeated`` if it was recorded by an earlier call."""
+    """A command, the map that it was made from, and what comes of it; ``offset`` is None if it is
+    not recorded, ``repeated`` if it was recorded by an earlier call."""
 
     command: Command
     current: CurrentMap
+    outcome: Outcome
     offset: Offset | None
     repeated: bool = False
 
@@ -53,8 +55,9 @@ def make_command(
     settings_of: SettingsOf,
     note: Callable[[str], None],
 ) -> Made:
-    """Make a command and record nothing. One that is in the log already is made as it was made
-    then. Raises MisuseError, also if the log has another command of this id."""
+    """Make a command, fold the log with it, and record nothing. One that is in the log already is
+    made as it was made then. Raises MisuseError, also if the log has another command of this id or
+    cannot be folded with this one."""
     current = CurrentMap(reader, settings_of, note=note)
     known = current.find_command(stamp.command_id)
     if known is not None:
@@ -66,7 +69,9 @@ def make_command(
             f"--command-id {visible(stamp.command_id)} is that of another command, at offset "
             f"{known.offset} (see `mapfold edits`); give another or none"
         )
-    return Made(command, current, known.offset if known else None, repeated=known is not None)
+    outcome = outcome_of(current, command, recorded=known is not None)
+    offset = known.offset if known else None
+    return Made(command, current, outcome, offset, repeated=known is not None)
 
 
 def record_command(
