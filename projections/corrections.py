@@ -15,7 +15,9 @@ had always been known, but only from the offset where it was recorded.
 """
 
 import hashlib
-from collections.abc import Callable, Iterable
+import heapq
+import math
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, TypeAlias
 
 import msgspec
@@ -171,22 +173,18 @@ class Corrections(msgspec.Struct, frozen=True, eq=False):
         return [i for i, det_id in enumerate(accepted.det_ids) if det_id not in dropped]
 
     def _canonical(self) -> list[object]:
+        # In the order of the commands, for two anchors may come to be in one place.
+        newest = {name.anchor: name for name in self.names}
         return [
             sorted(self.forgotten_runs),
             sorted(self.forgotten_ranges.items()),
             sorted(self.dropped),
-            [
-                (
-                    run,
-                    [(sorted(c.poses.items()), _numbers(c.transform), c.first, c.last) for c in cs],
-                )
-                for run, cs in sorted(self.poses.items())
-            ],
+            [(run, _normal_order(cs)) for run, cs in sorted(self.poses.items())],
             sorted(self.apart),
             sorted(self.joined),
             sorted(self.different),
             sorted(self.same),
-            sorted((n.anchor, n.name, n.offset) for n in self.names),
+            [(n.anchor, n.name) for n in self.names if newest[n.anchor] is n],
         ]
 
 
@@ -287,11 +285,66 @@ def _pose_correction(command: CorrectPoses) -> PoseCorrection:
     return PoseCorrection(poses, command.transform, command.first, command.last)
 
 
+def _normal_order(corrections: Sequence[PoseCorrection]) -> list[object]:
+    """One run's corrections, in an order that is the same for all orders with equal results.
+
+    Two that have no keyframe in common can change places. So of those that need not come after one
+    that is left, the one with the smallest row is next.
+    """
+    reaches = [_reach(correction) for correction in corrections]
+    heads = {n: (_row(correction), n) for n, correction in enumerate(corrections)}
+    after: dict[int, list[int]] = {n: [] for n in heads}
+    waits = dict.fromkeys(heads, 0)
+    for n, (low, high) in enumerate(reaches):
+        for earlier, (first, last) in enumerate(reaches[:n]):
+            if first <= high and low <= last:
+                bounds = max(low, first), min(high, last)
+                if _overlap(corrections[earlier], corrections[n], *bounds):
+                    after[earlier].append(n)
+                    waits[n] += 1
+    ready = [heads[n] for n in heads if not waits[n]]
+    heapq.heapify(ready)
+    ordered = list[object]()
+    while ready:
+        row, n = heapq.heappop(ready)
+        ordered.append(row)
+        for later in after[n]:
+            waits[later] -= 1
+            if not waits[later]:
+                heapq.heappush(ready, heads[later])
+    return ordered
+
+
+def _row(correction: PoseCorrection) -> tuple[object, ...]:
+    """All of a correction, in values that have an order. An empty tuple stands for none."""
+    bounds = [() if bound is None else (bound,) for bound in (correction.first, correction.last)]
+    return sorted(correction.poses.items()), _numbers(correction.transform), *bounds
+
+
+def _reach(correction: PoseCorrection) -> tuple[float, float]:
+    """The smallest and the greatest keyframe that a correction can change."""
+    if correction.transform is None:
+        return min(correction.poses), max(correction.poses)
+    first, last = correction.first, correction.last
+    return -math.inf if first is None else first, math.inf if last is None else last
+
+
+def _overlap(one: PoseCorrection, other: PoseCorrection, low: float, high: float) -> bool:
+    """Whether two corrections have a keyframe in common, of those from ``low`` to ``high``, which
+    both reach."""
+    if low > high:
+        return False
+    sets = sorted((c.poses for c in (one, other) if c.transform is None), key=len)
+    if len(sets) == 2:
+        return not sets[0].keys().isdisjoint(sets[1])
+    return not sets or any(low <= keyframe <= high for keyframe in sets[0])
+
+
 def _pairs(anchors: tuple[Anchor, ...]) -> list[tuple[Keyframe, Keyframe]]:
     """Every two different anchors, the smaller one first."""
     keyframes = sorted({_keyframe(anchor) for anchor in anchors})
     return [(a, b) for i, a in enumerate(keyframes) for b in keyframes[i + 1 :]]
 
 
-def _numbers(transform: RigidTransform | None) -> tuple[float, ...] | None:
-    return None if transform is None else tuple(transform.model_dump().values())
+def _numbers(transform: RigidTransform | None) -> tuple[float, ...]:
+    return () if transform is None else tuple(transform.model_dump().values())

@@ -26,6 +26,7 @@ from eventsrc.commands import (
 from eventsrc.envelope import DetId, KeyframeId, Offset, RunId
 from projections.corrections import (
     NO_CORRECTIONS,
+    Corrections,
     Keyframe,
     RecordedCommand,
     compile_corrections,
@@ -144,9 +145,93 @@ def test_any_commands_and_their_undos_are_no_corrections(commands: list[Command]
     assert (corrections.fingerprint(), corrections.settings, corrections.in_force) == ("", None, ())
 
 
-@given(st.permutations([EVERY[n] for n in (0, 1, 4, 5, 8)]))
+def shifted(
+    number: int, first: int | None, last: int | None, dx: float = 1.0, dyaw: float = 0.0
+) -> CorrectPoses:
+    transform = RigidTransform.of(dx, 0.0, dyaw)
+    low, high = (None if k is None else KeyframeId(k) for k in (first, last))
+    return CorrectPoses(
+        **head(number), run_id=RunId("r"), transform=transform, first=low, last=high
+    )
+
+
+INDEPENDENT = [EVERY[n] for n in (0, 1, 4, 5, 6, 8)] + [
+    shifted(20, 2, 5),
+    shifted(21, 6, None, dyaw=0.5),
+]
+
+
+@given(st.permutations(INDEPENDENT))
 def test_the_order_of_independent_commands_does_not_matter(commands: list[Command]) -> None:
-    # Names carry the offset of their command, so it is kept here.
-    events = [RecordedCommand(Offset(EVERY.index(command)), command) for command in commands]
-    expected = compile_corrections([RecordedCommand(Offset(n), EVERY[n]) for n in (0, 1, 4, 5, 8)])
-    assert compile_corrections(events).fingerprint() == expected.fingerprint()
+    expected = compile_corrections(recorded(*INDEPENDENT)).fingerprint()
+    assert compile_corrections(recorded(*commands)).fingerprint() == expected
+
+
+def test_the_order_of_names_and_of_overlapping_corrections_matters() -> None:
+    """Two anchors may come to be in one place, where the newer name counts."""
+    kitchen, hall = EVERY[0], NamePlace(**head(1), place=B, name="hall")
+    moved, turned = shifted(2, 1, 5), shifted(3, 5, 9, dyaw=0.5)
+    fixed = EVERY[6]
+    for one, other in ((kitchen, hall), (moved, turned), (fixed, moved)):
+        forth, back = recorded(one, other), recorded(other, one)
+        assert compile_corrections(forth).fingerprint() != compile_corrections(back).fingerprint()
+
+
+def test_a_replaced_name_of_the_same_anchor_is_not_in_the_fingerprint() -> None:
+    older, newer = EVERY[0], NamePlace(**head(1), place=A, name="hall")
+    both, one = recorded(older, newer), recorded(newer)
+    assert compile_corrections(both).fingerprint() == compile_corrections(one).fingerprint()
+
+
+KEYFRAMES = st.integers(0, 5)
+
+
+@st.composite
+def pose_corrections(draw: st.DrawFn, number: int) -> CorrectPoses:
+    if draw(st.booleans()):
+        bounds = st.none() | KEYFRAMES
+        dx, dyaw = draw(st.sampled_from([(1.0, 0.0), (0.0, 0.5), (2.0, 1.0)]))
+        return shifted(number, draw(bounds), draw(bounds), dx, dyaw)
+    found = draw(st.sets(KEYFRAMES, min_size=1, max_size=3))
+    poses = tuple(
+        CorrectedPose(keyframe_id=KeyframeId(k), x=float(number), y=0.0, yaw=0.0)
+        for k in sorted(found)
+    )
+    return CorrectPoses(**head(number), run_id=RunId("r"), poses=poses)
+
+
+def touched(correction: CorrectPoses) -> set[int]:
+    """The keyframes from -1 to 6 that a correction can change."""
+    if correction.transform is None:
+        return {pose.keyframe_id for pose in correction.poses}
+    first = -1 if correction.first is None else correction.first
+    last = 6 if correction.last is None else correction.last
+    return set(range(first, last + 1))
+
+
+def by_keyframe(corrections: list[CorrectPoses]) -> list[list[str]]:
+    """Which corrections apply to each keyframe, in order: what a normal order must keep."""
+    return [[c.command_id for c in corrections if k in touched(c)] for k in range(-1, 7)]
+
+
+@given(st.data())
+def test_pose_corrections_have_one_fingerprint_if_each_keyframe_sees_one_order(
+    data: st.DataObject,
+) -> None:
+    given_corrections = [
+        data.draw(pose_corrections(n)) for n in range(data.draw(st.integers(2, 5)))
+    ]
+    other = data.draw(st.permutations(given_corrections))
+    one, two = (compile_corrections(recorded(*c)) for c in (given_corrections, other))
+    if by_keyframe(given_corrections) == by_keyframe(other):
+        assert one.fingerprint() == two.fingerprint()
+    if one.fingerprint() == two.fingerprint():
+        for k in range(-1, 7):
+            assert applied(one, k) == applied(two, k)
+
+
+def applied(corrections: Corrections, keyframe: int) -> tuple[float, float, float]:
+    pose = (1.0, 2.0, 3.0)
+    for correction in corrections.poses[RunId("r")]:
+        pose = correction.apply(KeyframeId(keyframe), pose)
+    return pose
