@@ -66,7 +66,7 @@ def place_commands(
     entries = [
         teller.entry(recorded, text)
         for recorded in history.corrections.in_force
-        for text in _place_texts(history, recorded, place, moment)
+        for text in _place_texts(history, recorded, place, moment, end)
     ]
     refused = (r for r in history.refusals if r.cause.offset < end and place in (r.a, r.b))
     return [*entries, *(_refusal_entry(history, refusal, place) for refusal in refused)]
@@ -79,31 +79,65 @@ def _last_moment(record: PlaceHistory, end: Offset) -> Offset:
 
 
 def _place_texts(
-    history: History, recorded: RecordedCommand, place: PlaceOrdinal, end: Offset
+    history: History, recorded: RecordedCommand, place: PlaceOrdinal, moment: Offset, end: Offset
 ) -> Iterator[str]:
-    """What a command says about a place as it is after ``end`` events."""
+    """What a command says about a place as it is after ``moment`` events, of ``end`` in all."""
     command = recorded.command
     match command:
-        case NamePlace() if _place_of(history, command.place, end) == place:
-            replaced = history.places[place].name(end) != command.name
+        case NamePlace() if _place_of(history, command.place, moment) == place:
+            replaced = history.places[place].name(moment) != command.name
             yield f'named "{command.name}"' + (" until a later name," if replaced else "")
         case KeepApart() | UndoMerge():
-            own, others = _divided(history, command.places, place, end)
+            own, others = _divided(history, command.places, place, moment)
             if own:
-                replaced = not _some_pair(own, others, history.corrections.apart)
-                yield f"kept apart from {_named(history, others, end)}" + (
-                    " until a later join," if replaced else ""
-                )
+                yield _apart_text(history, own, others, moment)
         case Join():
-            own, others = _divided(history, command.places, place, end)
+            own, others = _divided(history, command.places, place, moment)
             if own:
-                pair = " and ".join(f"{a.run_id}:{a.keyframe_id}" for a in command.places)
-                replaced = not _some_pair(own, [*own, *others], history.corrections.joined)
-                yield f"joined {pair}" + (" until a later keep-apart," if replaced else "")
+                yield _join_text(history, command, end)
         case CorrectPoses():
-            moved = _moved(history, command, place, end)
+            moved = _moved(history, command, place, moment)
             if moved:
                 yield f"{counted(moved, 'keyframe')} of it moved"
+
+
+def _apart_text(
+    history: History, own: Sequence[Anchor], others: Sequence[Anchor], end: Offset
+) -> str:
+    """What a command that keeps anchors apart does, where ``own`` are in one place."""
+    if others:
+        text = f"kept apart from {_named(history, others, end)}"
+        if not _some_pair(own, others, history.corrections.apart):
+            return f"{text} until a later join,"
+        if all(_place_of(history, anchor, end) is None for anchor in others):
+            return f"{text}, without effect here as that is in no place,"
+        return text
+    text = f"{_both(own)} kept apart"
+    if len(set(own)) < 2:
+        return f"{text}, without effect as they are one keyframe,"
+    if not _some_pair(own, own, history.corrections.apart):
+        return f"{text} until a later join,"
+    return f"{text}, without effect here as no command divides a cell of core points,"
+
+
+def _join_text(history: History, command: Join, end: Offset) -> str:
+    """What a join of anchors does, as things are after ``end`` events."""
+    one, other = command.places
+    text = f"joined {_both(command.places)}"
+    if one == other:
+        return f"{text}, without effect as they are one keyframe,"
+    if not _some_pair([one], [other], history.corrections.joined):
+        return f"{text} until a later keep-apart,"
+    places = {_place_of(history, anchor, end) for anchor in command.places}
+    if None in places:
+        return f"{text}, without effect here as one of them is in no place,"
+    if len(places) > 1:
+        return f"{text}, without effect here as their places are kept apart,"
+    return text
+
+
+def _both(anchors: Sequence[Anchor]) -> str:
+    return " and ".join(f"{anchor.run_id}:{anchor.keyframe_id}" for anchor in anchors)
 
 
 def object_commands(teller: CommandTeller, history: History, det_ids: Iterable[str]) -> list[Entry]:
@@ -196,7 +230,7 @@ def _named(history: History, anchors: Sequence[Anchor], end: Offset) -> str:
         else place_name(history, place)
         for anchor in anchors
     )
-    return ", ".join(dict.fromkeys(named)) or "itself"
+    return ", ".join(dict.fromkeys(named))
 
 
 def _moved(history: History, command: CorrectPoses, place: PlaceOrdinal, end: Offset) -> int:

@@ -314,7 +314,7 @@ class ConstrainedPlaces(Places):
         group = self._group(point)
         for other in sorted(p for p, inside in self._inside.items() if group in inside):
             place = self.survivors.find(entered)
-            if other in (place, *self.survivors.absorbed_by):
+            if other == place or other in self.survivors.absorbed_by:
                 continue
             pair = point, self._point_of(self._inside[other][group])
             apart = self._apart(self._inside[place], self._inside[other])

@@ -189,9 +189,10 @@ KEYFRAMES = st.integers(0, 5)
 @st.composite
 def pose_corrections(draw: st.DrawFn, number: int) -> CorrectPoses:
     if draw(st.booleans()):
-        bounds = st.none() | KEYFRAMES
+        low, high = sorted((draw(KEYFRAMES), draw(KEYFRAMES)))
+        first, last = draw(st.sampled_from([None, low])), draw(st.sampled_from([None, high]))
         dx, dyaw = draw(st.sampled_from([(1.0, 0.0), (0.0, 0.5), (2.0, 1.0)]))
-        return shifted(number, draw(bounds), draw(bounds), dx, dyaw)
+        return shifted(number, first, last, dx, dyaw)
     found = draw(st.sets(KEYFRAMES, min_size=1, max_size=3))
     poses = tuple(
         CorrectedPose(keyframe_id=KeyframeId(k), x=float(number), y=0.0, yaw=0.0)

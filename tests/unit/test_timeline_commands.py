@@ -165,8 +165,55 @@ def test_a_later_command_on_the_same_two_counts(corridor: Open) -> None:
     apart = KeepApart(command_id="c5", places=(FIRST, THIRD), **SAID)
     timeline = corridor(apart, Join(command_id="c6", places=(FIRST, THIRD), **SAID))
     texts = [e.text for e in timeline.why("run-a_p0").entries]
-    assert f"kept apart from itself until a later join, by keep-apart c5 {BY}" in texts
+    assert f"run-a:2 and run-a:11 kept apart until a later join, by keep-apart c5 {BY}" in texts
     assert f"joined run-a:2 and run-a:11 by join c6 {BY}" in texts
+
+
+def texts_of(timeline: Timeline, place: str) -> list[str]:
+    """What `why` says of the commands about a place, less who gave them."""
+    entries = [e for e in timeline.why(place).entries if e.what in ("keep-apart", "join")]
+    return [e.text.removesuffix(f" {BY}") for e in entries]
+
+
+IN_NO_PLACE = anchor("run-a", 7)
+
+
+def test_why_says_that_a_command_on_a_keyframe_in_no_place_has_no_effect(corridor: Open) -> None:
+    apart = KeepApart(command_id="c5", places=(FIRST, IN_NO_PLACE), **SAID)
+    nowhere = "without effect here as that is in no place"
+    assert texts_of(corridor(apart), "run-a_p0") == [
+        f"kept apart from run-a:7, {nowhere}, by keep-apart c5"
+    ]
+
+
+def test_why_says_that_a_join_with_a_keyframe_in_no_place_has_no_effect(corridor: Open) -> None:
+    join = Join(command_id="c5", places=(FIRST, IN_NO_PLACE), **SAID)
+    nowhere = "without effect here as one of them is in no place"
+    assert texts_of(corridor(join), "run-a_p0") == [
+        f"joined run-a:2 and run-a:7, {nowhere}, by join c5"
+    ]
+
+
+def test_why_says_that_two_keyframes_in_one_cell_are_not_kept_apart(tmp_path: Path) -> None:
+    pair = anchor("run-a", 1), anchor("run-a", 2)
+    apart = KeepApart(command_id="c5", places=pair, **SAID)
+    log = write_mixed_log(tmp_path / "close", [*(envelope(k, 0.1 * k) for k in range(4)), apart])
+    undivided = "without effect here as no command divides a cell of core points"
+    with Timeline(log, RULES) as timeline:
+        assert len(timeline.at(5).places) == 1
+        assert texts_of(timeline, "run-a_p0") == [
+            f"run-a:1 and run-a:2 kept apart, {undivided}, by keep-apart c5"
+        ]
+
+
+def test_why_says_that_a_join_of_places_that_are_kept_apart_has_no_effect(corridor: Open) -> None:
+    """They are kept apart by other keyframes than those joined."""
+    apart = KeepApart(command_id="c5", places=(anchor("run-a", 1), anchor("run-a", 10)), **SAID)
+    refused = "without effect here as their places are kept apart"
+    assert texts_of(corridor(apart, JOIN), "run-a_p2") == [
+        "kept apart from run-a_p0 by keep-apart c5",
+        f"joined run-a:2 and run-a:11, {refused}, by join c2",
+    ]
 
 
 def test_names_of_places(corridor: Open) -> None:
