@@ -146,13 +146,13 @@ def _document(report: TailReport) -> dict[str, Any]:
 
 
 def _print(report: TailReport) -> None:
-    say(
-        f"{counted(report.events, 'event')} written in {report.batches:,}"
-        f" {'batch' if report.batches == 1 else 'batches'}; the databases are at offset"
-        f" {report.next_offset:,}"
-    )
+    done = []
     if report.refolds:
-        say(f"made the map anew {counted(report.refolds, 'time')} because of commands")
+        done.append(f"map made anew {counted(report.refolds, 'time')} because of commands")
+    if report.batches or not report.refolds:
+        batches = "batch" if report.batches == 1 else "batches"
+        done.append(f"{counted(report.events, 'event')} written in {report.batches:,} {batches}")
+    say(f"{'; '.join(done)}; the databases are at offset {report.next_offset:,}")
     for letter in report.parked:
         say(f"parked: offset {letter.offset:,}: {letter.reason}")
 

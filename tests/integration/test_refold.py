@@ -26,6 +26,7 @@ from projections.model.digest import map_digest
 from projections.model.fold import fold_log
 from projections.model.log_commands import read_corrections
 from projections.settings import Settings
+from tests.commands import Commands
 from tests.commands_in_logs import (
     append_command,
     command,
@@ -398,6 +399,22 @@ def test_a_live_tail_tries_an_impossible_command_again_when_another_comes(
     assert bad.command_id in notes[0]
     assert (running.result().refolds, running.result().parked) == (1, [])
     assert all_rows(targets) == fresh_rows(log, third_database)
+
+
+def test_the_command_line_tells_of_a_refold(
+    log: Path, tmp_path: Path, one_database: Targets
+) -> None:
+    mapfold = Commands.in_folder(tmp_path)
+
+    def told() -> str:
+        return mapfold("tail", log, "--once", "--db", one_database.graph_url).err
+
+    assert "120 events written in 1 batch; the databases are at offset 120" in told()
+    append_command(log, forget_run("run-b"))
+    after = told()
+    assert "map made anew 1 time because of commands; the databases are at offset 121" in after
+    assert "events written" not in after
+    assert "0 events written in 0 batches; the databases are at offset 121" in told()
 
 
 def test_a_stopped_refold_leaves_the_old_map(
