@@ -17,6 +17,7 @@ from pydantic import (
     Field,
     TypeAdapter,
     ValidationError,
+    field_validator,
     model_validator,
 )
 from pydantic_core import from_json
@@ -28,7 +29,11 @@ MAX_NAMED = 100_000
 """Keyframes or det_ids in one command."""
 MAX_YAW_RAD = 10_000.0
 """Bound of a corrected yaw and of a turn: a larger one is no angle but a mistake."""
+_MOST_SHOWN = 80
 _MAX_ROTATION_ERROR = 1e-9
+_BIDI_CONTROLS = frozenset(
+    "\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"
+)
 MAX_COMMAND_BYTES = 16 * 1024 * 1024
 MAX_JSON_VALUES = 2_000_000
 """Bound of the values in a command, counted as commas and opening brackets."""
@@ -72,6 +77,15 @@ class NamePlace(_Command):
     kind: Literal["name-place"] = "name-place"
     place: Anchor
     name: Text
+
+    @field_validator("name")
+    @classmethod
+    def _check_name(cls, name: str) -> str:
+        if not name.strip():
+            raise ValueError("a name must not be blank")
+        if not _BIDI_CONTROLS.isdisjoint(name):
+            raise ValueError("a name must not have characters that change the direction of text")
+        return name
 
 
 class KeepApart(_Command):
@@ -243,6 +257,14 @@ class InvalidCommand(ValueError):
     """A payload that is no command; the message names the field, its value and the rule."""
 
 
+class UnknownKind(InvalidCommand):
+    """A command of a kind that is not among `KINDS`."""
+
+    def __init__(self, kind: str) -> None:
+        shown = kind if len(kind) <= _MOST_SHOWN else f"{kind[:_MOST_SHOWN]}…"
+        super().__init__(f"it is a command of kind {shown!r}, which this version does not know")
+
+
 def parse_command(payload: bytes) -> Command:
     """A command from its JSON. Raises InvalidCommand."""
     if len(payload) > MAX_COMMAND_BYTES:
@@ -253,6 +275,8 @@ def parse_command(payload: bytes) -> Command:
         return _ADAPTER.validate_json(payload)
     except ValidationError as error:
         first = error.errors()[0]
+        if first["type"] == "union_tag_invalid":
+            raise UnknownKind(str(first["ctx"]["tag"])) from None
         field = ".".join(map(str, first["loc"])) or "the command"
         raise InvalidCommand(f"{field}: {describe_error(first)}") from None
 

@@ -12,6 +12,7 @@ set while the robot drove). Stamps far from the log time are none: runs are impo
 robots have clocks of their own.
 """
 
+import hashlib
 from array import array
 from bisect import bisect_left
 from collections import defaultdict
@@ -22,7 +23,7 @@ from typing import Literal, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from eventsrc.commands import InvalidCommand, parse_command
+from eventsrc.commands import InvalidCommand, encode_command, parse_command
 from eventsrc.envelope import ENVELOPE_VERSION, KeyframeId, Offset, RunId
 from eventsrc.gaps import Gap, GapLedger, gap_of
 from eventsrc.ingest import Accepted
@@ -34,6 +35,7 @@ from eventsrc.system_events import (
     RejectedPayload,
     is_system_key,
 )
+from eventsrc.text import visible
 from eventsrc.upcast import read_envelope
 
 from .event import Event
@@ -180,6 +182,7 @@ class EventFindings:
         self._seen: dict[RunId, set[KeyframeId]] = {}
         self._stamps = RunStamps()
         self._gaps = ReportedGaps()
+        self._commands: dict[str, tuple[Offset, bytes]] = {}
         self._logged_ns = 0
 
     def check(self, event: Event) -> None:
@@ -198,9 +201,19 @@ class EventFindings:
 
     def _check_command(self, event: Event) -> None:
         try:
-            parse_command(event.payload)
+            command = parse_command(event.payload)
         except InvalidCommand as error:
             what = f"{event.key} event cannot be read: {error}"
+            self._add("schema", what, event.offset, what)
+            return
+        digest = hashlib.sha256(encode_command(command)).digest()
+        command_id = command.command_id
+        first, known = self._commands.setdefault(command_id, (event.offset, digest))
+        if known != digest:
+            what = (
+                f"command {visible(command_id)} has the id of another one, at offset {first}, and "
+                "does not count"
+            )
             self._add("schema", what, event.offset, what)
 
     def _check_loss(self, event: Event) -> None:

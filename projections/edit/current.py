@@ -1,6 +1,7 @@
 """The map of a log as it is now, with its corrections, and what is called what in it."""
 
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 
 from eventsrc.envelope import FIRST_OFFSET, DetId, KeyframeId, Offset, RunId
@@ -31,7 +32,8 @@ class CurrentMap:
     """A log, the commands in it, and the map that it is folded to under ``settings_of`` these.
 
     With ``until`` it is the log as of its first ``until`` events. ``note`` is told of snapshots
-    that could not be used.
+    that could not be used. ``commands`` are those before ``until`` and ``corrections`` what they
+    compile to, where the caller has them.
     """
 
     def __init__(
@@ -40,13 +42,17 @@ class CurrentMap:
         settings_of: SettingsOf,
         *,
         until: Offset | None = None,
+        commands: Sequence[RecordedCommand] | None = None,
+        corrections: Corrections | None = None,
         note: Callable[[str], None] = lambda _: None,
     ) -> None:
         self.reader = reader
         self.settings_of = settings_of
         self.end = reader.next_offset if until is None else until
-        self.commands = read_commands(reader, self.end)
-        self.corrections = compile_corrections(self.commands)
+        self.commands = read_commands(reader, self.end) if commands is None else commands
+        if corrections is None:
+            corrections = compile_corrections(self.commands)
+        self.corrections = corrections
         self.settings = settings_of(self.corrections)
         self._note = note
         self._view: MapView | None = None
@@ -129,8 +135,9 @@ class CurrentMap:
         return Keyframe(record.run_id, record.keyframe_id)
 
     def find_place(self, text: str) -> Keyframe:
-        """The keyframe that stands for a place: of a place id, also of an absorbed one, that which
-        founded it; of ``run:keyframe``, for the place that it is in, this keyframe.
+        """The keyframe that stands for a place: of a place id, also of an absorbed one, or of a
+        place's name, that which founded it; of ``run:keyframe`` this keyframe, for the place that
+        it is in.
 
         Raises NoSuchThing, or MisuseError for a keyframe in no place.
         """
@@ -140,6 +147,8 @@ class CurrentMap:
                 return self.founder(place.ordinal)
         run_id, colon, number = text.rpartition(":")
         if not colon or all(run.run_id != run_id for run in view.runs):
+            if (named := self._named(text)) is not None:
+                return self.founder(named)
             raise NoSuchThing("place", text, (p.place_id for p in view.all_places))
         keyframe = _keyframe(run_id, number)
         if keyframe is None or keyframe not in self.keyframes:
@@ -152,6 +161,14 @@ class CurrentMap:
                 "one (`mapfold state LOG` lists the places)"
             )
         return keyframe
+
+    def _named(self, name: str) -> PlaceOrdinal | None:
+        """The place that is called so; None if none is. Raises MisuseError if several are."""
+        named = [place for place in self.view.places.values() if place.name == name]
+        if len(named) > 1:
+            ids = ", ".join(place.place_id for place in named)
+            raise MisuseError(f"{len(named)} places are called {name!r}: {ids}; give an id")
+        return named[0].ordinal if named else None
 
     def place_name(self, keyframe: Keyframe) -> str:
         """The id of the place that a keyframe is in now, or ``no place``."""
@@ -188,8 +205,10 @@ class CurrentMap:
         return NoSuchThing("observation", text, self.observations)
 
 
+_NUMBER = re.compile(r"-?[0-9]{1,19}")
+
+
 def _keyframe(run_id: str, number: str) -> Keyframe | None:
-    try:
-        return Keyframe(RunId(run_id), KeyframeId(int(number)))
-    except ValueError:
+    if _NUMBER.fullmatch(number) is None:
         return None
+    return Keyframe(RunId(run_id), KeyframeId(int(number)))

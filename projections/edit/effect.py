@@ -4,7 +4,6 @@ import contextlib
 import json
 import os
 from collections.abc import Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 from eventsrc.commands import Command
@@ -172,15 +171,22 @@ def effects_of(
     With ``known_only`` nothing is folded, and effects not in the cache are None.
     """
     cache = EffectCache(current)
-    at = partial(CurrentMap, current.reader, current.settings_of)
+    corrections = compile_corrections(())
     found: list[tuple[RecordedCommand, Effect | None]] = []
     before: MapView | None = None
     follows = Offset(-1)
-    for recorded in current.commands:
-        then = at(until=recorded.offset)
+    for number, recorded in enumerate(current.commands):
+        then = CurrentMap(
+            current.reader,
+            current.settings_of,
+            until=recorded.offset,
+            commands=current.commands[:number],
+            corrections=corrections,
+        )
         if before is not None and recorded.offset == follows:
             then.set_view(before)  # only commands in between, which change nothing by themselves
         change = Change.by(then, recorded.command)
+        corrections = change.corrections
         effect = cache.get(change)
         before = None
         if effect is None and not known_only:

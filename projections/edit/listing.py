@@ -81,10 +81,13 @@ def edits_text(found: Found, times: Mapping[Offset, int]) -> str:
     if not found:
         return "no command in this log; `mapfold edit LOG` gives one\n"
     undone = undone_by([recorded for recorded, _ in found])
+    first_of = _first_offsets(found)
     rows = []
     for (offset, command), effect in found:
         by = undone.get(command.command_id)
         state = "" if by is None else f"undone by {visible(by.command.command_id)}"
+        if (first := first_of[command.command_id]) != offset:
+            state = f"not counted: its id is that of {first}"
         rows.append(
             [
                 str(offset),
@@ -105,7 +108,9 @@ def edits_text(found: Found, times: Mapping[Offset, int]) -> str:
 
 
 def edits_document(found: Found, times: Mapping[Offset, int]) -> list[dict[str, Any]]:
-    """JSON: an object for each command, in order of offset."""
+    """JSON: an object for each command, in order of offset. One whose command_id an earlier one has
+    does not count, and has that one's offset as ``repeats``."""
+    first_of = _first_offsets(found)
     undone = undone_by([recorded for recorded, _ in found])
     return [
         {
@@ -114,6 +119,7 @@ def edits_document(found: Found, times: Mapping[Offset, int]) -> list[dict[str, 
             "what": what(recorded.command),
             "effect": None if effect is None else effect.document(),
             "undone_by": _id_of(undone.get(recorded.command.command_id)),
+            **_repeats(first_of[recorded.command.command_id], recorded.offset),
         }
         for recorded, effect in found
     ]
@@ -121,3 +127,15 @@ def edits_document(found: Found, times: Mapping[Offset, int]) -> list[dict[str, 
 
 def _id_of(recorded: RecordedCommand | None) -> str | None:
     return None if recorded is None else recorded.command.command_id
+
+
+def _first_offsets(found: Found) -> dict[str, Offset]:
+    """Of each command_id the offset of the command that counts."""
+    first: dict[str, Offset] = {}
+    for recorded, _ in found:
+        first.setdefault(recorded.command.command_id, recorded.offset)
+    return first
+
+
+def _repeats(first: Offset, offset: Offset) -> dict[str, Offset]:
+    return {} if first == offset else {"repeats": first}

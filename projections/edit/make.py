@@ -6,6 +6,7 @@ command stands in the way, or when the map would stay as it is.
 """
 
 import re
+import unicodedata
 from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeVar
 
@@ -76,6 +77,12 @@ def name_place(current: CurrentMap, stamp: Stamp, place: str, name: str) -> Name
     """The place is called ``name``."""
     anchor = current.find_place(place)
     number = current.place_of(anchor)
+    if any(unicodedata.category(character) == "Cf" for character in name):
+        raise MisuseError(
+            f"name '{visible(name)}' has invisible characters (category Cf); leave them out"
+        )
+    if any(known.place_id == name for known in current.view.all_places):
+        raise MisuseError(f"{name!r} is the id of a place; give another name")
     if number is not None and current.view.all_places[number].name == name:
         raise EditRefused(f"{current.place_name(anchor)} is called {name!r} already")
     return build(NamePlace, stamp, place=_anchor(anchor), name=name)
@@ -178,7 +185,7 @@ def forget_run(current: CurrentMap, stamp: Stamp, run_id: str) -> ForgetRun:
     return build(ForgetRun, stamp, run_id=run_id)
 
 
-_RANGE = re.compile(r"(-?\d{1,19})\.\.(-?\d{1,19})")
+_RANGE = re.compile(r"(-?[0-9]{1,19})\.\.(-?[0-9]{1,19})")
 
 
 def forget_keyframes(current: CurrentMap, stamp: Stamp, run_id: str, span: str) -> ForgetKeyframes:
@@ -229,9 +236,15 @@ def undo(current: CurrentMap, stamp: Stamp, command_id: str) -> Undo:
 
 def undone_by(commands: Sequence[RecordedCommand]) -> dict[str, RecordedCommand]:
     """The commands that are undone, by id, and the undo in force that does it."""
+    by_id: dict[str, RecordedCommand] = {}
+    for recorded in commands:
+        by_id.setdefault(recorded.command.command_id, recorded)
     undone: dict[str, RecordedCommand] = {}
-    for recorded in reversed(commands):
+    later: set[str] = set()
+    for recorded in reversed(by_id.values()):
         command = recorded.command
-        if isinstance(command, Undo) and command.command_id not in undone:
+        later.add(command.command_id)
+        in_force = command.command_id not in undone
+        if isinstance(command, Undo) and in_force and command.undone not in later:
             undone.setdefault(command.undone, recorded)
     return undone

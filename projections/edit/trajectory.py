@@ -299,6 +299,8 @@ def _number(name: str, value: object) -> float:
 
 
 def _converted(kind: type[int] | type[float], value: float | str) -> float | None:
+    if isinstance(value, str) and ("_" in value or not value.strip().isascii()):
+        return None  # Python reads 1_000 and other scripts' digits, other programs do not
     try:
         return kind(value)
     except (ValueError, OverflowError):

@@ -5,7 +5,7 @@ on ``mapfold/command`` that is no command is an error that names its offset: lea
 give another map than its author asked for.
 """
 
-from eventsrc.commands import InvalidCommand, UseSettings, parse_command
+from eventsrc.commands import InvalidCommand, UnknownKind, UseSettings, parse_command
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.log import Event, LogReader
 from eventsrc.system_events import COMMAND_KEY
@@ -20,12 +20,22 @@ def read_command(event: Event) -> RecordedCommand:
         command = parse_command(event.payload)
         if isinstance(command, UseSettings):
             Settings.from_document(command.settings)
+    except UnknownKind as error:
+        raise FoldError(
+            event.offset,
+            f"{error}; update mapfold, or look at the map before it: {_before(event.offset)}",
+        ) from None
     except (InvalidCommand, SettingsError) as error:
         raise FoldError(
             event.offset,
-            f"it is on {COMMAND_KEY}, but no command that this version knows: {error}",
+            f"it is on {COMMAND_KEY}, but no command that this version knows: {error}; update "
+            f"mapfold, or look at the map before it: {_before(event.offset)}",
         ) from None
     return RecordedCommand(event.offset, command)
+
+
+def _before(offset: Offset) -> str:
+    return f"`mapfold state LOG --at {offset}`"
 
 
 def read_commands(reader: LogReader, until: Offset | None = None) -> list[RecordedCommand]:

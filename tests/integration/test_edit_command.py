@@ -178,7 +178,7 @@ def test_control_characters_in_a_reason_are_kept_and_printed_as_escapes(
     mapfold: Commands,
 ) -> None:
     reason = "bell \x07 \x1b]0;title\x07 \u202e\nforged line"
-    mapfold("edit", "log", "name-place", LEFT, "\u202ellah", "--reason", reason)
+    mapfold("edit", "log", "name-place", LEFT, "hall", "--reason", reason)
     for args in (("edits", "log"), ("edits", "log", "--json"), ("edits", "log", "--effects")):
         said = mapfold(*args).out
         assert all(c.isprintable() or c == "\n" for c in said)

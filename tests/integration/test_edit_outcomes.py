@@ -6,8 +6,16 @@ from typing import Any
 
 import pytest
 
-from eventsrc.commands import CorrectPoses, InvalidCommand, RigidTransform, parse_command
+from eventsrc.commands import (
+    CorrectPoses,
+    InvalidCommand,
+    RigidTransform,
+    Undo,
+    parse_command,
+)
 from eventsrc.envelope import KeyframeId, RunId
+from eventsrc.log import LogWriter
+from eventsrc.system_events import COMMAND_KEY
 from tests.commands import Commands
 from tests.corrected_logs import EVENTS, FAR, LEFT, RIGHT, append, write_rooms
 from tests.fixtures_log import read_log
@@ -113,3 +121,69 @@ def test_a_range_that_ends_before_it_begins_is_no_command() -> None:
     assert parse_command(json.dumps(document | {"last": 2}).encode())
     with pytest.raises(InvalidCommand, match="first must not be more than last"):
         parse_command(json.dumps(document | {"last": 1}).encode())
+
+
+def test_a_place_is_named_by_its_name_unless_two_have_it(mapfold: Commands) -> None:
+    mapfold("edit", "log", "name-place", LEFT, "hall", *WHY)
+    said = mapfold("edit", "log", "join", "hall", FAR, "--dry-run", "--json").json
+    assert said["command"]["places"][0] == {"run_id": "run-a", "keyframe_id": 0}
+    mapfold("edit", "log", "name-place", FAR, "hall", *WHY)
+    said = mapfold("edit", "log", "join", "hall", FAR, *WHY, code=2)
+    assert f"2 places are called 'hall': {LEFT}, {FAR}; give an id" in said.err
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("  ", "blank"),
+        ("a\u202eb", "(category Cf)"),
+        ("a\u200bb", "(category Cf)"),
+        (RIGHT, "is the id of a place"),
+    ],
+)
+def test_names_that_cannot_be_told_apart_are_refused(
+    mapfold: Commands, name: str, says: str
+) -> None:
+    assert says in mapfold("edit", "log", "name-place", LEFT, name, *WHY, code=2).err
+
+
+@pytest.mark.parametrize("span", ["1..\u0663", "1_0..2_0"])
+def test_numbers_are_ascii_digits(mapfold: Commands, span: str) -> None:
+    said = mapfold("edit", "log", "forget-keyframes", "run-a", span, *WHY, code=2)
+    assert "is no range of keyframes" in said.err
+    said = mapfold("edit", "log", "join", "run-a:\u0661", FAR, *WHY, code=2)
+    assert "no keyframe" in said.err
+
+
+def test_a_second_command_of_an_id_is_marked_and_found_by_verify(mapfold: Commands) -> None:
+    log = mapfold.folder / "log"
+    mapfold("edit", "log", "forget-run", "run-b", *WHY, "--command-id", "c")
+    assert mapfold("log", "verify", "log").code == 0
+    _append_unobeyable(log)
+    first = read_log(log)[EVENTS]
+    with LogWriter(log) as writer:
+        writer.append(COMMAND_KEY, first.payload)
+        writer.append(COMMAND_KEY, first.payload.replace(b"run-b", b"run-a"))
+    said = mapfold("log", "verify", "log", code=None)
+    assert f"has the id of another one, at offset {EVENTS}" in said.out + said.err
+    found = mapfold("edits", "log", "--json").json
+    assert [each.get("repeats") for each in found] == [None, None, EVENTS, EVENTS]
+    assert f"not counted: its id is that of {EVENTS}" in mapfold("edits", "log").out
+
+
+def test_an_undo_before_its_command_undoes_nothing(mapfold: Commands) -> None:
+    append(mapfold.folder / "log", Undo(command_id="u", issued_by="raw", undone="c"))
+    mapfold("edit", "log", "forget-run", "run-b", *WHY, "--command-id", "c")
+    assert [e["undone_by"] for e in mapfold("edits", "log", "--json").json] == [None, None]
+    mapfold("edit", "log", "undo", "c", *WHY, "--command-id", "v")
+    assert [e["undone_by"] for e in mapfold("edits", "log", "--json").json] == [None, "v", None]
+
+
+def test_a_command_of_an_unknown_kind_is_named_with_a_next_step(mapfold: Commands) -> None:
+    digest = mapfold("state", "log", "--digest").out
+    with LogWriter(mapfold.folder / "log") as writer:
+        writer.append(COMMAND_KEY, b'{"kind": "zz"}')
+    said = mapfold("state", "log", code=1).err
+    assert "it is a command of kind 'zz', which this version does not know; update mapfold" in said
+    assert f"`mapfold state LOG --at {EVENTS}`" in said
+    assert mapfold("state", "log", "--at", str(EVENTS), "--digest").out == digest

@@ -79,7 +79,7 @@ def test_a_command_is_read_as_it_was_written(command: Command) -> None:
     [
         (b"{", "Invalid JSON"),
         (b"{}", "Unable to extract tag"),
-        (b'{"kind":"sing"}', "does not match any of the expected tags"),
+        (b'{"kind":"sing"}', "which this version does not know"),
         (b'{"kind":"forget-run","command_id":"c","issued_by":"a","run_id":""}', "is empty"),
         (b'{"kind":"forget-run","command_id":"c","issued_by":"a","run_id":"r","x":1}', "x: Extra"),
         (b'{"kind":"correct-poses","command_id":"c","issued_by":"a","run_id":"r"}', "either poses"),
