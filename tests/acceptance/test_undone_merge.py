@@ -36,7 +36,7 @@ def places_in_age(mapfold: Commands) -> set[str]:
     return {json.loads(properties)["place_id"] for (properties,) in rows}
 
 
-@pytest.mark.parametrize("name", ["sample", "house-a"])
+@pytest.mark.parametrize("name", ["sample", pytest.param("house-a", marks=pytest.mark.slow)])
 def test_an_undone_merge_is_two_places_after_every_rebuild_and_one_again_after_undo(
     tmp_path: Path, name: str
 ) -> None:

@@ -24,6 +24,7 @@ from projections.model.log_commands import read_corrections
 from projections.model.view import MapView
 from projections.settings import Settings
 from tests.corrected_logs import EVENTS, FAR, LEFT, RIGHT, append, make, write_rooms
+from tests.thorough import examples
 
 PLACES = st.sampled_from([LEFT, RIGHT, FAR, "run-a:3", "run-a:12", "run-b:4", "run-a:24"])
 OBJECTS = st.sampled_from(
@@ -79,7 +80,7 @@ def _map_of_robots_events(log: Path) -> str:
         )
 
 
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 @given(edits=st.lists(EDITS, min_size=1, max_size=6), data=st.data())
 def test_undone_in_any_order_they_leave_nothing(
     edits: list[tuple[Callable[..., Command], tuple[Any, ...]]],

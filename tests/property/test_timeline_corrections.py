@@ -24,10 +24,13 @@ from projections.model.log_commands import read_commands, read_corrections
 from projections.model.view import MapView
 from projections.settings import Settings
 from tests.fixtures_corrections import anchor, corrected_walks, write_mixed_log
+from tests.thorough import examples
 
 RULES = Settings(eps_m=0.7, min_samples=3, fusion_radius_m=1.0)
 Items = list[dict[str, Any] | Command]
-slow = settings(deadline=None, max_examples=100, suppress_health_check=[HealthCheck.too_slow])
+slow = settings(
+    deadline=None, max_examples=examples(100), suppress_health_check=[HealthCheck.too_slow]
+)
 
 
 def chosen(corrections: Corrections) -> Settings:
@@ -116,7 +119,7 @@ def test_a_difference_applied_to_the_first_map_gives_the_second(
         assert [c.offset for c in diff.commands] == ([] if known_at is not None else between)
 
 
-@settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.too_slow])
+@settings(deadline=None, max_examples=examples(60), suppress_health_check=[HealthCheck.too_slow])
 @given(corrected_walks(most=20), st.sampled_from(["kitchen", "hall"]), st.data())
 def test_a_name_is_found_by_the_fold_that_has_it_first(
     items: Items, name: str, data: st.DataObject
@@ -160,7 +163,7 @@ def groups(view: MapView) -> tuple[set[Any], set[Any]]:
     )
 
 
-@settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.too_slow])
+@settings(deadline=None, max_examples=examples(60), suppress_health_check=[HealthCheck.too_slow])
 @given(corrected_walks(most=20), st.data())
 def test_whatif_without_a_command_equals_a_fold_without_it(
     items: Items, data: st.DataObject
