@@ -271,6 +271,15 @@ def compile_corrections(commands: Iterable[RecordedCommand]) -> Corrections:
     )
 
 
+def check_settings(command: Command) -> None:
+    """Raises SettingsError if a ``use-settings`` has settings that no fold could have.
+
+    Checked before a command is recorded: in the log it would stop every fold.
+    """
+    if isinstance(command, UseSettings):
+        Settings.from_document(command.settings)
+
+
 def _keyframe(anchor: Anchor) -> Keyframe:
     return Keyframe(anchor.run_id, anchor.keyframe_id)
 

@@ -19,7 +19,7 @@ from eventsrc.recorder.edit_requests import Edits, KnownCommands
 from eventsrc.recorder.edits import EDIT_PREFIX, edit_key
 from eventsrc.transport.config import parse_address
 from eventsrc.transport.session import check_keys, open_session
-from projections.edit.usable import check_command
+from projections.corrections import check_settings
 
 from .options import ConfigOption, ConnectOption, JsonOption, ListenOption, zenoh_options
 from .recorder_text import EVERY_S, RecorderSummary, say_restart, show_status
@@ -141,7 +141,7 @@ def _edits(log: Path, writer: LogWriter) -> Edits:
     except LogDamaged as error:
         say(f"recording without edits: {error}")
         known = str(error)
-    return Edits(writer, known, check_command)
+    return Edits(writer, known, check_settings)
 
 
 @contextmanager

@@ -148,7 +148,7 @@ def _document(report: TailReport) -> dict[str, Any]:
 def _print(report: TailReport) -> None:
     done = []
     if report.refolds:
-        done.append(f"map made anew {counted(report.refolds, 'time')} because of commands")
+        done.append(f"refolded {counted(report.refolds, 'time')} because of commands")
     if report.batches or not report.refolds:
         batches = "batch" if report.batches == 1 else "batches"
         done.append(f"{counted(report.events, 'event')} written in {report.batches:,} {batches}")

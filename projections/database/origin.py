@@ -45,7 +45,7 @@ def command_for(name: str, log: Path, inputs: MapInputs, *options: str) -> str:
 
 def replay_advice(log: Path, inputs: MapInputs) -> str:
     """What to do about a projection that does not match the log, the settings or corrections."""
-    return f"to make the map anew run: {command_for('replay', log, inputs)}"
+    return f"to rebuild the map run: {command_for('replay', log, inputs)}"
 
 
 def _settings_differences(before: str, settings: Settings) -> list[str]:

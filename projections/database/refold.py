@@ -1,4 +1,4 @@
-"""Refold: a tail makes the map anew under other corrections while readers use the old one.
+"""Refold: a tail folds the log again under other corrections while readers use the old map.
 
 It is a rebuild (`shadows`) over the tail's own connections and locks, with three differences. It
 goes on until it has all events that came meanwhile. An event that cannot be folded is parked, as a
@@ -67,7 +67,7 @@ class Refold:
     _looked_at: float = 0.0
 
     def run(self) -> FoldedLog:
-        """Make the map anew and swap it in.
+        """Fold the log again and swap the new map in.
 
         Raises CommandsCame, RefoldStopped, ImpossibleCommand.
         """

@@ -114,7 +114,7 @@ class Shadow(Protocol[Conn]):
 
 
 class RebuildSink(Protocol[Conn]):
-    """A sink that can be made anew while readers use the old rows."""
+    """A sink that can be rebuilt while readers use the old rows."""
 
     def drop_leftovers(self, connection: Conn) -> None:
         """Drop what an earlier rebuild replaced or left. Raises DatabaseError like `ensure`."""

@@ -1,7 +1,7 @@
 """State of the databases compared with a log: lag, writer, dead letters, versions.
 
 A sink is *following* while a live tail writes it, with every event or still catching up; *stalled*
-when its tail has had no heartbeat for ``STALLED_S``; *refolding* while its tail makes the map anew
+when its tail has had no heartbeat for ``STALLED_S``; *refolding* while its tail folds the log again
 because of a command; *rebuilding* while a replay writes it. Without a writer it is *idle* when it
 has every event and *behind* when not. It is *other* when it was made from another log, with other
 settings or under other corrections than the commands that it knows.

@@ -13,7 +13,7 @@ same transaction that moves past it. Parked events are left out at every later s
 the rows remain what the fold says, until a rebuild tries them again.
 
 A command changes how earlier events are folded. One that only names places is applied at once, in
-the transaction that moves past it. Another one ends the following: a `refold` makes the map anew,
+the transaction that moves past it. Another one ends the following: a `refold` folds the log again,
 and following goes on from there. At the start of a pass the checkpoints tell which commands the map
 knows, so none is lost. Where a command moves a keyframe out of the map, the refold ends, the old
 map stays as it is, without what comes later, and the tail waits for another command.

@@ -28,7 +28,7 @@ def tail_numbers(progress: TailProgress, log: Path) -> Iterator[MetricValue]:
         "mapfold_tail_batches", "Transactions committed.", progress.batches, counter=True
     )
     yield MetricValue("mapfold_tail_parked", "Events left out.", progress.parked, counter=True)
-    yield MetricValue("mapfold_tail_restarts", "Folds begun anew.", progress.restarts, counter=True)
+    yield MetricValue("mapfold_tail_restarts", "Folds restarted.", progress.restarts, counter=True)
     yield MetricValue("mapfold_tail_troubles", "Failed attempts.", progress.failures, counter=True)
     yield MetricValue("mapfold_tail_next_offset", "Events in the databases.", progress.next_offset)
     yield MetricValue("mapfold_tail_log_next_offset", "Events in the log.", end)

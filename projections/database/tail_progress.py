@@ -12,7 +12,7 @@ from .checkpoints import DeadLetter
 @dataclass(slots=True)
 class TailReport:
     """What a tail did so far: batches and events written, its offset, what it parked, and how
-    often it made the map anew because of commands."""
+    often it refolded the log because of commands."""
 
     next_offset: Offset = FIRST_OFFSET
     events: int = 0

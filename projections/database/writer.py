@@ -2,7 +2,7 @@
 
 Rows and checkpoint move in one transaction, the checkpoint by compare-and-set. When a transaction
 fails because the server or the connection did, it is unknown whether it was committed. So the batch
-is kept, the connection is made anew (with growing pauses), and the checkpoint is read:
+is kept, it connects again (with growing pauses), and the checkpoint is read:
 
 * it is where the batch begins: the batch was not committed; write it again
 * it is where the batch ends: it was committed, only the answer was lost; go on

@@ -1,6 +1,6 @@
 """Two corrections as a person gives them: a merge of two rooms is undone, and one gets its name.
 
-They are recorded as ``mapfold edit`` records them, and the databases are made anew under them.
+They are recorded as ``mapfold edit`` records them, and the databases are rebuilt under them.
 """
 
 import time

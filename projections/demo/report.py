@@ -54,7 +54,7 @@ def tell_replay(replayed: RebuildReport, folded: Folded, same_rows: bool) -> Ite
     edges = sum(replayed.rows[label] for label in EDGE_LABELS)
     rows = "the same rows as" if same_rows else "OTHER rows than"
     yield (
-        f"   all made anew from the log in {replayed.total_s:.2f} s: "
+        f"   rebuilt from the log in {replayed.total_s:.2f} s: "
         f"{counted(nodes, 'node')}, {counted(edges, 'edge')}, "
         f"{counted(replayed.rows[TABLE], 'vector')};"
     )
@@ -120,7 +120,7 @@ def tell_corrected(corrected: Corrected) -> Iterator[str]:
         )
     digest = "the same digest as" if corrected.same_digest else "ANOTHER digest than"
     yield (
-        f"   made anew from the log in {corrected.replayed.total_s:.2f} s, {digest} a fold "
+        f"   rebuilt from the log in {corrected.replayed.total_s:.2f} s, {digest} a fold "
         f"without databases: {corrected.folded.digest[:8]}…"
     )
 

@@ -18,13 +18,13 @@ from eventsrc.recorder.edits import NewerCommand, NoAnswer, send_command
 from eventsrc.system_events import COMMAND_KEY
 from eventsrc.text import visible
 from eventsrc.transport.session import Session
+from projections.corrections import check_settings
 from projections.model.log_commands import read_commands
 
 from .conflicts import EditRefused
 from .current import CurrentMap, SettingsOf
 from .make import Stamp
 from .outcome import Outcome, outcome_of
-from .usable import check_command
 
 MakeCommand = Callable[[CurrentMap, Stamp], Command]
 """Makes the command from the map as it is. Raises MisuseError."""
@@ -63,7 +63,7 @@ def make_command(
     if known is not None:
         current = CurrentMap(reader, settings_of, until=known.offset, note=note)
     command = make(current, stamp)
-    check_command(command)
+    check_settings(command)
     if known is not None and known.command != command:
         raise EditRefused(
             f"--command-id {visible(stamp.command_id)} is that of another command, at offset "

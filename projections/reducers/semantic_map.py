@@ -180,7 +180,7 @@ class SemanticMap:
         In everything else ``corrections`` must be those of the map: ValueError if they are not.
         """
         if not corrections.differs_in_names_only(self.corrections):
-            raise ValueError("these corrections differ in more than names; fold the log anew")
+            raise ValueError("these corrections differ in more than names; fold the log again")
         older, self.names = self.names, PlaceNames(corrections.names)
         self.corrections = corrections
         self._anchors = self._all_anchors()

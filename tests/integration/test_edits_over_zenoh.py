@@ -35,7 +35,7 @@ from eventsrc.recorder.edits import (
 from eventsrc.recorder.queue import MessageQueue
 from eventsrc.system_events import COMMAND_KEY, REJECTED_KEY, RejectedPayload
 from eventsrc.transport.session import Received, Session
-from projections.edit.usable import check_command
+from projections.corrections import check_settings
 from tests.envelopes import envelope, payload
 from tests.fixtures_zenoh import DEADLINE_S, Program
 
@@ -54,7 +54,7 @@ def recording(session: Session, log: Path, *, accept: bool = True) -> Iterator[s
     with LogWriter(log) as writer, ThreadPoolExecutor(1) as thread:
         with LogReader(log) as reader:
             known = KnownCommands.of(reader)
-        edits = Edits(writer, known, check_command) if accept else None
+        edits = Edits(writer, known, check_settings) if accept else None
         recorder = Recorder(session, writer, [KEY], edits=edits)
         done = thread.submit(recorder.run, stop)
         try:
@@ -261,7 +261,7 @@ def test_a_command_published_as_data_is_rejected_and_is_no_command(
     with LogWriter(log) as writer, ThreadPoolExecutor(1) as thread:
         known = KnownCommands()
         recorder = Recorder(
-            connected(), writer, ["**"], max_events=2, edits=Edits(writer, known, check_command)
+            connected(), writer, ["**"], max_events=2, edits=Edits(writer, known, check_settings)
         )
         done = thread.submit(recorder.run, stop)
         session = connected()
@@ -365,7 +365,7 @@ def test_settings_that_no_fold_could_have_are_no_command(tmp_path: Path) -> None
     bad = UseSettings(command_id="id", issued_by="me", settings={"eps_m": -1.0})
     query = _Query(bad)
     with LogWriter(tmp_path / "log") as writer:
-        Edits(writer, KnownCommands(), check_command).append(EditRequest(query))  # type: ignore[arg-type]
+        Edits(writer, KnownCommands(), check_settings).append(EditRequest(query))  # type: ignore[arg-type]
         assert writer.next_offset == 0
     assert "eps_m" in str(query.replies[0][1]["error"])
 

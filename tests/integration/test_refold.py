@@ -300,7 +300,7 @@ def test_status_tells_how_far_a_refold_is(
     assert [(s.condition, s.refold_done) for s in after.sinks] == [("idle", None)] * 2
 
 
-def test_a_projection_under_other_corrections_is_told_and_made_anew(
+def test_a_projection_under_other_corrections_is_reported_and_refolded(
     log: Path, one_database: Targets, pg: psycopg.Connection, third_database: Targets
 ) -> None:
     """Such as one that another version of mapfold has made of the same commands."""
@@ -412,7 +412,7 @@ def test_the_command_line_tells_of_a_refold(
     assert "120 events written in 1 batch; the databases are at offset 120" in told()
     append_command(log, forget_run("run-b"))
     after = told()
-    assert "map made anew 1 time because of commands; the databases are at offset 121" in after
+    assert "refolded 1 time because of commands; the databases are at offset 121" in after
     assert "events written" not in after
     assert "0 events written in 0 batches; the databases are at offset 121" in told()
 
