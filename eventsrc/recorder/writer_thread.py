@@ -119,7 +119,7 @@ class RecorderReport:
     more; the next start may find some of them on the disk. ``unsealed`` segments are finished and
     not sealed, with ``sealing_error`` if sealing fails: they take more disk, nothing is lost.
     ``faults`` describe segment files that were deleted, cut short or written to by others, and
-    ``lost_from_log`` counts the recorded events in them.
+    ``lost_from_log`` counts the recorded events in them. ``commands`` of `mapfold edit` are synced.
     """
 
     recorded: int
@@ -137,6 +137,7 @@ class RecorderReport:
     sealing_error: str | None = None
     lost_from_log: int = 0
     faults: tuple[str, ...] = ()
+    commands: int = 0
 
     @property
     def lost(self) -> int:
@@ -247,6 +248,7 @@ class WriterThread:
             sealing_error=None if sealing.error is None else str(sealing.error),
             lost_from_log=sum(fault.lost_events for fault in writer.faults),
             faults=tuple(map(str, writer.faults)),
+            commands=0 if self._edits is None else self._edits.recorded,
         )
 
     def _unwritten(self) -> int:

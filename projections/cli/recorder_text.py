@@ -174,9 +174,10 @@ def unwritten_text(report: RecorderReport) -> str:
 
 def summary(log: Path, report: RecorderReport) -> str:
     """The last line of a recording."""
+    commands = f"{counted(report.commands, 'command')} of mapfold edit, " if report.commands else ""
     return (
         f"{log}: {report.recorded:,} recorded, {report.rejected:,} rejected, {report.lost:,} lost, "
-        f"{counted(report.missing, 'keyframe')} missing; "
+        f"{counted(report.missing, 'keyframe')} missing; {commands}"
         f"{counted(report.next_offset, 'event')} in the log"
     )
 
@@ -189,6 +190,7 @@ def as_json(report: RecorderReport) -> dict[str, int | str | None]:
         "queue_full": report.queue_full,
         "too_large": report.too_large,
         "transport_missed": report.transport_missed,
+        "commands": report.commands,
         "unwritten": report.unwritten,
         "lost_from_log": report.lost_from_log,
         "missing": report.missing,

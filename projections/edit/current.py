@@ -54,7 +54,7 @@ class CurrentMap:
             corrections = compile_corrections(self.commands)
         self.corrections = corrections
         self.settings = settings_of(self.corrections)
-        self._note = note
+        self.note = note
         self._view: MapView | None = None
 
     @property
@@ -73,7 +73,7 @@ class CurrentMap:
     def fold(self, corrections: Corrections, settings: Settings) -> MapView:
         """The map under other corrections or settings."""
         return fold_log_cached(
-            self.reader, settings, self.end, note=self._note, corrections=corrections
+            self.reader, settings, self.end, note=self.note, corrections=corrections
         )[1]
 
     @property

@@ -128,6 +128,7 @@ class EffectCache:
     """Effects that were worked out before: ``<log>.snapshots/effects.json``, safe to delete."""
 
     def __init__(self, current: CurrentMap) -> None:
+        self._note = current.note
         log = current.reader.path
         self._log_id = current.reader.log_id
         self._path = log.with_name(f"{log.name}.snapshots") / _CACHE
@@ -138,7 +139,7 @@ class EffectCache:
         return self._effects.get(change.identity)
 
     def put(self, change: Change, effect: Effect) -> None:
-        """Keep an effect. A cache that cannot be written is left as it is."""
+        """Keep an effect. A cache that cannot be written is left as it is, with a note."""
         self._effects = {**self._read(), change.identity: effect}
         document = {"version": _VERSION, "log_id": self._log_id, "effects": self._effects}
         beside = self._path.with_suffix(f".{os.getpid()}.part")
@@ -146,8 +147,9 @@ class EffectCache:
             self._path.parent.mkdir(exist_ok=True)
             beside.write_text(json.dumps(document), "utf-8")
             beside.replace(self._path)
-        except OSError:
-            with contextlib.suppress(OSError):
+        except OSError as error:
+            self._note(f"{self._path}: no effect was kept: {error.strerror}")
+            with contextlib.suppress(OSError):  # the same disk; the note has said what is wrong
                 beside.unlink(missing_ok=True)
 
     def _read(self) -> dict[str, Effect]:

@@ -64,6 +64,8 @@ def corrections(server: EmbeddedServer, folder: Path, quick: bool) -> None:
             given = time.perf_counter()
             _give(log, NamePlace(**_who("name"), place=_anchor(0), name="kitchen"))
             while str(asking.execute(NAMES).fetchone()) == unnamed["names"]:
+                assert following.is_alive(), "the tail has ended"
+                assert time.perf_counter() - given < WAIT_S, "the name has not come"
                 time.sleep(PAUSE_S)
             named = time.perf_counter() - given
             before = readers.answers_now(asking)

@@ -379,9 +379,10 @@ def test_the_effect_is_that_of_two_whole_folds(mapfold: Commands, kind: tuple[st
     assert effect_of(*maps) == Effect(**given["effect"])
 
 
-def test_a_cache_that_cannot_be_written_fails_nothing(mapfold: Commands) -> None:
+def test_a_cache_that_cannot_be_written_is_noted_and_fails_nothing(mapfold: Commands) -> None:
     (mapfold.folder / "log.snapshots").write_text("a file where a folder should be")
-    mapfold("edit", "log", "forget-run", "run-b", *WHY)
+    done = mapfold("edit", "log", "forget-run", "run-b", *WHY)
+    assert "effects.json: no effect was kept: File exists" in done.err
     assert mapfold("edits", "log", "--json").json[0]["effect"] is None
 
 

@@ -57,6 +57,7 @@ def test_the_recorder_appends_and_the_offset_comes_back(
     assert publish("tb/detections", *sent).wait() == 0
     running.end(signal.SIGINT)
     assert running.wait() == 0
+    assert "1 command of mapfold edit, 34 events in the log" in running.lines[-1]
     undo = mapfold("edit", "log", "undo", given["command_id"], *WHY).out
     assert f"undo recorded at offset {EVENTS + 4}" in undo
     counts = mapfold("state", "log", "--json").json["counts"]

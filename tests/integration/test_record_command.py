@@ -62,6 +62,7 @@ def test_a_signal_drains_the_queue_and_exits_0(
         "next_offset": 30,
         "unsealed": 0,
         "sealing_error": None,
+        "commands": 0,
         "recovered_segments": 0,
         "recovered_events": 0,
         "torn_bytes": 0,

@@ -14,6 +14,7 @@ from projections.database.grants import roles_sql
 from projections.database.status import projection_status
 from projections.errors import DatabaseError, ExtensionMissing
 from projections.settings import Settings
+from tests.drops import wait_for_drops
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows
 
@@ -37,6 +38,7 @@ def projected(log: Path, one_database: Targets, pg: psycopg.Connection) -> Itera
     pg.execute("CREATE ROLE a_reader LOGIN IN ROLE mapfold_reader")
     pg.execute("CREATE ROLE a_writer LOGIN IN ROLE mapfold_writer")
     yield one_database
+    wait_for_drops(one_database)  # else it and DROP OWNED may each wait for the other
     for role in ROLES:
         pg.execute(f"DROP OWNED BY {role}")  # type: ignore[arg-type]
     for role in ROLES:
