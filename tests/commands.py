@@ -3,6 +3,7 @@
 import json
 import os
 import sys
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,10 +48,34 @@ class Commands:
         clean |= {"MAPFOLD_HOME": str(folder / "home"), "COLUMNS": "100", **env}
         return cls(folder, clean)
 
+    @property
+    def home(self) -> Path:
+        """The home of the embedded server."""
+        return Path(self.env["MAPFOLD_HOME"])
+
+    def start(
+        self, *args: str | Path, stdout: int | None = None, stderr: int | None = None
+    ) -> prefork.Process:
+        """Start ``mapfold *args`` with these file descriptors, or nothing, for its streams."""
+        return prefork.start(
+            prefork.MAPFOLD,
+            [str(PROGRAM), *map(str, args)],
+            env=self.env,
+            cwd=self.folder,
+            stdout=stdout,
+            stderr=stderr,
+        )
+
+    def seconds(self, *args: str | Path) -> float:
+        """How long ``mapfold *args`` takes here and now."""
+        started = time.monotonic()
+        self(*args)
+        return time.monotonic() - started
+
     def __call__(self, *args: str | Path, stdin: bytes | None = None, code: int | None = 0) -> Said:
         """Run ``mapfold *args``; with ``code`` given, anything else it exits with is a failure."""
         done = prefork.run(
-            "projections.cli:main",
+            prefork.MAPFOLD,
             [str(PROGRAM), *map(str, args)],
             env=self.env,
             cwd=self.folder,

@@ -2,10 +2,8 @@
 
 import os
 import shutil
-import tempfile
 from collections.abc import Iterator
 from itertools import count
-from pathlib import Path
 from urllib.parse import urlsplit, urlunsplit
 
 import psycopg
@@ -14,14 +12,10 @@ from psycopg import sql
 
 from projections.database.connection import Targets, connect, ensure_extension
 from projections.database.embedded import EmbeddedServer
+from tests.servers import RUN_HOME
 
 _TEMPLATE = "mapfold_test_template"
 _numbers = count()
-
-# Not pytest's own temporary folder: each new session takes its permissions back to 0700, under the
-# feet of a server that runs as another user. The workers of a run inherit the variable.
-_RUN = os.environ.setdefault("MAPFOLD_TEST_RUN", str(os.getpid()))
-_HOME = Path(tempfile.gettempdir()) / f"mapfold-test-{_RUN}"
 
 
 class OtherServer(EmbeddedServer):
@@ -47,7 +41,7 @@ def pg_server() -> Iterator[EmbeddedServer]:
     if "MAPFOLD_TEST_DB" in os.environ:
         yield OtherServer(os.environ["MAPFOLD_TEST_DB"])
         return
-    with EmbeddedServer(_HOME) as server:
+    with EmbeddedServer(RUN_HOME) as server:
         with connect(server.url, autocommit=True) as connection:
             # These tests kill the server, never the machine; without it a database is dropped fast.
             connection.execute("ALTER SYSTEM SET fsync = off")
@@ -58,7 +52,7 @@ def pg_server() -> Iterator[EmbeddedServer]:
 def pytest_sessionfinish() -> None:
     """Remove the server's folder at the end of the run, when all workers have left it."""
     if "PYTEST_XDIST_WORKER" not in os.environ:
-        shutil.rmtree(_HOME, ignore_errors=True)
+        shutil.rmtree(RUN_HOME, ignore_errors=True)
 
 
 @pytest.fixture(scope="session")

@@ -1,9 +1,8 @@
 """Real Zenoh parts: a router on a free port, sessions connected to it, programs beside the test."""
 
 import functools
+import os
 import re
-import subprocess
-import sys
 import threading
 import urllib.request
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -14,6 +13,7 @@ from typing import IO
 import pytest
 
 from eventsrc.transport.session import Router, Session, ZenohOptions, open_session
+from tests import prefork
 
 MAPFOLD = "from projections.cli import main; main()"
 PUBLISHER = """
@@ -56,37 +56,46 @@ def connected(endpoint: str) -> Iterator[Callable[[], Session]]:
 
 
 class Program:
-    """Python code in a process of its own; its stderr is read line by line."""
+    """Python code in a process of its own; its stderr is read line by line.
+
+    Without ``stdout``, a file descriptor, `output` returns what it wrote there.
+    """
 
     def __init__(
         self,
         code: str,
         arguments: Sequence[str],
         *,
-        stdout: int | IO[str] = subprocess.PIPE,
+        stdout: int | None = None,
         env: Mapping[str, str] | None = None,
         cwd: Path | None = None,
     ) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", code, *arguments],
-            stdin=subprocess.DEVNULL,
-            stdout=stdout,
-            stderr=subprocess.PIPE,
-            text=True,
-            env=env,
-            cwd=cwd,
+        output, said = (os.pipe() if stdout is None else None), os.pipe()
+        self.process = prefork.start(
+            code,
+            ["-c", *arguments],
+            env=os.environ if env is None else env,
+            cwd=cwd or Path.cwd(),
+            stdout=stdout if output is None else output[1],
+            stderr=said[1],
         )
+        os.close(said[1])
+        self._output: IO[str] | None = None
+        if output is not None:
+            os.close(output[1])
+            self._output = os.fdopen(output[0])
         self.lines: list[str] = []
         self._said = threading.Condition()
         self._ended = False
-        self._reader = threading.Thread(target=self._read, args=(self.process.stderr,), daemon=True)
+        self._reader = threading.Thread(target=self._read, args=(said[0],), daemon=True)
         self._reader.start()
 
-    def _read(self, stream: IO[str]) -> None:
-        for line in stream:
-            with self._said:
-                self.lines.append(line.rstrip("\n"))
-                self._said.notify_all()
+    def _read(self, said: int) -> None:
+        with os.fdopen(said) as stream:
+            for line in stream:
+                with self._said:
+                    self.lines.append(line.rstrip("\n"))
+                    self._said.notify_all()
         with self._said:
             self._ended = True
             self._said.notify_all()
@@ -115,16 +124,15 @@ class Program:
 
     def output(self) -> str:
         """What it wrote to stdout; call it after `wait`."""
-        assert self.process.stdout is not None
-        return self.process.stdout.read()
+        assert self._output is not None
+        return self._output.read()
 
     def close(self) -> None:
         """Make sure that nothing is left behind."""
         self.process.kill()
         self.wait()
-        for stream in (self.process.stdout, self.process.stderr):
-            if stream is not None:
-                stream.close()
+        if self._output is not None:
+            self._output.close()
 
 
 @pytest.fixture

@@ -1,6 +1,6 @@
 """Start programs by forking a process that has imported their libraries already.
 
-A command started so is a process of its own, with its own arguments, folder, environment, streams
+A program started so is a process of its own, with its own arguments, folder, environment, streams
 and exit code. Only the interpreter's start and most imports are shared, four fifths of what a short
 command costs; the modules of projections.cli are imported after the fork, because they look at the
 environment. Under scripts/test_slow each is a new program instead.
@@ -9,45 +9,144 @@ environment. Under scripts/test_slow each is a new program instead.
 import atexit
 import contextlib
 import functools
-import gc
-import importlib
 import json
 import os
 import select
+import shutil
 import signal
 import socket
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from tests.thorough import THOROUGH
 
-MODULES = (
-    "numpy.typing",
-    "concurrent.futures.thread",
-    "msgspec",
-    "pydantic.main",
-    "pydantic.type_adapter",
-    "pydantic.types",
-    "pybase64",
-    "typer",
-    "typer.testing",
-    "rich.progress",
-    "mcap.reader",
-    "mcap.writer",
-    "zstandard",
-    "psycopg",
-    "psycopg_pool",
-    "pgvector.psycopg",
-    "eventsrc.log",
-    "projections.database",
-    "projections.history",
-)
 ROOT = Path(__file__).parents[1]
-MESSAGE_BYTES = 200_000
+
+MAPFOLD = "projections.cli:main"
+
+# Does in ten milliseconds what the program does; for scripts that call `mapfold`.
+_STAND_IN = """#!{python} -IS
+import _socket, array, json, os, signal, sys
+server = _socket.socket(_socket.AF_UNIX, _socket.SOCK_SEQPACKET)
+server.connect({path!r})
+asked = dict(entry={entry!r}, argv=sys.argv, env=dict(os.environ), cwd=os.getcwd())
+request = os.memfd_create("request")
+os.pwrite(request, json.dumps(asked).encode(), 0)
+fds = array.array("i", [request, 0, 1, 2])
+server.sendmsg([b"start"], [(_socket.SOL_SOCKET, _socket.SCM_RIGHTS, fds)])
+server.recv(100)
+code = int(server.recv(100))
+if code < 0:
+    signal.signal(-code, signal.SIG_DFL)
+    os.kill(os.getpid(), -code)
+sys.exit(code)
+"""
+
+
+class Process(Protocol):
+    """What `subprocess.Popen` and `Forked` have in common and tests use."""
+
+    @property
+    def pid(self) -> int:
+        """The process id."""
+
+    returncode: Any
+
+    def poll(self) -> int | None:
+        """The exit code, None while it runs."""
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait for the exit code; raises `subprocess.TimeoutExpired`."""
+
+    def send_signal(self, sig: int) -> None:
+        """Send a signal unless it has ended."""
+
+    def kill(self) -> None:
+        """SIGKILL."""
+
+
+class Forked:
+    """A process that the server forked, with the methods of `subprocess.Popen`."""
+
+    def __init__(self, request: Mapping[str, Any], files: Sequence[int]) -> None:
+        self._answers = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._answers.connect(_server())
+        with os.fdopen(os.memfd_create("request"), "wb") as file:
+            file.write(json.dumps(request).encode())
+            file.flush()
+            socket.send_fds(self._answers, [b"start"], [file.fileno(), *files])
+        self.args = request["argv"]
+        self.pid = int(self._answers.recv(100))
+        self.returncode: int | None = None
+        self._ending = threading.Lock()
+
+    def poll(self) -> int | None:
+        """The exit code, None while it runs."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.wait(0.0)
+        return self.returncode
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait for the exit code; raises `subprocess.TimeoutExpired`."""
+        if self.returncode is None and not select.select([self._answers], [], [], timeout)[0]:
+            raise subprocess.TimeoutExpired(self.args, timeout or 0.0)
+        with self._ending:
+            if self.returncode is None:
+                self.returncode = int(self._answers.recv(100))
+                self._answers.close()
+        return self.returncode
+
+    def send_signal(self, sig: int) -> None:
+        """Send a signal unless it has ended."""
+        if self.poll() is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self.pid, sig)
+
+    def kill(self) -> None:
+        """SIGKILL."""
+        self.send_signal(signal.SIGKILL)
+
+
+def start(
+    program: str,
+    argv: Sequence[str],
+    *,
+    env: Mapping[str, str],
+    cwd: Path,
+    stdin: int | None = None,
+    stdout: int | None = None,
+    stderr: int | None = None,
+) -> Process:
+    """Start ``module:function``, or Python code (what has a space), with this ``sys.argv``.
+
+    The streams are file descriptors; without them nothing is read and what is written is lost.
+    """
+    what = "code" if " " in program else "entry"
+    with Path(os.devnull).open("r+b") as null:
+        files = [null.fileno() if fd is None else fd for fd in (stdin, stdout, stderr)]
+        if not _must_be_new(env):
+            request = {what: program, "argv": list(argv), "env": dict(env), "cwd": str(cwd)}
+            return Forked(request, files)
+        if what == "entry":
+            module, function = program.split(":")
+            code = "import sys; sys.argv = sys.argv[1:]; "
+            program = f"{code}from {module} import {function}; {function}()"
+        else:
+            argv = argv[1:]
+        path = filter(None, [env.get("PYTHONPATH"), str(ROOT)])
+        return subprocess.Popen(
+            [sys.executable, "-c", program, *argv],
+            env={**env, "PYTHONPATH": os.pathsep.join(path)},
+            cwd=cwd,
+            stdin=files[0],
+            stdout=files[1],
+            stderr=files[2],
+        )
 
 
 def run(
@@ -59,27 +158,10 @@ def run(
     stdin: bytes | None = None,
     timeout: float,
 ) -> "subprocess.CompletedProcess[bytes]":
-    """Call ``module:function`` in a process of its own with ``sys.argv`` set to ``argv``.
+    """Run a program as `start` does, to its end.
 
     Raises `subprocess.TimeoutExpired` after killing a process that takes longer than ``timeout`` s.
     """
-    interpreter = {name: env.get(name) for name in _read_at_start({**os.environ, **env})}
-    if THOROUGH or interpreter != {name: os.environ.get(name) for name in interpreter}:
-        module, function = entry.split(":")
-        code = f"import sys; sys.argv = sys.argv[1:]; from {module} import {function}; {function}()"
-        return subprocess.run(
-            [sys.executable, "-c", code, *argv],
-            env={
-                **env,
-                "PYTHONPATH": os.pathsep.join([*env.get("PYTHONPATH", "").split(), str(ROOT)]),
-            },
-            cwd=cwd,
-            input=stdin,
-            stdin=subprocess.DEVNULL if stdin is None else None,
-            capture_output=True,
-            timeout=timeout,
-            check=False,
-        )
     with (
         tempfile.TemporaryFile() as given,
         tempfile.TemporaryFile() as out,
@@ -87,122 +169,57 @@ def run(
     ):
         given.write(stdin or b"")
         given.seek(0)
-        code = _fork(
-            {"entry": entry, "argv": list(argv), "env": dict(env), "cwd": str(cwd)},
-            [given.fileno(), out.fileno(), err.fileno()],
-            timeout,
-        )
+        files = {"stdin": given.fileno(), "stdout": out.fileno(), "stderr": err.fileno()}
+        process = start(entry, argv, env=env, cwd=cwd, **files)
+        try:
+            code = process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+            raise
         out.seek(0)
         err.seek(0)
         return subprocess.CompletedProcess(list(argv), code, out.read(), err.read())
 
 
-def _read_at_start(env: Mapping[str, str]) -> list[str]:
-    """Variables that the interpreter or a library reads when it starts."""
-    return [
+def folder_with_mapfold() -> Path:
+    """A folder for PATH whose ``mapfold`` is forked; the program's own folder when thorough."""
+    if THOROUGH:
+        return Path(sys.executable).parent
+    return Path(_server()).parent
+
+
+def _must_be_new(env: Mapping[str, str]) -> bool:
+    """Whether the interpreter or a library reads at its start what is different in ``env``."""
+    names = [
         name
-        for name in env
+        for name in {**os.environ, **env}
         if name.startswith(("PYTHON", "LC_", "LANG", "OPENBLAS", "OMP_", "NPY_", "LD_"))
     ]
-
-
-def _fork(request: Mapping[str, Any], files: Sequence[int], timeout: float) -> int:
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    with ours:
-        with theirs:
-            socket.send_fds(_server(), [json.dumps(request).encode()], [*files, theirs.fileno()])
-        ours.settimeout(timeout)
-        pid = int(ours.recv(100))
-        try:
-            return int(ours.recv(100))
-        except TimeoutError as error:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
-            raise subprocess.TimeoutExpired(request["argv"], timeout) from error
+    return THOROUGH or any(env.get(name) != os.environ.get(name) for name in names)
 
 
 @functools.cache
-def _server() -> socket.socket:
-    """The connection to the process that forks, started at the first use."""
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    with theirs:
+def _server() -> str:
+    """Where the process that forks listens; it is started at the first use."""
+    folder = Path(tempfile.mkdtemp(prefix="mapfold-test-prefork-"))
+    path = str(folder / "server")
+    program = folder / "mapfold"
+    program.write_text(_STAND_IN.format(python=sys.executable, path=path, entry=MAPFOLD))
+    program.chmod(0o755)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+        listener.bind(path)
+        listener.listen(100)
         process = subprocess.Popen(
-            [sys.executable, "-m", "tests.prefork", str(theirs.fileno())],
-            pass_fds=[theirs.fileno()],
+            [sys.executable, "-m", "tests.prefork_server", str(listener.fileno())],
+            pass_fds=[listener.fileno()],
             cwd=ROOT,
-            stdin=subprocess.DEVNULL,
+            stdin=subprocess.PIPE,
         )
 
     def stop() -> None:
-        ours.close()
-        process.wait()
+        process.communicate()
+        shutil.rmtree(folder, ignore_errors=True)
 
     atexit.register(stop)
-    return ours
-
-
-def _serve(requests: socket.socket) -> None:
-    """Fork for each request until the other end closes; a child returns from here."""
-    running: dict[int, tuple[int, socket.socket]] = {}
-    while True:
-        ready, _, _ = select.select([requests, *running], [], [])
-        for pidfd in ready:
-            if pidfd in running:
-                pid, answer = running.pop(pidfd)
-                os.close(pidfd)
-                code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-                with answer, contextlib.suppress(BrokenPipeError):
-                    answer.send(str(code).encode())
-        if requests not in ready:
-            continue
-        message, fds, _, _ = socket.recv_fds(requests, MESSAGE_BYTES, 4)
-        if not message:
-            sys.exit(0)
-        pid = os.fork()
-        if pid == 0:
-            requests.close()
-            for pidfd, (_, answer) in running.items():
-                os.close(pidfd)
-                answer.close()
-            _become(json.loads(message), fds)
-            return
-        answer = socket.socket(fileno=fds.pop())
-        for fd in fds:
-            os.close(fd)
-        answer.send(str(pid).encode())
-        running[os.pidfd_open(pid)] = (pid, answer)
-
-
-def _become(request: Mapping[str, Any], fds: list[int]) -> None:
-    """Take on the folder, the environment and the streams of a request."""
-    global entry
-    main = sys.modules["__main__"]
-    main.__spec__, main.__package__ = None, ""  # so that usage texts name argv[0]
-    for number, fd in enumerate(fds[:3]):
-        os.dup2(fd, number)
-    for fd in fds:
-        os.close(fd)
-    sys.stdin = os.fdopen(0, closefd=False)
-    sys.stdout = os.fdopen(1, "w", closefd=False)
-    sys.stderr = os.fdopen(2, "w", 1, errors="backslashreplace", closefd=False)
-    os.chdir(request["cwd"])
-    os.environ.clear()
-    os.environ.update(request["env"])
-    sys.argv = request["argv"]
-    entry = request["entry"]
-
-
-entry = ""
-
-if __name__ == "__main__":
-    import pydantic
-
-    for module in MODULES:
-        importlib.import_module(module)
-    pydantic.create_model("First")  # has pydantic look for its plugins
-    gc.collect()
-    gc.freeze()
-    with socket.socket(fileno=int(sys.argv[1])) as accepted:
-        _serve(accepted)
-    module, function = entry.split(":")
-    getattr(importlib.import_module(module), function)()
+    return path

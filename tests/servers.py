@@ -1,10 +1,12 @@
-"""Database servers that a test may kill."""
+"""Database servers that a test may kill, and data folders that are copied, not made anew."""
 
 import contextlib
+import fcntl
 import os
 import select
 import shutil
 import signal
+import subprocess
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,14 +15,56 @@ import psycopg
 
 from projections.database.connection import connect, ensure_extension
 from projections.database.embedded import EmbeddedServer
+from tests.thorough import THOROUGH
 
 WAIT_S = 120.0
+
+# Not pytest's own temporary folder: each new session takes its permissions back to 0700, under the
+# feet of a server that runs as another user. The workers of a run inherit the variable.
+RUN_HOME = (
+    Path(tempfile.gettempdir())
+    / f"mapfold-test-{os.environ.setdefault('MAPFOLD_TEST_RUN', str(os.getpid()))}"
+)
+"""A folder of this test run's own, shared by its workers."""
+
+
+def furnish(home: Path, *, extensions: bool = False) -> Path:
+    """Give ``home`` the data folder that its first start would make; returns ``home``.
+
+    It is a copy of one that is made once a run, because initdb takes ten times as long. With
+    ``extensions`` it has age and vector. Its server does not wait for the disk. Under
+    scripts/test_slow the first start makes it.
+    """
+    if not THOROUGH:
+        made = _data_folder(extensions)
+        home.mkdir(parents=True, exist_ok=True)
+        subprocess.run(["cp", "-a", str(made), str(home / "pg")], check=True)
+    return home
+
+
+def _data_folder(extensions: bool) -> Path:
+    """The data folder to copy; made by the first worker that needs it."""
+    home = RUN_HOME / ("extended" if extensions else "plain")
+    home.mkdir(parents=True, exist_ok=True)
+    with (home / "made.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (home / "made").exists():
+            with EmbeddedServer(home) as server:
+                if extensions:
+                    with connect(server.url, autocommit=True) as connection:
+                        ensure_extension(connection, "age")
+                        ensure_extension(connection, "vector")
+            (home / "pg" / "server.log").unlink()
+            with (home / "pg" / "postgresql.auto.conf").open("a") as settings:
+                settings.write("fsync = off\n")  # tests kill servers, never the machine
+            (home / "made").touch()
+    return home / "pg"
 
 
 @contextlib.contextmanager
 def server_to_kill() -> Iterator[EmbeddedServer]:
     """A running server of its own, with both extensions, stopped and removed at the end."""
-    home = Path(tempfile.mkdtemp(prefix="mapfold-test-kill-"))
+    home = furnish(Path(tempfile.mkdtemp(prefix="mapfold-test-kill-")), extensions=True)
     server = EmbeddedServer(home)
     try:
         with server, connect(server.url, autocommit=True) as connection:

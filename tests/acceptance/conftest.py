@@ -7,12 +7,14 @@ import pytest
 
 from tests.acceptance.awkward_run import awkward_payloads
 from tests.commands import Commands
+from tests.servers import furnish
 
 
 @pytest.fixture(scope="module")
 def mapfold(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Commands]:
     """The command, in a folder of its own, with its embedded server left running."""
     commands = Commands.in_folder(tmp_path_factory.mktemp("user"))
+    furnish(commands.home)
     commands("db", "start")
     yield commands
     commands("db", "stop")

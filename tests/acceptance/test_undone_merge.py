@@ -10,6 +10,7 @@ import pytest
 from eventsrc.append import append_payload
 from eventsrc.log import NEVER, LogWriter
 from tests.commands import Commands
+from tests.servers import furnish
 from tests.shared_data import shared_run
 
 SAMPLE = Path(__file__).resolve().parents[2] / "logs" / "sample"
@@ -41,6 +42,7 @@ def test_an_undone_merge_is_two_places_after_every_rebuild_and_one_again_after_u
     tmp_path: Path, name: str
 ) -> None:
     log, mapfold = copied_log(name, tmp_path), Commands.in_folder(tmp_path)
+    furnish(mapfold.home)
     (tmp_path / "fine.json").write_text(json.dumps(FINE))
     mapfold("edit", log, "use-settings", "fine.json", "--reason", "the rooms are small")
     digest = mapfold("replay", log, "--json").json["digest"]
@@ -58,7 +60,8 @@ def test_an_undone_merge_is_two_places_after_every_rebuild_and_one_again_after_u
     assert mapfold("status", log).code == 0
     mapfold("db", "check", log)
 
-    shutil.rmtree(tmp_path / "home")
+    shutil.rmtree(mapfold.home)
+    furnish(mapfold.home)
     shutil.rmtree(tmp_path / "log.snapshots", ignore_errors=True)
     other = mapfold("replay", log, "--json").json["digest"]
     assert other != digest

@@ -40,7 +40,11 @@ class AttackedCommand(Program):
         self._status = Path(self._folder.name) / "status"
         self._stdout = (Path(self._folder.name) / "stdout").open("w+")
         super().__init__(
-            _MAPFOLD, [str(self._status), *arguments], stdout=self._stdout, env=env, cwd=cwd
+            _MAPFOLD,
+            [str(self._status), *arguments],
+            stdout=self._stdout.fileno(),
+            env=env,
+            cwd=cwd,
         )
         # The attacker's own limit is higher: it holds one end of each of very many connections.
         most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]

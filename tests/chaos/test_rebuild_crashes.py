@@ -4,7 +4,6 @@ import json
 import os
 import re
 import signal
-import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -22,6 +21,7 @@ from projections.database.loader import CopyLoader, Load, TypeName
 from projections.database.vector_sink import VectorShadow
 from projections.errors import DatabaseError, DatabaseUnavailable
 from projections.settings import Settings
+from tests import prefork
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows
 from tests.servers import server_to_kill
@@ -65,12 +65,10 @@ def at_stage(stage: str, act: Callable[[], None]) -> Callable[[RebuildProgress],
 @pytest.mark.parametrize("kind", ["one_database", "two_databases"])
 def test_killed_at_any_statement(log: Path, kind: str, request: pytest.FixtureRequest) -> None:
     targets: Targets = request.getfixturevalue(kind)
-    result = subprocess.run(
-        [
-            sys.executable, "-m", "tests.chaos.rebuild_killer",
-            str(log), targets.graph_url, targets.vector_url,
-        ],
-        cwd=ROOT, capture_output=True, text=True, timeout=WAIT_S, check=False,
+    result = prefork.run(
+        "tests.chaos.rebuild_killer:main",
+        ["rebuild_killer", str(log), targets.graph_url, targets.vector_url],
+        env=os.environ, cwd=ROOT, timeout=WAIT_S,
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
     found = json.loads(result.stdout)

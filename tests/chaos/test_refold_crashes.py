@@ -1,8 +1,7 @@
 """Whatever dies while commands are in the log, the final rows equal those of a fresh replay."""
 
 import json
-import subprocess
-import sys
+import os
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from projections.database.connection import Targets
 from projections.database.embedded import EmbeddedServer
 from projections.errors import DatabaseUnavailable
 from projections.settings import Settings
+from tests import prefork
 from tests.commands_in_logs import (
     append_command,
     forget_keyframes,
@@ -40,12 +40,11 @@ def log(tmp_path: Path) -> Path:
 
 
 def kills(log: Path, targets: Targets, every: int, mode: str) -> dict[str, Any]:
-    result = subprocess.run(
-        [
-            sys.executable, "-m", "tests.chaos.refold_killer", str(log),
-            targets.graph_url, targets.vector_url, str(OLD_END), str(every), mode,
-        ],
-        cwd=ROOT, capture_output=True, text=True, timeout=WAIT_S, check=False,
+    urls = (targets.graph_url, targets.vector_url)
+    result = prefork.run(
+        "tests.chaos.refold_killer:main",
+        ["refold_killer", str(log), *urls, str(OLD_END), str(every), mode],
+        env=os.environ, cwd=ROOT, timeout=WAIT_S,
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
     found: dict[str, Any] = json.loads(result.stdout)
@@ -62,7 +61,7 @@ def test_a_tail_killed_at_any_statement_of_a_refold(
     write_log(log, walk(4, first=20))
     append_command(log, undo(forgotten))
     append_command(log, forget_keyframes(2, 9))
-    found = kills(log, request.getfixturevalue(kind), 11 * stride(5), "swaps")
+    found = kills(log, request.getfixturevalue(kind), 11 * stride(7), "swaps")
     assert found["wrong"] == []
     assert found["steps"] > 100
     assert found["old"] >= 1
@@ -74,7 +73,7 @@ def test_a_tail_killed_at_any_statement_of_a_refold_that_keeps_the_vectors(
 ) -> None:
     append_command(log, keep_apart(0, 1))
     write_log(log, walk(4, first=20))
-    found = kills(log, one_database, 11 * stride(5), "swaps")
+    found = kills(log, one_database, 11 * stride(7), "swaps")
     assert found["wrong"] == []
     assert found["steps"] > 80
 
@@ -85,7 +84,7 @@ def test_a_tail_killed_between_any_two_statements_while_places_are_named(
     for n, name in enumerate(["kitchen", "hall", "kitchen again"]):
         append_command(log, name_place(3, name))
         write_log(log, walk(3, seed=n, first=20 + 3 * n))
-    found = kills(log, two_databases, 3 * stride(3), "batches")
+    found = kills(log, two_databases, 3 * stride(7), "batches")
     assert found["wrong"] == []
     assert found["steps"] > 20
 
@@ -99,7 +98,7 @@ def test_the_server_killed_at_any_statement_of_a_refold(
     write_log(log, walk(4, first=20))
     rebuild(log, one_database, SETTINGS)
     expected = all_rows(one_database)
-    execute, killed, steps = psycopg.Cursor.execute, 0, range(5, 10_000, 45 * stride(2))
+    execute, killed, steps = psycopg.Cursor.execute, 0, range(5, 10_000, 45 * stride(3))
     with server_to_kill() as server:
         targets = Targets(server.url, server.url, server)
         for step in steps:

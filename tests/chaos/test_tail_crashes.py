@@ -1,7 +1,7 @@
 """Whatever dies during a tail, the final rows equal those of a rebuild."""
 
 import json
-import subprocess
+import os
 import sys
 import threading
 from collections.abc import Iterator
@@ -18,6 +18,7 @@ from projections.database.embedded import EmbeddedServer
 from projections.database.sink import Checkpoint, SinkName
 from projections.errors import CheckpointMoved, DatabaseUnavailable
 from projections.settings import Settings
+from tests import prefork
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows
 from tests.servers import kill_postgres, server_to_kill
@@ -33,12 +34,10 @@ def test_killed_between_any_two_statements(
 ) -> None:
     targets: Targets = request.getfixturevalue(kind)
     log = write_log(tmp_path / "log", walk(12) + list(bridge())[:12])
-    result = subprocess.run(
-        [
-            sys.executable, "-m", "tests.chaos.crash_driver",
-            str(log), targets.graph_url, targets.vector_url,
-        ],
-        cwd=ROOT, capture_output=True, text=True, timeout=WAIT_S, check=False,
+    result = prefork.run(
+        "tests.chaos.crash_driver:main",
+        ["crash_driver", str(log), targets.graph_url, targets.vector_url],
+        env=os.environ, cwd=ROOT, timeout=WAIT_S,
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
     found = json.loads(result.stdout)

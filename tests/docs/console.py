@@ -23,6 +23,9 @@ from pathlib import Path
 from typing import Final
 from urllib.parse import quote
 
+from tests.prefork import folder_with_mapfold
+from tests.servers import furnish
+
 ROOT: Final = Path(__file__).resolve().parents[2]
 HOME_OF_DOCS: Final = "/home/you/mapfold"
 _DEMO: Final = """#!/usr/bin/env bash
@@ -117,12 +120,15 @@ def _furnish(folder: Path) -> None:
     demo.write_text(_DEMO, "utf-8")
     demo.chmod(0o755)
     (folder / ".venv").symlink_to(sys.prefix)
+    furnish(folder / ".mapfold")
 
 
 def _environment() -> dict[str, str]:
     """As a user's shell has it: mapfold on the path, nothing set that changes what it does."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith("MAPFOLD")}
-    path = f"{Path(sys.executable).parent}{os.pathsep}{kept['PATH']}"
+    path = os.pathsep.join(
+        [str(folder_with_mapfold()), str(Path(sys.executable).parent), kept["PATH"]]
+    )
     return {**kept, "PATH": path, "COLUMNS": "100"}
 
 

@@ -19,6 +19,7 @@ from projections.database.embedded import EmbeddedServer
 from tests.commands import PROGRAM, Commands
 from tests.envelopes import MODEL, detection, envelope
 from tests.logs import append_raw, walk, write_log
+from tests.servers import furnish
 
 WAIT_S = 60
 REPLAYS = "SELECT count(*) FROM pg_stat_activity WHERE application_name = 'mapfold replay'"
@@ -28,6 +29,7 @@ REPLAYS = "SELECT count(*) FROM pg_stat_activity WHERE application_name = 'mapfo
 def mapfold() -> Iterator[Commands]:
     folder = Path(tempfile.mkdtemp(prefix="mapfold-test-commands-"))
     commands = Commands.in_folder(folder)
+    furnish(commands.home)
     yield commands
     server(commands).stop(discard_keep=True)
     shutil.rmtree(folder, ignore_errors=True)
@@ -39,7 +41,7 @@ def log(mapfold: Commands) -> Path:
 
 
 def server(commands: Commands) -> EmbeddedServer:
-    return EmbeddedServer(Path(commands.env["MAPFOLD_HOME"]))
+    return EmbeddedServer(commands.home)
 
 
 def test_replay_tail_status_and_check(mapfold: Commands, log: Path) -> None:

@@ -303,17 +303,12 @@ def test_killed_at_any_moment_it_is_recorded_once_or_not_at_all(
 ) -> None:
     rng = random.Random(seed)
     log, ids = mapfold.folder / "log", []
+    whole_s = mapfold.seconds("edit", "log", "name-place", LEFT, "n", *WHY, "--dry-run")
     for number in range(4):
         ids.append(f"c{number}")
         give = ["edit", "log", "name-place", LEFT, f"n{number}", *WHY, "--command-id", ids[-1]]
-        process = subprocess.Popen(
-            [str(PROGRAM), *give],
-            cwd=mapfold.folder,
-            env=dict(mapfold.env),
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        killer = threading.Timer(rng.uniform(0.2, 0.9), process.send_signal, [signal.SIGKILL])
+        process = mapfold.start(*give)
+        killer = threading.Timer(rng.uniform(0.0, whole_s), process.send_signal, [signal.SIGKILL])
         killer.start()
         process.wait()
         killer.cancel()

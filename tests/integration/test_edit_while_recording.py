@@ -2,7 +2,6 @@
 
 import random
 import signal
-import subprocess
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -13,7 +12,7 @@ import pytest
 from eventsrc.commands import Command, parse_command
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.system_events import COMMAND_KEY
-from tests.commands import PROGRAM, Commands
+from tests.commands import Commands
 from tests.corrected_logs import EVENTS, FAR, LEFT, RIGHT, write_rooms
 from tests.envelopes import envelope, payload
 from tests.fixtures_zenoh import Program
@@ -124,20 +123,16 @@ def test_whoever_is_killed_a_command_is_recorded_once(
     """The recorder or `edit` is killed in the middle; the same command is then given again."""
     rng = random.Random(seed)
     log, ids = mapfold.folder / "log", []
+    dry = ("edit", "log", "name-place", RIGHT, "n", *WHY, "--dry-run")
+    whole_s = 1.5 * mapfold.seconds(*dry)  # through a recorder it takes longer
     for number in range(3):
         running = recorder("--accept-edits")
         ids.append(f"c{number}")
         args = ("edit", "log", "name-place", RIGHT, f"n{number}", *WHY)
         give = (*args, "--command-id", ids[-1], "--connect", endpoint)
-        process = subprocess.Popen(
-            [str(PROGRAM), *give],
-            cwd=mapfold.folder,
-            env=dict(mapfold.env),
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
+        process = mapfold.start(*give)
         victim = rng.choice([process, running.process])
-        killer = threading.Timer(rng.uniform(0.3, 1.0), victim.send_signal, [signal.SIGKILL])
+        killer = threading.Timer(rng.uniform(0.0, whole_s), victim.send_signal, [signal.SIGKILL])
         killer.start()
         process.wait()
         killer.cancel()

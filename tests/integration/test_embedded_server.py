@@ -2,17 +2,18 @@
 
 import os
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 
 import psycopg
 import pytest
 
 from projections.database.embedded import EmbeddedServer
 from projections.errors import EmbeddedServerError
+from tests.prefork import Process, start
+from tests.servers import furnish
 
 WAIT_S = 60
 
@@ -28,37 +29,34 @@ with databases(None, None) as targets:
 
 
 @pytest.fixture
-def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def home(request: pytest.FixtureRequest) -> Iterator[Path]:
     import shutil
     import tempfile
 
     folder = Path(tempfile.mkdtemp(prefix="mapfold-test-home-"))
+    if request.node.name != "test_starts_serves_and_stops":  # that one makes a data folder
+        furnish(folder)
     yield folder
     EmbeddedServer(folder).stop(discard_keep=True)
     shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextmanager
-def holder(home: Path) -> Iterator[subprocess.Popen[str]]:
-    """Another process that uses the server of ``home`` until its stdin is closed."""
+def holder(home: Path) -> Iterator[tuple[Process, IO[bytes]]]:
+    """Another process that uses the server of ``home`` until its stdin, the pipe, is closed."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith("MAPFOLD_")}
-    process = subprocess.Popen(
-        [sys.executable, "-c", HOLDER],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        env={**environment, "MAPFOLD_HOME": str(home)},
-    )
-    try:
-        assert process.stdout is not None
-        assert process.stdout.readline().startswith("postgresql://")
-        yield process
-    finally:
-        process.kill()
-        process.wait(WAIT_S)
-        for pipe in (process.stdin, process.stdout):
-            assert pipe is not None
-            pipe.close()
+    environment["MAPFOLD_HOME"] = str(home)
+    (stdin, given), (said, stdout) = os.pipe(), os.pipe()
+    with os.fdopen(given, "wb") as pipe, os.fdopen(said) as lines:
+        process = start(HOLDER, ["-c"], env=environment, cwd=home, stdin=stdin, stdout=stdout)
+        os.close(stdin)
+        os.close(stdout)
+        try:
+            assert lines.readline().startswith("postgresql://")
+            yield process, pipe
+        finally:
+            process.kill()
+            process.wait(WAIT_S)
 
 
 def answers(server: EmbeddedServer) -> bool:
@@ -85,11 +83,10 @@ def test_data_survives_a_restart_of_the_server(home: Path) -> None:
 
 
 def test_two_commands_share_it_and_the_last_one_stops_it(home: Path) -> None:
-    with EmbeddedServer(home) as server, holder(home) as other:
+    with EmbeddedServer(home) as server, holder(home) as (other, pipe):
         server.stop()
         assert answers(server)
-        assert other.stdin is not None
-        other.stdin.close()
+        pipe.close()
         assert other.wait(WAIT_S) == 0
         assert not server.running
 
@@ -105,7 +102,7 @@ def test_db_start_keeps_it_and_db_stop_ends_that(home: Path) -> None:
 
 
 def test_db_stop_does_not_stop_a_server_in_use(home: Path) -> None:
-    with holder(home) as other:
+    with holder(home) as (other, _):
         server = EmbeddedServer(home)
         assert server.stop(discard_keep=True) is True
         assert answers(server)
@@ -114,7 +111,7 @@ def test_db_stop_does_not_stop_a_server_in_use(home: Path) -> None:
 
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_leaves_no_server_behind(home: Path, signum: signal.Signals) -> None:
-    with holder(home) as other:
+    with holder(home) as (other, _):
         assert EmbeddedServer(home).running
         other.send_signal(signum)
         assert other.wait(WAIT_S) != 0
@@ -122,7 +119,7 @@ def test_a_signal_leaves_no_server_behind(home: Path, signum: signal.Signals) ->
 
 
 def test_after_a_killed_command_the_next_command_stops_it(home: Path) -> None:
-    with holder(home) as other:
+    with holder(home) as (other, _):
         other.kill()
         other.wait(WAIT_S)
     assert EmbeddedServer(home).running

@@ -19,6 +19,7 @@ import pytest
 from projections.database.connection import connect
 from projections.database.embedded import EmbeddedServer
 from projections.errors import DatabaseUnavailable, EmbeddedServerError
+from tests.servers import furnish
 
 NOBODY = 65534
 SOCKET = ".s.PGSQL.5432"
@@ -94,7 +95,7 @@ def home(folders: list[Path]) -> Iterator[Path]:
     top = Path(tempfile.mkdtemp(prefix="mapfold-test-long-"))
     folders.append(top)
     deep = top / ("d" * 60) / ("e" * 60)
-    yield deep
+    yield furnish(deep)
     EmbeddedServer(deep).stop(discard_keep=True)
 
 
@@ -103,7 +104,7 @@ def short_home(folders: list[Path]) -> Iterator[Path]:
     """A home for a server whose socket is in its data folder."""
     top = Path(tempfile.mkdtemp(prefix="mapfold-test-short-"))
     folders.append(top)
-    yield top
+    yield furnish(top)
     with contextlib.suppress(EmbeddedServerError):
         EmbeddedServer(top).stop(discard_keep=True)
 
