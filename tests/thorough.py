@@ -13,3 +13,8 @@ def examples(number: int) -> int:
 def stride(quick: int) -> int:
     """Step of a loop over every byte or statement: 1 when thorough, else ``quick``."""
     return 1 if THOROUGH else quick
+
+
+def rounds(number: int, quick: int) -> int:
+    """Repetitions, or size of the data, of a test: ``number`` when thorough, else ``quick``."""
+    return number if THOROUGH else quick

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -21,6 +22,8 @@ from projections.cli.options import settings_from
 from projections.model.digest import map_digest
 from projections.model.fold import fold_log
 from projections.model.log_commands import read_corrections
+from tests.docs.console import ROOT, Command, matches, read
+from tests.prefork import folder_with_mapfold
 
 _COMMAND = [sys.executable, "-m", "projections.cli", "demo", "--speed", "300"]
 _DEADLINE_S = 120.0
@@ -49,10 +52,20 @@ def _run(*arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
 @pytest.fixture(scope="module")
 def played(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Played]:
     out = tmp_path_factory.mktemp("a folder") / "demo"
-    done = _run("--out", str(out), "--json")
+    done = _run("--out", str(out), "--json", env={**os.environ, "PATH": "/usr/bin:/bin"})
     assert done.returncode == 0, done.stderr
     yield Played(out, json.loads(done.stdout), done.stderr.splitlines())
     assert _processes_of(out) == []
+
+
+def test_the_readme_shows_what_it_prints(played: Played) -> None:
+    parts = [part for part in read(ROOT / "README.md") if isinstance(part, Command)]
+    (shown,) = [part for part in parts if part.text == "scripts/demo"]
+    printed = "\n".join(played.story)
+    printed = printed.replace("played 300 times as fast", "played 30 times as fast")
+    printed = re.sub(rf"'?{re.escape(str(played.out))}([^\s']*)'?", r"logs/demo\1", printed)
+    printed = re.sub(r"\. \S*/bin/activate", ". .venv/bin/activate", printed)
+    assert matches(shown.prints, printed.splitlines()), printed
 
 
 def test_every_keyframe_went_through_the_router_into_the_log(played: Played) -> None:
@@ -159,7 +172,8 @@ def test_the_commands_it_ends_with_work_as_printed(played: Played) -> None:
     start = next(i for i, line in enumerate(played.story) if "Go on with it" in line)
     commands = [line.strip() for line in played.story[start + 1 :]]
     assert len(commands) >= 6
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    assert "bin/activate" in commands[0]
+    commands.insert(1, f"PATH={folder_with_mapfold()}:$PATH")
     script = "set -e\n" + "\n".join(commands)
     done = subprocess.run(
         ["bash", "-c", script],
@@ -167,7 +181,6 @@ def test_the_commands_it_ends_with_work_as_printed(played: Played) -> None:
         text=True,
         check=False,
         timeout=_DEADLINE_S,
-        env={**os.environ, "PATH": path},
     )
     assert done.returncode == 0, done.stderr
     for asked in played.numbers["relocalize"]["questions"][:1]:

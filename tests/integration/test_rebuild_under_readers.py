@@ -17,10 +17,13 @@ from projections.settings import Settings
 from tests.drops import wait_for_drops
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows
+from tests.thorough import THOROUGH, rounds
 
 SETTINGS = Settings()
 WAIT_S = 60.0
-REBUILDS = 6
+REBUILDS = rounds(6, 2)
+PAUSE_S = 0.0 if THOROUGH else 0.002
+"""Between two questions of a reader, so that a rebuild is not slowed down most of all."""
 
 COUNT_PATHS = (
     "SELECT * FROM cypher('semantic_map', $$"
@@ -58,6 +61,7 @@ class Reader(threading.Thread):
                     self.first.set()
                 assert row is not None
                 self.answers.append(str(row[0]))
+                self.stop.wait(PAUSE_S)
 
 
 def single_answer(connection: psycopg.Connection, query: str) -> str:

@@ -20,14 +20,16 @@ from tests.integration.test_rebuild_under_readers import (
     COUNT_LABELS,
     COUNT_PATHS,
     COUNT_VECTORS,
+    PAUSE_S,
     Reader,
     single_answer,
 )
 from tests.logs import bridge, walk, write_log
+from tests.thorough import rounds
 
 SETTINGS = Settings()
 WAIT_S = 60.0
-ROUNDS = 3
+ROUNDS = rounds(3, 1)
 NAMES = (
     "SELECT * FROM cypher('semantic_map', $$ MATCH (p:Place) RETURN count(p.name) $$) AS (n agtype)"
 )
@@ -50,6 +52,7 @@ class Asker(threading.Thread):
             except Exception as error:  # noqa: BLE001 - counted by the test
                 self.errors.append(error)
                 return
+            self.stop.wait(PAUSE_S)
 
 
 @pytest.mark.parametrize("what", ["places", "keyframes"])
