@@ -2,16 +2,15 @@
 
 import os
 import re
-import resource
 import signal
 import socket
 import ssl
-import subprocess
-import sys
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+
+from tests import prefork
 
 DEADLINE_S = 30.0
 
@@ -53,20 +52,31 @@ def status(response: bytes) -> int:
     return int(response.split(maxsplit=2)[1])
 
 
+_LIMITED = """
+import resource, sys
+if limit := sys.argv.pop(1):
+    resource.setrlimit(resource.RLIMIT_NOFILE, (int(limit), int(limit)))
+sys.argv.insert(1, "serve")
+from projections.cli import main
+main()
+"""
+
+
 class Served:
     """``mapfold serve --http`` in a process of its own."""
 
     def __init__(self, *args: str, open_files: int | None = None, **env: str) -> None:
         clean = {k: v for k, v in os.environ.items() if not k.startswith("MAPFOLD_")}
-        self.program = subprocess.Popen(
-            [sys.executable, "-m", "projections.cli", "serve", *args],
-            stderr=subprocess.PIPE,
-            text=True,
+        said, stderr = os.pipe()
+        self.program = prefork.start(
+            _LIMITED,
+            ["-c", str(open_files or ""), *args],
             env={**clean, **env},
-            preexec_fn=None
-            if open_files is None
-            else lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (open_files, open_files)),
+            cwd=Path.cwd(),
+            stderr=stderr,
         )
+        os.close(stderr)
+        self._stderr = os.fdopen(said)
         self.said: list[str] = []
         self._ready = threading.Event()
         self._reader = threading.Thread(target=self._read)
@@ -90,9 +100,8 @@ class Served:
         return int(found[1]) * 1024
 
     def _read(self) -> None:
-        assert self.program.stderr is not None
-        with self.program.stderr:
-            for line in self.program.stderr:
+        with self._stderr:
+            for line in self._stderr:
                 self.said.append(line.rstrip("\n"))
                 if "Ctrl-C" in line:
                     self._ready.set()

@@ -1,6 +1,10 @@
 """How much the tests try: less by default, everything under ``scripts/test_slow``."""
 
 import os
+from collections.abc import Iterable
+from typing import TypeVar
+
+_Case = TypeVar("_Case")
 
 THOROUGH = os.environ.get("MAPFOLD_TEST_THOROUGH") == "1"
 
@@ -18,3 +22,11 @@ def stride(quick: int) -> int:
 def rounds(number: int, quick: int) -> int:
     """Repetitions, or size of the data, of a test: ``number`` when thorough, else ``quick``."""
     return number if THOROUGH else quick
+
+
+def every_other(cases: Iterable[_Case]) -> list[_Case]:
+    """Cases of a grid: all when thorough, else every other one.
+
+    In a `product` of two values and an odd number of others, each value stays.
+    """
+    return list(cases)[:: stride(2)]

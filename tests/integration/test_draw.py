@@ -1,7 +1,6 @@
 """`mapfold draw` on a log of a simulated run."""
 
-import subprocess
-import sys
+import os
 from pathlib import Path
 
 import pytest
@@ -9,8 +8,7 @@ import pytest
 from eventsrc.append import append_payload
 from eventsrc.log import LogWriter
 from eventsrc.sim import simulate_run
-
-_MAPFOLD = "from projections.cli import main; main()"
+from tests.commands import Commands, Said
 
 
 @pytest.fixture(scope="module")
@@ -22,22 +20,17 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def _draw(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", _MAPFOLD, "draw", *arguments],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+def _draw(*arguments: str) -> Said:
+    return Commands(Path.cwd(), os.environ)("draw", *arguments, code=None)
 
 
 def test_a_picture_of_any_point_with_other_settings(log: Path, tmp_path: Path) -> None:
     whole, part = tmp_path / "whole.svg", tmp_path / "part.svg"
     done = _draw(str(log), "--house", "7", "--merges", "--out", str(whole))
-    assert (done.returncode, done.stdout) == (0, "")
-    assert f"wrote {whole}" in done.stderr
+    assert (done.code, done.out) == (0, "")
+    assert f"wrote {whole}" in done.err
     arguments = ("--at", "40", "--set", "eps_m=0.75", "--set", "min_samples=8")
-    assert _draw(str(log), *arguments, "--out", str(part)).returncode == 0
+    assert _draw(str(log), *arguments, "--out", str(part)).code == 0
     assert "drive after 120 events" in whole.read_text("utf-8")
     assert "ε 1.5 m, min_samples 3" in whole.read_text("utf-8")
     assert "drive after 40 events" in part.read_text("utf-8")
@@ -49,7 +42,7 @@ def test_the_title_of_the_log_one_is_in(
 ) -> None:
     """``.`` has no name of its own."""
     monkeypatch.chdir(log)
-    assert _draw(".", "--at", "1", "--out", str(tmp_path / "here.svg")).returncode == 0
+    assert _draw(".", "--at", "1", "--out", str(tmp_path / "here.svg")).code == 0
     assert "drive after 1 event" in (tmp_path / "here.svg").read_text("utf-8")
 
 
@@ -63,6 +56,6 @@ def test_the_title_of_the_log_one_is_in(
 )
 def test_misuse_is_one_line_and_exit_2(log: Path, arguments: tuple[str, ...], says: str) -> None:
     done = _draw(str(log), *arguments)
-    assert done.returncode == 2
-    assert says in done.stderr
-    assert "Traceback" not in done.stderr
+    assert done.code == 2
+    assert says in done.err
+    assert "Traceback" not in done.err

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 from importlib.metadata import version
 from pathlib import Path
 
@@ -80,17 +81,14 @@ def _into_closed_pipe(mapfold: Commands, *args: str, stream: str = "stdout") -> 
     read_end, write_end = os.pipe()
     os.close(read_end)
     env = {k: v for k, v in mapfold.env.items() if k != "PYTHONUNBUFFERED"}
-    done = subprocess.run(
-        [str(PROGRAM), *args],
-        cwd=mapfold.folder,
-        env=env,
-        timeout=TIMEOUT_S,
-        check=False,
-        stdout=write_end if stream == "stdout" else subprocess.PIPE,
-        stderr=write_end if stream == "stderr" else subprocess.PIPE,
-    )
-    os.close(write_end)
-    return done.returncode, (done.stdout or done.stderr or b"").decode()
+    streams = {"stdout": write_end, "stderr": write_end}
+    with tempfile.TemporaryFile() as other:
+        streams["stderr" if stream == "stdout" else "stdout"] = other.fileno()
+        process = Commands(mapfold.folder, env).start(*args, **streams)
+        os.close(write_end)
+        code = process.wait(TIMEOUT_S)
+        other.seek(0)
+        return code, other.read().decode()
 
 
 @pytest.mark.parametrize(
@@ -136,19 +134,13 @@ def test_stdout_on_a_full_disk_is_a_failure(
     mapfold: Commands, args: tuple[str, ...], unbuffered: dict[str, str]
 ) -> None:
     env = {k: v for k, v in mapfold.env.items() if k != "PYTHONUNBUFFERED"}
-    with Path("/dev/full").open("wb") as full:
-        done = subprocess.run(
-            [str(PROGRAM), *args],
-            cwd=mapfold.folder,
-            env=env | unbuffered,
-            stdout=full,
-            stderr=subprocess.PIPE,
-            check=False,
-        )
-    assert done.returncode == 1
-    assert done.stderr == (
-        b"mapfold: stdout: No space left on device; the output is not complete\n"
-    )
+    with Path("/dev/full").open("wb") as full, tempfile.TemporaryFile() as stderr:
+        run = Commands(mapfold.folder, env | unbuffered)
+        process = run.start(*args, stdout=full.fileno(), stderr=stderr.fileno())
+        assert process.wait(TIMEOUT_S) == 1
+        stderr.seek(0)
+        said = stderr.read()
+    assert said == (b"mapfold: stdout: No space left on device; the output is not complete\n")
 
 
 def test_stderr_on_a_full_disk_changes_nothing(mapfold: Commands) -> None:

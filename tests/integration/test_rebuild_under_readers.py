@@ -3,6 +3,7 @@
 import sys
 import threading
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 
 import psycopg
@@ -17,7 +18,7 @@ from projections.settings import Settings
 from tests.drops import wait_for_drops
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows
-from tests.thorough import THOROUGH, rounds
+from tests.thorough import THOROUGH, every_other, rounds
 
 SETTINGS = Settings()
 WAIT_S = 60.0
@@ -132,8 +133,15 @@ class Interrupted(Exception):
     """Simulates what ends a rebuild in the middle."""
 
 
-@pytest.mark.parametrize("stage", ["folding", "writing", "swapping", "tidying", "indexing"])
-@pytest.mark.parametrize("kind", ["one_database", "two_databases"])
+@pytest.mark.parametrize(
+    ("kind", "stage"),
+    every_other(
+        product(
+            ["one_database", "two_databases"],
+            ["folding", "writing", "swapping", "tidying", "indexing"],
+        )
+    ),
+)
 def test_interrupted_at_each_stage_one_whole_map_is_served(
     tmp_path: Path, kind: str, stage: str, request: pytest.FixtureRequest
 ) -> None:

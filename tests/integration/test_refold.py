@@ -38,6 +38,7 @@ from tests.commands_in_logs import (
 )
 from tests.logs import append_raw, bridge, walk, write_log
 from tests.rows import all_rows, expected_graph, graph_rows
+from tests.thorough import rounds
 
 SETTINGS = Settings()
 WAIT_S = 60.0
@@ -51,7 +52,7 @@ def log(tmp_path: Path) -> Path:
     return write_log(tmp_path / "log", documents)
 
 
-@pytest.fixture(params=["one_database", "two_databases"])
+@pytest.fixture(params=["two_databases", "one_database"][: rounds(2, 1)])
 def targets(request: pytest.FixtureRequest) -> Targets:
     found: Targets = request.getfixturevalue(request.param)
     return found

@@ -1,9 +1,8 @@
 """`mapfold simulate` over a real router and into files, as a user runs it."""
 
 import json
+import os
 import queue
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,7 +10,12 @@ import pytest
 
 from eventsrc.sim import simulate_run
 from eventsrc.transport.session import Received, Session
+from tests.commands import Commands, Said
 from tests.fixtures_zenoh import DEADLINE_S, Program
+
+
+def _mapfold(*arguments: str) -> Said:
+    return Commands(Path.cwd(), os.environ)(*arguments, code=None)
 
 
 def test_every_keyframe_arrives_byte_for_byte_and_in_order(
@@ -42,46 +46,28 @@ def test_simulate_without_a_subscriber_is_one_line(
 
 def test_a_file_is_written_with_its_numbers(tmp_path: Path) -> None:
     out = tmp_path / "run.jsonl.gz"
-    command = "from projections.cli import main; main()"
-    done = subprocess.run(
-        [sys.executable, "-c", command, "simulate", "--run", "c", "--out", str(out), "--json"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    numbers = json.loads(done.stdout)
+    done = _mapfold("simulate", "--run", "c", "--out", str(out), "--json")
+    numbers = json.loads(done.out)
     run = simulate_run(run="c")
     assert numbers["run_id"] == run.run_id
     assert numbers["keyframes"] == len(run.envelopes)
     assert Path(numbers["out"]).exists()
     assert Path(numbers["truth"]).name == "run.truth.jsonl.gz"
-    assert f"{len(run.envelopes)} keyframes" in done.stderr
-    assert f"truth in {tmp_path / 'run.truth.jsonl.gz'}" in done.stderr
+    assert f"{len(run.envelopes)} keyframes" in done.err
+    assert f"truth in {tmp_path / 'run.truth.jsonl.gz'}" in done.err
 
 
 @pytest.mark.parametrize("name", ["", "two\nlines", "x" * 101])
 def test_an_unprintable_empty_or_long_run_name_is_misuse(name: str) -> None:
-    command = "from projections.cli import main; main()"
-    done = subprocess.run(
-        [sys.executable, "-c", command, "simulate", "--run", name, "--out", "never.jsonl"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 2
-    assert "give a name of 1 to 100 printable characters" in done.stderr
+    done = _mapfold("simulate", "--run", name, "--out", "never.jsonl")
+    assert done.code == 2
+    assert "give a name of 1 to 100 printable characters" in done.err
     assert not Path("never.jsonl").exists()
 
 
 def test_an_unwritable_place_is_one_clear_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    command = "from projections.cli import main; main()"
-    done = subprocess.run(
-        [sys.executable, "-c", command, "simulate", "--out", str(tmp_path / "file" / "x.jsonl")],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 2
-    assert len(done.stderr.strip().splitlines()) == 1
-    assert "cannot be written" in done.stderr
+    done = _mapfold("simulate", "--out", str(tmp_path / "file" / "x.jsonl"))
+    assert done.code == 2
+    assert len(done.err.strip().splitlines()) == 1
+    assert "cannot be written" in done.err
