@@ -99,8 +99,9 @@ def _become(request: Mapping[str, Any], fds: list[int]) -> None:
         os.dup2(fd, number)
     for fd in fds:
         os.close(fd)
-    sys.stdin = os.fdopen(0, closefd=False)
-    sys.stdout = os.fdopen(1, "w", closefd=False)
+    text = {"encoding": sys.stdout.encoding, "errors": sys.stdout.errors, "closefd": False}
+    sys.stdin = os.fdopen(0, **text)
+    sys.stdout = os.fdopen(1, "w", **text)
     sys.stderr = os.fdopen(2, "w", 1, errors="backslashreplace", closefd=False)
     os.chdir(request["cwd"])
     os.environ.clear()
@@ -150,8 +151,9 @@ if __name__ == "__main__":
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
-        except OSError:
-            _code = 120  # the interpreter's own code for it
+        except OSError as _error:
+            os.write(2, f"Exception ignored in: {stream}\nOSError: {_error}\n".encode())
+            _code = 120  # as the interpreter says and ends
     # Not the interpreter's way out: freeing every object copies every page that is shared, which
     # takes as long as a short command does.
     os._exit(_code)
