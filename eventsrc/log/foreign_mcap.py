@@ -7,7 +7,6 @@ in pieces.
 """
 
 import struct
-import zlib
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ import zstandard
 from lz4.frame import LZ4FrameDecompressor
 
 from . import mcap_records as _mcap
+from .crc import crc32
 from .mcap_records import FRAME, MAGIC, BadRecord, Channel, Opcode
 
 MAX_FOREIGN_BYTES: Final = 64 * 1024 * 1024
@@ -53,7 +53,7 @@ def decode_foreign_chunk(content: bytes, max_bytes: int) -> bytes:
     if len(body) != size:
         than = "more" if len(body) > size else "less"
         raise BadRecord(f"a chunk holds {than} than the {size:,} bytes that it declares")
-    if crc and zlib.crc32(body) != crc:
+    if crc and crc32(body) != crc:
         raise BadRecord("a chunk does not match its CRC")
     return body
 
@@ -159,13 +159,13 @@ class _CrcReader:
     def read(self, length: int) -> bytes:
         """Exactly ``length`` bytes. Memory grows with what is there, not with what is declared."""
         data = b"".join(self._pieces(length))
-        self.crc = zlib.crc32(data, self.crc)
+        self.crc = crc32(data, self.crc)
         return data
 
     def skip(self, length: int) -> None:
         """Read ``length`` bytes and drop them."""
         for piece in self._pieces(length):
-            self.crc = zlib.crc32(piece, self.crc)
+            self.crc = crc32(piece, self.crc)
 
     def begin_record(self) -> None:
         """Note the current position as the start of a record, for error messages."""

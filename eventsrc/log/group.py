@@ -4,7 +4,6 @@ A *group* is what one commit brings to the disk: an uncompressed chunk and its c
 """
 
 import time
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -12,6 +11,7 @@ from itertools import islice
 from eventsrc.envelope import Offset
 
 from . import mcap_records as _mcap
+from .crc import crc32
 from .durable_files import FsyncPolicy
 from .event import NewEvent
 from .format import key_channel, schema_of
@@ -48,7 +48,7 @@ class Group:
             parts[::2] = [_mcap.renumber(head, self.base - base) for head in parts[::2]]
         lead, body = b"".join(definitions), b"".join(parts)
         size = len(lead) + len(body)
-        crc = zlib.crc32(body, zlib.crc32(lead))
+        crc = crc32(body, crc32(lead))
         head = _mcap.encode_plain_chunk_head(size, crc, self.first_ns, self.last_ns)
         return head + lead, body, _mcap.encode_mark(self.first, self.following, mark_seed)
 

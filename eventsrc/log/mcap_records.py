@@ -15,7 +15,6 @@ chunk is synced.
 """
 
 import struct
-import zlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from io import BytesIO
@@ -42,6 +41,8 @@ from mcap.records import (
 )
 
 from eventsrc.envelope import Offset
+
+from .crc import crc32
 
 MAGIC = b"\x89MCAP0\r\n"
 PROFILE = "mapfold"
@@ -127,7 +128,7 @@ def checked_metadata(record: Metadata) -> dict[str, str]:
 
 def _metadata_crc(values: dict[str, str]) -> str:
     text = "".join(f"{len(k)}:{k}{len(v)}:{v}" for k, v in sorted(values.items()))
-    return f"{zlib.crc32(text.encode()):08x}"
+    return f"{crc32(text.encode()):08x}"
 
 
 def encode_message_head(channel: int, sequence: int, log: int, publish: int, size: int) -> bytes:
@@ -156,7 +157,7 @@ def encode_chunk(compressor: zstandard.ZstdCompressor, body: bytes, first: int, 
         first,
         last,
         len(body),
-        zlib.crc32(body),
+        crc32(body),
         4,
     )
     return b"".join((head, b"zstd", _U64.pack(len(data)), data))
@@ -212,7 +213,7 @@ def read_chunk(read: Callable[[int, int], bytes], length: int, position: int) ->
 def _checked_body(head: ChunkHead, body: bytes) -> bytes:
     if head.compressed:
         body = _decompress(body, head.plain_size)
-    if len(body) != head.plain_size or zlib.crc32(body) != head.crc:
+    if len(body) != head.plain_size or crc32(body) != head.crc:
         raise BadRecord("a chunk does not match its CRC")
     return body
 
@@ -236,7 +237,7 @@ def encode_message_index(channel: int, flat: list[int]) -> bytes:
 def encode_mark(first: Offset, following: Offset, seed: int) -> bytes:
     """The commit mark of a chunk that holds offsets ``first`` … ``following`` - 1."""
     mark = _MARK.pack(MARK_OPCODE, MARK_BYTES - FRAME.size, first, following)
-    return mark + _CRC.pack(zlib.crc32(mark) ^ seed)
+    return mark + _CRC.pack(crc32(mark) ^ seed)
 
 
 def decode_mark(data: bytes, seed: int) -> tuple[Offset, Offset]:
@@ -252,7 +253,7 @@ def decode_mark(data: bytes, seed: int) -> tuple[Offset, Offset]:
 def seed_of_mark(mark: bytes) -> int:
     """The mark seed that ``mark`` was made with, if it is undamaged."""
     (crc,) = _CRC.unpack_from(mark, _MARK.size)
-    return int(crc) ^ zlib.crc32(mark[: _MARK.size])
+    return int(crc) ^ crc32(mark[: _MARK.size])
 
 
 def iter_messages(body: bytes) -> Iterator[tuple[int, int, int, int, int, int]]:

@@ -1,9 +1,10 @@
 """Seal finished segments in a background thread, in offset order.
 
-Compressing and hashing release the interpreter lock, and the thread runs at a lower priority, so
-recording goes on meanwhile. Sealing may fall behind: a waiting segment takes its full size on disk
-and is read as before. A failure costs no more than that; it is tried again with the next segment
-and on the next start. Being killed in the middle costs nothing, so the thread is a daemon.
+The thread does it itself at a lower priority, or, for a recorder, has a process do the work
+(`seal_process`). If the process cannot be started or dies, the thread goes on by itself. Sealing
+may fall behind: a waiting segment takes its full size on disk and is read as before. A failure
+costs no more than that; it is tried again with the next segment and on the next start. Being killed
+in the middle costs nothing, so the thread is a daemon.
 """
 
 import contextlib
@@ -21,6 +22,7 @@ from .active_file import ActiveFile
 from .durable_files import sync_directory
 from .format import ACTIVE, SEALED, segment_path
 from .seal import SegmentPlan, seal
+from .seal_process import ProcessGone, SealingProcess
 
 _NICE: Final = 10
 """Recording has priority, but not so much that sealing starves on a busy machine."""
@@ -34,9 +36,18 @@ class Finished(NamedTuple):
 
 
 class Sealer:
-    """`submit` segments in offset order; `finish` waits for all of them."""
+    """`submit` segments in offset order; `finish` waits for all of them.
 
-    def __init__(self, log: Path, log_id: str, previous_sha256: str) -> None:
+    With ``in_process`` a `SealingProcess` seals. It is started for the first segment, unless that
+    is the last, because starting it takes longer than sealing a small one.
+    """
+
+    def __init__(
+        self, log: Path, log_id: str, previous_sha256: str, *, in_process: bool = False
+    ) -> None:
+        self._in_process = in_process
+        self._process: SealingProcess | None = None
+        self._finishing = False
         self._log = log
         self._log_id = log_id
         self._previous_sha256 = self._sealed_sha256 = previous_sha256
@@ -52,8 +63,9 @@ class Sealer:
         """Segments submitted and not sealed."""
         return self._count - self._sealed
 
-    def submit(self, base: Offset, following: Offset) -> None:
+    def submit(self, base: Offset, following: Offset, *, last: bool = False) -> None:
         """Queue the finished active segment of offsets ``base`` to before ``following``."""
+        self._finishing = last
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name="mapfold-sealer", daemon=True)
             self._thread.start()
@@ -74,6 +86,8 @@ class Sealer:
             waiting.append(finished)
             self._seal_all(waiting)
         self._seal_all(waiting)
+        if self._process is not None:
+            self._process.close()
 
     def _seal_all(self, waiting: deque[Finished]) -> None:
         """Seal in order, because each segment carries the hash of the one before. After an OSError
@@ -100,15 +114,28 @@ class Sealer:
         base, following = segment
         active = segment_path(self._log, base, ACTIVE)
         if active.exists():  # otherwise only the sync of the folder failed, the time before
-            file = ActiveFile(active, base)
             plan = SegmentPlan(self._log, self._log_id, base, self._previous_sha256, following)
-            self._sealed_sha256 = seal(plan, (file.read_chunk(chunk) for chunk in file.chunks))
+            self._sealed_sha256 = self._seal_in_process(plan) or self._seal_here(plan)
             active.unlink()
         elif not segment_path(self._log, base, SEALED).exists():
             lost = f"offsets {base} to {following - 1} are lost"
             raise LogDamaged(f"{active} was deleted before it was sealed: {lost}")
         sync_directory(self._log)
         self._previous_sha256 = self._sealed_sha256
+
+    def _seal_in_process(self, plan: SegmentPlan) -> str | None:
+        """The SHA-256 of the sealed file; None if this thread must seal."""
+        try:
+            if self._process is None and self._in_process and not self._finishing:
+                self._process = SealingProcess()
+            return None if self._process is None else self._process.seal(plan)
+        except ProcessGone:
+            self._in_process, self._process = False, None
+            return None
+
+    def _seal_here(self, plan: SegmentPlan) -> str:
+        file = ActiveFile(segment_path(self._log, plan.base, ACTIVE), plan.base)
+        return seal(plan, (file.read_chunk(chunk) for chunk in file.chunks))
 
 
 def _lower_priority() -> None:

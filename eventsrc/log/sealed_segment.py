@@ -7,7 +7,6 @@ before it, the CRC in the footer the summary and the footer, and the magic ends 
 
 import hashlib
 import os
-import zlib
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -16,6 +15,7 @@ from eventsrc.envelope import Offset
 from eventsrc.errors import LogDamaged
 
 from . import mcap_records as _mcap
+from .crc import crc32
 from .mcap_records import (
     BadRecord,
     Channel,
@@ -70,7 +70,7 @@ class SealedFile(SegmentFile):
         if length > _mcap.MAX_SUMMARY_BYTES:
             raise BadRecord(f"a summary of {length:,} bytes, more than {_mcap.MAX_SUMMARY_BYTES:,}")
         summary = os.pread(self._fd, length, footer.summary_start)
-        if zlib.crc32(tail[: _mcap.FOOTER_BYTES - 4], zlib.crc32(summary)) != footer.summary_crc:
+        if crc32(tail[: _mcap.FOOTER_BYTES - 4], crc32(summary)) != footer.summary_crc:
             raise BadRecord("the summary does not match its CRC")
         self._parse_summary(summary, size)
 
@@ -171,7 +171,7 @@ def _check(path: Path) -> FileCheck:
         at = 0
         while block := file.read(_BLOCK):
             sha256.update(block)
-            crc = zlib.crc32(block[: max(0, data_end_at - at)], crc)
+            crc = crc32(block[: max(0, data_end_at - at)], crc)
             at += len(block)
         fault = _data_end_fault(file.fileno(), data_end_at, crc)
         if fault is None:
@@ -199,8 +199,8 @@ def _data_end_fault(fd: int, at: int, crc: int) -> str | None:
 def _summary_fault(fd: int, start: int, size: int, tail: bytes) -> str | None:
     crc = 0
     for at in range(start, size - _mcap.TAIL_BYTES, _BLOCK):
-        crc = zlib.crc32(os.pread(fd, min(_BLOCK, size - _mcap.TAIL_BYTES - at), at), crc)
+        crc = crc32(os.pread(fd, min(_BLOCK, size - _mcap.TAIL_BYTES - at), at), crc)
     footer = tail[: _mcap.FOOTER_BYTES]
-    if zlib.crc32(footer[:-4], crc) != int.from_bytes(footer[-4:], "little"):
+    if crc32(footer[:-4], crc) != int.from_bytes(footer[-4:], "little"):
         return "the summary does not match its CRC"
     return None

@@ -52,7 +52,8 @@ class LogWriter:
 
     A segment file that somebody deletes, moves or cuts short while it is written is given up, and
     writing goes on in a new one behind the last recorded offset: see `faults`; `close` then raises
-    LogError. Full segments are sealed in a thread of their own.
+    LogError. Full segments are sealed in a thread of their own; with ``sealing_process`` in a
+    process, which costs its start and lets recording use a whole processor.
     """
 
     def __init__(
@@ -64,6 +65,7 @@ class LogWriter:
         rotate_bytes: int = ROTATE_BYTES,
         rotate_events: int = ROTATE_EVENTS,
         rotate_seconds: float = ROTATE_SECONDS,
+        sealing_process: bool = False,
     ) -> None:
         self.path = path
         self._fsync = fsync
@@ -71,6 +73,7 @@ class LogWriter:
         self._rotate_bytes = rotate_bytes
         self._rotate_events = rotate_events
         self._rotate_ns = int(rotate_seconds * 1e9)
+        self._sealing_process = sealing_process
         self._closed = False
         self._faults: list[FileFault] = []
         try:
@@ -85,7 +88,12 @@ class LogWriter:
         try:
             self.restart: Restart = restart(self.path)
             self.log_id = self.restart.log_id or uuid.uuid4().hex
-            self._sealer = Sealer(self.path, self.log_id, self.restart.previous_sha256)
+            self._sealer = Sealer(
+                self.path,
+                self.log_id,
+                self.restart.previous_sha256,
+                in_process=self._sealing_process,
+            )
             self._active = self._new_segment(self.restart.next_offset)
             self._active.create()
             for base, following in self.restart.unsealed:
@@ -207,8 +215,8 @@ class LogWriter:
         self._active = following
         self._submit(finished)
 
-    def _submit(self, finished: ActiveSegment) -> None:
-        self._sealer.submit(finished.base, finished.committed)
+    def _submit(self, finished: ActiveSegment, *, last: bool = False) -> None:
+        self._sealer.submit(finished.base, finished.committed, last=last)
 
     def close(self) -> None:
         """Commit, seal, release the lock. Raises LogError when the last events or a sealed segment
@@ -242,7 +250,7 @@ class LogWriter:
         """Submit the last segment. An empty one is deleted unless it is the log's only one, which
         carries the log's id."""
         if self._active.committed > self._active.base:
-            self._submit(self._active)
+            self._submit(self._active, last=True)
         elif self._active.base > 0:
             unlink_quietly(self._active.path)
 

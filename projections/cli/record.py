@@ -98,7 +98,7 @@ def record(
         RecorderSummary(log, json=json) as summary,
         stop_on_signals() as stop,
         open_session(options, mode=options.mode) as session,
-        LogWriter(log, fsync=policy) as writer,
+        LogWriter(log, fsync=policy, sealing_process=True) as writer,
     ):
         say_restart(log, writer)
         recorder = Recorder(

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import random
 import zlib
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 from eventsrc.errors import LogError
 from eventsrc.log import ALWAYS, LogReader, LogWriter, recover_log, verify_log
 from eventsrc.log import mcap_records as _mcap
+from eventsrc.log import seal as _seal
 from eventsrc.log import seal_worker as _sealer
 from eventsrc.log.format import ACTIVE, HEAD_BYTES, SEALED, read_head, segment_path
 from eventsrc.log.seal_worker import Sealer
@@ -162,3 +164,26 @@ def test_the_advice_for_a_full_disk_is_to_free_space(
     monkeypatch.setattr("eventsrc.log.active_segment.sync_file", refuse)
     with pytest.raises(LogError, match="No space left on device; free space on its disk"):
         LogWriter(log_path)
+
+
+def test_a_large_segment_is_synced_a_few_megabytes_at_a_time(
+    log_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Syncing all of it at once would keep the disk from the commits of the growing segment."""
+    unsynced, synced_to = [], 0
+    real = _seal.sync_file
+
+    def sync_file(fd: int) -> None:
+        nonlocal synced_to
+        size = os.fstat(fd).st_size
+        unsynced.append(size - synced_to)
+        synced_to = size
+        real(fd)
+
+    with LogWriter(log_path, fsync=ALWAYS) as writer:
+        for number in range(24):
+            writer.append(KEY, random.Random(number).randbytes(1_000_000))
+        monkeypatch.setattr(_seal, "sync_file", sync_file)
+    (sealed,) = log_path.glob("*.mcap")
+    assert synced_to == sealed.stat().st_size > 20_000_000
+    assert max(unsynced) < 7_000_000

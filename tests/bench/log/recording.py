@@ -119,7 +119,7 @@ def record(log: Path, fsync: FsyncPolicy, rate: float, seconds: float) -> Record
     with program(ROUTER) as router:
         endpoint = said(router)
         with (
-            LogWriter(log, fsync=fsync) as writer,
+            LogWriter(log, fsync=fsync, sealing_process=True) as writer,
             open_session(ZenohOptions(connect=(endpoint,)), mode="client") as session,
         ):
             recorder = Recorder(session, writer, [KEY])
