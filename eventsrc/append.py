@@ -6,7 +6,7 @@ under ``mapfold/rejected``, with its key, its bytes and the reason, so nothing i
 """
 
 from collections.abc import Sequence
-from typing import TypeAlias
+from typing import NamedTuple
 
 from eventsrc.transport.config import key_fault
 
@@ -16,8 +16,19 @@ from .log import LogWriter, NewEvent
 from .system_events import REJECTED_KEY, RejectedPayload
 from .upcast import PendingEvent, check_envelopes, detect_version
 
-PreparedEvent: TypeAlias = tuple[NewEvent, Envelope | Rejected]
-"""The event to append for one payload, and the result of its validation."""
+
+class Checked(NamedTuple):
+    """The version of a payload, and the result of its validation."""
+
+    version: int
+    result: Envelope | Rejected
+
+    @property
+    def stamp_ns(self) -> int | None:
+        """The robot's time; None if the payload has none."""
+        if isinstance(self.result, Rejected) or self.version != ENVELOPE_VERSION:
+            return None
+        return self.result.stamp_ns
 
 
 def append_payload(
@@ -32,53 +43,46 @@ def append_payload(
 
     ``logged_ns`` is when it was received, now by default.
     """
+    logged = writer.now_ns() if logged_ns is None else logged_ns
     messages = [(key, payload)]
-    ((event, result),) = prepare_events(writer, messages, logged_ns=logged_ns, max_bytes=max_bytes)
+    (checked,) = check_payloads(
+        messages, first=writer.next_offset, logged_ns=logged, max_bytes=max_bytes
+    )
+    version, result = checked
+    if isinstance(result, Rejected):
+        event = rejected_event(key, payload, result.reason, logged)
+    else:
+        stamp = checked.stamp_ns
+        event = NewEvent(key, payload, logged, logged if stamp is None else stamp, version)
     writer.append_all([event])
     return result
 
 
-def prepare_events(
-    writer: LogWriter,
-    messages: Sequence[tuple[str, bytes]],
-    *,
-    logged_ns: int | None = None,
-    max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES,
-) -> list[PreparedEvent]:
-    """The events to append to ``writer`` next, one for each (key, payload), in this order.
+def check_payloads(
+    messages: Sequence[tuple[str, bytes]], *, first: Offset, logged_ns: int, max_bytes: int
+) -> list[Checked]:
+    """Validate each payload, and the key that it came under, of messages (key, payload).
 
-    Faster together than one by one, with the same result. A dozen or two at a time is best, so that
-    what is decoded of them fits the processor's cache.
+    ``first`` is the offset that the first will have, or one before it, and ``logged_ns`` when they
+    are appended, or some time before: a payload of an older form has neither keyframe nor time, and
+    any of these is valid for it. Faster together than one by one, with the same results. A dozen or
+    two at a time is best, so that what is decoded of them fits the processor's cache.
     """
-    logged = writer.now_ns() if logged_ns is None else logged_ns
     pending = [
-        PendingEvent(Offset(offset), key, logged, payload, detect_version(payload))
-        for offset, (key, payload) in enumerate(messages, writer.next_offset)
+        PendingEvent(Offset(offset), key, logged_ns, payload, detect_version(payload))
+        for offset, (key, payload) in enumerate(messages, first)
     ]
-    results = _validate(pending, max_bytes)
-    return list(zip(map(_event, pending, results), results, strict=True))
-
-
-def _event(event: PendingEvent, result: Envelope | Rejected) -> NewEvent:
-    _, key, logged, payload, version = event
-    if isinstance(result, Rejected):
-        return _rejected_event(key, payload, result.reason, logged)
-    stamp = result.stamp_ns if version == ENVELOPE_VERSION else logged
-    return NewEvent(key, payload, logged, stamp, version)
-
-
-def _rejected_event(key: str, payload: bytes, reason: str, logged_ns: int) -> NewEvent:
-    escaped = key.encode(errors="backslashreplace").decode()  # a lone surrogate is not UTF-8
-    record = RejectedPayload.encode(escaped, reason, payload)
-    return NewEvent(REJECTED_KEY, record, logged_ns, logged_ns)
-
-
-def _validate(pending: Sequence[PendingEvent], max_bytes: int) -> list[Envelope | Rejected]:
-    """Validate each payload, and the key that it came under."""
     results = check_envelopes(pending, max_bytes=max_bytes)
     keys = {event.key for event in pending}  # usually one
     faults = {key: fault for key in keys if (fault := key_fault(key)) is not None}
     for index, event in enumerate(pending if faults else ()):
         if event.key in faults:
             results[index] = Rejected(f"key {abbreviate(event.key)} {faults[event.key]}")
-    return results
+    return [Checked(event.version, result) for event, result in zip(pending, results, strict=True)]
+
+
+def rejected_event(key: str, payload: bytes, reason: str, logged_ns: int) -> NewEvent:
+    """The event that keeps a refused payload."""
+    escaped = key.encode(errors="backslashreplace").decode()  # a lone surrogate is not UTF-8
+    record = RejectedPayload.encode(escaped, reason, payload)
+    return NewEvent(REJECTED_KEY, record, logged_ns, logged_ns)

@@ -1,7 +1,7 @@
 """The recorder's writer thread: from the queue into the log, then acknowledge what is synced.
 
-* This thread alone owns the LogWriter. It gets batches from the queue, validates and appends them,
-  and lets the log commit.
+* This thread alone appends to the log and commits. It gets batches from the queue that are checked
+  already (`checking`); the next batch is checked while this one is written and synced.
 * Only when an event is synced does it enter the gap ledger, count as recorded, and get an
   acknowledgement or a refusal.
 * An acknowledgement names the payloads of one sync only. What an earlier recorder synced may have
@@ -12,9 +12,9 @@
   in the old one are then not acknowledged any more, and no ledger is saved, because it would
   contain events that the log has lost.
 * When the log cannot be written any more, everything received and not known to be synced is counted
-  as unwritten: in the commit group, in the batch at hand, or in the queue.
+  as unwritten: in the commit group, in the batch at hand and the next, or in the queue.
 * Losses are recorded about once a second, not one by one, to spare an overloaded recorder.
-* `prepare_events` rejects messages under ``mapfold/``: they could forge a loss or a command.
+* `check_payloads` rejects messages under ``mapfold/``: they could forge a loss or a command.
 * A command that came as a query (`edit_requests`) is appended behind the messages of its batch and
   synced at once. It is not counted as a message.
 """
@@ -22,64 +22,32 @@
 import itertools
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple
 
 from pydantic import ValidationError
 
-from eventsrc.append import PreparedEvent, prepare_events
-from eventsrc.envelope import ENVELOPE_VERSION, KeyframeId, Offset, RunId
+from eventsrc.envelope import Offset, RunId
 from eventsrc.errors import LogError
 from eventsrc.gap_history import delete_ledger, save_ledger
 from eventsrc.gaps import Gap, GapLedger, Source
-from eventsrc.ingest import Rejected
 from eventsrc.log import LogWriter
 from eventsrc.robot.acks import (
     MAX_PER_ACK,
-    SENT_SUFFIX,
     Ack,
     Refusal,
     Refusals,
     Sent,
     ack_key,
-    payload_sha256,
     refusal_key,
 )
 from eventsrc.system_events import LOSS_KEY, Loss
 from eventsrc.transport.session import Received
 
+from .checking import Batch, CheckedMessage, Checker
 from .edit_requests import EditRequest, Edits
 from .queue import MessageQueue
-
-
-class UnsyncedEvent(NamedTuple):
-    """What to note and reply once an event is synced.
-
-    ``run_id`` and ``keyframe_id`` are None for a rejected payload and for a form older than the
-    envelope. ``refusal`` is the reply to a rejected payload; ``sha256`` is that of an envelope's
-    payload, otherwise empty.
-    """
-
-    offset: Offset
-    key: str
-    refusal: Refusal | None
-    run_id: RunId | None
-    keyframe_id: KeyframeId | None
-    sha256: str
-
-
-def unsynced_event(offset: Offset, message: Received, prepared: PreparedEvent) -> UnsyncedEvent:
-    """``message`` as it is appended at ``offset``."""
-    event, result = prepared
-    key = message.key
-    if isinstance(result, Rejected):
-        refusal = Refusal.of(message.payload, result.reason)
-        return UnsyncedEvent(offset, key, refusal, None, None, "")
-    if event.version != ENVELOPE_VERSION:
-        return UnsyncedEvent(offset, key, None, None, None, "")
-    sha256 = payload_sha256(message.payload)
-    return UnsyncedEvent(offset, key, None, result.run_id, result.keyframe_id, sha256)
 
 
 class Replies:
@@ -89,8 +57,8 @@ class Replies:
         self._synced: defaultdict[tuple[RunId, str], list[str]] = defaultdict(list)
         self._refusals: defaultdict[str, list[Refusal]] = defaultdict(list)
 
-    def add(self, event: UnsyncedEvent) -> None:
-        """Add an event that is synced."""
+    def add(self, event: CheckedMessage) -> None:
+        """Add a message whose event is synced."""
         if event.run_id is not None:
             self._synced[event.run_id, event.key].append(event.sha256)
         if event.refusal is not None:
@@ -155,10 +123,6 @@ SendReply = Callable[[str, bytes], None]
 """Sends a payload under a key."""
 
 _BATCH: Final = 256
-_VALIDATED_TOGETHER: Final = 16
-"""Messages validated at a time: enough to save time, few enough to fit the processor's cache."""
-_VALIDATED_TOGETHER_BYTES: Final = 1024 * 1024
-"""Fewer are validated at a time from this size on, since all that is decoded is held at once."""
 _IDLE_S: Final = 0.25
 _COMMIT_POLL_S: Final = 0.005
 """How long to wait for messages while events are unsynced: a tenth of the default commit time."""
@@ -199,13 +163,13 @@ class WriterThread:
         self._send_reply = send_reply
         self._events_left = max_events
         self._report_gaps = report_gaps
-        self._max_payload_bytes = max_payload_bytes
         self._losses_due_ns = time.monotonic_ns() + _LOSSES_EVERY_NS
         self._save_after_ns = _FIRST_SAVE_NS
         self._save_due_ns = time.monotonic_ns() + self._save_after_ns
-        self._unsynced: deque[UnsyncedEvent] = deque()
+        self._checker = Checker(queue, writer, max_payload_bytes)
+        self._unsynced: deque[tuple[Offset, CheckedMessage]] = deque()
         self._announcements: deque[_Announcement] = deque()
-        self._in_progress = 0  # removed from the queue and not yet appended
+        self._in_progress = 0  # checked and not appended
         self._failed = False
         self._faults = 0
         self._recorded = self._rejected = 0
@@ -215,6 +179,7 @@ class WriterThread:
         """Record until the queue is closed and empty, or ``max_events`` is reached. Raises LogError
         when the log cannot be written; everything synced is safe."""
         try:
+            self._checker.begin(self._limit())
             while self._step():
                 pass
             self._sync()
@@ -226,7 +191,12 @@ class WriterThread:
             if self._edits is not None:
                 self._edits.fail(str(error))
             raise
+        finally:
+            self._in_progress += self._checker.close()
         self._process_synced()
+
+    def _limit(self) -> int:
+        return _BATCH if self._events_left is None else min(_BATCH, self._events_left)
 
     def report(self) -> RecorderReport:
         """The numbers now; may be called from any thread."""
@@ -257,20 +227,18 @@ class WriterThread:
         return len(self._unsynced) + self._in_progress + self._queue.depth()
 
     def _step(self) -> bool:
-        """Record one batch; False when there will be no more."""
-        limit = _BATCH if self._events_left is None else min(_BATCH, self._events_left)
-        closed = self._queue.closed  # read first: what was put before closing is still recorded
+        """Record one batch, if it is there; False when there will be no more."""
         waiting = self._writer.durable_offset < self._writer.next_offset
-        received = self._queue.get(limit, _COMMIT_POLL_S if waiting else _IDLE_S)
-        messages = [message for message in received if isinstance(message, Received)]
-        batch = [message for message in messages if not message.key.endswith(SENT_SUFFIX)]
-        self._in_progress = len(batch)
-        for part in _parts(batch):
-            self._append(part)
-        if len(batch) < len(messages):
-            self._hold_announcements(messages)
-        if len(messages) < len(received):
-            self._append_edits(received)
+        batch = self._checker.take(_COMMIT_POLL_S if waiting else _IDLE_S)
+        if batch is not None:
+            if self._events_left is not None:
+                self._events_left -= len(batch.messages)
+            ended = batch.last or self._events_left == 0
+            if not ended:
+                self._checker.begin(self._limit())
+            self.append(batch)
+        else:
+            ended = False
         self._writer.commit_if_due()
         self._process_synced()
         now_ns = time.monotonic_ns()
@@ -281,42 +249,44 @@ class WriterThread:
             self._save_after_ns = min(2 * self._save_after_ns, _SAVE_EVERY_NS)
             self._save_due_ns = now_ns + self._save_after_ns
             self._save()
-        if self._events_left is not None:
-            self._events_left -= len(batch)
-        return bool(received or not closed) and self._events_left != 0
+        return not ended
 
-    def _append(self, messages: list[Received]) -> None:
-        payloads = [(message.key, message.payload) for message in messages]
-        prepared = prepare_events(self._writer, payloads, max_bytes=self._max_payload_bytes)
+    def append(self, batch: Batch) -> None:
+        """Append a batch; it commits in between."""
+        messages = batch.messages
+        self._in_progress = len(messages)
+        logged_ns = self._writer.now_ns()
+        events = [message.event(logged_ns) for message in messages]
         # Before appending: if that fails in the middle, what was synced by then still counts.
         offsets = map(Offset, itertools.count(self._writer.next_offset))
-        self._unsynced.extend(map(unsynced_event, offsets, messages, prepared))
-        self._in_progress -= len(messages)
-        self._writer.append_all([event for event, _ in prepared])
+        self._unsynced.extend(zip(offsets, messages, strict=False))
+        self._in_progress = 0
+        self._writer.append_all(events)
+        self._hold_announcements(batch.announcements)
+        if batch.edits:
+            self._append_edits(batch.edits)
 
-    def _append_edits(self, received: list[Received | EditRequest]) -> None:
+    def _append_edits(self, requests: list[EditRequest]) -> None:
         if self._edits is not None:
-            for request in received:
-                if isinstance(request, EditRequest):
-                    self._edits.append(request)
+            for request in requests:
+                self._edits.append(request)
             self._writer.sync()
 
-    def _hold_announcements(self, received: list[Received]) -> None:
+    def _hold_announcements(self, announcements: list[Received]) -> None:
         """Keep announcements until everything appended so far is synced."""
-        for message in received:
-            if message.key.endswith(SENT_SUFFIX):
-                try:
-                    sent = Sent.decode(message.payload)
-                except ValidationError:
-                    continue  # no announcement that this version understands
-                self._announcements.append(_Announcement(self._writer.next_offset, sent))
+        for message in announcements:
+            try:
+                sent = Sent.decode(message.payload)
+            except ValidationError:
+                continue  # no announcement that this version understands
+            self._announcements.append(_Announcement(self._writer.next_offset, sent))
 
     def _process_synced(self) -> None:
         """Count and acknowledge everything synced since the last call."""
         durable = self._writer.durable_offset
         self._discard_lost()
         now_ns = time.monotonic_ns()
-        if self._unsynced and self._unsynced[0].offset < durable:
+        if self._unsynced and self._unsynced[0][0] < durable:
             self._acknowledge(durable, now_ns)
         if self._edits is not None:
             self._edits.settle(durable)
@@ -328,13 +298,13 @@ class WriterThread:
         """Count the events before ``durable``, enter them in the ledger and send the replies."""
         waiting, replies, ledger = self._unsynced, Replies(), self._ledger
         rejected, before = 0, len(waiting)
-        while waiting and waiting[0].offset < durable:
-            event = waiting.popleft()
-            rejected += event.refusal is not None
-            run_id, keyframe_id = event.run_id, event.keyframe_id
+        while waiting and waiting[0][0] < durable:
+            _, message = waiting.popleft()
+            rejected += message.refusal is not None
+            run_id, keyframe_id = message.run_id, message.keyframe_id
             if run_id is not None and keyframe_id is not None:
                 ledger.record(run_id, keyframe_id, now_ns)
-            replies.add(event)
+            replies.add(message)
         self._rejected += rejected
         self._recorded += before - len(waiting) - rejected
         for key, payload in replies.messages(self._writer.log_id):
@@ -351,7 +321,7 @@ class WriterThread:
             return
         if self._edits is not None:
             self._edits.lose(lost)
-        kept = [e for e in self._unsynced if not any(a <= e.offset < b for a, b in lost)]
+        kept = [e for e in self._unsynced if not any(a <= e[0] < b for a, b in lost)]
         self._unsynced = deque(kept)
         if self._saves_ledger:
             self._saves_ledger = False
@@ -382,20 +352,6 @@ class WriterThread:
 
     def _append_loss(self, loss: Loss) -> None:
         self._writer.append(LOSS_KEY, loss.model_dump_json().encode())
-
-
-def _parts(messages: Sequence[Received]) -> Iterator[list[Received]]:
-    """``messages`` in parts to be validated together."""
-    part: list[Received] = []
-    size = 0
-    for message in messages:
-        part.append(message)
-        size += len(message.payload)
-        if len(part) == _VALIDATED_TOGETHER or size >= _VALIDATED_TOGETHER_BYTES:
-            yield part
-            part, size = [], 0
-    if part:
-        yield part
 
 
 def _loss(cause: Literal["keyframe_gap", "transport_miss"], gap: Gap[Source]) -> Loss:

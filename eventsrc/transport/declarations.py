@@ -158,11 +158,6 @@ def _parameters(text: str) -> dict[str, str]:
     return {name: value for name, _, value in pairs}
 
 
-def to_received(sample: zenoh.Sample) -> Received:
-    """Copy a message out of Zenoh."""
-    return Received(str(sample.key_expr), sample.payload.to_bytes(), sequence_number(sample))
-
-
 def sequence_number(sample: zenoh.Sample) -> SequenceNumber | None:
     """The number of ``sample``; None if no advanced publisher sent it."""
     info = sample.source_info

@@ -36,7 +36,6 @@ from .declarations import (
     heartbeats_under,
     parse_heartbeat,
     sequence_number,
-    to_received,
 )
 from .errors import ignore_transport_errors, is_panic, one_line, open_error, transport_errors
 
@@ -79,10 +78,12 @@ class Session:
         """
 
         def receive(sample: zenoh.Sample) -> None:
-            if limit is not None and len(sample.payload) > limit.size_bytes:
+            payload = sample.payload  # each access makes a new object
+            if limit is not None and len(payload) > limit.size_bytes:
                 limit.refuse(str(sample.key_expr), sequence_number(sample))
             else:
-                handler(to_received(sample))
+                key = str(sample.key_expr)
+                handler(Received(key, payload.to_bytes(), sequence_number(sample)))
 
         check_key_length(key_expr)
         with transport_errors(f"key expression {key_expr!r} cannot be subscribed to"):

@@ -18,6 +18,7 @@ from eventsrc.gap_history import ledger_of, save_ledger
 from eventsrc.gaps import Gap
 from eventsrc.log import Event, FsyncPolicy, LogReader, LogWriter
 from eventsrc.recorder import Recorder, RecorderReport
+from eventsrc.recorder.checking import Batch, Checker
 from eventsrc.recorder.queue import MessageQueue
 from eventsrc.recorder.writer_thread import WriterThread
 from eventsrc.robot.acks import (
@@ -521,8 +522,10 @@ def test_events_lost_before_their_acknowledgement_are_not_acknowledged(tmp_path:
     """The first group is processed only when the second has found the file deleted."""
     answered: list[tuple[str, bytes]] = []
     writer = LogWriter(tmp_path / "log")
+    queue = MessageQueue()
+    checker = Checker(queue, writer, 2**20)
     thread = WriterThread(
-        MessageQueue(),
+        queue,
         writer,
         None,
         lambda key, said: answered.append((key, said)),
@@ -531,7 +534,8 @@ def test_events_lost_before_their_acknowledgement_are_not_acknowledged(tmp_path:
         max_payload_bytes=2**20,
     )
     for run_id, count in (("lost", 3), ("kept", 2)):
-        thread._append([Received(KEY, p) for p in _keyframes(*range(count), run_id=run_id)])
+        messages = [Received(KEY, p) for p in _keyframes(*range(count), run_id=run_id)]
+        thread.append(Batch(list(checker.check(messages)), [], []))
         writer.sync()
         if run_id == "lost":
             next((tmp_path / "log").glob("*.active")).unlink()
