@@ -1,8 +1,9 @@
-"""Check messages in a thread of their own, one batch ahead of the writer thread.
+"""Get batches of messages from the queue and check them, under load one batch ahead of the writer.
 
-Most of the time that a message takes is spent on its validation and its SHA-256. Done here, it is
-done while the writer thread waits for the disk. Nothing is written or acknowledged here, and the
-writer thread appends the batches in the order in which the messages came.
+Most of the time that a message takes is spent on its validation and its SHA-256. When a whole batch
+more waits in the queue, a second thread checks it while the writer thread writes the one before and
+waits for the disk. Nothing is written or acknowledged here, and the writer thread appends the
+batches in the order in which the messages came.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,7 +24,6 @@ _CHECKED_TOGETHER: Final = 16
 """Messages checked at a time: enough to save time, few enough to fit the processor's cache."""
 _CHECKED_TOGETHER_BYTES: Final = 1024 * 1024
 """Fewer are checked at a time from this size on, since all that is decoded is held at once."""
-_IDLE_S: Final = 0.25
 
 
 class CheckedMessage(NamedTuple):
@@ -63,40 +63,42 @@ class Batch(NamedTuple):
 
 
 class Checker:
-    """Gets batches from a queue and checks them. `begin`, then `take` and `begin` by turns."""
+    """Gets batches from a queue and checks them; belongs to the writer thread."""
 
     def __init__(self, queue: MessageQueue, writer: LogWriter, max_payload_bytes: int) -> None:
         self._queue = queue
         self._writer = writer
         self._max_payload_bytes = max_payload_bytes
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="log-checker")
-        self._next: Future[Batch] | None = None
+        self._ahead: Future[Batch] | None = None
 
-    def begin(self, limit: int) -> None:
-        """Get and check the next batch, of up to ``limit`` messages, in the thread."""
-        self._next = self._thread.submit(self._get, limit)
-
-    def take(self, timeout_s: float) -> Batch | None:
-        """The batch that was begun; None if it is not there in time."""
-        if self._next is None:
-            raise AssertionError("take before begin")
-        try:
-            batch = self._next.result(timeout_s)
-        except TimeoutError:
-            return None
-        self._next = None
+    def take(self, limit: int, timeout_s: float) -> Batch:
+        """The batch that `begin_ahead` began; else up to ``limit`` messages, waiting for the first
+        for ``timeout_s`` at most."""
+        if self._ahead is None:
+            return self._get(limit, timeout_s)
+        batch = self._ahead.result()
+        self._ahead = None
         return batch
+
+    def begin_ahead(self, limit: int) -> None:
+        """Check the next batch, of up to ``limit`` messages, in the second thread if so many wait.
+
+        Smaller ones are left to `take`: they would cost more for being handed over than they save.
+        """
+        if self._queue.depth() >= limit:
+            self._ahead = self._thread.submit(self._get, limit, 0.0)
 
     def close(self) -> int:
         """End the thread; how many messages it has taken from the queue that nobody will append."""
         self._thread.shutdown()
-        if self._next is None or self._next.exception() is not None:  # which `take` has raised
+        if self._ahead is None or self._ahead.exception() is not None:  # which `take` has raised
             return 0
-        return len(self._next.result().messages)
+        return len(self._ahead.result().messages)
 
-    def _get(self, limit: int) -> Batch:
+    def _get(self, limit: int, timeout_s: float) -> Batch:
         closed = self._queue.closed  # read first: what was put before closing is still recorded
-        received = self._queue.get(limit, _IDLE_S)
+        received = self._queue.get(limit, timeout_s)
         payloads: list[Received] = []
         batch = Batch([], [], [], last=closed and not received)
         for message in received:

@@ -1,7 +1,7 @@
 """The recorder's writer thread: from the queue into the log, then acknowledge what is synced.
 
-* This thread alone appends to the log and commits. It gets batches from the queue that are checked
-  already (`checking`); the next batch is checked while this one is written and synced.
+* This thread alone appends to the log and commits. It gets checked batches from the queue
+  (`checking`); under load the next batch is checked while this one is written and synced.
 * Only when an event is synced does it enter the gap ledger, count as recorded, and get an
   acknowledgement or a refusal.
 * An acknowledgement names the payloads of one sync only. What an earlier recorder synced may have
@@ -179,7 +179,6 @@ class WriterThread:
         """Record until the queue is closed and empty, or ``max_events`` is reached. Raises LogError
         when the log cannot be written; everything synced is safe."""
         try:
-            self._checker.begin(self._limit())
             while self._step():
                 pass
             self._sync()
@@ -227,18 +226,15 @@ class WriterThread:
         return len(self._unsynced) + self._in_progress + self._queue.depth()
 
     def _step(self) -> bool:
-        """Record one batch, if it is there; False when there will be no more."""
+        """Record one batch; False when there will be no more."""
         waiting = self._writer.durable_offset < self._writer.next_offset
-        batch = self._checker.take(_COMMIT_POLL_S if waiting else _IDLE_S)
-        if batch is not None:
-            if self._events_left is not None:
-                self._events_left -= len(batch.messages)
-            ended = batch.last or self._events_left == 0
-            if not ended:
-                self._checker.begin(self._limit())
-            self.append(batch)
-        else:
-            ended = False
+        batch = self._checker.take(self._limit(), _COMMIT_POLL_S if waiting else _IDLE_S)
+        if self._events_left is not None:
+            self._events_left -= len(batch.messages)
+        ended = batch.last or self._events_left == 0
+        if not ended:
+            self._checker.begin_ahead(self._limit())
+        self.append(batch)
         self._writer.commit_if_due()
         self._process_synced()
         now_ns = time.monotonic_ns()
