@@ -45,6 +45,7 @@ class ActiveSegment:
     """`add` events, `commit` them; they are recorded when `commit` returns.
 
     ``on_fault`` is called during a commit, when a file was given up and the next one exists.
+    ``while_syncing`` runs the sync of a commit, and may do other work until it is done.
     """
 
     def __init__(
@@ -54,6 +55,7 @@ class ActiveSegment:
         base: Offset,
         policy: FsyncPolicy,
         on_fault: Callable[[FileFault], None] = lambda _: None,
+        while_syncing: Callable[[Callable[[], None]], None] = lambda sync: sync(),
     ) -> None:
         self.committed = base
         self.size = 0
@@ -61,6 +63,7 @@ class ActiveSegment:
         self._log_id = log_id
         self._folder: Identity | None = None
         self._on_fault = on_fault
+        self._while_syncing = while_syncing
         self._set_file(base)
         self._syncs = policy.syncs
         self._group = GroupBuilder(base, policy)
@@ -152,7 +155,7 @@ class ActiveSegment:
         write_all(self._fd, head)
         write_all(self._fd, body)
         if self._syncs:
-            sync_file(self._fd)
+            self._while_syncing(lambda: sync_file(self._fd))
         end = self.size + len(head) + len(body)
         problem = find_problem(self._fd, self.path, end)
         if problem is not None:

@@ -8,9 +8,11 @@ continues after the last good event.
 
 import contextlib
 import errno
+import threading
 import time
 import uuid
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
@@ -74,6 +76,8 @@ class LogWriter:
         self._rotate_events = rotate_events
         self._rotate_ns = int(rotate_seconds * 1e9)
         self._sealing_process = sealing_process
+        self._work: Callable[[], bool] | None = None
+        self._work_thread: ThreadPoolExecutor | None = None
         self._closed = False
         self._faults: list[FileFault] = []
         try:
@@ -104,7 +108,30 @@ class LogWriter:
 
     def _new_segment(self, base: Offset) -> ActiveSegment:
         self._begun = time.monotonic_ns()
-        return ActiveSegment(self.path, self.log_id, base, self._fsync, self._note_fault)
+        return ActiveSegment(
+            self.path, self.log_id, base, self._fsync, self._note_fault, self._work_while_syncing
+        )
+
+    def work_while_syncing(self, work: Callable[[], bool] | None) -> None:
+        """Call ``work`` in another thread, again and again, while a commit waits for the disk and
+        until it returns False. It must append nothing, and be short: the commit waits for its end.
+        """
+        self._work = work
+
+    def _work_while_syncing(self, sync: Callable[[], None]) -> None:
+        work = self._work
+        if work is None:
+            sync()
+            return
+        if self._work_thread is None:
+            self._work_thread = ThreadPoolExecutor(1, thread_name_prefix="log-worker")
+        synced = threading.Event()
+        working = self._work_thread.submit(_work_until, synced, work)
+        try:
+            sync()
+        finally:
+            synced.set()
+            working.result()
 
     def _note_fault(self, fault: FileFault) -> None:
         if not fault.lost and fault.following > fault.base:
@@ -230,6 +257,8 @@ class LogWriter:
             self._finish_active()
         finally:
             self._active.close()
+            if self._work_thread is not None:
+                self._work_thread.shutdown()
             self._sealer.finish()
             self._lock.release()
         if self._faults:
@@ -268,6 +297,11 @@ class LogWriter:
             return
         with contextlib.suppress(MapfoldError):  # the first error is the one to report
             self.close()
+
+
+def _work_until(done: threading.Event, work: Callable[[], bool]) -> None:
+    while not done.is_set() and work():
+        pass
 
 
 def _advice(error: OSError) -> str:

@@ -1,4 +1,4 @@
-"""Record from Zenoh to a log: callback → bounded queue → checking thread → writer thread."""
+"""Record from Zenoh to a log: callback → bounded queue → one writer thread."""
 
 from .queue import DEFAULT_QUEUE_SIZE
 from .recorder import DEFAULT_KEYS, Recorder

@@ -1,13 +1,12 @@
-"""Get batches of messages from the queue and check them, under load one batch ahead of the writer.
+"""Get batches of messages from the queue and check them, also while the writer waits for the disk.
 
-Most of the time that a message takes is spent on its validation and its SHA-256. When a whole batch
-more waits in the queue, a second thread checks it while the writer thread writes the one before and
-waits for the disk. Nothing is written or acknowledged here, and the writer thread appends the
-batches in the order in which the messages came.
+Most of the time that a message takes is spent on its validation and its SHA-256. Both are done
+ahead, a few messages at a time, while a commit waits for the disk (`LogWriter.work_while_syncing`).
+Nothing is appended or acknowledged meanwhile, and messages are appended in the order in which they
+came.
 """
 
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Final, NamedTuple
 
 from eventsrc.append import check_payloads, rejected_event
@@ -18,8 +17,9 @@ from eventsrc.robot.acks import SENT_SUFFIX, Refusal, payload_sha256
 from eventsrc.transport.session import Received
 
 from .edit_requests import EditRequest
-from .queue import MessageQueue
+from .queue import MAX_BATCH_BYTES, MessageQueue
 
+_BATCH: Final = 256
 _CHECKED_TOGETHER: Final = 16
 """Messages checked at a time: enough to save time, few enough to fit the processor's cache."""
 _CHECKED_TOGETHER_BYTES: Final = 1024 * 1024
@@ -53,54 +53,67 @@ class CheckedMessage(NamedTuple):
         )
 
 
-class Batch(NamedTuple):
-    """What came together. ``last`` if the queue was closed and empty, so that no other follows."""
+class Batch:
+    """Messages, announcements and commands that are appended together."""
 
-    messages: list[CheckedMessage]
-    announcements: list[Received]
-    edits: list[EditRequest]
-    last: bool = False
+    def __init__(self) -> None:
+        self.messages: list[CheckedMessage] = []
+        self.announcements: list[Received] = []
+        self.edits: list[EditRequest] = []
+        self.size = 0
+        """Payload bytes of the messages."""
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing is in it."""
+        return not (self.messages or self.announcements or self.edits)
 
 
 class Checker:
-    """Gets batches from a queue and checks them; belongs to the writer thread."""
+    """Gets batches from a queue and checks them, ``max_messages`` in all; belongs to the writer
+    thread."""
 
-    def __init__(self, queue: MessageQueue, writer: LogWriter, max_payload_bytes: int) -> None:
+    def __init__(
+        self,
+        queue: MessageQueue,
+        writer: LogWriter,
+        *,
+        max_payload_bytes: int,
+        max_messages: int | None,
+    ) -> None:
         self._queue = queue
         self._writer = writer
         self._max_payload_bytes = max_payload_bytes
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="log-checker")
-        self._ahead: Future[Batch] | None = None
+        self._left = max_messages
+        self._ahead = Batch()
 
-    def take(self, limit: int, timeout_s: float) -> Batch:
-        """The batch that `begin_ahead` began; else up to ``limit`` messages, waiting for the first
-        for ``timeout_s`` at most."""
-        if self._ahead is None:
-            return self._get(limit, timeout_s)
-        batch = self._ahead.result()
-        self._ahead = None
-        return batch
+    @property
+    def waiting(self) -> int:
+        """Messages that were taken from the queue and checked, and not taken from here."""
+        return len(self._ahead.messages)
 
-    def begin_ahead(self, limit: int) -> None:
-        """Check the next batch, of up to ``limit`` messages, in the second thread if so many wait.
-
-        Smaller ones are left to `take`: they would cost more for being handed over than they save.
-        """
-        if self._queue.depth() >= limit:
-            self._ahead = self._thread.submit(self._get, limit, 0.0)
-
-    def close(self) -> int:
-        """End the thread; how many messages it has taken from the queue that nobody will append."""
-        self._thread.shutdown()
-        if self._ahead is None or self._ahead.exception() is not None:  # which `take` has raised
-            return 0
-        return len(self._ahead.result().messages)
-
-    def _get(self, limit: int, timeout_s: float) -> Batch:
+    def take(self, timeout_s: float) -> Batch | None:
+        """The next batch; an empty one if nothing came in time, None if nothing will come any
+        more."""
         closed = self._queue.closed  # read first: what was put before closing is still recorded
+        self._add(_BATCH, timeout_s if self._ahead.empty else 0.0)
+        batch, self._ahead = self._ahead, Batch()
+        return None if batch.empty and (closed or self._left == 0) else batch
+
+    def check_ahead(self) -> bool:
+        """Check a few messages for the next batch; False if none wait or the batch is full."""
+        return self._add(_CHECKED_TOGETHER, 0.0)
+
+    def _add(self, limit: int, timeout_s: float) -> bool:
+        """Add up to ``limit`` messages from the queue; False if there is none or no room."""
+        batch = self._ahead
+        limit = min(limit, _BATCH - len(batch.messages))
+        if self._left is not None:
+            limit = min(limit, self._left)
+        if limit == 0 or batch.size >= MAX_BATCH_BYTES:
+            return False
         received = self._queue.get(limit, timeout_s)
         payloads: list[Received] = []
-        batch = Batch([], [], [], last=closed and not received)
         for message in received:
             if isinstance(message, EditRequest):
                 batch.edits.append(message)
@@ -108,9 +121,12 @@ class Checker:
                 batch.announcements.append(message)
             else:
                 payloads.append(message)
+                batch.size += len(message.payload)
+        if self._left is not None:
+            self._left -= len(payloads)
         for part in _parts(payloads):
             batch.messages.extend(self.check(part))
-        return batch
+        return bool(received)
 
     def check(self, messages: Sequence[Received]) -> Iterator[CheckedMessage]:
         """Check messages together."""

@@ -1,4 +1,4 @@
-"""Record what is published over Zenoh: callback → queue → checking thread → writer thread."""
+"""Record what is published over Zenoh: callback → bounded queue → one writer thread."""
 
 import threading
 from collections.abc import Callable, Sequence

@@ -1,7 +1,7 @@
 """The recorder's writer thread: from the queue into the log, then acknowledge what is synced.
 
 * This thread alone appends to the log and commits. It gets checked batches from the queue
-  (`checking`); under load the next batch is checked while this one is written and synced.
+  (`checking`), and has the next messages checked while it waits for the disk.
 * Only when an event is synced does it enter the gap ledger, count as recorded, and get an
   acknowledgement or a refusal.
 * An acknowledgement names the payloads of one sync only. What an earlier recorder synced may have
@@ -122,7 +122,6 @@ class RecorderReport:
 SendReply = Callable[[str, bytes], None]
 """Sends a payload under a key."""
 
-_BATCH: Final = 256
 _IDLE_S: Final = 0.25
 _COMMIT_POLL_S: Final = 0.005
 """How long to wait for messages while events are unsynced: a tenth of the default commit time."""
@@ -161,12 +160,13 @@ class WriterThread:
         self._ledger: GapLedger[RunId] = GapLedger() if ledger is None else ledger
         self._saves_ledger = ledger is not None  # else it does not cover the whole log
         self._send_reply = send_reply
-        self._events_left = max_events
         self._report_gaps = report_gaps
         self._losses_due_ns = time.monotonic_ns() + _LOSSES_EVERY_NS
         self._save_after_ns = _FIRST_SAVE_NS
         self._save_due_ns = time.monotonic_ns() + self._save_after_ns
-        self._checker = Checker(queue, writer, max_payload_bytes)
+        self._checker = Checker(
+            queue, writer, max_payload_bytes=max_payload_bytes, max_messages=max_events
+        )
         self._unsynced: deque[tuple[Offset, CheckedMessage]] = deque()
         self._announcements: deque[_Announcement] = deque()
         self._in_progress = 0  # checked and not appended
@@ -178,9 +178,11 @@ class WriterThread:
     def run(self) -> None:
         """Record until the queue is closed and empty, or ``max_events`` is reached. Raises LogError
         when the log cannot be written; everything synced is safe."""
+        self._writer.work_while_syncing(self._checker.check_ahead)
         try:
             while self._step():
                 pass
+            self._writer.work_while_syncing(None)
             self._sync()
             self._write_losses(self._ledger.flush(), self._queue.drain_missed(None))
             self._save()
@@ -191,11 +193,8 @@ class WriterThread:
                 self._edits.fail(str(error))
             raise
         finally:
-            self._in_progress += self._checker.close()
+            self._writer.work_while_syncing(None)
         self._process_synced()
-
-    def _limit(self) -> int:
-        return _BATCH if self._events_left is None else min(_BATCH, self._events_left)
 
     def report(self) -> RecorderReport:
         """The numbers now; may be called from any thread."""
@@ -223,17 +222,15 @@ class WriterThread:
     def _unwritten(self) -> int:
         if not self._failed:
             return 0
-        return len(self._unsynced) + self._in_progress + self._queue.depth()
+        checked = self._in_progress + self._checker.waiting
+        return len(self._unsynced) + checked + self._queue.depth()
 
     def _step(self) -> bool:
         """Record one batch; False when there will be no more."""
         waiting = self._writer.durable_offset < self._writer.next_offset
-        batch = self._checker.take(self._limit(), _COMMIT_POLL_S if waiting else _IDLE_S)
-        if self._events_left is not None:
-            self._events_left -= len(batch.messages)
-        ended = batch.last or self._events_left == 0
-        if not ended:
-            self._checker.begin_ahead(self._limit())
+        batch = self._checker.take(_COMMIT_POLL_S if waiting else _IDLE_S)
+        if batch is None:
+            return False
         self.append(batch)
         self._writer.commit_if_due()
         self._process_synced()
@@ -245,7 +242,7 @@ class WriterThread:
             self._save_after_ns = min(2 * self._save_after_ns, _SAVE_EVERY_NS)
             self._save_due_ns = now_ns + self._save_after_ns
             self._save()
-        return not ended
+        return True
 
     def append(self, batch: Batch) -> None:
         """Append a batch; it commits in between."""

@@ -523,7 +523,7 @@ def test_events_lost_before_their_acknowledgement_are_not_acknowledged(tmp_path:
     answered: list[tuple[str, bytes]] = []
     writer = LogWriter(tmp_path / "log")
     queue = MessageQueue()
-    checker = Checker(queue, writer, 2**20)
+    checker = Checker(queue, writer, max_payload_bytes=2**20, max_messages=None)
     thread = WriterThread(
         queue,
         writer,
@@ -535,7 +535,9 @@ def test_events_lost_before_their_acknowledgement_are_not_acknowledged(tmp_path:
     )
     for run_id, count in (("lost", 3), ("kept", 2)):
         messages = [Received(KEY, p) for p in _keyframes(*range(count), run_id=run_id)]
-        thread.append(Batch(list(checker.check(messages)), [], []))
+        batch = Batch()
+        batch.messages.extend(checker.check(messages))
+        thread.append(batch)
         writer.sync()
         if run_id == "lost":
             next((tmp_path / "log").glob("*.active")).unlink()
