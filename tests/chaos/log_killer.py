@@ -19,7 +19,7 @@ from eventsrc.log import LogReader, LogWriter, verify_log
 from tests.chaos.log_writer import KEY, payload_at
 
 ROOT = Path(__file__).parents[2]
-LONGEST_LIFE_S = 0.6
+LONGEST_LIFE_S = 0.9
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,8 @@
     python -m tests.chaos.log_writer LOG FSYNC
 
 Prints ``next N`` once, then the durable offset after each commit, one a line. Event i always has
-the same payload, so whoever reads the log can tell what should stand there.
+the same payload, so whoever reads the log can tell what should stand there. Every other writer, by
+chance, has its segments sealed by a process.
 """
 
 import random
@@ -24,7 +25,10 @@ def payload_at(offset: int) -> bytes:
 
 def main(log: Path, fsync: str) -> None:
     """Write until killed."""
-    with LogWriter(log, fsync=parse_fsync(fsync), rotate_events=ROTATE_EVENTS) as writer:
+    by_process = random.random() < 0.5
+    with LogWriter(
+        log, fsync=parse_fsync(fsync), rotate_events=ROTATE_EVENTS, sealing_process=by_process
+    ) as writer:
         print("next", writer.next_offset, flush=True)
         said = writer.durable_offset
         while True:
