@@ -49,6 +49,7 @@ def pg_server() -> Iterator[EmbeddedServer]:
         yield server
 
 
+@pytest.hookimpl(trylast=True)  # behind xdist's, which waits for the workers
 def pytest_sessionfinish() -> None:
     """Remove the server's folder at the end of the run, when all workers have left it."""
     if "PYTEST_XDIST_WORKER" not in os.environ:
