@@ -5,6 +5,7 @@ import itertools
 import json
 import random
 import shutil
+import zlib
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,6 @@ from eventsrc.log.mcap_records import (
     encode_mark,
     encode_message_head,
     encode_plain_chunk_head,
-    zlib,
 )
 from eventsrc.log.recover import TooManyLosses
 from eventsrc.system_events import LOSS_KEY

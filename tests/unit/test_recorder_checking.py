@@ -1,4 +1,4 @@
-"""Messages are checked one batch ahead: the same log, and still one commit after the other."""
+"""Messages are checked while a commit waits for the disk: the same log, commit after commit."""
 
 import errno
 import os
