@@ -15,7 +15,8 @@ seconds.
 
 The deltas of one event come in this order: RunSeen, KeyframeAdded, ObservationAdded …, then places
 (PlaceFormed, PlacesMerged, MergeRefused, KeyframePlaced, PlaceChanged, PlaceNamed), landmarks
-(ObjectFound / ObjectSeen, ObjectsMerged), located-in (ObjectMoved), adjacency (PlacesLinked). A
+(ObjectFound / ObjectSeen, ObjectsMerged, ObjectRelocated, ObjectClassified, ObjectEstimated,
+ObjectMissing), located-in (ObjectMoved), adjacency (PlacesLinked). A
 delta names only things that deltas before it have introduced.
 
 Deltas are frozen msgspec structs: a fold makes some ten a keyframe, and a struct takes a third of
@@ -241,10 +242,11 @@ class ObjectSeen(msgspec.Struct, frozen=True, gc=False):
 
 
 class ObjectsMerged(msgspec.Struct, frozen=True, gc=False):
-    """Two Objects became one by a ``same-object`` command; the survivor's new values.
+    """Two Objects became one; the survivor's new values.
 
     All observations of ``absorbed`` belong to ``survivor`` from now on. No ObjectSeen is emitted
-    for them: who keeps observations must move them all.
+    for them: who keeps observations must move them all. ``evidence`` is None where a
+    ``same-object`` command did it.
     """
 
     offset: Offset
@@ -255,6 +257,76 @@ class ObjectsMerged(msgspec.Struct, frozen=True, gc=False):
     sum_y_um: int
     first_seen: float
     last_seen: float
+    evidence: "MergeEvidence | None" = None
+
+
+class MergeEvidence(msgspec.Struct, frozen=True, gc=False):
+    """Why fusion by evidence made two Objects one.
+
+    ``look`` and ``geometry`` are log-likelihood ratios in thousandths of a nat: same thing against
+    two things. ``distance_um`` is that of the two estimates, ``pictures_with_both`` of ``pictures``
+    showed both at once.
+    """
+
+    look: int
+    geometry: int
+    distance_um: int
+    pictures_with_both: int
+    pictures: int
+
+
+class ObjectEstimated(msgspec.Struct, frozen=True, gc=False):
+    """Where an Object stands, estimated from the bearings of its observations; new values.
+
+    Position in µm, covariance in µm² (rounded to integers), and the number of spots (places to
+    stand, 0.35 m apart) that it was seen from. Only fusion by evidence emits it.
+    """
+
+    offset: Offset
+    object: ObjectOrdinal
+    x_um: int
+    y_um: int
+    var_xx_um2: int
+    var_xy_um2: int
+    var_yy_um2: int
+    spots: int
+
+
+class ObjectClassified(msgspec.Struct, frozen=True, gc=False):
+    """Most of an Object's observations are of this class now; ties go to the class seen first."""
+
+    offset: Offset
+    object: ObjectOrdinal
+    class_name: str
+
+
+class ObjectMissing(msgspec.Struct, frozen=True, gc=False):
+    """An Object was not seen where it should have been; new values.
+
+    ``looks`` is in how many keyframes of the run it should have been seen and was not. ``missing``
+    tells whether that is enough to call it missing; it is False again once it is seen there.
+    """
+
+    offset: Offset
+    object: ObjectOrdinal
+    run: RunOrdinal
+    looks: int
+    missing: bool
+
+
+class ObjectRelocated(msgspec.Struct, frozen=True, gc=False):
+    """An Object that was missing stands elsewhere; its estimate begins anew there.
+
+    ``from_x_um`` … is the estimate that it had, ``to_x_um`` … the first one at the new position.
+    """
+
+    offset: Offset
+    object: ObjectOrdinal
+    observation: ObservationOrdinal
+    from_x_um: int
+    from_y_um: int
+    to_x_um: int
+    to_y_um: int
 
 
 class ObjectMoved(msgspec.Struct, frozen=True, gc=False):
@@ -291,6 +363,10 @@ Delta: TypeAlias = (
     | ObjectFound
     | ObjectSeen
     | ObjectsMerged
+    | ObjectEstimated
+    | ObjectClassified
+    | ObjectMissing
+    | ObjectRelocated
     | ObjectMoved
     | PlacesLinked
 )

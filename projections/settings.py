@@ -6,16 +6,39 @@ refused, not mixed.
 
 import hashlib
 from collections.abc import Iterable
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+)
 from pydantic_core import ErrorDetails
 
 from eventsrc.envelope import Text, describe_error
 
 from .errors import SettingsError
+from .evidence import EvidenceConstants
 
 _MAX_SHOWN = 80
+
+
+class Camera(BaseModel):
+    """A level pinhole camera: horizontal field of view, picture size in pixels, and the angle from
+    the robot's heading to where it looks, radians to the left."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    hfov_deg: Annotated[float, Field(ge=1.0, le=170.0)] = 69.4
+    width_px: Annotated[float, Field(gt=0.0, le=1e6)] = 640.0
+    height_px: Annotated[float, Field(gt=0.0, le=1e6)] = 400.0
+    yaw_rad: Annotated[float, Field(ge=-7.0, le=7.0)] = 0.0
+
+
+_YOUNGER = ("fusion", "camera", "evidence")
 
 
 class Settings(BaseModel):
@@ -38,6 +61,23 @@ class Settings(BaseModel):
     neighbourhood: str | None = None
     """The name of the `projections.exact.Neighbourhood` that takes the place of plain distance,
     and of ``eps_m``. A rule is code: only a program can give one, no command."""
+    fusion: Literal["page", "evidence"] = "page"
+    """The rule that fuses observations into Objects: by ``fusion_radius_m`` and
+    ``fusion_similarity``, or by the evidence of bearings and looks."""
+    camera: Camera = Camera()
+    """The camera of envelopes that do not state theirs; for fusion by evidence."""
+    evidence: EvidenceConstants = EvidenceConstants()
+    """The constants of fusion by evidence."""
+
+    @model_serializer(mode="wrap")
+    def _without_younger_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out younger settings that have their default, so that older fingerprints hold."""
+        values: dict[str, Any] = handler(self)
+        return {
+            name: value
+            for name, value in values.items()
+            if name not in _YOUNGER or getattr(self, name) != Settings.model_fields[name].default
+        }
 
     def fingerprint(self) -> str:
         """16 hex digits that are equal exactly when every setting is."""
