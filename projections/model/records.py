@@ -5,6 +5,7 @@ in which the fold met or founded them. Positions are integer micrometres (``_um`
 and ``_x``/``_y`` values are metres, correctly rounded. Times are robot seconds.
 """
 
+import math
 from dataclasses import dataclass, field
 
 from eventsrc.envelope import DetId, KeyframeId, Offset, RunId
@@ -17,7 +18,7 @@ from projections.deltas import (
     RunOrdinal,
     UnitVector,
 )
-from projections.exact import mean_m
+from projections.exact import UM_PER_M, mean_m
 from projections.reducers.survivors import PlaceSurvivors
 
 
@@ -112,11 +113,54 @@ class ObservationRecord:
     similarity_q40: int | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """Where an Object stands, with its covariance in µm²; seen from ``spots`` places to stand."""
+
+    x_um: int
+    y_um: int
+    var_xx_um2: int
+    var_xy_um2: int
+    var_yy_um2: int
+    spots: int
+
+    @property
+    def est_x(self) -> float:
+        """Metres."""
+        return self.x_um / UM_PER_M
+
+    @property
+    def est_y(self) -> float:
+        """Metres."""
+        return self.y_um / UM_PER_M
+
+    @property
+    def est_sigma_m(self) -> float:
+        """Metres; the standard error in the direction in which it is largest."""
+        half = (self.var_xx_um2 + self.var_yy_um2) / 2
+        apart = (self.var_xx_um2 - self.var_yy_um2) / 2
+        return math.sqrt(half + math.sqrt(apart * apart + self.var_xy_um2**2)) / UM_PER_M
+
+
+@dataclass(frozen=True, slots=True)
+class Relocation:
+    """An Object stands elsewhere since ``observation``, of the event at ``offset``."""
+
+    offset: Offset
+    observation: ObservationOrdinal
+    from_x_um: int
+    from_y_um: int
+    to_x_um: int
+    to_y_um: int
+
+
 @dataclass(slots=True, eq=False)
 class ObjectRecord:
     """A landmark. ``observations`` are ordinals in the order in which they were fused.
 
-    `MapView.objects` lists those that were not absorbed.
+    `MapView.objects` lists those that were not absorbed. The fields after ``observations`` are
+    those of fusion by evidence: ``looks`` is in how many keyframes of a run it should have been
+    seen and was not, ``missing_in`` the run in which that was often enough to call it missing.
     """
 
     ordinal: ObjectOrdinal
@@ -129,6 +173,10 @@ class ObjectRecord:
     last_seen: float = 0.0
     place: PlaceOrdinal | None = None
     observations: list[ObservationOrdinal] = field(default_factory=list)
+    estimate: Estimate | None = None
+    looks: int = 0
+    missing_in: RunOrdinal | None = None
+    relocations: list[Relocation] = field(default_factory=list)
 
     @property
     def mean_x(self) -> float:

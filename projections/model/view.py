@@ -18,9 +18,13 @@ from projections.deltas import (
     KeyframeAdded,
     KeyframePlaced,
     MergeRefused,
+    ObjectClassified,
+    ObjectEstimated,
     ObjectFound,
+    ObjectMissing,
     ObjectMoved,
     ObjectOrdinal,
+    ObjectRelocated,
     ObjectSeen,
     ObjectsMerged,
     ObservationAdded,
@@ -36,7 +40,15 @@ from projections.deltas import (
 from projections.reducers.survivors import ObjectSurvivors, PlaceSurvivors
 from projections.settings import Settings
 
-from .records import KeyframeRecord, ObjectRecord, ObservationRecord, PlaceRecord, RunRecord
+from .records import (
+    Estimate,
+    KeyframeRecord,
+    ObjectRecord,
+    ObservationRecord,
+    PlaceRecord,
+    Relocation,
+    RunRecord,
+)
 
 _BY_CORRECTION: tuple[SkipKind, ...] = ("forgotten", "dropped")
 
@@ -214,13 +226,48 @@ class MapView:
             for observation in absorbed.observations:
                 self.observations[observation].object = delta.survivor
             survivor.observations = sorted(survivor.observations + absorbed.observations)
-            absorbed.observations, absorbed.place = [], None
+            relocations = survivor.relocations + absorbed.relocations
+            survivor.relocations = sorted(relocations, key=lambda r: (r.offset, r.observation))
+            absorbed.observations, absorbed.relocations, absorbed.place = [], [], None
             self.object_survivors.merge(delta.survivor, (delta.absorbed,))
         survivor.obs_count = delta.obs_count
         survivor.sum_x_um = delta.sum_x_um
         survivor.sum_y_um = delta.sum_y_um
         survivor.first_seen = delta.first_seen
         survivor.last_seen = delta.last_seen
+
+    def _object_estimated(self, delta: ObjectEstimated) -> None:
+        self.all_objects[delta.object].estimate = Estimate(
+            delta.x_um,
+            delta.y_um,
+            delta.var_xx_um2,
+            delta.var_xy_um2,
+            delta.var_yy_um2,
+            delta.spots,
+        )
+
+    def _object_classified(self, delta: ObjectClassified) -> None:
+        self.all_objects[delta.object].class_name = delta.class_name
+
+    def _object_missing(self, delta: ObjectMissing) -> None:
+        found = self.all_objects[delta.object]
+        found.looks = delta.looks
+        found.missing_in = delta.run if delta.missing else None
+
+    def _object_relocated(self, delta: ObjectRelocated) -> None:
+        found = self.all_objects[delta.object]
+        found.looks, found.missing_in = 0, None
+        if all(known.observation != delta.observation for known in found.relocations):
+            found.relocations.append(
+                Relocation(
+                    delta.offset,
+                    delta.observation,
+                    delta.from_x_um,
+                    delta.from_y_um,
+                    delta.to_x_um,
+                    delta.to_y_um,
+                )
+            )
 
     def _object_moved(self, delta: ObjectMoved) -> None:
         self.all_objects[delta.object].place = delta.place
@@ -247,6 +294,10 @@ class MapView:
         ObjectFound: _object_found,
         ObjectSeen: _object_seen,
         ObjectsMerged: _objects_merged,
+        ObjectEstimated: _object_estimated,
+        ObjectClassified: _object_classified,
+        ObjectMissing: _object_missing,
+        ObjectRelocated: _object_relocated,
         ObjectMoved: _object_moved,
         PlacesLinked: _places_linked,
     }
