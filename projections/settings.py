@@ -5,7 +5,7 @@ refused, not mixed.
 """
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -71,13 +71,19 @@ class Settings(BaseModel):
 
     @model_serializer(mode="wrap")
     def _without_younger_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out younger settings that have their default, so that older fingerprints hold."""
+        """Leave out younger settings that have their default, so that older fingerprints hold; for
+        fusion by evidence name all, so that its fingerprint tells when a default has changed."""
         values: dict[str, Any] = handler(self)
+        if self.fusion == "evidence":
+            return values
         return {
             name: value
             for name, value in values.items()
             if name not in _YOUNGER or getattr(self, name) != Settings.model_fields[name].default
         }
+
+    def __hash__(self) -> int:
+        return hash(self.fingerprint())
 
     def fingerprint(self) -> str:
         """16 hex digits that are equal exactly when every setting is."""
@@ -85,27 +91,34 @@ class Settings(BaseModel):
         canonical = self.model_dump_json(exclude=plain)  # fingerprints older than the setting hold
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
+    def by_name(self) -> dict[str, Any]:
+        """All settings, those with their default too, by the names that ``--set`` takes:
+        ``eps_m``, ``camera.hfov_deg``, ``evidence.sizes_m.chair``."""
+        return settings_by_name(_tree(self))
+
+    def changed_from(self, base: "Settings") -> dict[str, Any]:
+        """The settings that differ from ``base`` by name, with the values here; None for a size
+        that only ``base`` has."""
+        before, here = base.by_name(), self.by_name()
+        names = [*here, *(name for name in before if name not in here)]
+        return {name: here.get(name) for name in names if here.get(name) != before.get(name)}
+
     def with_assignments(self, assignments: Iterable[str], option: str = "--set") -> "Settings":
         """These settings changed by ``name=value`` texts, as ``option`` takes them.
 
         Raises SettingsError that names the option, the setting and the rule it breaks.
         """
-        values: dict[str, Any] = self.model_dump()
+        values = _tree(self)
         for text in assignments:
-            name, equals, value = text.partition("=")
-            name = name.strip()
-            if not equals:
-                raise SettingsError(
-                    f"{option} {_plain(text)}: write it as name=value, such as eps_m=1.0"
-                )
-            if name not in values or name == "neighbourhood":
-                raise SettingsError(f"{option} {_plain(text)}: {_no_setting(name)}")
-            values[name] = None if value.strip() in ("", "none") else value.strip()
+            try:
+                _assign(values, text)
+            except SettingsError as error:
+                raise SettingsError(f"{option} {_plain(text)}: {error}") from None
         try:
             return Settings.model_validate(values)
         except ValidationError as error:
             first = error.errors()[0]
-            fault = f"{first['loc'][0]}={_plain(str(first['input']))}: {_rule(first)}"
+            fault = f"{_dotted(first)}={_plain(str(first['input']))}: {_rule(first)}"
             raise SettingsError(f"{option} {fault}") from None
 
     @classmethod
@@ -117,7 +130,7 @@ class Settings(BaseModel):
             settings = cls.model_validate(document)
         except ValidationError as error:
             first = error.errors()[0]
-            name = str(first["loc"][0])
+            name = _dotted(first)
             if first["type"] == "extra_forbidden":
                 raise SettingsError(_no_setting(name)) from None
             raise SettingsError(f"{name} is {_shown(first['input'])}: {_rule(first)}") from None
@@ -143,6 +156,72 @@ def _plain(text: str) -> str:
     return text if text.isprintable() and len(text) <= _MAX_SHOWN else _shown(text)
 
 
+def _dotted(error: ErrorDetails) -> str:
+    """The name of the setting that an error is about."""
+    return ".".join(str(part) for part in error["loc"] if part != "[key]")
+
+
 def _no_setting(name: str) -> str:
-    names = ", ".join(sorted(Settings.model_fields.keys() - {"neighbourhood"}))
-    return f"no setting {_shown(name)}; there are {names}"
+    """``no setting 'eps'; there are …``: those of its group, else the plain ones and groups."""
+    every = [name for name in Settings().by_name() if name != "neighbourhood"]
+    group = name.partition(".")[0] + "."
+    names = sorted(each for each in every if each.startswith(group))
+    if names:
+        names += [f"{_SIZES}CLASS"] if _SIZES.startswith(group) else []
+    else:
+        groups = sorted({each.partition(".")[0] for each in every if "." in each})
+        names = [*sorted(each for each in every if "." not in each), *(f"{g}.NAME" for g in groups)]
+    return f"no setting {_shown(name)}; there are {', '.join(names)}"
+
+
+def settings_by_name(document: Mapping[str, Any]) -> dict[str, Any]:
+    """The values of a document of settings by the names that ``--set`` takes. Settings that it
+    leaves out are not there."""
+    found: dict[str, Any] = {}
+    for name, value in document.items():
+        if isinstance(value, Mapping):
+            inner = settings_by_name(value)
+            found |= {f"{name}.{key}": each for key, each in inner.items()}
+        else:
+            found[name] = value
+    return found
+
+
+def _tree(settings: Settings) -> dict[str, Any]:
+    """All settings as a document, those with their default too."""
+    values = {name: getattr(settings, name) for name in Settings.model_fields}
+    return {
+        name: value.model_dump() if isinstance(value, BaseModel) else value
+        for name, value in values.items()
+    }
+
+
+_SIZES = "evidence.sizes_m."
+_EXAMPLES = {
+    "camera": "camera.hfov_deg=90",
+    "evidence": "evidence.range_m=1.3",
+    "evidence.sizes_m": f"{_SIZES}chair=0.9",
+}
+
+
+def _assign(values: dict[str, Any], text: str) -> None:
+    """Change the document of settings by one ``name=value``. Raises SettingsError."""
+    # A class's name may hold dots and equals signs; its size is a number.
+    split = text.rpartition("=") if text.lstrip().startswith(_SIZES) else text.partition("=")
+    name, value = split[0].strip(), split[2].strip()
+    if not split[1]:
+        raise SettingsError("write it as name=value, such as eps_m=1.0")
+    given = None if value in ("", "none") else value
+    if name.startswith(_SIZES):
+        values["evidence"]["sizes_m"].pop(name[len(_SIZES) :], None)
+        if given is not None:
+            values["evidence"]["sizes_m"][name[len(_SIZES) :]] = given
+        return
+    group, dot, last = name.partition(".")
+    inner = values.get(group) if dot else values
+    key = last if dot else name
+    if not isinstance(inner, dict) or key not in inner or key == "neighbourhood":
+        raise SettingsError(_no_setting(name))
+    if isinstance(inner[key], dict):
+        raise SettingsError(f"it has several values; give one of them, such as {_EXAMPLES[name]}")
+    inner[key] = given

@@ -64,7 +64,9 @@ def known_point(reader: LogReader, text: str | None, end: Offset) -> Offset:
 SetOption = Annotated[
     list[str] | None,
     typer.Option(
-        "--set", metavar="NAME=VALUE", help="Change one setting of the fold, such as eps_m=1.0."
+        "--set",
+        metavar="NAME=VALUE",
+        help="Change one setting of the fold: eps_m=1.0, camera.hfov_deg=90.",
     ),
 ]
 SettingsOption = Annotated[

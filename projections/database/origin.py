@@ -3,7 +3,7 @@ if it was not."""
 
 import json
 import shlex
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias
 
@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
 from projections.errors import ProjectionMismatch, ProjectionMissing
-from projections.settings import Settings
+from projections.settings import Settings, settings_by_name
 
 from .checkpoints import event_hash
 from .inputs import MapInputs
@@ -32,9 +32,8 @@ def command_line(
 ) -> str:
     """``mapfold NAME LOG`` with ``options``, and ``--set`` for all that the command would not take
     by itself: from the log, whose settings are ``logged``, or the defaults."""
-    default = (logged or Settings()).model_dump()
-    changed = [key for key, value in settings.model_dump().items() if value != default[key]]
-    words = ["mapfold", name, shlex.quote(str(log)), *options, *_options(settings, changed)]
+    changed = settings.changed_from(logged or Settings())
+    words = ["mapfold", name, shlex.quote(str(log)), *options, *_options(changed)]
     return " ".join(words)
 
 
@@ -50,10 +49,12 @@ def replay_advice(log: Path, inputs: MapInputs) -> str:
 
 def _settings_differences(before: str, settings: Settings) -> list[str]:
     """Settings that differ from a checkpoint's, as text: ``eps_m=0.75 there, 1.5 here``."""
-    old, new = json.loads(before), json.loads(settings.model_dump_json())
-    return [
-        f"{name}={old.get(name)} there, {new.get(name)} here" for name in _changed_names(old, new)
-    ] or ["made by another version"]
+    default = Settings().by_name()  # of those younger than the checkpoint
+    old, new = default | settings_by_name(json.loads(before)), settings.by_name()
+    changed = [name for name in sorted(old | new) if old.get(name) != new.get(name)]
+    return [f"{name}={old.get(name)} there, {new.get(name)} here" for name in changed] or [
+        "made by another version"
+    ]
 
 
 def _options_to_match(before: str, settings: Settings) -> str | None:
@@ -62,27 +63,22 @@ def _options_to_match(before: str, settings: Settings) -> str | None:
         old = Settings.model_validate_json(before)
     except ValidationError:
         return None
-    changed = _changed_names(old.model_dump(), settings.model_dump())
+    changed = old.changed_from(settings)
     if _NOT_AN_OPTION in changed:
         return None
-    return " ".join(_options(old, changed)) or None
+    return " ".join(_options(dict(sorted(changed.items())))) or None
 
 
-def _options(settings: Settings, names: Iterable[str]) -> list[str]:
-    values = settings.model_dump()
+def _options(values: Mapping[str, Any]) -> list[str]:
     return [
-        f"--set {shlex.quote(f'{name}={_option_value(values[name])}')}"
-        for name in names
+        f"--set {shlex.quote(f'{name}={_option_value(value)}')}"
+        for name, value in values.items()
         if name != _NOT_AN_OPTION
     ]
 
 
 def _option_value(value: object) -> str:
     return "none" if value is None else str(value)
-
-
-def _changed_names(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    return [name for name in sorted(old.keys() | new.keys()) if old.get(name) != new.get(name)]
 
 
 def origin_fault(found: Checkpoint, log_id: str, inputs: MapInputs) -> Fault | None:

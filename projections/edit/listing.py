@@ -25,7 +25,7 @@ from projections.corrections import RecordedCommand
 from projections.history.records import iso_time
 from projections.history.rendering import table
 from projections.model.command_text import command_document
-from projections.settings import Settings
+from projections.settings import Settings, settings_by_name
 
 from .effect import Effect
 from .make import undone_by
@@ -54,8 +54,8 @@ def what(command: Command) -> str:
         case CorrectPoses():
             return f"{command.run_id}: {_poses(command)}"
         case UseSettings():
-            plain = Settings().model_dump()
-            changed = [f"{k}={v}" for k, v in command.settings.items() if plain.get(k) != v]
+            plain, given = Settings().by_name(), settings_by_name(command.settings)
+            changed = [f"{k}={v}" for k, v in given.items() if plain.get(k) != v]
             return ", ".join(changed) or "the defaults"
         case Undo():
             return command.undone

@@ -70,15 +70,9 @@ def _axis(text: str) -> list[str]:
     return [f"{name}={value}" for value in values.split(",")]
 
 
-def changed_settings(base: Settings, other: Settings) -> dict[str, object]:
-    """The settings in which ``other`` differs from ``base``, with its values."""
-    before = base.model_dump()
-    return {name: value for name, value in other.model_dump().items() if value != before[name]}
-
-
 def settings_name(base: Settings, other: Settings) -> str:
     """``eps_m=1.0 min_samples=8``: the settings that differ from the base."""
-    changed = changed_settings(base, other)
+    changed = other.changed_from(base)
     return " ".join(f"{name}={value}" for name, value in changed.items()) or "no change"
 
 
@@ -244,7 +238,7 @@ def _objects_part_at(first: FoldResult, second: FoldResult) -> Offset | None:
 def _document(each: Alternative, base: Settings) -> dict[str, Any]:
     result, counts = each.result, each.result.counts
     return {
-        "set": changed_settings(base, result.settings),
+        "set": result.settings.changed_from(base),
         "digest": result.digest,
         "places": counts["places"],
         "noise": counts["noise"],

@@ -132,9 +132,8 @@ def _counts(view: MapView) -> str:
 
 
 def _settings(settings: Settings) -> str:
-    default = Settings().model_dump()
-    changed = {k: v for k, v in settings.model_dump().items() if v != default[k]}
-    shown = changed or {k: v for k, v in default.items() if v is not None}
+    changed = settings.changed_from(Settings())
+    shown = changed or {k: v for k, v in Settings().model_dump().items() if v is not None}
     text = ", ".join(f"{name}={value}" for name, value in shown.items())
     return text if changed else f"default: {text}"
 

@@ -135,6 +135,25 @@ def test_a_refusal_names_the_settings_that_fit(mapfold: Commands, log: Path) -> 
     assert advised(said) == ["replay", str(log), "--set", "min_samples=4"]
 
 
+def test_a_refusal_names_settings_of_groups_that_fit(mapfold: Commands, log: Path) -> None:
+    """Also from a map whose settings are older than the groups, and back to it."""
+    own = ("--set", "camera.hfov_deg=90.0", "--set", "evidence.sizes_m.potted plant=0.4")
+    mapfold("replay", log)
+    said = mapfold("tail", log, "--once", *own, code=1).err
+    assert (
+        "(camera.hfov_deg=69.4 there, 90.0 here, "
+        "evidence.sizes_m.potted plant=None there, 0.4 here)" in said
+    )
+    fitting = said.partition("to go on with them add ")[2].partition(";")[0]
+    mapfold("tail", log, "--once", *own, *shlex.split(fitting))
+    assert advised(said) == ["replay", str(log), *own]
+    mapfold(*advised(said))
+    said = mapfold("tail", log, "--once", code=1).err
+    fitting = said.partition("to go on with them add ")[2].partition("; to")[0]
+    assert shlex.split(fitting) == list(own)
+    mapfold("tail", log, "--once", *own)
+
+
 def test_another_log_has_no_lag(mapfold: Commands, log: Path) -> None:
     mapfold("replay", log)
     other = write_log(mapfold.folder / "other", walk(5))

@@ -30,8 +30,9 @@ from eventsrc.commands import (
 from eventsrc.errors import MisuseError
 from projections.edit import make as by
 from projections.edit.correct_poses import Span, by_trajectory, by_transform
+from projections.edit.listing import what
 from projections.edit.trajectory import Trajectory, TrajectoryPose, read_trajectory
-from projections.settings import Settings
+from projections.settings import Camera, Settings
 from tests.corrected_logs import FAR, LEFT, MERGE, RIGHT, append, give, make, write_rooms
 
 CUP_LEFT, CUP_RIGHT, LAMP = "obj-2237cc2f33929b56", "obj-dc4cb3fc37c4dc9a", "obj-36156c6b0fcc3c5d"
@@ -259,6 +260,18 @@ def test_settings_are_recorded_in_full(log: Path) -> None:
     assert isinstance(made, UseSettings)
     assert Settings.from_document(made.settings) == settings
     assert made.settings["fusion_similarity"] == 0.7, "whatever a later default is"
+
+
+def test_settings_of_fusion_by_evidence_are_recorded_in_full_and_listed_by_name(log: Path) -> None:
+    settings = Settings().with_assignments(["fusion=evidence", "evidence.sizes_m.cup=0.1"])
+    made = make(log, by.use_settings, settings)
+    assert isinstance(made, UseSettings)
+    assert Settings.from_document(made.settings) == settings
+    assert made.settings["camera"] == Camera().model_dump(), "whatever a later default is"
+    assert what(made) == "fusion=evidence, evidence.sizes_m.cup=0.1"
+    partial = UseSettings(**WHO, settings={"camera": {"hfov_deg": 90}})
+    assert what(partial) == "camera.hfov_deg=90"
+    assert what(UseSettings(**WHO, settings={})) == "the defaults"
 
 
 def test_places_are_those_of_the_settings(log: Path) -> None:

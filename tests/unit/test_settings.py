@@ -1,9 +1,12 @@
 """Settings: assignments from the command line, fingerprints, messages of refusals."""
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from projections.errors import SettingsError
-from projections.settings import Settings
+from projections.evidence import EvidenceConstants
+from projections.settings import Camera, Settings, settings_by_name
 
 
 def test_assignments_change_what_they_name() -> None:
@@ -89,3 +92,108 @@ def test_a_neighbourhood_changes_the_fingerprint_and_none_keeps_that_of_older_ve
 def test_no_command_can_name_a_neighbourhood() -> None:
     with pytest.raises(SettingsError, match="no setting 'neighbourhood'"):
         Settings().with_assignments(["neighbourhood=walls"])
+
+
+def test_dotted_names_change_one_value_of_a_group() -> None:
+    changed = Settings().with_assignments(
+        [
+            "fusion=evidence",
+            "camera.hfov_deg=90",
+            "evidence.range_m = 1.3",
+            "evidence.sizes_m.potted plant=0.4",
+            "evidence.sizes_m.no. 7=x=0.5",
+            "evidence.side_by=heading",
+        ]
+    )
+    assert changed.fusion == "evidence"
+    assert changed.camera == Camera(hfov_deg=90.0)
+    assert changed.evidence.range_m == 1.3
+    assert changed.evidence.sizes_m == {"no. 7=x": 0.5, "potted plant": 0.4}
+    assert changed.evidence.side_by == "heading"
+    fewer = changed.with_assignments(["evidence.sizes_m.no. 7=x=none"])
+    assert fewer.evidence.sizes_m == {"potted plant": 0.4}
+    assert fewer.changed_from(changed) == {"evidence.sizes_m.no. 7=x": None}
+    assert hash(fewer) != hash(changed)
+    assert {fewer, changed, fewer} == {changed, fewer}
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("fusion=magic", "--set fusion=magic: input should be 'page' or 'evidence'"),
+        (
+            "camera=90",
+            "camera=90: it has several values; give one of them, such as camera.hfov_deg=90",
+        ),
+        ("evidence.sizes_m=1", "give one of them, such as evidence.sizes_m.chair=0.9"),
+        ("camera.hfov_deg=0", "--set camera.hfov_deg=0: input should be greater than or equal to"),
+        ("camera.fov=9", "no setting 'camera.fov'; there are camera.height_px, camera.hfov_deg"),
+        ("evidence.sizes_m.chair=-1", "--set evidence.sizes_m.chair=-1: input should be greater"),
+        ("evidence.sizes_m.=1", "--set evidence.sizes_m.=: is empty"),
+        ("evidence.reach=1", ", evidence.sizes_m.CLASS"),
+        ("eps_m.x=1", "no setting 'eps_m.x'; there are embedding_dim, embedding_model, eps_m"),
+        ("where=1", "min_samples, camera.NAME, evidence.NAME"),
+        ("eps_m.neighbourhood=x", "no setting 'eps_m.neighbourhood'"),
+    ],
+)
+def test_a_wrong_dotted_assignment_is_refused_in_words(text: str, says: str) -> None:
+    with pytest.raises(SettingsError, match="--set") as caught:
+        Settings().with_assignments([text])
+    assert says in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("document", "says"),
+    [
+        ({"camera": {"hfov_deg": "wide"}}, "camera.hfov_deg is 'wide': input should be a valid"),
+        ({"camera": {"zoom": 2}}, "no setting 'camera.zoom'; there are camera.height_px"),
+        ({"camera": 5}, "camera is 5: input should be"),
+        ({"evidence": {"sizes_m": {"cup": 0}}}, "evidence.sizes_m.cup is 0: input should be"),
+        ({"evidence": {"range_m": None}}, "evidence.range_m is None: input should be"),
+    ],
+)
+def test_a_wrong_group_in_a_document_is_refused_in_words(document: object, says: str) -> None:
+    with pytest.raises(SettingsError) as caught:
+        Settings.from_document(document)
+    assert str(caught.value).startswith(says)
+
+
+_NAMES = st.text(st.characters(exclude_categories=["C"]), min_size=1, max_size=9)
+_CHANGED = st.builds(
+    Settings,
+    eps_m=st.floats(0.1, 9.0),
+    embedding_model=st.none() | st.just("clip"),
+    fusion=st.sampled_from(["page", "evidence"]),
+    camera=st.builds(Camera, hfov_deg=st.floats(1.0, 170.0), yaw_rad=st.floats(-7.0, 7.0)),
+    evidence=st.builds(
+        EvidenceConstants,
+        range_m=st.floats(0.1, 9.0),
+        sizes_m=st.dictionaries(_NAMES.map(str.strip).filter(bool), st.floats(0.1, 9.0)),
+        different=st.none() | st.floats(-1.0, 0.9),
+    ),
+)
+
+
+@given(_CHANGED, _CHANGED)
+def test_changed_settings_by_name_are_the_assignments_between_two(
+    base: Settings, other: Settings
+) -> None:
+    """So commands that name them give the same map, and documents leave nothing out."""
+    changed = other.changed_from(base)
+    texts = [f"{name}={'none' if value is None else value}" for name, value in changed.items()]
+    assert base.with_assignments(texts) == other
+    assert (changed == {}) is (base == other)
+    assert Settings.from_document(other.model_dump(mode="json")) == other
+    assert settings_by_name(other.model_dump()).items() <= other.by_name().items()
+
+
+def test_documents_of_page_maps_name_no_younger_setting() -> None:
+    assert not {"fusion", "camera", "evidence"} & Settings(eps_m=1.0).model_dump().keys()
+    assert Settings(camera=Camera(yaw_rad=1.0)).model_dump()["camera"]["yaw_rad"] == 1.0
+
+
+def test_documents_of_evidence_maps_name_every_constant() -> None:
+    """So their fingerprint changes with a default, on which the map depends."""
+    document = Settings(fusion="evidence").model_dump()
+    assert document["evidence"] == EvidenceConstants().model_dump()
+    assert document["camera"] == Camera().model_dump()
