@@ -1,0 +1,27 @@
+"""Fold a case's envelopes and time it."""
+
+import time
+from collections.abc import Sequence
+
+from eventsrc.ingest import Accepted
+from projections.exact import unit_vectors
+from projections.model.fold import READ_AHEAD, gc_paused
+from projections.model.view import MapView
+from projections.reducers.semantic_map import SemanticMap
+from projections.settings import Settings
+
+
+def fold_timed(events: Sequence[Accepted], settings: Settings) -> tuple[MapView, float]:
+    """The view of validated envelopes folded in order, and the seconds of processor time that unit
+    vectors, fold and view took."""
+    semantic_map, view = SemanticMap(settings), MapView(settings, keep_embeddings=False)
+    start = time.process_time()
+    with gc_paused():
+        for first in range(0, len(events), READ_AHEAD):
+            chunk = events[first : first + READ_AHEAD]
+            units = iter(unit_vectors([v for accepted in chunk for v in accepted.vectors]))
+            for accepted in chunk:
+                offset = semantic_map.next_offset
+                own = [next(units) for _ in accepted.vectors]
+                view.apply_event(offset, semantic_map.fold(offset, accepted, own))
+    return view, time.process_time() - start
