@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.deltas import Pose
+from projections.deltas import ObjectEstimated, ObjectOrdinal, Pose
 from tests.bench.truth.scoring import (
     ObjectScores,
     count_spots,
@@ -16,6 +16,7 @@ from tests.bench.truth.scoring import (
     score_objects,
 )
 from tests.bench.truth.tables import HOUSE, Row, objects_table
+from tests.bench.truth.worlds import TrueThing
 from tests.bench.truth_cases import hand_made
 
 
@@ -70,6 +71,33 @@ def test_spots_are_counted_where_no_earlier_spot_is_near():
     assert at(0.0, 0.34, -0.34) == 1
     assert at(0.0, 0.35) == 2
     assert at(0.0, 0.3, 0.6, 0.9) == 2  # 0.3 is of the first spot, 0.6 the second, 0.9 is of it
+
+
+def test_errors_are_of_objects_with_an_estimate_that_were_seen_from_two_spots():
+    def estimated(thing: int, x: float, y: float, xx: float, yy: float) -> ObjectEstimated:
+        at = round(x * 1e6), round(y * 1e6)
+        return ObjectEstimated(
+            20, ObjectOrdinal(thing), *at, round(xx * 1e12), 0, round(yy * 1e12), 9
+        )
+
+    view, truth = hand_made(
+        [
+            ("a", x, 0, i, o)
+            for o, i in enumerate("ABCD")
+            for x in ((0, 0.3) if i == "C" else (0, 1))
+        ]
+        + [("a", x, 0, None, 4) for x in (0, 1)],
+        [
+            estimated(0, 2.0, 1.3, 0.01, 0.04),  # 0.3 m off, σ 0.2: inside 2σ
+            estimated(1, 3.3, 1.0, 0.01, 0.04),  # 0.3 m off, σ 0.1: outside
+            estimated(2, 9.0, 9.0, 0.01, 0.01),  # from one spot only
+            estimated(4, 9.0, 9.0, 0.01, 0.01),  # of no thing; D has no estimate
+        ],
+    )
+    things = {i: TrueThing(i, x, 1.0) for i, x in zip("ABCD", (2.0, 3.0, 4.0, 5.0), strict=True)}
+    scores = score_objects(view, truth, things)
+    assert scores.errors_m == pytest.approx((0.3, 0.3))
+    assert scores.inside_share == 0.5
 
 
 offsets = st.floats(-3.0, 3.0)

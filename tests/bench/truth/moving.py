@@ -90,9 +90,9 @@ def _observations(view: MapView, truth: Truth, first_run: str) -> tuple[Counter[
 
 def _report(record: ObjectRecord) -> str | None:
     """What the map says of an Object; None that it stands where it stood."""
-    if getattr(record, "missing_in", None) is not None:
+    if record.missing_in is not None:
         return "missing"
-    return "moved" if getattr(record, "relocations", None) else None
+    return "moved" if record.relocations else None
 
 
 def _is_of(view: MapView, record: ObjectRecord, run_id: str) -> bool:

@@ -67,7 +67,7 @@ def score_objects(view: MapView, truth: Truth, things: Mapping[str, TrueThing]) 
     errors, inside = [], 0
     for ordinal, record in view.objects.items():
         thing = things.get(owners.get(ordinal, ""))
-        estimate = getattr(record, "estimate", None)
+        estimate = record.estimate
         if thing is None or estimate is None or spots_of(view, record) < LEAST_SEEN:
             continue
         dx, dy = estimate.x_um * _M - thing.x, estimate.y_um * _M - thing.y
