@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from eventsrc.transport.config import key_fault
 
-from .envelope import ENVELOPE_VERSION, Envelope, Offset
+from .envelope import Envelope, Offset, has_keyframe_id
 from .ingest import DEFAULT_MAX_PAYLOAD_BYTES, Rejected, abbreviate
 from .log import LogWriter, NewEvent
 from .system_events import REJECTED_KEY, RejectedPayload
@@ -26,7 +26,7 @@ class Checked(NamedTuple):
     @property
     def stamp_ns(self) -> int | None:
         """The robot's time; None if the payload has none."""
-        if isinstance(self.result, Rejected) or self.version != ENVELOPE_VERSION:
+        if isinstance(self.result, Rejected) or not has_keyframe_id(self.version):
             return None
         return self.result.stamp_ns
 
@@ -38,15 +38,21 @@ def append_payload(
     *,
     logged_ns: int | None = None,
     max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES,
+    version: int | None = None,
 ) -> Envelope | Rejected:
     """Append ``payload``, which came under ``key``; returns the result of its validation.
 
-    ``logged_ns`` is when it was received, now by default.
+    ``logged_ns`` is when it was received, now by default; ``version`` the envelope version that it
+    was recorded in before.
     """
     logged = writer.now_ns() if logged_ns is None else logged_ns
     messages = [(key, payload)]
     (checked,) = check_payloads(
-        messages, first=writer.next_offset, logged_ns=logged, max_bytes=max_bytes
+        messages,
+        first=writer.next_offset,
+        logged_ns=logged,
+        max_bytes=max_bytes,
+        version=version,
     )
     version, result = checked
     if isinstance(result, Rejected):
@@ -59,7 +65,12 @@ def append_payload(
 
 
 def check_payloads(
-    messages: Sequence[tuple[str, bytes]], *, first: Offset, logged_ns: int, max_bytes: int
+    messages: Sequence[tuple[str, bytes]],
+    *,
+    first: Offset,
+    logged_ns: int,
+    max_bytes: int,
+    version: int | None = None,
 ) -> list[Checked]:
     """Validate each payload, and the key that it came under, of messages (key, payload).
 
@@ -69,7 +80,7 @@ def check_payloads(
     two at a time is best, so that what is decoded of them fits the processor's cache.
     """
     pending = [
-        PendingEvent(Offset(offset), key, logged_ns, payload, detect_version(payload))
+        PendingEvent(Offset(offset), key, logged_ns, payload, version or detect_version(payload))
         for offset, (key, payload) in enumerate(messages, first)
     ]
     results = check_envelopes(pending, max_bytes=max_bytes)

@@ -34,8 +34,10 @@ KeyframeId = NewType("KeyframeId", int)
 """The number a robot gives a keyframe within its run."""
 DetId = NewType("DetId", str)
 
-ENVELOPE_VERSION = 2
+ENVELOPE_VERSION = 3
 """The version of the models below; `eventsrc.upcast` converts older ones to it."""
+FIRST_ENVELOPE_VERSION = 2
+"""Since this version payloads are envelopes, with a run, a keyframe id and a time."""
 
 MAX_ID_LENGTH = 256
 MAX_POSITION_M = 1e7
@@ -67,6 +69,14 @@ def describe_error(error: ErrorDetails) -> str:
     at, char = next((i, c) for i, c in enumerate(text) if unicodedata.category(c) == "Cc")
     return f"has the control character U+{ord(char):04X} at index {at}"
 
+
+HFOV_DEG = Field(ge=1.0, le=170.0)
+PIXELS = Field(gt=0.0, le=1e6)
+ANGLE_RAD = Field(ge=-7.0, le=7.0)
+"""Bounds of a camera's field of view, its picture's size, and the angle at which it is mounted."""
+SIGMA_M = Field(ge=0.001, le=1000.0)
+"""Bounds of a standard error, metres."""
+MAX_DEPTH_M = 1000.0
 
 INT64 = Field(ge=-(2**63), lt=2**63)
 Int64 = Annotated[int, INT64]
@@ -117,7 +127,9 @@ class Detection(_Model):
     """One detected object in a keyframe.
 
     ``bbox`` is x_min, y_min, x_max, y_max in pixels. ``embedding`` is base64 of
-    ``embedding_dim`` little-endian float32.
+    ``embedding_dim`` little-endian float32. ``depth_m`` is how far away the thing is along the ray
+    through the box's centre, ``position`` its x and y in the map frame, in metres; their standard
+    errors count only beside them.
     """
 
     det_id: Annotated[DetId, TEXT] | None = None
@@ -127,6 +139,20 @@ class Detection(_Model):
     embedding: str | None = None
     embedding_dim: Annotated[int, Field(ge=1, le=MAX_DIMENSION)] | None = None
     embedding_model: Text | None = None
+    depth_m: Annotated[float, Field(gt=0.0, le=MAX_DEPTH_M)] | None = None
+    depth_sigma_m: Annotated[float, SIGMA_M] | None = None
+    position: tuple[Position, Position] | None = None
+    position_sigma_m: Annotated[float, SIGMA_M] | None = None
+
+
+class EnvelopeCamera(_Model):
+    """The level pinhole camera that took the picture: horizontal field of view, picture size, and
+    the angle from the robot's heading to where it looks, to the left."""
+
+    hfov_deg: Annotated[float, HFOV_DEG]
+    width_px: Annotated[float, PIXELS]
+    height_px: Annotated[float, PIXELS]
+    yaw_rad: Annotated[float, ANGLE_RAD] = 0.0
 
 
 class Envelope(_Model):
@@ -134,6 +160,7 @@ class Envelope(_Model):
 
     ``timestamp`` is the robot's time in seconds since the Unix epoch, ``map_x`` and ``map_y`` are
     metres and ``map_yaw`` radians in the map frame; all three are None when the robot has no pose.
+    Without ``camera`` it is the one of the map's settings.
     """
 
     run_id: Annotated[RunId, TEXT]
@@ -142,6 +169,7 @@ class Envelope(_Model):
     map_x: Position | None = None
     map_y: Position | None = None
     map_yaw: float | None = None
+    camera: EnvelopeCamera | None = None
     detections: Annotated[tuple[Detection, ...], Field(max_length=MAX_DETECTIONS), FailFast()]
 
     @model_validator(mode="after")
@@ -158,6 +186,21 @@ class Envelope(_Model):
         if 0 < len(part) <= 9 and "e" not in part:
             return int(whole + part.ljust(9, "0"))  # the same, faster
         return int(Decimal(text).scaleb(9).to_integral_value())
+
+
+def has_evidence(envelope: Envelope) -> bool:
+    """Whether it states its camera, or a depth or position of any detection."""
+    if envelope.camera is not None:
+        return True
+    for detection in envelope.detections:
+        if detection.depth_m is not None or detection.position is not None:
+            return True
+    return False
+
+
+def has_keyframe_id(version: int) -> bool:
+    """Whether payloads of this envelope version name their keyframe."""
+    return FIRST_ENVELOPE_VERSION <= version <= ENVELOPE_VERSION
 
 
 def default_det_id(run_id: RunId, keyframe_id: KeyframeId, index: int) -> DetId:

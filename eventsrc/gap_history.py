@@ -32,7 +32,7 @@ from eventsrc.log.format import LEDGER
 from eventsrc.log.log_identity import same_but_sealed, segment_signatures
 from eventsrc.log.reader import LogReader
 
-from .envelope import ENVELOPE_VERSION, FIRST_OFFSET, Int64, KeyframeId, Offset, RunId
+from .envelope import FIRST_OFFSET, Int64, KeyframeId, Offset, RunId, has_keyframe_id
 from .gaps import DEFAULT_SETTLE_NS, GapLedger, RunState, gap_of, is_consistent
 from .system_events import LOSS_KEY, Loss, is_system_key
 
@@ -258,7 +258,7 @@ def _add_loss(ledger: GapLedger[RunId], payload: bytes, now_ns: int) -> None:
 
 
 def _identity(event: Event) -> tuple[RunId, KeyframeId] | None:
-    if event.version != ENVELOPE_VERSION:
+    if not has_keyframe_id(event.version):
         return None
     try:
         found = _Identity.model_validate_json(event.payload)

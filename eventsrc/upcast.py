@@ -9,7 +9,9 @@ current one and validates it like a new one.
         or pose, so the event around it supplies them: the run is ``unnamed:<key>``, the keyframe id
         is the event's offset, the time is the event's stamp, and there is no pose. So it becomes
         observations without a place. ``class_name`` became ``class``.
-    2   the envelope of `eventsrc.envelope`.
+    2   the envelope before it had a camera, and detections a depth or a position. It may have had
+        unknown fields of these names, with any content: they are dropped.
+    3   the envelope of `eventsrc.envelope`.
 
 To change the envelope: raise ENVELOPE_VERSION, add the upcaster from the version before to
 ``UPCASTERS``, and a log of that version to the tests. Never change a released upcaster.
@@ -27,6 +29,7 @@ from .envelope import (
     Envelope,
     Offset,
     contains_non_finite,
+    has_evidence,
 )
 from .ingest import (
     DEFAULT_MAX_PAYLOAD_BYTES,
@@ -75,10 +78,15 @@ def read_envelope(
     event: VersionedEvent, *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES
 ) -> Accepted | Rejected:
     """Validate an event of any version as an envelope of the current one."""
-    if event.version == ENVELOPE_VERSION:
-        return ingest(event.payload, max_bytes=max_bytes)
+    if event.version in _SAME_BUT_FOR_NEW_FIELDS:
+        read = ingest(event.payload, max_bytes=max_bytes)
+        return _converted(event, max_bytes) if _must_convert(event, read) else read
     if event.version not in UPCASTERS:
         return Rejected(f"envelope version {event.version} is unknown here; upgrade mapfold")
+    return _converted(event, max_bytes)
+
+
+def _converted(event: VersionedEvent, max_bytes: int) -> Accepted | Rejected:
     rejected = check_cost(event.payload, max_bytes)
     if rejected is not None:
         return rejected
@@ -95,10 +103,14 @@ def read_envelope(
 def read_envelopes(
     events: Sequence[VersionedEvent], *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES
 ) -> list[Accepted | Rejected]:
-    """`read_envelope` of each; faster together if all are of the current version."""
-    if any(event.version != ENVELOPE_VERSION for event in events):
+    """`read_envelope` of each; faster together, but for those of version 1."""
+    if any(event.version not in _SAME_BUT_FOR_NEW_FIELDS for event in events):
         return [read_envelope(event, max_bytes=max_bytes) for event in events]
-    return ingest_all([event.payload for event in events], max_bytes=max_bytes)
+    read = ingest_all([event.payload for event in events], max_bytes=max_bytes)
+    for index, event in enumerate(events):
+        if _must_convert(event, read[index]):
+            read[index] = _converted(event, max_bytes)
+    return read
 
 
 def check_envelopes(
@@ -106,7 +118,7 @@ def check_envelopes(
 ) -> list[Envelope | Rejected]:
     """Like `read_envelopes`, without the vectors and ids."""
     if any(event.version != ENVELOPE_VERSION for event in events):
-        read = [read_envelope(event, max_bytes=max_bytes) for event in events]
+        read = read_envelopes(events, max_bytes=max_bytes)
         return [result if isinstance(result, Rejected) else result.envelope for result in read]
     return check_all([event.payload for event in events], max_bytes=max_bytes)
 
@@ -147,5 +159,44 @@ def _upcast_detection(detection: dict[str, Any]) -> dict[str, Any]:
     return known
 
 
-UPCASTERS: Mapping[int, Upcaster] = MappingProxyType({1: _upcast_bare_list})
+_NEW_IN_ENVELOPE = frozenset({"camera"})
+_NEW_IN_DETECTION = frozenset({"depth_m", "depth_sigma_m", "position", "position_sigma_m"})
+_SAME_BUT_FOR_NEW_FIELDS = (2, 3)
+
+
+def _must_convert(event: VersionedEvent, read: Accepted | Rejected) -> bool:
+    """Whether an envelope of version 2 that was read as one of version 3 must be converted first:
+    if it is none of version 3, or has fields that version 2 did not know. Hardly any has, and to
+    parse each twice would take far longer."""
+    if event.version == ENVELOPE_VERSION:
+        return False
+    if isinstance(read, Rejected):
+        return _has_new_fields(event.payload)
+    return has_evidence(read.envelope)
+
+
+def _has_new_fields(payload: bytes) -> bool:
+    try:
+        document = json.loads(payload)
+        return bool(_drop_new_fields(document, None) != document)
+    except (ValueError, RecursionError):
+        return False
+
+
+def _drop_new_fields(document: Any, _event: VersionedEvent | None) -> Any:
+    if not isinstance(document, dict):
+        return document
+    older = {name: value for name, value in document.items() if name not in _NEW_IN_ENVELOPE}
+    if isinstance(older.get("detections"), list):
+        older["detections"] = [_older_detection(each) for each in older["detections"]]
+    return older
+
+
+def _older_detection(detection: Any) -> Any:
+    if not isinstance(detection, dict):
+        return detection
+    return {name: value for name, value in detection.items() if name not in _NEW_IN_DETECTION}
+
+
+UPCASTERS: Mapping[int, Upcaster] = MappingProxyType({1: _upcast_bare_list, 2: _drop_new_fields})
 """From each older version to the next."""

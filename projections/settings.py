@@ -18,7 +18,7 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails
 
-from eventsrc.envelope import Text, describe_error
+from eventsrc.envelope import ANGLE_RAD, HFOV_DEG, PIXELS, Text, describe_error
 
 from .errors import SettingsError
 from .evidence import EvidenceConstants
@@ -32,10 +32,10 @@ class Camera(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    hfov_deg: Annotated[float, Field(ge=1.0, le=170.0)] = 69.4
-    width_px: Annotated[float, Field(gt=0.0, le=1e6)] = 640.0
-    height_px: Annotated[float, Field(gt=0.0, le=1e6)] = 400.0
-    yaw_rad: Annotated[float, Field(ge=-7.0, le=7.0)] = 0.0
+    hfov_deg: Annotated[float, HFOV_DEG] = 69.4
+    width_px: Annotated[float, PIXELS] = 640.0
+    height_px: Annotated[float, PIXELS] = 400.0
+    yaw_rad: Annotated[float, ANGLE_RAD] = 0.0
 
 
 _YOUNGER = ("fusion", "camera", "evidence")

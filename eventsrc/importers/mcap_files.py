@@ -37,7 +37,11 @@ class McapFile:
                 self._read += len(message.payload)
                 if message.encoding == "json":
                     yield ImportedMessage(
-                        message.payload, message.key, message.logged_ns, message.published_ns
+                        message.payload,
+                        message.key,
+                        message.logged_ns,
+                        message.published_ns,
+                        message.version,
                     )
                 else:
                     self.skipped += 1
@@ -69,4 +73,6 @@ class OtherLog:
             for event in reader.read():
                 self.at = event.offset
                 self._read += len(event.payload)
-                yield ImportedMessage(event.payload, event.key, event.logged_ns, event.stamp_ns)
+                yield ImportedMessage(
+                    event.payload, event.key, event.logged_ns, event.stamp_ns, event.version
+                )

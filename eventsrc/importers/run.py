@@ -17,6 +17,7 @@ from eventsrc.errors import MisuseError
 from eventsrc.ingest import Rejected
 from eventsrc.log import FsyncPolicy, LogWriter
 from eventsrc.system_events import LOSS_KEY, REJECTED_KEY
+from eventsrc.upcast import UPCASTERS
 
 from .json_lines import JsonLines
 from .mcap_files import MCAP_MAGIC, McapFile, OtherLog
@@ -114,7 +115,11 @@ class _Import:
 
     def _append_envelope(self, source: Source, message: ImportedMessage) -> None:
         outcome = append_payload(
-            self._writer, message.key or self._key, message.payload, logged_ns=message.logged_ns
+            self._writer,
+            message.key or self._key,
+            message.payload,
+            logged_ns=message.logged_ns,
+            version=message.version if message.version in UPCASTERS else None,
         )
         if isinstance(outcome, Rejected):
             self.rejected += 1

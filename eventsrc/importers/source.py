@@ -12,13 +12,15 @@ class ImportedMessage:
     ``payload`` is one JSON envelope (`eventsrc.envelope`; example and limits: docs/recording.md);
     any other payload is kept as rejected. ``logged_ns`` is when the source received it.
     ``stamp_ns`` is used for system events of another mapfold log only: the event of an envelope is
-    stamped with the envelope's own time.
+    stamped with the envelope's own time. ``version`` is the envelope version that another mapfold
+    log has it in; None if there is none.
     """
 
     payload: bytes
     key: str | None = None
     logged_ns: int | None = None
     stamp_ns: int | None = None
+    version: int | None = None
 
 
 class Source(Protocol):

@@ -17,6 +17,7 @@ from lz4.frame import LZ4FrameDecompressor
 
 from . import mcap_records as _mcap
 from .crc import crc32
+from .format import ENVELOPE_VERSION_KEY, envelope_version
 from .mcap_records import FRAME, MAGIC, BadRecord, Channel, Opcode
 
 MAX_FOREIGN_BYTES: Final = 64 * 1024 * 1024
@@ -105,20 +106,23 @@ class ForeignRecord(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ForeignMessage:
-    """One message. ``key`` is its MCAP topic; times are int nanoseconds."""
+    """One message. ``key`` is its MCAP topic; times are int nanoseconds; ``version`` is the
+    envelope version that a mapfold log has it in, None in other files."""
 
     key: str
     encoding: str
+    version: int | None
     logged_ns: int
     published_ns: int
     payload: bytes
 
 
 class _ChannelName(NamedTuple):
-    """The topic and message encoding of a channel."""
+    """The topic and message encoding of a channel, and its envelope version if it has one."""
 
     key: str
     encoding: str
+    version: int | None
 
 
 def foreign_messages(file: BinaryIO) -> Iterator[ForeignMessage]:
@@ -237,7 +241,11 @@ class _Channels:
     def add(self, content: bytes) -> None:
         _mcap.check_definitions(len(content))
         channel = _mcap.decode_as(Channel, content)
-        name = _ChannelName(channel.topic, channel.message_encoding)
+        name = _ChannelName(
+            channel.topic,
+            channel.message_encoding,
+            envelope_version(channel) if ENVELOPE_VERSION_KEY in channel.metadata else None,
+        )
         if self._names.get(channel.id) != name:
             self._names_size += len(name.key) + len(name.encoding)
             _mcap.check_definitions(self._names_size)

@@ -24,7 +24,7 @@ from typing import Literal, NamedTuple, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from eventsrc.commands import InvalidCommand, encode_command, parse_command
-from eventsrc.envelope import ENVELOPE_VERSION, KeyframeId, Offset, RunId
+from eventsrc.envelope import KeyframeId, Offset, RunId, has_keyframe_id
 from eventsrc.gaps import Gap, GapLedger, gap_of
 from eventsrc.ingest import Accepted
 from eventsrc.system_events import (
@@ -252,7 +252,7 @@ class EventFindings:
             return
         seen.add(keyframe_id)
         self._stamps.add(run_id, keyframe_id, event.stamp_ns, event.offset)
-        if event.version == ENVELOPE_VERSION:  # older ones count no keyframes
+        if has_keyframe_id(event.version):  # older ones count no keyframes
             self._gaps.add_keyframe(run_id, keyframe_id)
 
     def _add(self, kind: Kind, about: str, offset: Offset, message: str, count: int = 1) -> None:

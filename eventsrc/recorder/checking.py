@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
 from eventsrc.append import check_payloads, rejected_event
-from eventsrc.envelope import ENVELOPE_VERSION, KeyframeId, RunId
+from eventsrc.envelope import KeyframeId, RunId, has_keyframe_id
 from eventsrc.ingest import Rejected
 from eventsrc.log import LogWriter, NewEvent
 from eventsrc.robot.acks import SENT_SUFFIX, Refusal, payload_sha256
@@ -140,7 +140,7 @@ class Checker:
             if isinstance(result, Rejected):
                 refusal = Refusal.of(payload, result.reason)
                 yield CheckedMessage(key, payload, version, refusal)
-            elif version != ENVELOPE_VERSION:
+            elif not has_keyframe_id(version):
                 yield CheckedMessage(key, payload, version, None)
             else:
                 run_id, keyframe_id = result.run_id, result.keyframe_id

@@ -9,11 +9,12 @@ import hashlib
 import marshal
 from collections.abc import MutableSequence
 from operator import attrgetter
+from typing import Any
 from zlib import crc32
 
 import numpy as np
 
-from eventsrc.envelope import DetId, KeyframeId, Offset, RunId
+from eventsrc.envelope import Detection, DetId, KeyframeId, Offset, RunId, has_evidence
 from eventsrc.ingest import Accepted
 from projections.deltas import KeyframeOrdinal, RunOrdinal
 from projections.reducers import State, packed
@@ -36,15 +37,29 @@ def content_digest(accepted: Accepted) -> bytes:
         else:
             checksum = crc32(vector.data, checksum)
             lengths.append(len(vector))
-    content = (
+    content: Any = (
         (envelope.timestamp, envelope.map_x, envelope.map_y, envelope.map_yaw),
         accepted.det_ids,
         [*map(_detection_content, envelope.detections)],
         lengths,
         checksum,
     )
+    if has_evidence(envelope):
+        camera = envelope.camera
+        content += (
+            camera and (camera.hfov_deg, camera.width_px, camera.height_px, camera.yaw_rad),
+            [*map(_evidence, envelope.detections)],
+        )
     # Format version 2 has no references, so equal values give equal bytes.
     return hashlib.blake2b(marshal.dumps(content, 2), digest_size=_DIGEST_BYTES).digest()
+
+
+def _evidence(detection: Detection) -> tuple[object, ...]:
+    depth, position = detection.depth_m, detection.position
+    return (
+        depth and (depth, detection.depth_sigma_m),
+        position and (position, detection.position_sigma_m),
+    )
 
 
 class FoldedIds:

@@ -1,10 +1,19 @@
 """docs/recording.md is run, not trusted."""
 
+import json
 import re
 import signal
 from collections.abc import Callable
 from pathlib import Path
 
+from eventsrc.envelope import (
+    MAX_DEPTH_M,
+    MAX_POSITION_M,
+    Detection,
+    Envelope,
+    EnvelopeCamera,
+)
+from eventsrc.ingest import Accepted, ingest
 from eventsrc.metrics import serving_metrics
 from eventsrc.recorder import DEFAULT_QUEUE_SIZE, RecorderReport
 from eventsrc.recorder.queue import DEFAULT_QUEUE_BYTES
@@ -57,3 +66,23 @@ def test_the_numbers_on_the_page_are_those_in_the_code() -> None:
     assert f"or {DEFAULT_QUEUE_BYTES >> 20} MB" in PAGE
     assert f"at most {WINDOW:,} unacknowledged envelopes" in PAGE
     assert f"{DEFAULT_SPOOL_BYTES >> 30} GiB unless" in PAGE
+
+
+def test_the_envelope_on_the_page_has_every_field_and_is_accepted() -> None:
+    document = json.loads(_block("json"))
+    assert isinstance(ingest(_block("json").encode()), Accepted)
+    shown = (document, document["camera"], {**document["detections"][0], "det_id": "by default"})
+    for fields, model in zip(shown, (Envelope, EnvelopeCamera, Detection), strict=True):
+        assert set(fields) == {f.alias or name for name, f in model.model_fields.items()}
+
+
+def test_the_bounds_of_optional_fields_on_the_page_are_those_of_the_envelope() -> None:
+    schema = Envelope.model_json_schema()["$defs"]
+    hfov = schema["EnvelopeCamera"]["properties"]["hfov_deg"]
+    assert (hfov["minimum"], hfov["maximum"]) == (1, 170)
+    for name in ("depth_sigma_m", "position_sigma_m"):
+        sigma = schema["Detection"]["properties"][name]["anyOf"][0]
+        assert (sigma["minimum"], sigma["maximum"]) == (0.001, 1000)
+        assert f"`{name}`" in PAGE
+    assert MAX_DEPTH_M == 1000.0
+    assert MAX_POSITION_M == 1e7

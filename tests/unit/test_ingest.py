@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from eventsrc.envelope import has_evidence
 from eventsrc.ingest import Accepted, Rejected, ingest
 from tests.envelopes import detection, embedding, envelope, payload
 
@@ -236,3 +237,83 @@ def test_vectors_whose_squares_overflow_or_vanish_are_accepted(value: float) -> 
     (vector,) = result.vectors
     assert vector is not None
     assert vector.tolist() == [np.float32(value)] * 512
+
+
+CAMERA = {"hfov_deg": 90.0, "width_px": 640, "height_px": 480.5}
+MEASURED = {
+    "depth_m": 2.5,
+    "depth_sigma_m": 0.1,
+    "position": [1.0, -2],
+    "position_sigma_m": 0.25,
+}
+
+
+def test_a_camera_and_measured_depths_and_positions_are_accepted() -> None:
+    result = ingest(payload(envelope(camera=CAMERA, detections=[detection(**MEASURED)])))
+    assert isinstance(result, Accepted)
+    camera, (seen,) = result.envelope.camera, result.envelope.detections
+    assert camera is not None
+    assert (camera.hfov_deg, camera.width_px, camera.height_px) == (90.0, 640.0, 480.5)
+    assert camera.yaw_rad == 0.0
+    assert (seen.depth_m, seen.depth_sigma_m) == (2.5, 0.1)
+    assert (seen.position, seen.position_sigma_m) == ((1.0, -2.0), 0.25)
+    assert has_evidence(result.envelope)
+
+
+@pytest.mark.parametrize("fields", [{}, {"depth_sigma_m": 0.1}, {"position": None}])
+def test_a_standard_error_alone_is_no_evidence(fields: dict[str, Any]) -> None:
+    result = ingest(payload(envelope(camera=None, detections=[detection(**fields)])))
+    assert isinstance(result, Accepted)
+    assert not has_evidence(result.envelope)
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        ("depth_m", 0.0),
+        ("depth_m", -1.0),
+        ("depth_m", 1001.0),
+        ("depth_m", "far"),
+        ("depth_m", True),
+        ("depth_sigma_m", 0.0),
+        ("depth_sigma_m", 1e9),
+        ("position", [1.0]),
+        ("position", [1.0, 2.0, 3.0]),
+        ("position", {"x": 1.0, "y": 2.0}),
+        ("position", [1.1e7, 0.0]),
+        ("position_sigma_m", 0.0009),
+        ("position_sigma_m", [0.1]),
+    ],
+)
+def test_a_wrong_depth_or_position_is_refused(place: str, value: Any) -> None:
+    raw = payload(envelope(detections=[detection(**{**MEASURED, place: value})]))
+    assert refusal(raw).startswith(f"detections.0.{place}")
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        ("hfov_deg", 0.5),
+        ("hfov_deg", 171.0),
+        ("hfov_deg", "90"),
+        ("width_px", 0),
+        ("width_px", 1e7),
+        ("height_px", -1.0),
+        ("yaw_rad", 7.1),
+    ],
+)
+def test_a_wrong_camera_is_refused(place: str, value: Any) -> None:
+    raw = payload(envelope(camera={**CAMERA, place: value}))
+    assert refusal(raw).startswith(f"camera.{place}: ")
+
+
+def test_a_camera_needs_its_size_and_field_of_view() -> None:
+    for place in CAMERA:
+        less = {name: value for name, value in CAMERA.items() if name != place}
+        assert refusal(payload(envelope(camera=less))) == (
+            f"camera.{place}: required field is missing"
+        )
+    assert refusal(payload(envelope(camera=[90.0]))).startswith("camera: ")
+    for text in ("NaN", "Infinity"):
+        raw = payload(envelope(camera={**CAMERA, "yaw_rad": "?"})).replace(b'"?"', text.encode())
+        assert refusal(raw).startswith("camera.yaw_rad: ")

@@ -86,7 +86,7 @@ def test_the_log_is_that_of_appending_one_by_one(messages: list[tuple[str, bytes
         report = recorded.thread.report()
         assert report.recorded + report.rejected == len(events) == len(messages)
         assert report.rejected == sum(event.key == "mapfold/rejected" for event in events)
-        valid = [e for e in events if e.key != "mapfold/rejected" and e.version == 2]
+        valid = [e for e in events if e.key != "mapfold/rejected" and e.version == 3]
         assert sorted(recorded.acknowledged) == sorted(payload_sha256(e.payload) for e in valid)
 
 

@@ -7,9 +7,12 @@ import pytest
 
 from eventsrc.append import append_payload
 from eventsrc.envelope import ENVELOPE_VERSION, Envelope
-from eventsrc.ingest import Accepted, Rejected
+from eventsrc.gap_history import fold_and_save_ledger
+from eventsrc.importers.run import import_files
+from eventsrc.ingest import Accepted, Rejected, ingest
 from eventsrc.log import Event, LogReader, LogWriter
 from eventsrc.log.format import ENVELOPE_VERSION_KEY, envelope_version, key_channel
+from eventsrc.log.verify import verify_log
 from eventsrc.upcast import UPCASTERS, detect_version, read_envelope
 from projections.model.fold import fold_log
 from projections.settings import Settings
@@ -57,7 +60,7 @@ def test_there_is_an_upcaster_for_every_older_version() -> None:
 
 @pytest.mark.parametrize(
     ("payload", "version"),
-    [(BARE, 1), (b' \n[ {"class"', 1), (b"[1]", 2), (b"[]", 2), (b"{}", 2), (b"", 2)],
+    [(BARE, 1), (b' \n[ {"class"', 1), (b"[1]", 3), (b"[]", 3), (b"{}", 3), (b"", 3)],
 )
 def test_the_version_is_detected_from_the_payload(payload: bytes, version: int) -> None:
     assert detect_version(payload) == version
@@ -69,13 +72,85 @@ def test_a_log_of_both_forms_keeps_the_bytes_and_folds(log_path: Path) -> None:
         assert isinstance(append_payload(writer, KEY, BARE, logged_ns=10**9), Envelope)
         assert isinstance(append_payload(writer, KEY, b'[{"class": "cup"}]'), Rejected)
     events = read_log(log_path)
-    assert [e.version for e in events[:2]] == [2, 1]
+    assert [e.version for e in events[:2]] == [ENVELOPE_VERSION, 1]
     assert events[1].payload == BARE
     assert events[2].key == "mapfold/rejected"
     with LogReader(log_path) as reader:
         _, view = fold_log(reader, Settings())
     counts = view.counts()
     assert (counts["keyframes"], counts["observations"], counts["places"]) == (2, 2, 0)
+
+
+OLDER = {
+    "camera": "front",
+    "position": [0.1, "left"],
+    "detections": [
+        {
+            "class": "cup",
+            "confidence": 0.5,
+            "bbox": [1.0, 2.0, 3.0, 4.0],
+            "position": {"x": 1.0},
+            "depth_m": "far",
+            "depth_sigma_m": -1,
+            "position_sigma_m": None,
+            "track": [7],
+        }
+    ],
+}
+
+
+def test_unknown_fields_of_version_2_with_names_of_version_3_are_dropped() -> None:
+    payload = envelope(1, **OLDER)
+    assert isinstance(read_envelope(event(payload, 3)), Rejected)
+    for version in (2, 1):
+        body = payload if version == 2 else json.dumps(OLDER["detections"]).encode()
+        read = read_envelope(event(body, version))
+        assert isinstance(read, Accepted)
+        assert read.envelope.camera is None
+        (cup,) = read.envelope.detections
+        assert (cup.class_name, cup.depth_m, cup.position) == ("cup", None, None)
+    fits = envelope(1, camera={"hfov_deg": 90.0, "width_px": 640.0, "height_px": 480.0})
+    read = read_envelope(event(fits, 2))
+    assert isinstance(read, Accepted)
+    assert read.envelope.camera is None, "whoever wrote it did not mean our field"
+    younger = read_envelope(event(fits, 3))
+    assert isinstance(younger, Accepted)
+    assert younger.envelope.camera is not None
+
+
+def test_a_faulty_envelope_of_version_2_is_refused_with_its_own_fault() -> None:
+    for body in (b"{", b"[1]", b'{"run_id": 1}', b'{"camera": ' + b"[" * 9_999):
+        read = read_envelope(event(body, 2))
+        assert read == ingest(body)
+        assert isinstance(read, Rejected)
+    read = read_envelope(event(envelope(1, **{**OLDER, "map_x": "east"}), 2))
+    assert isinstance(read, Rejected)
+    assert read.reason.startswith("map_x: ")
+
+
+def test_a_log_of_version_2_reads_verifies_and_is_imported_as_it_was(tmp_path: Path) -> None:
+    payloads = [envelope(number, **OLDER) for number in (1, 2, 4)]
+    with LogWriter(tmp_path / "old") as writer:
+        for number, payload in enumerate(payloads):
+            writer.append(KEY, payload, stamp_ns=10**9 * number, version=2)
+    with LogWriter(tmp_path / "new") as writer:
+        report = import_files(writer, [str(tmp_path / "old")])
+        assert (report.accepted, report.rejected) == (3, 0)
+        (segment,) = (tmp_path / "old").glob("*.mcap")
+        report = import_files(writer, [str(segment)])
+        assert (report.accepted, report.rejected) == (3, 0)
+    for name in ("old", "new"):
+        events = [e for e in read_log(tmp_path / name) if e.key == KEY]
+        assert {e.version for e in events} == {2}
+        assert [e.payload for e in events[:3]] == payloads
+        with LogReader(tmp_path / name) as reader:
+            _, view = fold_log(reader, Settings())
+            findings = {f.kind for f in verify_log(tmp_path / name).findings}
+            ledger = fold_and_save_ledger(reader)
+        assert view.counts()["observations"] == 3
+        assert "schema" not in findings
+        assert ("duplicate" in findings) is (name == "new"), "its keyframes are counted"
+        assert [(gap.first, gap.last) for gap in ledger.gaps()] == [(3, 3)]
 
 
 @pytest.mark.parametrize("said", ["", "two", "\x00", "-1", "9" * 5_000])

@@ -1,0 +1,78 @@
+"""Envelopes of version 2 mean what they meant, whatever fields of later names they hold."""
+
+import json
+from typing import Any
+
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from eventsrc.ingest import Accepted, Rejected, ingest
+from eventsrc.log import Event
+from eventsrc.upcast import check_envelopes, read_envelope, read_envelopes
+from tests.envelopes import detection, envelope
+
+KEY = "tb/detections"
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers(-9, 9) | st.floats(-2.0, 2.0) | st.text(max_size=3),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=2), inner),
+    max_leaves=4,
+)
+IN_DETECTION = ("depth_m", "depth_sigma_m", "position", "position_sigma_m")
+LATER = st.dictionaries(st.sampled_from([*IN_DETECTION, "camera", "x"]), JSON, max_size=3)
+CAMERA = st.fixed_dictionaries(
+    {"hfov_deg": st.just(90.0), "width_px": st.just(640.0), "height_px": st.just(400.0)}
+)
+ENVELOPES = st.builds(
+    lambda more, camera, inner, broken: {
+        **more,
+        **({} if camera is None else {"camera": camera}),
+        **envelope(7, detections=[detection("cup", [1.0, 2.0], **each) for each in inner]),
+        **broken,
+    },
+    LATER,
+    st.none() | CAMERA,
+    st.lists(LATER | st.just({"depth_m": 1.5}), max_size=3),
+    st.just({}) | st.just({"map_x": "east"}) | st.just({"detections": 3}),
+)
+
+
+def plain(document: dict[str, Any]) -> dict[str, Any]:
+    """Without the fields that version 2 did not know."""
+    found = {name: value for name, value in document.items() if name != "camera"}
+    if isinstance(found["detections"], list):
+        found["detections"] = [
+            {name: value for name, value in each.items() if name not in IN_DETECTION}
+            for each in found["detections"]
+        ]
+    return found
+
+
+@settings(suppress_health_check=[HealthCheck.too_slow])
+@given(st.lists(st.tuples(ENVELOPES, st.sampled_from([2, 3])), max_size=4))
+def test_an_older_envelope_is_read_as_if_it_had_no_field_of_later_names(
+    documents: list[tuple[dict[str, Any], int]],
+) -> None:
+    events = [
+        Event(offset, KEY, 0, 0, json.dumps(document).encode(), version)
+        for offset, (document, version) in enumerate(documents)
+    ]
+    expected = [
+        ingest(json.dumps(plain(document) if version == 2 else document).encode())
+        for document, version in documents
+    ]
+    read = read_envelopes(events)
+    checked = check_envelopes(events)
+    for event, want, *found in zip(events, expected, read, checked, strict=True):
+        both = [read_envelope(event), found[0]]
+        for result in both:
+            if isinstance(want, Rejected):
+                assert result == want
+                assert found[1] == want
+            else:
+                assert isinstance(result, Accepted)
+                assert result.envelope == want.envelope
+                assert result.det_ids == want.det_ids
+                assert [v.tobytes() for v in result.vectors if v is not None] == [
+                    v.tobytes() for v in want.vectors if v is not None
+                ]
+                assert found[1] == want.envelope
