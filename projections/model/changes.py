@@ -136,8 +136,10 @@ class ChangeTracker:
     def _objects_merged(self, delta: ObjectsMerged) -> None:
         self._objects.update((delta.survivor, delta.absorbed))
         self._located.add(delta.absorbed)
-        # Before the view applies it, as above.
-        self._reassigned.update(self.view.all_objects[delta.absorbed].observations)
+        # Before the view applies it, as above. An Object that this event has found is not there
+        # yet: all its observations are new.
+        if delta.absorbed < len(self.view.all_objects):
+            self._reassigned.update(self.view.all_objects[delta.absorbed].observations)
 
     # Of the class, not bound to the tracker; `MapView` says why.
     _COLLECTORS: ClassVar[dict[type, Callable[["ChangeTracker", Any], None]]] = {

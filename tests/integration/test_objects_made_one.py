@@ -10,6 +10,7 @@ from eventsrc.log import LogReader
 from projections.corrections import Corrections
 from projections.database import rebuild, tail
 from projections.database.connection import Targets
+from projections.database.graph_render import expected_rows
 from projections.database.live_fold import LiveFold, batches
 from projections.database.memory_sink import MemorySink, MemoryTables
 from projections.model.fold import fold_log
@@ -17,6 +18,7 @@ from projections.model.log_commands import read_corrections
 from projections.model.view import MapView
 from projections.settings import Settings
 from tests.commands_in_logs import append_command, command
+from tests.envelopes import detection, envelope
 from tests.integration.test_refold import parsed
 from tests.logs import walk, write_log
 from tests.rows import all_rows, expected_graph
@@ -75,3 +77,31 @@ def test_batches_of_any_size_give_the_rows_of_a_rebuild(log: Path, size: int) ->
     shadow.finish(folding.view)(anew)
     shadow.swap_in(anew)
     assert live.graph == anew.graph
+
+
+def test_an_object_is_found_and_absorbed_by_one_event(tmp_path: Path) -> None:
+    """The first detection of the second keyframe founds an Object far from the other one; the
+    second detection joins it and is, by command, of the other one."""
+    documents = [
+        envelope(0, 0.0, detections=[detection("cup", [1.0, 0.0], det_id="a")]),
+        envelope(
+            1,
+            100.0,
+            detections=[
+                detection("cup", [0.0, 1.0], det_id="b"),
+                detection("cup", [0.0, 1.0], det_id="c"),
+            ],
+        ),
+    ]
+    log = write_log(tmp_path / "log", [])
+    append_command(log, command(SameObject, det_ids=("a", "c")))
+    write_log(log, documents)
+    view, corrections = fold(log)
+    assert [o.obs_count for o in view.objects.values()] == [3]
+    following, live = LiveFold(SETTINGS, corrections=corrections), MemoryTables()
+    with LogReader(log) as reader:
+        for batch in batches(reader.read(FIRST_OFFSET), 1):
+            assert not any(following.feed(batch))
+            MemorySink().prepare(following.tracker.drain(), following.view).send(live)
+    assert list(live.graph["Object"]) == [row[0] for row in expected_rows(view, "Object")]
+    assert list(live.graph["OBSERVES"].values()) == list(expected_rows(view, "OBSERVES"))
