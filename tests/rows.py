@@ -130,6 +130,11 @@ def _expect_landmarks(view: MapView, rows: dict[str, list[tuple[Any, ...]]]) -> 
             "first_seen": obj.first_seen,
             "last_seen": obj.last_seen,
         }
+        if view.settings.fusion == "evidence":
+            properties["missing"] = obj.missing_in is not None
+            if (at := obj.estimate) is not None:
+                properties |= {"est_x": at.x_um / 1e6, "est_y": at.y_um / 1e6}
+                properties["est_sigma_m"] = at.est_sigma_m
         rows["Object"].append((gid("Object", n), properties))
         if obj.place is not None:
             ends = gid("Object", n), gid("Place", obj.place + 1)

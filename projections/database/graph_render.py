@@ -17,7 +17,7 @@ from typing import Final
 
 from projections.deltas import PlaceOrdinal
 from projections.exact import Q40, UM_PER_M
-from projections.model.records import KeyframeRecord
+from projections.model.records import KeyframeRecord, ObjectRecord
 from projections.model.view import MapView
 
 from .labels import LABELS, Label, adjacency_number, graphid_base
@@ -114,16 +114,28 @@ def observation_rows(view: MapView, observations: Iterable[int]) -> Iterator[Ver
 
 
 def object_rows(view: MapView, objects: Iterable[int]) -> Iterator[VertexRow]:
-    """Objects."""
-    base = BASE["Object"]
+    """Objects; under fusion by evidence also where they stand, and whether they are missing."""
+    base, by_evidence = BASE["Object"], view.settings.fusion == "evidence"
     for i in objects:
         o = view.all_objects[i]
+        more = _evidence(o) if by_evidence else ""
         properties = (
             f'{{"object_id": {text(o.object_id)}, "class_name": {text(o.class_name)},'
             f' "mean_x": {o.mean_x!r}, "mean_y": {o.mean_y!r}, "obs_count": {o.obs_count},'
-            f' "first_seen": {o.first_seen!r}, "last_seen": {o.last_seen!r}}}'
+            f' "first_seen": {o.first_seen!r}, "last_seen": {o.last_seen!r}{more}}}'
         )
         yield base + i, properties
+
+
+def _evidence(found: ObjectRecord) -> str:
+    """More properties of an Object; one without an estimate has no position."""
+    at, missing = found.estimate, "false" if found.missing_in is None else "true"
+    position = (
+        ""
+        if at is None
+        else f', "est_x": {at.est_x!r}, "est_y": {at.est_y!r}, "est_sigma_m": {at.est_sigma_m!r}'
+    )
+    return f'{position}, "missing": {missing}'
 
 
 def place_rows(view: MapView, places: Iterable[int]) -> Iterator[VertexRow]:

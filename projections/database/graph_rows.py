@@ -3,8 +3,8 @@
 Two kinds of rows. *Fixed* ones are written once, when their event is folded: Keyframe, Pose,
 Observation and the edges HAS_KEYFRAME, HAS_POSE, HAS_OBSERVATION, OBSERVES (an observation is fused
 by the event that adds it, or never). *Changing* ones can get other values later: Run, Object, Place
-and the edges LOCATED_IN, IN_PLACE, ADJACENT_TO. Where corrections make two Objects one, OBSERVES is
-a changing one too.
+and the edges LOCATED_IN, IN_PLACE, ADJACENT_TO. Where two Objects may become one, by a correction
+or under fusion by evidence, OBSERVES is a changing one too.
 """
 
 from collections.abc import Sequence
@@ -67,7 +67,7 @@ def fixed_rows(
 
 
 def _objects_may_merge(view: MapView) -> bool:
-    return bool(view.corrections.same)
+    return view.settings.fusion == "evidence" or bool(view.corrections.same)
 
 
 def _new_rows(

@@ -3,7 +3,7 @@
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Self, TypeAlias
+from typing import Final, Self, TypeAlias
 
 import msgspec
 
@@ -21,6 +21,10 @@ from projections.settings import Settings
 
 SettingsOf: TypeAlias = Callable[[Corrections], Settings]
 """The settings that a map is made with under a log's corrections, which may name some."""
+_PAGE_FUSION: Final = {
+    name: Settings.model_fields[name].default for name in ("fusion", "camera", "evidence")
+}
+"""The settings that change Objects alone, with their defaults."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,8 +32,8 @@ class MapInputs:
     """``corrections`` are of the commands before the offset ``known_at``.
 
     ``fingerprint`` identifies settings and corrections. ``observed`` leaves out the corrections of
-    places and Objects: maps with the same one have the same observations, so vectors of one and a
-    graph of the other go together.
+    places and Objects, and the settings of fusion by evidence: maps with the same one have the same
+    observations, so vectors of one and a graph of the other go together.
     """
 
     settings: Settings
@@ -49,7 +53,7 @@ class MapInputs:
             corrections,
             known_at,
             map_fingerprint(settings, corrections),
-            map_fingerprint(settings, of_observations),
+            map_fingerprint(settings.model_copy(update=_PAGE_FUSION), of_observations),
         )
 
     @property

@@ -94,21 +94,33 @@ def _rows(connection: Connection, name: str, **values: Any) -> list[Any]:
 def places_near(connection: Connection, x: float, y: float, radius: float) -> list[dict[str, Any]]:
     """Places with a centroid within ``radius`` metres, nearest first, with ``distance_m``."""
     found = _read_square(connection, "places", x, y, radius)
-    return _nearest(found, "centroid_x", "centroid_y", "place_id", x, y, radius)
+    return _nearest(found, ("centroid_x",), ("centroid_y",), "place_id", (x, y), radius)
 
 
 def objects_near(connection: Connection, x: float, y: float, radius: float) -> list[dict[str, Any]]:
-    """Objects with a mean position within ``radius`` metres, nearest first, with ``distance_m``."""
+    """Objects within ``radius`` metres, nearest first, with ``distance_m``.
+
+    That is measured to where an Object stands by estimate, or to its mean position if it has none.
+    """
     found = _read_square(connection, "objects", x, y, radius)
-    return _nearest(found, "mean_x", "mean_y", "object_id", x, y, radius)
+    return _nearest(found, ("est_x", "mean_x"), ("est_y", "mean_y"), "object_id", (x, y), radius)
 
 
 def _nearest(
-    found: list[Any], x_key: str, y_key: str, id_key: str, x: float, y: float, radius: float
+    found: list[Any],
+    x_keys: tuple[str, ...],
+    y_keys: tuple[str, ...],
+    id_key: str,
+    spot: tuple[float, float],
+    radius: float,
 ) -> list[dict[str, Any]]:
-    measured = [
-        {**thing, "distance_m": math.hypot(thing[x_key] - x, thing[y_key] - y)} for thing in found
-    ]
+    """Those within ``radius`` of ``spot``; a thing's position is under the first key it has."""
+
+    def distance(thing: dict[str, Any]) -> float:
+        at = [next(thing[key] for key in keys if key in thing) for keys in (x_keys, y_keys)]
+        return math.hypot(at[0] - spot[0], at[1] - spot[1])
+
+    measured = [{**thing, "distance_m": distance(thing)} for thing in found]
     return sorted(
         (thing for thing in measured if thing["distance_m"] <= radius),
         key=lambda thing: (thing["distance_m"], thing[id_key]),

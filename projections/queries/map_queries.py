@@ -9,6 +9,7 @@ from typing import Any, Protocol
 from projections.database.connection import Connection
 from projections.deltas import PlaceOrdinal
 from projections.errors import QuestionError
+from projections.model.records import ObjectRecord
 from projections.model.view import MapView
 from projections.relocalize import CandidatePlace, Candidates, Crop
 
@@ -23,11 +24,15 @@ _OBJECT_FIELDS = (
     "obs_count",
     "first_seen",
     "last_seen",
+    "est_x",
+    "est_y",
+    "est_sigma_m",
+    "missing",
     "place_id",
     "place_name",
 )
 """The fields of an Object in their order; agtype has its own order. Only an Object in a Place that
-has a name has the last one."""
+has a name has the last one; only fusion by evidence gives ``est_x`` to ``missing``."""
 
 
 class MapSource(Protocol):
@@ -117,8 +122,17 @@ class FoldedMap:
             "obs_count": thing.obs_count,
             "first_seen": thing.first_seen,
             "last_seen": thing.last_seen,
+            **self._evidence(thing),
             "place_id": self._view.place_id(thing.place),
         } | self._place_name(thing.place)
+
+    def _evidence(self, thing: ObjectRecord) -> dict[str, Any]:
+        if self._view.settings.fusion != "evidence":
+            return {}
+        at, missing = thing.estimate, {"missing": thing.missing_in is not None}
+        if at is None:
+            return missing
+        return {"est_x": at.est_x, "est_y": at.est_y, "est_sigma_m": at.est_sigma_m} | missing
 
     def _place_name(self, place: PlaceOrdinal | None) -> dict[str, str]:
         name = None if place is None else self._view.all_places[place].name

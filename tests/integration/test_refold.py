@@ -270,6 +270,46 @@ def test_settings_of_the_log_are_used_and_changed(
         tail(log, one_database, SETTINGS, once=True)
 
 
+def test_settings_of_fusion_by_evidence_keep_the_vectors(
+    log: Path, targets: Targets, third_database: Targets
+) -> None:
+    def settings_of(corrections: Any) -> Settings:
+        return corrections.settings or Settings()
+
+    tail(log, targets, settings_of, once=True)
+    table = oid(targets)
+    given: dict[str, object] = {
+        "fusion": "evidence",
+        "camera": {"hfov_deg": 90.0},
+        "evidence": {"range_m": 1.25, "sizes_m": {"baker's rack": 1.5, "a=b.c": 0.25}},
+    }
+    append_command(log, command(UseSettings, settings=given))
+    write_log(log, walk(10, seed=5, run_id="run-d"))
+    assert tail(log, targets, settings_of, once=True).refolds == 1
+    assert oid(targets) == table
+    evidence = Settings.of_document(given)
+    rebuild(log, third_database, evidence)
+    rows = all_rows(targets)
+    assert rows == all_rows(third_database)
+    objects = [json.loads(row[1]) for row in rows[0]["Object"]]
+    assert objects
+    assert all("missing" in each for each in objects)
+    assert tail(log, targets, settings_of, once=True).refolds == 0
+    assert all(report.sound for report in check(log, targets, settings_of))
+    # Without the log's settings it is refused, and the options that it names make it go on.
+    with pytest.raises(ProjectionMismatch, match="fusion=evidence there, page here") as refused:
+        tail(log, targets, Settings(), once=True)
+    (options,) = re.findall(r"to go on with them add (.*?); to rebuild", str(refused.value))
+    words = shlex.split(options)
+    assert set(words[::2]) == {"--set"}
+    assert Settings().with_assignments(words[1::2]) == evidence
+    append_command(log, command(UseSettings, settings={}))
+    assert tail(log, targets, settings_of, once=True).refolds == 1
+    assert oid(targets) == table
+    rebuild(log, third_database, Settings())
+    assert all_rows(targets) == all_rows(third_database)
+
+
 def test_status_tells_how_far_a_refold_is(
     log: Path, targets: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:

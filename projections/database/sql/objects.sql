@@ -48,8 +48,13 @@ WHERE ag_catalog.agtype_access_operator(VARIADIC ARRAY[properties, '"centroid_x"
         BETWEEN %(y0)s AND %(y1)s
 
 -- name: near_objects
+-- By estimate where there is one, as fusion by evidence makes it.
 SELECT properties FROM {object}
-WHERE ag_catalog.agtype_access_operator(VARIADIC ARRAY[properties, '"mean_x"'::ag_catalog.agtype])::float8
-        BETWEEN %(x0)s AND %(x1)s
-  AND ag_catalog.agtype_access_operator(VARIADIC ARRAY[properties, '"mean_y"'::ag_catalog.agtype])::float8
-        BETWEEN %(y0)s AND %(y1)s
+WHERE coalesce(
+        ag_catalog.agtype_access_operator(VARIADIC ARRAY[properties, '"est_x"'::ag_catalog.agtype]),
+        ag_catalog.agtype_access_operator(VARIADIC ARRAY[properties, '"mean_x"'::ag_catalog.agtype])
+    )::float8 BETWEEN %(x0)s AND %(x1)s
+  AND coalesce(
+        ag_catalog.agtype_access_operator(VARIADIC ARRAY[properties, '"est_y"'::ag_catalog.agtype]),
+        ag_catalog.agtype_access_operator(VARIADIC ARRAY[properties, '"mean_y"'::ag_catalog.agtype])
+    )::float8 BETWEEN %(y0)s AND %(y1)s

@@ -1,0 +1,174 @@
+"""Deltas of fusion by evidence in the databases: live batches and a rebuild give what they say."""
+
+import contextlib
+import math
+from collections.abc import Iterator
+
+import psycopg
+import pytest
+
+from projections import deltas as d
+from projections.database.checkpoints import ensure_schema
+from projections.database.connection import Connection, Targets, connect, pin_session_settings
+from projections.database.graph_sink import GraphSink
+from projections.database.loader import LoaderName
+from projections.database.memory_sink import MemorySink, MemoryTables
+from projections.database.vector_sink import VectorSink
+from projections.model.changes import ChangeTracker
+from projections.model.records import ObjectRecord
+from projections.model.view import MapView
+from projections.queries.graph_reads import objects_near
+from projections.queries.map_queries import FoldedMap, LiveMap
+from projections.queries.relocalize import prepare_graph
+from projections.settings import Settings
+from tests.integration.test_projections import parsed
+from tests.rows import all_rows, expected_graph
+from tests.told_objects import Story, random_steps, told_rows, without_sigma
+
+EVIDENCE = Settings(fusion="evidence")
+
+
+@contextlib.contextmanager
+def session(targets: Targets) -> Iterator[Connection]:
+    with connect(targets.graph_url, autocommit=True) as connection:
+        pin_session_settings(connection)
+        ensure_schema(connection)
+        yield connection
+
+
+def follow(
+    connection: Connection, events: list[list[d.Delta]], size: int, loader: LoaderName
+) -> MapView:
+    """Both sinks live, in batches of ``size``."""
+    tracker = ChangeTracker(MapView(EVIDENCE, keep_embeddings=False))
+    sinks = GraphSink(loader), VectorSink(loader, dimension=3)
+    with connection.transaction():
+        for sink in sinks:
+            sink.ensure(connection)
+    for start in range(0, len(events), size):
+        for offset in range(start, min(start + size, len(events))):
+            tracker.apply_event(d.Offset(offset), events[offset], offset * 1_000)
+        changes = tracker.drain()
+        writes = [sink.prepare(changes, tracker.view) for sink in sinks]
+        is_small = all(write.is_small for write in writes)
+        with (
+            connection.pipeline() if is_small else contextlib.nullcontext(),
+            connection.transaction(),
+        ):
+            for write in writes:
+                write.send(connection)
+    return tracker.view
+
+
+def rebuild(
+    connection: Connection, events: list[list[d.Delta]], size: int, loader: LoaderName
+) -> MapView:
+    tracker = ChangeTracker(MapView(EVIDENCE, keep_embeddings=False))
+    shadows = GraphSink(loader).shadow(), VectorSink(loader, dimension=3).shadow()
+    with connection.transaction():
+        for shadow in shadows:
+            shadow.create(connection)
+        for offset, deltas in enumerate(events):
+            tracker.apply_event(d.Offset(offset), deltas, offset * 1_000)
+            if offset % size == 0 or offset + 1 == len(events):
+                changes = tracker.drain()
+                for shadow in shadows:
+                    shadow.load(changes, tracker.view)(connection)
+        for shadow in shadows:
+            shadow.finish(tracker.view)(connection)
+        for shadow in shadows:
+            shadow.lock_readers(connection)
+            shadow.swap_in(connection)
+    return tracker.view
+
+
+@pytest.mark.parametrize(
+    ("seed", "size", "loader"), [(1, 1, "copy"), (2, 7, "insert"), (3, 7, "copy"), (4, 99, "copy")]
+)
+def test_live_batches_and_a_rebuild_give_what_the_deltas_say(
+    seed: int, size: int, loader: LoaderName, one_database: Targets
+) -> None:
+    events = Story.of(random_steps(seed, 70)).events
+    with session(one_database) as connection:
+        view = follow(connection, events, size, loader)
+        assert len(view.objects) < len(view.all_objects)
+        live = all_rows(one_database)
+        rebuild(connection, events, 13, loader)
+        assert all_rows(one_database) == live
+    graph = parsed(dict(live[0]))
+    assert graph == expected_graph(view)
+    told = told_rows(events)
+    assert {label: graph[label] for label in ("OBSERVES", "LOCATED_IN")} == {
+        label: told[label] for label in ("OBSERVES", "LOCATED_IN")
+    }
+    found, sigmas = without_sigma(graph["Object"])
+    expected, expected_sigmas = without_sigma(told["Object"])
+    assert found == expected
+    assert sigmas == pytest.approx(expected_sigmas, rel=1e-12)
+    memory, tracker = MemoryTables(), ChangeTracker(MapView(EVIDENCE, keep_embeddings=False))
+    for offset, deltas in enumerate(events):
+        tracker.apply_event(d.Offset(offset), deltas, offset * 1_000)
+        MemorySink().prepare(tracker.drain(), tracker.view).send(memory)
+    assert [row[0] for row in live[1]] == sorted(memory.vectors)
+    assert [row[2] for row in live[1]] == [
+        row.added.det_id for _, row in sorted(memory.vectors.items())
+    ]
+
+
+def test_a_query_finds_objects_by_where_they_stand(
+    one_database: Targets, pg: psycopg.Connection
+) -> None:
+    """The example of docs/fusion.md, and a boolean that Cypher takes for one."""
+    events = Story.of(random_steps(5, 70)).events
+    with session(one_database) as connection:
+        view = follow(connection, events, 10, "copy")
+    rows = pg.execute(
+        "SELECT * FROM cypher('semantic_map', $q$"
+        " MATCH (o:Object) WHERE o.missing AND o.est_sigma_m < 1.0"
+        " RETURN o.object_id, o.est_x, o.est_y ORDER BY o.object_id"
+        " $q$) AS (object_id agtype, x agtype, y agtype)"
+    ).fetchall()
+    expected = [
+        (f'"{o.object_id}"', o.estimate.est_x, o.estimate.est_y)
+        for o in view.objects.values()
+        if o.missing_in is not None and o.estimate is not None and o.estimate.est_sigma_m < 1.0
+    ]
+    assert [(row[0], float(row[1]), float(row[2])) for row in rows] == sorted(expected)
+    assert 0 < len(rows) < len(view.objects)
+
+
+def test_questions_use_where_objects_stand(one_database: Targets) -> None:
+    events = Story.of(random_steps(6, 70)).events
+    # One has no estimate: its mean position counts.
+    events = [
+        [e for e in deltas if not (isinstance(e, d.ObjectEstimated) and e.object == 0)]
+        for deltas in events
+    ]
+    with session(one_database) as connection:
+        view = follow(connection, events, 10, "copy")
+        prepare_graph(connection)
+        live, folded = LiveMap(connection), FoldedMap(view)
+        for thing in view.objects.values():
+            found = live.find_object(thing.object_id)
+            assert found is not None
+            assert found == folded.find_object(thing.object_id)
+            assert list(found) == list(folded.find_object(thing.object_id) or {})
+            assert found["missing"] is (thing.missing_in is not None)
+            x, y = found.get("est_x", found["mean_x"]), found.get("est_y", found["mean_y"])
+            (nearest, *_) = objects_near(connection, x, y, 0.5)
+            assert nearest["distance_m"] == 0.0
+        for radius in (1.0, 3.0):
+            near = {
+                o.object_id: pytest.approx(distance)
+                for o in view.objects.values()
+                if (distance := math.dist(stands_at(o), (x, y))) <= radius
+            }
+            found_near = objects_near(connection, x, y, radius)
+            assert {o["object_id"]: o["distance_m"] for o in found_near} == near
+            assert found_near == sorted(found_near, key=lambda o: o["distance_m"])
+        assert 1 < len(near) < len(view.objects)
+
+
+def stands_at(thing: ObjectRecord) -> tuple[float, float]:
+    at = thing.estimate
+    return (thing.mean_x, thing.mean_y) if at is None else (at.est_x, at.est_y)

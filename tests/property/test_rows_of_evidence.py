@@ -1,0 +1,168 @@
+"""Estimates, classes, merges, missing and relocated Objects in rows: batches of any size and a
+rebuild give what the deltas say."""
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from projections import deltas as d
+from projections.database.graph_render import object_rows
+from projections.database.labels import COUNT_KEYS, LABELS, TABLE
+from projections.database.memory_sink import MemorySink, MemoryTables
+from projections.model.changes import ChangeTracker
+from projections.model.records import Estimate
+from projections.model.view import MapView
+from projections.settings import Settings
+from tests.thorough import examples
+from tests.told_objects import STEPS, Step, Story, random_steps, told_rows, without_sigma
+
+EVIDENCE = Settings(fusion="evidence")
+Events = Sequence[Sequence[d.Delta]]
+
+
+def followed(events: Events, size: int, tables: MemoryTables) -> MapView:
+    """A live sink's tables after batches of ``size``, each sent twice, as after a failed commit."""
+    tracker, sink = ChangeTracker(MapView(EVIDENCE, keep_embeddings=False)), MemorySink()
+    for start in range(0, len(events), size):
+        for offset in range(start, min(start + size, len(events))):
+            tracker.apply_event(d.Offset(offset), events[offset], offset)
+        prepared = sink.prepare(tracker.drain(), tracker.view)
+        prepared.send(tables)
+        prepared.send(tables)
+    return tracker.view
+
+
+def rebuilt(events: Events, size: int) -> tuple[MapView, MemoryTables, dict[str, int]]:
+    tracker, tables = ChangeTracker(MapView(EVIDENCE, keep_embeddings=False)), MemoryTables()
+    shadow = MemorySink().shadow()
+    shadow.create(tables)
+    for offset, deltas in enumerate(events):
+        tracker.apply_event(d.Offset(offset), deltas, offset)
+        if offset % size == 0:
+            shadow.load(tracker.drain(), tracker.view)(tables)
+    shadow.load(tracker.drain(), tracker.view)(tables)
+    rows = shadow.finish(tracker.view)(tables)
+    shadow.swap_in(tables)
+    return tracker.view, tables, dict(rows)
+
+
+def parsed(tables: MemoryTables, label: Any) -> list[tuple[Any, ...]]:
+    rows = [row for _, row in sorted(tables.graph[label].items())]
+    return [(*map(str, row[:-1]), json.loads(row[-1])) for row in rows]
+
+
+def check_rows(tables: MemoryTables, events: Events) -> None:
+    told = told_rows(events)
+    for label in ("OBSERVES", "LOCATED_IN"):
+        assert parsed(tables, label) == told[label]
+    found, sigmas = without_sigma(parsed(tables, "Object"))
+    expected, expected_sigmas = without_sigma(told["Object"])
+    assert found == expected
+    assert sigmas == pytest.approx(expected_sigmas, rel=1e-12)
+
+
+@settings(max_examples=examples(500))
+@given(STEPS, st.integers(1, 30), st.integers(1, 30))
+def test_batches_of_any_size_and_a_rebuild_give_what_the_deltas_say(
+    steps: list[Step], size: int, rebuild_size: int
+) -> None:
+    events = Story.of(steps).events
+    live = MemoryTables()
+    followed(events, size, live)
+    check_rows(live, events)
+    view, anew, counted = rebuilt(events, rebuild_size)
+    assert live.graph == anew.graph
+    assert live.vectors.keys() == anew.vectors.keys()
+    counts = view.counts()
+    assert {label: counted[label] for label in LABELS} == {
+        label: counts[COUNT_KEYS[label]] for label in LABELS
+    }
+    assert counted[TABLE] == len(view.observations)
+
+
+@pytest.mark.parametrize("size", [1, 7, 1_000])
+@pytest.mark.parametrize("seed", range(5))
+def test_longer_stories(seed: int, size: int) -> None:
+    events, live = Story.of(random_steps(seed, 80)).events, MemoryTables()
+    followed(events, size, live)
+    check_rows(live, events)
+    assert live.graph == rebuilt(events, 10)[1].graph
+
+
+def test_the_stories_have_every_kind_of_delta() -> None:
+    """Else the tests here would say less than their names do."""
+    kinds = {type(delta) for event in Story.of(random_steps(1, 60)).events for delta in event}
+    assert {
+        d.ObjectsMerged, d.ObjectEstimated, d.ObjectClassified, d.ObjectMissing, d.ObjectRelocated
+    } <= kinds  # fmt: skip
+
+
+@settings(max_examples=examples(500))
+@given(STEPS)
+def test_rows_after_each_event_are_those_of_the_events_so_far(steps: list[Step]) -> None:
+    events, tables = Story.of(steps).events, MemoryTables()
+    tracker = ChangeTracker(MapView(EVIDENCE, keep_embeddings=False))
+    for offset, deltas in enumerate(events):
+        tracker.apply_event(d.Offset(offset), deltas, offset)
+        MemorySink().prepare(tracker.drain(), tracker.view).send(tables)
+        check_rows(tables, events[: offset + 1])
+
+
+@given(STEPS)
+def test_the_rows_of_the_page_have_none_of_it(steps: list[Step]) -> None:
+    events = Story.of(steps).events
+    view = MapView(Settings())
+    for offset, deltas in enumerate(events):
+        view.apply_event(d.Offset(offset), deltas)
+    for _, properties in object_rows(view, view.objects):
+        assert list(json.loads(properties)) == [
+            "object_id", "class_name", "mean_x", "mean_y", "obs_count", "first_seen", "last_seen",
+        ]  # fmt: skip
+
+
+@given(STEPS)
+def test_applying_events_twice_changes_no_object(steps: list[Step]) -> None:
+    once, twice = MapView(EVIDENCE), MapView(EVIDENCE)
+    for offset, deltas in enumerate(Story.of(steps).events):
+        once.apply_event(d.Offset(offset), deltas)
+        twice.apply_event(d.Offset(offset), deltas)
+        twice.apply_event(d.Offset(offset), deltas)
+    assert once.objects.keys() == twice.objects.keys()
+    for ordinal, found in once.objects.items():
+        other = twice.objects[ordinal]
+        fields = (
+            "class_name", "obs_count", "observations", "estimate", "looks", "missing_in",
+            "relocations", "place",
+        )  # fmt: skip
+        assert [getattr(found, f) for f in fields] == [getattr(other, f) for f in fields]
+
+
+@pytest.mark.parametrize(
+    ("variances", "sigma"),
+    [
+        ((0, 0, 0), 0.0),
+        ((40_000_000_000, 0, 10_000_000_000), 0.2),
+        ((10_000_000_000, 0, 40_000_000_000), 0.2),
+        ((25_000_000_000, 15_000_000_000, 25_000_000_000), 0.2),
+        ((25_000_000_000, -15_000_000_000, 25_000_000_000), 0.2),
+    ],
+)
+def test_sigma_is_that_of_the_least_sure_direction(
+    variances: tuple[int, int, int], sigma: float
+) -> None:
+    assert Estimate(1, 2, *variances, 3).est_sigma_m == pytest.approx(sigma, rel=1e-15)
+
+
+def test_an_object_without_an_estimate_has_no_position() -> None:
+    view = MapView(EVIDENCE)
+    for offset, deltas in enumerate(Story.of([Step(sees=(0,))]).events):
+        view.apply_event(
+            d.Offset(offset), [e for e in deltas if not isinstance(e, d.ObjectEstimated)]
+        )
+    ((_, properties),) = object_rows(view, [0])
+    assert json.loads(properties)["missing"] is False
+    assert "est_x" not in properties
