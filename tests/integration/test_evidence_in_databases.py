@@ -1,8 +1,11 @@
 """Deltas of fusion by evidence in the databases: live batches and a rebuild give what they say."""
 
 import contextlib
+import json
 import math
+import re
 from collections.abc import Iterator
+from pathlib import Path
 
 import psycopg
 import pytest
@@ -26,6 +29,7 @@ from tests.rows import all_rows, expected_graph
 from tests.told_objects import Story, random_steps, told_rows, without_sigma
 
 EVIDENCE = Settings(fusion="evidence")
+PAGE = Path(__file__).parents[2] / "docs" / "projections.md"
 
 
 @contextlib.contextmanager
@@ -115,26 +119,23 @@ def test_live_batches_and_a_rebuild_give_what_the_deltas_say(
     ]
 
 
-def test_a_query_finds_objects_by_where_they_stand(
+def test_the_example_of_the_page_finds_objects_by_where_they_stand(
     one_database: Targets, pg: psycopg.Connection
 ) -> None:
-    """The example of docs/fusion.md, and a boolean that Cypher takes for one."""
-    events = Story.of(random_steps(5, 70)).events
+    (query,) = re.findall(r"    SELECT[^;]*o\.est_sigma_m < 0\.5[^;]*;", PAGE.read_text())
     with session(one_database) as connection:
-        view = follow(connection, events, 10, "copy")
-    rows = pg.execute(
-        "SELECT * FROM cypher('semantic_map', $q$"
-        " MATCH (o:Object) WHERE o.missing AND o.est_sigma_m < 1.0"
-        " RETURN o.object_id, o.est_x, o.est_y ORDER BY o.object_id"
-        " $q$) AS (object_id agtype, x agtype, y agtype)"
-    ).fetchall()
-    expected = [
-        (f'"{o.object_id}"', o.estimate.est_x, o.estimate.est_y)
-        for o in view.objects.values()
-        if o.missing_in is not None and o.estimate is not None and o.estimate.est_sigma_m < 1.0
-    ]
-    assert [(row[0], float(row[1]), float(row[2])) for row in rows] == sorted(expected)
-    assert 0 < len(rows) < len(view.objects)
+        view = follow(connection, Story.of(random_steps(10, 30)).events, 10, "copy")
+    rows = pg.execute(query.encode()).fetchall()
+    near = [
+        o for o in view.objects.values()
+        if o.estimate is not None and math.dist(stands_at(o), (3.0, 1.0)) < 2.0
+    ]  # fmt: skip
+    found = [o for o in near if o.missing_in is None]
+    assert sorted(json.loads(row[0]) for row in rows) == sorted(o.object_id for o in found)
+    assert {(json.loads(row[0]), float(row[2]), float(row[3])) for row in rows} == {
+        (o.object_id, *stands_at(o)) for o in found
+    }
+    assert 0 < len(found) < len(near) < len(view.objects)
 
 
 def test_questions_use_where_objects_stand(one_database: Targets) -> None:

@@ -1,6 +1,8 @@
 """A tail that meets commands comes to the rows of a fresh replay, and names places at once."""
 
 import json
+import re
+import shlex
 import threading
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -287,7 +289,7 @@ def test_settings_of_fusion_by_evidence_keep_the_vectors(
     write_log(log, walk(10, seed=5, run_id="run-d"))
     assert tail(log, targets, settings_of, once=True).refolds == 1
     assert oid(targets) == table
-    evidence = Settings.of_document(given)
+    evidence = Settings.from_document(given)
     rebuild(log, third_database, evidence)
     rows = all_rows(targets)
     assert rows == all_rows(third_database)
