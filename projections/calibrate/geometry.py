@@ -1,0 +1,170 @@
+"""Ranges, errors of bearings and poses, and sizes of classes, read off things that qualified."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from projections.evidence import EvidenceConstants
+
+from .shrinking import PRIOR_COUNT, Reading, level, rounded, spread, unread
+from .sightings import Flags, Floats, Sightings
+from .things import Thing
+
+LEAST_OF_A_CLASS = 4
+_MAD = 1.4826
+"""A normal distribution's standard deviation, in units of its median absolute deviation."""
+_FEWEST_LEFT = 0.05
+"""Of an observation whose leverage is nearly 1 nothing is left to read: it counts no less."""
+_CAP = 9.0
+"""Squared residuals count up to so many variances: the boxes of other things hardly matter."""
+_ROUNDS = 200
+_PRIOR_RANGES = 7
+_HINT_SIGMAS = 6.0
+_HINT_LEAST = 0.06
+
+
+class Errors(NamedTuple):
+    """Standard errors: of bearings, radians, and of poses, metres."""
+
+    bearing: float
+    bearing_cut: float
+    pose: float
+
+
+def ranges(things: Sequence[Thing], prior: EvidenceConstants) -> tuple[Reading, Reading]:
+    """Median and spread of the distances."""
+    if not things:
+        return unread("range_m", prior.range_m), unread("range_spread", prior.range_spread)
+    logs = np.log(np.concatenate([thing.range for thing in things]))
+    middle = float(np.median(logs))
+    return (
+        spread("range_m", float(np.exp(middle)), prior.range_m, len(logs)),
+        spread("range_spread", robust_spread(logs - middle), prior.range_spread, len(logs)),
+    )
+
+
+def errors(
+    things: Sequence[Thing], seen: Sightings, prior: EvidenceConstants
+) -> tuple[Reading, Reading, Reading]:
+    """Errors of bearings, of cut ones, and of poses.
+
+    By how far the lines of sight run past the thing: an error of the bearing grows with the
+    distance, one of the pose does not. The prior is there as so many observations that are as
+    far past as it expects.
+    """
+    priors = Errors(prior.bearing_rad, prior.bearing_cut_rad, prior.pose_m)
+    names = ("bearing_rad", "bearing_cut_rad", "pose_m")
+    if not things:
+        one, cut, pose = (unread(*pair) for pair in zip(names, priors, strict=True))
+        return one, cut, pose
+    distance = np.concatenate([thing.range for thing in things])
+    residual = np.concatenate([thing.residual for thing in things])
+    left = 1.0 - np.concatenate([thing.leverage for thing in things])
+    cut_at = seen.cut[np.concatenate([thing.rows for thing in things])]
+    past2 = (distance * np.sin(residual)) ** 2 / np.maximum(left, _FEWEST_LEFT)
+    weight = np.clip(left / _FEWEST_LEFT, 0.0, 1.0)
+
+    parts = np.stack([distance**2 * ~cut_at, distance**2 * cut_at, np.ones(len(distance))], axis=1)
+    alone = _variances(parts, past2, weight, priors)
+    usual = _prior_ranges(prior)
+    zeros, ones = np.zeros(len(usual)), np.ones(len(usual))
+    prior_parts = np.concatenate(
+        [np.stack([usual**2, zeros, ones], axis=1), np.stack([zeros, usual**2, ones], axis=1)]
+    )
+    prior_past2 = prior_parts @ np.square(priors)
+    both = _variances(
+        np.concatenate([parts, prior_parts]),
+        np.concatenate([past2, prior_past2]),
+        np.concatenate([weight, np.full(len(prior_parts), PRIOR_COUNT / len(prior_parts))]),
+        priors,
+    )
+    counts = (int((~cut_at).sum()), int(cut_at.sum()), len(cut_at))
+    one, cut, pose = (
+        Reading(name, rounded(value), rounded(own) if count else None, usually, count)
+        for name, value, own, usually, count in zip(
+            names, both, alone, priors, counts, strict=True
+        )
+    )
+    return one, cut, pose
+
+
+def sizes(
+    things: Sequence[Thing], seen: Sightings, prior: EvidenceConstants
+) -> tuple[dict[str, Reading], Reading]:
+    """The median height of each class's boxes, in metres, and the spread about it."""
+    by_class: dict[str, list[float]] = {}
+    for thing in things:
+        depth = thing.range * np.cos(seen.off_axis[thing.rows])
+        for row, metres in zip(thing.rows, seen.height[thing.rows] * depth, strict=True):
+            if metres > 0.0:  # not NaN
+                by_class.setdefault(seen.classes[row], []).append(float(metres))
+    found: dict[str, Reading] = {}
+    about: list[Floats] = []
+    for name, metres in sorted(by_class.items()):
+        if len(metres) >= LEAST_OF_A_CLASS:
+            logs = np.log(metres)
+            middle = float(np.median(logs))
+            value = rounded(float(np.exp(middle)))
+            found[name] = Reading(f"sizes_m[{name}]", value, value, None, len(metres))
+            about.append((logs - middle) * (len(metres) / (len(metres) - 1)) ** 0.5)
+    if not about:
+        return found, unread("size_spread", prior.size_spread)
+    logs = np.concatenate(about)
+    return found, spread("size_spread", robust_spread(logs), prior.size_spread, len(logs))
+
+
+def camera_faults(things: Sequence[Thing], seen: Sightings) -> list[Reading]:
+    """What bearings say about the camera: the share by which they grow too fast from the middle
+    of the picture to its side, and the angle by which all are off. Only what stands out."""
+    if not things:
+        return []
+    rows = np.concatenate([thing.rows for thing in things])
+    use: Flags = ~seen.cut[rows]
+    residual = np.concatenate([thing.residual for thing in things])[use]
+    axis = seen.off_axis[rows][use]
+    if len(axis) < PRIOR_COUNT:
+        return []
+    design = np.stack([np.sin(axis) * np.cos(axis), np.ones(len(axis))], axis=1)
+    weight = np.ones(len(axis))
+    for _ in range(10):
+        normal = design.T @ (design * weight[:, None])
+        found = np.linalg.solve(normal, design.T @ (weight * residual))
+        left = residual - design @ found
+        sigma = max(robust_spread(left), 1e-6)
+        weight = 1.0 / (1.0 + (left / (2.0 * sigma)) ** 2)
+    error = sigma * np.sqrt(np.diag(np.linalg.inv(normal)))
+    return [
+        Reading(name, rounded(float(value)), rounded(float(value)), 0.0, len(axis))
+        for name, value, off in zip(("hfov", "yaw_rad"), found, error, strict=True)
+        if abs(value) > max(_HINT_LEAST, _HINT_SIGMAS * off)
+    ]
+
+
+def robust_spread(values: Floats) -> float:
+    """The standard deviation by the median absolute value; of values about 0."""
+    return float(_MAD * np.median(np.abs(values)))
+
+
+def _variances(parts: Floats, squares: Floats, weight: Floats, start: Errors) -> Errors:
+    """The components θ ≥ 0 of the variances parts · θ that the squares fit best (maximum
+    likelihood of normal errors, squares capped), as standard errors."""
+    theta = np.square(np.array(start))
+    for _ in range(_ROUNDS):
+        variance = parts @ theta
+        capped = np.minimum(squares, _CAP * variance)
+        up = parts.T @ (weight * capped / variance**2)
+        down = parts.T @ (weight / variance)
+        theta = theta * np.where(down > 0.0, up / np.where(down > 0.0, down, 1.0), 1.0)
+        theta = np.maximum(theta, 1e-12)
+    return Errors(*(float(value) for value in np.sqrt(theta)))
+
+
+def _prior_ranges(prior: EvidenceConstants) -> Floats:
+    """Distances as the prior expects them: evenly over two standard deviations each way."""
+    steps = np.linspace(-2.0, 2.0, _PRIOR_RANGES)
+    usual: Floats = prior.range_m * np.exp(prior.range_spread * steps)
+    return usual
+
+
+__all__ = ["Errors", "camera_faults", "errors", "level", "ranges", "robust_spread", "sizes"]

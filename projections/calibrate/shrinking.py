@@ -1,0 +1,54 @@
+"""What a map shows, drawn towards what is usual while it shows it rarely."""
+
+import math
+from typing import NamedTuple
+
+PRIOR_COUNT = 100
+"""A prior counts as much as this many observations: a reading of n has the weight n/(n + 100)."""
+_DIGITS = 4
+
+
+class Reading(NamedTuple):
+    """A constant as a map shows it.
+
+    ``value`` is what to use, ``seen`` what the map alone says (None where it says nothing),
+    ``prior`` what is usual, ``count`` how many observations or pairs it rests on.
+    """
+
+    name: str
+    value: float | str | None
+    seen: float | str | None
+    prior: float | str | None
+    count: int
+
+
+def spread(name: str, seen: float, prior: float, count: int) -> Reading:
+    """A reading of a quantity that is above 0: its logarithm is drawn towards the prior's."""
+    if not count or not (math.isfinite(seen) and seen > 0.0):
+        return unread(name, prior)
+    share = count / (count + PRIOR_COUNT)
+    value = math.exp(share * math.log(seen) + (1.0 - share) * math.log(prior))
+    return Reading(name, rounded(value), rounded(seen), prior, count)
+
+
+def level(name: str, seen: float, prior: float, count: int) -> Reading:
+    """A reading of a quantity that may be negative."""
+    if not count or not math.isfinite(seen):
+        return unread(name, prior)
+    share = count / (count + PRIOR_COUNT)
+    value = share * seen + (1.0 - share) * prior
+    return Reading(name, rounded(value), rounded(seen), prior, count)
+
+
+def unread(name: str, prior: float | str | None) -> Reading:
+    """A constant of which the map shows nothing: the prior."""
+    return Reading(name, prior, None, prior, 0)
+
+
+def rounded(value: float) -> float:
+    """Four significant digits, at most four decimals: machines whose logarithms differ in the last
+    bit agree."""
+    if value == 0.0:
+        return 0.0
+    decimals = _DIGITS - 1 - math.floor(math.log10(abs(value)))
+    return round(value, max(0, min(decimals, _DIGITS))) + 0.0
