@@ -7,7 +7,7 @@ import numpy as np
 
 from projections.evidence import EvidenceConstants
 
-from .shrinking import PRIOR_COUNT, Reading, level, rounded, spread, unread
+from .shrinking import PRIOR_COUNT, Reading, rounded, spread, unread
 from .sightings import Flags, Floats, Sightings
 from .things import Thing
 
@@ -20,6 +20,7 @@ _CAP = 9.0
 """Squared residuals count up to so many variances: the boxes of other things hardly matter."""
 _ROUNDS = 200
 _PRIOR_RANGES = 7
+_TO_PART = 10.0
 _HINT_SIGMAS = 6.0
 _HINT_LEAST = 0.06
 
@@ -50,8 +51,9 @@ def errors(
     """Errors of bearings, of cut ones, and of poses.
 
     By how far the lines of sight run past the thing: an error of the bearing grows with the
-    distance, one of the pose does not. The prior is there as so many observations that are as
-    far past as it expects.
+    distance, one of the pose does not. Where all distances are much the same that does not tell
+    them apart: for each of the three, some observations that have this error only, of the size
+    that the prior expects, take part.
     """
     priors = Errors(prior.bearing_rad, prior.bearing_cut_rad, prior.pose_m)
     names = ("bearing_rad", "bearing_cut_rad", "pose_m")
@@ -66,25 +68,20 @@ def errors(
     weight = np.clip(left / _FEWEST_LEFT, 0.0, 1.0)
 
     parts = np.stack([distance**2 * ~cut_at, distance**2 * cut_at, np.ones(len(distance))], axis=1)
-    alone = _variances(parts, past2, weight, priors)
-    usual = _prior_ranges(prior)
-    zeros, ones = np.zeros(len(usual)), np.ones(len(usual))
-    prior_parts = np.concatenate(
-        [np.stack([usual**2, zeros, ones], axis=1), np.stack([zeros, usual**2, ones], axis=1)]
-    )
-    prior_past2 = prior_parts @ np.square(priors)
-    both = _variances(
+    usual = _prior_ranges(prior) ** 2
+    none, ones = np.zeros(len(usual)), np.ones(len(usual))
+    alike = [(usual, none, none), (none, usual, none), (none, none, ones)]
+    prior_parts = np.concatenate([np.stack(each, axis=1) for each in alike])
+    found = _variances(
         np.concatenate([parts, prior_parts]),
-        np.concatenate([past2, prior_past2]),
-        np.concatenate([weight, np.full(len(prior_parts), PRIOR_COUNT / len(prior_parts))]),
+        np.concatenate([past2, prior_parts @ np.square(priors)]),
+        np.concatenate([weight, np.full(len(prior_parts), _TO_PART / len(usual))]),
         priors,
     )
     counts = (int((~cut_at).sum()), int(cut_at.sum()), len(cut_at))
     one, cut, pose = (
-        Reading(name, rounded(value), rounded(own) if count else None, usually, count)
-        for name, value, own, usually, count in zip(
-            names, both, alone, priors, counts, strict=True
-        )
+        spread(name, value, usually, count)
+        for name, value, usually, count in zip(names, found, priors, counts, strict=True)
     )
     return one, cut, pose
 
@@ -106,7 +103,7 @@ def sizes(
             logs = np.log(metres)
             middle = float(np.median(logs))
             value = rounded(float(np.exp(middle)))
-            found[name] = Reading(f"sizes_m[{name}]", value, value, None, len(metres))
+            found[name] = Reading(f"sizes_m.{name}", value, value, None, len(metres))
             about.append((logs - middle) * (len(metres) / (len(metres) - 1)) ** 0.5)
     if not about:
         return found, unread("size_spread", prior.size_spread)
@@ -165,6 +162,3 @@ def _prior_ranges(prior: EvidenceConstants) -> Floats:
     steps = np.linspace(-2.0, 2.0, _PRIOR_RANGES)
     usual: Floats = prior.range_m * np.exp(prior.range_spread * steps)
     return usual
-
-
-__all__ = ["Errors", "camera_faults", "errors", "level", "ranges", "robust_spread", "sizes"]

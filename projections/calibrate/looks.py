@@ -44,7 +44,7 @@ def in_pictures(seen: Sightings) -> tuple[Floats, Flags]:
     first, second = _pairs_in_pictures(seen.picture)
     stride = -(-len(first) // _MOST_PAIRS) or 1
     first, second = first[::stride], second[::stride]
-    labels = np.array([name for name in seen.classes], dtype=object)
+    labels = np.array(list(seen.classes), dtype=object)
     same = np.array(labels[first] == labels[second], dtype=np.bool_)
     return seen.cosines(first, second), same
 

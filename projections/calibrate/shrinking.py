@@ -1,14 +1,17 @@
 """What a map shows, drawn towards what is usual while it shows it rarely."""
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
 
 PRIOR_COUNT = 100
 """A prior counts as much as this many observations: a reading of n has the weight n/(n + 100)."""
 _DIGITS = 4
+_LEAST = 0.001
+"""Of errors and spreads; no map is better than a millimetre or a milliradian."""
 
 
-class Reading(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Reading:
     """A constant as a map shows it.
 
     ``value`` is what to use, ``seen`` what the map alone says (None where it says nothing),
@@ -28,7 +31,7 @@ def spread(name: str, seen: float, prior: float, count: int) -> Reading:
         return unread(name, prior)
     share = count / (count + PRIOR_COUNT)
     value = math.exp(share * math.log(seen) + (1.0 - share) * math.log(prior))
-    return Reading(name, rounded(value), rounded(seen), prior, count)
+    return Reading(name, max(rounded(value), _LEAST), rounded(seen), prior, count)
 
 
 def level(name: str, seen: float, prior: float, count: int) -> Reading:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .sightings import Flags, Floats, Ints, Sightings
+from .sightings import Floats, Ints, Sightings
 
 LEAST_OBSERVATIONS = 3
 SPOT_M = 0.8
@@ -27,8 +27,8 @@ class Thing(NamedTuple):
     """A thing that qualified.
 
     ``rows`` are its observations with a box, ``range`` their distances in metres, ``residual``
-    their bearings less those of the position, radians to the left; ``leverage`` is how far each
-    one draws the position to itself, 0 to 1: (1 − leverage) of its variance is left in its residual.
+    their bearings less those of the position, radians to the left; ``leverage`` is how far
+    each draws the position to itself, 0 to 1: (1 − leverage) of its variance is in its residual.
     """
 
     thing: int
@@ -50,9 +50,7 @@ def qualified(seen: Sightings, bearing_rad: float, cut_rad: float, pose_m: float
     return [thing for thing in found if thing is not None]
 
 
-def _triangulate(
-    seen: Sightings, rows: Ints, bearing_var: Floats, pose_var: float
-) -> Thing | None:
+def _triangulate(seen: Sightings, rows: Ints, bearing_var: Floats, pose_var: float) -> Thing | None:
     if len(rows) < LEAST_OBSERVATIONS or not _far_apart(seen.x[rows], seen.y[rows]):
         return None
     x, y, sight = seen.x[rows], seen.y[rows], seen.sight[rows]
@@ -83,9 +81,7 @@ def _triangulate(
     det = xx * yy - xy * xy
     spread = (yy * across_x**2 - 2.0 * xy * across_x * across_y + xx * across_y**2) / det
     leverage = np.clip(weight * spread, 0.0, 1.0)
-    return Thing(
-        int(seen.thing[rows[0]]), float(px), float(py), rows, distance, residual, leverage
-    )
+    return Thing(int(seen.thing[rows[0]]), float(px), float(py), rows, distance, residual, leverage)
 
 
 def _far_apart(x: Floats, y: Floats) -> bool:
@@ -106,8 +102,3 @@ def _normal_matrix(nx: Floats, ny: Floats, weight: Floats) -> tuple[float, float
 def _smallest_eigenvalue(nx: Floats, ny: Floats, weight: Floats) -> float:
     xx, xy, yy = _normal_matrix(nx, ny, weight)
     return (xx + yy) / 2.0 - math.hypot((xx - yy) / 2.0, xy)
-
-
-def flags_of(things: list[Thing], values: Flags) -> Flags:
-    """The flags of the things' observations, one after another."""
-    return np.concatenate([values[thing.rows] for thing in things])

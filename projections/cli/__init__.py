@@ -34,6 +34,7 @@ COMMANDS: "Mapping[str, str]" = {
     "diff": "projections.cli.time_travel",
     "bisect": "projections.cli.time_travel",
     "whatif": "projections.cli.whatif",
+    "calibrate": "projections.cli.calibrate",
     "edit": "projections.cli.edit",
     "edits": "projections.cli.edits",
 }

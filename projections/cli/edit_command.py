@@ -146,7 +146,7 @@ def _edit(log: Path, make_: MakeCommand, common: _Common) -> None:
         raise MisuseError("--reason TEXT is missing: say why, for whoever reads the log later")
     stamp = Stamp(
         command_id=uuid.uuid4().hex if common.command_id is None else common.command_id,
-        issued_by=_user() if common.issued_by is None else common.issued_by,
+        issued_by=user_at_host() if common.issued_by is None else common.issued_by,
         reason=common.reason,
     )
     if common.dry_run:
@@ -191,31 +191,48 @@ def _show(made: Made, common: _Common) -> None:
 
 def _report(made: Made, common: _Common) -> None:
     """Print where a command is, and what it changed in the map it was made from."""
-    outcome = made.outcome
-    effect = outcome.effect
-    if effect is not None and made.offset == made.current.end:
-        EffectCache(made.current).put(outcome.change, effect)
-    _say_void(made)
+    keep_effect(made)
     if common.json:
-        document = {
-            "offset": made.offset,
-            "command_id": made.command.command_id,
-            "repeated": made.repeated,
-            "effect": None if effect is None else effect.document(),
-        }
-        if effect is None:
-            document["effect_unknown"] = outcome.unknown
-        emit(document)
-        return
+        emit(recorded_document(made))
+    else:
+        display(recorded_text(made))
+
+
+def keep_effect(made: Made) -> None:
+    """Keep the effect of a recorded command for `mapfold edits`, and say which commands have none
+    any more because of it."""
+    outcome = made.outcome
+    if outcome.effect is not None and made.offset == made.current.end:
+        EffectCache(made.current).put(outcome.change, outcome.effect)
+    _say_void(made)
+
+
+def recorded_document(made: Made) -> dict[str, Any]:
+    """JSON of a recorded command: where it is and what it changed."""
+    effect = made.outcome.effect
+    document = {
+        "offset": made.offset,
+        "command_id": made.command.command_id,
+        "repeated": made.repeated,
+        "effect": None if effect is None else effect.document(),
+    }
+    if effect is None:
+        document["effect_unknown"] = made.outcome.unknown
+    return document
+
+
+def recorded_text(made: Made) -> str:
+    """A line on a recorded command: where it is and what it changed."""
+    effect = made.outcome.effect
     when = "was recorded before" if made.repeated else "recorded"
     if effect is None:
-        changes = f"its effect is not known: {visible(outcome.unknown)}"
+        changes = f"its effect is not known: {visible(made.outcome.unknown)}"
     elif effect.none:
         changes = "changes nothing in the map as it is"
     else:
         changes = f"changes {effect}"
     command_id = visible(made.command.command_id)
-    display(f"{made.command.kind} {when} at offset {made.offset}, command {command_id}; {changes}")
+    return f"{made.command.kind} {when} at offset {made.offset}, command {command_id}; {changes}"
 
 
 def _say_void(made: Made) -> None:
@@ -224,8 +241,8 @@ def _say_void(made: Made) -> None:
         say(void_text(recorded, why))
 
 
-def _user() -> str:
-    """``user@host``."""
+def user_at_host() -> str:
+    """``user@host``: who gives a command."""
     try:
         name = getpass.getuser()
     except (OSError, KeyError):  # a user id without a name

@@ -1,0 +1,156 @@
+"""A calibration as text and as JSON."""
+
+from collections.abc import Iterator
+from typing import Any
+
+from eventsrc.text import counted, visible
+from projections.history.rendering import table
+
+from .looks import FEWEST_DIFFERENT
+from .rounds import Calibration
+from .shrinking import Reading
+
+_MOST_SIZES = 8
+_RESTS_ON = {
+    "bearing_rad": "observation",
+    "bearing_cut_rad": "cut observation",
+    "size_spread": "whole box",
+    "different": "pair",
+    "different_spread": "pair",
+    "same_class": "pair",
+    "same_class_spread": "pair",
+    "session_shift": "observation",
+}
+_SIZE = "sizes_m."
+
+
+def readings(calibration: Calibration) -> list[Reading]:
+    """All constants, in the order of `EvidenceConstants`, a class's size each by itself."""
+    return [*calibration.last.readings, *calibration.last.sizes]
+
+
+def document(calibration: Calibration) -> dict[str, Any]:
+    """JSON. ``name`` is what ``--set`` takes."""
+    last = calibration.last
+    return {
+        "keyframes": calibration.keyframes,
+        "observations": calibration.observations,
+        "objects": calibration.objects,
+        "runs": calibration.runs,
+        "things": last.things,
+        "observations_of_things": last.observations,
+        "fusion": calibration.settings.fusion,
+        "constants": [
+            {
+                "name": f"evidence.{each.name}",
+                "value": each.value,
+                "prior": each.prior,
+                "seen": each.seen,
+                "count": each.count,
+            }
+            for each in readings(calibration)
+        ],
+        "hints": list(hints(calibration)),
+    }
+
+
+def text(calibration: Calibration, *, all_: bool = False) -> str:
+    """A line on what it rests on, a table of the constants, and the hints."""
+    last = calibration.last
+    rests_on = (
+        f"{counted(calibration.keyframes, 'keyframe')} with a pose, "
+        f"{counted(calibration.observations, 'observation')} of "
+        f"{counted(calibration.objects, 'object')} in {counted(calibration.runs, 'run')}; "
+        f"{counted(last.things, 'thing')} with bearings that cross well, seen "
+        f"{last.observations:,} times"
+    )
+    rows = [_row(each) for each in last.readings]
+    sizes = sorted(last.sizes, key=lambda each: (-each.count, each.name))
+    shown = sizes if all_ else sizes[:_MOST_SIZES]
+    rows += [_row(each) for each in shown]
+    lines = [rests_on]
+    lines += table(
+        ("evidence.", "value", "prior", "this map", "rests on"),
+        rows,
+        right=("value", "prior", "this map"),
+    ).splitlines()
+    if len(shown) < len(sizes):
+        lines.append(f"… and the sizes of {len(sizes) - len(shown):,} more (--all shows them)")
+    return "".join(f"{line}\n" for line in [*lines, *hints(calibration)])
+
+
+def _row(reading: Reading) -> tuple[str, ...]:
+    rests = _RESTS_ON.get(reading.name, "observation")
+    if reading.name.startswith(_SIZE):
+        rests = "whole box"
+    counts = f"{reading.count:,} {rests}{'' if reading.count == 1 else _plural(rests)}"
+    return (
+        visible(reading.name),
+        _number(reading.value),
+        _number(reading.prior),
+        _number(reading.seen),
+        counts,
+    )
+
+
+def _plural(word: str) -> str:
+    return "es" if word.endswith("x") else "s"
+
+
+def _number(value: float | str | None) -> str:
+    if value is None:
+        return "-"
+    return value if isinstance(value, str) else f"{value:g}"
+
+
+def hints(calibration: Calibration) -> Iterator[str]:
+    """What stands in the way of a better calibration, and the next step."""
+    last, camera = calibration.last, calibration.settings.camera
+    if not calibration.observations:
+        yield "no observation has a pose and an embedding: all constants are priors"
+        return
+    if calibration.unboxed:
+        yield (
+            f"{counted(calibration.unboxed, 'observation')} with an empty box: nothing is known of"
+            " their direction"
+        )
+    if not last.things:
+        yield (
+            "nothing was seen three times from spots 0.8 m apart with bearings that cross: ranges,"
+            " errors, sizes and the likeness of one thing are priors"
+        )
+    elif calibration.runs == 1:
+        yield "one run: what a thing's likeness loses between runs is a prior"
+    pairs = next(each.count for each in last.readings if each.name == "different")
+    if pairs < FEWEST_DIFFERENT:
+        yield (
+            f"{counted(pairs, 'pair')} of different classes in one picture, fewer than"
+            f" {FEWEST_DIFFERENT}: the fold goes on taking `different` from the pictures"
+        )
+    if calibration.beyond:
+        boxes = f"{calibration.beyond:,} box{'' if calibration.beyond == 1 else 'es'}"
+        yield (
+            f"{boxes} beyond the picture of {camera.width_px:g} × {camera.height_px:g} pixels: give"
+            " the camera, --set camera.width_px=… --set camera.height_px=… --set camera.hfov_deg=…"
+        )
+    for fault in last.camera:
+        yield _camera_hint(fault, camera.hfov_deg)
+    if calibration.settings.fusion != "evidence":
+        yield (
+            "the map is folded by the page's rule, which uses none of these; --set fusion=evidence"
+            " --write switches the log to fusion by evidence"
+        )
+
+
+def _camera_hint(fault: Reading, hfov_deg: float) -> str:
+    value = fault.value if isinstance(fault.value, float) else 0.0
+    if fault.name == "yaw_rad":
+        return (
+            f"bearings are off by {value:+.3g} rad on the whole: the camera may be turned; compare"
+            " camera.yaw_rad"
+        )
+    which = "too wide" if value > 0 else "too narrow"
+    return (
+        f"bearings are off by {abs(value):.0%} of the angle from the picture's middle: "
+        f"camera.hfov_deg={hfov_deg:g} seems {which}"
+    )
