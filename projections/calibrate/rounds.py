@@ -4,14 +4,15 @@ The first fold uses the constants that the settings have. Both readings are draw
 priors, never towards constants read before: what a map shows counts once.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 
-from eventsrc.envelope import FIRST_OFFSET, Offset
+from eventsrc.envelope import FIRST_OFFSET, Envelope, Offset
+from eventsrc.ingest import Accepted
 from eventsrc.log import LogReader
 from projections.corrections import NO_CORRECTIONS, Corrections
-from projections.deltas import KeyframeOrdinal
+from projections.deltas import Delta, KeyframeAdded, KeyframeOrdinal
 from projections.evidence import EvidenceConstants
 from projections.model.fold import READ_AHEAD, fold_parsed, gc_paused, parse_events
 from projections.model.view import MapView
@@ -19,7 +20,7 @@ from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Camera, Settings
 
 from .reading import Round, read
-from .sightings import Row, Sightings, sightings_of
+from .sightings import Row, sightings_of
 
 ROUNDS = 2
 
@@ -46,8 +47,10 @@ class Calibration:
         return self.settings.model_copy(update={"evidence": self.last.constants})
 
 
-Progress = Callable[[int, int], None]
-"""Told how many events of how many are folded, over all rounds."""
+Cameras = dict[KeyframeOrdinal, Camera]
+"""Those of the keyframes whose envelopes state one."""
+Fold = Callable[[Settings], tuple[MapView, Cameras]]
+"""Folds a log under settings; the view has the embeddings."""
 
 
 def calibrate(
@@ -55,20 +58,41 @@ def calibrate(
     settings: Settings,
     corrections: Corrections = NO_CORRECTIONS,
     until: Offset | None = None,
-    progress: Progress = lambda _done, _total: None,
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> Calibration:
     """Calibrate the map of a log's first ``until`` events, all of them for None; folded by
-    evidence whatever rule the settings name. Raises FoldError, LogDamaged."""
+    evidence whatever rule the settings name. ``progress`` is told how many events of how many are
+    folded, over all rounds. Raises FoldError, LogDamaged."""
     end = reader.next_offset if until is None else min(until, reader.next_offset)
+    before = 0
+
+    def fold(used: Settings) -> tuple[MapView, Cameras]:
+        nonlocal before
+        semantic_map = SemanticMap(used, corrections=corrections)
+        view, cameras = MapView(used, corrections=corrections), Cameras()
+        coming = iter(reader.read(FIRST_OFFSET, end))
+        with gc_paused():
+            while chunk := list(islice(coming, READ_AHEAD)):
+                for event in parse_events(chunk):
+                    deltas = fold_parsed(event, semantic_map)
+                    view.apply_event(event.offset, deltas)
+                    if isinstance(event.parsed, Accepted):
+                        note_camera(cameras, event.parsed.envelope, deltas)
+                progress(before + view.next_offset, ROUNDS * end)
+        before += end
+        return view, cameras
+
+    return calibrate_by(fold, settings)
+
+
+def calibrate_by(fold: Fold, settings: Settings) -> Calibration:
+    """Calibrate what ``fold`` folds, in rounds."""
     constants, prior = settings.evidence, EvidenceConstants()
-    for number in range(ROUNDS):
-        used = settings.model_copy(update={"fusion": "evidence", "evidence": constants})
-
-        def folded(done: int, before: int = number * end) -> None:
-            progress(before + done, ROUNDS * end)
-
-        view, cameras = _fold(reader, used, corrections, end, folded)
-        seen = _sightings(view, cameras, settings.camera)
+    for _ in range(ROUNDS):
+        view, cameras = fold(
+            settings.model_copy(update={"fusion": "evidence", "evidence": constants})
+        )
+        seen = sightings_of(_rows(view, cameras, settings.camera))
         last = read(seen, constants, prior)
         constants = last.constants
     return Calibration(
@@ -83,32 +107,23 @@ def calibrate(
     )
 
 
-def _fold(
-    reader: LogReader,
-    settings: Settings,
-    corrections: Corrections,
-    end: Offset,
-    folded: Callable[[int], None],
-) -> tuple[MapView, dict[KeyframeOrdinal, Camera]]:
-    """The map, and the cameras of the keyframes whose envelope states one."""
-    semantic_map = SemanticMap(settings, corrections=corrections)
-    view = MapView(settings, corrections=corrections)
-    cameras: dict[KeyframeOrdinal, Camera] = {}
-    coming = iter(reader.read(FIRST_OFFSET, end))
-    with gc_paused():
-        while chunk := list(islice(coming, READ_AHEAD)):
-            for event in parse_events(chunk):
-                deltas = fold_parsed(event, semantic_map)
-                view.apply_event(event.offset, deltas)
-            folded(view.next_offset)
-    return view, cameras
+def note_camera(cameras: Cameras, envelope: Envelope, deltas: Sequence[Delta]) -> None:
+    """Keep the camera that an envelope states, if ``deltas`` are those of a new keyframe."""
+    stated = envelope.camera
+    if stated is None:
+        return
+    camera = Camera(
+        hfov_deg=stated.hfov_deg,
+        width_px=stated.width_px,
+        height_px=stated.height_px,
+        yaw_rad=stated.yaw_rad,
+    )
+    for delta in deltas:
+        if isinstance(delta, KeyframeAdded):
+            cameras[delta.keyframe] = camera
 
 
-def _sightings(view: MapView, cameras: dict[KeyframeOrdinal, Camera], default: Camera) -> Sightings:
-    return sightings_of(_rows(view, cameras, default))
-
-
-def _rows(view: MapView, cameras: dict[KeyframeOrdinal, Camera], default: Camera) -> Iterator[Row]:
+def _rows(view: MapView, cameras: Cameras, default: Camera) -> Iterator[Row]:
     for observation in view.observations:
         keyframe = view.keyframes[observation.keyframe]
         if observation.object is None or keyframe.pose is None or observation.embedding is None:
