@@ -5,6 +5,7 @@ Each place has a colour of its own; the rest of the picture is grey.
 
 import colorsys
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -87,9 +88,9 @@ def check_suffix(out: Path) -> None:
         raise MisuseError(f"{out}: a picture is .png, .svg or .pdf; give such a name")
 
 
-def new_canvas(view: MapView, floor: Floor) -> Canvas:
-    """An empty canvas that fits every pose of ``view`` and every wall of ``floor``."""
-    x0, y0, x1, y1 = bounds = _bounds(view, floor)
+def new_canvas(view: MapView, floor: Floor, more: Sequence[tuple[float, float]] = ()) -> Canvas:
+    """An empty canvas that fits every pose of ``view``, wall of ``floor`` and spot of ``more``."""
+    x0, y0, x1, y1 = bounds = _bounds(view, floor, more)
     height = _WIDTH_IN * (y1 - y0) / (x1 - x0) + _HEAD_IN + _FOOT_IN
     figure = Figure(figsize=(_WIDTH_IN, height), facecolor="white")
     axes = figure.add_axes((0.0, _FOOT_IN / height, 1.0, 1 - (_HEAD_IN + _FOOT_IN) / height))
@@ -100,11 +101,12 @@ def new_canvas(view: MapView, floor: Floor) -> Canvas:
     return Canvas(figure, axes, bounds, (x1 - x0) / (_WIDTH_IN * 72))
 
 
-def _bounds(view: MapView, floor: Floor) -> Bounds:
+def _bounds(view: MapView, floor: Floor, more: Sequence[tuple[float, float]]) -> Bounds:
     reach = _AROUND_POSES_M
     poses = [spot for _, drive in drives(view) for spot in drive]
     spots = [(x + dx, y + dy) for x, y in poses for dx in (-reach, reach) for dy in (-reach, reach)]
     spots += [end for x0, y0, x1, y1 in floor.walls for end in ((x0, y0), (x1, y1))]
+    spots += more
     if not spots:
         return (-2.0, -1.0, 2.0, 1.0)
     xs, ys = [x for x, _ in spots], [y for _, y in spots]

@@ -7,14 +7,24 @@ clear of it.
 import math
 from collections.abc import Sequence
 
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle, Ellipse
 
+from projections.model.records import ObjectRecord
 from projections.model.view import MapView
 
 from . import canvas as palette
 from .canvas import HALO, Canvas
 from .labels import Extent, LabelRequest, place_labels
-from .scene import Bridge, Floor, LostRobot, Spot, object_groups, place_names
+from .scene import (
+    Bridge,
+    Floor,
+    LostRobot,
+    Spot,
+    object_groups,
+    object_spot,
+    place_names,
+    two_sigma,
+)
 
 _LABEL_PT = 8.0
 _RINGS_M = tuple(0.07 * 1.28**step for step in range(15))
@@ -61,10 +71,14 @@ def draw_objects(canvas: Canvas, view: MapView, min_observations: int) -> int:
     groups = object_groups(view, min_observations)
     for group in groups:
         colour = palette.INK if group.place is None else palette.place_colour(group.place)
-        xs, ys = [m.mean_x for m in group.members], [m.mean_y for m in group.members]
+        xs, ys = zip(*map(object_spot, group.members), strict=True)
+        face, edge = ("white", colour) if group.missing else (colour, "white")
+        width = 1.1 if group.missing else 0.6
         canvas.axes.scatter(
-            xs, ys, s=15, marker="D", facecolor=colour, edgecolor="white", lw=0.6, zorder=10
+            xs, ys, s=15, marker="D", facecolor=face, edgecolor=edge, lw=width, zorder=10
         )
+        for member in group.members:
+            _draw_evidence(canvas, member, colour)
         canvas.occupied += (Extent(x, y, 0.04, 0.04) for x, y in zip(xs, ys, strict=True))
     requests = [_label_request(canvas, group.label, group.spot) for group in groups]
     boxes = place_labels(requests, canvas.occupied, canvas.bounds, _RINGS_M)
@@ -73,6 +87,23 @@ def draw_objects(canvas: Canvas, view: MapView, min_observations: int) -> int:
             _draw_leader(canvas, group.spot, box)
             _draw_text(canvas, box, group.label, _LABEL_PT, palette.INK)
     return sum(box is None for box in boxes)
+
+
+def _draw_evidence(canvas: Canvas, found: ObjectRecord, colour: str) -> None:
+    """An estimate's ellipse, and an arrow from where the object stood before it was moved."""
+    if found.estimate is not None:
+        width, height, angle = two_sigma(found.estimate)
+        ellipse = Ellipse(
+            object_spot(found), width, height, angle=angle, fill=False, edgecolor=colour,
+            lw=0.7, alpha=0.75, zorder=8,
+            linestyle="-" if found.missing_in is None else (0, (3, 2)),
+        )  # fmt: skip
+        canvas.axes.add_patch(ellipse)
+    if found.relocations:
+        last = found.relocations[-1]
+        arrow = {"arrowstyle": "-|>", "color": colour, "lw": 0.9, "ls": ":"}
+        start = last.from_x_um / 1e6, last.from_y_um / 1e6
+        canvas.axes.annotate("", object_spot(found), start, zorder=9, arrowprops=arrow)
 
 
 def draw_bridges(canvas: Canvas, bridges: Sequence[Bridge]) -> None:

@@ -1,7 +1,8 @@
 """A map's picture: layers from the floor up, fixed text before labels that can be moved.
 
-Objects are drawn at the fold's position, which is where the *robot* was when it saw them (mean);
-their labels are moved to stay legible, and a thin line leads back.
+Objects are drawn where they stand if the fold has estimates of that, as fusion by evidence does;
+else at the page's position, which is where the *robot* was when it saw them (mean). Their labels
+are moved to stay legible, and a thin line leads back.
 """
 
 from collections.abc import Iterable, Sequence
@@ -23,11 +24,24 @@ from .overlays import (
     draw_place_names,
     draw_room_names,
 )
-from .scene import Bridge, Floor, LostRobot, place_names, spot_of
+from .scene import (
+    Bridge,
+    Floor,
+    LostRobot,
+    object_spot,
+    place_names,
+    shown_objects,
+    spot_of,
+)
 
 LEGEND = (
     "■ start    ● keyframe, in its place's colour    ◆ object, drawn where the robot saw it from "
     "(mean)    dashed: neighbouring places and their transitions"
+)
+EVIDENCE_LEGEND = (
+    "■ start    ● keyframe, in its place's colour    ◆ object, drawn where it stands, with the "
+    "ellipse of two standard errors    ◇ dashed: missing    dotted arrow: moved    "
+    "dashed line: neighbouring places"
 )
 
 
@@ -59,7 +73,9 @@ def compose(
     min_observations: int = 2,
 ) -> Canvas:
     """The finished canvas, not yet written to a file."""
-    canvas = new_canvas(view, floor)
+    by_evidence = view.settings.fusion == "evidence"
+    shown = shown_objects(view, min_observations) if by_evidence else []
+    canvas = new_canvas(view, floor, [object_spot(found) for found in shown])
     draw_floor(canvas, floor)
     draw_regions(canvas, view)
     draw_drives(canvas, view)
@@ -73,7 +89,8 @@ def compose(
     left_out = draw_objects(canvas, view, min_observations)
     canvas.header(0, title, 14, palette.INK, "bold")
     canvas.header(1, _numbers(view, min_observations), 9.5, palette.SMALL_PRINT)
-    for line, text in enumerate(legend_lines(lost, bridges, left_out)):
+    legend = legend_lines(lost, bridges, left_out, by_evidence=by_evidence)
+    for line, text in enumerate(legend):
         canvas.footer(line, text, palette.SMALL_PRINT)
     return canvas
 
@@ -90,7 +107,9 @@ def _numbers(view: MapView, min_observations: int) -> str:
     )
 
 
-def legend_lines(lost: LostRobot | None, bridges: Sequence[Bridge], left_out: int) -> list[str]:
+def legend_lines(
+    lost: LostRobot | None, bridges: Sequence[Bridge], left_out: int, *, by_evidence: bool = False
+) -> list[str]:
     """The lines below the map; ``left_out`` counts labels without room."""
     parts = []
     if bridges:
@@ -99,7 +118,7 @@ def legend_lines(lost: LostRobot | None, bridges: Sequence[Bridge], left_out: in
         parts.append("✖ lost robot, true spot    ● (red) where the map puts it")
     if left_out:
         parts.append(f"{counted(left_out, 'object label')} had no room")
-    return [LEGEND, "    ".join(parts)]
+    return [EVIDENCE_LEGEND if by_evidence else LEGEND, "    ".join(parts)]
 
 
 def fold_with_merges(events: Iterable[FoldedEvent], view: MapView) -> list[PlacesMerged]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from eventsrc.envelope import RunId
 from eventsrc.sim import House
-from projections.model.records import KeyframeRecord, ObjectRecord
+from projections.model.records import Estimate, KeyframeRecord, ObjectRecord
 from projections.model.view import MapView
 
 _NEAR_M = 1.0
@@ -61,10 +61,14 @@ class Bridge:
 
 @dataclass(frozen=True, slots=True)
 class ObjectGroup:
-    """Objects of one class in one place near each other: one label, a dot for each."""
+    """Objects of one class in one place near each other: one label, a dot for each.
+
+    All of them are missing, or none is.
+    """
 
     class_name: str
     place: int | None
+    missing: bool
     members: tuple[ObjectRecord, ...]
 
     @property
@@ -74,39 +78,55 @@ class ObjectGroup:
 
     @property
     def label(self) -> str:
-        """The class, and how many if more than one."""
-        count = len(self.members)
-        return self.class_name if count == 1 else f"{self.class_name} ×{count}"
+        """The class, how many if more than one, and whether they are missing."""
+        count, ending = len(self.members), " (missing)" if self.missing else ""
+        return f"{self.class_name}{f' ×{count}' if count > 1 else ''}{ending}"
 
     @property
     def spot(self) -> tuple[float, float]:
         """The middle of its members."""
-        count = len(self.members)
-        return (
-            sum(member.mean_x for member in self.members) / count,
-            sum(member.mean_y for member in self.members) / count,
-        )
+        xs, ys = zip(*map(object_spot, self.members), strict=True)
+        return sum(xs) / len(xs), sum(ys) / len(ys)
 
 
 def object_groups(view: MapView, min_observations: int) -> list[ObjectGroup]:
     """The objects seen at least that often, by place and class; most seen first."""
-    grouped: dict[tuple[int | None, str], list[list[ObjectRecord]]] = defaultdict(list)
-    for found in view.objects.values():
-        if found.obs_count >= min_observations:
-            _add_to_group(grouped[found.place, found.class_name], found)
+    grouped: dict[tuple[int | None, str, bool], list[list[ObjectRecord]]] = defaultdict(list)
+    for found in shown_objects(view, min_observations):
+        _add_to_group(grouped[found.place, found.class_name, found.missing_in is not None], found)
     groups = [
-        ObjectGroup(name, place, tuple(members))
-        for (place, name), clumps in grouped.items()
+        ObjectGroup(name, place, missing, tuple(members))
+        for (place, name, missing), clumps in grouped.items()
         for members in clumps
     ]
     return sorted(groups, key=lambda group: (-group.obs_count, group.members[0].ordinal))
 
 
+def shown_objects(view: MapView, min_observations: int) -> list[ObjectRecord]:
+    """The objects seen at least that often."""
+    return [found for found in view.objects.values() if found.obs_count >= min_observations]
+
+
+def object_spot(found: ObjectRecord) -> tuple[float, float]:
+    """Where an object is drawn: where it stands by estimate, else where the robot saw it from."""
+    at = found.estimate
+    return (found.mean_x, found.mean_y) if at is None else (at.est_x, at.est_y)
+
+
+def two_sigma(at: Estimate) -> tuple[float, float, float]:
+    """The ellipse of two standard errors around an estimate: full width and height in metres, and
+    the angle from the x axis to the width, in degrees."""
+    half = (at.var_xx_um2 + at.var_yy_um2) / 2
+    apart, across = (at.var_xx_um2 - at.var_yy_um2) / 2, float(at.var_xy_um2)
+    spread = math.hypot(apart, across)
+    wide, high = (4e-6 * math.sqrt(max(v, 0.0)) for v in (half + spread, half - spread))
+    return wide, high, math.degrees(math.atan2(across, apart) / 2)
+
+
 def _add_to_group(clumps: list[list[ObjectRecord]], found: ObjectRecord) -> None:
     """Add an object to the first clump whose first member is near, else begin another."""
     for clump in clumps:
-        first = clump[0].mean_x, clump[0].mean_y
-        if math.dist(first, (found.mean_x, found.mean_y)) <= _NEAR_M:
+        if math.dist(object_spot(clump[0]), object_spot(found)) <= _NEAR_M:
             clump.append(found)
             return
     clumps.append([found])
