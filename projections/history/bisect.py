@@ -19,7 +19,7 @@ from .condition_functions import Direction, Names, Value
 from .conditions import Expression
 from .history import NEVER, History
 from .names import id_of_place, keyframe_ordinal
-from .records import Cause, PlaceHistory
+from .records import Cause, ObjectHistory, PlaceHistory
 
 
 class CountIndex:
@@ -34,12 +34,13 @@ class CountIndex:
         self.objects_of: defaultdict[str, array[int]] = defaultdict(lambda: array("q"))
         for keyframe in history.keyframes:
             self.keyframes_of[keyframe.run_id].append(keyframe.offset)
-        for each in history.objects:
-            self.objects_of[each.found.class_name].append(each.found.offset)
-        self.objects = _sorted(each.found.offset for each in history.objects)
         self.fused_of: defaultdict[str, array[int]] = defaultdict(lambda: array("q"))
-        for merge in history.object_merges:
-            self.fused_of[history.objects[merge.absorbed].found.class_name].append(merge.offset)
+        for each in history.objects:
+            self._add_classes(each)
+        for counts in (self.objects_of, self.fused_of):
+            for class_name, offsets in counts.items():
+                counts[class_name] = _sorted(offsets)
+        self.objects = _sorted(each.found.offset for each in history.objects)
         self.fused = _sorted(merge.offset for merge in history.object_merges)
         self.refused = _sorted(refusal.cause.offset for refusal in history.refusals)
         self.places_called: defaultdict[str, list[PlaceHistory]] = defaultdict(list)
@@ -49,6 +50,19 @@ class CountIndex:
             for name in dict.fromkeys(named.name for named in place.names):
                 if name is not None:
                     self.places_called[name].append(place)
+
+    def _add_classes(self, record: ObjectHistory) -> None:
+        """When an object counts to which class: one of it from being found or called so on, until
+        it is called otherwise or fused into another."""
+        name = record.found.class_name
+        until = record.absorbed_by
+        self.objects_of[name].append(record.found.offset)
+        for classified in record.classes:
+            self.fused_of[name].append(classified.offset)
+            name = classified.class_name
+            self.objects_of[name].append(classified.offset)
+        if until is not None:
+            self.fused_of[name].append(until.offset)
 
 
 def _sorted(offsets: Iterable[int]) -> "array[int]":
@@ -65,8 +79,8 @@ class HistoryFacts:
 
     @property
     def objects_merge(self) -> bool:
-        """Whether commands make two objects one, so that counts of objects may fall."""
-        return bool(self._history.object_merges)
+        """Whether two objects become one, or change their class: counts of objects may fall."""
+        return bool(self._history.object_merges) or any(o.classes for o in self._history.objects)
 
     def place_count(self) -> int:
         return self._count(self._index.formed) - self._count(self._index.absorbed)

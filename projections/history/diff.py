@@ -13,6 +13,7 @@ from eventsrc.envelope import Offset, RunId
 from projections.corrections import RecordedCommand
 from projections.model.command_text import command_document
 from projections.model.digest import map_digest
+from projections.model.records import Estimate, Relocation
 from projections.model.view import MapView
 
 from .records import Cause
@@ -31,7 +32,8 @@ class PlaceRow:
 
 @dataclass(frozen=True, slots=True)
 class ObjectRow:
-    """An object: its mean position in metres, its detections in order."""
+    """An object: its mean position in metres, its detections in order; under fusion by evidence
+    where it stands, and whether it is missing."""
 
     object_id: str
     class_name: str
@@ -41,6 +43,9 @@ class ObjectRow:
     first_seen: float
     last_seen: float
     det_ids: tuple[str, ...]
+    estimate: Estimate | None = None
+    missing: bool = False
+    relocations: tuple[Relocation, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,6 +172,9 @@ def _object_rows(view: MapView, ids: list[str]) -> Iterable[ObjectRow]:
             o.first_seen,
             o.last_seen,
             tuple(observations[number].det_id for number in o.observations),
+            o.estimate,
+            o.missing_in is not None,
+            tuple(o.relocations),
         )
 
 
@@ -293,6 +301,20 @@ def _object(row: ObjectRow) -> dict[str, Any]:
         "place_id": row.place_id,
         "first_seen": row.first_seen,
         "last_seen": row.last_seen,
+        **_evidence(row),
+    }
+
+
+def _evidence(row: ObjectRow) -> dict[str, Any]:
+    at = row.estimate
+    if at is None:
+        return {}
+    return {
+        "est_x": at.est_x,
+        "est_y": at.est_y,
+        "est_sigma_m": at.est_sigma_m,
+        "spots": at.spots,
+        "missing": row.missing,
     }
 
 

@@ -5,15 +5,24 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from eventsrc.envelope import DetId, Offset
+from eventsrc.envelope import Offset
 from eventsrc.text import counted
 from projections.deltas import ObjectSeen, ObservationOrdinal, PlaceOrdinal, Pose
 from projections.exact import Q40, mean_m
+from projections.model.records import ObservationRecord
 
+from .evidence import (
+    evidence_document,
+    evidence_entries,
+    evidence_facts,
+    evidence_text,
+    standing_text,
+    votes_text,
+)
 from .history import History
 from .merges import merge_reason
 from .names import id_of_place, keyframe_name, place_name, place_title
-from .records import Cause, Merge, ObjectHistory, PlaceHistory, count_before
+from .records import Cause, Merge, ObjectHistory, ObjectMerge, PlaceHistory, count_before
 
 MOST_FOUNDERS = 6
 """Founding members that are named; one event may place many keyframes."""
@@ -183,7 +192,7 @@ def _standing_place_summary(history: History, record: PlaceHistory, end: Offset)
 
 def _objects_text(history: History, place: PlaceOrdinal, end: Offset) -> str:
     classes = Counter(
-        o.found.class_name for o in history.objects if o.stands(end) and o.place(end) == place
+        o.class_name(end) for o in history.objects if o.stands(end) and o.place(end) == place
     )
     if not classes:
         return "no objects"
@@ -208,24 +217,27 @@ def _neighbours_text(history: History, place: PlaceOrdinal, end: Offset) -> str:
 
 def explain_object(
     history: History,
-    det_id: Callable[[ObservationOrdinal], DetId],
+    observation: Callable[[ObservationOrdinal], ObservationRecord],
     record: ObjectHistory,
     end: Offset,
 ) -> Explanation:
-    """What happened to an object in the events below ``end``; ``det_id`` names an observation."""
+    """What happened to an object in the events below ``end``."""
+    seen = [observation(each.observation) for each in sightings_of(history, record, end)]
+    votes = Counter(each.class_name for each in seen)
     entries = sorted(
-        (e for e in _object_entries(history, det_id, record) if e.cause.offset < end),
+        (e for e in _object_entries(history, observation, record) if e.cause.offset < end),
         key=lambda entry: entry.cause.offset,
     )
     return Explanation(
         kind="object",
         subject=record.object_id,
-        summary=_object_summary(history, record, end),
+        summary=_object_summary(history, record, votes, end),
         entries=tuple(entries),
         facts={
-            "class_name": record.found.class_name,
+            "class_name": record.class_name(end),
             "place_id": id_of_place(history, record.place(end)),
-            "det_ids": [det_id(seen.observation) for seen in sightings_of(history, record, end)],
+            "det_ids": [each.det_id for each in seen],
+            **evidence_facts(record, votes, end),
         },
     )
 
@@ -238,7 +250,9 @@ def sightings_of(history: History, record: ObjectHistory, end: Offset) -> list[O
     return sorted(found, key=lambda seen: seen.observation)
 
 
-def _object_summary(history: History, record: ObjectHistory, end: Offset) -> str:
+def _object_summary(
+    history: History, record: ObjectHistory, votes: Counter[str], end: Offset
+) -> str:
     last = record.values(end)
     if last is None:
         return "not seen yet"
@@ -251,16 +265,24 @@ def _object_summary(history: History, record: ObjectHistory, end: Offset) -> str
     least = min(seen.similarity_q40 for seen in sightings) / Q40
     similar = f" (similarity at least {least:.2f})" if last.obs_count > 1 else ""
     return (
-        f"a {record.found.class_name}, seen {counted(last.obs_count, 'time')}{similar}, "
+        f"a {record.class_name(end)}{_votes(record, votes)}, "
+        f"seen {counted(last.obs_count, 'time')}{similar}, "
         f"on average from ({x:.2f}, {y:.2f}); in {place_title(history, record.place(end), end)}"
+        f"{standing_text(history, record, end)}"
     )
 
 
+def _votes(record: ObjectHistory, votes: Counter[str]) -> str:
+    return votes_text(votes) if record.estimates else ""
+
+
 def _object_entries(
-    history: History, det_id: Callable[[ObservationOrdinal], DetId], record: ObjectHistory
+    history: History,
+    observation: Callable[[ObservationOrdinal], ObservationRecord],
+    record: ObjectHistory,
 ) -> Iterator[Entry]:
     pose = history.keyframes[history.keyframe_count(Offset(record.found.offset + 1)) - 1].pose
-    first = det_id(record.sightings[0].observation)
+    first = observation(record.sightings[0].observation).det_id
     yield Entry(
         record.cause,
         "found",
@@ -272,12 +294,24 @@ def _object_entries(
     yield from _moves(history, record)
     for merge in record.merges:
         absorbed = history.objects[merge.absorbed].object_id
-        text = f"{absorbed} was fused into it by a command"
-        yield Entry(merge.cause, "fused", text, {"object_id": absorbed})
+        text = f"{absorbed} was fused into it {_why_fused(merge)}"
+        yield Entry(merge.cause, "fused", text, {"object_id": absorbed, **_evidence_of(merge)})
     if (ended := record.absorbed_by) is not None:
         survivor = history.objects[ended.survivor].object_id
-        text = f"fused into {survivor} by a command"
-        yield Entry(ended.cause, "ended", text, {"object_id": survivor})
+        text = f"fused into {survivor} {_why_fused(ended)}"
+        yield Entry(ended.cause, "ended", text, {"object_id": survivor, **_evidence_of(ended)})
+    for offset, what, told, facts in evidence_entries(record):
+        yield Entry(history.cause_at(offset), what, told, facts)
+
+
+def _why_fused(merge: ObjectMerge) -> str:
+    evidence = merge.values.evidence
+    return "by a command" if evidence is None else f"as one thing: {evidence_text(evidence)}"
+
+
+def _evidence_of(merge: ObjectMerge) -> dict[str, Any]:
+    evidence = merge.values.evidence
+    return {} if evidence is None else {"evidence": evidence_document(evidence)}
 
 
 def _sightings(history: History, record: ObjectHistory) -> Iterator[Entry]:

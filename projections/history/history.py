@@ -23,9 +23,13 @@ from projections.deltas import (
     KeyframeOrdinal,
     KeyframePlaced,
     MergeRefused,
+    ObjectClassified,
+    ObjectEstimated,
     ObjectFound,
+    ObjectMissing,
     ObjectMoved,
     ObjectOrdinal,
+    ObjectRelocated,
     ObjectSeen,
     ObjectsMerged,
     PlaceChanged,
@@ -205,6 +209,18 @@ class History:
     def _object_seen(self, delta: ObjectSeen, _: Cause) -> None:
         self.objects[delta.object].sightings.append(delta)
 
+    def _object_estimated(self, delta: ObjectEstimated, _: Cause) -> None:
+        self.objects[delta.object].estimates.append(delta)
+
+    def _object_classified(self, delta: ObjectClassified, _: Cause) -> None:
+        self.objects[delta.object].classes.append(delta)
+
+    def _object_missing(self, delta: ObjectMissing, _: Cause) -> None:
+        self.objects[delta.object].looks.append(delta)
+
+    def _object_relocated(self, delta: ObjectRelocated, _: Cause) -> None:
+        self.objects[delta.object].relocations.append(delta)
+
     # Functions of the class, not methods bound to the history, as in `MapView`.
     _APPLIERS: ClassVar[dict[type, Callable[["History", Any, Cause], None]]] = {
         RunSeen: _run_seen,
@@ -218,6 +234,10 @@ class History:
         ObjectsMerged: _objects_merged,
         ObjectFound: _object_found,
         ObjectSeen: _object_seen,
+        ObjectEstimated: _object_estimated,
+        ObjectClassified: _object_classified,
+        ObjectMissing: _object_missing,
+        ObjectRelocated: _object_relocated,
     }
 
     def _object_moved(self, delta: ObjectMoved) -> _Move:

@@ -8,11 +8,10 @@ that every question is a look-up. An event at offset o, and a merge it causes, s
 from collections.abc import Callable, Iterator, Sequence
 from typing import TypeAlias, TypeVar
 
-from eventsrc.envelope import FIRST_OFFSET, DetId, Offset
+from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
 from eventsrc.text import counted
 from projections.corrections import Corrections
-from projections.deltas import ObservationOrdinal
 from projections.errors import LogPointError
 from projections.model.fold import READ_AHEAD, FoldedEvent, fold_events, fold_log_cached, gc_paused
 from projections.model.snapshot_cache import SnapshotCache
@@ -131,7 +130,8 @@ class KnownHistory:
         """
         history, last = self.history, self.checked(end)
         if thing in history.object_ordinals:
-            explained = explain_object(history, self._det_id, find_object(history, thing), last)
+            seen = self._latest.observations.__getitem__
+            explained = explain_object(history, seen, find_object(history, thing), last)
             told = object_commands(self._teller, history, explained.facts["det_ids"])
             return with_entries(explained, told)
         if thing not in history.place_ordinals and thing.startswith("obj-"):
@@ -184,9 +184,6 @@ class KnownHistory:
                 f"{counted(self.end, 'event')}; give 0 to {self.end}"
             )
         return end
-
-    def _det_id(self, observation: ObservationOrdinal) -> DetId:
-        return self._latest.observations[observation].det_id
 
     def _fold_to(self, end: Offset) -> None:
         events = self.reader.read(self._history.next_offset, end)

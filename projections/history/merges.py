@@ -22,6 +22,7 @@ from projections.corrections import RecordedCommand
 from projections.deltas import KeyframeOrdinal, Link, PlaceOrdinal
 from projections.model.command_text import command_document, command_on, command_title
 
+from .evidence import evidence_document
 from .history import History
 from .names import keyframe_name, log_name, place_name
 from .records import EdgeChange, Merge, ObjectMerge, Refusal
@@ -272,12 +273,14 @@ def _joined_document(history: History, link: Link) -> dict[str, Any]:
 
 def object_merge_document(history: History, merge: ObjectMerge) -> dict[str, Any]:
     """One merge of objects as JSON."""
-    survivor, absorbed = (history.objects[n].found for n in (merge.survivor, merge.absorbed))
+    survivor, absorbed = (history.objects[n] for n in (merge.survivor, merge.absorbed))
+    evidence = merge.values.evidence
     return {
         **merge.cause.document(),
-        "class_name": survivor.class_name,
+        "class_name": survivor.class_name(Offset(merge.offset + 1)),
         "survivor": survivor.object_id,
         "absorbed": absorbed.object_id,
+        **({} if evidence is None else {"evidence": evidence_document(evidence)}),
     }
 
 

@@ -57,7 +57,7 @@ _POLL_S = 0.2
 _PLACE_DELTAS = frozenset({KeyframeAdded, PlaceFormed, KeyframePlaced, PlacesMerged})
 """The deltas that `fold_result` needs from a history; the rest is in the view."""
 _OBJECT_DELTAS = frozenset({ObjectFound, ObjectSeen, ObjectsMerged})
-"""Needed too where a command makes two objects one."""
+"""Needed too where two objects may become one."""
 
 _done: "Synchronized[int] | None" = None
 """In a worker process: the number of events that all workers have folded."""
@@ -220,7 +220,8 @@ class _Fold:
         self.view = MapView(settings, keep_embeddings=False, corrections=corrections)
         self.history = History(settings, corrections)
         self.seconds = 0.0
-        self._needed = _PLACE_DELTAS | _OBJECT_DELTAS if corrections.same else _PLACE_DELTAS
+        objects_merge = bool(corrections.same) or settings.fusion == "evidence"
+        self._needed = _PLACE_DELTAS | _OBJECT_DELTAS if objects_merge else _PLACE_DELTAS
 
     def fold(self, read: ParsedEvent) -> None:
         offset, deltas = read.offset, fold_parsed(read, self.map)

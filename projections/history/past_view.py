@@ -3,13 +3,17 @@
 from bisect import bisect_left
 from dataclasses import replace
 
+from msgspec.structs import astuple
+
 from eventsrc.envelope import Offset
 from projections.deltas import PlaceOrdinal
 from projections.model.records import (
+    Estimate,
     KeyframeRecord,
     ObjectRecord,
     ObservationRecord,
     PlaceRecord,
+    Relocation,
     RunRecord,
 )
 from projections.model.view import MapView
@@ -117,7 +121,7 @@ def _observations(history: History, latest: MapView, end: Offset) -> list[Observ
     found = latest.observations[
         : bisect_left(latest.observations, keyframes, key=lambda o: o.keyframe)
     ]
-    if not history.corrections.same:
+    if not history.object_merges:
         return found
     # A merge of objects changes the object of observations: here they are not shared.
     objects = {
@@ -136,18 +140,30 @@ def _objects(history: History, end: Offset) -> list[ObjectRecord]:
             survivor, absorbed = records[merge.survivor], records[merge.absorbed]
             survivor.observations = sorted(survivor.observations + absorbed.observations)
             absorbed.observations = []
+            relocations = survivor.relocations + absorbed.relocations
+            survivor.relocations = sorted(relocations, key=lambda r: (r.offset, r.observation))
+            absorbed.relocations = []
     return records
 
 
 def _object(history: ObjectHistory, end: Offset) -> ObjectRecord:
     found, seen = history.found, history.sightings[: count_before(history.sightings, end)]
-    record = ObjectRecord(found.object, found.object_id, found.class_name)
+    record = ObjectRecord(found.object, found.object_id, history.class_name(end))
     record.observations = [delta.observation for delta in seen]
     if (last := history.values(end)) is not None:
         record.obs_count = last.obs_count
         record.sum_x_um, record.sum_y_um = last.sum_x_um, last.sum_y_um
         record.first_seen, record.last_seen = last.first_seen, last.last_seen
     record.place = history.place(end)
+    if (estimated := last_before(history.estimates, end)) is not None:
+        _, _, *values = astuple(estimated)
+        record.estimate = Estimate(*values)
+    if (looked := history.looked_for(end)) is not None:
+        record.looks = looked.looks
+        record.missing_in = looked.run if looked.missing else None
+    for moved in history.relocations[: count_before(history.relocations, end)]:
+        offset, _, *values = astuple(moved)
+        record.relocations.append(Relocation(offset, *values))
     return record
 
 

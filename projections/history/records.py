@@ -22,9 +22,13 @@ from projections.deltas import (
     KeyframeOrdinal,
     KeyframePlaced,
     Link,
+    ObjectClassified,
+    ObjectEstimated,
     ObjectFound,
+    ObjectMissing,
     ObjectMoved,
     ObjectOrdinal,
+    ObjectRelocated,
     ObjectSeen,
     ObjectsMerged,
     PlaceChanged,
@@ -154,7 +158,7 @@ class Refusal:
 
 @dataclass(frozen=True, slots=True)
 class ObjectMerge:
-    """Two objects became one, by a command. ``values`` are the survivor's since."""
+    """Two objects became one, by a command or by evidence. ``values`` are the survivor's since."""
 
     cause: Cause
     values: ObjectsMerged
@@ -219,6 +223,10 @@ class ObjectHistory:
     """Merges it survived."""
     absorbed_by: ObjectMerge | None = None
     """The merge that ended it."""
+    estimates: list[ObjectEstimated] = field(default_factory=list)
+    classes: list[ObjectClassified] = field(default_factory=list)
+    looks: list[ObjectMissing] = field(default_factory=list)
+    relocations: list[ObjectRelocated] = field(default_factory=list)
 
     @property
     def object_id(self) -> str:
@@ -241,6 +249,19 @@ class ObjectHistory:
         if seen is None or merged is None or seen.obs_count > merged.values.obs_count:
             return seen
         return merged.values
+
+    def class_name(self, end: Offset) -> str:
+        """Its class after the events below ``end``."""
+        classified = last_before(self.classes, end)
+        return self.found.class_name if classified is None else classified.class_name
+
+    def looked_for(self, end: Offset) -> ObjectMissing | None:
+        """In how many keyframes it was looked for and not seen, after the events below ``end``;
+        None if it has stood elsewhere since."""
+        looked, moved = last_before(self.looks, end), last_before(self.relocations, end)
+        if looked is None or (moved is not None and moved.offset > looked.offset):
+            return None
+        return looked
 
 
 class _HasOffset(Protocol):

@@ -1,5 +1,6 @@
 """Text output of `mapfold diff`, `merges`, `bisect` and `why`."""
 
+import math
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -7,9 +8,11 @@ from eventsrc.envelope import Offset
 from eventsrc.text import counted
 from projections.deltas import PlaceOrdinal
 from projections.model.command_text import command_title
+from projections.model.records import Estimate
 
 from .bisect import Search, Turn
 from .diff import Difference, ObjectRow, PlaceRow, object_shift_m, place_shift_m
+from .evidence import evidence_text
 from .explanation import Explanation
 from .history import History
 from .merges import merge_reason, refuser
@@ -149,16 +152,31 @@ class _ObjectChange:
         return len(self.after.det_ids) - len(self.before.det_ids)
 
     def text(self) -> str:
-        after, shift = self.after, object_shift_m(self.before, self.after)
+        before, after = self.before, self.after
+        shift = object_shift_m(before, after)
         parts = [f"{after.object_id} {after.class_name}:"]
+        if before.class_name != after.class_name:
+            parts.append(f"{before.class_name} → {after.class_name}")
         if self.relocated:
             parts.append(f"{self.before.place_id or 'no place'} → {after.place_id or 'no place'}")
         if self.seen:
             now = counted(len(after.det_ids), "time")
-            parts.append(f"seen {len(self.before.det_ids):,} → {now}")
+            parts.append(f"seen {len(before.det_ids):,} → {now}")
+        if before.missing != after.missing:
+            parts.append("missing" if after.missing else "not missing any more")
         if shift >= _MOVED_M:
             parts.append(f"moved {shift:.2f} m")
+        if before.estimate is not None and before.estimate != after.estimate:
+            parts.append(_estimate_change(before.estimate, after.estimate))
         return parts[0] + " " + ", ".join(parts[1:])
+
+
+def _estimate_change(before: Estimate, after: Estimate | None) -> str:
+    if after is None:
+        return "no estimate any more"
+    shift = math.hypot(after.est_x - before.est_x, after.est_y - before.est_y)
+    place = f"stands {shift:.2f} m elsewhere, " if shift >= _MOVED_M else ""
+    return f"{place}± {before.est_sigma_m:.2f} → {after.est_sigma_m:.2f} m"
 
 
 def _objects(diff: Difference) -> tuple[str, str, list[list[str]]]:
@@ -250,6 +268,7 @@ def object_merges_text(history: History, merges: Sequence[ObjectMerge]) -> str:
     """The table of merges of objects, or that there are none."""
     if not merges:
         return "no merges of objects\n"
+    by_evidence = any(merge.values.evidence is not None for merge in merges)
     rows = [
         (
             f"{merge.cause.offset:,}",
@@ -257,11 +276,13 @@ def object_merges_text(history: History, merges: Sequence[ObjectMerge]) -> str:
             merge.cause.name,
             history.objects[merge.survivor].object_id,
             history.objects[merge.absorbed].object_id,
-            history.objects[merge.survivor].found.class_name,
+            history.objects[merge.survivor].class_name(Offset(merge.offset + 1)),
+            *([evidence_text(merge.values.evidence)] if by_evidence else []),
         )
         for merge in merges
     ]
-    return table(_OBJECTS_HEADER, rows, right=("offset",))
+    header = (*_OBJECTS_HEADER, "because") if by_evidence else _OBJECTS_HEADER
+    return table(header, rows, right=("offset",))
 
 
 def merge_text(history: History, merge: Merge) -> str:
@@ -275,7 +296,7 @@ def merge_text(history: History, merge: Merge) -> str:
     for place, size in zip(merge.absorbed, merge.absorbed_sizes, strict=True):
         lines.append(f"absorbed  {_place(history, merge, place, size)}")
     objects = [history.objects[number] for number in merge.objects]
-    named = [f"object    {o.object_id} ({o.found.class_name})" for o in objects]
+    named = [f"object    {o.object_id} ({o.class_name(Offset(after))})" for o in objects]
     lines += shortened(named, MOST_THINGS, "--json lists all")
     lines += shortened(
         [_edge_text(history, e) for e in merge.edges], MOST_THINGS, "--json lists all"

@@ -4,7 +4,8 @@ The canonical form is the sections of `_SECTIONS` in their order, one line for e
 ordinal, each line a JSON array. Integers are exact, a float is written as the shortest decimal that
 names it, an embedding enters by its checksum. Settings and the number of events are not part of it:
 the same map reached another way has the same digest. Under corrections there are two more sections:
-the places' names, and the corrections' fingerprint.
+the places' names, and the corrections' fingerprint. Under fusion by evidence there is one more
+before them: of each Object its estimate, whether it is missing, and its relocations.
 """
 
 import hashlib
@@ -28,6 +29,10 @@ def map_digest(view: MapView) -> str:
         remaining = lines(view)
         while chunk := "".join(islice(remaining, _LINES_AT_ONCE)):
             digest.update(chunk.encode("ascii"))
+    if view.settings.fusion == "evidence":
+        digest.update(b"evidence\n")
+        for line in _evidence(view):
+            digest.update(line.encode())
     if own := view.corrections.fingerprint():
         names = [_line((p.ordinal, p.name)) for p in view.places.values() if p.name is not None]
         digest.update(f"names\n{''.join(names)}corrections\n{_line(own)}".encode())
@@ -71,6 +76,17 @@ def _objects(view: MapView) -> Iterator[str]:
             f"[{_text(o.object_id)},{_text(o.class_name)},{o.obs_count},{o.sum_x_um},{o.sum_y_um},"
             f"{o.first_seen!r},{o.last_seen!r},{_number(o.place)}]\n"
         )
+
+
+def _evidence(view: MapView) -> Iterator[str]:
+    for o in view.objects.values():
+        at = o.estimate
+        estimate = at and (at.x_um, at.y_um, at.var_xx_um2, at.var_xy_um2, at.var_yy_um2, at.spots)
+        relocations = [
+            (r.offset, r.observation, r.from_x_um, r.from_y_um, r.to_x_um, r.to_y_um)
+            for r in o.relocations
+        ]
+        yield _line((o.ordinal, estimate, o.looks, o.missing_in, relocations))
 
 
 def _number(value: int | None) -> str:

@@ -12,6 +12,7 @@ import json
 import math
 import zlib
 from collections.abc import Callable, Sequence
+from dataclasses import astuple
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,15 @@ from projections.reducers import State, part, prefixed
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 
-from .records import KeyframeRecord, ObjectRecord, ObservationRecord, PlaceRecord, RunRecord
+from .records import (
+    Estimate,
+    KeyframeRecord,
+    ObjectRecord,
+    ObservationRecord,
+    PlaceRecord,
+    Relocation,
+    RunRecord,
+)
 from .view import MapView
 
 MAGIC = b"mapfold snapshot 1\n"
@@ -115,6 +124,7 @@ def dump_view(view: MapView) -> State:
         ],
         "object_times": _floats([(o.first_seen, o.last_seen) for o in view.all_objects], 2),
         "absorbed_objects": sorted(view.object_survivors.absorbed_by.items()),
+        **_dump_evidence(view),
         "places": [
             [
                 p.place_id,
@@ -245,6 +255,31 @@ def _load_objects(view: MapView, state: State) -> None:
         view.object_survivors.merge(survivor, (absorbed,))
     absorbed_by = view.object_survivors.absorbed_by
     view.objects = {o.ordinal: o for o in view.all_objects if o.ordinal not in absorbed_by}
+    if view.settings.fusion == "evidence":
+        _load_evidence(view, state)
+
+
+def _dump_evidence(view: MapView) -> State:
+    """What fusion by evidence knows of Objects; nothing under the page's rule."""
+    if view.settings.fusion != "evidence":
+        return {}
+    return {
+        "estimates": [
+            [o.ordinal, *astuple(o.estimate)] for o in view.all_objects if o.estimate is not None
+        ],
+        "presence": [[o.looks, o.missing_in] for o in view.all_objects],
+        "relocations": [[o.ordinal, *astuple(r)] for o in view.all_objects for r in o.relocations],
+    }
+
+
+def _load_evidence(view: MapView, state: State) -> None:
+    objects = view.all_objects
+    for ordinal, *estimate in state["estimates"]:
+        objects[ordinal].estimate = Estimate(*estimate)
+    for record, (looks, missing_in) in zip(objects, state["presence"], strict=True):
+        record.looks, record.missing_in = looks, missing_in
+    for ordinal, *relocation in state["relocations"]:
+        objects[ordinal].relocations.append(Relocation(*relocation))
 
 
 def _load_places(view: MapView, rows: list[list[Any]]) -> None:

@@ -7,6 +7,7 @@ survivor up, so a merge costs little however many keyframes move.
 """
 
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any, ClassVar
 
@@ -105,6 +106,11 @@ class MapView:
     def place_id(self, place: PlaceOrdinal | None) -> str | None:
         """The id of a place, absorbed ones too; None for None."""
         return None if place is None else self.all_places[place].place_id
+
+    def class_counts(self, found: ObjectRecord) -> dict[str, int]:
+        """How many observations of an Object are of each class, most first; ties by name."""
+        names = (self.observations[number].class_name for number in found.observations)
+        return dict(sorted(Counter(names).items(), key=lambda item: (-item[1], item[0])))
 
     def edges(self) -> list[tuple[PlaceOrdinal, PlaceOrdinal, int]]:
         """(a, b, shared_transitions), ascending."""
