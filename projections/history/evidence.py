@@ -11,7 +11,7 @@ from typing import Any
 
 from eventsrc.envelope import Offset
 from eventsrc.text import counted
-from projections.deltas import MergeEvidence, ObjectEstimated, ObservationOrdinal
+from projections.deltas import MergeEvidence, ObjectEstimated, ObjectMissing, ObservationOrdinal
 from projections.exact import UM_PER_M
 from projections.model.records import Estimate
 
@@ -117,13 +117,14 @@ def evidence_entries(
             yield classified.offset, "classified", text, {"from": name, "to": classified.class_name}
             name = classified.class_name
     was_missing = False
-    for looked in record.looks:
-        if looked.missing and not was_missing:
+    for offset, looked in _presence(record):
+        is_missing = looked is not None and looked.missing
+        if looked is not None and is_missing and not was_missing:
             text = f"missing: not seen in {counted(looked.looks, 'keyframe')} that should show it"
-            yield looked.offset, "missing", text, {"looks": looked.looks}
-        elif was_missing and not looked.missing and not _moved_at(record, looked.offset):
-            yield looked.offset, "back", "seen where it was missing", {}
-        was_missing = looked.missing
+            yield offset, "missing", text, {"looks": looked.looks}
+        elif looked is not None and was_missing and not is_missing:
+            yield offset, "back", "seen where it was missing", {}
+        was_missing = is_missing
     for moved in record.relocations:
         start, stop = (moved.from_x_um, moved.from_y_um), (moved.to_x_um, moved.to_y_um)
         text = (
@@ -137,23 +138,24 @@ def evidence_entries(
         yield moved.offset, "moved", text, facts
 
 
+def _presence(record: ObjectHistory) -> list[tuple[Offset, ObjectMissing | None]]:
+    """When it was looked for, and (None) when it turned out to stand elsewhere, in order."""
+    moved = [(each.offset, None) for each in record.relocations]
+    looked = [(each.offset, each) for each in record.looks]
+    return sorted([*moved, *looked], key=lambda event: event[0])
+
+
 def _missing_since(record: ObjectHistory, end: Offset) -> Offset | None:
     """The event since which it is missing, of those below ``end``; None if it is not."""
-    looked = record.looked_for(end)
-    if looked is None or not looked.missing:
-        return None
-    since = looked.offset
-    for earlier in reversed(record.looks):
-        if earlier.offset >= end:
-            continue
-        if not earlier.missing or _moved_at(record, earlier.offset):
+    since = None
+    for offset, looked in _presence(record):
+        if offset >= end:
             break
-        since = earlier.offset
+        if looked is None or not looked.missing:
+            since = None
+        elif since is None:
+            since = offset
     return since
-
-
-def _moved_at(record: ObjectHistory, offset: Offset) -> bool:
-    return any(moved.offset == offset for moved in record.relocations)
 
 
 def _is_milestone(before: int, after: int) -> bool:

@@ -263,17 +263,16 @@ class MapView:
     def _object_relocated(self, delta: ObjectRelocated) -> None:
         found = self.all_objects[delta.object]
         found.looks, found.missing_in = 0, None
-        if all(known.observation != delta.observation for known in found.relocations):
-            found.relocations.append(
-                Relocation(
-                    delta.offset,
-                    delta.observation,
-                    delta.from_x_um,
-                    delta.from_y_um,
-                    delta.to_x_um,
-                    delta.to_y_um,
-                )
-            )
+        moved = Relocation(
+            delta.offset,
+            delta.observation,
+            delta.from_x_um,
+            delta.from_y_um,
+            delta.to_x_um,
+            delta.to_y_um,
+        )
+        if moved not in found.relocations:
+            found.relocations.append(moved)
 
     def _object_moved(self, delta: ObjectMoved) -> None:
         self.all_objects[delta.object].place = delta.place
