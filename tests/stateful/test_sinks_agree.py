@@ -1,7 +1,8 @@
 """Memory, both loaders, one database and two databases: after any steps their rows are equal.
 
-The machine writes events (walks, merges, duplicates, conflicts, unreadable ones) and commands,
-tails in batches of any size, crashes tails at any statement, rebuilds to any offset, and compares.
+The machine writes events (walks, merges, duplicates, conflicts, unreadable ones) and commands, also
+some that change the rule by which observations are fused; it tails in batches of any size, crashes
+tails at any statement, rebuilds to any offset, and compares.
 The memory sink gets each event once, in order, from the start again where a command changes more
 than names; the databases get crashes, retries, rebuilds and refolds.
 """
@@ -27,9 +28,10 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
-from eventsrc.commands import Command
+from eventsrc.commands import Command, SameObject, UseSettings
 from eventsrc.envelope import Offset
 from eventsrc.log import LogReader
+from projections.corrections import Corrections
 from projections.database import rebuild, tail
 from projections.database.connection import Targets, connect
 from projections.database.live_fold import LiveFold
@@ -38,15 +40,26 @@ from projections.database.memory_sink import MemorySink, MemoryTables
 from projections.errors import FoldError
 from projections.model.log_commands import read_corrections
 from projections.settings import Settings
-from tests.commands_in_logs import append_command, forget_keyframes, keep_apart, name_place, undo
+from tests.commands_in_logs import (
+    append_command,
+    command,
+    forget_keyframes,
+    keep_apart,
+    name_place,
+    undo,
+)
 from tests.drops import wait_for_drops
 from tests.envelopes import envelope
 from tests.logs import append_raw, bridge, walk, write_log
 from tests.rows import ORDER, graph_rows, vector_rows
 
-SETTINGS = Settings()
 EXAMPLES = int(os.environ.get("MAPFOLD_STATEFUL_EXAMPLES", "8"))
 PLACES = st.sampled_from(["one", "two"])
+
+
+def settings_of(corrections: Corrections) -> Settings:
+    """The log's settings, else the defaults."""
+    return corrections.settings or Settings()
 
 
 class Crash(Exception):
@@ -75,14 +88,16 @@ class SinksAgree(RuleBasedStateMachine):
     targets: dict[str, Targets]
     loaders: ClassVar[dict[str, LoaderName]] = {"one": "copy", "two": "insert"}
 
-    @initialize()
-    def begin(self) -> None:
+    @initialize(fusion=st.sampled_from(["page", "evidence"]))
+    def begin(self, fusion: str) -> None:
         self.folder = Path(tempfile.mkdtemp(prefix="mapfold-agree-"))
         self.log = write_log(self.folder / "log", walk(3, seed=99, run_id="first"))
         self.keyframes = {"run-a": 0, "run-b": 0}
         self.unreadable = False
         self.given: list[Command] = []
-        self.fold, self.memory = LiveFold(SETTINGS), MemoryTables()
+        if fusion != "page":
+            self._give(command(UseSettings, settings={"fusion": fusion}))
+        self.fold, self.memory = LiveFold(Settings()), MemoryTables()
         for name in self.targets:
             self._empty(self.targets[name])
 
@@ -132,6 +147,17 @@ class SinksAgree(RuleBasedStateMachine):
         if first != second:
             self._give(keep_apart(first, second))
 
+    @rule(fusion=st.sampled_from(["page", "evidence"]), range_m=st.sampled_from([1.0, 3.0]))
+    def fusion_is_changed(self, fusion: str, range_m: float) -> None:
+        given = {"fusion": fusion, "evidence": {"range_m": range_m}}
+        self._give(command(UseSettings, settings=given))
+
+    @rule(first=st.integers(0, 20), second=st.integers(0, 20))
+    def objects_are_made_one(self, first: int, second: int) -> None:
+        if first != second:
+            det_ids = f"run-a_kf{first}_d0", f"run-a_kf{second}_d0"
+            self._give(command(SameObject, det_ids=det_ids))
+
     @rule(index=st.integers(0, 20))
     def command_is_undone(self, index: int) -> None:
         if self.given:
@@ -155,14 +181,16 @@ class SinksAgree(RuleBasedStateMachine):
     @rule(name=PLACES, size=st.integers(1, 20), only=st.sampled_from(["graph", "vectors"]))
     def one_sink_goes_ahead(self, name: str, size: int, only: Any) -> None:
         tail(
-            self.log, self.targets[name], SETTINGS, once=True, only=only, batch_events=size,
+            self.log, self.targets[name], settings_of, once=True, only=only, batch_events=size,
             loader=self.loaders[name],
         )  # fmt: skip
 
     @rule(name=PLACES, until=st.none() | st.integers(0, 40))
     def rebuild_to_some_offset(self, name: str, until: int | None) -> None:
         try:
-            rebuild(self.log, self.targets[name], SETTINGS, until=until, loader=self.loaders[name])
+            rebuild(
+                self.log, self.targets[name], settings_of, until=until, loader=self.loaders[name]
+            )
         except FoldError:
             assert self.unreadable
 
@@ -171,7 +199,7 @@ class SinksAgree(RuleBasedStateMachine):
         with pytest.MonkeyPatch.context() as patch:
             Bomb(patch, at)
             with contextlib.suppress(Crash, FoldError):
-                rebuild(self.log, self.targets[name], SETTINGS, loader=self.loaders[name])
+                rebuild(self.log, self.targets[name], settings_of, loader=self.loaders[name])
 
     @rule(size=st.integers(1, 20))
     def all_agree_once_caught_up(self, size: int) -> None:
@@ -204,15 +232,18 @@ class SinksAgree(RuleBasedStateMachine):
 
     def _tail(self, name: str, size: int) -> None:
         tail(
-            self.log, self.targets[name], SETTINGS, once=True, batch_events=size,
+            self.log, self.targets[name], settings_of, once=True, batch_events=size,
             loader=self.loaders[name],
         )  # fmt: skip
 
     def _memory_catches_up(self) -> None:
         with LogReader(self.log) as reader:
             corrections = read_corrections(reader)
-            if not corrections.differs_in_names_only(self.fold.map.corrections):
-                self.fold = LiveFold(SETTINGS, corrections=corrections)
+            settings = settings_of(corrections)
+            if settings != self.fold.map.settings or not corrections.differs_in_names_only(
+                self.fold.map.corrections
+            ):
+                self.fold = LiveFold(settings, corrections=corrections)
                 self.memory = MemoryTables()
             for event in reader.read(self.memory.next_offset):
                 for _ in self.fold.feed([event]):
