@@ -28,9 +28,9 @@ class EvidenceConstants(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    range_m: _Positive = 2.0
+    range_m: _Positive = 3.0
     """Median distance at which things are seen."""
-    range_spread: _Spread = 0.5
+    range_spread: _Spread = 0.55
     """Standard deviation of the logarithm of that distance."""
     bearing_rad: _Angle = 0.05
     """Standard error of the bearing of a box's centre, pose's heading included."""

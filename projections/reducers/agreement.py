@@ -1,0 +1,134 @@
+"""How much a sight and an estimate speak for one thing: the logarithm of a likelihood ratio.
+
+The numerator is the density of what the camera measured if the thing stands where the estimate
+says, with the errors of both; the denominator that for another thing somewhere in view. Four parts:
+
+bearing     variance: the estimate's across the ray, bearing and pose error; another thing: anywhere
+            in the picture
+range       the thing is at a distance from which things are usually seen
+box height  the size it has at that distance is that of the thing, which may be unsure together with
+            the position: two boxes from one spot are compared without regard to the distance
+elevation   likewise that of the box's centre above the camera; another thing: as different as
+            boxes in one picture are (`Slopes`)
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from projections.exact_functions import log
+from projections.reducers import State
+
+from .sights import Sight
+from .spots import LEAST_ELEVATION_M2, LEAST_M, SIZE, SLOPE, Estimate
+
+Floats = NDArray[np.float64]
+ESTIMATE_FIELDS = len(Estimate._fields)
+WORST = -20.0
+_ANYWHERE = -0.74
+"""log(1.2 rad / √2π)."""
+_OTHER_SIZES = 0.36
+_WORST_HEIGHT = -6.0
+_WORST_ELEVATION = -6.0
+_SIZE_KNOWN = 0.3
+_BEHIND_M2 = 0.04
+_SLOPE_GUESS, _GUESS_PAIRS = 0.01, 10.0
+
+
+class Slopes:
+    """How much the slopes of two boxes in one picture differ: the mean square."""
+
+    def __init__(self) -> None:
+        self._sum, self._count = _SLOPE_GUESS * _GUESS_PAIRS, _GUESS_PAIRS
+
+    @property
+    def mean_square(self) -> float:
+        """A guess that ten pairs outweigh, at first."""
+        return self._sum / self._count
+
+    def learn(self, sights: Sequence[Sight]) -> None:
+        """Take in a picture."""
+        slopes = [sight.slope for sight in sights if sight.log_height is not None]
+        for index, one in enumerate(slopes):
+            for other in slopes[:index]:
+                self._sum += (one - other) * (one - other)
+                self._count += 1.0
+
+    def dump(self) -> State:
+        """Everything, for a snapshot."""
+        return {"sums": [self._sum, self._count]}
+
+    def load(self, state: State) -> None:
+        """Take over what `dump` gave."""
+        self._sum, self._count = state["sums"]
+
+
+class Agreement:
+    """Ratios for many estimates and the sights of a picture."""
+
+    def __init__(self, range_m: float, range_spread: float) -> None:
+        self._log_range = log(range_m)
+        self._range_variance = range_spread * range_spread
+
+    def ratios(self, estimates: Floats, sights: Sequence[Sight], slopes: float) -> Floats:
+        """A row for each estimate, a column for each sight."""
+        rows = [
+            (*sight[:6], 0.0, 0.0, 0.0)
+            if sight.log_height is None
+            else (*sight[:6], sight.log_height, sight.slope, 1.0)
+            for sight in sights
+        ]
+        px, py, cos, sin, per_m2, least, height, slope, is_whole = np.array(rows).T
+        x, y, xx, xy, yy, z, zx, zy, zv, e, ex, ey, ev = estimates.T[:, :, np.newaxis]
+        dx, dy = x - px, y - py
+        ahead = dx * cos + dy * sin
+        across = dy * cos - dx * sin
+        along = np.maximum(ahead, LEAST_M)
+        square = along * along
+        log_along = logs(along)
+        cc, ss, cs = cos * cos, sin * sin, 2.0 * cos * sin
+        along_variance = xx * cc + xy * cs + yy * ss
+        variance = xx * ss - xy * cs + yy * cc + per_m2 * square + least
+        ratio = across * across / variance + logs(variance / square)
+        residual = log_along - self._log_range
+        ratio += residual * residual / (self._range_variance + along_variance / square)
+        behind = np.minimum(ahead - LEAST_M, 0.0)
+        ratio += behind * behind / (along_variance + _BEHIND_M2)
+        ratio *= -0.5
+        ratio += _ANYWHERE
+        residual = height + log_along - z
+        gx, gy = cos / along - zx, sin / along - zy
+        spread = gx * gx * xx + 2.0 * gx * gy * xy + gy * gy * yy
+        variance = spread + (zv + SIZE * SIZE)
+        part = _ratio(residual, variance, variance + _OTHER_SIZES, _WORST_HEIGHT)
+        residual = along * slope - e
+        gx, gy = slope * cos - ex, slope * sin - ey
+        spread = gx * gx * xx + 2.0 * gx * gy * xy + gy * gy * yy
+        variance = spread + (SLOPE * SLOPE) * square + (ev + LEAST_ELEVATION_M2)
+        part += _ratio(residual, variance, variance + slopes * square, _WORST_ELEVATION)
+        part *= is_whole
+        part *= zv < _SIZE_KNOWN
+        ratio += part
+        worst: Floats = np.maximum(ratio, WORST)
+        return worst
+
+
+def logs(values: Floats) -> Floats:
+    """Natural logarithms of positive numbers, right to some 10⁻⁵, the same bits everywhere."""
+    mantissas, twos = np.frexp(values)
+    s = (mantissas - 0.7071067811865476) / (mantissas + 0.7071067811865476)
+    square = s * s
+    series = square * (1.0 / 7.0) + 0.2
+    series = series * square + 1.0 / 3.0
+    result: Floats = (twos - 0.5) * 0.6931471805599453 + 2.0 * s * (series * square + 1.0)
+    return result
+
+
+def _ratio(residual: Floats, variance: Floats, other: Floats, worst: float) -> Floats:
+    """log N(residual; variance) − log N(residual; other), not below ``worst``."""
+    ratio = residual * residual * (1.0 / other - 1.0 / variance)
+    ratio += logs(other / variance)
+    ratio *= 0.5
+    result: Floats = np.maximum(ratio, worst)
+    return result

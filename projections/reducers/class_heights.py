@@ -1,0 +1,112 @@
+"""How tall the things of a class are and how high they stand, learned from the map.
+
+A thing whose estimate is sure gives its class the logarithm of its size and its elevation. The next
+thing of the class starts from their mean, so that one box that is not cut tells how far away it
+stands. The sums are integers, and a thing's older values are taken out before it gives new ones:
+the result depends on what the things say now and not on the order in which they said it.
+Elevations are metres above the camera.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from projections.exact_functions import log
+from projections.reducers import State
+
+_UNIT = 1 << 16
+_UNKNOWN = 3.0
+"""How many things the prior spread counts for."""
+_SPREAD = 0.3
+_SURE_M2 = 0.15
+_SURE_SIZE = 0.1
+
+
+class HeightPrior(NamedTuple):
+    """Mean and precision (1 / variance) of a class's log size, and of its elevation in metres."""
+
+    log_size: float
+    log_size_weight: float
+    elevation: float
+    elevation_weight: float
+
+
+Given = tuple[str, int, int]
+"""What a thing gave: class name, log size and elevation in units of 2⁻¹⁶."""
+UNKNOWN_CLASS = HeightPrior(-0.4, 2.0, 0.0, 0.25)
+
+
+class ClassHeights:
+    """Sums over the sure things of each class."""
+
+    def __init__(self, sizes_m: Mapping[str, float], size_spread: float) -> None:
+        weight = 1.0 / (size_spread * size_spread)
+        self._stated = {
+            name: HeightPrior(log(size), weight, 0.0, UNKNOWN_CLASS.elevation_weight)
+            for name, size in sizes_m.items()
+        }
+        self._sums: dict[str, list[int]] = {}
+
+    def prior(self, class_name: str) -> HeightPrior:
+        """What is known of a thing of this class before it is looked at."""
+        stated = self._stated.get(class_name, UNKNOWN_CLASS)
+        sums = self._sums.get(class_name)
+        if sums is None or sums[0] == 0:
+            return stated
+        count = sums[0]
+        share = (1.0 + 1.0 / count) / (count + _UNKNOWN - 1.0)
+        log_size, size_spread = _moments(count, sums[1], sums[2])
+        elevation, elevation_spread = _moments(count, sums[3], sums[4])
+        learned = HeightPrior(
+            log_size,
+            1.0 / ((size_spread + _UNKNOWN * _SPREAD * _SPREAD) * share),
+            elevation,
+            1.0 / ((elevation_spread + _UNKNOWN * _SPREAD * _SPREAD) * share),
+        )
+        if class_name not in self._stated:
+            return learned
+        return HeightPrior(stated[0], stated[1], learned[2], learned[3])
+
+    def give(
+        self,
+        before: Given | None,
+        class_name: str,
+        log_size: float,
+        size_variance: float,
+        elevation: float,
+        variance_m2: float,
+        spots: int,
+    ) -> Given | None:
+        """Replace what a thing gave before; nothing if it is not sure enough now."""
+        if before is not None:
+            self.take_back(before)
+        if spots < 2 or variance_m2 >= _SURE_M2 or size_variance >= _SURE_SIZE:
+            return None
+        given = class_name, round(log_size * _UNIT), round(elevation * _UNIT)
+        self._add(given, 1)
+        return given
+
+    def take_back(self, given: Given) -> None:
+        """The thing is gone."""
+        self._add(given, -1)
+
+    def _add(self, given: Given, sign: int) -> None:
+        class_name, size, elevation = given
+        sums = self._sums.setdefault(class_name, [0, 0, 0, 0, 0])
+        sums[0] += sign
+        sums[1] += sign * size
+        sums[2] += sign * size * size
+        sums[3] += sign * elevation
+        sums[4] += sign * elevation * elevation
+
+    def dump(self) -> State:
+        """Everything, for a snapshot."""
+        return {"sums": sorted([name, *sums] for name, sums in self._sums.items())}
+
+    def load(self, state: State) -> None:
+        """Take over what `dump` gave."""
+        self._sums = {name: list(sums) for name, *sums in state["sums"]}
+
+
+def _moments(count: int, total: int, squares: int) -> tuple[float, float]:
+    """Mean and sum of squared deviations."""
+    return total / (count * _UNIT), (count * squares - total * total) / (count * _UNIT * _UNIT)

@@ -1,0 +1,349 @@
+"""Landmarks by evidence: observations fused into Objects where they stand.
+
+The rules, for the observations of one picture:
+
+1.  Each becomes a sight (`sights`) and a look (`looks`). Candidates are the Objects whose estimate
+    is within reach of the robot: the usual range times exp(1.8 spreads).
+2.  The evidence that an observation is of a candidate is a log-likelihood ratio: of its sight and
+    the estimate (`agreement`), of its look and the exemplars (the mean of the best four; each that
+    is missing costs an eighth), and half of that of its label and the labels seen so far. Below
+    −8 the sight alone rules a candidate out.
+3.  Pairs are taken best first while the evidence is above 0. Each observation goes to one Object,
+    and each Object gets one observation of a picture: two things in one picture are not one. What
+    is left founds Objects.
+4.  The Object's estimate is solved anew from its spots (`spots`), its class is that of most of its
+    observations.
+5.  Two Objects are merged when better views show that they are one (`evidence_merging`).
+
+Under ``same-object`` and ``different-objects`` the rules of `constrained_landmarks` hold besides:
+Objects that are kept apart are no candidates for each other's observations, those that are one are
+merged at once, also within one picture.
+
+Everything is bit-exact: integers, and float64 by operations that IEEE 754 defines to the last bit,
+in one order; transcendental functions are those of `projections.exact_functions`.
+"""
+
+from collections.abc import Sequence
+from typing import TypeAlias
+
+import numpy as np
+
+from eventsrc.envelope import DetId, Offset
+from projections.deltas import (
+    MergeEvidence,
+    ObjectClassified,
+    ObjectEstimated,
+    ObjectFound,
+    ObjectOrdinal,
+    ObjectRelocated,
+    ObjectSeen,
+    ObjectsMerged,
+    Pose,
+    RunOrdinal,
+)
+from projections.evidence import EvidenceConstants
+from projections.exact import MAX_IN_A_SUM, Q40
+from projections.pair_groups import PairGroups
+from projections.reducers import State, part, prefixed
+from projections.settings import Camera
+
+from .agreement import Agreement, Slopes
+from .evidence_merging import Merging
+from .label_counts import LabelCounts
+from .landmarks import object_id
+from .looks import Floats, LookRatios, Looks, LookScale, looks_of
+from .sights import Sight, Sighting, Sights
+from .spots import Spots
+from .thing_index import ThingIndex
+from .things import INVERSE, RUN, SIDE_COS, SIDE_SIN, Thing
+
+__all__ = ["EvidenceLandmarks", "LandmarkDelta", "Sighting"]
+
+LandmarkDelta: TypeAlias = (
+    ObjectFound | ObjectSeen | ObjectsMerged | ObjectRelocated | ObjectClassified | ObjectEstimated
+)
+_BEST = 4
+_MISSING = 0.125
+_LEAST_AGREEMENT = -8.0
+_LABEL_WEIGHT = 0.5
+
+
+class EvidenceLandmarks:
+    """The reducer."""
+
+    def __init__(
+        self, constants: EvidenceConstants, groups: PairGroups[DetId] | None = None
+    ) -> None:
+        self._groups = groups
+        self._sights = Sights(constants)
+        self._look_ratios = LookRatios(constants)
+        self._scale = LookScale(constants.different)
+        self._slopes = Slopes()
+        self._labels = LabelCounts()
+        self._agreement = Agreement(constants.range_m, constants.range_spread)
+        self._index = ThingIndex(constants)
+        self._object_of: dict[int, ObjectOrdinal] = {}  # group → its Object
+        self._merging = Merging(self._index, self._look_ratios, self._scale, self._labels, groups)
+
+    def fold(
+        self,
+        offset: Offset,
+        run: RunOrdinal,
+        timestamp: float,
+        pose: Pose,
+        camera: Camera,
+        sightings: Sequence[Sighting],
+    ) -> list[LandmarkDelta]:
+        """Fuse the observations of one picture."""
+        if not sightings:
+            return []
+        labels = [sighting.class_name for sighting in sightings]
+        looks, inverses = looks_of([sighting.vector for sighting in sightings])
+        sights = self._sights.of(pose, camera, sightings)
+        self._scale.learn(labels, looks)
+        self._slopes.learn(sights)
+        self._labels.learn(labels)
+        chosen = self._choose(run, pose, labels, looks, inverses, sights, sightings)
+        deltas: list[LandmarkDelta] = []
+        seen: list[ObjectOrdinal] = []
+        renamed: set[ObjectOrdinal] = set()
+        to_unite: list[tuple[ObjectOrdinal, ObjectOrdinal]] = []
+        for k, sighting in enumerate(sightings):
+            wanted, cosine = chosen[k]
+            group = None if self._groups is None else self._groups.group_of.get(sighting.det_id)
+            own = None if group is None else self._object_of.get(group)
+            if group is not None:
+                wanted = self._allowed(group, own, wanted)
+            ordinal, found = self._take(offset, sighting, wanted, pose, timestamp, renamed)
+            deltas += found
+            thing = self._index.thing(ordinal)
+            sight = sights[k]
+            thing.spots.add(sight)
+            thing.keep(looks[k], float(inverses[k]), sight.cos, sight.sin, run)
+            self._index.solve(ordinal)
+            seen.append(ordinal)
+            deltas.append(
+                ObjectSeen(
+                    offset,
+                    ordinal,
+                    sighting.observation,
+                    Q40 if wanted is None else round(cosine * Q40),
+                    thing.count,
+                    thing.sum_x_um,
+                    thing.sum_y_um,
+                    thing.first_seen,
+                    thing.last_seen,
+                )
+            )
+            if group is not None:
+                thing.groups.add(group)
+                if own is None:
+                    self._object_of[group] = ordinal
+                elif own != ordinal:
+                    to_unite.append((own, ordinal))
+        self._index.count_meetings(seen)
+        changed = set(seen)
+        for pair in to_unite:
+            one, other = map(self._index.survivor_of, pair)
+            if one != other:
+                deltas.append(self._unite(offset, one, other, changed, renamed, None))
+        for ordinal in sorted(changed):
+            partner = self._merging.partner_of(ordinal) if ordinal in changed else None
+            if partner is not None:
+                other, why = partner
+                deltas.append(self._unite(offset, ordinal, other, changed, renamed, why))
+        for ordinal in sorted(renamed):
+            class_name = self._index.thing(ordinal).class_name
+            deltas.append(ObjectClassified(offset, ordinal, class_name))
+        deltas += [self._index.estimated(offset, ordinal) for ordinal in sorted(changed)]
+        return deltas
+
+    def dump(self) -> State:
+        """Everything, for a snapshot."""
+        return (
+            {"object_of": sorted(map(list, self._object_of.items()))}
+            | prefixed("scale", self._scale.dump())
+            | prefixed("slopes", self._slopes.dump())
+            | prefixed("labels", self._labels.dump())
+            | prefixed("things", self._index.dump())
+        )
+
+    def load(self, state: State) -> None:
+        """Take over what `dump` gave."""
+        self._object_of = {group: ObjectOrdinal(ordinal) for group, ordinal in state["object_of"]}
+        self._scale.load(part("scale", state))
+        self._slopes.load(part("slopes", state))
+        self._labels.load(part("labels", state))
+        self._index.load(part("things", state))
+
+    def _allowed(
+        self, group: int, own: ObjectOrdinal | None, wanted: ObjectOrdinal | None
+    ) -> ObjectOrdinal | None:
+        """The wanted Object, unless a command keeps it apart; then the group's own one, if any."""
+        if self._groups is None or wanted is None:
+            return own
+        inside = {group} if own is None else self._index.thing(own).groups
+        others = self._index.thing(wanted).groups
+        return own if wanted != own and self._groups.conflicts(inside, others) else wanted
+
+    def _take(
+        self,
+        offset: Offset,
+        sighting: Sighting,
+        wanted: ObjectOrdinal | None,
+        pose: Pose,
+        timestamp: float,
+        renamed: set[ObjectOrdinal],
+    ) -> tuple[ObjectOrdinal, list[ObjectFound]]:
+        """Add the observation to the wanted Object's sums, or found one."""
+        label = sighting.class_name
+        if wanted is None:
+            times = timestamp, timestamp
+            thing = Thing(1, pose.x_um, pose.y_um, *times, label, {label: 1}, Spots())
+            ordinal = self._index.add(thing)
+            identity = object_id(sighting.det_id)
+            return ordinal, [ObjectFound(offset, ordinal, identity, label, sighting.observation)]
+        thing = self._index.thing(wanted)
+        if thing.count >= MAX_IN_A_SUM:
+            raise OverflowError(
+                f"object {wanted} of class {thing.class_name!r} has {MAX_IN_A_SUM} observations, "
+                "the bound of its exact arithmetic"
+            )
+        thing.count += 1
+        thing.sum_x_um += pose.x_um
+        thing.sum_y_um += pose.y_um
+        thing.first_seen = min(thing.first_seen, timestamp)
+        thing.last_seen = max(thing.last_seen, timestamp)
+        thing.classes[label] = thing.classes.get(label, 0) + 1
+        if thing.reclassify():
+            renamed.add(wanted)
+        return wanted, []
+
+    def _unite(
+        self,
+        offset: Offset,
+        one: ObjectOrdinal,
+        other: ObjectOrdinal,
+        changed: set[ObjectOrdinal],
+        renamed: set[ObjectOrdinal],
+        evidence: MergeEvidence | None,
+    ) -> ObjectsMerged:
+        """Merge two Objects; the one founded first survives."""
+        survivor, absorbed = min(one, other), max(one, other)
+        moved = self._index.thing(absorbed).groups
+        self._object_of |= dict.fromkeys(moved, survivor)
+        if self._index.unite(survivor, absorbed):
+            renamed.add(survivor)
+        renamed.discard(absorbed)
+        changed.discard(absorbed)
+        changed.add(survivor)
+        thing = self._index.thing(survivor)
+        return ObjectsMerged(
+            offset,
+            survivor,
+            absorbed,
+            thing.count,
+            thing.sum_x_um,
+            thing.sum_y_um,
+            thing.first_seen,
+            thing.last_seen,
+            evidence,
+        )
+
+    def _choose(
+        self,
+        run: RunOrdinal,
+        pose: Pose,
+        labels: list[str],
+        looks: Looks,
+        inverses: Floats,
+        sights: list[Sight],
+        sightings: Sequence[Sighting],
+    ) -> list[tuple[ObjectOrdinal | None, float]]:
+        """The Object of each observation, None for a new one, and the cosine of the best pair."""
+        chosen: list[tuple[ObjectOrdinal | None, float]] = [(None, 1.0)] * len(sights)
+        near = self._index.near(pose.x_um / 1e6, pose.y_um / 1e6)
+        if not near:
+            return chosen
+        agreement = self._agreement.ratios(
+            self._index.estimates[near], sights, self._slopes.mean_square
+        )
+        rows = np.nonzero(agreement.max(axis=1) > _LEAST_AGREEMENT)[0].tolist()
+        if not rows:
+            return chosen
+        ordinals = [near[row] for row in rows]
+        things = [self._index.thing(ordinal) for ordinal in ordinals]
+        values, cosines = self._look_values(things, run, labels, looks, inverses, sights)
+        values += agreement[rows]
+        values += _LABEL_WEIGHT * np.array(
+            [[self._labels.ratio(thing, label) for label in labels] for thing in things]
+        )
+        if self._groups is not None:
+            self._forbid(self._groups, values, things, sightings)
+        flat = values.ravel().tolist()
+        width = len(labels)
+        used: set[int] = set()
+        for place in np.argsort(-values, axis=None, kind="stable").tolist():
+            if flat[place] <= 0.0:
+                break
+            row, column = divmod(place, width)
+            if row not in used and chosen[column][0] is None:
+                chosen[column] = ordinals[row], float(cosines[row, column])
+                used.add(row)
+        return chosen
+
+    def _look_values(
+        self,
+        things: list[Thing],
+        run: RunOrdinal,
+        labels: list[str],
+        looks: Looks,
+        inverses: Floats,
+        sights: list[Sight],
+    ) -> tuple[Floats, Floats]:
+        """The ratio of looks of each Object and observation, and the best cosine."""
+        most, width = max(thing.exemplars for thing in things), len(labels)
+        dots = np.zeros((len(things), most, width))
+        marks = np.zeros((len(things), most, 5))
+        is_kept = np.zeros((len(things), most, 1), bool)
+        for row, thing in enumerate(things):
+            count = thing.exemplars
+            dots[row, :count] = thing.looks[:count] @ looks.T
+            marks[row, :count] = thing.marks[:count]
+            is_kept[row, :count] = True
+        cosines = dots * marks[:, :, INVERSE, np.newaxis] * inverses
+        different = self._scale.different()
+        likeness = (cosines - different) * (1.0 / (1.0 - different))
+        directions = np.array([(sight.cos, sight.sin) for sight in sights])
+        sides = (
+            marks[:, :, SIDE_COS, np.newaxis] * directions[:, 0]
+            + marks[:, :, SIDE_SIN, np.newaxis] * directions[:, 1]
+        )
+        agree = np.array([[label in thing.classes for label in labels] for thing in things])
+        other_run = marks[:, :, RUN, np.newaxis] != run
+        ratios = self._look_ratios.ratios(likeness, sides, other_run, agree[:, np.newaxis])
+        ratios = np.sort(np.where(is_kept, ratios, -np.inf), axis=1)[:, ::-1]
+        counts = np.array([[min(thing.exemplars, _BEST)] for thing in things])
+        total = np.zeros((len(things), width))
+        for rank in range(min(most, _BEST)):
+            total += np.where(rank < counts, ratios[:, rank], 0.0)
+        best: Floats = np.where(is_kept, cosines, -np.inf).max(axis=1)
+        return total / counts - _MISSING * (_BEST - counts), best
+
+    def _forbid(
+        self,
+        groups: PairGroups[DetId],
+        values: Floats,
+        things: list[Thing],
+        sightings: Sequence[Sighting],
+    ) -> None:
+        """Leave out what commands keep apart."""
+        for column, sighting in enumerate(sightings):
+            group = groups.group_of.get(sighting.det_id)
+            if group is None:
+                continue
+            own = self._object_of.get(group)
+            inside = {group} if own is None else self._index.thing(own).groups
+            for row, thing in enumerate(things):
+                if thing.groups is not inside and groups.conflicts(inside, thing.groups):
+                    values[row, column] = -np.inf

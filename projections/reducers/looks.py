@@ -1,0 +1,135 @@
+"""How much two looks speak for one thing: the ratio of two likelihoods, as a logarithm.
+
+Cosines are taken as relative likeness u (`projections.evidence`). For one thing u is normal about
+a mean that falls with the change of side and between runs,
+
+    μ = same_back + same_side · exp(κ (cos Δ − 1)) − session_shift in another run
+
+and counts as μ where it is above. For two things it is a mixture of look-alikes (a little below μ),
+other things of the class, and things of another class; its shares depend on whether the labels
+agree. Of a sum of densities the largest term is taken, so that a pair needs no exponential.
+
+Looks are kept as integer multiples of 2⁻¹¹ in float32: by Cauchy and Schwarz every partial sum of a
+product is at most about 2²², below 2²⁴, so products of matrices are exact with every BLAS.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from projections.evidence import EvidenceConstants
+from projections.exact import UNIT
+from projections.exact_functions import exp, log
+from projections.reducers import State
+
+Floats = NDArray[np.float64]
+Looks = NDArray[np.float32]
+"""Rows of multiples of 2⁻¹¹."""
+LOOK_UNIT = 1 << 11
+_STEPS = 64
+_WORST = 8.0
+_LOOK_ALIKE = 0.05
+_SHARES = {True: (0.15, 0.85, 0.1), False: (0.02, 0.1, 0.88)}
+"""Of look-alikes, others of the class, others, among two things whose labels agree or do not."""
+_RECENT = 8
+_ENOUGH_PAIRS = 20_000
+_FIRST_GUESS, _GUESS_WEIGHT = 0.5, 0.5
+
+
+def looks_of(vectors: Sequence[Floats]) -> tuple[Looks, Floats]:
+    """Looks of unit vectors in multiples of 2⁻²⁰, and the inverses of their lengths."""
+    looks = np.rint(np.array(vectors) * (LOOK_UNIT / UNIT)).astype(np.float32)
+    squares = np.einsum("ij,ij->i", looks, looks).astype(np.float64)
+    return looks, 1.0 / np.sqrt(np.maximum(squares, 1.0))
+
+
+class LookRatios:
+    """Ratios for arrays of pairs."""
+
+    def __init__(self, constants: EvidenceConstants) -> None:
+        sides = [exp(constants.same_kappa * (2.0 * k / _STEPS - 2.0)) for k in range(_STEPS + 1)]
+        means = [constants.same_back + constants.same_side * side for side in sides]
+        self._means = np.array(means)
+        self._shift = constants.session_shift
+        self._same = 1.0 / constants.same_spread
+        self._class_mean = constants.same_class
+        self._class = 1.0 / constants.same_class_spread
+        self._other = 1.0 / constants.different_spread
+        same, of_class = log(constants.same_spread), log(constants.same_class_spread)
+        other = log(constants.different_spread)
+        self._shares = {
+            agree: (log(a), log(b) + same - of_class, log(c) + same - other)
+            for agree, (a, b, c) in _SHARES.items()
+        }
+
+    def ratios(
+        self,
+        likeness: Floats,
+        sides: Floats,
+        other_run: NDArray[np.bool_],
+        labels_agree: NDArray[np.bool_],
+    ) -> Floats:
+        """``sides`` are cosines of the change of side; the arrays broadcast."""
+        steps = np.rint((sides + 1.0) * (_STEPS / 2)).astype(np.int64)
+        below = likeness - self._means.take(steps, mode="clip")
+        below += self._shift * other_run
+        below *= self._same
+        z = np.minimum(below, 0.0)
+        same = np.maximum(z * z * -0.5, -_WORST)
+        yes, no = self._shares[True], self._shares[False]
+        z = np.minimum(below + _LOOK_ALIKE * self._same, 0.0)
+        different = z * z * -0.5 + np.where(labels_agree, yes[0], no[0])
+        z = (likeness - self._class_mean) * self._class
+        np.maximum(different, z * z * -0.5 + np.where(labels_agree, yes[1], no[1]), out=different)
+        z = likeness * self._other
+        np.maximum(different, z * z * -0.5 + np.where(labels_agree, yes[2], no[2]), out=different)
+        ratios: Floats = same - different
+        return ratios
+
+
+class LookScale:
+    """The mean cosine of different things, learned from pairs with different labels in one picture
+    or in pictures next to each other: nearly all are different things."""
+
+    def __init__(self, stated: float | None) -> None:
+        self._stated = stated
+        self._sum, self._count = 0, 0
+        self._recent: list[tuple[str, Looks]] = []
+
+    def different(self) -> float:
+        """The mean cosine; a guess that a single pair outweighs, at first."""
+        if self._stated is not None:
+            return self._stated
+        total = self._sum / (LOOK_UNIT * LOOK_UNIT) + _FIRST_GUESS * _GUESS_WEIGHT
+        return total / (self._count + _GUESS_WEIGHT)
+
+    def learn(self, labels: Sequence[str], looks: Looks) -> None:
+        """Take in a picture."""
+        if self._stated is not None or self._count >= _ENOUGH_PAIRS:
+            return
+        rows = list(zip(labels, looks, strict=True))
+        both = self._recent + rows
+        dots: list[list[float]] = (np.array([row for _, row in both]) @ looks.T).tolist()
+        before = len(self._recent)
+        for column, label in enumerate(labels):
+            for row in range(before + column):
+                if both[row][0] != label:
+                    self._sum += int(dots[row][column])
+                    self._count += 1
+        self._recent = both[-_RECENT:]
+
+    def dump(self) -> State:
+        """Everything, for a snapshot."""
+        return {
+            "sum": self._sum,
+            "count": self._count,
+            "labels": [label for label, _ in self._recent],
+            "looks": np.array([row for _, row in self._recent], np.float32).astype(np.int16),
+        }
+
+    def load(self, state: State) -> None:
+        """Take over what `dump` gave."""
+        self._sum, self._count = state["sum"], state["count"]
+        rows = state["looks"].astype(np.float32)
+        self._recent = list(zip(state["labels"], rows, strict=True))

@@ -1,0 +1,122 @@
+"""Sights: what one picture says about where the things in it stand, in the map frame.
+
+A sight is a ray from the camera with a usual distance on it. The bearing comes from the box's
+centre in a level pinhole camera, f = width / 2 / tan(hfov / 2); a box that the picture's border
+cuts at a side has a larger bearing error. The distance is log-normal: the usual range, combined by
+precision with the range that the box's height gives where the border cuts it neither at top nor
+bottom and the class has a known size, z = size · f / height. The error of the mapped pose is in
+both directions. So at the distance a the variances are
+
+    along the ray   (spread · a)² + pose²          across it   (bearing · a)² + pose²
+
+A measured depth or position takes the place of the usual range.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eventsrc.envelope import DetId
+from projections.deltas import ObservationOrdinal, Pose
+from projections.evidence import EvidenceConstants
+from projections.exact_functions import cos_sin, log
+from projections.settings import Camera
+
+_CUT_PX = 2.0
+_HALF_DEGREE = 0.008726646259971648
+_LEAST_M = 0.05
+
+
+class Sighting(NamedTuple):
+    """A detection that may be fused. ``vector`` is its unit vector, multiples of 2⁻²⁰ as of
+    `projections.exact.Units`, ``norm2`` its squared norm. ``depth`` is metres along the ray and
+    its standard error; ``position`` is x, y in the map frame and their standard error, metres."""
+
+    observation: ObservationOrdinal
+    det_id: DetId
+    class_name: str
+    vector: NDArray[np.float64]
+    norm2: int
+    bbox: tuple[float, float, float, float]
+    depth: tuple[float, float] | None = None
+    position: tuple[float, float, float] | None = None
+
+
+class Sight(NamedTuple):
+    """From (x, y) along the unit vector (cos, sin). The variance across the ray at the distance a
+    is ``a² · across_per_m2 + across_m2``. ``log_height`` is the logarithm of the box's height over
+    the focal length, along the ray: + log(distance) is that of the thing's height in metres; None
+    where the border cuts it. ``measured`` is a distance and its variance."""
+
+    x: float
+    y: float
+    cos: float
+    sin: float
+    across_per_m2: float
+    across_m2: float
+    log_height: float | None
+    slope: float
+    measured: tuple[float, float] | None
+
+
+class Sights:
+    """Makes the sights of a picture's detections."""
+
+    def __init__(self, constants: EvidenceConstants) -> None:
+        self._constants = constants
+
+    def of(self, pose: Pose, camera: Camera, sightings: Sequence[Sighting]) -> list[Sight]:
+        """The sight of each detection."""
+        x, y = pose.x_um / 1e6, pose.y_um / 1e6
+        cos, sin = cos_sin(pose.yaw_rad + camera.yaw_rad)
+        half_cos, half_sin = cos_sin(camera.hfov_deg * _HALF_DEGREE)
+        focal = camera.width_px * 0.5 * half_cos / half_sin
+        return [self._one(x, y, cos, sin, focal, camera, sighting) for sighting in sightings]
+
+    def _one(
+        self,
+        x: float,
+        y: float,
+        cos: float,
+        sin: float,
+        focal: float,
+        camera: Camera,
+        sighting: Sighting,
+    ) -> Sight:
+        constants = self._constants
+        pose_m2 = constants.pose_m * constants.pose_m
+        if sighting.position is not None:
+            there_x, there_y, error = sighting.position
+            dx, dy = there_x - x, there_y - y
+            far = (dx * dx + dy * dy) ** 0.5
+            if far >= _LEAST_M:
+                cos, sin = dx / far, dy / far
+            var = error * error
+            return Sight(x, y, cos, sin, 0.0, var, None, 0.0, (max(far, _LEAST_M), var))
+        left, top, right, bottom = sighting.bbox
+        aside = camera.width_px * 0.5 - (left + right) * 0.5
+        slant = (focal * focal + aside * aside) ** 0.5
+        ahead, aside = focal / slant, aside / slant
+        is_cut = left <= _CUT_PX or right >= camera.width_px - _CUT_PX
+        bearing = constants.bearing_cut_rad if is_cut else constants.bearing_rad
+        measured, log_height, slope = None, None, 0.0
+        if sighting.depth is not None:
+            depth, error = sighting.depth
+            measured = max(depth, _LEAST_M), error * error + pose_m2
+        height = bottom - top
+        if height > 0.0 and top > _CUT_PX and bottom < camera.height_px - _CUT_PX:
+            log_height = log(height * ahead / focal)
+            slope = (camera.height_px - top - bottom) * 0.5 * ahead / focal
+        return Sight(
+            x,
+            y,
+            cos * ahead - sin * aside,
+            sin * ahead + cos * aside,
+            bearing * bearing,
+            pose_m2,
+            log_height,
+            slope,
+            measured,
+        )

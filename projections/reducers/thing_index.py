@@ -1,0 +1,214 @@
+"""All Objects of fusion by evidence, found by where they stand.
+
+An Object is within reach of a point at most ``reach_m`` from its estimate. Each is listed in the
+nine cells of that side around its estimate, so one look-up finds all that are within reach.
+"""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from eventsrc.envelope import Offset
+from projections.deltas import ObjectEstimated, ObjectOrdinal
+from projections.evidence import EvidenceConstants
+from projections.exact_functions import exp
+from projections.reducers import State, part, prefixed
+
+from .agreement import ESTIMATE_FIELDS
+from .class_heights import ClassHeights
+from .looks import Floats
+from .spots import Estimate, Solver, Spots
+from .things import Thing
+
+_REACH_SPREADS = 1.8
+_UM, _UM2 = 1e6, 1e12
+
+
+class ThingIndex:
+    """Objects by ordinal, their estimates as one matrix, and the grid. Absorbed ones are None."""
+
+    def __init__(self, constants: EvidenceConstants) -> None:
+        self._reach_m = constants.range_m * exp(_REACH_SPREADS * constants.range_spread)
+        self._solver = Solver(constants.range_m, constants.range_spread)
+        self._heights = ClassHeights(constants.sizes_m, constants.size_spread)
+        self._things: list[Thing | None] = []
+        self._survivors: dict[ObjectOrdinal, ObjectOrdinal] = {}
+        self._near: dict[tuple[int, int], list[ObjectOrdinal]] = {}
+        self.estimates: Floats = np.zeros((64, ESTIMATE_FIELDS))
+
+    def thing(self, ordinal: ObjectOrdinal) -> Thing:
+        """An Object that is not absorbed."""
+        thing = self._things[ordinal]
+        if thing is None:
+            raise KeyError(f"object {ordinal} was merged into {self._survivors[ordinal]}")
+        return thing
+
+    def survivor_of(self, ordinal: ObjectOrdinal) -> ObjectOrdinal:
+        """The Object that it is part of now."""
+        while ordinal in self._survivors:
+            ordinal = self._survivors[ordinal]
+        return ordinal
+
+    def add(self, thing: Thing) -> ObjectOrdinal:
+        """Enter a new Object; `solve` must follow."""
+        ordinal = ObjectOrdinal(len(self._things))
+        self._things.append(thing)
+        if ordinal >= len(self.estimates):
+            self.estimates = np.concatenate([self.estimates, np.zeros_like(self.estimates)])
+        return ordinal
+
+    def solve(self, ordinal: ObjectOrdinal) -> None:
+        """Estimate anew where an Object stands, and list it there."""
+        thing = self.thing(ordinal)
+        prior = self._heights.prior(thing.class_name)
+        is_new = thing.estimate is None
+        thing.estimate = made = self._solver.solve(thing.spots.spots, prior, thing.estimate)
+        self.estimates[ordinal] = made
+        cell = int(made.x // self._reach_m), int(made.y // self._reach_m)
+        if is_new or cell != thing.cell:
+            if not is_new:
+                self._unlist(ordinal, thing.cell)
+            self._list(ordinal, thing, cell)
+        thing.given = self._heights.give(
+            thing.given,
+            thing.class_name,
+            made.log_size,
+            made.log_size_variance,
+            made.elevation,
+            made.xx + made.yy,
+            thing.spots.seen_from,
+        )
+
+    def near(self, x: float, y: float) -> list[ObjectOrdinal]:
+        """The Objects within reach of a point, ascending."""
+        reach = self._reach_m
+        listed = sorted(self._near.get((int(x // reach), int(y // reach)), ()))
+        if not listed:
+            return listed
+        rows = self.estimates[listed]
+        dx, dy = rows[:, 0] - x, rows[:, 1] - y
+        is_near: list[bool] = (dx * dx + dy * dy <= reach * reach).tolist()
+        return [ordinal for ordinal, near in zip(listed, is_near, strict=True) if near]
+
+    def count_meetings(self, seen: list[ObjectOrdinal]) -> None:
+        """One picture shows them all."""
+        for index, one in enumerate(seen):
+            for other in seen[:index]:
+                if one != other:
+                    for a, b in ((one, other), (other, one)):
+                        met = self.thing(a).met
+                        met[b] = met.get(b, 0) + 1
+
+    def unite(self, survivor: ObjectOrdinal, absorbed: ObjectOrdinal) -> bool:
+        """Merge two Objects; whether the survivor's class is another one now."""
+        thing, other = self.thing(survivor), self.thing(absorbed)
+        self._unlist(absorbed, other.cell)
+        if other.given is not None:
+            self._heights.take_back(other.given)
+        self._things[absorbed] = None
+        self._survivors[absorbed] = survivor
+        is_renamed = thing.absorb(other)
+        thing.met.pop(absorbed, None)
+        for third, count in other.met.items():
+            met = self.thing(third).met
+            del met[absorbed]
+            if third != survivor:
+                thing.met[third] = met[survivor] = thing.met.get(third, 0) + count
+        self.solve(survivor)
+        return is_renamed
+
+    def estimated(self, offset: Offset, ordinal: ObjectOrdinal) -> ObjectEstimated:
+        """The delta of an Object's estimate."""
+        x, y, xx, xy, yy = self.estimates[ordinal, :5].tolist()
+        spots = self.thing(ordinal).spots.seen_from
+        return ObjectEstimated(
+            offset,
+            ordinal,
+            round(x * _UM),
+            round(y * _UM),
+            round(xx * _UM2),
+            round(xy * _UM2),
+            round(yy * _UM2),
+            spots,
+        )
+
+    def _list(self, ordinal: ObjectOrdinal, thing: Thing, cell: tuple[int, int]) -> None:
+        thing.cell = cell
+        for around in _around(cell):
+            self._near.setdefault(around, []).append(ordinal)
+
+    def _unlist(self, ordinal: ObjectOrdinal, cell: tuple[int, int]) -> None:
+        for around in _around(cell):
+            self._near[around].remove(ordinal)
+
+    def dump(self) -> State:
+        """Everything, for a snapshot. The looks are one matrix, a row for each exemplar."""
+        alive = [(o, thing) for o, thing in enumerate(self._things) if thing is not None]
+        things = [thing for _, thing in alive]
+        looks = [thing.looks[: thing.exemplars] for thing in things]
+        marks = [thing.marks[: thing.exemplars] for thing in things]
+        spots = [spot for thing in things for spot in thing.spots.spots]
+        return {
+            "size": len(self._things),
+            "survivors": sorted(map(list, self._survivors.items())),
+            "ordinals": [ordinal for ordinal, _ in alive],
+            "sums": [
+                [t.count, t.sum_x_um, t.sum_y_um, t.checked, t.exemplars, len(t.spots.spots)]
+                for t in things
+            ],
+            "spots_ever": [thing.spots.seen_from for thing in things],
+            "seen": np.array([(t.first_seen, t.last_seen) for t in things]).reshape(-1, 2),
+            "classes": [[t.class_name, *map(list, t.classes.items())] for t in things],
+            "met": [sorted(map(list, thing.met.items())) for thing in things],
+            "groups": [sorted(thing.groups) for thing in things],
+            "given": [thing.given for thing in things],
+            "estimates": np.array([thing.estimate for thing in things]),
+            "spots": np.array(spots),
+            "looks": np.concatenate(looks).astype(np.int16) if looks else np.zeros((0, 0)),
+            "marks": np.concatenate(marks) if marks else np.zeros((0, 5)),
+        } | prefixed("heights", self._heights.dump())
+
+    def load(self, state: State) -> None:
+        """Take over what `dump` gave."""
+        self._things = [None] * state["size"]
+        self._survivors = {ObjectOrdinal(a): ObjectOrdinal(b) for a, b in state["survivors"]}
+        self._heights.load(part("heights", state))
+        while len(self.estimates) < state["size"]:
+            self.estimates = np.concatenate([self.estimates, np.zeros_like(self.estimates)])
+        looks, marks, spots = state["looks"], state["marks"], state["spots"].tolist()
+        seen, estimates = state["seen"].tolist(), state["estimates"].tolist()
+        first_look = first_spot = 0
+        for row, ordinal in enumerate(state["ordinals"]):
+            count, x, y, checked, exemplars, spot_count = state["sums"][row]
+            name, *classes = state["classes"][row]
+            given = state["given"][row]
+            thing = Thing(
+                count,
+                x,
+                y,
+                seen[row][0],
+                seen[row][1],
+                name,
+                dict(classes),
+                Spots(spots[first_spot : first_spot + spot_count], state["spots_ever"][row]),
+                looks[first_look : first_look + exemplars].astype(np.float32),
+                marks[first_look : first_look + exemplars].copy(),
+                exemplars=exemplars,
+                met={ObjectOrdinal(other): n for other, n in state["met"][row]},
+                checked=checked,
+                given=None if given is None else (given[0], given[1], given[2]),
+                estimate=Estimate(*estimates[row]),
+                groups=set(state["groups"][row]),
+            )
+            first_look, first_spot = first_look + exemplars, first_spot + spot_count
+            self._things[ordinal] = thing
+            self.estimates[ordinal] = estimates[row]
+            cell = (
+                int(estimates[row][0] // self._reach_m),
+                int(estimates[row][1] // self._reach_m),
+            )
+            self._list(ObjectOrdinal(ordinal), thing, cell)
+
+
+def _around(cell: tuple[int, int]) -> Iterable[tuple[int, int]]:
+    return ((cell[0] + dx, cell[1] + dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1))
