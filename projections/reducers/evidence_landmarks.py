@@ -106,7 +106,7 @@ class EvidenceLandmarks:
         chosen = self._choose(run, pose, labels, looks, inverses, sights, sightings)
         deltas: list[LandmarkDelta] = []
         seen: list[ObjectOrdinal] = []
-        renamed: set[ObjectOrdinal] = set()
+        named: dict[ObjectOrdinal, str] = {}  # the classes before
         to_unite: list[tuple[ObjectOrdinal, ObjectOrdinal]] = []
         for k, sighting in enumerate(sightings):
             wanted, cosine = chosen[k]
@@ -114,12 +114,12 @@ class EvidenceLandmarks:
             own = None if group is None else self._object_of.get(group)
             if group is not None:
                 wanted = self._allowed(group, own, wanted)
-            ordinal, found = self._take(offset, sighting, wanted, pose, timestamp, renamed)
+            ordinal, found = self._take(offset, sighting, wanted, pose, timestamp, named)
             deltas += found
             thing = self._index.thing(ordinal)
             sight = sights[k]
             thing.spots.add(sight)
-            thing.keep(looks[k], float(inverses[k]), sight.cos, sight.sin, run)
+            thing.keep(looks[k], float(inverses[k]), sight.side_cos, sight.side_sin, run)
             self._index.solve(ordinal)
             seen.append(ordinal)
             deltas.append(
@@ -146,15 +146,16 @@ class EvidenceLandmarks:
         for pair in to_unite:
             one, other = map(self._index.survivor_of, pair)
             if one != other:
-                deltas.append(self._unite(offset, one, other, changed, renamed, None))
+                deltas.append(self._unite(offset, one, other, changed, named, None))
         for ordinal in sorted(changed):
             partner = self._merging.partner_of(ordinal) if ordinal in changed else None
             if partner is not None:
                 other, why = partner
-                deltas.append(self._unite(offset, ordinal, other, changed, renamed, why))
-        for ordinal in sorted(renamed):
+                deltas.append(self._unite(offset, ordinal, other, changed, named, why))
+        for ordinal in sorted(changed):
             class_name = self._index.thing(ordinal).class_name
-            deltas.append(ObjectClassified(offset, ordinal, class_name))
+            if class_name != named[ordinal]:
+                deltas.append(ObjectClassified(offset, ordinal, class_name))
         deltas += [self._index.estimated(offset, ordinal) for ordinal in sorted(changed)]
         return deltas
 
@@ -193,7 +194,7 @@ class EvidenceLandmarks:
         wanted: ObjectOrdinal | None,
         pose: Pose,
         timestamp: float,
-        renamed: set[ObjectOrdinal],
+        named: dict[ObjectOrdinal, str],
     ) -> tuple[ObjectOrdinal, list[ObjectFound]]:
         """Add the observation to the wanted Object's sums, or found one."""
         label = sighting.class_name
@@ -201,6 +202,7 @@ class EvidenceLandmarks:
             times = timestamp, timestamp
             thing = Thing(1, pose.x_um, pose.y_um, *times, label, {label: 1}, Spots())
             ordinal = self._index.add(thing)
+            named[ordinal] = label
             identity = object_id(sighting.det_id)
             return ordinal, [ObjectFound(offset, ordinal, identity, label, sighting.observation)]
         thing = self._index.thing(wanted)
@@ -209,14 +211,14 @@ class EvidenceLandmarks:
                 f"object {wanted} of class {thing.class_name!r} has {MAX_IN_A_SUM} observations, "
                 "the bound of its exact arithmetic"
             )
+        named.setdefault(wanted, thing.class_name)
         thing.count += 1
         thing.sum_x_um += pose.x_um
         thing.sum_y_um += pose.y_um
         thing.first_seen = min(thing.first_seen, timestamp)
         thing.last_seen = max(thing.last_seen, timestamp)
         thing.classes[label] = thing.classes.get(label, 0) + 1
-        if thing.reclassify():
-            renamed.add(wanted)
+        thing.reclassify()
         return wanted, []
 
     def _unite(
@@ -225,16 +227,15 @@ class EvidenceLandmarks:
         one: ObjectOrdinal,
         other: ObjectOrdinal,
         changed: set[ObjectOrdinal],
-        renamed: set[ObjectOrdinal],
+        named: dict[ObjectOrdinal, str],
         evidence: MergeEvidence | None,
     ) -> ObjectsMerged:
         """Merge two Objects; the one founded first survives."""
         survivor, absorbed = min(one, other), max(one, other)
         moved = self._index.thing(absorbed).groups
         self._object_of |= dict.fromkeys(moved, survivor)
-        if self._index.unite(survivor, absorbed):
-            renamed.add(survivor)
-        renamed.discard(absorbed)
+        named.setdefault(survivor, self._index.thing(survivor).class_name)
+        self._index.unite(survivor, absorbed)
         changed.discard(absorbed)
         changed.add(survivor)
         thing = self._index.thing(survivor)
@@ -314,7 +315,7 @@ class EvidenceLandmarks:
         cosines = dots * marks[:, :, INVERSE, np.newaxis] * inverses
         different = self._scale.different()
         likeness = (cosines - different) * (1.0 / (1.0 - different))
-        directions = np.array([(sight.cos, sight.sin) for sight in sights])
+        directions = np.array([(sight.side_cos, sight.side_sin) for sight in sights])
         sides = (
             marks[:, :, SIDE_COS, np.newaxis] * directions[:, 0]
             + marks[:, :, SIDE_SIN, np.newaxis] * directions[:, 1]

@@ -7,6 +7,8 @@ their labels; unless more than a tenth of the pictures of one show both, or a co
 apart. The best one is taken, of equal ones that founded first.
 """
 
+import math
+
 import numpy as np
 
 from eventsrc.envelope import DetId
@@ -78,7 +80,7 @@ class Merging:
                 evidence = MergeEvidence(
                     round(look * 1000.0),
                     round(float(geometry[row]) * 1000.0),
-                    round((dx[row] * dx[row] + dy[row] * dy[row]) ** 0.5 * 1e6),
+                    round(math.sqrt(dx[row] * dx[row] + dy[row] * dy[row]) * 1e6),
                     both,
                     thing.count + other.count - both,
                 )

@@ -1,17 +1,16 @@
 """Sights: what one picture says about where the things in it stand, in the map frame.
 
-A sight is a ray from the camera with a usual distance on it. The bearing comes from the box's
-centre in a level pinhole camera, f = width / 2 / tan(hfov / 2); a box that the picture's border
-cuts at a side has a larger bearing error. The distance is log-normal: the usual range, combined by
-precision with the range that the box's height gives where the border cuts it neither at top nor
-bottom and the class has a known size, z = size · f / height. The error of the mapped pose is in
-both directions. So at the distance a the variances are
+A sight is a ray from the camera. Its bearing comes from the box's centre in a level pinhole camera,
+f = width / 2 / tan(hfov / 2); a box that the picture's border cuts at a side has a larger bearing
+error. The error of the mapped pose is in it too, so at the distance a the variance across the ray
+is (bearing error · a)² + (pose error)².
 
-    along the ray   (spread · a)² + pose²          across it   (bearing · a)² + pose²
-
-A measured depth or position takes the place of the usual range.
+The box's height and its centre's height above the horizon, where the border cuts it neither at top
+nor at bottom, tell about the distance once they are compared (`spots`). A measured depth or
+position of the detection tells it directly.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -48,7 +47,8 @@ class Sight(NamedTuple):
     """From (x, y) along the unit vector (cos, sin). The variance across the ray at the distance a
     is ``a² · across_per_m2 + across_m2``. ``log_height`` is the logarithm of the box's height over
     the focal length, along the ray: + log(distance) is that of the thing's height in metres; None
-    where the border cuts it. ``measured`` is a distance and its variance."""
+    where the border cuts it. (side_cos, side_sin) is the direction that tells from which side
+    the thing is seen, by line of sight or heading. ``measured`` is a distance and its variance."""
 
     x: float
     y: float
@@ -58,6 +58,8 @@ class Sight(NamedTuple):
     across_m2: float
     log_height: float | None
     slope: float
+    side_cos: float
+    side_sin: float
     measured: tuple[float, float] | None
 
 
@@ -66,6 +68,7 @@ class Sights:
 
     def __init__(self, constants: EvidenceConstants) -> None:
         self._constants = constants
+        self._by_heading = constants.side_by == "heading"
 
     def of(self, pose: Pose, camera: Camera, sightings: Sequence[Sighting]) -> list[Sight]:
         """The sight of each detection."""
@@ -90,33 +93,40 @@ class Sights:
         if sighting.position is not None:
             there_x, there_y, error = sighting.position
             dx, dy = there_x - x, there_y - y
-            far = (dx * dx + dy * dy) ** 0.5
+            side = cos, sin
+            far = math.sqrt(dx * dx + dy * dy)
             if far >= _LEAST_M:
                 cos, sin = dx / far, dy / far
+                if not self._by_heading:
+                    side = cos, sin
             var = error * error
-            return Sight(x, y, cos, sin, 0.0, var, None, 0.0, (max(far, _LEAST_M), var))
+            measured = max(far, _LEAST_M), var
+            return Sight(x, y, cos, sin, 0.0, var, None, 0.0, *side, measured)
         left, top, right, bottom = sighting.bbox
         aside = camera.width_px * 0.5 - (left + right) * 0.5
-        slant = (focal * focal + aside * aside) ** 0.5
+        slant = math.sqrt(focal * focal + aside * aside)
         ahead, aside = focal / slant, aside / slant
         is_cut = left <= _CUT_PX or right >= camera.width_px - _CUT_PX
         bearing = constants.bearing_cut_rad if is_cut else constants.bearing_rad
-        measured, log_height, slope = None, None, 0.0
+        log_height, slope, known = None, 0.0, None
         if sighting.depth is not None:
             depth, error = sighting.depth
-            measured = max(depth, _LEAST_M), error * error + pose_m2
+            known = max(depth, _LEAST_M), error * error + pose_m2
         height = bottom - top
         if height > 0.0 and top > _CUT_PX and bottom < camera.height_px - _CUT_PX:
             log_height = log(height * ahead / focal)
             slope = (camera.height_px - top - bottom) * 0.5 * ahead / focal
+        to_cos, to_sin = cos * ahead - sin * aside, sin * ahead + cos * aside
         return Sight(
             x,
             y,
-            cos * ahead - sin * aside,
-            sin * ahead + cos * aside,
+            to_cos,
+            to_sin,
             bearing * bearing,
             pose_m2,
             log_height,
             slope,
-            measured,
+            cos if self._by_heading else to_cos,
+            sin if self._by_heading else to_sin,
+            known,
         )

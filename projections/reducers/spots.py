@@ -19,6 +19,7 @@ eliminated (Schur's complement). A residual beyond about two standard errors wei
 +, −, ×, ÷ in one fixed order: the same bits on every machine.
 """
 
+import math
 from typing import NamedTuple
 
 from projections.exact_functions import log
@@ -104,7 +105,7 @@ class Spots:
         share = new[_WEIGHT] / total
         for index in range(_WEIGHT):
             nearest[index] += (new[index] - nearest[index]) * share
-        length = (nearest[2] * nearest[2] + nearest[3] * nearest[3]) ** 0.5
+        length = math.sqrt(nearest[2] * nearest[2] + nearest[3] * nearest[3])
         if length > 0.0:
             nearest[2] /= length
             nearest[3] /= length

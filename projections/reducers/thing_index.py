@@ -99,23 +99,22 @@ class ThingIndex:
                         met = self.thing(a).met
                         met[b] = met.get(b, 0) + 1
 
-    def unite(self, survivor: ObjectOrdinal, absorbed: ObjectOrdinal) -> bool:
-        """Merge two Objects; whether the survivor's class is another one now."""
+    def unite(self, survivor: ObjectOrdinal, absorbed: ObjectOrdinal) -> None:
+        """Merge two Objects."""
         thing, other = self.thing(survivor), self.thing(absorbed)
         self._unlist(absorbed, other.cell)
         if other.given is not None:
             self._heights.take_back(other.given)
         self._things[absorbed] = None
         self._survivors[absorbed] = survivor
-        is_renamed = thing.absorb(other)
+        thing.absorb(other)
         thing.met.pop(absorbed, None)
         for third, count in other.met.items():
-            met = self.thing(third).met
-            del met[absorbed]
             if third != survivor:
+                met = self.thing(third).met
+                del met[absorbed]
                 thing.met[third] = met[survivor] = thing.met.get(third, 0) + count
         self.solve(survivor)
-        return is_renamed
 
     def estimated(self, offset: Offset, ordinal: ObjectOrdinal) -> ObjectEstimated:
         """The delta of an Object's estimate."""

@@ -61,14 +61,12 @@ class Thing:
         self.marks[count] = inverse, cos, sin, run, kind
         self.exemplars = count + 1
 
-    def reclassify(self) -> bool:
-        """Take the class of most observations, the one seen first where two tie; whether that is
-        another one than before."""
-        before, self.class_name = self.class_name, max(self.classes, key=self.classes.__getitem__)
-        return before != self.class_name
+    def reclassify(self) -> None:
+        """Take the class of most observations, the one seen first where two tie."""
+        self.class_name = max(self.classes, key=self.classes.__getitem__)
 
-    def absorb(self, other: "Thing") -> bool:
-        """Take over all that another thing has; whether the class is another one now."""
+    def absorb(self, other: "Thing") -> None:
+        """Take over all that another thing has."""
         self.count += other.count
         self.sum_x_um += other.sum_x_um
         self.sum_y_um += other.sum_y_um
@@ -82,7 +80,7 @@ class Thing:
             other.looks[: other.exemplars], other.marks[: other.exemplars].tolist(), strict=True
         ):
             self.keep(look, mark[INVERSE], mark[SIDE_COS], mark[SIDE_SIN], int(mark[RUN]))
-        return self.reclassify()
+        self.reclassify()
 
     def _drop(self, index: int) -> int:
         last = self.exemplars - 1

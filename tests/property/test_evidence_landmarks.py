@@ -1,0 +1,175 @@
+"""Fusion by evidence on made-up rooms: rules that hold for any input."""
+
+import json
+from collections import Counter
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from eventsrc.envelope import DetId
+from projections.deltas import (
+    ObjectClassified,
+    ObjectEstimated,
+    ObjectFound,
+    ObjectOrdinal,
+    ObjectSeen,
+    ObjectsMerged,
+    ObservationOrdinal,
+)
+from projections.evidence import EvidenceConstants
+from projections.pair_groups import PairGroups
+from projections.reducers import State
+from projections.reducers.evidence_landmarks import EvidenceLandmarks, LandmarkDelta
+from tests.evidence_pictures import Picture, a_room, fold_all, fold_one, pictures_of
+
+_SEEDS = st.integers(0, 10_000)
+
+
+def _assignment(deltas: list[LandmarkDelta]) -> dict[ObservationOrdinal, ObjectOrdinal]:
+    """The Object of each observation after all deltas."""
+    of: dict[ObservationOrdinal, ObjectOrdinal] = {}
+    for delta in deltas:
+        if isinstance(delta, ObjectSeen):
+            of[delta.observation] = delta.object
+        elif isinstance(delta, ObjectsMerged):
+            for observation, ordinal in of.items():
+                if ordinal == delta.absorbed:
+                    of[observation] = delta.survivor
+    return of
+
+
+def _through_json(state: State) -> State:
+    """As a snapshot keeps it: arrays as they are, the rest as JSON."""
+    return {
+        key: value if isinstance(value, np.ndarray) else json.loads(json.dumps(value))
+        for key, value in state.items()
+    }
+
+
+@settings(max_examples=15, deadline=None)
+@given(_SEEDS, st.integers(0, 40))
+def test_a_dump_taken_anywhere_goes_on_as_if_nothing_had_happened(seed: int, cut: int) -> None:
+    pictures = pictures_of(a_room(seed), seed, 40)
+    landmarks = EvidenceLandmarks(EvidenceConstants())
+    before = [delta for picture in pictures[:cut] for delta in fold_one(landmarks, picture)]
+    other = EvidenceLandmarks(EvidenceConstants())
+    other.load(_through_json(landmarks.dump()))
+    after = [delta for picture in pictures[cut:] for delta in fold_one(other, picture)]
+    assert before + after == fold_all(pictures)
+
+
+@settings(max_examples=15, deadline=None)
+@given(_SEEDS)
+def test_two_things_in_one_picture_are_never_one(seed: int) -> None:
+    pictures = pictures_of(a_room(seed, 12), seed, 40)
+    landmarks = EvidenceLandmarks(EvidenceConstants())
+    for picture in pictures:
+        seen = [d.object for d in fold_one(landmarks, picture) if isinstance(d, ObjectSeen)]
+        assert len(set(seen)) == len(seen) == len(picture.sightings)
+
+
+@settings(max_examples=15, deadline=None)
+@given(_SEEDS)
+def test_deltas_are_complete_and_in_order(seed: int) -> None:
+    pictures = pictures_of(a_room(seed, 12), seed, 60)
+    landmarks = EvidenceLandmarks(EvidenceConstants())
+    alive: set[ObjectOrdinal] = set()
+    members: Counter[ObjectOrdinal] = Counter()
+    labels: dict[ObjectOrdinal, list[str]] = {}
+    classes: dict[ObjectOrdinal, str] = {}
+    for picture in pictures:
+        deltas = fold_one(landmarks, picture)
+        kinds = [type(delta).__name__ for delta in deltas]
+        order = ["ObjectsMerged", "ObjectClassified", "ObjectEstimated"]
+        later = [order.index(kind) for kind in kinds if kind in order]
+        assert later == sorted(later)
+        assert [d.observation for d in deltas if isinstance(d, ObjectSeen)] == [
+            sighting.observation for sighting in picture.sightings
+        ]
+        label_of = {s.observation: s.class_name for s in picture.sightings}
+        changed: set[ObjectOrdinal] = set()
+        for delta in deltas:
+            if isinstance(delta, ObjectFound):
+                assert delta.object == len(classes)
+                alive.add(delta.object)
+                classes[delta.object] = delta.class_name
+                labels[delta.object] = []
+            elif isinstance(delta, ObjectSeen):
+                members[delta.object] += 1
+                assert delta.obs_count == members[delta.object]
+                labels[delta.object].append(label_of[delta.observation])
+                changed.add(delta.object)
+            elif isinstance(delta, ObjectsMerged):
+                assert delta.survivor < delta.absorbed
+                assert delta.evidence is not None
+                alive.remove(delta.absorbed)
+                members[delta.survivor] += members.pop(delta.absorbed)
+                assert delta.obs_count == members[delta.survivor]
+                labels[delta.survivor] += labels.pop(delta.absorbed)
+                changed.add(delta.survivor)
+                changed.discard(delta.absorbed)
+            elif isinstance(delta, ObjectClassified):
+                assert classes[delta.object] != delta.class_name
+                classes[delta.object] = delta.class_name
+        estimated = [delta for delta in deltas if isinstance(delta, ObjectEstimated)]
+        assert [delta.object for delta in estimated] == sorted(changed)
+        for delta in estimated:
+            assert delta.object in alive
+            assert delta.var_xx_um2 * delta.var_yy_um2 > delta.var_xy_um2**2
+        for ordinal in alive:
+            counts = Counter(labels[ordinal])
+            assert counts[classes[ordinal]] == max(counts.values())
+
+
+@settings(max_examples=10, deadline=None)
+@given(_SEEDS, st.data())
+def test_commands_are_obeyed(seed: int, data: st.DataObject) -> None:
+    pictures = pictures_of(a_room(seed, 6), seed, 40)
+    det_ids = [s.det_id for picture in pictures for s in picture.sightings]
+    number = {det_id: index for index, det_id in enumerate(det_ids)}
+    if len(det_ids) < 4:
+        return
+    named = st.sampled_from(det_ids)
+    same = data.draw(st.lists(st.tuples(named, named), max_size=4))
+    same_groups = PairGroups[DetId](same, [])
+    apart = [
+        (a, b)
+        for a, b in data.draw(st.lists(st.tuples(named, named), max_size=4))
+        if a != b
+        and (
+            a not in same_groups.group_of or same_groups.group_of[a] != same_groups.group_of.get(b)
+        )
+    ]
+    of = _assignment(fold_all(pictures, PairGroups(same, apart)))
+    for a, b in same:
+        assert of[ObservationOrdinal(number[a])] == of[ObservationOrdinal(number[b])]
+    for a, b in apart:
+        assert of[ObservationOrdinal(number[a])] != of[ObservationOrdinal(number[b])]
+
+
+def test_it_finds_the_things_of_a_room_where_they_stand() -> None:
+    room = a_room(3, 8)
+    pictures = pictures_of(room, 3, 120)
+    deltas = fold_all(pictures)
+    truth = _truth(pictures)
+    of = _assignment(deltas)
+    pairs = Counter((truth[observation], ordinal) for observation, ordinal in of.items())
+    wrong = sum(pairs.values()) - sum(
+        max(n for (thing, _), n in pairs.items() if thing == one) for one in set(truth.values())
+    )
+    assert wrong <= 0.03 * len(of)
+    last = {d.object: d for d in deltas if isinstance(d, ObjectEstimated)}
+    for (thing, ordinal), count in pairs.items():
+        if count >= 10:
+            where = last[ordinal]
+            assert abs(where.x_um / 1e6 - room[thing].x) < 0.15
+            assert abs(where.y_um / 1e6 - room[thing].y) < 0.15
+
+
+def _truth(pictures: list[Picture]) -> dict[ObservationOrdinal, int]:
+    return {
+        sighting.observation: thing
+        for picture in pictures
+        for sighting, thing in zip(picture.sightings, picture.things, strict=True)
+    }
