@@ -137,7 +137,8 @@ def same_object(current: CurrentMap, stamp: Stamp, first: str, second: str) -> S
     if one.object == other.object:
         raise EditRefused(f"{first} and {second} are one object already")
     check_same(current, one.det_id, other.det_id)
-    if one.class_name != other.class_name:
+    is_voted = current.settings.fusion == "evidence"  # then classes of one object may differ
+    if one.class_name != other.class_name and not is_voted:
         raise EditRefused(
             f"{first} is a {one.class_name!r} and {second} a {other.class_name!r}; only objects of "
             "one class can be one"

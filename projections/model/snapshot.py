@@ -44,7 +44,7 @@ from .records import (
 from .view import MapView
 
 MAGIC = b"mapfold snapshot 1\n"
-_TYPES = frozenset({"<i4", "<i8", "<f8", "|u1", "<u4", "|i1"})
+_TYPES = frozenset({"<i2", "<i4", "<i8", "<f4", "<f8", "|u1", "<u4", "|i1"})
 _LENGTH_BYTES = 8
 _MAX_RATIO = 16
 _ALWAYS_ALLOWED_BYTES = 64 * 1024 * 1024

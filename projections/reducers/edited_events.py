@@ -1,7 +1,9 @@
 """Corrections of single events: an envelope as it would be, had the robot known better.
 
 An event is corrected before it is folded, so the map is that of a log with the corrected events:
-without forgotten keyframes, without dropped detections, with the corrected poses written in.
+without forgotten keyframes, without dropped detections, with the corrected poses written in. A
+position of a detection is of the pose that the robot had, so it moves and turns with that pose; in
+a keyframe that had none it is left out.
 """
 
 import math
@@ -9,12 +11,15 @@ import shlex
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from eventsrc.envelope import MAX_POSITION_M, DetId, Offset
+from eventsrc.envelope import MAX_POSITION_M, Detection, DetId, Envelope, Offset
 from eventsrc.ingest import Accepted
 from eventsrc.text import visible
 from projections.corrections import Corrections
 from projections.errors import ImpossibleCommand
 from projections.exact import Units
+from projections.exact_functions import cos_sin
+
+from .envelope_evidence import small_angle
 
 
 class EditedEvent(NamedTuple):
@@ -75,8 +80,28 @@ def _with_pose(corrections: Corrections, offset: Offset, accepted: Accepted) -> 
             f"beyond ±{MAX_POSITION_M:,.0f} m; take it back: "
             f"mapfold edit LOG undo {shlex.quote(command_id)} --reason …",
         )
-    moved = envelope.model_copy(update={"map_x": x, "map_y": y, "map_yaw": yaw})
+    update: dict[str, object] = {"map_x": x, "map_y": y, "map_yaw": yaw}
+    if any(detection.position is not None for detection in envelope.detections):
+        update["detections"] = _with_positions(envelope, pose)
+    moved = envelope.model_copy(update=update)
     return Accepted(moved, accepted.det_ids, accepted.vectors)
+
+
+def _with_positions(envelope: Envelope, pose: tuple[float, float, float]) -> tuple[Detection, ...]:
+    """The detections, their positions moved as the pose is."""
+    old_x, old_y, old_yaw = envelope.map_x, envelope.map_y, envelope.map_yaw
+    if old_x is None or old_y is None or old_yaw is None:
+        return tuple(d.model_copy(update={"position": None}) for d in envelope.detections)
+    x, y, yaw = pose
+    cos, sin = cos_sin(small_angle(yaw) - small_angle(old_yaw))
+    moved = []
+    for detection in envelope.detections:
+        if detection.position is not None:
+            dx, dy = detection.position[0] - old_x, detection.position[1] - old_y
+            position = x + (cos * dx - sin * dy), y + (sin * dx + cos * dy)
+            detection = detection.model_copy(update={"position": position})
+        moved.append(detection)
+    return tuple(moved)
 
 
 def is_in_bounds(pose: tuple[float, float, float]) -> bool:

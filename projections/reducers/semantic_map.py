@@ -8,7 +8,8 @@ Per keyframe, in this order:
 2.  The run, the keyframe and its observations are added. An observation whose det_id an earlier
     keyframe has is left out and reported.
 3.  With a pose, the keyframe goes to places, and its observations in the map's embedding space go
-    to landmarks. A keyframe without a pose is only kept.
+    to landmarks: one by one under the page's rule, all together under fusion by evidence. A
+    keyframe without a pose is only kept.
 4.  Names of places, located-in and adjacency are told what places and landmarks changed, in order,
     and give the deltas that follow from it.
 
@@ -19,9 +20,6 @@ from collections.abc import Sequence
 from functools import reduce
 from operator import or_
 from typing import TypeAlias
-
-import numpy as np
-from numpy.typing import NDArray
 
 from eventsrc.envelope import FIRST_OFFSET, DetId, Offset, RunId
 from eventsrc.ingest import Accepted
@@ -56,16 +54,17 @@ from .constrained_places import ConstrainedPlaces
 from .core_index import CoreIndex
 from .edited_events import edit_event, edits_events
 from .embedding_space import Space
+from .envelope_evidence import camera_of, sightings_of, with_small_yaw
+from .evidence_landmarks import EvidenceLandmarks
 from .folded_ids import FoldedIds, content_digest
+from .fusible import FusibleObservation
 from .landmarks import Landmarks
 from .located_in import LocatedIn
 from .place_names import PlaceNames
 from .places import Places
 from .rule_index import RuleCoreIndex
 
-FusibleObservation: TypeAlias = tuple[ObservationOrdinal, DetId, str, NDArray[np.float64], int]
-"""Ordinal, det_id, class name, unit vector of the map's space, its squared norm."""
-Reducer: TypeAlias = FoldedIds | Places | Landmarks | LocatedIn | Adjacency
+Reducer: TypeAlias = FoldedIds | Places | Landmarks | EvidenceLandmarks | LocatedIn | Adjacency
 
 
 class SemanticMap:
@@ -102,12 +101,7 @@ class SemanticMap:
             groups = PairGroups(corrections.joined, corrections.apart)
             self._anchored = ConstrainedPlaces(core_index, groups)
         self.places = self._anchored or Places(core_index)
-        limits = settings.fusion_radius_m, settings.fusion_similarity
-        self._named_landmarks = None
-        if corrections.same or corrections.different:
-            named = PairGroups(corrections.same, corrections.different)
-            self._named_landmarks = ConstrainedLandmarks(*limits, named)
-        self.landmarks = self._named_landmarks or Landmarks(*limits)
+        self.landmarks = _landmarks(settings, corrections)
         self.located_in = LocatedIn()
         self.adjacency = Adjacency()
         self.observation_count = 0
@@ -169,7 +163,16 @@ class SemanticMap:
         fusible = self._observe(offset, keyframe, accepted, units, deltas)
         if pose is not None:
             place = self._place(offset, keyframe, run, envelope.run_id, pose, deltas)
-            self._fuse(offset, keyframe, place, pose, fusible, envelope.timestamp, deltas)
+            landmarks, timestamp = self.landmarks, envelope.timestamp
+            if isinstance(landmarks, EvidenceLandmarks):
+                camera = camera_of(envelope, self.settings.camera)
+                seen = sightings_of(accepted, fusible)
+                facing = with_small_yaw(pose)
+                fused = landmarks.fold(offset, run, timestamp, facing, camera, seen)
+                self._locate(fused, keyframe, place)
+                deltas += fused
+            else:
+                self._fuse(landmarks, offset, keyframe, place, pose, fusible, timestamp, deltas)
             deltas += self.located_in.collect_moves(offset)
             deltas += self.adjacency.collect_changes(offset)
         return deltas
@@ -325,6 +328,7 @@ class SemanticMap:
 
     def _fuse(
         self,
+        landmarks: Landmarks,
         offset: Offset,
         keyframe: KeyframeOrdinal,
         place: PlaceOrdinal | None,
@@ -333,24 +337,40 @@ class SemanticMap:
         timestamp: float,
         deltas: list[Delta],
     ) -> None:
-        """Run landmarks and tell located-in."""
+        """Run landmarks of the page's rule and tell located-in."""
         x_um, y_um = pose.x_um, pose.y_um
-        if self._named_landmarks is not None:
+        if isinstance(landmarks, ConstrainedLandmarks):
             for seen in fusible:
-                more = self._named_landmarks.fold_named(offset, *seen, timestamp, x_um, y_um)
+                more = landmarks.fold_named(offset, *seen, timestamp, x_um, y_um)
                 deltas += more
-                for delta in more:
-                    if type(delta) is ObjectSeen:
-                        self.located_in.object_seen(delta.object, keyframe, place)
-                    elif type(delta) is ObjectsMerged:
-                        self.located_in.objects_merged(delta.survivor, delta.absorbed)
+                self._locate(more, keyframe, place)
             return
         for observation, det_id, class_name, vector, norm2 in fusible:
-            fused = self.landmarks.fold(
+            fused = landmarks.fold(
                 offset, observation, det_id, class_name, vector, norm2, timestamp, x_um, y_um
             )
             deltas += fused
             self.located_in.object_seen(fused[-1].object, keyframe, place)
+
+    def _locate(
+        self, fused: Sequence[Delta], keyframe: KeyframeOrdinal, place: PlaceOrdinal | None
+    ) -> None:
+        """Tell located-in what was seen and what became one."""
+        for delta in fused:
+            if type(delta) is ObjectSeen:
+                self.located_in.object_seen(delta.object, keyframe, place)
+            elif type(delta) is ObjectsMerged:
+                self.located_in.objects_merged(delta.survivor, delta.absorbed)
+
+
+def _landmarks(settings: Settings, corrections: Corrections) -> Landmarks | EvidenceLandmarks:
+    named = None
+    if corrections.same or corrections.different:
+        named = PairGroups(corrections.same, corrections.different)
+    if settings.fusion == "evidence":
+        return EvidenceLandmarks(settings.evidence, named)
+    limits = settings.fusion_radius_m, settings.fusion_similarity
+    return Landmarks(*limits) if named is None else ConstrainedLandmarks(*limits, named)
 
 
 def _check_named(settings: Settings, neighbourhood: Neighbourhood | None) -> None:

@@ -1,0 +1,79 @@
+"""What an envelope says to fusion by evidence: its camera, its pose, and what was detected.
+
+A depth without a standard error has a twentieth of itself, at least 0.05 m; a position without one
+has 0.1 m.
+"""
+
+import math
+from collections.abc import Iterable
+
+from eventsrc.envelope import Detection, Envelope
+from eventsrc.ingest import Accepted
+from projections.deltas import Pose
+from projections.settings import Camera
+
+from .evidence_landmarks import Sighting
+from .fusible import FusibleObservation
+
+_DEPTH_SIGMA_SHARE = 0.05
+_LEAST_DEPTH_SIGMA_M = 0.05
+_POSITION_SIGMA_M = 0.1
+_MANY_TURNS = 1e6
+_TURN = 2.0 * math.pi
+
+
+def camera_of(envelope: Envelope, otherwise: Camera) -> Camera:
+    """The camera that an envelope states."""
+    stated = envelope.camera
+    if stated is None:
+        return otherwise
+    return Camera(
+        hfov_deg=stated.hfov_deg,
+        width_px=stated.width_px,
+        height_px=stated.height_px,
+        yaw_rad=stated.yaw_rad,
+    )
+
+
+def small_angle(angle: float) -> float:
+    """The angle, without most of its turns if there are very many: `exact_functions` computes the
+    cosine of a small one. The remainder is exact everywhere."""
+    return angle if abs(angle) <= _MANY_TURNS else math.fmod(angle, _TURN)
+
+
+def with_small_yaw(pose: Pose) -> Pose:
+    """The pose with a heading of which the cosine can be computed."""
+    yaw = small_angle(pose.yaw_rad)
+    return pose if yaw == pose.yaw_rad else Pose(pose.x_um, pose.y_um, yaw)
+
+
+def sightings_of(accepted: Accepted, fusible: Iterable[FusibleObservation]) -> list[Sighting]:
+    """The fusible observations of an envelope, with their boxes, depths and positions."""
+    detections = dict(zip(accepted.det_ids, accepted.envelope.detections, strict=True))
+    return [
+        Sighting(
+            observation,
+            det_id,
+            class_name,
+            vector,
+            norm2,
+            (detection := detections[det_id]).bbox,
+            _depth(detection),
+            _position(detection),
+        )
+        for observation, det_id, class_name, vector, norm2 in fusible
+    ]
+
+
+def _depth(detection: Detection) -> tuple[float, float] | None:
+    depth, sigma = detection.depth_m, detection.depth_sigma_m
+    if depth is None:
+        return None
+    return depth, max(_LEAST_DEPTH_SIGMA_M, _DEPTH_SIGMA_SHARE * depth) if sigma is None else sigma
+
+
+def _position(detection: Detection) -> tuple[float, float, float] | None:
+    position, sigma = detection.position, detection.position_sigma_m
+    if position is None:
+        return None
+    return *position, _POSITION_SIGMA_M if sigma is None else sigma
