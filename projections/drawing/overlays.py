@@ -26,7 +26,11 @@ from .scene import (
     two_sigma,
 )
 
+DOT_M = 0.04
+"""What an object's dot occupies to each side."""
 _LABEL_PT = 8.0
+_WIDE_M = 2.0
+"""Ellipses wider than this are drawn faintly."""
 _RINGS_M = tuple(0.07 * 1.28**step for step in range(15))
 
 
@@ -79,7 +83,7 @@ def draw_objects(canvas: Canvas, view: MapView, min_observations: int) -> int:
         )
         for member in group.members:
             _draw_evidence(canvas, member, colour)
-        canvas.occupied += (Extent(x, y, 0.04, 0.04) for x, y in zip(xs, ys, strict=True))
+        canvas.occupied += (Extent(x, y, DOT_M, DOT_M) for x, y in zip(xs, ys, strict=True))
     requests = [_label_request(canvas, group.label, group.spot) for group in groups]
     boxes = place_labels(requests, canvas.occupied, canvas.bounds, _RINGS_M)
     for group, box in zip(groups, boxes, strict=True):
@@ -95,7 +99,7 @@ def _draw_evidence(canvas: Canvas, found: ObjectRecord, colour: str) -> None:
         width, height, angle = two_sigma(found.estimate)
         ellipse = Ellipse(
             object_spot(found), width, height, angle=angle, fill=False, edgecolor=colour,
-            lw=0.7, alpha=0.75, zorder=8,
+            lw=0.7, alpha=0.75 if width < _WIDE_M else 0.35, zorder=8,
             linestyle="-" if found.missing_in is None else (0, (3, 2)),
         )  # fmt: skip
         canvas.axes.add_patch(ellipse)

@@ -16,7 +16,9 @@ from projections.model.view import MapView
 from . import canvas as palette
 from .base_layers import draw_drives, draw_floor, draw_regions, draw_walls
 from .canvas import Canvas, check_suffix, new_canvas
+from .labels import Extent
 from .overlays import (
+    DOT_M,
     draw_adjacency,
     draw_bridges,
     draw_lost,
@@ -75,7 +77,8 @@ def compose(
     """The finished canvas, not yet written to a file."""
     by_evidence = view.settings.fusion == "evidence"
     shown = shown_objects(view, min_observations) if by_evidence else []
-    canvas = new_canvas(view, floor, [object_spot(found) for found in shown])
+    standing = [object_spot(found) for found in shown]
+    canvas = new_canvas(view, floor, standing)
     draw_floor(canvas, floor)
     draw_regions(canvas, view)
     draw_drives(canvas, view)
@@ -84,6 +87,7 @@ def compose(
     draw_place_names(canvas, view)
     if lost is not None:
         draw_lost(canvas, lost)
+    canvas.occupied += (Extent(x, y, DOT_M, DOT_M) for x, y in standing)  # rooms' corners
     draw_room_names(canvas, floor)
     draw_bridges(canvas, bridges)
     left_out = draw_objects(canvas, view, min_observations)

@@ -124,6 +124,26 @@ def test_missing_and_present_objects_of_a_class_have_labels_of_their_own() -> No
     assert {"cup", "cup (missing)"} <= set(texts(compose(view, "", Floor())))
 
 
+def test_a_wide_ellipse_is_faint() -> None:
+    unsure = d.ObjectEstimated(3, 1, 3_000_000, 0, 10_000_000_000, 0, 640_000_000_000, 1)
+    alphas = {
+        tuple(e.get_center()): e.get_alpha()
+        for e in ellipses(compose(view_with(EVIDENCE, CUP, unsure), "", Floor()))
+    }
+    assert 0 < alphas[3.0, 0.0] < alphas[1.0, 1.5]
+
+
+def test_the_name_of_a_room_keeps_clear_of_the_objects_in_its_corners() -> None:
+    floor = Floor(rooms=(("kitchen", (0.0, 0.0, 4.0, 4.0)),))
+    texts_before = compose(view_with(EVIDENCE), "", floor).axes.texts
+    (corner,) = [t.get_position() for t in texts_before if t.get_text() == "kitchen"]
+    there = round(corner[0] * 1e6), round(corner[1] * 1e6)
+    standing = d.ObjectEstimated(3, 0, *there, 10_000_000, 0, 10_000_000, 2)
+    texts_then = compose(view_with(EVIDENCE, standing), "", floor).axes.texts
+    (then,) = [t.get_position() for t in texts_then if t.get_text() == "kitchen"]
+    assert math.dist(then, corner) > 1.0
+
+
 def test_an_arrow_leads_from_where_a_moved_object_stood() -> None:
     moved = d.ObjectRelocated(4, 0, 0, 3_000_000, -500_000, 1_000_000, 1_500_000)
     canvas = compose(view_with(EVIDENCE, CUP, moved), "", Floor())
