@@ -1,0 +1,186 @@
+"""Maps folded by evidence: tails in batches of any size and rebuilds have the rows of the fold."""
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from eventsrc.commands import DifferentObjects, SameObject
+from eventsrc.envelope import FIRST_OFFSET, Offset
+from eventsrc.log import LogReader
+from projections import deltas as d
+from projections.database import rebuild, tail
+from projections.database.check import check
+from projections.database.connection import Targets
+from projections.database.graph_render import expected_rows
+from projections.database.labels import LABELS
+from projections.database.live_fold import LiveFold, batches
+from projections.database.loader import LoaderName
+from projections.database.memory_sink import MemorySink, MemoryTables
+from projections.model.fold import fold_events, fold_log
+from projections.model.log_commands import read_corrections
+from projections.model.snapshot_cache import SnapshotCache
+from projections.model.view import MapView
+from projections.reducers.semantic_map import SemanticMap
+from projections.settings import Settings
+from tests.commands_in_logs import append_command, command, forget_keyframes, undo
+from tests.flickering_house import flickering_house
+from tests.integration.test_projections import parsed
+from tests.logs import write_log
+from tests.rows import all_rows, expected_graph, graph_rows
+
+EVIDENCE = Settings(fusion="evidence")
+
+
+@pytest.fixture(scope="module")
+def documents() -> list[dict[str, Any]]:
+    return flickering_house("a", 240) + flickering_house("b", 60)
+
+
+@pytest.fixture
+def log(tmp_path: Path, documents: list[dict[str, Any]]) -> Path:
+    return write_log(tmp_path / "log", documents)
+
+
+def view_of(log: Path) -> MapView:
+    with LogReader(log) as reader:
+        return fold_log(reader, EVIDENCE, corrections=read_corrections(reader))[1]
+
+
+def test_the_log_has_what_these_tests_are_about(log: Path) -> None:
+    """Merges of Objects that earlier batches found, other classes, estimates."""
+    fold = SemanticMap(EVIDENCE)
+    kinds: Counter[type] = Counter()
+    older, merged_later = 0, 0
+    with LogReader(log) as reader:
+        for event in fold_events(reader.read(FIRST_OFFSET), fold):
+            kinds.update(map(type, event.deltas))
+            found = [delta for delta in event.deltas if isinstance(delta, d.ObjectFound)]
+            for delta in event.deltas:
+                if isinstance(delta, d.ObjectsMerged):
+                    assert delta.evidence is not None
+                    merged_later += delta.absorbed < older
+            older += len(found)
+    assert kinds[d.ObjectEstimated] > kinds[d.ObjectFound] > 20
+    assert kinds[d.ObjectClassified] > 5
+    assert merged_later > 3
+
+
+@pytest.mark.parametrize("size", [1, 17])
+def test_batches_of_any_size_give_the_rows_of_the_fold(log: Path, size: int) -> None:
+    live, anew = MemoryTables(), MemoryTables()
+    following, folding = LiveFold(EVIDENCE), LiveFold(EVIDENCE)
+    sink, shadow = MemorySink(), MemorySink().shadow()
+    with LogReader(log) as reader:
+        for batch in batches(reader.read(FIRST_OFFSET), size):
+            assert not any(following.feed(batch))
+            sink.prepare(following.tracker.drain(), following.view).send(live)
+            assert not any(folding.feed(batch))
+            shadow.load(folding.tracker.drain(), folding.view)(anew)
+    shadow.finish(folding.view)(anew)
+    shadow.swap_in(anew)
+    assert live.graph == anew.graph
+    view = view_of(log)
+    for label in LABELS:
+        rows = [live.graph[label][key] for key in sorted(live.graph[label])]
+        assert rows == list(expected_rows(view, label))
+
+
+@pytest.mark.parametrize(("size", "loader"), [(1, "copy"), (23, "insert"), (256, "copy")])
+def test_a_tail_that_goes_on_has_the_rows_of_a_rebuild(
+    tmp_path: Path,
+    documents: list[dict[str, Any]],
+    one_database: Targets,
+    third_database: Targets,
+    size: int,
+    loader: LoaderName,
+) -> None:
+    log = tmp_path / "log"
+    for start in range(0, len(documents), 90):
+        write_log(log, documents[start : start + 130])
+        tail(log, one_database, EVIDENCE, once=True, batch_events=size, loader=loader)
+    rebuild(log, third_database, EVIDENCE, loader=loader)
+    rows = all_rows(one_database)
+    assert rows == all_rows(third_database)
+    view = view_of(log)
+    assert parsed(dict(rows[0])) == expected_graph(view)
+    assert len(view.objects) < len(view.all_objects)
+    for report in check(log, one_database, EVIDENCE):
+        assert (report.differing, report.foreign) == (0, ())
+
+
+def test_a_check_names_an_estimate_that_was_changed(
+    log: Path, one_database: Targets, pg: Any
+) -> None:
+    rebuild(log, one_database, EVIDENCE)
+    view = view_of(log)
+    thing = next(o for o in view.objects.values() if o.estimate is not None)
+    pg.execute(
+        "SELECT * FROM cypher('semantic_map', $q$"
+        f" MATCH (o:Object {{object_id: '{thing.object_id}'}}) SET o.est_x = 0.25, o.missing = true"
+        " $q$) AS (o agtype)"
+    )
+    graph, vectors = check(log, one_database, EVIDENCE)
+    assert vectors.sound
+    (difference,) = graph.differences
+    assert (difference.table, difference.kind) == ("Object", "different")
+    assert "'est_x': 'float 0.25'" in str(difference.found)
+
+
+def test_a_tail_starts_from_a_snapshot(log: Path, one_database: Targets) -> None:
+    with LogReader(log) as reader:
+        cache = SnapshotCache(log, reader.log_id, EVIDENCE, lambda _: None)
+        cache.keep(*fold_log(reader, EVIDENCE, Offset(150), keep_embeddings=False))
+    rebuild(log, one_database, EVIDENCE, until=Offset(180))
+    folded: list[int] = []
+    tail(log, one_database, EVIDENCE, once=True, on_fold=folded.append)
+    assert parsed(graph_rows(one_database.graph_url)) == expected_graph(view_of(log))
+
+
+def test_commands_about_objects_are_obeyed_by_tails(
+    tmp_path: Path,
+    documents: list[dict[str, Any]],
+    one_database: Targets,
+    third_database: Targets,
+) -> None:
+    log = write_log(tmp_path / "log", documents[:160])
+
+    def agree() -> MapView:
+        tail(log, one_database, EVIDENCE, once=True, batch_events=40)
+        rebuild(log, third_database, EVIDENCE)
+        rows, view = all_rows(one_database), view_of(log)
+        assert rows == all_rows(third_database)
+        assert parsed(dict(rows[0])) == expected_graph(view)
+        return view
+
+    view = agree()
+    first, second = sorted(view.objects.values(), key=lambda o: -o.obs_count)[:2]
+    det_ids = tuple(view.observations[o.observations[0]].det_id for o in (first, second))
+    given = command(SameObject, det_ids=det_ids)
+    append_command(log, given)
+    one = agree()
+    objects = {o.object for o in one.observations if o.det_id in det_ids}
+    assert len(objects) == 1
+    append_command(log, undo(given))
+    absorbed = next(o for o in view.all_objects if o.ordinal not in view.objects)
+    kept = view.objects[view.object_survivors.find(absorbed.ordinal)]
+    apart = (
+        view.observations[kept.observations[0]].det_id,
+        founder_of(log, absorbed.ordinal, view),
+    )
+    append_command(log, command(DifferentObjects, det_ids=apart))
+    two = agree()
+    assert len({o.object for o in two.observations if o.det_id in apart}) == 2
+    append_command(log, forget_keyframes(10, 40, run_id="sim-7-a"))
+    agree()
+
+
+def founder_of(log: Path, ordinal: int, view: MapView) -> str:
+    """The det_id that founded an Object, absorbed ones too."""
+    with LogReader(log) as reader:
+        for event in fold_events(reader.read(FIRST_OFFSET), SemanticMap(EVIDENCE)):
+            for delta in event.deltas:
+                if isinstance(delta, d.ObjectFound) and delta.object == ordinal:
+                    return view.observations[delta.observation].det_id
+    raise AssertionError(ordinal)
