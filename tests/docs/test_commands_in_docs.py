@@ -8,7 +8,13 @@ import pytest
 from tests.docs.console import ROOT, Command, File, matches, read, run
 from tests.thorough import THOROUGH
 
-DOCUMENTS = ("README.md", "docs/corrections.md", "docs/simulator.md", "docs/time-travel.md")
+DOCUMENTS = (
+    "README.md",
+    "docs/corrections.md",
+    "docs/fusion.md",
+    "docs/simulator.md",
+    "docs/time-travel.md",
+)
 
 
 @pytest.mark.parametrize("name", DOCUMENTS)
