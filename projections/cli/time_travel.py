@@ -79,7 +79,7 @@ def merges(
         typer.Option("--refused", help="Instead the merges that a command refused, and which."),
     ] = False,
     objects: Annotated[
-        bool, typer.Option("--objects", help="Instead the objects that a command made one.")
+        bool, typer.Option("--objects", help="Instead the objects that became one, and why.")
     ] = False,
     known_at: KnownAtOption = None,
     json_: JsonOption = False,

@@ -287,7 +287,7 @@ def _object_entries(
         record.cause,
         "found",
         f"new object: {first}, seen from {position_text(pose)}, "
-        f"matched no {record.found.class_name} nearby",
+        f"matched no {'object' if record.estimates else record.found.class_name} nearby",
         {"det_id": first},
     )
     yield from _sightings(history, record)

@@ -84,9 +84,10 @@ class FoldResult:
     ``posed`` are the ordinals of keyframes with a pose. By keyframe, ``keyframe_offsets`` is its
     event, ``placed_offsets`` the event that placed it and ``placed_in`` the number of the place it
     joined; ``merged`` are the merges as (offset, absorbed, survivor). By observation,
-    ``fused_into`` is its first object (-1 for none), ``observation_offsets`` its event and
-    ``det_ids`` its det_id; ``fused_later`` are the merges of objects as (offset, absorbed,
-    survivor). ``names`` are the names of places by id. ``seconds`` is the time of the fold.
+    ``fused_into`` is the number of its object after its own event (-1 for none),
+    ``observation_offsets`` its event and ``det_ids`` its det_id; ``fused_later`` are the merges of
+    objects by later events as (offset, absorbed, survivor). An object's number follows from its id.
+    ``names`` are the names of places by id. ``seconds`` is the time of the fold.
     """
 
     settings: Settings
@@ -116,10 +117,12 @@ def fold_result(view: MapView, history: History, truth: Truth | None, seconds: f
     """The result of a fold that took ``seconds``."""
     numbers = _place_numbers(history.places)
     fused = array("q", (-1 if o.object is None else o.object for o in view.observations))
-    founded = array("q", fused)  # its object before any merge of objects
+    numbers_of = [_object_number(o.object_id) for o in view.all_objects]
+    first = array("q", (-1 if o < 0 else numbers_of[o] for o in fused))
     for each in history.objects:
         for seen in each.sightings:
-            founded[seen.observation] = each.found.object
+            at_once = history.object_survivor(each.found.object, Offset(seen.offset + 1))
+            first[seen.observation] = numbers_of[at_once]
     offsets = history.keyframe_offsets
     return FoldResult(
         settings=view.settings,
@@ -137,11 +140,13 @@ def fold_result(view: MapView, history: History, truth: Truth | None, seconds: f
             for merge in history.merges
             for place in merge.absorbed
         ),
-        fused_into=founded,
+        fused_into=first,
         observation_offsets=array("q", (offsets[o.keyframe] for o in view.observations)),
         det_ids=tuple(o.det_id for o in view.observations),
         fused_later=tuple(
-            (merge.offset, merge.absorbed, merge.survivor) for merge in history.object_merges
+            (merge.offset, numbers_of[merge.absorbed], numbers_of[merge.survivor])
+            for merge in history.object_merges
+            if history.objects[merge.absorbed].found.offset < merge.offset
         ),
         names={p.place_id: p.name for p in view.places.values() if p.name is not None},
         scores=None if truth is None else _scores(view, truth),
@@ -151,6 +156,11 @@ def fold_result(view: MapView, history: History, truth: Truth | None, seconds: f
 
 def _scores(view: MapView, truth: Truth) -> dict[str, dict[str, Any]]:
     return {"places": place_scores(view, truth), "objects": object_scores(view, truth)}
+
+
+def _object_number(object_id: str) -> int:
+    """The same in every fold for Objects that the same detection founded."""
+    return int(object_id[-15:], 16)
 
 
 def _place_numbers(places: Sequence[PlaceHistory]) -> list[int]:

@@ -164,16 +164,15 @@ class _ObjectChange:
             parts.append(f"seen {len(before.det_ids):,} → {now}")
         if before.missing != after.missing:
             parts.append("missing" if after.missing else "not missing any more")
-        if shift >= _MOVED_M:
+        if before.estimate is not None and after.estimate is not None:
+            if before.estimate != after.estimate:
+                parts.append(_estimate_change(before.estimate, after.estimate))
+        elif shift >= _MOVED_M:
             parts.append(f"moved {shift:.2f} m")
-        if before.estimate is not None and before.estimate != after.estimate:
-            parts.append(_estimate_change(before.estimate, after.estimate))
         return parts[0] + " " + ", ".join(parts[1:])
 
 
-def _estimate_change(before: Estimate, after: Estimate | None) -> str:
-    if after is None:
-        return "no estimate any more"
+def _estimate_change(before: Estimate, after: Estimate) -> str:
     shift = math.hypot(after.est_x - before.est_x, after.est_y - before.est_y)
     place = f"stands {shift:.2f} m elsewhere, " if shift >= _MOVED_M else ""
     return f"{place}± {before.est_sigma_m:.2f} → {after.est_sigma_m:.2f} m"

@@ -25,6 +25,7 @@ OTHERS = st.lists(
         min_samples=st.integers(2, 4),
         fusion_radius_m=st.sampled_from([1.0, 2.0]),
         fusion_similarity=st.sampled_from([0.7, 0.999]),
+        fusion=st.sampled_from(["page", "page", "evidence"]),
     ),
     min_size=1,
     max_size=3,

@@ -110,7 +110,7 @@ def why(thing: int, end: int) -> Explanation:
 def test_why_tells_the_story_of_an_object() -> None:
     text = explanation_text(why(0, len(EVENTS)))
     assert [line.split("  ", 3)[-1] for line in text.splitlines()[1:]] == [
-        "new object: det-0, seen from (0.00, 0.00), matched no chair nearby",
+        "new object: det-0, seen from (0.00, 0.00), matched no object nearby",
         "stands at (1.00, 2.00) ± 0.80 m, seen from 1 spot",
         f"obj-b was fused into it as one thing: {BECAUSE}",
         "stands at (1.20, 2.00) ± 0.12 m, seen from 3 spots",

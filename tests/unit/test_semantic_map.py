@@ -1,6 +1,7 @@
 """The fold: duplicates, conflicts, missing poses, foreign vectors, fusion; and its purity."""
 
 import builtins
+import copy
 import datetime
 import os
 import random
@@ -282,3 +283,24 @@ def test_observations_carry_what_the_table_needs() -> None:
     assert (added.run_id, added.keyframe_id, added.det_id) == ("run-a", 3, "run-a_kf3_d0")
     assert added.bbox == (120.0, 80.0, 250.0, 310.0)
     assert (added.embedding / 2**20).round(6).tolist() == [0.6, 0.8]
+
+
+@pytest.mark.parametrize(
+    ("fields", "kind"),
+    [
+        ({}, "duplicate"),
+        ({"depth_sigma_m": 0.5}, "conflict"),
+        ({"depth_m": 2.5}, "conflict"),
+        ({"position": [1.0, 2.0]}, "conflict"),
+        ({"position_sigma_m": 0.5}, "duplicate"),
+    ],
+)
+def test_a_depth_or_a_position_is_content_and_a_standard_error_of_none_is_not(
+    fields: dict[str, Any], kind: str
+) -> None:
+    first = envelope(7, detections=[detection("cup", [1.0, 0.0], depth_m=2.0)])
+    again = copy.deepcopy(first)
+    again["detections"][0] |= fields
+    assert [d.kind for d in fold([first, again]).deltas[1]] == [kind]
+    stated = {**first, "camera": {"hfov_deg": 80.0, "width_px": 64.0, "height_px": 48.0}}
+    assert [d.kind for d in fold([first, stated]).deltas[1]] == ["conflict"]
