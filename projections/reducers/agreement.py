@@ -13,6 +13,7 @@ elevation   likewise that of the box's centre above the camera; another thing: a
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ from .spots import LEAST_ELEVATION_M2, LEAST_M, SIZE, SLOPE, Estimate
 
 Floats = NDArray[np.float64]
 ESTIMATE_FIELDS = len(Estimate._fields)
-WORST = -20.0
+_WORST_CHI2 = 25.0
 _ANYWHERE = -0.74
 """log(1.2 rad / √2π)."""
 _OTHER_SIZES = 0.36
@@ -64,6 +65,14 @@ class Slopes:
         self._sum, self._count = state["sums"]
 
 
+class Pairs(NamedTuple):
+    """Pairs of an estimate and a sight that may be of one thing: row, column and ratio of each."""
+
+    rows: NDArray[np.intp]
+    columns: NDArray[np.intp]
+    ratios: Floats
+
+
 class Agreement:
     """Ratios for many estimates and the sights of a picture."""
 
@@ -71,26 +80,63 @@ class Agreement:
         self._log_range = log(range_m)
         self._range_variance = range_spread * range_spread
 
-    def ratios(self, estimates: Floats, sights: Sequence[Sight], slopes: float) -> Floats:
-        """A row for each estimate, a column for each sight."""
-        rows = [
-            (*sight[:6], 0.0, 0.0, 0.0)
-            if sight.log_height is None
-            else (*sight[:6], sight.log_height, sight.slope, 1.0)
-            for sight in sights
-        ]
-        px, py, cos, sin, per_m2, least, height, slope, is_whole = np.array(rows).T
-        x, y, xx, xy, yy, z, zx, zy, zv, e, ex, ey, ev = estimates.T[:, :, np.newaxis]
-        dx, dy = x - px, y - py
-        ahead = dx * cos + dy * sin
-        across = dy * cos - dx * sin
+    def pairs(
+        self, estimates: Floats, sights: Sequence[Sight], slopes: float, least: float
+    ) -> Pairs:
+        """The pairs whose ratio is above ``least``. ``estimates`` has a column for each one."""
+        seen = np.array(
+            [
+                (*sight[:6], 0.0, 0.0, 0.0)
+                if sight.log_height is None
+                else (*sight[:6], sight.log_height, sight.slope, 1.0)
+                for sight in sights
+            ]
+        ).T
+        # What the bearing rules out at its best is left out first, since that is nearly all.
+        dx = estimates[0, :, np.newaxis] - seen[0]
+        dy = estimates[1, :, np.newaxis] - seen[1]
+        ahead = dx * seen[2] + dy * seen[3]
+        across = dy * seen[2] - dx * seen[3]
+        trace = (estimates[2] + estimates[4])[:, np.newaxis]
+        bound = ahead * ahead * seen[4] + (trace + seen[5])
+        rows, columns = np.nonzero(
+            (across * across < _WORST_CHI2 * bound)
+            & (np.minimum(ahead, 0.0) * ahead < _WORST_CHI2 * (trace + _BEHIND_M2))
+        )
+        if not len(rows):
+            return Pairs(rows, columns, np.zeros(0))
+        ratios = self._ratios(
+            estimates[:, rows],
+            seen[:, columns],
+            ahead[rows, columns],
+            across[rows, columns],
+            slopes,
+        )
+        kept = np.nonzero(ratios > least)[0]
+        return Pairs(rows[kept], columns[kept], ratios[kept])
+
+    def _ratios(
+        self, estimates: Floats, seen: Floats, ahead: Floats, across: Floats, slopes: float
+    ) -> Floats:
+        """The ratio of each pair: columns of the two matrices."""
+        _, _, xx, xy, yy, z, zx, zy, zv, e, ex, ey, ev = estimates
+        _, _, cos, sin, per_m2, least, height, slope, is_whole = seen
         along = np.maximum(ahead, LEAST_M)
         square = along * along
-        log_along = logs(along)
-        cc, ss, cs = cos * cos, sin * sin, 2.0 * cos * sin
-        along_variance = xx * cc + xy * cs + yy * ss
-        variance = xx * ss - xy * cs + yy * cc + per_m2 * square + least
-        ratio = across * across / variance + logs(variance / square)
+        cc, ss, cs = cos * cos, sin * sin, 2.0 * cos * sin * xy
+        along_variance = xx * cc + cs + yy * ss
+        variance = xx * ss - cs + yy * cc + per_m2 * square + least
+        gx, gy = cos / along - zx, sin / along - zy
+        size = gx * gx * xx + 2.0 * gx * gy * xy + gy * gy * yy + (zv + SIZE * SIZE)
+        other_size = size + _OTHER_SIZES
+        gx, gy = slope * cos - ex, slope * sin - ey
+        rise = gx * gx * xx + 2.0 * gx * gy * xy + gy * gy * yy
+        rise += (SLOPE * SLOPE) * square + (ev + LEAST_ELEVATION_M2)
+        other_rise = rise + slopes * square
+        log_along, log_variance, log_size, log_rise = logs(
+            np.array((along, variance / square, other_size / size, other_rise / rise))
+        )
+        ratio = across * across / variance + log_variance
         residual = log_along - self._log_range
         ratio += residual * residual / (self._range_variance + along_variance / square)
         behind = np.minimum(ahead - LEAST_M, 0.0)
@@ -98,20 +144,13 @@ class Agreement:
         ratio *= -0.5
         ratio += _ANYWHERE
         residual = height + log_along - z
-        gx, gy = cos / along - zx, sin / along - zy
-        spread = gx * gx * xx + 2.0 * gx * gy * xy + gy * gy * yy
-        variance = spread + (zv + SIZE * SIZE)
-        part = _ratio(residual, variance, variance + _OTHER_SIZES, _WORST_HEIGHT)
+        part = residual * residual * (1.0 / other_size - 1.0 / size) + log_size
+        part = np.maximum(part, 2.0 * _WORST_HEIGHT)
         residual = along * slope - e
-        gx, gy = slope * cos - ex, slope * sin - ey
-        spread = gx * gx * xx + 2.0 * gx * gy * xy + gy * gy * yy
-        variance = spread + (SLOPE * SLOPE) * square + (ev + LEAST_ELEVATION_M2)
-        part += _ratio(residual, variance, variance + slopes * square, _WORST_ELEVATION)
-        part *= is_whole
-        part *= zv < _SIZE_KNOWN
-        ratio += part
-        worst: Floats = np.maximum(ratio, WORST)
-        return worst
+        rest = residual * residual * (1.0 / other_rise - 1.0 / rise) + log_rise
+        part += np.maximum(rest, 2.0 * _WORST_ELEVATION)
+        whole: Floats = ratio + part * (0.5 * is_whole * (zv < _SIZE_KNOWN))
+        return whole
 
 
 def logs(values: Floats) -> Floats:
@@ -122,13 +161,4 @@ def logs(values: Floats) -> Floats:
     series = square * (1.0 / 7.0) + 0.2
     series = series * square + 1.0 / 3.0
     result: Floats = (twos - 0.5) * 0.6931471805599453 + 2.0 * s * (series * square + 1.0)
-    return result
-
-
-def _ratio(residual: Floats, variance: Floats, other: Floats, worst: float) -> Floats:
-    """log N(residual; variance) − log N(residual; other), not below ``worst``."""
-    ratio = residual * residual * (1.0 / other - 1.0 / variance)
-    ratio += logs(other / variance)
-    ratio *= 0.5
-    result: Floats = np.maximum(ratio, worst)
     return result

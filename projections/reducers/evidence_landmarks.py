@@ -27,6 +27,7 @@ from collections.abc import Sequence
 from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from eventsrc.envelope import DetId, Offset
 from projections.deltas import (
@@ -118,9 +119,9 @@ class EvidenceLandmarks:
             deltas += found
             thing = self._index.thing(ordinal)
             sight = sights[k]
-            thing.spots.add(sight)
+            spot = thing.spots.add(sight)
             thing.keep(looks[k], float(inverses[k]), sight.side_cos, sight.side_sin, run)
-            self._index.solve(ordinal)
+            self._index.solve(ordinal, spot)
             seen.append(ordinal)
             deltas.append(
                 ObjectSeen(
@@ -264,87 +265,91 @@ class EvidenceLandmarks:
         """The Object of each observation, None for a new one, and the cosine of the best pair."""
         chosen: list[tuple[ObjectOrdinal | None, float]] = [(None, 1.0)] * len(sights)
         near = self._index.near(pose.x_um / 1e6, pose.y_um / 1e6)
-        if not near:
+        if not len(near):
             return chosen
-        agreement = self._agreement.ratios(
-            self._index.estimates[near], sights, self._slopes.mean_square
+        rows, columns, values = self._agreement.pairs(
+            self._index.estimates[:, near], sights, self._slopes.mean_square, _LEAST_AGREEMENT
         )
-        rows = np.nonzero(agreement.max(axis=1) > _LEAST_AGREEMENT)[0].tolist()
-        if not rows:
+        if not len(rows):
             return chosen
-        ordinals = [near[row] for row in rows]
-        things = [self._index.thing(ordinal) for ordinal in ordinals]
-        values, cosines = self._look_values(things, run, labels, looks, inverses, sights)
-        values += agreement[rows]
-        values += _LABEL_WEIGHT * np.array(
-            [[self._labels.ratio(thing, label) for label in labels] for thing in things]
+        things = [self._index.thing(ordinal) for ordinal in near[rows].tolist()]
+        names = [labels[column] for column in columns.tolist()]
+        values += _LABEL_WEIGHT * self._labels.ratios(things, names)
+        agree = np.array(
+            [label in thing.classes for thing, label in zip(things, names, strict=True)]
         )
+        kept = np.nonzero(values + self._look_ratios.at_best(agree) > 0.0)[0]
+        if not len(kept):
+            return chosen
+        columns, values = columns[kept], values[kept]
+        pairs = list(zip(near[rows[kept]].tolist(), columns.tolist(), strict=True))
+        things = [things[place] for place in kept.tolist()]
+        by_look, cosines = self._look_values(
+            things, columns, run, agree[kept, np.newaxis], looks, inverses, sights
+        )
+        values += by_look
         if self._groups is not None:
-            self._forbid(self._groups, values, things, sightings)
-        flat = values.ravel().tolist()
-        width = len(labels)
-        used: set[int] = set()
-        for place in np.argsort(-values, axis=None, kind="stable").tolist():
+            self._forbid(self._groups, values, pairs, things, sightings)
+        flat = values.tolist()
+        used: set[ObjectOrdinal] = set()
+        for place in np.argsort(-values, kind="stable").tolist():
             if flat[place] <= 0.0:
                 break
-            row, column = divmod(place, width)
-            if row not in used and chosen[column][0] is None:
-                chosen[column] = ordinals[row], float(cosines[row, column])
-                used.add(row)
+            ordinal, column = pairs[place]
+            if ordinal not in used and chosen[column][0] is None:
+                chosen[column] = ordinal, float(cosines[place])
+                used.add(ordinal)
         return chosen
 
     def _look_values(
         self,
         things: list[Thing],
+        columns: NDArray[np.intp],
         run: RunOrdinal,
-        labels: list[str],
+        agree: NDArray[np.bool_],
         looks: Looks,
         inverses: Floats,
         sights: list[Sight],
     ) -> tuple[Floats, Floats]:
-        """The ratio of looks of each Object and observation, and the best cosine."""
-        most, width = max(thing.exemplars for thing in things), len(labels)
-        dots = np.zeros((len(things), most, width))
-        marks = np.zeros((len(things), most, 5))
-        is_kept = np.zeros((len(things), most, 1), bool)
+        """The ratio of looks of each pair of an Object and an observation, and the best cosine."""
+        counts = np.array([thing.exemplars for thing in things])
+        most = int(counts.max())
+        dots = np.zeros((len(things), most))
+        column_of = columns.tolist()
         for row, thing in enumerate(things):
             count = thing.exemplars
-            dots[row, :count] = thing.looks[:count] @ looks.T
-            marks[row, :count] = thing.marks[:count]
-            is_kept[row, :count] = True
-        cosines = dots * marks[:, :, INVERSE, np.newaxis] * inverses
+            dots[row, :count] = thing.looks[:count] @ looks[column_of[row]]
+        marks = np.array([thing.marks[:most] for thing in things])
+        cosines = dots * marks[:, :, INVERSE] * inverses[columns, np.newaxis]
+        is_missing = np.arange(most) >= counts[:, np.newaxis]
         different = self._scale.different()
         likeness = (cosines - different) * (1.0 / (1.0 - different))
-        directions = np.array([(sight.side_cos, sight.side_sin) for sight in sights])
-        sides = (
-            marks[:, :, SIDE_COS, np.newaxis] * directions[:, 0]
-            + marks[:, :, SIDE_SIN, np.newaxis] * directions[:, 1]
-        )
-        agree = np.array([[label in thing.classes for label in labels] for thing in things])
-        other_run = marks[:, :, RUN, np.newaxis] != run
-        ratios = self._look_ratios.ratios(likeness, sides, other_run, agree[:, np.newaxis])
-        ratios = np.sort(np.where(is_kept, ratios, -np.inf), axis=1)[:, ::-1]
-        counts = np.array([[min(thing.exemplars, _BEST)] for thing in things])
-        total = np.zeros((len(things), width))
+        toward = np.array([(sight.side_cos, sight.side_sin) for sight in sights])[columns]
+        sides = marks[:, :, SIDE_COS] * toward[:, :1] + marks[:, :, SIDE_SIN] * toward[:, 1:]
+        ratios = self._look_ratios.ratios(likeness, sides, marks[:, :, RUN] != run, agree)
+        ratios[is_missing] = -np.inf
+        ratios.sort(axis=1)
+        counts = np.minimum(counts, _BEST)
+        total = np.zeros(len(things))
         for rank in range(min(most, _BEST)):
-            total += np.where(rank < counts, ratios[:, rank], 0.0)
-        best: Floats = np.where(is_kept, cosines, -np.inf).max(axis=1)
-        return total / counts - _MISSING * (_BEST - counts), best
+            total += np.where(rank < counts, ratios[:, most - 1 - rank], 0.0)
+        cosines[is_missing] = -1.0
+        return total / counts - _MISSING * (_BEST - counts), cosines.max(axis=1)
 
     def _forbid(
         self,
         groups: PairGroups[DetId],
         values: Floats,
+        pairs: list[tuple[ObjectOrdinal, int]],
         things: list[Thing],
         sightings: Sequence[Sighting],
     ) -> None:
         """Leave out what commands keep apart."""
-        for column, sighting in enumerate(sightings):
-            group = groups.group_of.get(sighting.det_id)
+        for place, ((_, column), thing) in enumerate(zip(pairs, things, strict=True)):
+            group = groups.group_of.get(sightings[column].det_id)
             if group is None:
                 continue
             own = self._object_of.get(group)
             inside = {group} if own is None else self._index.thing(own).groups
-            for row, thing in enumerate(things):
-                if thing.groups is not inside and groups.conflicts(inside, thing.groups):
-                    values[row, column] = -np.inf
+            if thing.groups is not inside and groups.conflicts(inside, thing.groups):
+                values[place] = -np.inf

@@ -55,19 +55,21 @@ class Merging:
         if thing.count < thing.checked:
             return None
         thing.checked = thing.count + 1 + thing.count // 4
-        x, y, xx, xy, yy = self._index.estimates[ordinal, :5].tolist()
-        near = [other for other in self._index.near(x, y) if other != ordinal]
-        if not near:
+        x, y, xx, xy, yy = self._index.estimates[:5, ordinal].tolist()
+        near = self._index.near(x, y)
+        near = near[near != ordinal]
+        if not len(near):
             return None
-        rows = self._index.estimates[near]
-        dx, dy = rows[:, 0] - x, rows[:, 1] - y
-        a, b, c = rows[:, 2] + xx, rows[:, 3] + xy, rows[:, 4] + yy
+        others = self._index.estimates[:5, near]
+        dx, dy = others[0] - x, others[1] - y
+        a, b, c = others[2] + xx, others[3] + xy, others[4] + yy
         det = a * c - b * b
         chi2 = (c * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / det
         geometry = np.minimum(chi2, _WORST_CHI2) * -0.5 - 0.5 * logs(det) + _LOG_AREA
         best: tuple[float, ObjectOrdinal, MergeEvidence] | None = None
-        for row in np.nonzero(geometry > _LEAST_GEOMETRY)[0].tolist():
-            partner = near[row]
+        kept = np.nonzero(geometry > _LEAST_GEOMETRY)[0]
+        for row, number in zip(kept.tolist(), near[kept].tolist(), strict=True):
+            partner = ObjectOrdinal(number)
             other = self._index.thing(partner)
             both = thing.met.get(partner, 0)
             if both * _SHARE_OF_PICTURES > min(thing.count, other.count):
@@ -102,7 +104,10 @@ class Merging:
         )
         ratios = np.maximum(np.minimum(ratios, _MOST_PER_PAIR), -_MOST_PER_PAIR)
         total = int(np.rint(ratios * _UNIT).astype(np.int64).sum())  # exact: integers
+        names = list(other.classes)
+        ratios = self._labels.ratios([one] * len(names), names).tolist()
         labels = 0.0
-        for label, count in other.classes.items():
-            labels += count * self._labels.ratio(one, label)
-        return total / (ratios.size * _UNIT) + _LABEL_WEIGHT * labels / other.count
+        for count, ratio in zip(other.classes.values(), ratios, strict=True):
+            labels += count * ratio
+        mean = total / (one.exemplars * other.exemplars * _UNIT)
+        return mean + _LABEL_WEIGHT * labels / other.count

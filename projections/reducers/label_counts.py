@@ -1,10 +1,13 @@
 """How much a label speaks for a thing: labels flicker, so agreement is evidence and no gate."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
-from projections.exact_functions import log
+import numpy as np
+
 from projections.reducers import State
 
+from .agreement import logs
+from .looks import Floats
 from .things import Thing
 
 _DOUBT = 0.1
@@ -24,11 +27,14 @@ class LabelCounts:
             self._counts[label] = self._counts.get(label, 0) + 1
             self._total += 1
 
-    def ratio(self, thing: Thing, label: str) -> float:
-        """log of how probable the label is for the thing, over how frequent it is."""
-        usual = (self._counts.get(label, 0) + 1.0) / (self._total + 10.0)
-        own = (thing.classes.get(label, 0) + _DOUBT * usual) / (thing.count + _DOUBT)
-        return log(own / usual)
+    def ratios(self, things: Sequence[Thing], labels: Sequence[str]) -> Floats:
+        """For each pair, log of the label's probability for the thing, over its usual one."""
+        counts = [thing.count for thing in things]
+        same = [thing.classes.get(label, 0) for thing, label in zip(things, labels, strict=True)]
+        usual = np.array([self._counts.get(label, 0) for label in labels]) + 1.0
+        usual /= self._total + 10.0
+        own = (np.array(same) + _DOUBT * usual) / (np.array(counts) + _DOUBT)
+        return logs(own / usual)
 
     def dump(self) -> State:
         """Everything, for a snapshot."""

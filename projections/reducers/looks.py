@@ -33,7 +33,7 @@ _LOOK_ALIKE = 0.05
 _SHARES = {True: (0.15, 0.85, 0.1), False: (0.02, 0.1, 0.88)}
 """Of look-alikes, others of the class, others, among two things whose labels agree or do not."""
 _RECENT = 8
-_ENOUGH_PAIRS = 20_000
+_ENOUGH_PAIRS = 3_000
 _FIRST_GUESS, _GUESS_WEIGHT = 0.5, 0.5
 
 
@@ -62,6 +62,11 @@ class LookRatios:
             agree: (log(a), log(b) + same - of_class, log(c) + same - other)
             for agree, (a, b, c) in _SHARES.items()
         }
+
+    def at_best(self, labels_agree: NDArray[np.bool_]) -> Floats:
+        """What no ratio is above."""
+        best: Floats = np.where(labels_agree, -self._shares[True][0], -self._shares[False][0])
+        return best
 
     def ratios(
         self,

@@ -16,7 +16,10 @@ the camera. At the distance a from a spot,
 z and e start from what their class is like (`class_heights`). Driving towards a thing, its growing
 box tells its distance as a change of bearing does. Gauss-Newton in information form; z and e are
 eliminated (Schur's complement). A residual beyond about two standard errors weighs less (Cauchy).
-+, −, ×, ÷ in one fixed order: the same bits on every machine.
+
+Each spot's part of the normal equations is kept, linearised where the estimate was; a sight changes
+the part of its spot alone. All are made anew once the estimate has moved by more than `_MOVED_M`
+since. +, −, ×, ÷, √ in one fixed order: the same bits on every machine.
 """
 
 import math
@@ -35,14 +38,20 @@ SLOPE = 0.02
 LEAST_ELEVATION_M2 = 0.0004
 _TOGETHER = 1.5
 _TAIL = 4.0
-_FIRST_ROUNDS = 3
-_ROUNDS = 2
+_MORE_ROUNDS = 2
+_MOVED_M = 0.1
+COMMON_M2 = 0.02
 _WEIGHT, _COUNT, _HEIGHT, _HEIGHTS, _SLOPED, _DEPTH, _DEPTH_WEIGHT = range(6, 13)
 
 Spot = list[float]
 """Means of x, y, cos, sin, across_per_m2, across_m2 of its sights, weighed by the precision of the
 bearing; that weight; number of sights; mean log height, their number, mean slope; mean measured
 distance, its precision."""
+Part = list[float]
+"""A spot's part of the normal equations in (x, y): matrix xx, xy, yy and right side of what is
+measured; the same of the range prior at weight 1; weight, gradient x, y and sum of the log size;
+of the elevation."""
+PART_SIZE = 18
 
 
 class Estimate(NamedTuple):
@@ -65,42 +74,49 @@ class Estimate(NamedTuple):
 
 
 class Spots:
-    """The spots that a thing was seen from, the number of spots ever."""
+    """The spots that a thing was seen from, their parts, the sum of these, where they were
+    linearised, and the number of spots ever."""
 
-    __slots__ = ("seen_from", "spots")
+    __slots__ = ("at", "parts", "seen_from", "spots", "total")
 
-    def __init__(self, spots: list[Spot] | None = None, seen_from: int = 0) -> None:
-        self.spots: list[Spot] = [] if spots is None else spots
-        self.seen_from = seen_from
+    def __init__(self) -> None:
+        self.spots: list[Spot] = []
+        self.parts: list[Part] = []
+        self.total: Part = [0.0] * PART_SIZE
+        self.at = (0.0, 0.0)
+        self.seen_from = 0
 
-    def add(self, sight: Sight) -> None:
-        """Take in a sight."""
+    def add(self, sight: Sight) -> int:
+        """Take in a sight; the index of its spot, whose part is out of date then."""
         weight = 1.0 / (sight.across_per_m2 + sight.across_m2)
         height, heights = (0.0, 0.0) if sight.log_height is None else (sight.log_height, 1.0)
         depth, depth_weight = (0.0, 0.0)
         if sight.measured is not None:
             depth, depth_weight = sight.measured[0], 1.0 / sight.measured[1]
         spot = [*sight[:6], weight, 1.0, height, heights, sight.slope, depth, depth_weight]
-        self._take(spot)
+        return self._take(spot)
 
     def take_in(self, other: "Spots") -> None:
-        """Take in the spots of another thing, which has turned out to be the same."""
+        """Take in the spots of another thing, which has turned out to be the same. All parts are
+        out of date then."""
         for spot in other.spots:
             self._take(spot)
 
-    def _take(self, new: Spot) -> None:
-        nearest, best = None, SPOT_M * SPOT_M
-        for spot in self.spots:
+    def _take(self, new: Spot) -> int:
+        found, best = -1, SPOT_M * SPOT_M
+        for index, spot in enumerate(self.spots):
             dx, dy = spot[0] - new[0], spot[1] - new[1]
             far = dx * dx + dy * dy
             if far < best:
-                nearest, best = spot, far
-        if nearest is None:
+                found, best = index, far
+        if found < 0:
             self.seen_from += 1
             self.spots.append(new)
+            self.parts.append([0.0] * PART_SIZE)
             if len(self.spots) > MAX_SPOTS:
-                del self.spots[1]  # the first one holds the view that founded the thing
-            return
+                self._drop(1)  # the first one holds the view that founded the thing
+            return len(self.spots) - 1
+        nearest = self.spots[found]
         total = nearest[_WEIGHT] + new[_WEIGHT]
         share = new[_WEIGHT] / total
         for index in range(_WEIGHT):
@@ -120,6 +136,11 @@ class Spots:
             nearest[_DEPTH_WEIGHT] += new[_DEPTH_WEIGHT]
             share = new[_DEPTH_WEIGHT] / nearest[_DEPTH_WEIGHT]
             nearest[_DEPTH] += (new[_DEPTH] - nearest[_DEPTH]) * share
+        return found
+
+    def _drop(self, index: int) -> None:
+        self.total = [a - b for a, b in zip(self.total, self.parts[index], strict=True)]
+        del self.spots[index], self.parts[index]
 
 
 class Solver:
@@ -130,107 +151,140 @@ class Solver:
         self._log_range = log(range_m)
         self._range_weight = 1.0 / (range_spread * range_spread)
 
-    def solve(self, spots: list[Spot], prior: HeightPrior, before: Estimate | None) -> Estimate:
-        """The estimate, starting from the one before, or from the first spot's."""
-        rounds = _ROUNDS
-        if before is not None:
-            x, y = before.x, before.y
+    def first(self, spots: Spots, prior: HeightPrior) -> Estimate:
+        """The estimate of a new thing."""
+        spot = spots.spots[0]
+        start = spot[_DEPTH] if spot[_DEPTH_WEIGHT] > 0.0 else self._range_m
+        x, y = spot[0] + start * spot[2], spot[1] + start * spot[3]
+        self._linearise(spots, x, y, None)
+        estimate = self._solve(spots, prior)
+        for _ in range(_MORE_ROUNDS):
+            self._linearise(spots, estimate.x, estimate.y, estimate)
+            estimate = self._solve(spots, prior)
+        return estimate
+
+    def next(
+        self, spots: Spots, prior: HeightPrior, before: Estimate, index: int | None
+    ) -> Estimate:
+        """The estimate after the spot of that index has changed, or all of them (None)."""
+        if index is None:
+            self._linearise(spots, before.x, before.y, before)
         else:
-            first, rounds = spots[0], _FIRST_ROUNDS
-            start = first[_DEPTH] if first[_DEPTH_WEIGHT] > 0.0 else self._range_m
-            x, y = first[0] + start * first[2], first[1] + start * first[3]
-        count = len(spots)
-        range_weight = self._range_weight
+            part = self._part(spots.spots[index], before.x, before.y, before)
+            old, total = spots.parts[index], spots.total
+            spots.total = [a + (b - c) for a, b, c in zip(total, part, old, strict=True)]
+            spots.parts[index] = part
+        estimate = self._solve(spots, prior)
+        dx, dy = estimate.x - spots.at[0], estimate.y - spots.at[1]
+        if dx * dx + dy * dy > _MOVED_M * _MOVED_M:
+            self._linearise(spots, estimate.x, estimate.y, estimate)
+            estimate = self._solve(spots, prior)
+        return estimate
+
+    def _linearise(self, spots: Spots, x: float, y: float, about: Estimate | None) -> None:
+        """Make all parts anew."""
+        spots.at = x, y
+        spots.parts = [self._part(spot, x, y, about) for spot in spots.spots]
+        total = [0.0] * PART_SIZE
+        for part in spots.parts:
+            total = [a + b for a, b in zip(total, part, strict=True)]
+        spots.total = total
+
+    def _part(self, spot: Spot, x: float, y: float, about: Estimate | None) -> Part:
+        """The part of a spot, linearised at (x, y); outliers by the sizes of ``about``."""
+        px, py, cos, sin, per_m2, least, _, count, height, heights, slope, depth, weight = spot
+        dx, dy = x - px, y - py
+        along, across = dx * cos + dy * sin, dy * cos - dx * sin
+        if along < LEAST_M:
+            along = LEAST_M
+        variance = per_m2 * along * along + least
+        w = (min(_TOGETHER, count)) / variance
+        w /= 1.0 + across * across / (variance * _TAIL)
+        ws, wc = w * sin, w * cos
+        # the bearing's line: n·p = n·s with n = (−sin, cos)
+        offset = cos * py - sin * px
+        xx, xy, yy, bx, by = ws * sin, -ws * cos, wc * cos, -ws * offset, wc * offset
+        if weight > 0.0:
+            wc, ws = weight * cos, weight * sin
+            distance = cos * px + sin * py + depth
+            xx += wc * cos
+            xy += wc * sin
+            yy += ws * sin
+            bx += wc * distance
+            by += ws * distance
+        log_along = log(along)
+        gx, gy = cos / along, sin / along
+        here = gx * x + gy * y
+        aim = self._log_range - log_along + here
+        part = [xx, xy, yy, bx, by, gx * gx, gx * gy, gy * gy, gx * aim, gy * aim]
+        if heights == 0.0:
+            return part + _NO_HEIGHT
+        share = min(_TOGETHER, heights)
+        value = height + log_along
+        w = share / (SIZE * SIZE)
+        if about is not None:
+            rest = value - about.log_size
+            w /= 1.0 + rest * rest * w / _TAIL
+        # log size = value + g·(p − here)
+        constant = value - here
+        wx, wy = w * gx, w * gy
+        part[0] += wx * gx
+        part[1] += wx * gy
+        part[2] += wy * gy
+        part[3] -= wx * constant
+        part[4] -= wy * constant
+        part += [w, wx, wy, w * constant]
+        value = along * slope
+        w = share / (SLOPE * SLOPE * along * along + LEAST_ELEVATION_M2)
+        if about is not None:
+            rest = value - about.elevation
+            w /= 1.0 + rest * rest * w / _TAIL
+        gx, gy = slope * cos, slope * sin
+        constant = value - gx * x - gy * y
+        wx, wy = w * gx, w * gy
+        part[0] += wx * gx
+        part[1] += wx * gy
+        part[2] += wy * gy
+        part[3] -= wx * constant
+        part[4] -= wy * constant
+        part += [w, wx, wy, w * constant]
+        return part
+
+    def _solve(self, spots: Spots, prior: HeightPrior) -> Estimate:
+        """Solve the normal equations of all parts."""
+        xx, xy, yy, bx, by, rxx, rxy, ryy, rx, ry, zw, zx, zy, zr, ew, ex, ey, er = spots.total
+        count = len(spots.spots)
+        weight = self._range_weight
         if count > _TOGETHER:
-            range_weight *= _TOGETHER / count
-        size_weight = 1.0 / (SIZE * SIZE)
-        log_range = self._log_range
+            weight *= _TOGETHER / count
         z_mean, z_prior, e_mean, e_prior = prior
-        for _ in range(rounds):
-            xx = xy = yy = bx = by = 0.0
-            zw, zx, zy, zr = z_prior, 0.0, 0.0, z_prior * z_mean
-            ew, ex, ey, er = e_prior, 0.0, 0.0, e_prior * e_mean
-            for px, py, cos, sin, ak, a0, _, n, height, heights, slope, depth, dw in spots:
-                dx, dy = x - px, y - py
-                along, across = dx * cos + dy * sin, dy * cos - dx * sin
-                if along < LEAST_M:
-                    along = LEAST_M
-                variance = ak * along * along + a0
-                w = (min(_TOGETHER, n)) / variance
-                w /= 1.0 + across * across / (variance * _TAIL)
-                xx += w * sin * sin
-                xy -= w * sin * cos
-                yy += w * cos * cos
-                bx += w * sin * across
-                by -= w * cos * across
-                log_along = log(along)
-                gx, gy = cos / along, sin / along
-                residual = log_range - log_along
-                xx += range_weight * gx * gx
-                xy += range_weight * gx * gy
-                yy += range_weight * gy * gy
-                bx += range_weight * gx * residual
-                by += range_weight * gy * residual
-                if dw > 0.0:
-                    residual = depth - along
-                    xx += dw * cos * cos
-                    xy += dw * cos * sin
-                    yy += dw * sin * sin
-                    bx += dw * cos * residual
-                    by += dw * sin * residual
-                if heights > 0.0:
-                    share = min(_TOGETHER, heights)
-                    value = height + log_along
-                    w = size_weight * share
-                    if zw > z_prior:
-                        residual = value - zr / zw
-                        w /= 1.0 + residual * residual * w / _TAIL
-                    xx += w * gx * gx
-                    xy += w * gx * gy
-                    yy += w * gy * gy
-                    bx -= w * gx * value
-                    by -= w * gy * value
-                    zw += w
-                    zx += w * gx
-                    zy += w * gy
-                    zr += w * value
-                    value = along * slope
-                    w = share / (SLOPE * SLOPE * along * along + LEAST_ELEVATION_M2)
-                    if ew > e_prior:
-                        residual = value - er / ew
-                        w /= 1.0 + residual * residual * w / _TAIL
-                    gx, gy = slope * cos, slope * sin
-                    xx += w * gx * gx
-                    xy += w * gx * gy
-                    yy += w * gy * gy
-                    bx -= w * gx * value
-                    by -= w * gy * value
-                    ew += w
-                    ex += w * gx
-                    ey += w * gy
-                    er += w * value
-            z, e = zr / zw, er / ew
-            xx -= zx * zx / zw + ex * ex / ew
-            xy -= zx * zy / zw + ex * ey / ew
-            yy -= zy * zy / zw + ey * ey / ew
-            bx += zx * z + ex * e
-            by += zy * z + ey * e
-            det = xx * yy - xy * xy
-            dx, dy = (yy * bx - xy * by) / det, (xx * by - xy * bx) / det
-            x += dx
-            y += dy
+        zw += z_prior
+        zr += z_prior * z_mean
+        ew += e_prior
+        er += e_prior * e_mean
+        # z = (zr + (zx, zy)·p) / zw minimises the sum of squares for a given p, e likewise
+        xx += weight * rxx - zx * zx / zw - ex * ex / ew
+        xy += weight * rxy - zx * zy / zw - ex * ey / ew
+        yy += weight * ryy - zy * zy / zw - ey * ey / ew
+        bx += weight * rx + zx * zr / zw + ex * er / ew
+        by += weight * ry + zy * zr / zw + ey * er / ew
+        det = xx * yy - xy * xy
+        x, y = (yy * bx - xy * by) / det, (xx * by - xy * bx) / det
         return Estimate(
             x,
             y,
-            yy / det,
+            yy / det + COMMON_M2,
             -xy / det,
-            xx / det,
-            z + (zx * dx + zy * dy) / zw,
+            xx / det + COMMON_M2,
+            (zr + zx * x + zy * y) / zw,
             zx / zw,
             zy / zw,
             1.0 / zw,
-            e + (ex * dx + ey * dy) / ew,
+            (er + ex * x + ey * y) / ew,
             ex / ew,
             ey / ew,
             1.0 / ew,
         )
+
+
+_NO_HEIGHT = [0.0] * 8

@@ -7,6 +7,7 @@ nine cells of that side around its estimate, so one look-up finds all that are w
 from collections.abc import Iterable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from eventsrc.envelope import Offset
 from projections.deltas import ObjectEstimated, ObjectOrdinal
@@ -17,11 +18,12 @@ from projections.reducers import State, part, prefixed
 from .agreement import ESTIMATE_FIELDS
 from .class_heights import ClassHeights
 from .looks import Floats
-from .spots import Estimate, Solver, Spots
+from .spots import PART_SIZE, Estimate, Part, Solver, Spot, Spots
 from .things import Thing
 
 _REACH_SPREADS = 1.8
 _UM, _UM2 = 1e6, 1e12
+_NONE = np.zeros(0, np.int64)
 
 
 class ThingIndex:
@@ -34,7 +36,7 @@ class ThingIndex:
         self._things: list[Thing | None] = []
         self._survivors: dict[ObjectOrdinal, ObjectOrdinal] = {}
         self._near: dict[tuple[int, int], list[ObjectOrdinal]] = {}
-        self.estimates: Floats = np.zeros((64, ESTIMATE_FIELDS))
+        self.estimates: Floats = np.zeros((ESTIMATE_FIELDS, 64))
 
     def thing(self, ordinal: ObjectOrdinal) -> Thing:
         """An Object that is not absorbed."""
@@ -53,17 +55,20 @@ class ThingIndex:
         """Enter a new Object; `solve` must follow."""
         ordinal = ObjectOrdinal(len(self._things))
         self._things.append(thing)
-        if ordinal >= len(self.estimates):
-            self.estimates = np.concatenate([self.estimates, np.zeros_like(self.estimates)])
+        self._make_room(len(self._things))
         return ordinal
 
-    def solve(self, ordinal: ObjectOrdinal) -> None:
-        """Estimate anew where an Object stands, and list it there."""
+    def solve(self, ordinal: ObjectOrdinal, spot: int | None = None) -> None:
+        """Estimate anew where an Object stands, and list it there; one spot has changed, or all."""
         thing = self.thing(ordinal)
         prior = self._heights.prior(thing.class_name)
         is_new = thing.estimate is None
-        thing.estimate = made = self._solver.solve(thing.spots.spots, prior, thing.estimate)
-        self.estimates[ordinal] = made
+        if thing.estimate is None:
+            made = self._solver.first(thing.spots, prior)
+        else:
+            made = self._solver.next(thing.spots, prior, thing.estimate, spot)
+        thing.estimate = made
+        self.estimates[:, ordinal] = made
         cell = int(made.x // self._reach_m), int(made.y // self._reach_m)
         if is_new or cell != thing.cell:
             if not is_new:
@@ -79,16 +84,18 @@ class ThingIndex:
             thing.spots.seen_from,
         )
 
-    def near(self, x: float, y: float) -> list[ObjectOrdinal]:
+    def near(self, x: float, y: float) -> NDArray[np.int64]:
         """The Objects within reach of a point, ascending."""
         reach = self._reach_m
-        listed = sorted(self._near.get((int(x // reach), int(y // reach)), ()))
+        listed = self._near.get((int(x // reach), int(y // reach)))
         if not listed:
-            return listed
-        rows = self.estimates[listed]
-        dx, dy = rows[:, 0] - x, rows[:, 1] - y
-        is_near: list[bool] = (dx * dx + dy * dy <= reach * reach).tolist()
-        return [ordinal for ordinal, near in zip(listed, is_near, strict=True) if near]
+            return _NONE
+        ordinals = np.array(listed)
+        ordinals.sort()
+        places = self.estimates[:2, ordinals]
+        dx, dy = places[0] - x, places[1] - y
+        near: NDArray[np.int64] = ordinals[dx * dx + dy * dy <= reach * reach]
+        return near
 
     def count_meetings(self, seen: list[ObjectOrdinal]) -> None:
         """One picture shows them all."""
@@ -118,7 +125,7 @@ class ThingIndex:
 
     def estimated(self, offset: Offset, ordinal: ObjectOrdinal) -> ObjectEstimated:
         """The delta of an Object's estimate."""
-        x, y, xx, xy, yy = self.estimates[ordinal, :5].tolist()
+        x, y, xx, xy, yy = self.estimates[:5, ordinal].tolist()
         spots = self.thing(ordinal).spots.seen_from
         return ObjectEstimated(
             offset,
@@ -130,6 +137,10 @@ class ThingIndex:
             round(yy * _UM2),
             spots,
         )
+
+    def _make_room(self, count: int) -> None:
+        while self.estimates.shape[1] < count:
+            self.estimates = np.concatenate([self.estimates, self.estimates * 0.0], axis=1)
 
     def _list(self, ordinal: ObjectOrdinal, thing: Thing, cell: tuple[int, int]) -> None:
         thing.cell = cell
@@ -146,7 +157,7 @@ class ThingIndex:
         things = [thing for _, thing in alive]
         looks = [thing.looks[: thing.exemplars] for thing in things]
         marks = [thing.marks[: thing.exemplars] for thing in things]
-        spots = [spot for thing in things for spot in thing.spots.spots]
+        spots = [spot + part for t in things for spot, part in _spots_and_parts(t)]
         return {
             "size": len(self._things),
             "survivors": sorted(map(list, self._survivors.items())),
@@ -163,6 +174,7 @@ class ThingIndex:
             "given": [thing.given for thing in things],
             "estimates": np.array([thing.estimate for thing in things]),
             "spots": np.array(spots),
+            "normal": np.array([[*t.spots.at, *t.spots.total] for t in things]),
             "looks": np.concatenate(looks).astype(np.int16) if looks else np.zeros((0, 0)),
             "marks": np.concatenate(marks) if marks else np.zeros((0, 5)),
         } | prefixed("heights", self._heights.dump())
@@ -172,8 +184,7 @@ class ThingIndex:
         self._things = [None] * state["size"]
         self._survivors = {ObjectOrdinal(a): ObjectOrdinal(b) for a, b in state["survivors"]}
         self._heights.load(part("heights", state))
-        while len(self.estimates) < state["size"]:
-            self.estimates = np.concatenate([self.estimates, np.zeros_like(self.estimates)])
+        self._make_room(state["size"])
         looks, marks, spots = state["looks"], state["marks"], state["spots"].tolist()
         seen, estimates = state["seen"].tolist(), state["estimates"].tolist()
         first_look = first_spot = 0
@@ -189,9 +200,8 @@ class ThingIndex:
                 seen[row][1],
                 name,
                 dict(classes),
-                Spots(spots[first_spot : first_spot + spot_count], state["spots_ever"][row]),
+                Spots(),
                 looks[first_look : first_look + exemplars].astype(np.float32),
-                marks[first_look : first_look + exemplars].copy(),
                 exemplars=exemplars,
                 met={ObjectOrdinal(other): n for other, n in state["met"][row]},
                 checked=checked,
@@ -199,14 +209,25 @@ class ThingIndex:
                 estimate=Estimate(*estimates[row]),
                 groups=set(state["groups"][row]),
             )
+            thing.marks[:exemplars] = marks[first_look : first_look + exemplars]
+            thing.spots.seen_from = state["spots_ever"][row]
+            for numbers in spots[first_spot : first_spot + spot_count]:
+                thing.spots.spots.append(numbers[:-PART_SIZE])
+                thing.spots.parts.append(numbers[-PART_SIZE:])
+            at_x, at_y, *thing.spots.total = state["normal"][row].tolist()
+            thing.spots.at = at_x, at_y
             first_look, first_spot = first_look + exemplars, first_spot + spot_count
             self._things[ordinal] = thing
-            self.estimates[ordinal] = estimates[row]
+            self.estimates[:, ordinal] = estimates[row]
             cell = (
                 int(estimates[row][0] // self._reach_m),
                 int(estimates[row][1] // self._reach_m),
             )
             self._list(ObjectOrdinal(ordinal), thing, cell)
+
+
+def _spots_and_parts(thing: Thing) -> Iterable[tuple[Spot, Part]]:
+    return zip(thing.spots.spots, thing.spots.parts, strict=True)
 
 
 def _around(cell: tuple[int, int]) -> Iterable[tuple[int, int]]:

@@ -35,7 +35,7 @@ class Thing:
     classes: dict[str, int]
     spots: Spots
     looks: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
-    marks: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 5)))
+    marks: NDArray[np.float64] = field(default_factory=lambda: np.zeros((MOST_EXEMPLARS, 5)))
     exemplars: int = 0
     cell: tuple[int, int] = (0, 0)
     met: dict[ObjectOrdinal, int] = field(default_factory=dict)
@@ -90,10 +90,10 @@ class Thing:
 
     def _grow(self, size: int, dim: int) -> None:
         count = self.exemplars
-        looks, marks = np.zeros((size, dim), np.float32), np.zeros((size, 5))
+        looks = np.zeros((size, dim), np.float32)
         if count:
-            looks[:count], marks[:count] = self.looks, self.marks
-        self.looks, self.marks = looks, marks
+            looks[:count] = self.looks
+        self.looks = looks
 
 
 def _eighth(cos: float, sin: float) -> int:
