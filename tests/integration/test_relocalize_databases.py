@@ -30,16 +30,25 @@ def log(tmp_path: Path) -> Path:
     return write_log(tmp_path / "log", [*walk(60, seed=3), *other])
 
 
+@pytest.fixture(params=["page", "evidence"])
+def rule(request: pytest.FixtureRequest) -> Settings:
+    return Settings(fusion=request.param)
+
+
 @pytest.fixture
-def view(log: Path) -> MapView:
+def view(log: Path, rule: Settings) -> MapView:
+    return view_of(log, rule)
+
+
+def view_of(log: Path, settings: Settings) -> MapView:
     with LogReader(log) as reader:
-        return fold_log(reader, SETTINGS)[1]
+        return fold_log(reader, settings)[1]
 
 
 @pytest.fixture(params=["one_database", "two_databases"])
-def targets(request: pytest.FixtureRequest, log: Path) -> Targets:
+def targets(request: pytest.FixtureRequest, log: Path, rule: Settings) -> Targets:
     found: Targets = request.getfixturevalue(request.param)
-    rebuild(log, found, SETTINGS)
+    rebuild(log, found, rule)
     return found
 
 
@@ -92,6 +101,23 @@ def test_the_library_call_answers(targets: Targets, view: MapView) -> None:
         live, exact = relocalize(targets, crops), rank(crops, index.search(crops))
         assert [p.place_id for p in live.places] == [p.place_id for p in exact.places]
         assert live.confidence == pytest.approx(exact.confidence, abs=0.02)
+
+
+def test_a_graph_by_evidence_goes_with_vectors_of_the_other_rule(
+    log: Path, two_databases: Targets
+) -> None:
+    """The rule changes Objects alone, which are in the graph."""
+    evidence = Settings(fusion="evidence")
+    rebuild(log, two_databases, SETTINGS, only="vectors")
+    rebuild(log, two_databases, evidence, only="graph")
+    crops = next(questions())
+    ours, theirs = (ExactIndex(view_of(log, s)).search(crops, 200) for s in (evidence, SETTINGS))
+    assert found(ours) != found(theirs)
+    with CandidateReader(two_databases) as reader:
+        assert found(reader.candidates(crops, 200)) == found(ours)
+    rebuild(log, two_databases, SETTINGS, only="graph")
+    with CandidateReader(two_databases) as reader:
+        assert found(reader.candidates(crops, 200)) == found(theirs)
 
 
 def test_another_embedding_space_is_refused(targets: Targets) -> None:
