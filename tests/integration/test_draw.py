@@ -37,6 +37,15 @@ def test_a_picture_of_any_point_with_other_settings(log: Path, tmp_path: Path) -
     assert "ε 0.75 m, min_samples 8" in part.read_text("utf-8")
 
 
+def test_a_picture_by_evidence_shows_where_objects_stand(log: Path, tmp_path: Path) -> None:
+    out = tmp_path / "map.svg"
+    arguments = ("--at", "90", "--set", "fusion=evidence", "--house", "7")
+    assert _draw(str(log), *arguments, "--out", str(out)).returncode == 0
+    text = out.read_text("utf-8")
+    assert "drawn where it stands, with the ellipse of two standard errors" in text
+    assert "drawn where the robot saw it from" not in text
+
+
 def test_the_title_of_the_log_one_is_in(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
