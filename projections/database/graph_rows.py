@@ -47,7 +47,8 @@ CHANGING: Final[tuple[Label, ...]] = (
 class GraphRows:
     """Rows to insert (never seen before), to upsert, and graphids to delete, by label.
 
-    ``replaced`` are rows to delete and insert anew, of labels that cannot be upserted.
+    ``replaced`` are edges to delete and insert anew, of labels that cannot be upserted; no other
+    edge of the label starts where one of them does.
     """
 
     inserted: dict[Label, list[Any]]

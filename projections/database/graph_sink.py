@@ -69,7 +69,7 @@ class GraphSink:
             kind = "upsert_vertex" if label in VERTEX_LABELS else "upsert_edge"
             unnest_columns(kind, GRAPH, label, upserted)(connection)
         for label, replaced in rows.replaced.items():
-            _delete(connection, label, [row[0] for row in replaced])
+            _delete(connection, label, [row[1] for row in replaced], "delete_from")
             _new_rows(InsertLoader(), GRAPH, label, replaced)(connection)
         for label, ids in rows.deleted.items():
             _delete(connection, label, ids)
@@ -150,8 +150,10 @@ class GraphShadow:
         return load
 
 
-def _delete(connection: Connection, label: Label, ids: Sequence[int]) -> None:
-    query = statements("graph")["delete"].format(
+def _delete(
+    connection: Connection, label: Label, ids: Sequence[int], statement: str = "delete"
+) -> None:
+    query = statements("graph")[statement].format(
         graph=sql.Identifier(GRAPH), label=sql.Identifier(label)
     )
     connection.execute(query, [[str(i) for i in ids]])

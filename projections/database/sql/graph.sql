@@ -30,6 +30,11 @@ SET start_id = EXCLUDED.start_id, end_id = EXCLUDED.end_id, properties = EXCLUDE
 DELETE FROM {graph}.{label}
 WHERE id OPERATOR(ag_catalog.=) ANY (%s::text[]::ag_catalog.graphid[])
 
+-- name: delete_from
+-- Edges by where they start, for labels that have no index of their ids.
+DELETE FROM {graph}.{label}
+WHERE start_id OPERATOR(ag_catalog.=) ANY (%s::text[]::ag_catalog.graphid[])
+
 -- name: copy_vertex
 COPY {graph}.{label} (id, properties) FROM STDIN
 
