@@ -2,7 +2,8 @@
 
 One observation is one vote for the place of its keyframe, as labelled now; noise does not vote, and
 votes once it is promoted. Ties go to the place founded first. An Object none of whose observations
-has a place is nowhere. The votes of an absorbed Object are its survivor's.
+has a place is nowhere. The votes of an absorbed Object are its survivor's. When an Object turns out
+to stand elsewhere, only the votes since count.
 """
 
 from eventsrc.envelope import Offset
@@ -65,6 +66,23 @@ class LocatedIn:
             self.waiting.setdefault(keyframe, []).append(ordinal)
         else:
             self._vote(ordinal, place)
+
+    def object_relocated(
+        self, ordinal: ObjectOrdinal, keyframe: KeyframeOrdinal, place: PlaceOrdinal | None
+    ) -> None:
+        """The Object stands elsewhere, as the observation shows that was made from a keyframe in
+        ``place``: its votes until now are void, those to come of earlier keyframes too."""
+        for voted in self.votes[ordinal]:
+            self.voters[voted].pop(ordinal, None)
+        self.votes[ordinal] = {}
+        self._touched[ordinal] = None
+        for earlier, waiting in list(self.waiting.items()):
+            kept = [each for each in waiting if self.survivors.find(each) != ordinal]
+            if kept:
+                self.waiting[earlier] = kept
+            else:
+                del self.waiting[earlier]
+        self.object_seen(ordinal, keyframe, place)
 
     def collect_moves(self, offset: Offset) -> list[ObjectMoved]:
         """Recount the Objects whose votes changed; those that moved, ascending."""

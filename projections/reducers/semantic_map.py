@@ -30,6 +30,7 @@ from projections.deltas import (
     KeyframeAdded,
     KeyframeOrdinal,
     KeyframePlaced,
+    ObjectRelocated,
     ObjectSeen,
     ObjectsMerged,
     ObservationAdded,
@@ -355,12 +356,14 @@ class SemanticMap:
     def _locate(
         self, fused: Sequence[Delta], keyframe: KeyframeOrdinal, place: PlaceOrdinal | None
     ) -> None:
-        """Tell located-in what was seen and what became one."""
+        """Tell located-in what was seen, what became one and what stands elsewhere."""
         for delta in fused:
             if type(delta) is ObjectSeen:
                 self.located_in.object_seen(delta.object, keyframe, place)
             elif type(delta) is ObjectsMerged:
                 self.located_in.objects_merged(delta.survivor, delta.absorbed)
+            elif type(delta) is ObjectRelocated:
+                self.located_in.object_relocated(delta.object, keyframe, place)
 
 
 def _landmarks(settings: Settings, corrections: Corrections) -> Landmarks | EvidenceLandmarks:

@@ -57,7 +57,13 @@ EDITS: st.SearchStrategy[tuple[Callable[..., Command], tuple[Any, ...]]] = st.on
     ),
     st.tuples(
         st.just(by.use_settings),
-        st.tuples(st.builds(Settings, eps_m=st.sampled_from([0.6, 1.5, 30.0]))),
+        st.tuples(
+            st.builds(
+                Settings,
+                eps_m=st.sampled_from([0.6, 1.5, 30.0]),
+                fusion=st.sampled_from(["page", "evidence"]),
+            )
+        ),
     ),
 )
 
