@@ -18,7 +18,7 @@ def _run(name: str) -> tuple[dict[str, Any], ...]:
 
 
 def flickering_house(
-    name: str, count: int, *, seed: int = 0, first: int = 0, noise_m: float = 0.15
+    name: str, count: int, *, seed: int = 0, first: int = 0, noise_m: float = 0.3
 ) -> list[dict[str, Any]]:
     """``count`` keyframes of the run ``name`` from ``first`` on; a fifth of their labels are of
     another class of the house."""

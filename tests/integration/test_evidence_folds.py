@@ -63,8 +63,8 @@ def test_the_log_has_what_these_tests_are_about(log: Path) -> None:
                     merged_later += delta.absorbed < older
             older += len(found)
     assert kinds[d.ObjectEstimated] > kinds[d.ObjectFound] > 20
-    assert kinds[d.ObjectClassified] > 5
-    assert merged_later > 3
+    assert kinds[d.ObjectClassified] > 3
+    assert merged_later > 2
 
 
 @pytest.mark.parametrize("size", [1, 17])
