@@ -2,8 +2,8 @@
 
 One observation is one vote for the place of its keyframe, as labelled now; noise does not vote, and
 votes once it is promoted. Ties go to the place founded first. An Object none of whose observations
-has a place is nowhere. The votes of an absorbed Object are its survivor's. When an Object turns out
-to stand elsewhere, only the votes since count.
+has a place is nowhere. The votes of an absorbed Object are its survivor's. An Object that turns out
+to stand where another was found, and absorbs that, has the votes of that one only.
 """
 
 from eventsrc.envelope import Offset
@@ -67,22 +67,19 @@ class LocatedIn:
         else:
             self._vote(ordinal, place)
 
-    def object_relocated(
-        self, ordinal: ObjectOrdinal, keyframe: KeyframeOrdinal, place: PlaceOrdinal | None
-    ) -> None:
-        """The Object stands elsewhere, as the observation shows that was made from a keyframe in
-        ``place``: its votes until now are void, those to come of earlier keyframes too."""
+    def object_left(self, ordinal: ObjectOrdinal) -> None:
+        """The Object is not where it was seen: its votes until now are void, those to come of
+        keyframes until now too."""
         for voted in self.votes[ordinal]:
-            self.voters[voted].pop(ordinal, None)
+            del self.voters[voted][ordinal]
         self.votes[ordinal] = {}
         self._touched[ordinal] = None
-        for earlier, waiting in list(self.waiting.items()):
+        for keyframe, waiting in list(self.waiting.items()):
             kept = [each for each in waiting if self.survivors.find(each) != ordinal]
             if kept:
-                self.waiting[earlier] = kept
+                self.waiting[keyframe] = kept
             else:
-                del self.waiting[earlier]
-        self.object_seen(ordinal, keyframe, place)
+                del self.waiting[keyframe]
 
     def collect_moves(self, offset: Offset) -> list[ObjectMoved]:
         """Recount the Objects whose votes changed; those that moved, ascending."""

@@ -18,6 +18,7 @@ The fold has no clock, chance, disk, network or database. The same events give t
 
 from collections.abc import Sequence
 from functools import reduce
+from itertools import zip_longest
 from operator import or_
 from typing import TypeAlias
 
@@ -357,13 +358,13 @@ class SemanticMap:
         self, fused: Sequence[Delta], keyframe: KeyframeOrdinal, place: PlaceOrdinal | None
     ) -> None:
         """Tell located-in what was seen, what became one and what stands elsewhere."""
-        for delta in fused:
+        for delta, following in zip_longest(fused, fused[1:]):
             if type(delta) is ObjectSeen:
                 self.located_in.object_seen(delta.object, keyframe, place)
             elif type(delta) is ObjectsMerged:
+                if type(following) is ObjectRelocated and following.object == delta.survivor:
+                    self.located_in.object_left(delta.survivor)
                 self.located_in.objects_merged(delta.survivor, delta.absorbed)
-            elif type(delta) is ObjectRelocated:
-                self.located_in.object_relocated(delta.object, keyframe, place)
 
 
 def _landmarks(settings: Settings, corrections: Corrections) -> Landmarks | EvidenceLandmarks:

@@ -62,22 +62,19 @@ def test_votes_are_void_when_an_object_stands_elsewhere(
                 chosen = waiting[a % len(waiting)]
                 recount.place_of[chosen] = b % 3
                 located.keyframe_placed(KeyframeOrdinal(chosen), PlaceOrdinal(b % 3))
-        elif kind == "merge" and len(alive) > 1:
+        elif kind in ("merge", "relocate") and len(alive) > 1:
             one, other = alive[a % len(alive)], alive[b % len(alive)]
             if one != other:
                 survivor, absorbed = min(one, other), max(one, other)
+                if kind == "relocate":
+                    located.object_left(ObjectOrdinal(survivor))
+                    recount.votes = [(o, k) for o, k in recount.votes if o != survivor]
                 located.objects_merged(ObjectOrdinal(survivor), ObjectOrdinal(absorbed))
                 alive.remove(absorbed)
                 recount.votes = [(survivor if o == absorbed else o, k) for o, k in recount.votes]
         elif kind == "join":
             located.places_merged(PlaceOrdinal(0), (PlaceOrdinal(2),))
             recount.place_of = {k: 0 if p == 2 else p for k, p in recount.place_of.items()}
-        elif kind == "relocate":
-            ordinal = alive[a % len(alive)]
-            located.object_seen(ObjectOrdinal(ordinal), keyframe, at)
-            located.object_relocated(ObjectOrdinal(ordinal), keyframe, at)
-            recount.votes = [(o, k) for o, k in recount.votes if o != ordinal]
-            recount.votes.append((ordinal, number))
         moved = {m.object: m.place for m in located.collect_moves(Offset(number))}
         for ordinal in alive:
             assert located.located[ordinal] == recount.located(ordinal)
