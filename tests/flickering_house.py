@@ -4,6 +4,7 @@ So fusion by evidence has something to do in tests: things are found twice and m
 their class is another one than at first.
 """
 
+from collections.abc import Collection
 from functools import cache
 from typing import Any
 
@@ -18,10 +19,15 @@ def _run(name: str) -> tuple[dict[str, Any], ...]:
 
 
 def flickering_house(
-    name: str, count: int, *, seed: int = 0, first: int = 0, noise_m: float = 0.3
+    name: str,
+    count: int,
+    *,
+    seed: int = 0,
+    noise_m: float = 0.3,
+    without: Collection[str] = (),
 ) -> list[dict[str, Any]]:
-    """``count`` keyframes of the run ``name`` from ``first`` on; a fifth of their labels are of
-    another class of the house."""
+    """The first ``count`` keyframes of the run ``name``; a fifth of their labels are of another
+    class of the house. Things of the classes ``without`` were carried away before."""
     rng = np.random.default_rng([seed, ord(name)])
     classes = sorted({d["class"] for envelope in _run(name) for d in envelope["detections"]})
     documents = []
@@ -32,6 +38,7 @@ def flickering_house(
             if rng.random() < 0.2
             else seen
             for seen in envelope["detections"]
+            if seen["class"] not in without
         ]
         documents.append(
             {
@@ -42,4 +49,4 @@ def flickering_house(
                 "detections": detections,
             }
         )
-    return documents[first : first + count]
+    return documents[:count]
