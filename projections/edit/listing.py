@@ -30,6 +30,7 @@ from projections.settings import Settings, settings_by_name
 from .effect import Effect
 from .make import undone_by
 
+_MOST_CONSTANTS = 4
 Found = Sequence[tuple[RecordedCommand, Effect | None]]
 
 
@@ -56,6 +57,10 @@ def what(command: Command) -> str:
         case UseSettings():
             plain, given = Settings().by_name(), settings_by_name(command.settings)
             changed = [f"{k}={v}" for k, v in given.items() if plain.get(k) != v]
+            constants = [text for text in changed if text.startswith("evidence.")]
+            if len(constants) > _MOST_CONSTANTS:  # of a calibration: some forty
+                changed = [text for text in changed if text not in constants]
+                changed.append(f"{len(constants)} constants of evidence")
             return ", ".join(changed) or "the defaults"
         case Undo():
             return command.undone

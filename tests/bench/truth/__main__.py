@@ -1,7 +1,8 @@
 """One table: Objects by the page's rule and by evidence, side by side, against the truth.
 
 python -m tests.bench.truth [--half develop|validate] [--quick] [--world W…] [--profile P…]
-    [--moved FRACTION] [--limit N] [--set NAME=VALUE…] [--worlds DIR] [--cache DIR] [--json FILE]
+    [--moved FRACTION] [--calibrated] [--limit N] [--set NAME=VALUE…]
+    [--worlds DIR] [--cache DIR] [--json FILE]
 
 A line for each robot (profile) in a building (world), runs a, b and c in one log; the worst last.
 """
@@ -17,6 +18,7 @@ from projections.errors import SettingsError
 from projections.settings import Settings
 
 from . import tables
+from .calibrating import calibrated_settings, calibration_table
 from .folding import fold_timed
 from .moving import score_moved
 from .scoring import score_objects
@@ -49,6 +51,8 @@ def main() -> None:
         f"{options.half} half, {len(chosen)} of world × profile, at most {limit} keyframes a run"
         + (f", {options.moved:g} of the movable things moved" if options.moved else "")
     )
+    if options.calibrated:
+        print(calibration_table(rows))
     print(tables.moved_table(rows) if options.moved else tables.objects_table(rows))
     if options.json:
         document = [dataclasses.asdict(row) for row in rows]
@@ -65,6 +69,9 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--profile", nargs="+", default=[], metavar="P")
     parser.add_argument(
         "--moved", type=float, default=0.0, help="share of the movable things moved after run a"
+    )
+    parser.add_argument(
+        "--calibrated", action="store_true", help="the map's own constants beside the priors"
     )
     parser.add_argument("--limit", type=int, help=f"most keyframes a run ({LIMIT})")
     parser.add_argument(
@@ -98,6 +105,10 @@ def _row(case: Case, options: argparse.Namespace) -> tables.Row:
     page, page_s = fold_timed(case.events, Settings())
     settings = Settings(fusion="evidence", camera=case.camera).with_assignments(options.set)
     evidence, evidence_s = fold_timed(case.events, settings)
+    calibrated, calibrated_s = None, 0.0
+    if options.calibrated:
+        own, calibrated_s = calibrated_settings(case.events, settings)
+        calibrated = score_objects(fold_timed(case.events, own)[0], case.truth, case.things)
     moved = (case.truth, case.things, case.first_run, case.looks_again)
     return tables.Row(
         case.name,
@@ -108,6 +119,8 @@ def _row(case: Case, options: argparse.Namespace) -> tables.Row:
         evidence_s,
         score_moved(evidence, *moved) if options.moved else None,
         score_moved(evidence, *moved, least_seen=2, least_looks=3) if options.moved else None,
+        calibrated,
+        calibrated_s,
     )
 
 

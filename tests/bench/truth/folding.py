@@ -1,9 +1,10 @@
 """Fold a case's envelopes and time it."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from eventsrc.ingest import Accepted
+from projections.deltas import Delta
 from projections.exact import unit_vectors
 from projections.model.fold import READ_AHEAD, gc_paused
 from projections.model.view import MapView
@@ -14,8 +15,18 @@ from projections.settings import Settings
 def fold_timed(events: Sequence[Accepted], settings: Settings) -> tuple[MapView, float]:
     """The view of validated envelopes folded in order, and the seconds of processor time that unit
     vectors, fold and view took."""
-    semantic_map, view = SemanticMap(settings), MapView(settings, keep_embeddings=False)
     start = time.process_time()
+    view = MapView(settings, keep_embeddings=False)
+    for _ in fold_into(view, events):
+        pass
+    return view, time.process_time() - start
+
+
+def fold_into(
+    view: MapView, events: Sequence[Accepted]
+) -> Iterator[tuple[Accepted, Sequence[Delta]]]:
+    """Fold envelopes into an empty view; each with its deltas."""
+    semantic_map = SemanticMap(view.settings)
     with gc_paused():
         for first in range(0, len(events), READ_AHEAD):
             chunk = events[first : first + READ_AHEAD]
@@ -23,5 +34,6 @@ def fold_timed(events: Sequence[Accepted], settings: Settings) -> tuple[MapView,
             for accepted in chunk:
                 offset = semantic_map.next_offset
                 own = [next(units) for _ in accepted.vectors]
-                view.apply_event(offset, semantic_map.fold(offset, accepted, own))
-    return view, time.process_time() - start
+                deltas = semantic_map.fold(offset, accepted, own)
+                view.apply_event(offset, deltas)
+                yield accepted, deltas

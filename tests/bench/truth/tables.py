@@ -12,7 +12,8 @@ HOUSE = "house-a"
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """The scores of one case; ``well`` is `moved` over things that were seen well."""
+    """The scores of one case; ``well`` is `moved` over things that were seen well, ``calibrated``
+    `evidence` with the constants of the map itself."""
 
     name: str
     keyframes: int
@@ -22,6 +23,8 @@ class Row:
     evidence_s: float
     moved: MovedScores | None = None
     well: MovedScores | None = None
+    calibrated: ObjectScores | None = None
+    calibrated_s: float = 0.0
 
 
 _HEADS = (
@@ -67,16 +70,16 @@ def _cells(row: Row) -> Iterable[str]:
         str(page.instances),
         str(page.objects),
         str(evidence.objects),
-        _number(page.ratio, 2),
-        _number(evidence.ratio, 2),
-        _number(page.v_measure, 3),
-        _number(evidence.v_measure, 3),
-        _number(page.adjusted_rand, 3),
-        _number(evidence.adjusted_rand, 3),
-        _number(evidence.median_error_m, 2),
-        _number(evidence.inside_share, 2),
-        _number(row.page_s, 2),
-        _number(_quotient(row.evidence_s, row.page_s), 2),
+        number(page.ratio, 2),
+        number(evidence.ratio, 2),
+        number(page.v_measure, 3),
+        number(evidence.v_measure, 3),
+        number(page.adjusted_rand, 3),
+        number(evidence.adjusted_rand, 3),
+        number(evidence.median_error_m, 2),
+        number(evidence.inside_share, 2),
+        number(row.page_s, 2),
+        number(_quotient(row.evidence_s, row.page_s), 2),
     )
 
 
@@ -97,10 +100,10 @@ def _mean_cells(title: str, rows: Sequence[Row]) -> Iterable[str]:
         _mean((scores.v_measure for scores in evidences), 3),
         _mean((scores.adjusted_rand for scores in pages), 3),
         _mean((scores.adjusted_rand for scores in evidences), 3),
-        _number(errors[len(errors) // 2] if errors else math.nan, 2),
-        _number(_quotient(sum(scores.inside for scores in evidences), len(errors)), 2),
-        _number(page_s, 2),
-        _number(_quotient(evidence_s, page_s), 2),
+        number(errors[len(errors) // 2] if errors else math.nan, 2),
+        number(_quotient(sum(scores.inside for scores in evidences), len(errors)), 2),
+        number(page_s, 2),
+        number(_quotient(evidence_s, page_s), 2),
     )
 
 
@@ -120,12 +123,12 @@ def _moved_cells(scores: MovedScores, well: MovedScores) -> Iterable[str]:
         str(scores.moved),
         str(scores.missing),
         str(scores.knowable),
-        _number(_quotient(_told(scores), scores.knowable), 2),
+        number(_quotient(_told(scores), scores.knowable), 2),
         str(scores.wronged),
         str(scores.others),
-        _number(_quotient(scores.wronged, scores.others), 3),
+        number(_quotient(scores.wronged, scores.others), 3),
         str(well.knowable),
-        _number(_quotient(_told(well), well.knowable), 2),
+        number(_quotient(_told(well), well.knowable), 2),
         f"{scores.gone}/{scores.phantoms}",
     )
 
@@ -156,12 +159,13 @@ def _moved_line(name: str, cells: Iterable[str]) -> str:
 
 def _mean(values: Iterable[float], digits: int) -> str:
     present = [value for value in values if not math.isnan(value)]
-    return _number(sum(present) / len(present) if present else math.nan, digits)
+    return number(sum(present) / len(present) if present else math.nan, digits)
 
 
 def _quotient(a: float, b: float) -> float:
     return a / b if b else math.nan
 
 
-def _number(value: float, digits: int) -> str:
+def number(value: float, digits: int) -> str:
+    """A number for a table; - for NaN."""
     return "-" if math.isnan(value) else f"{value:.{digits}f}"

@@ -1,0 +1,202 @@
+"""`mapfold calibrate` on logs: what it prints, records, and what the next fold does with it."""
+
+import json
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from eventsrc.log import LogReader, LogWriter
+from projections.calibrate.rounds import calibrate
+from projections.evidence import EvidenceConstants
+from projections.model.log_commands import read_corrections
+from projections.settings import Settings
+from tests.commands import Commands
+from tests.envelopes import envelope
+from tests.fixtures_zenoh import Program
+from tests.logs import walk, write_log
+from tests.seen_rooms import BEARING_RAD, SIZES, drive, write_room
+
+BY_EVIDENCE = ("--set", "fusion=evidence")
+
+
+@pytest.fixture
+def mapfold(tmp_path: Path) -> Commands:
+    write_room(tmp_path / "log")
+    return Commands.in_folder(tmp_path)
+
+
+def _by_name(document: Any) -> dict[str, dict[str, Any]]:
+    return {each["name"]: each for each in document["constants"]}
+
+
+def _settings(log: Path) -> Settings:
+    with LogReader(log) as reader:
+        return read_corrections(reader).settings or Settings()
+
+
+def test_constants_are_printed_with_their_priors_and_what_they_rest_on(mapfold: Commands) -> None:
+    said = mapfold("calibrate", "log")
+    first, header, *rest = said.out.splitlines()
+    assert first.startswith("160 keyframes with a pose, ")
+    assert "6 things with bearings that cross well, seen " in first
+    assert header.split() == ["evidence.", "value", "prior", "this", "map", "rests", "on"]
+    rows = {line.split()[0]: line for line in rest}
+    assert rows["bearing_rad"].endswith(" observations")
+    assert rows["sizes_m.lamp"].endswith(" whole boxes")
+    assert rows["sizes_m.lamp"].split()[2] == "-"
+    assert rest[-1].startswith("the map is folded by the page's rule")
+    assert "hint" not in said.err
+    assert mapfold("edits", "log", "--json").json == []
+
+
+def test_json_names_constants_as_set_takes_them(mapfold: Commands) -> None:
+    found = mapfold("calibrate", "log", "--json", *BY_EVIDENCE).json
+    assert (found["keyframes"], found["things"], found["runs"]) == (160, 6, 2)
+    assert (found["fusion"], found["recorded"], found["hints"]) == ("evidence", None, [])
+    named = _by_name(found)
+    assert named["evidence.bearing_rad"]["prior"] == EvidenceConstants().bearing_rad
+    assert named["evidence.bearing_rad"]["seen"] == pytest.approx(BEARING_RAD, abs=0.012)
+    for name, size in SIZES.items():
+        assert named[f"evidence.sizes_m.{name}"]["value"] == pytest.approx(size, rel=0.1)
+    given = [f"{n}={e['value']}" for n, e in named.items() if e["value"] is not None]
+    taken = Settings(fusion="evidence").with_assignments(given)
+    assert taken.evidence.sizes_m["lamp"] == named["evidence.sizes_m.lamp"]["value"]
+
+
+def test_the_same_log_gives_the_same_answer(mapfold: Commands) -> None:
+    assert mapfold("calibrate", "log", "--json").out == mapfold("calibrate", "log", "--json").out
+
+
+def test_written_constants_are_in_every_fold_and_can_be_undone(mapfold: Commands) -> None:
+    log = mapfold.folder / "log"
+    before = mapfold("state", "log", "--json").json["settings"]
+    mapfold("edit", "log", "use-settings", "--set", "eps_m=0.9", *BY_EVIDENCE, "--reason", "why")
+    evidence = mapfold("state", "log", "--json").json["settings"]
+    read = mapfold("calibrate", "log", "--json").json
+    said = mapfold("calibrate", "log", "--write", "--json").json
+    assert said["constants"] == read["constants"]
+    assert said["recorded"]["offset"] == 161
+    settings = _settings(log)
+    assert (settings.eps_m, settings.fusion) == (0.9, "evidence")
+    named = _by_name(said)
+    assert settings.evidence.range_m == named["evidence.range_m"]["value"] != 2.0
+    assert set(settings.evidence.sizes_m) == set(SIZES)
+    calibrated = mapfold("state", "log", "--json").json["settings"]
+    assert len({json.dumps(each) for each in (before, evidence, calibrated)}) == 3
+    listed = mapfold("edits", "log", "--json").json[-1]
+    assert listed["reason"].startswith("calibrated: 6 things seen ")
+    undo = ("undo", said["recorded"]["command_id"], "--reason", "no")
+    mapfold("edit", "log", *undo)
+    assert mapfold("state", "log", "--json").json["settings"] == evidence
+    assert _settings(log).evidence == EvidenceConstants()
+
+
+def test_write_with_set_switches_the_rule_in_one_command(mapfold: Commands) -> None:
+    said = mapfold("calibrate", "log", "--write", *BY_EVIDENCE, "--reason", "try it").out
+    assert "folded by the page's rule" not in said
+    assert "use-settings recorded at offset 160, command " in said.splitlines()[-1]
+    settings = _settings(mapfold.folder / "log")
+    assert (settings.fusion, settings.evidence.range_m != 2.0) == ("evidence", True)
+    assert mapfold("edits", "log", "--json").json[0]["reason"] == "try it"
+
+
+def test_what_is_in_the_log_already_is_not_recorded_again(tmp_path: Path) -> None:
+    write_log(tmp_path / "log", [envelope(k, 0.1 * k) for k in range(3)])
+    said = Commands.in_folder(tmp_path)("calibrate", "log", "--write")
+    assert said.out.splitlines()[-1] == "the log has these constants already; nothing is recorded"
+    with LogReader(tmp_path / "log") as reader:
+        assert reader.next_offset == 3
+
+
+def test_the_camera_of_the_settings_serves_where_envelopes_state_none(tmp_path: Path) -> None:
+    write_room(tmp_path / "stated")
+    write_room(tmp_path / "log", camera=False)
+    mapfold = Commands.in_folder(tmp_path)
+    camera = ("hfov_deg=90", "width_px=800", "height_px=600")
+    given = [word for each in camera for word in ("--set", f"camera.{each}")]
+    found = mapfold("calibrate", "log", "--json", *given).json
+    assert found["constants"] == mapfold("calibrate", "stated", "--json").json["constants"]
+    wrong = mapfold("calibrate", "log").out
+    assert "beyond the picture of 640 × 400 pixels: give the camera" in wrong
+
+
+THIN: dict[str, tuple[list[dict[str, Any]], str]] = {
+    "empty": ([], "no observation has a pose and an embedding: all constants are priors"),
+    "no detections": ([envelope(k, 0.1 * k) for k in range(5)], "all constants are priors"),
+    "no poses": ([envelope(k, None) for k in range(5)], "all constants are priors"),
+    "no revisits": (walk(40, detections=1), "nothing was seen three times from spots 0.8 m apart"),
+    "one run": (drive(4, "run-a", 60), "one run: what a thing's likeness loses between runs"),
+}
+
+
+@pytest.mark.parametrize("name", THIN)
+def test_thin_maps_keep_their_priors_and_say_why(tmp_path: Path, name: str) -> None:
+    documents, reason = THIN[name]
+    write_log(tmp_path / "log", documents)
+    mapfold = Commands.in_folder(tmp_path)
+    assert reason in mapfold("calibrate", "log").out
+    for each in mapfold("calibrate", "log", "--json").json["constants"]:
+        if each["count"] == 0:
+            assert each["value"] == each["prior"]
+            assert each["seen"] is None
+
+
+def test_a_log_that_is_none_and_options_that_do_not_fit_are_errors(mapfold: Commands) -> None:
+    assert "no log at nowhere" in mapfold("calibrate", "nowhere", code=2).err
+    assert "are for --write" in mapfold("calibrate", "log", "--reason", "x", code=2).err
+    assert (
+        "no setting 'evidence.x'"
+        in mapfold("calibrate", "log", "--set", "evidence.x=1", code=2).err
+    )
+
+
+def test_a_second_calibration_is_drawn_to_the_priors_not_to_the_first(mapfold: Commands) -> None:
+    with LogReader(mapfold.folder / "log") as reader:
+        first = calibrate(reader, Settings(fusion="evidence"))
+        again = calibrate(reader, first.calibrated)
+    for one, other in zip(first.last.readings, again.last.readings, strict=True):
+        assert one.prior == other.prior
+        if isinstance(one.value, float) and isinstance(other.value, float):
+            assert other.value == pytest.approx(one.value, rel=0.1, abs=0.01)
+
+
+def test_a_correction_counts(mapfold: Commands) -> None:
+    mapfold("edit", "log", "forget-run", "run-b", "--reason", "why")
+    found = mapfold("calibrate", "log", "--json").json
+    assert (found["keyframes"], found["runs"]) == (80, 1)
+
+
+def test_progress_counts_the_events_of_both_rounds(mapfold: Commands) -> None:
+    told: list[tuple[int, int]] = []
+    with LogReader(mapfold.folder / "log") as reader:
+        calibrate(reader, Settings(), progress=lambda done, total: told.append((done, total)))
+    assert {total for _, total in told} == {320}
+    assert [done for done, _ in told] == sorted(done for done, _ in told)
+    assert told[-1] == (320, 320)
+
+
+Start = Callable[..., Program]
+
+
+def test_a_recorder_that_takes_commands_records_it(
+    mapfold: Commands, start: Start, endpoint: str
+) -> None:
+    log = mapfold.folder / "log"
+    running = start("record", str(log), "--connect", endpoint, "--accept-edits")
+    running.wait_for("taking commands")
+    said = mapfold("calibrate", "log", "--write", "--json", "--connect", endpoint).json
+    assert said["recorded"]["offset"] == 160
+    running.end(signal.SIGINT)
+    assert running.wait() == 0
+    assert set(_settings(log).evidence.sizes_m) == set(SIZES)
+
+
+def test_a_log_that_another_writer_holds_is_named(mapfold: Commands) -> None:
+    away = ("--connect", "tcp/127.0.0.1:9")
+    with LogWriter(mapfold.folder / "log"):
+        said = mapfold("calibrate", "log", "--write", *away, code=1)
+    assert "log is being written by process" in said.err
+    assert _settings(mapfold.folder / "log") == Settings()
