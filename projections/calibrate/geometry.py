@@ -1,5 +1,6 @@
 """Ranges, errors of bearings and poses, and sizes of classes, read off things that qualified."""
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -7,16 +8,18 @@ import numpy as np
 
 from projections.evidence import EvidenceConstants
 
+from .halves import inflation
 from .shrinking import PRIOR_COUNT, Reading, rounded, spread, unread
 from .sightings import Flags, Floats, Sightings
 from .things import Thing
 
 LEAST_OF_A_CLASS = 4
+LEAST_THINGS = 3
 _MAD = 1.4826
 """A normal distribution's standard deviation, in units of its median absolute deviation."""
 _FEWEST_LEFT = 0.05
 """Of an observation whose leverage is nearly 1 nothing is left to read: it counts no less."""
-_CAP = 9.0
+_CAP = 25.0
 """Squared residuals count up to so many variances: the boxes of other things hardly matter."""
 _ROUNDS = 200
 _PRIOR_RANGES = 7
@@ -78,9 +81,10 @@ def errors(
         np.concatenate([weight, np.full(len(prior_parts), _TO_PART / len(usual))]),
         priors,
     )
+    wider = inflation(things, seen, *found) ** 0.5
     counts = (int((~cut_at).sum()), int(cut_at.sum()), len(cut_at))
     one, cut, pose = (
-        spread(name, value, usually, count)
+        spread(name, value * wider, usually, count)
         for name, value, usually, count in zip(names, found, priors, counts, strict=True)
     )
     return one, cut, pose
@@ -90,25 +94,32 @@ def sizes(
     things: Sequence[Thing], seen: Sightings, prior: EvidenceConstants
 ) -> tuple[dict[str, Reading], Reading]:
     """The median height of each class's boxes, in metres, and the spread about it."""
-    by_class: dict[str, list[float]] = {}
+    by_class: dict[str, list[tuple[float, int]]] = {}
     for thing in things:
         depth = thing.range * np.cos(seen.off_axis[thing.rows])
-        for row, metres in zip(thing.rows, seen.height[thing.rows] * depth, strict=True):
-            if metres > 0.0:  # not NaN
-                by_class.setdefault(seen.classes[row], []).append(float(metres))
+        metres = seen.height[thing.rows] * depth
+        whole = metres > 0.0  # not NaN
+        if whole.any():
+            names = Counter(seen.classes[row] for row in thing.rows)
+            name = min(names, key=lambda each: (-names[each], each))
+            size = float(np.median(np.log(metres[whole])))
+            by_class.setdefault(name, []).append((size, int(whole.sum())))
     found: dict[str, Reading] = {}
-    about: list[Floats] = []
-    for name, metres in sorted(by_class.items()):
-        if len(metres) >= LEAST_OF_A_CLASS:
-            logs = np.log(metres)
-            middle = float(np.median(logs))
-            value = rounded(float(np.exp(middle)))
-            found[name] = Reading(f"sizes_m.{name}", value, value, None, len(metres))
-            about.append((logs - middle) * (len(metres) / (len(metres) - 1)) ** 0.5)
-    if not about:
+    about, freedom, boxes = 0.0, 0, 0
+    for name, of_things in sorted(by_class.items()):
+        logs = np.array([size for size, _ in of_things])
+        count = sum(whole for _, whole in of_things)
+        if count < LEAST_OF_A_CLASS or len(logs) < LEAST_THINGS:
+            continue
+        middle = float(np.median(logs))
+        value = rounded(float(np.exp(middle)))
+        found[name] = Reading(f"sizes_m.{name}", value, value, None, count)
+        about += float(np.minimum((logs - middle) ** 2, _CAP * prior.size_spread**2).sum())
+        freedom += len(logs) - 1
+        boxes += len(logs)
+    if not freedom:
         return found, unread("size_spread", prior.size_spread)
-    logs = np.concatenate(about)
-    return found, spread("size_spread", robust_spread(logs), prior.size_spread, len(logs))
+    return found, spread("size_spread", (about / freedom) ** 0.5, prior.size_spread, boxes)
 
 
 def camera_faults(things: Sequence[Thing], seen: Sightings) -> list[Reading]:
