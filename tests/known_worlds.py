@@ -51,6 +51,7 @@ def rows_of(known: Known) -> list[Row]:
     rng = np.random.default_rng(known.seed)
     looks = _Looks(known, rng)
     classes = len(known.sizes_m)
+    tallness = known.size_spread * rng.normal(size=known.things)
     focal = known.camera.width_px / 2.0 / math.tan(math.radians(known.camera.hfov_deg) / 2.0)
     rows = []
     for picture in range(known.things * known.looks):
@@ -72,7 +73,7 @@ def rows_of(known: Known) -> list[Row]:
             off = math.remainder(off, 2.0 * math.pi)
             if abs(off) > 0.6:  # outside the picture
                 continue
-            size = known.sizes_m[name] * math.exp(known.size_spread * rng.normal())
+            size = known.sizes_m[name] * math.exp(tallness[each] + 0.05 * rng.normal())
             middle = known.camera.width_px / 2.0 - focal * math.tan(off)
             tall = size * focal / (distance * math.cos(off))
             tall = min(tall, known.camera.height_px - 20.0)

@@ -14,7 +14,6 @@ from .sightings import Flags, Floats, Sightings
 from .things import Thing
 
 LEAST_OF_A_CLASS = 4
-LEAST_THINGS = 3
 _MAD = 1.4826
 """A normal distribution's standard deviation, in units of its median absolute deviation."""
 _FEWEST_LEFT = 0.05
@@ -109,7 +108,7 @@ def sizes(
     for name, of_things in sorted(by_class.items()):
         logs = np.array([size for size, _ in of_things])
         count = sum(whole for _, whole in of_things)
-        if count < LEAST_OF_A_CLASS or len(logs) < LEAST_THINGS:
+        if count < LEAST_OF_A_CLASS:
             continue
         middle = float(np.median(logs))
         value = rounded(float(np.exp(middle)))

@@ -14,7 +14,7 @@ _MOST_SIZES = 8
 _RESTS_ON = {
     "bearing_rad": "observation",
     "bearing_cut_rad": "cut observation",
-    "size_spread": "whole box",
+    "size_spread": "thing",
     "different": "pair",
     "different_spread": "pair",
     "same_class": "pair",

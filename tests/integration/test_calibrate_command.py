@@ -82,7 +82,11 @@ def test_written_constants_are_in_every_fold_and_can_be_undone(mapfold: Commands
     settings = _settings(log)
     assert (settings.eps_m, settings.fusion) == (0.9, "evidence")
     named = _by_name(said)
-    assert settings.evidence.range_m == named["evidence.range_m"]["value"] != 2.0
+    assert (
+        settings.evidence.range_m
+        == named["evidence.range_m"]["value"]
+        != EvidenceConstants().range_m
+    )
     assert set(settings.evidence.sizes_m) == set(SIZES)
     calibrated = mapfold("state", "log", "--json").json["settings"]
     assert len({json.dumps(each) for each in (before, evidence, calibrated)}) == 3
@@ -99,7 +103,10 @@ def test_write_with_set_switches_the_rule_in_one_command(mapfold: Commands) -> N
     assert "folded by the page's rule" not in said
     assert "use-settings recorded at offset 160, command " in said.splitlines()[-1]
     settings = _settings(mapfold.folder / "log")
-    assert (settings.fusion, settings.evidence.range_m != 2.0) == ("evidence", True)
+    assert (settings.fusion, settings.evidence.range_m != EvidenceConstants().range_m) == (
+        "evidence",
+        True,
+    )
     assert mapfold("edits", "log", "--json").json[0]["reason"] == "try it"
 
 

