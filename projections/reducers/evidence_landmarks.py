@@ -44,6 +44,7 @@ from projections.deltas import (
 )
 from projections.evidence import EvidenceConstants
 from projections.exact import MAX_IN_A_SUM, Q40
+from projections.exact_functions import exp
 from projections.pair_groups import PairGroups
 from projections.reducers import State, part, prefixed
 from projections.settings import Camera
@@ -64,6 +65,8 @@ LandmarkDelta: TypeAlias = (
     ObjectFound | ObjectSeen | ObjectsMerged | ObjectRelocated | ObjectClassified | ObjectEstimated
 )
 _BEST = 4
+SOFT = 1.0
+KEEP = 0.7
 _MISSING = 0.125
 _LEAST_AGREEMENT = -8.0
 _LABEL_WEIGHT = 0.5
@@ -110,7 +113,7 @@ class EvidenceLandmarks:
         named: dict[ObjectOrdinal, str] = {}  # the classes before
         to_unite: list[tuple[ObjectOrdinal, ObjectOrdinal]] = []
         for k, sighting in enumerate(sightings):
-            wanted, cosine = chosen[k]
+            wanted, cosine, share = chosen[k]
             group = None if self._groups is None else self._groups.group_of.get(sighting.det_id)
             own = None if group is None else self._object_of.get(group)
             if group is not None:
@@ -119,8 +122,9 @@ class EvidenceLandmarks:
             deltas += found
             thing = self._index.thing(ordinal)
             sight = sights[k]
-            spot = thing.spots.add(sight)
-            thing.keep(looks[k], float(inverses[k]), sight.side_cos, sight.side_sin, run)
+            spot = thing.spots.add(sight, share)
+            if share >= KEEP:
+              thing.keep(looks[k], float(inverses[k]), sight.side_cos, sight.side_sin, run)
             self._index.solve(ordinal, spot)
             seen.append(ordinal)
             deltas.append(
@@ -261,9 +265,9 @@ class EvidenceLandmarks:
         inverses: Floats,
         sights: list[Sight],
         sightings: Sequence[Sighting],
-    ) -> list[tuple[ObjectOrdinal | None, float]]:
+    ) -> list[tuple[ObjectOrdinal | None, float, float]]:
         """The Object of each observation, None for a new one, and the cosine of the best pair."""
-        chosen: list[tuple[ObjectOrdinal | None, float]] = [(None, 1.0)] * len(sights)
+        chosen: list[tuple[ObjectOrdinal | None, float, float]] = [(None, 1.0, 1.0)] * len(sights)
         near = self._index.near(pose.x_um / 1e6, pose.y_um / 1e6)
         if not len(near):
             return chosen
@@ -297,7 +301,12 @@ class EvidenceLandmarks:
                 break
             ordinal, column = pairs[place]
             if ordinal not in used and chosen[column][0] is None:
-                chosen[column] = ordinal, float(cosines[place])
+                rivals = 1.0
+                for other, (rival, of) in enumerate(pairs):
+                    if of == column and other != place and rival not in used:
+                        rivals += exp(min(SOFT * flat[other], 50.0))
+                mine = exp(min(SOFT * flat[place], 50.0))
+                chosen[column] = ordinal, float(cosines[place]), mine / (mine + rivals)
                 used.add(ordinal)
         return chosen
 

@@ -86,14 +86,14 @@ class Spots:
         self.at = (0.0, 0.0)
         self.seen_from = 0
 
-    def add(self, sight: Sight) -> int:
+    def add(self, sight: Sight, share: float) -> int:
         """Take in a sight; the index of its spot, whose part is out of date then."""
-        weight = 1.0 / (sight.across_per_m2 + sight.across_m2)
-        height, heights = (0.0, 0.0) if sight.log_height is None else (sight.log_height, 1.0)
+        weight = share / (sight.across_per_m2 + sight.across_m2)
+        height, heights = (0.0, 0.0) if sight.log_height is None else (sight.log_height, share)
         depth, depth_weight = (0.0, 0.0)
         if sight.measured is not None:
-            depth, depth_weight = sight.measured[0], 1.0 / sight.measured[1]
-        spot = [*sight[:6], weight, 1.0, height, heights, sight.slope, depth, depth_weight]
+            depth, depth_weight = sight.measured[0], share / sight.measured[1]
+        spot = [*sight[:6], weight, share, height, heights, sight.slope, depth, depth_weight]
         return self._take(spot)
 
     def take_in(self, other: "Spots") -> None:
