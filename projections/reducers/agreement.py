@@ -26,7 +26,7 @@ from .spots import LEAST_ELEVATION_M2, LEAST_M, SIZE, SLOPE, Estimate
 
 Floats = NDArray[np.float64]
 ESTIMATE_FIELDS = len(Estimate._fields)
-_WORST_CHI2 = 25.0
+_WORST_CHI2 = 16.0
 _ANYWHERE = -0.74
 """log(1.2 rad / √2π)."""
 _OTHER_SIZES = 0.36

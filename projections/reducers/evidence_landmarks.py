@@ -7,7 +7,7 @@ The rules, for the observations of one picture:
 2.  The evidence that an observation is of a candidate is a log-likelihood ratio: of its sight and
     the estimate (`agreement`), of its look and the exemplars (the mean of the best four; each that
     is missing costs an eighth), and half of that of its label and the labels seen so far. Below
-    −8 the sight alone rules a candidate out.
+    −5 the sight alone rules a candidate out.
 3.  Pairs are taken best first while the evidence is above 0. Each observation goes to one Object,
     and each Object gets one observation of a picture: two things in one picture are not one. What
     is left founds Objects.
@@ -65,10 +65,9 @@ LandmarkDelta: TypeAlias = (
     ObjectFound | ObjectSeen | ObjectsMerged | ObjectRelocated | ObjectClassified | ObjectEstimated
 )
 _BEST = 4
-SOFT = 1.0
-KEEP = 0.7
+_SURE = 0.7
 _MISSING = 0.125
-_LEAST_AGREEMENT = -8.0
+_LEAST_AGREEMENT = -5.0
 _LABEL_WEIGHT = 0.5
 
 
@@ -123,8 +122,8 @@ class EvidenceLandmarks:
             thing = self._index.thing(ordinal)
             sight = sights[k]
             spot = thing.spots.add(sight, share)
-            if share >= KEEP:
-              thing.keep(looks[k], float(inverses[k]), sight.side_cos, sight.side_sin, run)
+            if share >= _SURE:
+                thing.keep(looks[k], float(inverses[k]), sight.side_cos, sight.side_sin, run)
             self._index.solve(ordinal, spot)
             seen.append(ordinal)
             deltas.append(
@@ -304,8 +303,8 @@ class EvidenceLandmarks:
                 rivals = 1.0
                 for other, (rival, of) in enumerate(pairs):
                     if of == column and other != place and rival not in used:
-                        rivals += exp(min(SOFT * flat[other], 50.0))
-                mine = exp(min(SOFT * flat[place], 50.0))
+                        rivals += exp(min(flat[other], 50.0))
+                mine = exp(min(flat[place], 50.0))
                 chosen[column] = ordinal, float(cosines[place]), mine / (mine + rivals)
                 used.add(ordinal)
         return chosen

@@ -1,6 +1,6 @@
 """Which Object turns out to be the same as another, now that it was seen better.
 
-An Object is compared with those around it whenever it has got a quarter more observations. Two are
+An Object is compared with those around it whenever it has got a third more observations. Two are
 one while the evidence is above 0: of their estimates (χ² of the difference, against anywhere in
 9 m²), of their looks (the mean over all pairs of exemplars, each within ±6), and half of that of
 their labels; unless more than a tenth of the pictures of one show both, or a command keeps them
@@ -25,7 +25,7 @@ from .things import INVERSE, RUN, SIDE_COS, SIDE_SIN, Thing
 _LOG_AREA = log(9.0) - 1.8378770664093453
 """log(9 m² / 2π)."""
 _WORST_CHI2 = 40.0
-_LEAST_GEOMETRY = -8.0
+_LEAST_GEOMETRY = -4.0
 _SHARE_OF_PICTURES = 10
 _MOST_PER_PAIR = 6.0
 _LABEL_WEIGHT = 0.5
@@ -54,7 +54,7 @@ class Merging:
         thing = self._index.thing(ordinal)
         if thing.count < thing.checked:
             return None
-        thing.checked = thing.count + 1 + thing.count // 4
+        thing.checked = thing.count + 1 + thing.count // 3
         x, y, xx, xy, yy = self._index.estimates[:5, ordinal].tolist()
         near = self._index.near(x, y)
         near = near[near != ordinal]

@@ -27,11 +27,12 @@ Floats = NDArray[np.float64]
 Looks = NDArray[np.float32]
 """Rows of multiples of 2⁻¹¹."""
 LOOK_UNIT = 1 << 11
-_STEPS = 64
+_STEPS = 32
 _WORST = 8.0
 _LOOK_ALIKE = 0.05
-_SHARES = {True: (0.15, 0.85, 0.1), False: (0.02, 0.1, 0.88)}
-"""Of look-alikes, others of the class, others, among two things whose labels agree or do not."""
+_SHARES = (0.02, 0.1, 0.88), (0.15, 0.85, 0.1)
+"""Of look-alikes, others of the class, others, among two things whose labels differ or agree."""
+_LEAST_LIKENESS, _PER_LIKENESS, _LIKENESSES = -1.0, 128.0, 289
 _RECENT = 8
 _ENOUGH_PAIRS = 3_000
 _FIRST_GUESS, _GUESS_WEIGHT = 0.5, 0.5
@@ -45,27 +46,35 @@ def looks_of(vectors: Sequence[Floats]) -> tuple[Looks, Floats]:
 
 
 class LookRatios:
-    """Ratios for arrays of pairs."""
+    """Ratios for arrays of pairs, from a table over likeness and change of side."""
 
     def __init__(self, constants: EvidenceConstants) -> None:
-        sides = [exp(constants.same_kappa * (2.0 * k / _STEPS - 2.0)) for k in range(_STEPS + 1)]
-        means = [constants.same_back + constants.same_side * side for side in sides]
-        self._means = np.array(means)
-        self._shift = constants.session_shift
-        self._same = 1.0 / constants.same_spread
-        self._class_mean = constants.same_class
-        self._class = 1.0 / constants.same_class_spread
-        self._other = 1.0 / constants.different_spread
-        same, of_class = log(constants.same_spread), log(constants.same_class_spread)
-        other = log(constants.different_spread)
-        self._shares = {
-            agree: (log(a), log(b) + same - of_class, log(c) + same - other)
-            for agree, (a, b, c) in _SHARES.items()
-        }
+        c = constants
+        sides = [exp(c.same_kappa * (2.0 * k / _STEPS - 2.0)) for k in range(_STEPS + 1)]
+        of_run = np.array([c.same_back + c.same_side * side for side in sides])
+        means = np.array([of_run, of_run - c.session_shift])[:, :, np.newaxis]
+        likeness = np.arange(_LIKENESSES) / _PER_LIKENESS + _LEAST_LIKENESS
+        below = (likeness - means) / c.same_spread
+        z = np.minimum(below, 0.0)
+        same = np.maximum(z * z * -0.5, -_WORST)
+        alike = np.minimum(below + _LOOK_ALIKE / c.same_spread, 0.0)
+        of_class = (likeness - c.same_class) / c.same_class_spread
+        other = likeness / c.different_spread
+        class_height = log(c.same_spread) - log(c.same_class_spread)
+        other_height = log(c.same_spread) - log(c.different_spread)
+        parts = []
+        for shares in _SHARES:
+            different = alike * alike * -0.5 + log(shares[0])
+            one = of_class * of_class * -0.5 + (log(shares[1]) + class_height)
+            different = np.maximum(different, one)
+            one = other * other * -0.5 + (log(shares[2]) + other_height)
+            parts.append(same - np.maximum(different, one))
+        self._table = np.array(parts).ravel()  # agree, other run, side, likeness
+        self._best = [-log(shares[0]) for shares in _SHARES]
 
     def at_best(self, labels_agree: NDArray[np.bool_]) -> Floats:
         """What no ratio is above."""
-        best: Floats = np.where(labels_agree, -self._shares[True][0], -self._shares[False][0])
+        best: Floats = np.where(labels_agree, self._best[1], self._best[0])
         return best
 
     def ratios(
@@ -75,21 +84,13 @@ class LookRatios:
         other_run: NDArray[np.bool_],
         labels_agree: NDArray[np.bool_],
     ) -> Floats:
-        """``sides`` are cosines of the change of side; the arrays broadcast."""
-        steps = np.rint((sides + 1.0) * (_STEPS / 2)).astype(np.int64)
-        below = likeness - self._means.take(steps, mode="clip")
-        below += self._shift * other_run
-        below *= self._same
-        z = np.minimum(below, 0.0)
-        same = np.maximum(z * z * -0.5, -_WORST)
-        yes, no = self._shares[True], self._shares[False]
-        z = np.minimum(below + _LOOK_ALIKE * self._same, 0.0)
-        different = z * z * -0.5 + np.where(labels_agree, yes[0], no[0])
-        z = (likeness - self._class_mean) * self._class
-        np.maximum(different, z * z * -0.5 + np.where(labels_agree, yes[1], no[1]), out=different)
-        z = likeness * self._other
-        np.maximum(different, z * z * -0.5 + np.where(labels_agree, yes[2], no[2]), out=different)
-        ratios: Floats = same - different
+        """``sides`` are cosines of the change of side; the arrays broadcast. Likeness and side are
+        rounded to the table's steps, far below their spreads."""
+        place = np.rint((likeness - _LEAST_LIKENESS) * _PER_LIKENESS)
+        place = np.minimum(np.maximum(place, 0.0), _LIKENESSES - 1.0)
+        step = np.minimum(np.maximum(np.rint((sides + 1.0) * (_STEPS / 2)), 0.0), float(_STEPS))
+        row = labels_agree * (2.0 * (_STEPS + 1)) + other_run * (_STEPS + 1.0) + step
+        ratios: Floats = self._table.take((row * _LIKENESSES + place).astype(np.intp))
         return ratios
 
 
