@@ -158,7 +158,6 @@ def logs(values: Floats) -> Floats:
     mantissas, twos = np.frexp(values)
     s = (mantissas - 0.7071067811865476) / (mantissas + 0.7071067811865476)
     square = s * s
-    series = square * (1.0 / 7.0) + 0.2
-    series = series * square + 1.0 / 3.0
-    result: Floats = (twos - 0.5) * 0.6931471805599453 + 2.0 * s * (series * square + 1.0)
+    series = (square * 0.4 + 2.0 / 3.0) * square + 2.0
+    result: Floats = (twos - 0.5) * 0.6931471805599453 + s * series
     return result

@@ -281,7 +281,7 @@ class EvidenceLandmarks:
         agree = np.array(
             [label in thing.classes for thing, label in zip(things, names, strict=True)]
         )
-        kept = np.nonzero(values + self._look_ratios.at_best(agree) > 0.0)[0]
+        kept = (values + self._look_ratios.at_best(agree) > 0.0).nonzero()[0]
         if not len(kept):
             return chosen
         columns, values = columns[kept], values[kept]
@@ -295,7 +295,7 @@ class EvidenceLandmarks:
             self._forbid(self._groups, values, pairs, things, sightings)
         flat = values.tolist()
         used: set[ObjectOrdinal] = set()
-        for place in np.argsort(-values, kind="stable").tolist():
+        for place in (-values).argsort(kind="stable").tolist():
             if flat[place] <= 0.0:
                 break
             ordinal, column = pairs[place]

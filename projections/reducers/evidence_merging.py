@@ -25,7 +25,7 @@ from .things import INVERSE, RUN, SIDE_COS, SIDE_SIN, Thing
 _LOG_AREA = log(9.0) - 1.8378770664093453
 """log(9 m² / 2π)."""
 _WORST_CHI2 = 40.0
-_LEAST_GEOMETRY = -4.0
+_LEAST_GEOMETRY = -3.0
 _SHARE_OF_PICTURES = 10
 _MOST_PER_PAIR = 6.0
 _LABEL_WEIGHT = 0.5
@@ -67,7 +67,7 @@ class Merging:
         chi2 = (c * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / det
         geometry = np.minimum(chi2, _WORST_CHI2) * -0.5 - 0.5 * logs(det) + _LOG_AREA
         best: tuple[float, ObjectOrdinal, MergeEvidence] | None = None
-        kept = np.nonzero(geometry > _LEAST_GEOMETRY)[0]
+        kept = (geometry > _LEAST_GEOMETRY).nonzero()[0]
         for row, number in zip(kept.tolist(), near[kept].tolist(), strict=True):
             partner = ObjectOrdinal(number)
             other = self._index.thing(partner)
