@@ -6,6 +6,7 @@ from collections import Counter
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from eventsrc.envelope import DetId
 from projections.deltas import (
@@ -21,6 +22,7 @@ from projections.evidence import EvidenceConstants
 from projections.pair_groups import PairGroups
 from projections.reducers import State
 from projections.reducers.evidence_landmarks import EvidenceLandmarks, LandmarkDelta
+from projections.reducers.thing_index import ThingIndex
 from tests.evidence_pictures import Picture, a_room, fold_all, fold_one, pictures_of
 
 _SEEDS = st.integers(0, 10_000)
@@ -173,3 +175,27 @@ def _truth(pictures: list[Picture]) -> dict[ObservationOrdinal, int]:
         for picture in pictures
         for sighting, thing in zip(picture.sightings, picture.things, strict=True)
     }
+
+
+@settings(max_examples=10, deadline=None)
+@given(_SEEDS)
+def test_the_grid_changes_nothing(seed: int) -> None:
+    """The naive search goes through all Objects and keeps those within reach."""
+
+    class Naive(ThingIndex):
+        def near(self, x: float, y: float) -> NDArray[np.int64]:
+            found = []
+            for ordinal, thing in enumerate(self._things):
+                if thing is not None and thing.estimate is not None:
+                    dx, dy = thing.estimate.x - x, thing.estimate.y - y
+                    if dx * dx + dy * dy <= self._reach_m * self._reach_m:
+                        found.append(ordinal)
+            return np.array(found, np.int64)
+
+    pictures = pictures_of(a_room(seed, 30, 30.0), seed, 60, side=30.0)
+    constants = EvidenceConstants(range_m=2.0)
+    landmarks, naive = EvidenceLandmarks(constants), EvidenceLandmarks(constants)
+    index = Naive(constants)
+    naive._index = naive._merging._index = index
+    for picture in pictures:
+        assert fold_one(landmarks, picture) == fold_one(naive, picture)
