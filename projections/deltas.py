@@ -15,9 +15,10 @@ seconds.
 
 The deltas of one event come in this order: RunSeen, KeyframeAdded, ObservationAdded …, then places
 (PlaceFormed, PlacesMerged, MergeRefused, KeyframePlaced, PlaceChanged, PlaceNamed), landmarks
-(ObjectFound / ObjectSeen, ObjectsMerged, ObjectRelocated, ObjectClassified, ObjectEstimated,
-ObjectMissing), located-in (ObjectMoved), adjacency (PlacesLinked). A
-delta names only things that deltas before it have introduced.
+(ObjectFound / ObjectSeen, ObjectsMerged / ObjectRelocated, ObjectClassified, ObjectEstimated,
+ObjectMissing), located-in (ObjectMoved), adjacency (PlacesLinked). An ObjectRelocated stands right
+after the ObjectsMerged that makes the Object found elsewhere part of the one that moved. A delta
+names only things that deltas before it have introduced.
 
 Deltas are frozen msgspec structs: a fold makes some ten a keyframe, and a struct takes a third of
 the time of a frozen dataclass to make. ``gc=False`` keeps them out of the garbage collector, which

@@ -54,6 +54,7 @@ from .evidence_merging import Merging
 from .label_counts import LabelCounts
 from .landmarks import object_id
 from .looks import Floats, LookRatios, Looks, LookScale, looks_of
+from .relocations import Moved
 from .sights import Sight, Sighting, Sights
 from .spots import Spots
 from .thing_index import ThingIndex
@@ -162,6 +163,46 @@ class EvidenceLandmarks:
                 deltas.append(ObjectClassified(offset, ordinal, class_name))
         deltas += [self._index.estimated(offset, ordinal) for ordinal in sorted(changed)]
         return deltas
+
+    def class_of(self, ordinal: ObjectOrdinal) -> str:
+        """The class of most of an Object's observations."""
+        return self._index.thing(ordinal).class_name
+
+    def observations_of(self, ordinal: ObjectOrdinal) -> int:
+        """How many observations an Object has."""
+        return self._index.thing(ordinal).count
+
+    def compare(self, one: ObjectOrdinal, other: ObjectOrdinal) -> float | None:
+        """The log-likelihood ratio of two Objects' looks; None where a command keeps them apart."""
+        thing, second = self._index.thing(one), self._index.thing(other)
+        if self._groups is not None and self._groups.conflicts(thing.groups, second.groups):
+            return None
+        return self._merging.look(thing, second)
+
+    def relocate(self, offset: Offset, moved: Moved) -> list[LandmarkDelta]:
+        """Make an Object found elsewhere one with the one that stood here before, and estimate it
+        from the later observations only."""
+        thing, later = self._index.thing(moved.old), self._index.thing(moved.new)
+        before, after = self._index.estimates[:2, [moved.old, moved.new]].T.tolist()
+        dx, dy = after[0] - before[0], after[1] - before[1]
+        evidence = MergeEvidence(
+            round(moved.look * 1000.0),
+            0,
+            round((dx * dx + dy * dy) ** 0.5 * 1e6),
+            thing.met.get(moved.new, 0),
+            thing.count + later.count,
+        )
+        thing.spots, thing.estimate = Spots(), later.estimate
+        class_name = thing.class_name
+        merged = self._unite(offset, moved.old, moved.new, set(), {}, evidence)
+        places = [round(number * 1e6) for number in (*before, *after)]
+        deltas: list[LandmarkDelta] = [
+            merged,
+            ObjectRelocated(offset, moved.old, moved.observation, *places),
+        ]
+        if thing.class_name != class_name:
+            deltas.append(ObjectClassified(offset, moved.old, thing.class_name))
+        return [*deltas, self._index.estimated(offset, moved.old)]
 
     def dump(self) -> State:
         """Everything, for a snapshot."""

@@ -76,7 +76,7 @@ class Merging:
                 continue
             if self._groups is not None and self._groups.conflicts(thing.groups, other.groups):
                 continue
-            look = self._look(thing, other)
+            look = self.look(thing, other)
             value = look + float(geometry[row])
             if value > 0.0 and (best is None or value > best[0]):
                 evidence = MergeEvidence(
@@ -89,8 +89,9 @@ class Merging:
                 best = value, partner, evidence
         return None if best is None else best[1:]
 
-    def _look(self, one: Thing, other: Thing) -> float:
-        """The mean over pairs of exemplars, and the labels."""
+    def look(self, one: Thing, other: Thing) -> float:
+        """How much the looks of two things speak for one, as the logarithm of a ratio of two
+        likelihoods: the mean over pairs of exemplars, and the labels."""
         a, b = one.marks[: one.exemplars], other.marks[: other.exemplars]
         dots = (one.looks[: one.exemplars] @ other.looks[: other.exemplars].T).astype(np.float64)
         cosines = dots * a[:, INVERSE, np.newaxis] * b[:, INVERSE]

@@ -57,7 +57,7 @@ from .core_index import CoreIndex
 from .edited_events import edit_event, edits_events
 from .embedding_space import Space
 from .envelope_evidence import camera_of, sightings_of, with_small_yaw
-from .evidence_landmarks import EvidenceLandmarks
+from .evidence_fusion import EvidenceFusion
 from .folded_ids import FoldedIds, content_digest
 from .fusible import FusibleObservation
 from .landmarks import Landmarks
@@ -66,7 +66,7 @@ from .place_names import PlaceNames
 from .places import Places
 from .rule_index import RuleCoreIndex
 
-Reducer: TypeAlias = FoldedIds | Places | Landmarks | EvidenceLandmarks | LocatedIn | Adjacency
+Reducer: TypeAlias = FoldedIds | Places | Landmarks | EvidenceFusion | LocatedIn | Adjacency
 
 
 class SemanticMap:
@@ -166,7 +166,7 @@ class SemanticMap:
         if pose is not None:
             place = self._place(offset, keyframe, run, envelope.run_id, pose, deltas)
             landmarks, timestamp = self.landmarks, envelope.timestamp
-            if isinstance(landmarks, EvidenceLandmarks):
+            if isinstance(landmarks, EvidenceFusion):
                 camera = camera_of(envelope, self.settings.camera)
                 seen = sightings_of(accepted, fusible)
                 facing = with_small_yaw(pose)
@@ -367,12 +367,12 @@ class SemanticMap:
                 self.located_in.objects_merged(delta.survivor, delta.absorbed)
 
 
-def _landmarks(settings: Settings, corrections: Corrections) -> Landmarks | EvidenceLandmarks:
+def _landmarks(settings: Settings, corrections: Corrections) -> Landmarks | EvidenceFusion:
     named = None
     if corrections.same or corrections.different:
         named = PairGroups(corrections.same, corrections.different)
     if settings.fusion == "evidence":
-        return EvidenceLandmarks(settings.evidence, named)
+        return EvidenceFusion(settings.evidence, named)
     limits = settings.fusion_radius_m, settings.fusion_similarity
     return Landmarks(*limits) if named is None else ConstrainedLandmarks(*limits, named)
 

@@ -124,6 +124,7 @@ def check_order(deltas: list[d.Delta]) -> None:
     kinds = (d.ObjectFound, d.ObjectsMerged, d.ObjectRelocated, d.ObjectClassified)
     ranks = {kind: rank for rank, kind in enumerate((*kinds, d.ObjectEstimated, d.ObjectMissing))}
     ranks[d.ObjectSeen] = ranks[d.ObjectFound]
+    ranks[d.ObjectRelocated] = ranks[d.ObjectsMerged]
     found = [ranks[type(delta)] for delta in deltas if type(delta) in ranks]
     assert found == sorted(found)
     estimated = [delta.object for delta in deltas if isinstance(delta, d.ObjectEstimated)]
@@ -142,6 +143,8 @@ def test_the_view_equals_a_recount_after_every_event(documents: list[dict[str, A
         check_recounts(folded)
         check_order(folded.deltas[-1])
     event(f"merges: {bool(folded.all(d.ObjectsMerged))}")
+    event(f"relocated: {bool(folded.all(d.ObjectRelocated))}")
+    event(f"missing: {bool(folded.all(d.ObjectMissing))}")
     event(f"classified: {bool(folded.all(d.ObjectClassified))}")
     for merge in folded.all(d.ObjectsMerged):
         assert merge.evidence is not None

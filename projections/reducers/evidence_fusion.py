@@ -1,0 +1,91 @@
+"""Fusion by evidence, whole: landmarks, which of them are missing, which stand elsewhere now."""
+
+from collections.abc import Container, Sequence
+from typing import TypeAlias
+
+from eventsrc.envelope import DetId, Offset
+from projections.deltas import (
+    ObjectClassified,
+    ObjectEstimated,
+    ObjectMissing,
+    ObjectOrdinal,
+    Pose,
+    RunOrdinal,
+)
+from projections.evidence import EvidenceConstants
+from projections.pair_groups import PairGroups
+from projections.reducers import State, part, prefixed
+from projections.settings import Camera
+
+from .evidence_landmarks import EvidenceLandmarks, LandmarkDelta
+from .presence import Presence
+from .relocations import Relocations
+from .sights import Sighting
+
+FusionDelta: TypeAlias = LandmarkDelta | ObjectMissing
+
+
+class EvidenceFusion:
+    """The reducer."""
+
+    def __init__(
+        self, constants: EvidenceConstants, groups: PairGroups[DetId] | None = None
+    ) -> None:
+        self._landmarks = EvidenceLandmarks(constants, groups)
+        self._presence = Presence()
+        self._relocations = Relocations(self._presence, self._landmarks)
+
+    def fold(
+        self,
+        offset: Offset,
+        run: RunOrdinal,
+        timestamp: float,
+        pose: Pose,
+        camera: Camera,
+        sightings: Sequence[Sighting],
+    ) -> list[FusionDelta]:
+        """Fuse the observations of one picture; look for what it does not show."""
+        fused = self._landmarks.fold(offset, run, timestamp, pose, camera, sightings)
+        missing = self._presence.fold(offset, run, pose, camera, fused)
+        moved = self._relocations.fold(fused)
+        if not moved:
+            return [*fused, *missing]
+        for pair in moved:
+            fused += self._landmarks.relocate(offset, pair)
+            self._presence.relocate(pair.old, pair.new)
+        elsewhere = {ordinal for pair in moved for ordinal in (pair.old, pair.new)}
+        left = [delta for delta in missing if delta.object not in elsewhere]
+        return [*_in_order(fused, {pair.new for pair in moved}), *left]
+
+    def dump(self) -> State:
+        """Everything, for a snapshot."""
+        return (
+            prefixed("landmarks", self._landmarks.dump())
+            | prefixed("presence", self._presence.dump())
+            | prefixed("relocations", self._relocations.dump())
+        )
+
+    def load(self, state: State) -> None:
+        """Take over what `dump` gave."""
+        self._landmarks.load(part("landmarks", state))
+        self._presence.load(part("presence", state))
+        self._relocations.load(part("relocations", state))
+
+
+def _in_order(
+    fused: Sequence[LandmarkDelta], absorbed: Container[ObjectOrdinal]
+) -> list[LandmarkDelta]:
+    """Classes and estimates last, ascending, the latest of each Object that is left."""
+    others: list[LandmarkDelta] = []
+    classes: dict[ObjectOrdinal, LandmarkDelta] = {}
+    estimates: dict[ObjectOrdinal, LandmarkDelta] = {}
+    for delta in fused:
+        if type(delta) is ObjectClassified:
+            classes[delta.object] = delta
+        elif type(delta) is ObjectEstimated:
+            estimates[delta.object] = delta
+        else:
+            others.append(delta)
+    for latest in (classes, estimates):
+        others += [latest[ordinal] for ordinal in sorted(latest) if ordinal not in absorbed]
+    return others

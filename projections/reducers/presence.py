@@ -1,0 +1,270 @@
+"""Presence: which Objects are not where they should be seen.
+
+A keyframe *looks for* an Object when its pose is in a cell of the grid next to a pose that the
+Object was seen from, along a similar line of sight and from a similar distance, and the Object's
+estimate lies well inside the picture. A look is a *hit* or a *miss*. Walls, furniture and the
+detector's habits are in the record of hits and misses: from such a place such a thing is seen so
+often.
+
+An Object's *odds* are how likely the looks of a run are if it is still there, over how likely they
+are if it is gone. In its home run, the one that found it, it is there. In another run every miss
+multiplies them by its share of misses so far (of `_PRIOR` looks at the map's rate and its own), and
+every sighting by `_SEEN`, within bounds: sightings of something else that took its place are
+assigned to it now and then, so one alone does not outweigh many misses. A new run starts with what
+was left, or with 1 if it was surely there.
+
+It is *missing* when the odds fall below `_MISSING` with `_LEAST_LOOKS` misses in the run, and no
+longer when they rise above `_BACK`.
+
+Distances are metres in float64; with +, −, ×, ÷ only, in one order, so everything is bit-exact.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from eventsrc.envelope import Offset
+from projections.deltas import (
+    Delta,
+    ObjectEstimated,
+    ObjectFound,
+    ObjectMissing,
+    ObjectOrdinal,
+    ObjectSeen,
+    ObjectsMerged,
+    Pose,
+    RunOrdinal,
+)
+from projections.exact_functions import cos_sin
+from projections.reducers import State
+from projections.settings import Camera
+
+_CELL_UM = 750_000
+_NEAR_M2 = 1.1 * 1.1
+_LEAST_AHEAD_M = 0.3
+_INNER = 0.84
+"""Share of half the picture's width in which it should be."""
+_DISTANCES2 = 1.6 * 1.6
+"""Square of the ratio of two distances up to which they are similar."""
+_TURN2 = 0.87 * 0.87
+"""Square of the least cosine between similar lines of sight, 30°."""
+_PRIOR = 4.0
+_SEEN, _SURE, _FLOOR = 8.0, 512.0, 1.0 / 1024.0
+_MISSING, _BACK = 0.05, 0.05
+_LEAST_LOOKS, _LEAST_HITS = 2, 1
+_HALF_DEGREE = 0.008726646259971648
+_Cell = tuple[int, int]
+
+
+@dataclass(slots=True, eq=False)
+class Attendance:
+    """What is known of one Object. ``hits`` and ``misses`` are those of all looks while it was not
+    missing; ``odds`` and ``looks`` (the misses) of ``run``, the last run that saw or missed it.
+    ``confirmed`` is the last run before ``run`` that it surely was there in."""
+
+    home: RunOrdinal
+    run: RunOrdinal
+    confirmed: RunOrdinal
+    x: float = 0.0
+    y: float = 0.0
+    hits: int = 0
+    misses: int = 0
+    odds: float = 1.0
+    looks: int = 0
+    is_missing: bool = False
+    cells: set[_Cell] = field(default_factory=set)
+
+    def enter(self, run: RunOrdinal) -> None:
+        """What follows is of this run."""
+        if run != self.run:
+            if self.odds >= 1.0:
+                self.confirmed, self.odds = self.run, 1.0
+            self.run, self.looks = run, 0
+
+
+class Presence:
+    """The reducer. ``attendance`` is by Object, absorbed ones left out; ``missed`` are the Objects
+    whose odds the last keyframe has lowered."""
+
+    def __init__(self) -> None:
+        self.attendance: dict[ObjectOrdinal, Attendance] = {}
+        self.missed: list[ObjectOrdinal] = []
+        # cell → Object → the first pose in it, or next to it, that the Object was seen from
+        self._vantages: dict[_Cell, dict[ObjectOrdinal, tuple[float, float]]] = {}
+        self._hits, self._misses = 0, 0
+
+    def fold(
+        self, offset: Offset, run: RunOrdinal, pose: Pose, camera: Camera, fused: Iterable[Delta]
+    ) -> list[ObjectMissing]:
+        """Look for all Objects that this keyframe should see; ``fused`` are the deltas of fusion.
+
+        One delta for each Object that is missing now or no longer is, ascending.
+        """
+        seen = self._take_in(run, fused)
+        changed = self._look(run, pose, camera, seen)
+        for ordinal in seen:
+            known = self.attendance[ordinal]
+            if run != known.home:
+                known.enter(run)
+                known.odds = min(known.odds * _SEEN, _SURE)
+                if known.is_missing and known.odds > _BACK:
+                    known.is_missing = False
+                    changed.append(ordinal)
+            self._add_vantage(ordinal, known, pose)
+        return [
+            ObjectMissing(offset, ordinal, run, known.looks, known.is_missing)
+            for ordinal in sorted(changed)
+            for known in (self.attendance[ordinal],)
+        ]
+
+    def relocate(self, old: ObjectOrdinal, new: ObjectOrdinal) -> None:
+        """The Object ``old`` stands where ``new`` was found, which is absorbed: forget from where
+        it was seen before."""
+        self._unlist(old)
+        self._unlist(new, old)
+        known = self.attendance.pop(new)
+        known.cells = self.attendance[old].cells
+        self.attendance[old] = known
+
+    def dump(self) -> State:
+        """Everything, for a snapshot."""
+        known = sorted(self.attendance.items())
+        vantages = sorted(
+            (*c, o, *at) for c, near in self._vantages.items() for o, at in near.items()
+        )
+        return {
+            "looks": [self._hits, self._misses],
+            "objects": [
+                [o, k.home, k.run, k.confirmed, k.hits, k.misses, k.looks, int(k.is_missing)]
+                for o, k in known
+            ],
+            "numbers": np.array([(k.x, k.y, k.odds) for _, k in known]).reshape(-1, 3),
+            "cells": [list(row[:3]) for row in vantages],
+            "poses": np.array([row[3:] for row in vantages]).reshape(-1, 2),
+        }
+
+    def load(self, state: State) -> None:
+        """Take over what `dump` gave."""
+        self._hits, self._misses = state["looks"]
+        numbers = state["numbers"].tolist()
+        for (ordinal, home, run, confirmed, hits, misses, looks, is_missing), (x, y, odds) in zip(
+            state["objects"], numbers, strict=True
+        ):
+            self.attendance[ordinal] = Attendance(
+                home, run, confirmed, x, y, hits, misses, odds, looks, bool(is_missing)
+            )
+        for (column, row, ordinal), at in zip(state["cells"], state["poses"].tolist(), strict=True):
+            self._list(ordinal, (column, row), (at[0], at[1]))
+
+    def _take_in(self, run: RunOrdinal, fused: Iterable[Delta]) -> list[ObjectOrdinal]:
+        """Bring estimates and merges up to date; the Objects seen, ascending."""
+        attendance, seen = self.attendance, set[ObjectOrdinal]()
+        for delta in fused:
+            if type(delta) is ObjectSeen:
+                seen.add(delta.object)
+            elif type(delta) is ObjectEstimated:
+                known = attendance[delta.object]
+                known.x, known.y = delta.x_um / 1e6, delta.y_um / 1e6
+            elif type(delta) is ObjectFound:
+                attendance[delta.object] = Attendance(run, run, run)
+            elif type(delta) is ObjectsMerged:
+                self._merge(delta.survivor, delta.absorbed)
+                if delta.absorbed in seen:
+                    seen.remove(delta.absorbed)
+                    seen.add(delta.survivor)
+        return sorted(seen)
+
+    def _merge(self, survivor: ObjectOrdinal, absorbed: ObjectOrdinal) -> None:
+        """Hits, misses and vantages are of both. A part found in another run was there then."""
+        known, other = self.attendance[survivor], self.attendance[absorbed]
+        known.hits += other.hits
+        known.misses += other.misses
+        if other.home != known.home:
+            known.enter(max(known.run, other.run))
+            known.odds = _SURE
+        self._unlist(absorbed, survivor)
+        del self.attendance[absorbed]
+
+    def _look(
+        self, run: RunOrdinal, pose: Pose, camera: Camera, seen: Sequence[ObjectOrdinal]
+    ) -> list[ObjectOrdinal]:
+        """Count hits and misses; the Objects that are missing now."""
+        self.missed = []
+        near = self._vantages.get((pose.x_um // _CELL_UM, pose.y_um // _CELL_UM))
+        if not near:
+            return []
+        missing: list[ObjectOrdinal] = []
+        x, y = pose.x_um / 1e6, pose.y_um / 1e6
+        cos, sin = cos_sin(pose.yaw_rad + camera.yaw_rad)
+        half_cos, half_sin = cos_sin(camera.hfov_deg * _HALF_DEGREE)
+        inner = half_sin / half_cos * _INNER
+        hits = misses = 0
+        usual = _PRIOR * (self._misses + 1) / (self._hits + self._misses + 2)
+        attendance = self.attendance
+        for ordinal, vantage in near.items():
+            known = attendance[ordinal]
+            dx, dy = known.x - x, known.y - y
+            ahead, aside = dx * cos + dy * sin, dy * cos - dx * sin
+            if ahead < _LEAST_AHEAD_M or abs(aside) > ahead * inner:
+                continue
+            if not _is_similar(dx, dy, known.x - vantage[0], known.y - vantage[1]):
+                continue
+            if ordinal in seen:
+                known.hits += 1
+                hits += 1
+                continue
+            if run != known.home:
+                known.enter(run)
+                share = (usual + known.misses) / (_PRIOR + known.hits + known.misses)
+                known.odds = max(known.odds * share, _FLOOR)
+                known.looks += 1
+                self.missed.append(ordinal)
+            if known.is_missing:
+                continue
+            known.misses += 1
+            misses += 1
+            if known.odds < _MISSING and known.looks >= _LEAST_LOOKS and known.hits >= _LEAST_HITS:
+                known.is_missing = True
+                missing.append(ordinal)
+        self._hits += hits
+        self._misses += misses
+        self.missed.sort()
+        return missing
+
+    def _add_vantage(self, ordinal: ObjectOrdinal, known: Attendance, pose: Pose) -> None:
+        """Enter the pose in its cell and the three that are next to it."""
+        left = (pose.x_um - _CELL_UM // 2) // _CELL_UM
+        below = (pose.y_um - _CELL_UM // 2) // _CELL_UM
+        for column in (left, left + 1):
+            for row in (below, below + 1):
+                if (column, row) not in known.cells:
+                    self._list(ordinal, (column, row), (pose.x_um / 1e6, pose.y_um / 1e6))
+
+    def _list(self, ordinal: ObjectOrdinal, cell: _Cell, at: tuple[float, float]) -> None:
+        self.attendance[ordinal].cells.add(cell)
+        self._vantages.setdefault(cell, {})[ordinal] = at
+
+    def _unlist(self, ordinal: ObjectOrdinal, heir: ObjectOrdinal | None = None) -> None:
+        """Take an Object's vantages away; an heir gets those in cells where it has none."""
+        known = self.attendance[ordinal]
+        for cell in known.cells:
+            at = self._vantages[cell].pop(ordinal)
+            if heir is not None and cell not in self.attendance[heir].cells:
+                self._list(heir, cell, at)
+            elif not self._vantages[cell]:
+                del self._vantages[cell]
+        known.cells = set()
+
+
+def _is_similar(dx: float, dy: float, vx: float, vy: float) -> bool:
+    """Whether two lines of sight to one point, given as offsets, are of poses near each other and
+    similar in direction and length."""
+    apart_x, apart_y = dx - vx, dy - vy
+    if apart_x * apart_x + apart_y * apart_y > _NEAR_M2:
+        return False
+    far2, usual2 = dx * dx + dy * dy, vx * vx + vy * vy
+    if far2 > usual2 * _DISTANCES2 or usual2 > far2 * _DISTANCES2:
+        return False
+    dot = dx * vx + dy * vy
+    return dot > 0.0 and dot * dot >= _TURN2 * far2 * usual2
