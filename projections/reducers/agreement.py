@@ -30,8 +30,8 @@ _WORST_CHI2 = 16.0
 _ANYWHERE = -0.74
 """log(1.2 rad / √2π)."""
 _OTHER_SIZES = 0.36
-_WORST_HEIGHT = -6.0
-_WORST_ELEVATION = -6.0
+_WORST_PART = -12.0
+"""Twice what box height, or elevation, can say against a thing at most."""
 _SIZE_KNOWN = 0.3
 _BEHIND_M2 = 0.04
 _SLOPE_GUESS, _GUESS_PAIRS = 0.01, 10.0
@@ -119,37 +119,33 @@ class Agreement:
         self, estimates: Floats, seen: Floats, ahead: Floats, across: Floats, slopes: float
     ) -> Floats:
         """The ratio of each pair: columns of the two matrices."""
-        _, _, xx, xy, yy, z, zx, zy, zv, e, ex, ey, ev = estimates
+        _, _, xx, xy, yy = estimates[:5]
+        heights = estimates[5:].reshape(2, 4, -1)  # of log size and elevation
         _, _, cos, sin, per_m2, least, height, slope, is_whole = seen
         along = np.maximum(ahead, LEAST_M)
         square = along * along
         cc, ss, cs = cos * cos, sin * sin, 2.0 * cos * sin * xy
         along_variance = xx * cc + cs + yy * ss
         variance = xx * ss - cs + yy * cc + per_m2 * square + least
-        gx, gy = cos / along - zx, sin / along - zy
-        size = gx * gx * xx + 2.0 * gx * gy * xy + gy * gy * yy + (zv + SIZE * SIZE)
-        other_size = size + _OTHER_SIZES
-        gx, gy = slope * cos - ex, slope * sin - ey
-        rise = gx * gx * xx + 2.0 * gx * gy * xy + gy * gy * yy
-        rise += (SLOPE * SLOPE) * square + (ev + LEAST_ELEVATION_M2)
-        other_rise = rise + slopes * square
-        log_along, log_variance, log_size, log_rise = logs(
-            np.array((along, variance / square, other_size / size, other_rise / rise))
-        )
-        ratio = across * across / variance + log_variance
+        steep = np.array((1.0 / along, slope))
+        gx, gy = steep * cos - heights[:, 1], steep * sin - heights[:, 2]
+        spread = gx * (gx * xx + 2.0 * xy * gy) + gy * gy * yy + heights[:, 3]
+        spread[0] += SIZE * SIZE
+        spread[1] += (SLOPE * SLOPE) * square + LEAST_ELEVATION_M2
+        other = np.array((spread[0] + _OTHER_SIZES, spread[1] + slopes * square))
+        logarithms = logs(np.array((along, variance / square, *(other / spread))))
+        log_along = logarithms[0]
+        ratio = across * across / variance + logarithms[1]
         residual = log_along - self._log_range
         ratio += residual * residual / (self._range_variance + along_variance / square)
         behind = np.minimum(ahead - LEAST_M, 0.0)
         ratio += behind * behind / (along_variance + _BEHIND_M2)
-        ratio *= -0.5
-        ratio += _ANYWHERE
-        residual = height + log_along - z
-        part = residual * residual * (1.0 / other_size - 1.0 / size) + log_size
-        part = np.maximum(part, 2.0 * _WORST_HEIGHT)
-        residual = along * slope - e
-        rest = residual * residual * (1.0 / other_rise - 1.0 / rise) + log_rise
-        part += np.maximum(rest, 2.0 * _WORST_ELEVATION)
-        whole: Floats = ratio + part * (0.5 * is_whole * (zv < _SIZE_KNOWN))
+        rest = np.array((height + log_along, along * slope)) - heights[:, 0]
+        part = np.maximum(rest * rest * (1.0 / other - 1.0 / spread) + logarithms[2:], _WORST_PART)
+        whole: Floats = (part[0] + part[1]) * (is_whole * (heights[0, 3] < _SIZE_KNOWN))
+        whole -= ratio
+        whole *= 0.5
+        whole += _ANYWHERE
         return whole
 
 

@@ -6,11 +6,12 @@ The rules, for the observations of one picture:
     is within reach of the robot: the usual range times exp(1.8 spreads).
 2.  The evidence that an observation is of a candidate is a log-likelihood ratio: of its sight and
     the estimate (`agreement`), of its look and the exemplars (the mean of the best four; each that
-    is missing costs an eighth), and half of that of its label and the labels seen so far. Below
-    −5 the sight alone rules a candidate out.
+    is missing costs an eighth), and half of that of its label and the labels seen so far
+    (`label_counts`). Below −5 the sight alone rules a candidate out.
 3.  Pairs are taken best first while the evidence is above 0. Each observation goes to one Object,
     and each Object gets one observation of a picture: two things in one picture are not one. What
-    is left founds Objects.
+    is left founds Objects. Where other Objects, or a new one, were nearly as probable, the sight
+    weighs only its probability in the estimate, and below 0.7 the look is no exemplar.
 4.  The Object's estimate is solved anew from its spots (`spots`), its class is that of most of its
     observations.
 5.  Two Objects are merged when better views show that they are one (`evidence_merging`).
@@ -362,12 +363,12 @@ class EvidenceLandmarks:
     ) -> tuple[Floats, Floats]:
         """The ratio of looks of each pair of an Object and an observation, and the best cosine."""
         counts = np.array([thing.exemplars for thing in things])
-        most = int(counts.max())
+        most = max([len(thing.looks) for thing in things])
         dots = np.zeros((len(things), most))
         column_of = columns.tolist()
         for row, thing in enumerate(things):
-            count = thing.exemplars
-            dots[row, :count] = thing.looks[:count] @ looks[column_of[row]]
+            room = len(thing.looks)  # rows of zeros after the exemplars
+            dots[row, :room] = thing.looks @ looks[column_of[row]]
         marks = np.array([thing.marks[:most] for thing in things])
         cosines = dots * marks[:, :, INVERSE] * inverses[columns, np.newaxis]
         is_missing = np.arange(most) >= counts[:, np.newaxis]

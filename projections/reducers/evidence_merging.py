@@ -1,10 +1,10 @@
 """Which Object turns out to be the same as another, now that it was seen better.
 
-An Object is compared with those around it whenever it has got a third more observations. Two are
-one while the evidence is above 0: of their estimates (χ² of the difference, against anywhere in
+An Object is compared with those around it each time it has half as many more observations. Two
+are one while the evidence is above 0: of their estimates (χ² of the difference, against anywhere in
 9 m²), of their looks (the mean over all pairs of exemplars, each within ±6), and half of that of
 their labels; unless more than a tenth of the pictures of one show both, or a command keeps them
-apart. The best one is taken, of equal ones that founded first.
+apart. Of several the one with the most evidence is taken, of equal ones that founded first.
 """
 
 import math
@@ -54,7 +54,7 @@ class Merging:
         thing = self._index.thing(ordinal)
         if thing.count < thing.checked:
             return None
-        thing.checked = thing.count + 1 + thing.count // 3
+        thing.checked = thing.count + 1 + thing.count // 2
         x, y, xx, xy, yy = self._index.estimates[:5, ordinal].tolist()
         near = self._index.near(x, y)
         near = near[near != ordinal]

@@ -26,6 +26,9 @@ from projections.settings import Camera
 _CUT_PX = 2.0
 _HALF_DEGREE = 0.008726646259971648
 _LEAST_M = 0.05
+_LEAST_ERROR_M = 0.001
+_FAR_PX = 1e6
+_LEAST_PX = 0.5
 
 
 class Sighting(NamedTuple):
@@ -99,10 +102,10 @@ class Sights:
                 cos, sin = dx / far, dy / far
                 if not self._by_heading:
                     side = cos, sin
-            var = error * error
+            var = max(error, _LEAST_ERROR_M) * max(error, _LEAST_ERROR_M)
             measured = max(far, _LEAST_M), var
             return Sight(x, y, cos, sin, 0.0, var, None, 0.0, *side, measured)
-        left, top, right, bottom = sighting.bbox
+        left, top, right, bottom = (min(max(at, -_FAR_PX), _FAR_PX) for at in sighting.bbox)
         aside = camera.width_px * 0.5 - (left + right) * 0.5
         slant = math.sqrt(focal * focal + aside * aside)
         ahead, aside = focal / slant, aside / slant
@@ -113,7 +116,7 @@ class Sights:
             depth, error = sighting.depth
             known = max(depth, _LEAST_M), error * error + pose_m2
         height = bottom - top
-        if height > 0.0 and top > _CUT_PX and bottom < camera.height_px - _CUT_PX:
+        if height > _LEAST_PX and top > _CUT_PX and bottom < camera.height_px - _CUT_PX:
             log_height = log(height * ahead / focal)
             slope = (camera.height_px - top - bottom) * 0.5 * ahead / focal
         to_cos, to_sin = cos * ahead - sin * aside, sin * ahead + cos * aside

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from eventsrc.envelope import DetId
+from eventsrc.envelope import DetId, Offset
 from projections.deltas import (
     ObjectClassified,
     ObjectEstimated,
@@ -17,13 +17,23 @@ from projections.deltas import (
     ObjectSeen,
     ObjectsMerged,
     ObservationOrdinal,
+    Pose,
+    RunOrdinal,
 )
 from projections.evidence import EvidenceConstants
 from projections.pair_groups import PairGroups
 from projections.reducers import State
 from projections.reducers.evidence_landmarks import EvidenceLandmarks, LandmarkDelta
 from projections.reducers.thing_index import ThingIndex
-from tests.evidence_pictures import Picture, a_room, fold_all, fold_one, pictures_of
+from tests.evidence_pictures import (
+    DIM,
+    Picture,
+    a_room,
+    a_sighting,
+    fold_all,
+    fold_one,
+    pictures_of,
+)
 
 _SEEDS = st.integers(0, 10_000)
 
@@ -199,3 +209,32 @@ def test_the_grid_changes_nothing(seed: int) -> None:
     naive._index = naive._merging._index = index
     for picture in pictures:
         assert fold_one(landmarks, picture) == fold_one(naive, picture)
+
+
+_PIXEL = st.one_of(
+    st.floats(-1e300, 1e300), st.sampled_from([0.0, 5e-324, -5e-324, 320.0, 640.0, 400.0])
+)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.tuples(_PIXEL, _PIXEL, _PIXEL, _PIXEL), min_size=1, max_size=12), _SEEDS)
+def test_boxes_of_any_size_give_finite_estimates(
+    boxes: list[tuple[float, float, float, float]], seed: int
+) -> None:
+    chance = np.random.default_rng(seed)
+    landmarks = EvidenceLandmarks(EvidenceConstants())
+    for number, box in enumerate(boxes):
+        sighting = a_sighting(number, "chair", chance.normal(size=DIM), box)
+        if number % 3 == 1:
+            sighting = sighting._replace(depth=(1e6, 1e-300))
+        if number % 3 == 2:
+            sighting = sighting._replace(position=(-9e6, 9e6, 1e-300))
+        x_um = int(chance.choice([0, 10**13, -(10**13)]))
+        pose = Pose(x_um, 0, float(chance.uniform(-4, 4)))
+        picture = Picture(Offset(number + 1), RunOrdinal(0), 0.0, pose, [sighting], [0])
+        for delta in fold_one(landmarks, picture):
+            if isinstance(delta, ObjectEstimated):
+                assert abs(delta.x_um) < 10**14
+                assert delta.var_xx_um2 > 0
+                assert delta.var_yy_um2 > 0
+    assert np.isfinite(landmarks.dump()["things.estimates"]).all()
