@@ -1,5 +1,6 @@
 """Maps folded by evidence: tails in batches of any size and rebuilds have the rows of the fold."""
 
+import json
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -184,3 +185,25 @@ def founder_of(log: Path, ordinal: int, view: MapView) -> str:
                 if isinstance(delta, d.ObjectFound) and delta.object == ordinal:
                     return view.observations[delta.observation].det_id
     raise AssertionError(ordinal)
+
+
+def test_what_was_carried_away_is_missing_in_the_graph(
+    tmp_path: Path, one_database: Targets, third_database: Targets
+) -> None:
+    gone = ("lamp", "couch", "bed", "potted plant")
+    log = tmp_path / "log"
+    write_log(log, flickering_house("a", 445, noise_m=0.05))
+    tail(log, one_database, EVIDENCE, once=True)
+    before = [json.loads(row[1]) for row in graph_rows(one_database.graph_url)["Object"]]
+    assert not any(thing["missing"] for thing in before)
+    write_log(log, flickering_house("c", 324, noise_m=0.05, without=gone))
+    tail(log, one_database, EVIDENCE, once=True, batch_events=40)
+    after = [json.loads(row[1]) for row in graph_rows(one_database.graph_url)["Object"]]
+    missing = [thing["class_name"] for thing in after if thing["missing"]]
+    assert sum(class_name in gone for class_name in missing) >= 4
+    assert sum(class_name not in gone for class_name in missing) <= 2
+    rebuild(log, third_database, EVIDENCE)
+    rows = all_rows(one_database)
+    assert rows == all_rows(third_database)
+    assert parsed(dict(rows[0])) == expected_graph(view_of(log))
+    assert all(report.sound for report in check(log, one_database, EVIDENCE))
