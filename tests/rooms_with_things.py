@@ -81,6 +81,19 @@ def drive(seed: int, count: int, things: int = 6) -> list[dict[str, Any]]:
     return documents
 
 
+def long_drive(seed: int, runs: int = 3, each: int = 80) -> list[dict[str, Any]]:
+    """Keyframes of several runs, and two things carried elsewhere before each but the first."""
+    room = Room(seed, 8)
+    documents = []
+    for run in range(runs):
+        if run:
+            room.carry()
+            room.carry()
+        numbers = range(each * run, each * (run + 1))
+        documents += [room.keyframe(number, f"run-{run}") for number in numbers]
+    return documents
+
+
 @st.composite
 def drives(draw: st.DrawFn, most: int = 30) -> list[dict[str, Any]]:
     """`drive` of any length and seed."""
