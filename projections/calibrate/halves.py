@@ -15,6 +15,11 @@ from .sightings import Floats, Ints, Sightings
 from .things import Thing
 
 LEAST_HALF = 3
+SPOT_M = 0.35
+TOGETHER = 1.5
+MOST = 9.0
+"""As in the fold (`projections.reducers.spots`): views from one spot weigh this much together, and
+an estimate rests on twelve spots at most, so a half of them on six."""
 _ROUNDS = 6
 _WORST = 20.0
 _UNSURE_M2 = 1.0
@@ -85,13 +90,27 @@ def _position(
     normals = np.stack([-np.sin(sight), np.cos(sight)], axis=1)
     offset = normals[:, 0] * x + normals[:, 1] * y
     at = np.array([thing.x, thing.y])
+    counts = _counts(x, y)
     for _ in range(_ROUNDS):
         square = np.maximum((at[0] - x) ** 2 + (at[1] - y) ** 2, _LEAST_M2)
         variance = bearing_var * square + pose_var
         past = offset - normals @ at
-        weight = 1.0 / (variance * (1.0 + past**2 / (4.0 * variance)))
+        weight = counts / (variance * (1.0 + past**2 / (4.0 * variance)))
         info = normals.T @ (normals * weight[:, None])
         if np.linalg.eigvalsh(info)[0] < 0.5 / _UNSURE_M2:
             return float(at[0]), float(at[1]), info
         at = np.linalg.solve(info, normals.T @ (weight * offset))
     return float(at[0]), float(at[1]), info
+
+
+def _counts(x: Floats, y: Floats) -> Floats:
+    """How much each view counts beside the others of its spot, and of all spots."""
+    spot = np.full(len(x), -1)
+    for index in range(len(x)):
+        if spot[index] < 0:
+            near = np.hypot(x - x[index], y - y[index]) < SPOT_M
+            spot[near & (spot < 0)] = index
+    alike = np.bincount(spot)[spot]
+    counts = np.minimum(1.0, TOGETHER / alike)
+    found: Floats = counts * min(1.0, MOST / float(counts.sum()))
+    return found
