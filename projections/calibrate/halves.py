@@ -15,11 +15,9 @@ from .sightings import Floats, Ints, Sightings
 from .things import Thing
 
 LEAST_HALF = 3
-SPOT_M = 0.35
-TOGETHER = 1.5
-MOST = 9.0
-"""As in the fold (`projections.reducers.spots`): views from one spot weigh this much together, and
-an estimate rests on twelve spots at most, so a half of them on six."""
+MOST = 18.0
+"""So many views an estimate of the fold rests on at most: twelve spots of 1.5 views
+(`projections.reducers.spots`). What more of them agree on does not make it surer."""
 _ROUNDS = 6
 _WORST = 20.0
 _UNSURE_M2 = 1.0
@@ -90,7 +88,7 @@ def _position(
     normals = np.stack([-np.sin(sight), np.cos(sight)], axis=1)
     offset = normals[:, 0] * x + normals[:, 1] * y
     at = np.array([thing.x, thing.y])
-    counts = _counts(x, y)
+    counts = min(1.0, MOST / len(rows))
     for _ in range(_ROUNDS):
         square = np.maximum((at[0] - x) ** 2 + (at[1] - y) ** 2, _LEAST_M2)
         variance = bearing_var * square + pose_var
@@ -101,16 +99,3 @@ def _position(
             return float(at[0]), float(at[1]), info
         at = np.linalg.solve(info, normals.T @ (weight * offset))
     return float(at[0]), float(at[1]), info
-
-
-def _counts(x: Floats, y: Floats) -> Floats:
-    """How much each view counts beside the others of its spot, and of all spots."""
-    spot = np.full(len(x), -1)
-    for index in range(len(x)):
-        if spot[index] < 0:
-            near = np.hypot(x - x[index], y - y[index]) < SPOT_M
-            spot[near & (spot < 0)] = index
-    alike = np.bincount(spot)[spot]
-    counts = np.minimum(1.0, TOGETHER / alike)
-    found: Floats = counts * min(1.0, MOST / float(counts.sum()))
-    return found
