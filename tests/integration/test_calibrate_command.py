@@ -1,6 +1,7 @@
 """`mapfold calibrate` on logs: what it prints, records, and what the next fold does with it."""
 
 import json
+import re
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -108,6 +109,8 @@ def test_write_with_set_switches_the_rule_in_one_command(mapfold: Commands) -> N
         True,
     )
     assert mapfold("edits", "log", "--json").json[0]["reason"] == "try it"
+    listed = mapfold("edits", "log").out
+    assert re.search(r"use-settings fusion=evidence, \d+ constants of evidence  ", listed)
 
 
 def test_what_is_in_the_log_already_is_not_recorded_again(tmp_path: Path) -> None:

@@ -67,6 +67,15 @@ def test_boxes_that_show_the_near_side_of_a_thing_do() -> None:
     assert _inflation(_moved(rows, aside)) > 1.7
 
 
+def test_what_is_seen_ever_again_does_not_make_errors_grow_without_end() -> None:
+    """An estimate of the fold rests on so many views at most, however many there are."""
+    known = Known(things=24, looks=40)
+    rows = rows_of(known)
+    off = _moved(rows, lambda row: (0.15 * row.run, 0.0))
+    again = [row._replace(picture=row.picture + 100_000 * copy) for copy in range(6) for row in off]
+    assert _inflation(again) < 1.3 * _inflation(off)
+
+
 def test_nothing_to_split_says_nothing() -> None:
     assert _inflation([]) == 1.0
     few = rows_of(Known(things=1, looks=5))
