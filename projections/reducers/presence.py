@@ -51,7 +51,7 @@ _TURN2 = 0.87 * 0.87
 """Square of the least cosine between similar lines of sight, 30°."""
 _PRIOR = 4.0
 _SEEN, _SURE, _FLOOR = 8.0, 512.0, 1.0 / 1024.0
-_MISSING, _BACK = 0.05, 0.05
+_MISSING, _BACK = 0.07, 0.07
 _LEAST_LOOKS, _LEAST_HITS = 2, 1
 _HALF_DEGREE = 0.008726646259971648
 _Cell = tuple[int, int]

@@ -5,7 +5,7 @@ it, of the same class, with `_LEAST_OLD` observations and at least a metre away,
 thing, unless it was surely seen in the newcomer's run (`presence`). The evidence is the
 log-likelihood ratio of their looks, which must be `_LEAST_LOOK`, less `_ODDS_WEIGHT` of the
 logarithm of the older one's odds to be still where it was. The best candidate is the newcomer if
-its evidence, plus `_LEAD_WEIGHT` of its lead over the next (at most `_MOST_LEAD`), is `_ENOUGH`.
+its evidence is `_ENOUGH`; of equal ones the latest.
 
 A newcomer is compared when its observations have doubled, and with an Object whose misses have
 doubled. Of a class the latest `_MOST` Objects are kept, and of newcomers, so the cost of a keyframe
@@ -32,8 +32,7 @@ from .presence import Presence
 _LEAST_NEW, _LEAST_OLD = 4, 2
 _APART_M2 = 1.0
 _LEAST_LOOK, _ODDS_WEIGHT = 1.5, 0.3
-_LEAD_WEIGHT, _MOST_LEAD = 0.5, 4.0
-_ENOUGH = 3.25
+_ENOUGH = 2.25
 _MOST = 128
 
 
@@ -157,12 +156,9 @@ class Relocations:
                 if look is not None:
                     odds = min(self._presence.attendance[old].odds, 1.0)
                     candidates.append(_Candidate(look - _ODDS_WEIGHT * log(odds), look, old))
-        if not candidates:
-            return None
-        best, *others = sorted(candidates, reverse=True)
-        lead = min(best.evidence - others[0].evidence, _MOST_LEAD) if others else _MOST_LEAD
-        is_enough = best.evidence + _LEAD_WEIGHT * lead >= _ENOUGH
-        return best if is_enough and best.look >= _LEAST_LOOK else None
+        best = max(candidates, default=None)
+        is_enough = best is not None and best.evidence >= _ENOUGH and best.look >= _LEAST_LOOK
+        return best if is_enough else None
 
     def _could_be(self, old: ObjectOrdinal, newcomer: ObjectOrdinal) -> bool:
         """Whether they can be one thing, whatever they look like."""

@@ -85,7 +85,7 @@ class Oracle:
             if run != known.home:
                 known.enter(run)
                 known.odds = min(known.odds * 8, Fraction(512))
-                known.is_missing = known.is_missing and known.odds <= Fraction(0.05)
+                known.is_missing = known.is_missing and known.odds <= Fraction(0.07)
         return [
             ObjectMissing(offset, ObjectOrdinal(o), RunOrdinal(run), k.looks, k.is_missing)
             for o, k in sorted(self.known.items())
@@ -135,7 +135,7 @@ class Oracle:
         if not known.is_missing:
             known.misses += 1
             self.looks.append(False)
-            known.is_missing = known.odds < Fraction(0.05) and known.looks >= 2 and known.hits >= 1
+            known.is_missing = known.odds < Fraction(0.07) and known.looks >= 2 and known.hits >= 1
 
 
 class Step(NamedTuple):

@@ -90,34 +90,33 @@ def story() -> Story:
 
 
 def test_the_best_candidate_is_the_newcomer_at_its_fourth_observation(story):
-    story.table.looks |= {(0, 3): 2.0, (1, 3): -0.75, (2, 3): 9.0}
+    story.table.looks |= {(0, 3): 2.5, (1, 3): 2.3, (2, 3): 9.0}
     assert story.see(3, 1, 3) == []
-    assert story.see(3, 1) == [Moved(0, 3, 15, 2.0)]
+    assert story.see(3, 1) == [Moved(0, 3, 15, 2.5)]
     assert story.see(0, 1, 60) == []  # it is told once
 
 
 @pytest.mark.parametrize(
-    ("first", "second", "is_told"),
+    ("first", "second", "told"),
     [
-        (2.0, -0.5, True),  # 2 + 0.5 × 2.5
-        (2.0, -0.4, False),
-        (1.5, -5.0, True),  # a lead counts up to 4
-        (1.4, -5.0, False),  # looks less than 1.5
-        (3.3, 3.3, True),
-        (3.2, 3.2, False),
-        (None, 3.3, True),  # kept apart by a command
+        (2.25, 2.0, [0]),
+        (2.24, 2.0, []),
+        (2.3, 2.4, [1]),
+        (None, 2.3, [1]),  # kept apart by a command
+        (2.3, None, [0]),
     ],
 )
-def test_the_evidence_and_its_lead_must_be_enough(story, first, second, is_told):
+def test_the_evidence_of_the_best_must_be_enough(story, first, second, told):
     story.table.looks |= {(0, 3): first, (1, 3): second}
-    assert bool(story.see(3, 1, 4)) == is_told
+    assert [pair.old for pair in story.see(3, 1, 4)] == told
 
 
-def test_misses_of_the_older_one_add_to_the_evidence(story):
-    story.table.looks |= {(0, 3): 2.0, (1, 3): 1.5}
+@pytest.mark.parametrize(("look", "is_told"), [(1.4, False), (1.5, True)])
+def test_misses_of_the_older_one_add_to_evidence_of_looks(story, look, is_told):
+    story.table.looks |= {(0, 3): look}
     assert story.see(3, 1, 30) == []
-    told = story.miss(0, 1, 8)
-    assert told == [Moved(0, 3, 15, 2.0)]
+    told = story.miss(0, 1, 16)
+    assert told == ([Moved(0, 3, 15, look)] if is_told else [])
 
 
 def test_what_was_surely_seen_in_the_run_is_no_candidate(story):
@@ -169,11 +168,11 @@ def test_newcomers_are_compared_when_they_have_doubled(story):
 
 
 def test_a_snapshot_goes_on_where_it_was_taken(story):
-    story.table.looks |= {(0, 3): 2.0}
+    story.table.looks |= {(0, 3): 2.5}
     story.see(3, 1, 3)
     again = Relocations(story.presence, story.table)
     state: dict[str, Any] = story.relocations.dump()
     again.load(state)
     assert again.dump() == state
     story.relocations = again
-    assert story.see(3, 1) == [Moved(0, 3, 15, 2.0)]
+    assert story.see(3, 1) == [Moved(0, 3, 15, 2.5)]
