@@ -27,8 +27,8 @@ from .spots import LEAST_ELEVATION_M2, LEAST_M, SIZE, SLOPE, Estimate
 Floats = NDArray[np.float64]
 ESTIMATE_FIELDS = len(Estimate._fields)
 _WORST_CHI2 = 16.0
-_ANYWHERE = -0.74
-"""log(1.2 rad / √2π)."""
+_ANYWHERE = -1.5
+"""log(0.56 rad / √2π): in front of one another for a picture, things are not spread evenly."""
 _OTHER_SIZES = 0.36
 _WORST_PART = -12.0
 """Twice what box height, or elevation, can say against a thing at most."""

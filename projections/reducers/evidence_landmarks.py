@@ -11,7 +11,7 @@ The rules, for the observations of one picture:
 3.  Pairs are taken best first while the evidence is above 0. Each observation goes to one Object,
     and each Object gets one observation of a picture: two things in one picture are not one. What
     is left founds Objects. Where other Objects, or a new one, were nearly as probable, the sight
-    weighs only its probability in the estimate, and below 0.7 the look is no exemplar.
+    weighs only its probability in the estimate, and below 0.85 the look is no exemplar.
 4.  The Object's estimate is solved anew from its spots (`spots`), its class is that of most of its
     observations.
 5.  Two Objects are merged when better views show that they are one (`evidence_merging`).
@@ -67,7 +67,7 @@ LandmarkDelta: TypeAlias = (
     ObjectFound | ObjectSeen | ObjectsMerged | ObjectRelocated | ObjectClassified | ObjectEstimated
 )
 _BEST = 4
-_SURE = 0.7
+_SURE = 0.85
 _MISSING = 0.125
 _LEAST_AGREEMENT = -5.0
 _LABEL_WEIGHT = 0.5

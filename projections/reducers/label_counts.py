@@ -10,7 +10,7 @@ from .agreement import logs
 from .looks import Floats
 from .things import Thing
 
-_DOUBT = 0.1
+_DOUBT = 0.3
 """How many observations of the labels' usual mix are added to those of a thing."""
 
 

@@ -14,7 +14,7 @@ from projections.deltas import ObjectOrdinal
 from .class_heights import Given
 from .spots import Estimate, Spots
 
-MOST_EXEMPLARS = 8
+MOST_EXEMPLARS = 6
 _OF_A_KIND = 3
 INVERSE, SIDE_COS, SIDE_SIN, RUN, KIND = range(5)
 """Columns of ``marks``: 1 / length of the look, line of sight, run, kind of exemplar."""
