@@ -24,11 +24,9 @@ Everything is bit-exact: integers, and float64 by operations that IEEE 754 defin
 in one order; transcendental functions are those of `projections.exact_functions`.
 """
 
+import math
 from collections.abc import Sequence
 from typing import TypeAlias
-
-import numpy as np
-from numpy.typing import NDArray
 
 from eventsrc.envelope import DetId, Offset
 from projections.deltas import (
@@ -45,32 +43,28 @@ from projections.deltas import (
 )
 from projections.evidence import EvidenceConstants
 from projections.exact import MAX_IN_A_SUM, Q40
-from projections.exact_functions import exp
 from projections.pair_groups import PairGroups
 from projections.reducers import State, part, prefixed
 from projections.settings import Camera
 
 from .agreement import Agreement, Slopes
+from .evidence_matching import Matching
 from .evidence_merging import Merging
 from .label_counts import LabelCounts
 from .landmarks import object_id
-from .looks import Floats, LookRatios, Looks, LookScale, looks_of
+from .looks import LookRatios, LookScale, looks_of
 from .relocations import Moved
-from .sights import Sight, Sighting, Sights
+from .sights import Sighting, Sights
 from .spots import Spots
 from .thing_index import ThingIndex
-from .things import INVERSE, RUN, SIDE_COS, SIDE_SIN, Thing
+from .things import Thing
 
 __all__ = ["EvidenceLandmarks", "LandmarkDelta", "Sighting"]
 
 LandmarkDelta: TypeAlias = (
     ObjectFound | ObjectSeen | ObjectsMerged | ObjectRelocated | ObjectClassified | ObjectEstimated
 )
-_BEST = 4
 _SURE = 0.85
-_MISSING = 0.125
-_LEAST_AGREEMENT = -5.0
-_LABEL_WEIGHT = 0.5
 
 
 class EvidenceLandmarks:
@@ -85,9 +79,17 @@ class EvidenceLandmarks:
         self._scale = LookScale(constants.different)
         self._slopes = Slopes()
         self._labels = LabelCounts()
-        self._agreement = Agreement(constants.range_m, constants.range_spread)
         self._index = ThingIndex(constants)
         self._object_of: dict[int, ObjectOrdinal] = {}  # group → its Object
+        self._matching = Matching(
+            Agreement(constants.range_m, constants.range_spread),
+            self._index,
+            self._look_ratios,
+            self._scale,
+            self._slopes,
+            self._labels,
+            groups,
+        )
         self._merging = Merging(self._index, self._look_ratios, self._scale, self._labels, groups)
 
     def fold(
@@ -108,7 +110,9 @@ class EvidenceLandmarks:
         self._scale.learn(labels, looks)
         self._slopes.learn(sights)
         self._labels.learn(labels)
-        chosen = self._choose(run, pose, labels, looks, inverses, sights, sightings)
+        chosen = self._matching.choose(
+            run, pose, labels, looks, inverses, sights, sightings, self._object_of
+        )
         deltas: list[LandmarkDelta] = []
         seen: list[ObjectOrdinal] = []
         named: dict[ObjectOrdinal, str] = {}  # the classes before
@@ -189,7 +193,7 @@ class EvidenceLandmarks:
         evidence = MergeEvidence(
             round(moved.look * 1000.0),
             0,
-            round((dx * dx + dy * dy) ** 0.5 * 1e6),
+            round(math.sqrt(dx * dx + dy * dy) * 1e6),
             thing.met.get(moved.new, 0),
             thing.count + later.count,
         )
@@ -296,110 +300,3 @@ class EvidenceLandmarks:
             thing.last_seen,
             evidence,
         )
-
-    def _choose(
-        self,
-        run: RunOrdinal,
-        pose: Pose,
-        labels: list[str],
-        looks: Looks,
-        inverses: Floats,
-        sights: list[Sight],
-        sightings: Sequence[Sighting],
-    ) -> list[tuple[ObjectOrdinal | None, float, float]]:
-        """The Object of each observation, None for a new one, and the cosine of the best pair."""
-        chosen: list[tuple[ObjectOrdinal | None, float, float]] = [(None, 1.0, 1.0)] * len(sights)
-        near = self._index.near(pose.x_um / 1e6, pose.y_um / 1e6)
-        if not len(near):
-            return chosen
-        rows, columns, values = self._agreement.pairs(
-            self._index.estimates[:, near], sights, self._slopes.mean_square, _LEAST_AGREEMENT
-        )
-        if not len(rows):
-            return chosen
-        things = [self._index.thing(ordinal) for ordinal in near[rows].tolist()]
-        names = [labels[column] for column in columns.tolist()]
-        values += _LABEL_WEIGHT * self._labels.ratios(things, names)
-        agree = np.array(
-            [label in thing.classes for thing, label in zip(things, names, strict=True)]
-        )
-        kept = (values + self._look_ratios.at_best(agree) > 0.0).nonzero()[0]
-        if not len(kept):
-            return chosen
-        columns, values = columns[kept], values[kept]
-        pairs = list(zip(near[rows[kept]].tolist(), columns.tolist(), strict=True))
-        things = [things[place] for place in kept.tolist()]
-        by_look, cosines = self._look_values(
-            things, columns, run, agree[kept, np.newaxis], looks, inverses, sights
-        )
-        values += by_look
-        if self._groups is not None:
-            self._forbid(self._groups, values, pairs, things, sightings)
-        flat = values.tolist()
-        used: set[ObjectOrdinal] = set()
-        for place in (-values).argsort(kind="stable").tolist():
-            if flat[place] <= 0.0:
-                break
-            ordinal, column = pairs[place]
-            if ordinal not in used and chosen[column][0] is None:
-                rivals = 1.0
-                for other, (rival, of) in enumerate(pairs):
-                    if of == column and other != place and rival not in used:
-                        rivals += exp(min(flat[other], 50.0))
-                mine = exp(min(flat[place], 50.0))
-                chosen[column] = ordinal, float(cosines[place]), mine / (mine + rivals)
-                used.add(ordinal)
-        return chosen
-
-    def _look_values(
-        self,
-        things: list[Thing],
-        columns: NDArray[np.intp],
-        run: RunOrdinal,
-        agree: NDArray[np.bool_],
-        looks: Looks,
-        inverses: Floats,
-        sights: list[Sight],
-    ) -> tuple[Floats, Floats]:
-        """The ratio of looks of each pair of an Object and an observation, and the best cosine."""
-        counts = np.array([thing.exemplars for thing in things])
-        most = max([len(thing.looks) for thing in things])
-        dots = np.zeros((len(things), most))
-        column_of = columns.tolist()
-        for row, thing in enumerate(things):
-            room = len(thing.looks)  # rows of zeros after the exemplars
-            dots[row, :room] = thing.looks @ looks[column_of[row]]
-        marks = np.array([thing.marks[:most] for thing in things])
-        cosines = dots * marks[:, :, INVERSE] * inverses[columns, np.newaxis]
-        is_missing = np.arange(most) >= counts[:, np.newaxis]
-        different = self._scale.different()
-        likeness = (cosines - different) * (1.0 / (1.0 - different))
-        toward = np.array([(sight.side_cos, sight.side_sin) for sight in sights])[columns]
-        sides = marks[:, :, SIDE_COS] * toward[:, :1] + marks[:, :, SIDE_SIN] * toward[:, 1:]
-        ratios = self._look_ratios.ratios(likeness, sides, marks[:, :, RUN] != run, agree)
-        ratios[is_missing] = -np.inf
-        ratios.sort(axis=1)
-        counts = np.minimum(counts, _BEST)
-        total = np.zeros(len(things))
-        for rank in range(min(most, _BEST)):
-            total += np.where(rank < counts, ratios[:, most - 1 - rank], 0.0)
-        cosines[is_missing] = -1.0
-        return total / counts - _MISSING * (_BEST - counts), cosines.max(axis=1)
-
-    def _forbid(
-        self,
-        groups: PairGroups[DetId],
-        values: Floats,
-        pairs: list[tuple[ObjectOrdinal, int]],
-        things: list[Thing],
-        sightings: Sequence[Sighting],
-    ) -> None:
-        """Leave out what commands keep apart."""
-        for place, ((_, column), thing) in enumerate(zip(pairs, things, strict=True)):
-            group = groups.group_of.get(sightings[column].det_id)
-            if group is None:
-                continue
-            own = self._object_of.get(group)
-            inside = {group} if own is None else self._index.thing(own).groups
-            if thing.groups is not inside and groups.conflicts(inside, thing.groups):
-                values[place] = -np.inf

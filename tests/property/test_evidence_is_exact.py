@@ -58,9 +58,12 @@ def test_no_float_is_raised_to_a_power() -> None:
         agreement,
         class_heights,
         evidence_landmarks,
+        evidence_matching,
         evidence_merging,
         label_counts,
         looks,
+        presence,
+        relocations,
         sights,
         spots,
         thing_index,
@@ -69,7 +72,17 @@ def test_no_float_is_raised_to_a_power() -> None:
 
     modules = (
         *(agreement, class_heights, evidence_landmarks, evidence_merging, exact_functions),
-        *(label_counts, looks, sights, spots, thing_index, things),
+        *(
+            evidence_matching,
+            presence,
+            relocations,
+            label_counts,
+            looks,
+            sights,
+            spots,
+            thing_index,
+            things,
+        ),
     )
     for module in modules:
         tree = ast.parse(inspect.getsource(module))

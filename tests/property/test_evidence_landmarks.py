@@ -206,7 +206,7 @@ def test_the_grid_changes_nothing(seed: int) -> None:
     constants = EvidenceConstants(range_m=2.0)
     landmarks, naive = EvidenceLandmarks(constants), EvidenceLandmarks(constants)
     index = Naive(constants)
-    naive._index = naive._merging._index = index
+    naive._index = naive._merging._index = naive._matching._index = index
     for picture in pictures:
         assert fold_one(landmarks, picture) == fold_one(naive, picture)
 
