@@ -25,6 +25,8 @@ _PRIOR_RANGES = 7
 _TO_PART = 10.0
 _HINT_SIGMAS = 6.0
 _HINT_LEAST = 0.06
+_LEAST_INFORMATION = 1e-6
+"""So that boxes that are all in the middle of the picture tell nothing."""
 
 
 class Errors(NamedTuple):
@@ -135,7 +137,7 @@ def camera_faults(things: Sequence[Thing], seen: Sightings) -> list[Reading]:
     design = np.stack([np.sin(axis) * np.cos(axis), np.ones(len(axis))], axis=1)
     weight = np.ones(len(axis))
     for _ in range(10):
-        normal = design.T @ (design * weight[:, None])
+        normal = design.T @ (design * weight[:, None]) + _LEAST_INFORMATION * np.eye(2)
         found = np.linalg.solve(normal, design.T @ (weight * residual))
         left = residual - design @ found
         sigma = max(robust_spread(left), 1e-6)

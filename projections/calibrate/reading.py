@@ -1,7 +1,9 @@
 """From the observations of a folded map to constants: one round of a calibration."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
+
+import numpy as np
 
 from projections.evidence import EvidenceConstants
 
@@ -27,6 +29,11 @@ class Round:
 
 def read(seen: Sightings, used: EvidenceConstants, prior: EvidenceConstants) -> Round:
     """Read the constants off a map that was folded with ``used``, drawn towards ``prior``."""
+    with np.errstate(all="ignore"):  # of nonsense; what is not finite is left to the prior
+        return _read(seen, used, prior)
+
+
+def _read(seen: Sightings, used: EvidenceConstants, prior: EvidenceConstants) -> Round:
     things = qualified(seen, used.bearing_rad, used.bearing_cut_rad, used.pose_m)
     found: list[Reading] = [*ranges(things, prior), *errors(things, seen, prior)]
     by_class, about = sizes(things, seen, prior)
@@ -44,6 +51,8 @@ def read(seen: Sightings, used: EvidenceConstants, prior: EvidenceConstants) -> 
     else:
         found += different((cosines - zero) / (1.0 - zero), same_class, prior)
         found += same(of_things(seen, things, zero), prior).values()
+    found = [_bounded(reading) for reading in found]
+    by_class = {name: _bounded(reading, "sizes_m") for name, reading in by_class.items()}
     values: dict[str, Any] = {reading.name: reading.value for reading in found}
     values["sizes_m"] = {name: reading.value for name, reading in by_class.items()}
     return Round(
@@ -54,3 +63,31 @@ def read(seen: Sightings, used: EvidenceConstants, prior: EvidenceConstants) -> 
         sum(len(thing.rows) for thing in things),
         tuple(camera_faults(things, seen)),
     )
+
+
+_LEAST = 0.001
+_BOUNDS: dict[str, tuple[float, float]] = {
+    "range_m": (_LEAST, 1000.0),
+    "sizes_m": (_LEAST, 1000.0),
+    "pose_m": (_LEAST, 1000.0),
+    "bearing_rad": (_LEAST, 3.2),
+    "bearing_cut_rad": (_LEAST, 3.2),
+    "range_spread": (_LEAST, 2.0),
+    "size_spread": (_LEAST, 2.0),
+    "different_spread": (_LEAST, 2.0),
+    "same_class_spread": (_LEAST, 2.0),
+    "same_spread": (_LEAST, 2.0),
+    "same_class": (-2.0, 2.0),
+    "same_back": (-2.0, 2.0),
+    "same_side": (-2.0, 2.0),
+    "session_shift": (-2.0, 2.0),
+}
+"""What `EvidenceConstants` takes: a map of nonsense may show more."""
+
+
+def _bounded(reading: Reading, group: str | None = None) -> Reading:
+    """The reading with a value that the settings take."""
+    bounds = _BOUNDS.get(group or reading.name)
+    if bounds is None or not isinstance(reading.value, float):
+        return reading
+    return replace(reading, value=min(max(reading.value, bounds[0]), bounds[1]))
