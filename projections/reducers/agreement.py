@@ -22,13 +22,15 @@ from projections.exact_functions import log
 from projections.reducers import State
 
 from .sights import Sight
-from .spots import LEAST_ELEVATION_M2, LEAST_M, SIZE, SLOPE, Estimate
+from .spots import LEAST_ELEVATION_M2, LEAST_M, SLOPE, Estimate
 
 Floats = NDArray[np.float64]
 ESTIMATE_FIELDS = len(Estimate._fields)
 _WORST_CHI2 = 16.0
 _ANYWHERE = -1.5
 """log(0.56 rad / √2π): in front of one another for a picture, things are not spread evenly."""
+_SIZE = 0.15
+"""A little more than in the estimate, where the error of a mean counts."""
 _OTHER_SIZES = 0.36
 _WORST_PART = -12.0
 """Twice what box height, or elevation, can say against a thing at most."""
@@ -130,7 +132,7 @@ class Agreement:
         steep = np.array((1.0 / along, slope))
         gx, gy = steep * cos - heights[:, 1], steep * sin - heights[:, 2]
         spread = gx * (gx * xx + 2.0 * xy * gy) + gy * gy * yy + heights[:, 3]
-        spread[0] += SIZE * SIZE
+        spread[0] += _SIZE * _SIZE
         spread[1] += (SLOPE * SLOPE) * square + LEAST_ELEVATION_M2
         other = np.array((spread[0] + _OTHER_SIZES, spread[1] + slopes * square))
         logarithms = logs(np.array((along, variance / square, *(other / spread))))

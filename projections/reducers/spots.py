@@ -1,16 +1,17 @@
 """Where a thing stands: the estimate from its sights, and how sure it is.
 
 Sights from one spot (closer than `SPOT_M`) share their errors: twelve views from one pose are no
-triangulation. So a spot keeps the mean of its sights, and they weigh min(n, 1.5) together. Of all
-spots, what is known beforehand about the range is shared too and weighs 1.5 spots together.
+triangulation. So a spot keeps the mean of its sights, and they weigh min(n, 1.5) together; a sight
+that may be of another thing counts as its probability. Of all spots, what is known beforehand about
+the range is shared too and weighs 1.5 spots together.
 
 The unknowns are the position p, the logarithm z of the thing's height, and its elevation e above
 the camera. At the distance a from a spot,
 
     bearing     0 = across / a                   variance (bearing error)² + (pose error / a)²
     range       log a = log(usual range)         (range_spread)²
-    box height  log a + log(height / f) = z      _SIZE², where the border does not cut it
-    its centre  a · slope = e                    (_SLOPE a)² + 2 cm²; a level camera
+    box height  log a + log(height / f) = z      SIZE², where the border does not cut it
+    its centre  a · slope = e                    (SLOPE · a)² + (2 cm)²; a level camera
     measured    a = depth                        that of the depth or position
 
 z and e start from what their class is like (`class_heights`). Driving towards a thing, its growing
@@ -20,6 +21,9 @@ eliminated (Schur's complement). A residual beyond about two standard errors wei
 Each spot's part of the normal equations is kept, linearised where the estimate was; a sight changes
 the part of its spot alone. All are made anew once the estimate has moved by more than `_MOVED_M`
 since. +, −, ×, ÷, √ in one fixed order: the same bits on every machine.
+
+What all poses have in common (a session's drift, a box whose centre is not the thing's) does not
+fade with their number: `COMMON_M2` is added to the variance of the estimate.
 """
 
 import math
@@ -33,7 +37,7 @@ from .sights import Sight
 SPOT_M = 0.35
 MAX_SPOTS = 12
 LEAST_M = 0.3
-SIZE = 0.15
+SIZE = 0.12
 SLOPE = 0.02
 LEAST_ELEVATION_M2 = 0.0004
 _TOGETHER = 1.5
@@ -41,6 +45,7 @@ _TAIL = 4.0
 _MORE_ROUNDS = 1
 _MOVED_M = 0.2
 COMMON_M2 = 0.02
+"""(0.14 m)²."""
 _WEIGHT, _COUNT, _HEIGHT, _HEIGHTS, _SLOPED, _DEPTH, _DEPTH_WEIGHT = range(6, 13)
 
 Spot = list[float]
