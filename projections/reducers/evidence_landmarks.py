@@ -3,7 +3,7 @@
 The rules, for the observations of one picture:
 
 1.  Each becomes a sight (`sights`) and a look (`looks`). Candidates are the Objects whose estimate
-    is within reach of the robot: the usual range times exp(1.8 spreads).
+    is within reach of the robot: the usual range times exp(1.5 spreads), and 1.5 m.
 2.  The evidence that an observation is of a candidate is a log-likelihood ratio: of its sight and
     the estimate (`agreement`), of its look and the exemplars (the mean of the best four; each that
     is missing costs an eighth), and half of that of its label and the labels seen so far

@@ -21,7 +21,7 @@ from .looks import Floats
 from .spots import PART_SIZE, Estimate, Part, Solver, Spot, Spots
 from .things import Thing
 
-_REACH_SPREADS = 1.8
+_REACH_SPREADS, _REACH_MORE_M = 1.5, 1.5
 _UM, _UM2 = 1e6, 1e12
 _NONE = np.zeros(0, np.int64)
 
@@ -30,7 +30,8 @@ class ThingIndex:
     """Objects by ordinal, their estimates as one matrix, and the grid. Absorbed ones are None."""
 
     def __init__(self, constants: EvidenceConstants) -> None:
-        self._reach_m = constants.range_m * exp(_REACH_SPREADS * constants.range_spread)
+        spreads = exp(_REACH_SPREADS * constants.range_spread)
+        self._reach_m = constants.range_m * spreads + _REACH_MORE_M
         self._solver = Solver(constants.range_m, constants.range_spread)
         self._heights = ClassHeights(constants.sizes_m, constants.size_spread)
         self._things: list[Thing | None] = []
