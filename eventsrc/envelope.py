@@ -71,7 +71,7 @@ def describe_error(error: ErrorDetails) -> str:
 
 
 HFOV_DEG = Field(ge=1.0, le=170.0)
-PIXELS = Field(gt=0.0, le=1e6)
+PIXELS = Field(ge=1.0, le=1e6)
 ANGLE_RAD = Field(ge=-7.0, le=7.0)
 """Bounds of a camera's field of view, its picture's size, and the angle at which it is mounted."""
 SIGMA_M = Field(ge=0.001, le=1000.0)

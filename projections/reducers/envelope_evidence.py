@@ -5,7 +5,7 @@ has 0.1 m.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Sequence
 
 from eventsrc.envelope import Detection, Envelope
 from eventsrc.ingest import Accepted
@@ -18,6 +18,8 @@ from .fusible import FusibleObservation
 _DEPTH_SIGMA_SHARE = 0.05
 _LEAST_DEPTH_SIGMA_M = 0.05
 _POSITION_SIGMA_M = 0.1
+MOST_OF_A_PICTURE = 256
+"""Observations of one picture that fuse, the first ones: what they cost grows with the square."""
 _MANY_TURNS = 1e6
 _TURN = 2.0 * math.pi
 
@@ -47,8 +49,9 @@ def with_small_yaw(pose: Pose) -> Pose:
     return pose if yaw == pose.yaw_rad else Pose(pose.x_um, pose.y_um, yaw)
 
 
-def sightings_of(accepted: Accepted, fusible: Iterable[FusibleObservation]) -> list[Sighting]:
-    """The fusible observations of an envelope, with their boxes, depths and positions."""
+def sightings_of(accepted: Accepted, fusible: Sequence[FusibleObservation]) -> list[Sighting]:
+    """The fusible observations of an envelope, with their boxes, depths and positions; of very
+    many the first ones. The others stay observations without an Object."""
     detections = dict(zip(accepted.det_ids, accepted.envelope.detections, strict=True))
     return [
         Sighting(
@@ -61,7 +64,7 @@ def sightings_of(accepted: Accepted, fusible: Iterable[FusibleObservation]) -> l
             _depth(detection),
             _position(detection),
         )
-        for observation, det_id, class_name, vector, norm2 in fusible
+        for observation, det_id, class_name, vector, norm2 in fusible[:MOST_OF_A_PICTURE]
     ]
 
 

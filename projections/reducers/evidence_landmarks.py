@@ -267,8 +267,7 @@ class EvidenceLandmarks:
         thing.sum_y_um += pose.y_um
         thing.first_seen = min(thing.first_seen, timestamp)
         thing.last_seen = max(thing.last_seen, timestamp)
-        thing.classes[label] = thing.classes.get(label, 0) + 1
-        thing.reclassify()
+        thing.count_label(label)
         return wanted, []
 
     def _unite(

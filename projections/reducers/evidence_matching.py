@@ -84,6 +84,9 @@ class Matching:
         if self._groups is not None:
             self._forbid(self._groups, values, pairs, things, sightings, object_of)
         flat = values.tolist()
+        places_of: list[list[int]] = [[] for _ in sights]
+        for place, (_, column) in enumerate(pairs):
+            places_of[column].append(place)
         used: set[ObjectOrdinal] = set()
         for place in (-values).argsort(kind="stable").tolist():
             if flat[place] <= 0.0:
@@ -91,8 +94,8 @@ class Matching:
             ordinal, column = pairs[place]
             if ordinal not in used and chosen[column][0] is None:
                 rivals = 1.0
-                for other, (rival, of) in enumerate(pairs):
-                    if of == column and other != place and rival not in used:
+                for other in places_of[column]:
+                    if other != place and pairs[other][0] not in used:
                         rivals += exp(min(flat[other], 50.0))
                 mine = exp(min(flat[place], 50.0))
                 chosen[column] = ordinal, float(cosines[place]), mine / (mine + rivals)

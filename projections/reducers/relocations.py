@@ -184,7 +184,10 @@ class Relocations:
     def _drop_class(self, ordinal: ObjectOrdinal) -> None:
         class_name = self._class_of.pop(ordinal, None)
         if class_name is not None:
-            del self._by_class[class_name][ordinal]
+            own = self._by_class[class_name]
+            del own[ordinal]
+            if not own:
+                del self._by_class[class_name]
 
     def _forget(self, ordinal: ObjectOrdinal) -> None:
         self._drop_class(ordinal)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from eventsrc.envelope import DetId
+from eventsrc.envelope import MAX_DEPTH_M, DetId
 from projections.deltas import ObservationOrdinal, Pose
 from projections.evidence import EvidenceConstants
 from projections.exact_functions import cos_sin, log
@@ -29,6 +29,8 @@ _LEAST_M = 0.05
 _LEAST_ERROR_M = 0.001
 _FAR_PX = 1e6
 _LEAST_PX = 0.5
+_STEEPEST = 10.0
+"""Greatest slope of a line of sight, up or down, at which a box tells a height: 84°."""
 
 
 class Sighting(NamedTuple):
@@ -93,9 +95,9 @@ class Sights:
     ) -> Sight:
         constants = self._constants
         pose_m2 = constants.pose_m * constants.pose_m
-        if sighting.position is not None:
-            there_x, there_y, error = sighting.position
-            dx, dy = there_x - x, there_y - y
+        there = _position_in_range(sighting, x, y)
+        if there is not None:
+            dx, dy, error = there
             side = cos, sin
             far = math.sqrt(dx * dx + dy * dy)
             if far >= _LEAST_M:
@@ -117,8 +119,11 @@ class Sights:
             known = max(depth, _LEAST_M), error * error + pose_m2
         height = bottom - top
         if height > _LEAST_PX and top > _CUT_PX and bottom < camera.height_px - _CUT_PX:
-            log_height = log(height * ahead / focal)
             slope = (camera.height_px - top - bottom) * 0.5 * ahead / focal
+            if abs(slope) <= _STEEPEST:
+                log_height = log(height * ahead / focal)
+            else:
+                slope = 0.0
         to_cos, to_sin = cos * ahead - sin * aside, sin * ahead + cos * aside
         return Sight(
             x,
@@ -133,3 +138,13 @@ class Sights:
             sin if self._by_heading else to_sin,
             known,
         )
+
+
+def _position_in_range(sighting: Sighting, x: float, y: float) -> tuple[float, float, float] | None:
+    """The offset of the stated position from (x, y) and its error; None where it is farther away
+    than a depth may be."""
+    if sighting.position is None:
+        return None
+    there_x, there_y, error = sighting.position
+    dx, dy = there_x - x, there_y - y
+    return (dx, dy, error) if dx * dx + dy * dy <= MAX_DEPTH_M * MAX_DEPTH_M else None

@@ -44,6 +44,8 @@ _TOGETHER = 1.5
 _TAIL = 4.0
 _MORE_ROUNDS = 1
 _MOVED_M = 0.2
+_LEAST_DET, _FARTHEST_M, _MOST_VARIANCE_M2 = 1e-13, 1e5, 1e7
+"""Beyond these a solution is none; no sane picture of a level camera comes near them."""
 COMMON_M2 = 0.02
 """(0.14 m)²."""
 _WEIGHT, _COUNT, _HEIGHT, _HEIGHTS, _SLOPED, _DEPTH, _DEPTH_WEIGHT = range(6, 13)
@@ -162,10 +164,10 @@ class Solver:
         start = spot[_DEPTH] if spot[_DEPTH_WEIGHT] > 0.0 else self._range_m
         x, y = spot[0] + start * spot[2], spot[1] + start * spot[3]
         self._linearise(spots, x, y, None)
-        estimate = self._solve(spots, prior)
+        estimate = self._solve(spots, prior) or _anywhere(x, y, prior)
         for _ in range(_MORE_ROUNDS):
             self._linearise(spots, estimate.x, estimate.y, estimate)
-            estimate = self._solve(spots, prior)
+            estimate = self._solve(spots, prior) or estimate
         return estimate
 
     def next(
@@ -180,10 +182,13 @@ class Solver:
             spots.total = [a + (b - c) for a, b, c in zip(total, part, old, strict=True)]
             spots.parts[index] = part
         estimate = self._solve(spots, prior)
+        if estimate is None:
+            self._linearise(spots, before.x, before.y, before)
+            estimate = self._solve(spots, prior) or before
         dx, dy = estimate.x - spots.at[0], estimate.y - spots.at[1]
         if dx * dx + dy * dy > _MOVED_M * _MOVED_M:
             self._linearise(spots, estimate.x, estimate.y, estimate)
-            estimate = self._solve(spots, prior)
+            estimate = self._solve(spots, prior) or estimate
         return estimate
 
     def _linearise(self, spots: Spots, x: float, y: float, about: Estimate | None) -> None:
@@ -255,8 +260,9 @@ class Solver:
         part += [w, wx, wy, w * constant]
         return part
 
-    def _solve(self, spots: Spots, prior: HeightPrior) -> Estimate:
-        """Solve the normal equations of all parts."""
+    def _solve(self, spots: Spots, prior: HeightPrior) -> Estimate | None:
+        """Solve the normal equations of all parts; None where rounding errors decide the result,
+        or it is far from where the parts were linearised."""
         xx, xy, yy, bx, by, rxx, rxy, ryy, rx, ry, zw, zx, zy, zr, ew, ex, ey, er = spots.total
         count = len(spots.spots)
         weight = self._range_weight
@@ -274,7 +280,12 @@ class Solver:
         bx += weight * rx + zx * zr / zw + ex * er / ew
         by += weight * ry + zy * zr / zw + ey * er / ew
         det = xx * yy - xy * xy
+        if not (xx > 0.0 and yy > 0.0 and det > _LEAST_DET * (xx + yy) * (xx + yy)):
+            return None
         x, y = (yy * bx - xy * by) / det, (xx * by - xy * bx) / det
+        is_near = abs(x - spots.at[0]) <= _FARTHEST_M and abs(y - spots.at[1]) <= _FARTHEST_M
+        if not (is_near and (xx + yy) / det <= _MOST_VARIANCE_M2):
+            return None
         return Estimate(
             x,
             y,
@@ -290,6 +301,13 @@ class Solver:
             ey / ew,
             1.0 / ew,
         )
+
+
+def _anywhere(x: float, y: float, prior: HeightPrior) -> Estimate:
+    """The estimate of a thing whose first sight tells nothing."""
+    z_mean, z_prior, e_mean, e_prior = prior
+    size, elevation = (z_mean, 0.0, 0.0, 1.0 / z_prior), (e_mean, 0.0, 0.0, 1.0 / e_prior)
+    return Estimate(x, y, _MOST_VARIANCE_M2, 0.0, _MOST_VARIANCE_M2, *size, *elevation)
 
 
 _NO_HEIGHT = [0.0] * 8

@@ -61,6 +61,17 @@ class Thing:
         self.marks[count] = inverse, cos, sin, run, kind
         self.exemplars = count + 1
 
+    def count_label(self, label: str) -> None:
+        """Count an observation's label. As `reclassify`, without a look at all classes."""
+        count = self.classes.get(label, 0) + 1
+        self.classes[label] = count
+        most = self.classes[self.class_name]
+        if count > most:
+            self.class_name = label
+        elif count == most > 1:
+            both = (label, self.class_name)
+            self.class_name = next(name for name in self.classes if name in both)
+
     def reclassify(self) -> None:
         """Take the class of most observations, the one seen first where two tie."""
         self.class_name = max(self.classes, key=self.classes.__getitem__)
