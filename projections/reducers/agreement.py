@@ -12,6 +12,7 @@ elevation   likewise that of the box's centre above the camera; another thing: a
             boxes in one picture are (`Slopes`)
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -149,6 +150,15 @@ class Agreement:
         whole *= 0.5
         whole += _ANYWHERE
         return whole
+
+
+def log_of(value: float) -> float:
+    """`logs` of one number, to the last bit."""
+    mantissa, twos = math.frexp(value)
+    s = (mantissa - 0.7071067811865476) / (mantissa + 0.7071067811865476)
+    square = s * s
+    series = (square * 0.4 + 2.0 / 3.0) * square + 2.0
+    return (twos - 0.5) * 0.6931471805599453 + s * series
 
 
 def logs(values: Floats) -> Floats:

@@ -67,10 +67,8 @@ class Matching:
             return chosen
         things = [self._index.thing(ordinal) for ordinal in near[rows].tolist()]
         names = [labels[column] for column in columns.tolist()]
-        values += _LABEL_WEIGHT * self._labels.ratios(things, names)
-        agree = np.array(
-            [label in thing.classes for thing, label in zip(things, names, strict=True)]
-        )
+        by_label, agree = self._labels.ratios(things, names)
+        values += _LABEL_WEIGHT * by_label
         kept = (values + self._look_ratios.at_best(agree) > 0.0).nonzero()[0]
         if not len(kept):
             return chosen
@@ -83,7 +81,7 @@ class Matching:
         values += by_look
         if self._groups is not None:
             self._forbid(self._groups, values, pairs, things, sightings, object_of)
-        flat = values.tolist()
+        flat, flat_cosines = values.tolist(), cosines.tolist()
         places_of: list[list[int]] = [[] for _ in sights]
         for place, (_, column) in enumerate(pairs):
             places_of[column].append(place)
@@ -98,7 +96,7 @@ class Matching:
                     if other != place and pairs[other][0] not in used:
                         rivals += exp(min(flat[other], 50.0))
                 mine = exp(min(flat[place], 50.0))
-                chosen[column] = ordinal, float(cosines[place]), mine / (mine + rivals)
+                chosen[column] = ordinal, flat_cosines[place], mine / (mine + rivals)
                 used.add(ordinal)
         return chosen
 

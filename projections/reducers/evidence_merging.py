@@ -105,10 +105,12 @@ class Merging:
         )
         ratios = np.maximum(np.minimum(ratios, _MOST_PER_PAIR), -_MOST_PER_PAIR)
         total = int(np.rint(ratios * _UNIT).astype(np.int64).sum())  # exact: integers
-        names = list(other.classes)
-        ratios = self._labels.ratios([one] * len(names), names).tolist()
-        labels = 0.0
-        for count, ratio in zip(other.classes.values(), ratios, strict=True):
-            labels += count * ratio
         mean = total / (one.exemplars * other.exemplars * _UNIT)
-        return mean + _LABEL_WEIGHT * labels / other.count
+        return mean + self._by_labels(one, other)
+
+    def _by_labels(self, one: Thing, other: Thing) -> float:
+        """The part of the labels in `look`."""
+        labels = 0.0
+        for label, count in other.classes.items():
+            labels += count * self._labels.ratio(one, label)
+        return _LABEL_WEIGHT * labels / other.count

@@ -23,7 +23,6 @@ from .things import Thing
 
 _REACH_SPREADS, _REACH_MORE_M = 1.5, 1.5
 _UM, _UM2 = 1e6, 1e12
-_NONE = np.zeros(0, np.int64)
 
 
 class ThingIndex:
@@ -37,6 +36,7 @@ class ThingIndex:
         self._things: list[Thing | None] = []
         self._survivors: dict[ObjectOrdinal, ObjectOrdinal] = {}
         self._near: dict[tuple[int, int], list[ObjectOrdinal]] = {}
+        self._sorted: dict[tuple[int, int], NDArray[np.int64]] = {}  # `_near` as arrays
         self.estimates: Floats = np.zeros((ESTIMATE_FIELDS, 64))
 
     def thing(self, ordinal: ObjectOrdinal) -> Thing:
@@ -88,15 +88,18 @@ class ThingIndex:
     def near(self, x: float, y: float) -> NDArray[np.int64]:
         """The Objects within reach of a point, ascending."""
         reach = self._reach_m
-        listed = self._near.get((int(x // reach), int(y // reach)))
-        if not listed:
-            return _NONE
-        ordinals = np.array(listed)
-        ordinals.sort()
-        places = self.estimates[:2, ordinals]
-        dx, dy = places[0] - x, places[1] - y
+        ordinals = self._listed((int(x // reach), int(y // reach)))
+        dx = self.estimates[0].take(ordinals) - x
+        dy = self.estimates[1].take(ordinals) - y
         near: NDArray[np.int64] = ordinals[dx * dx + dy * dy <= reach * reach]
         return near
+
+    def _listed(self, cell: tuple[int, int]) -> NDArray[np.int64]:
+        """The Objects listed in a cell, ascending; kept until the list changes."""
+        ordinals = self._sorted.get(cell)
+        if ordinals is None:
+            ordinals = self._sorted[cell] = np.array(sorted(self._near.get(cell, ())), np.int64)
+        return ordinals
 
     def count_meetings(self, seen: list[ObjectOrdinal]) -> None:
         """One picture shows them all."""
@@ -127,7 +130,6 @@ class ThingIndex:
     def estimated(self, offset: Offset, ordinal: ObjectOrdinal) -> ObjectEstimated:
         """The delta of an Object's estimate."""
         x, y, xx, xy, yy = self.estimates[:5, ordinal].tolist()
-        spots = self.thing(ordinal).spots.seen_from
         return ObjectEstimated(
             offset,
             ordinal,
@@ -136,7 +138,7 @@ class ThingIndex:
             round(xx * _UM2),
             round(xy * _UM2),
             round(yy * _UM2),
-            spots,
+            self.thing(ordinal).spots.seen_from,
         )
 
     def _make_room(self, count: int) -> None:
@@ -147,10 +149,12 @@ class ThingIndex:
         thing.cell = cell
         for around in _around(cell):
             self._near.setdefault(around, []).append(ordinal)
+            self._sorted.pop(around, None)
 
     def _unlist(self, ordinal: ObjectOrdinal, cell: tuple[int, int]) -> None:
         for around in _around(cell):
             self._near[around].remove(ordinal)
+            self._sorted.pop(around, None)
 
     def dump(self) -> State:
         """Everything, for a snapshot. The looks are one matrix, a row for each exemplar."""
