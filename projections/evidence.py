@@ -17,10 +17,10 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from eventsrc.envelope import Text
 
-_Positive = Annotated[float, Field(gt=0.0, le=1000.0)]
-_Angle = Annotated[float, Field(gt=0.0, le=3.2)]
+_Positive = Annotated[float, Field(ge=0.001, le=1000.0)]
+_Angle = Annotated[float, Field(ge=0.0001, le=3.2)]
 _Likeness = Annotated[float, Field(ge=-2.0, le=2.0)]
-_Spread = Annotated[float, Field(gt=0.0, le=2.0)]
+_Spread = Annotated[float, Field(ge=0.001, le=2.0)]
 
 
 class EvidenceConstants(BaseModel):
@@ -54,7 +54,7 @@ class EvidenceConstants(BaseModel):
     """Mean relative likeness of one thing seen from opposite sides in one run."""
     same_side: _Likeness = 0.15
     """What it gains when both see the same side."""
-    same_kappa: Annotated[float, Field(gt=0.0, le=100.0)] = 2.0
+    same_kappa: Annotated[float, Field(ge=0.001, le=100.0)] = 2.0
     """How fast that fades with the change of side Δ: exp(kappa (cos Δ − 1))."""
     same_spread: _Spread = 0.09
     side_by: Literal["sight", "heading"] = "sight"

@@ -19,7 +19,7 @@ PIXELS = st.one_of(
 )
 POSITIONS = st.one_of(st.integers(-FAR_UM, FAR_UM), st.integers(-5_000_000, 5_000_000))
 CAMERAS = st.sampled_from(
-    [Camera(), Camera(hfov_deg=1.0, width_px=1e6, height_px=1e-3), Camera(hfov_deg=170.0)]
+    [Camera(), Camera(hfov_deg=1.0, width_px=1e6, height_px=1.0), Camera(hfov_deg=170.0)]
 )
 LOOKS = [
     quantise(np.array(look, dtype=np.float32))
