@@ -87,14 +87,7 @@ class Agreement:
         self, estimates: Floats, sights: Sequence[Sight], slopes: float, least: float
     ) -> Pairs:
         """The pairs whose ratio is above ``least``. ``estimates`` has a column for each one."""
-        seen = np.array(
-            [
-                (*sight[:6], 0.0, 0.0, 0.0)
-                if sight.log_height is None
-                else (*sight[:6], sight.log_height, sight.slope, 1.0)
-                for sight in sights
-            ]
-        ).T
+        seen = np.array([_column_of(sight) for sight in sights]).T
         # What the bearing rules out at its best is left out first, since that is nearly all.
         dx = estimates[0, :, np.newaxis] - seen[0]
         dy = estimates[1, :, np.newaxis] - seen[1]
@@ -102,20 +95,20 @@ class Agreement:
         across = dy * seen[2] - dx * seen[3]
         trace = (estimates[2] + estimates[4])[:, np.newaxis]
         bound = ahead * ahead * seen[4] + (trace + seen[5])
-        rows, columns = np.nonzero(
-            (across * across < _WORST_CHI2 * bound)
-            & (np.minimum(ahead, 0.0) * ahead < _WORST_CHI2 * (trace + _BEHIND_M2))
+        may_be = (across * across < _WORST_CHI2 * bound) & (
+            np.minimum(ahead, 0.0) * ahead < _WORST_CHI2 * (trace + _BEHIND_M2)
         )
+        rows, columns = may_be.nonzero()
         if not len(rows):
             return Pairs(rows, columns, np.zeros(0))
         ratios = self._ratios(
-            estimates[:, rows],
-            seen[:, columns],
-            ahead[rows, columns],
-            across[rows, columns],
+            estimates.take(rows, axis=1),
+            seen.take(columns, axis=1),
+            ahead[may_be],
+            across[may_be],
             slopes,
         )
-        kept = np.nonzero(ratios > least)[0]
+        kept = (ratios > least).nonzero()[0]
         return Pairs(rows[kept], columns[kept], ratios[kept])
 
     def _ratios(
@@ -124,10 +117,10 @@ class Agreement:
         """The ratio of each pair: columns of the two matrices."""
         _, _, xx, xy, yy = estimates[:5]
         heights = estimates[5:].reshape(2, 4, -1)  # of log size and elevation
-        _, _, cos, sin, per_m2, least, height, slope, is_whole = seen
+        _, _, cos, sin, per_m2, least, height, slope, is_whole, cc, ss, twice_cs = seen
         along = np.maximum(ahead, LEAST_M)
         square = along * along
-        cc, ss, cs = cos * cos, sin * sin, 2.0 * cos * sin * xy
+        cs = twice_cs * xy
         along_variance = xx * cc + cs + yy * ss
         variance = xx * ss - cs + yy * cc + per_m2 * square + least
         steep = np.array((1.0 / along, slope))
@@ -136,7 +129,11 @@ class Agreement:
         spread[0] += _SIZE * _SIZE
         spread[1] += (SLOPE * SLOPE) * square + LEAST_ELEVATION_M2
         other = np.array((spread[0] + _OTHER_SIZES, spread[1] + slopes * square))
-        logarithms = logs(np.array((along, variance / square, *(other / spread))))
+        wanted = np.empty((4, len(along)))
+        wanted[0] = along
+        np.divide(variance, square, out=wanted[1])
+        np.divide(other, spread, out=wanted[2:])
+        logarithms = logs(wanted)
         log_along = logarithms[0]
         ratio = across * across / variance + logarithms[1]
         residual = log_along - self._log_range
@@ -150,6 +147,13 @@ class Agreement:
         whole *= 0.5
         whole += _ANYWHERE
         return whole
+
+
+def _column_of(sight: Sight) -> tuple[float, ...]:
+    """What `Agreement` compares of a sight, and products of its direction's parts."""
+    _, _, cos, sin, *_ = sight
+    whole = (0.0, 0.0, 0.0) if sight.log_height is None else (sight.log_height, sight.slope, 1.0)
+    return *sight[:6], *whole, cos * cos, sin * sin, 2.0 * cos * sin
 
 
 def log_of(value: float) -> float:

@@ -113,6 +113,7 @@ class EvidenceLandmarks:
         chosen = self._matching.choose(
             run, pose, labels, looks, inverses, sights, sightings, self._object_of
         )
+        inverse_of = inverses.tolist()  # 1 / length of each look
         deltas: list[LandmarkDelta] = []
         seen: list[ObjectOrdinal] = []
         named: dict[ObjectOrdinal, str] = {}  # the classes before
@@ -129,7 +130,7 @@ class EvidenceLandmarks:
             sight = sights[k]
             spot = thing.spots.add(sight, share)
             if share >= _SURE:
-                thing.keep(looks[k], float(inverses[k]), sight.side_cos, sight.side_sin, run)
+                thing.keep(looks[k], inverse_of[k], sight.side_cos, sight.side_sin, run)
             self._index.solve(ordinal, spot)
             seen.append(ordinal)
             deltas.append(

@@ -61,7 +61,10 @@ class Matching:
         if not len(near):
             return chosen
         rows, columns, values = self._agreement.pairs(
-            self._index.estimates[:, near], sights, self._slopes.mean_square, _LEAST_AGREEMENT
+            self._index.estimates.take(near, axis=1),
+            sights,
+            self._slopes.mean_square,
+            _LEAST_AGREEMENT,
         )
         if not len(rows):
             return chosen
@@ -114,11 +117,11 @@ class Matching:
         counts = np.array([thing.exemplars for thing in things])
         most = max([len(thing.looks) for thing in things])
         dots = np.zeros((len(things), most))
-        column_of = columns.tolist()
-        for row, thing in enumerate(things):
+        look_of = list(looks)
+        for row, (thing, column) in enumerate(zip(things, columns.tolist(), strict=True)):
             room = len(thing.looks)  # rows of zeros after the exemplars
-            dots[row, :room] = thing.looks @ looks[column_of[row]]
-        marks = np.array([thing.marks[:most] for thing in things])
+            dots[row, :room] = thing.looks.dot(look_of[column])
+        marks = np.array([thing.marks for thing in things])[:, :most]
         cosines = dots * marks[:, :, INVERSE] * inverses[columns, np.newaxis]
         is_missing = np.arange(most) >= counts[:, np.newaxis]
         different = self._scale.different()
@@ -128,10 +131,12 @@ class Matching:
         ratios = self._look_ratios.ratios(likeness, sides, marks[:, :, RUN] != run, agree)
         ratios[is_missing] = -np.inf
         ratios.sort(axis=1)
+        best = ratios[:, : -_BEST - 1 : -1]  # descending
+        best = np.where(best == -np.inf, 0.0, best)
+        total = best[:, 0].copy()
+        for rank in range(1, best.shape[1]):
+            total += best[:, rank]
         counts = np.minimum(counts, _BEST)
-        total = np.zeros(len(things))
-        for rank in range(min(most, _BEST)):
-            total += np.where(rank < counts, ratios[:, most - 1 - rank], 0.0)
         cosines[is_missing] = -1.0
         return total / counts - _MISSING * (_BEST - counts), cosines.max(axis=1)
 

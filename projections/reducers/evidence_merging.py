@@ -66,8 +66,8 @@ class Merging:
         det = a * c - b * b
         chi2 = (c * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / det
         geometry = np.minimum(chi2, _WORST_CHI2) * -0.5 - 0.5 * logs(det) + _LOG_AREA
-        best: tuple[float, ObjectOrdinal, MergeEvidence] | None = None
         kept = (geometry > _LEAST_GEOMETRY).nonzero()[0]
+        candidates: list[tuple[int, ObjectOrdinal, Thing, int]] = []
         for row, number in zip(kept.tolist(), near[kept].tolist(), strict=True):
             partner = ObjectOrdinal(number)
             other = self._index.thing(partner)
@@ -76,7 +76,12 @@ class Merging:
                 continue
             if self._groups is not None and self._groups.conflicts(thing.groups, other.groups):
                 continue
-            look = self.look(thing, other)
+            candidates.append((row, partner, other, both))
+        if not candidates:
+            return None
+        best: tuple[float, ObjectOrdinal, MergeEvidence] | None = None
+        looks = self._looks(thing, [other for _, _, other, _ in candidates])
+        for (row, partner, other, both), look in zip(candidates, looks, strict=True):
             value = look + float(geometry[row])
             if value > 0.0 and (best is None or value > best[0]):
                 evidence = MergeEvidence(
@@ -92,8 +97,16 @@ class Merging:
     def look(self, one: Thing, other: Thing) -> float:
         """How much the looks of two things speak for one, as the logarithm of a ratio of two
         likelihoods: the mean over pairs of exemplars, and the labels."""
-        a, b = one.marks[: one.exemplars], other.marks[: other.exemplars]
-        dots = (one.looks[: one.exemplars] @ other.looks[: other.exemplars].T).astype(np.float64)
+        return self._looks(one, [other])[0]
+
+    def _looks(self, one: Thing, others: list[Thing]) -> list[float]:
+        """`look` for each of several others: their exemplars are columns of one matrix."""
+        counts = [other.exemplars for other in others]
+        agree = [o.class_name in one.classes or one.class_name in o.classes for o in others]
+        a = one.marks[: one.exemplars]
+        b = np.concatenate([other.marks[: other.exemplars] for other in others])
+        looks = np.concatenate([other.looks[: other.exemplars] for other in others])
+        dots = (one.looks[: one.exemplars] @ looks.T).astype(np.float64)
         cosines = dots * a[:, INVERSE, np.newaxis] * b[:, INVERSE]
         different = self._scale.different()
         ratios = self._look_ratios.ratios(
@@ -101,12 +114,18 @@ class Merging:
             a[:, SIDE_COS, np.newaxis] * b[:, SIDE_COS]
             + a[:, SIDE_SIN, np.newaxis] * b[:, SIDE_SIN],
             a[:, RUN, np.newaxis] != b[:, RUN],
-            np.array(one.class_name in other.classes or other.class_name in one.classes),
+            np.array(agree).repeat(counts),
         )
         ratios = np.maximum(np.minimum(ratios, _MOST_PER_PAIR), -_MOST_PER_PAIR)
-        total = int(np.rint(ratios * _UNIT).astype(np.int64).sum())  # exact: integers
-        mean = total / (one.exemplars * other.exemplars * _UNIT)
-        return mean + self._by_labels(one, other)
+        sums = np.rint(ratios * _UNIT).astype(np.int64).sum(axis=0)  # exact: integers
+        values: list[float] = []
+        first = 0
+        for other, count in zip(others, counts, strict=True):
+            total = int(sums[first : first + count].sum())
+            mean = total / (one.exemplars * count * _UNIT)
+            values.append(mean + self._by_labels(one, other))
+            first += count
+        return values
 
     def _by_labels(self, one: Thing, other: Thing) -> float:
         """The part of the labels in `look`."""

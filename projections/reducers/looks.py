@@ -40,7 +40,9 @@ _FIRST_GUESS, _GUESS_WEIGHT = 0.5, 0.5
 
 def looks_of(vectors: Sequence[Floats]) -> tuple[Looks, Floats]:
     """Looks of unit vectors in multiples of 2⁻²⁰, and the inverses of their lengths."""
-    looks = np.rint(np.array(vectors) * (LOOK_UNIT / UNIT)).astype(np.float32)
+    scaled = np.array(vectors)
+    scaled *= LOOK_UNIT / UNIT
+    looks = np.rint(scaled, out=scaled).astype(np.float32)
     squares = np.einsum("ij,ij->i", looks, looks).astype(np.float64)
     return looks, 1.0 / np.sqrt(np.maximum(squares, 1.0))
 

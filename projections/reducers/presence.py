@@ -40,6 +40,8 @@ from projections.exact_functions import cos_sin
 from projections.reducers import State
 from projections.settings import Camera
 
+from .sights import half_field
+
 _CELL_UM = 750_000
 _NEAR_M2 = 1.1 * 1.1
 _LEAST_AHEAD_M = 0.3
@@ -53,7 +55,6 @@ _PRIOR = 4.0
 _SEEN, _SURE, _FLOOR = 8.0, 512.0, 1.0 / 1024.0
 _MISSING, _BACK = 0.07, 0.07
 _LEAST_LOOKS, _LEAST_HITS = 2, 1
-_HALF_DEGREE = 0.008726646259971648
 _Cell = tuple[int, int]
 
 
@@ -197,7 +198,7 @@ class Presence:
         missing: list[ObjectOrdinal] = []
         x, y = pose.x_um / 1e6, pose.y_um / 1e6
         cos, sin = cos_sin(pose.yaw_rad + camera.yaw_rad)
-        half_cos, half_sin = cos_sin(camera.hfov_deg * _HALF_DEGREE)
+        half_cos, half_sin = half_field(camera.hfov_deg)
         inner = half_sin / half_cos * _INNER
         hits = misses = 0
         usual = _PRIOR * (self._misses + 1) / (self._hits + self._misses + 2)

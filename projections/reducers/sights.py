@@ -12,6 +12,7 @@ position of the detection tells it directly.
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +32,12 @@ _FAR_PX = 1e6
 _LEAST_PX = 0.5
 _STEEPEST = 10.0
 """Greatest slope of a line of sight, up or down, at which a box tells a height: 84°."""
+
+
+@lru_cache(maxsize=64)
+def half_field(hfov_deg: float) -> tuple[float, float]:
+    """Cosine and sine of half the field of view."""
+    return cos_sin(hfov_deg * _HALF_DEGREE)
 
 
 class Sighting(NamedTuple):
@@ -79,7 +86,7 @@ class Sights:
         """The sight of each detection."""
         x, y = pose.x_um / 1e6, pose.y_um / 1e6
         cos, sin = cos_sin(pose.yaw_rad + camera.yaw_rad)
-        half_cos, half_sin = cos_sin(camera.hfov_deg * _HALF_DEGREE)
+        half_cos, half_sin = half_field(camera.hfov_deg)
         focal = camera.width_px * 0.5 * half_cos / half_sin
         return [self._one(x, y, cos, sin, focal, camera, sighting) for sighting in sightings]
 

@@ -3,13 +3,16 @@
 import math
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from projections.evidence import EvidenceConstants
 from projections.reducers.agreement import log_of, logs
+from projections.reducers.evidence_landmarks import EvidenceLandmarks
 from projections.reducers.label_counts import LabelCounts
 from projections.reducers.spots import Spots
 from projections.reducers.things import Thing
+from tests.evidence_pictures import a_room, fold_one, pictures_of
 
 LABELS = st.sampled_from(["chair", "table", "bed", "lamp"])
 POSITIVE = st.floats(1e-12, 1e12)
@@ -48,3 +51,15 @@ def test_the_ratio_of_one_label_is_that_of_a_pair_among_many(
         counts.ratio(thing, label) for thing, label in zip(things, labels, strict=True)
     ]
     assert agree.tolist() == [label in classes for classes, label in pairs]
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 10_000))
+def test_the_looks_of_one_thing_compare_as_among_several(seed: int) -> None:
+    landmarks = EvidenceLandmarks(EvidenceConstants())
+    for picture in pictures_of(a_room(seed, 10), seed, 40):
+        fold_one(landmarks, picture)
+    things = [thing for thing in landmarks._index._things if thing is not None]
+    merging = landmarks._merging
+    for one in things:
+        assert merging._looks(one, things) == [merging.look(one, other) for other in things]
