@@ -40,7 +40,7 @@ def test_a_picture_of_any_point_with_other_settings(log: Path, tmp_path: Path) -
 def test_a_picture_by_evidence_shows_where_objects_stand(log: Path, tmp_path: Path) -> None:
     out = tmp_path / "map.svg"
     arguments = ("--at", "90", "--set", "fusion=evidence", "--house", "7")
-    assert _draw(str(log), *arguments, "--out", str(out)).returncode == 0
+    assert _draw(str(log), *arguments, "--out", str(out)).code == 0
     text = out.read_text("utf-8")
     assert "drawn where it stands, with the ellipse of two standard errors" in text
     assert "drawn where the robot saw it from" not in text
