@@ -24,6 +24,7 @@ from .errors import SettingsError
 from .evidence import EvidenceConstants
 
 _MAX_SHOWN = 80
+_MOST_CONSTANTS = 4
 
 
 class Camera(BaseModel):
@@ -185,6 +186,16 @@ def settings_by_name(document: Mapping[str, Any]) -> dict[str, Any]:
         else:
             found[name] = value
     return found
+
+
+def assignment_texts(changed: Mapping[str, Any]) -> list[str]:
+    """``name=value`` for settings by name; of many constants, as a calibration gives, only the
+    number: ``28 constants of evidence``."""
+    constants = [name for name in changed if name.startswith("evidence.")]
+    if len(constants) <= _MOST_CONSTANTS:
+        constants = []
+    texts = [f"{name}={value}" for name, value in changed.items() if name not in constants]
+    return [*texts, f"{len(constants)} constants of evidence"] if constants else texts
 
 
 def _tree(settings: Settings) -> dict[str, Any]:

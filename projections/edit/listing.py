@@ -25,12 +25,11 @@ from projections.corrections import RecordedCommand
 from projections.history.records import iso_time
 from projections.history.rendering import table
 from projections.model.command_text import command_document
-from projections.settings import Settings, settings_by_name
+from projections.settings import Settings, assignment_texts, settings_by_name
 
 from .effect import Effect
 from .make import undone_by
 
-_MOST_CONSTANTS = 4
 Found = Sequence[tuple[RecordedCommand, Effect | None]]
 
 
@@ -56,12 +55,8 @@ def what(command: Command) -> str:
             return f"{command.run_id}: {_poses(command)}"
         case UseSettings():
             plain, given = Settings().by_name(), settings_by_name(command.settings)
-            changed = [f"{k}={v}" for k, v in given.items() if plain.get(k) != v]
-            constants = [text for text in changed if text.startswith("evidence.")]
-            if len(constants) > _MOST_CONSTANTS:  # of a calibration: some forty
-                changed = [text for text in changed if text not in constants]
-                changed.append(f"{len(constants)} constants of evidence")
-            return ", ".join(changed) or "the defaults"
+            changed = {name: value for name, value in given.items() if plain.get(name) != value}
+            return ", ".join(assignment_texts(changed)) or "the defaults"
         case Undo():
             return command.undone
 

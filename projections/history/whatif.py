@@ -12,7 +12,7 @@ from projections.errors import SettingsError
 from projections.evaluate.truth import Truth
 from projections.model.command_text import command_document, command_name
 from projections.model.partitions import PartitionComparison, Regrouping, compare_partitions
-from projections.settings import Settings
+from projections.settings import Settings, assignment_texts
 
 from .aligned import aligned
 from .known import Progress
@@ -73,7 +73,7 @@ def _axis(text: str) -> list[str]:
 def settings_name(base: Settings, other: Settings) -> str:
     """``eps_m=1.0 min_samples=8``: the settings that differ from the base."""
     changed = other.changed_from(base)
-    return " ".join(f"{name}={value}" for name, value in changed.items()) or "no change"
+    return " ".join(assignment_texts(changed)) or "no change"
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ from eventsrc.envelope import Offset
 from eventsrc.text import counted
 from projections.deltas import PlaceOrdinal
 from projections.exact import UM_PER_M
-from projections.settings import Settings
+from projections.settings import Settings, assignment_texts
 
 from .command_text import command_document
 from .records import ObjectRecord
@@ -135,17 +135,17 @@ def state_text(view: MapView, digest: str, known_at: Offset | None = None) -> st
 
 
 def _standing(view: MapView) -> str:
-    """``12 seen from two spots or more (half to 0.14 m), 3 from one, 1 missing, 2 moved``."""
+    """``12 seen from two spots or more (median standard error 0.14 m), 3 from one, 1 missing``."""
     found = view.objects.values()
     seen = [o.estimate for o in found if o.estimate is not None and o.estimate.spots > 1]
-    half = f" (half to {median(e.est_sigma_m for e in seen):.2f} m)" if seen else ""
+    error = f" (median standard error {median(e.est_sigma_m for e in seen):.2f} m)" if seen else ""
     rest = {
         "missing": sum(o.missing_in is not None for o in found),
         "moved": sum(bool(o.relocations) for o in found),
     }
     more = "".join(f", {count:,} {word}" for word, count in rest.items() if count)
     once = len(found) - len(seen)
-    return f"{len(seen):,} seen from two spots or more{half}, {once:,} from one{more}"
+    return f"{len(seen):,} seen from two spots or more{error}, {once:,} from one{more}"
 
 
 def _counts(view: MapView) -> str:
@@ -175,7 +175,7 @@ def _counts(view: MapView) -> str:
 def _settings(settings: Settings) -> str:
     changed = settings.changed_from(Settings())
     shown = changed or {k: v for k, v in Settings().model_dump().items() if v is not None}
-    text = ", ".join(f"{name}={value}" for name, value in shown.items())
+    text = ", ".join(assignment_texts(shown))
     return text if changed else f"default: {text}"
 
 
