@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from eventsrc.envelope import Text
 
 _Positive = Annotated[float, Field(ge=0.001, le=1000.0)]
-_Angle = Annotated[float, Field(ge=0.0001, le=3.2)]
+_Angle = Annotated[float, Field(ge=0.001, le=3.2)]
 _Likeness = Annotated[float, Field(ge=-2.0, le=2.0)]
 _Spread = Annotated[float, Field(ge=0.001, le=2.0)]
 

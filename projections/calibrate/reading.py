@@ -1,5 +1,6 @@
 """From the observations of a folded map to constants: one round of a calibration."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -65,29 +66,18 @@ def _read(seen: Sightings, used: EvidenceConstants, prior: EvidenceConstants) ->
     )
 
 
-_LEAST = 0.001
-_BOUNDS: dict[str, tuple[float, float]] = {
-    "range_m": (_LEAST, 1000.0),
-    "sizes_m": (_LEAST, 1000.0),
-    "pose_m": (_LEAST, 1000.0),
-    "bearing_rad": (_LEAST, 3.2),
-    "bearing_cut_rad": (_LEAST, 3.2),
-    "range_spread": (_LEAST, 2.0),
-    "size_spread": (_LEAST, 2.0),
-    "different_spread": (_LEAST, 2.0),
-    "same_class_spread": (_LEAST, 2.0),
-    "same_spread": (_LEAST, 2.0),
-    "same_class": (-2.0, 2.0),
-    "same_back": (-2.0, 2.0),
-    "same_side": (-2.0, 2.0),
-    "session_shift": (-2.0, 2.0),
-}
-"""What `EvidenceConstants` takes: a map of nonsense may show more."""
-
-
 def _bounded(reading: Reading, group: str | None = None) -> Reading:
-    """The reading with a value that the settings take."""
-    bounds = _BOUNDS.get(group or reading.name)
-    if bounds is None or not isinstance(reading.value, float):
+    """The reading with a value that the settings take: a map of nonsense may show more."""
+    if not isinstance(reading.value, float):
         return reading
-    return replace(reading, value=min(max(reading.value, bounds[0]), bounds[1]))
+    least, most = _bounds(group or reading.name)
+    return replace(reading, value=min(max(reading.value, least), most))
+
+
+_FIELDS: dict[str, Any] = EvidenceConstants.model_json_schema()["properties"]
+
+
+def _bounds(name: str) -> tuple[float, float]:
+    """The least and the greatest value of a constant; of each entry's value where it is a table."""
+    (rule,) = _FIELDS[name].get("patternProperties", {name: _FIELDS[name]}).values()
+    return rule.get("minimum", -math.inf), rule.get("maximum", math.inf)

@@ -1,7 +1,8 @@
 """A calibration: fold the log by evidence, read the constants, fold with them, read again.
 
-The first fold uses the constants that the settings have. Both readings are drawn towards the
-priors, never towards constants read before: what a map shows counts once.
+The first fold uses the priors, and both readings are drawn towards them, never towards constants
+read before: what a map shows counts once, and a map that was calibrated gives the same constants
+again.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -16,6 +17,7 @@ from projections.deltas import Delta, KeyframeAdded, KeyframeOrdinal
 from projections.evidence import EvidenceConstants
 from projections.model.fold import READ_AHEAD, fold_parsed, gc_paused, parse_events
 from projections.model.view import MapView
+from projections.reducers.envelope_evidence import camera_of
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Camera, Settings
 
@@ -77,7 +79,7 @@ def calibrate(
                     deltas = fold_parsed(event, semantic_map)
                     view.apply_event(event.offset, deltas)
                     if isinstance(event.parsed, Accepted):
-                        note_camera(cameras, event.parsed.envelope, deltas)
+                        note_camera(cameras, event.parsed.envelope, deltas, used.camera)
                 progress(before + view.next_offset, ROUNDS * end)
         before += end
         return view, cameras
@@ -87,7 +89,7 @@ def calibrate(
 
 def calibrate_by(fold: Fold, settings: Settings) -> Calibration:
     """Calibrate what ``fold`` folds, in rounds."""
-    constants, prior = settings.evidence, EvidenceConstants()
+    constants = prior = EvidenceConstants()
     for _ in range(ROUNDS):
         view, cameras = fold(
             settings.model_copy(update={"fusion": "evidence", "evidence": constants})
@@ -107,20 +109,15 @@ def calibrate_by(fold: Fold, settings: Settings) -> Calibration:
     )
 
 
-def note_camera(cameras: Cameras, envelope: Envelope, deltas: Sequence[Delta]) -> None:
+def note_camera(
+    cameras: Cameras, envelope: Envelope, deltas: Sequence[Delta], default: Camera
+) -> None:
     """Keep the camera that an envelope states, if ``deltas`` are those of a new keyframe."""
-    stated = envelope.camera
-    if stated is None:
+    if envelope.camera is None:
         return
-    camera = Camera(
-        hfov_deg=stated.hfov_deg,
-        width_px=stated.width_px,
-        height_px=stated.height_px,
-        yaw_rad=stated.yaw_rad,
-    )
     for delta in deltas:
         if isinstance(delta, KeyframeAdded):
-            cameras[delta.keyframe] = camera
+            cameras[delta.keyframe] = camera_of(envelope, default)
 
 
 def _rows(view: MapView, cameras: Cameras, default: Camera) -> Iterator[Row]:

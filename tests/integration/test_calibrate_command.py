@@ -163,14 +163,22 @@ def test_a_log_that_is_none_and_options_that_do_not_fit_are_errors(mapfold: Comm
     )
 
 
-def test_a_second_calibration_is_drawn_to_the_priors_not_to_the_first(mapfold: Commands) -> None:
+def test_a_second_calibration_gives_the_constants_of_the_first(mapfold: Commands) -> None:
     with LogReader(mapfold.folder / "log") as reader:
         first = calibrate(reader, Settings(fusion="evidence"))
         again = calibrate(reader, first.calibrated)
-    for one, other in zip(first.last.readings, again.last.readings, strict=True):
-        assert one.prior == other.prior
-        if isinstance(one.value, float) and isinstance(other.value, float):
-            assert other.value == pytest.approx(one.value, rel=0.1, abs=0.01)
+    assert first.calibrated != first.settings
+    assert again.last == first.last
+    assert again.calibrated == again.settings == first.calibrated
+
+
+def test_a_second_calibration_without_new_events_records_nothing(mapfold: Commands) -> None:
+    first = mapfold("calibrate", "log", "--write", "--json", *BY_EVIDENCE).json
+    again = mapfold("calibrate", "log", "--write", "--json").json
+    assert first["recorded"]["offset"] == 160
+    assert again["recorded"] is None
+    assert again["constants"] == first["constants"]
+    assert len(mapfold("edits", "log", "--json").json) == 1
 
 
 def test_a_correction_counts(mapfold: Commands) -> None:

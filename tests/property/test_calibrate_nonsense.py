@@ -3,10 +3,13 @@
 import math
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
-from projections.calibrate.reading import read
+from projections.calibrate.reading import _bounded, read
+from projections.calibrate.shrinking import Reading
 from projections.calibrate.sightings import Row, sightings_of
 from projections.deltas import Pose
 from projections.evidence import EvidenceConstants
@@ -55,6 +58,37 @@ def test_constants_are_always_such_as_the_settings_take(found: list[Row]) -> Non
         assert each.count >= 0
         if isinstance(each.value, float):
             assert math.isfinite(each.value)
+
+
+_LIKENESSES = ("same_class", "same_back", "same_side", "session_shift")
+_SPREADS = ("range", "size", "different", "same_class", "same")
+BOUNDS = {
+    **dict.fromkeys(("range_m", "pose_m", "sizes_m"), (0.001, 1000.0)),
+    **dict.fromkeys(("bearing_rad", "bearing_cut_rad"), (0.001, 3.2)),
+    **dict.fromkeys([f"{name}_spread" for name in _SPREADS], (0.001, 2.0)),
+    **dict.fromkeys(_LIKENESSES, (-2.0, 2.0)),
+    "same_kappa": (0.001, 100.0),
+}
+
+
+@pytest.mark.parametrize("name", BOUNDS)
+def test_a_reading_beyond_what_the_settings_take_is_the_nearest_that_they_take(name: str) -> None:
+    def constants(value: float) -> EvidenceConstants:
+        given = {"cup": value} if name == "sizes_m" else value
+        return EvidenceConstants.model_validate({name: given})
+
+    for bound, beyond in zip(BOUNDS[name], (-1e9, 1e9), strict=True):
+        for value, expected in ((beyond, bound), (bound, bound), (0.5, 0.5)):
+            reading = Reading("sizes_m.cup" if name == "sizes_m" else name, value, value, 1.0, 9)
+            found = _bounded(reading, name if name == "sizes_m" else None)
+            assert (found.value, found.seen) == (expected, value)
+        constants(bound)
+        with pytest.raises(ValidationError):
+            constants(beyond)
+
+
+def test_every_constant_that_is_a_number_has_bounds() -> None:
+    assert {*BOUNDS, "different", "side_by"} == set(EvidenceConstants.model_fields)
 
 
 def test_looks_that_are_nearly_all_the_same_give_constants_too() -> None:

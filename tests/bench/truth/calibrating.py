@@ -23,7 +23,7 @@ def calibrated_settings(events: Sequence[Accepted], settings: Settings) -> tuple
     def fold(used: Settings) -> tuple[MapView, Cameras]:
         view, cameras = MapView(used), Cameras()
         for accepted, deltas in fold_into(view, events):
-            note_camera(cameras, accepted.envelope, deltas)
+            note_camera(cameras, accepted.envelope, deltas, used.camera)
         return view, cameras
 
     start = time.process_time()
