@@ -10,11 +10,8 @@ from projections.deltas import ObservationOrdinal, Pose, RunOrdinal
 from projections.evidence import EvidenceConstants
 from projections.exact import metres_to_um, unit_vectors
 from projections.pair_groups import PairGroups
-from projections.reducers.evidence_landmarks import (
-    EvidenceLandmarks,
-    LandmarkDelta,
-    Sighting,
-)
+from projections.reducers.evidence_landmarks import EvidenceLandmarks, LandmarkDelta
+from projections.reducers.sights import Sighting
 from projections.settings import Camera
 
 CAMERA = Camera(hfov_deg=70.0, width_px=640.0, height_px=400.0)

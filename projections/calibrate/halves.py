@@ -4,20 +4,22 @@ Lines of sight err together: a box shows the near side of a thing, or what a tab
 stretch of a drive is off as a whole. Their residuals about one position do not tell. Two positions
 do, each from half of the views, split by side and by run: if errors were independent, the square of
 their distance would be 2 in the mean, in units of its variance. The quotient is what the variances
-of bearings and poses are too small by, for whoever counts views as independent.
+of bearings and poses are too small by for a fold that counts views as independent.
 """
 
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from projections.reducers.spots import MAX_SPOTS, VIEWS_OF_A_SPOT
+
 from .sightings import Floats, Ints, Sightings
 from .things import Thing
 
 LEAST_HALF = 3
-MOST = 18.0
-"""So many views an estimate of the fold rests on at most: twelve spots of 1.5 views
-(`projections.reducers.spots`). What more of them agree on does not make it surer."""
+MOST = MAX_SPOTS * VIEWS_OF_A_SPOT
+"""So many views an estimate of the fold rests on at most. What more of them agree on does not make
+it surer."""
 _ROUNDS = 6
 _WORST = 20.0
 _UNSURE_M2 = 1.0

@@ -59,8 +59,6 @@ from .spots import Spots
 from .thing_index import ThingIndex
 from .things import Thing
 
-__all__ = ["EvidenceLandmarks", "LandmarkDelta", "Sighting"]
-
 LandmarkDelta: TypeAlias = (
     ObjectFound | ObjectSeen | ObjectsMerged | ObjectRelocated | ObjectClassified | ObjectEstimated
 )

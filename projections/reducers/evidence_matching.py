@@ -11,7 +11,7 @@ from projections.exact_functions import exp
 from projections.pair_groups import PairGroups
 
 from .agreement import Agreement, Slopes
-from .label_counts import LabelCounts
+from .label_counts import LABEL_WEIGHT, LabelCounts
 from .looks import Floats, LookRatios, Looks, LookScale
 from .sights import Sight, Sighting
 from .thing_index import ThingIndex
@@ -20,7 +20,6 @@ from .things import INVERSE, RUN, SIDE_COS, SIDE_SIN, Thing
 _BEST = 4
 _MISSING = 0.125
 _LEAST_AGREEMENT = -5.0
-_LABEL_WEIGHT = 0.5
 
 
 class Matching:
@@ -71,7 +70,7 @@ class Matching:
         things = [self._index.thing(ordinal) for ordinal in near[rows].tolist()]
         names = [labels[column] for column in columns.tolist()]
         by_label, agree = self._labels.ratios(things, names)
-        values += _LABEL_WEIGHT * by_label
+        values += LABEL_WEIGHT * by_label
         kept = (values + self._look_ratios.at_best(agree) > 0.0).nonzero()[0]
         if not len(kept):
             return chosen

@@ -17,7 +17,7 @@ from projections.exact_functions import log
 from projections.pair_groups import PairGroups
 
 from .agreement import logs
-from .label_counts import LabelCounts
+from .label_counts import LABEL_WEIGHT, LabelCounts
 from .looks import LookRatios, LookScale
 from .thing_index import ThingIndex
 from .things import INVERSE, RUN, SIDE_COS, SIDE_SIN, Thing
@@ -28,7 +28,6 @@ _WORST_CHI2 = 40.0
 _LEAST_GEOMETRY = -3.0
 _SHARE_OF_PICTURES = 10
 _MOST_PER_PAIR = 6.0
-_LABEL_WEIGHT = 0.5
 _UNIT = 1 << 20
 
 
@@ -132,4 +131,4 @@ class Merging:
         labels = 0.0
         for label, count in other.classes.items():
             labels += count * self._labels.ratio(one, label)
-        return _LABEL_WEIGHT * labels / other.count
+        return LABEL_WEIGHT * labels / other.count

@@ -11,6 +11,8 @@ from .agreement import log_of, logs
 from .looks import Floats
 from .things import Thing
 
+LABEL_WEIGHT = 0.5
+"""What counts of a label's log-likelihood ratio: the labels of one thing err together."""
 _DOUBT = 0.3
 """How many observations of the labels' usual mix are added to those of a thing."""
 

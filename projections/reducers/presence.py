@@ -14,7 +14,7 @@ assigned to it now and then, so one alone does not outweigh many misses. A new r
 was left, or with 1 if it was surely there.
 
 It is *missing* when the odds fall below `_MISSING` with `_LEAST_LOOKS` misses in the run, and no
-longer when they rise above `_BACK`.
+longer when they rise above that.
 
 Distances are metres in float64; with +, −, ×, ÷ only, in one order, so everything is bit-exact.
 """
@@ -53,7 +53,7 @@ _TURN2 = 0.87 * 0.87
 """Square of the least cosine between similar lines of sight, 30°."""
 _PRIOR = 4.0
 _SEEN, _SURE, _FLOOR = 8.0, 512.0, 1.0 / 1024.0
-_MISSING, _BACK = 0.07, 0.07
+_MISSING = 0.07
 _LEAST_LOOKS, _LEAST_HITS = 2, 1
 _Cell = tuple[int, int]
 
@@ -109,7 +109,7 @@ class Presence:
             if run != known.home:
                 known.enter(run)
                 known.odds = min(known.odds * _SEEN, _SURE)
-                if known.is_missing and known.odds > _BACK:
+                if known.is_missing and known.odds > _MISSING:
                     known.is_missing = False
                     changed.append(ordinal)
             self._add_vantage(ordinal, known, pose)

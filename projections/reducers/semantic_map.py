@@ -56,10 +56,9 @@ from .constrained_places import ConstrainedPlaces
 from .core_index import CoreIndex
 from .edited_events import edit_event, edits_events
 from .embedding_space import Space
-from .envelope_evidence import camera_of, sightings_of, with_small_yaw
+from .envelope_evidence import FusibleObservation, camera_of, sightings_of, with_small_yaw
 from .evidence_fusion import EvidenceFusion
 from .folded_ids import FoldedIds, content_digest
-from .fusible import FusibleObservation
 from .landmarks import Landmarks
 from .located_in import LocatedIn
 from .place_names import PlaceNames

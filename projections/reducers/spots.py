@@ -40,7 +40,8 @@ LEAST_M = 0.3
 SIZE = 0.12
 SLOPE = 0.02
 LEAST_ELEVATION_M2 = 0.0004
-_TOGETHER = 1.5
+VIEWS_OF_A_SPOT = 1.5
+"""As many independent views all those of one spot count together."""
 _TAIL = 4.0
 _MORE_ROUNDS = 1
 _MOVED_M = 0.2
@@ -208,7 +209,7 @@ class Solver:
         if along < LEAST_M:
             along = LEAST_M
         variance = per_m2 * along * along + least
-        w = (min(_TOGETHER, count)) / variance
+        w = (min(VIEWS_OF_A_SPOT, count)) / variance
         w /= 1.0 + across * across / (variance * _TAIL)
         ws, wc = w * sin, w * cos
         # the bearing's line: n·p = n·s with n = (−sin, cos)
@@ -229,7 +230,7 @@ class Solver:
         part = [xx, xy, yy, bx, by, gx * gx, gx * gy, gy * gy, gx * aim, gy * aim]
         if heights == 0.0:
             return part + _NO_HEIGHT
-        share = min(_TOGETHER, heights)
+        share = min(VIEWS_OF_A_SPOT, heights)
         value = height + log_along
         w = share / (SIZE * SIZE)
         if about is not None:
@@ -266,8 +267,8 @@ class Solver:
         xx, xy, yy, bx, by, rxx, rxy, ryy, rx, ry, zw, zx, zy, zr, ew, ex, ey, er = spots.total
         count = len(spots.spots)
         weight = self._range_weight
-        if count > _TOGETHER:
-            weight *= _TOGETHER / count
+        if count > VIEWS_OF_A_SPOT:
+            weight *= VIEWS_OF_A_SPOT / count
         z_mean, z_prior, e_mean, e_prior = prior
         zw += z_prior
         zr += z_prior * z_mean
