@@ -22,6 +22,7 @@ from eventsrc.envelope import ANGLE_RAD, HFOV_DEG, PIXELS, Text, describe_error
 
 from .errors import SettingsError
 from .evidence import EvidenceConstants
+from .localizer import LocalizerConstants
 
 _MAX_SHOWN = 80
 _MOST_CONSTANTS = 4
@@ -39,7 +40,7 @@ class Camera(BaseModel):
     yaw_rad: Annotated[float, ANGLE_RAD] = 0.0
 
 
-_YOUNGER = ("fusion", "camera", "evidence")
+_YOUNGER = ("fusion", "camera", "evidence", "localizer")
 
 
 class Settings(BaseModel):
@@ -69,18 +70,20 @@ class Settings(BaseModel):
     """The camera of envelopes that do not state theirs; for fusion by evidence."""
     evidence: EvidenceConstants = EvidenceConstants()
     """The constants of fusion by evidence."""
+    localizer: LocalizerConstants = LocalizerConstants()
+    """The corrections of re-localisation's numbers; the fold does not use them."""
 
     @model_serializer(mode="wrap")
     def _without_younger_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Leave out younger settings that have their default, so that older fingerprints hold; for
-        fusion by evidence name all, so that its fingerprint tells when a default has changed."""
+        fusion by evidence name all that it uses, so that its fingerprint tells when a default has
+        changed."""
         values: dict[str, Any] = handler(self)
-        if self.fusion == "evidence":
-            return values
+        left_out = ("localizer",) if self.fusion == "evidence" else _YOUNGER
         return {
             name: value
             for name, value in values.items()
-            if name not in _YOUNGER or getattr(self, name) != Settings.model_fields[name].default
+            if name not in left_out or getattr(self, name) != Settings.model_fields[name].default
         }
 
     def __hash__(self) -> int:
@@ -191,11 +194,14 @@ def settings_by_name(document: Mapping[str, Any]) -> dict[str, Any]:
 def assignment_texts(changed: Mapping[str, Any]) -> list[str]:
     """``name=value`` for settings by name; of many constants, as a calibration gives, only the
     number: ``28 constants of evidence``."""
-    constants = [name for name in changed if name.startswith("evidence.")]
-    if len(constants) <= _MOST_CONSTANTS:
-        constants = []
-    texts = [f"{name}={value}" for name, value in changed.items() if name not in constants]
-    return [*texts, f"{len(constants)} constants of evidence"] if constants else texts
+    many = {}
+    for group in ("evidence", "localizer"):
+        constants = [name for name in changed if name.startswith(f"{group}.")]
+        if len(constants) > _MOST_CONSTANTS:
+            many[group] = constants
+    hidden = {name for constants in many.values() for name in constants}
+    texts = [f"{name}={value}" for name, value in changed.items() if name not in hidden]
+    return texts + [f"{len(constants)} constants of {group}" for group, constants in many.items()]
 
 
 def _tree(settings: Settings) -> dict[str, Any]:

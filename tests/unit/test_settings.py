@@ -6,7 +6,8 @@ from hypothesis import strategies as st
 
 from projections.errors import SettingsError
 from projections.evidence import EvidenceConstants
-from projections.settings import Camera, Settings, settings_by_name
+from projections.localizer import LocalizerConstants
+from projections.settings import Camera, Settings, assignment_texts, settings_by_name
 
 
 def test_assignments_change_what_they_name() -> None:
@@ -171,6 +172,9 @@ _CHANGED = st.builds(
         sizes_m=st.dictionaries(_NAMES.map(str.strip).filter(bool), st.floats(0.1, 9.0)),
         different=st.none() | st.floats(-1.0, 0.9),
     ),
+    localizer=st.builds(
+        LocalizerConstants, known_shift=st.floats(-9.0, 9.0), known_count=st.integers(0, 99)
+    ),
 )
 
 
@@ -188,7 +192,8 @@ def test_changed_settings_by_name_are_the_assignments_between_two(
 
 
 def test_documents_of_page_maps_name_no_younger_setting() -> None:
-    assert not {"fusion", "camera", "evidence"} & Settings(eps_m=1.0).model_dump().keys()
+    younger = {"fusion", "camera", "evidence", "localizer"}
+    assert not younger & Settings(eps_m=1.0).model_dump().keys()
     assert Settings(camera=Camera(yaw_rad=1.0)).model_dump()["camera"]["yaw_rad"] == 1.0
 
 
@@ -197,3 +202,19 @@ def test_documents_of_evidence_maps_name_every_constant() -> None:
     document = Settings(fusion="evidence").model_dump()
     assert document["evidence"] == EvidenceConstants().model_dump()
     assert document["camera"] == Camera().model_dump()
+
+
+@pytest.mark.parametrize("fusion", ["page", "evidence"])
+def test_documents_name_corrections_of_relocalisation_only_where_there_are_any(fusion: str) -> None:
+    """The fold does not use them: a map made before they existed keeps its fingerprint."""
+    plain = Settings.from_document({"fusion": fusion})
+    assert "localizer" not in plain.model_dump()
+    corrected = plain.with_assignments(["localizer.known_shift=0.5"])
+    assert corrected.model_dump()["localizer"]["known_shift"] == 0.5
+    assert corrected.fingerprint() != plain.fingerprint()
+
+
+def test_many_constants_are_told_by_their_number() -> None:
+    changed = {f"localizer.c{n}": n for n in range(5)} | {"eps_m": 1, "evidence.range_m": 2}
+    texts = ["eps_m=1", "evidence.range_m=2", "5 constants of localizer"]
+    assert assignment_texts(changed) == texts
