@@ -304,14 +304,14 @@ class ObjectClassified(msgspec.Struct, frozen=True, gc=False):
 class ObjectMissing(msgspec.Struct, frozen=True, gc=False):
     """An Object was not seen where it should have been; new values.
 
-    ``looks`` is in how many keyframes of the run it should have been seen and was not. ``missing``
+    ``misses`` is in how many keyframes of the run it should have been seen and was not. ``missing``
     tells whether that is enough to call it missing; it is False again once it is seen there.
     """
 
     offset: Offset
     object: ObjectOrdinal
     run: RunOrdinal
-    looks: int
+    misses: int
     missing: bool
 
 

@@ -55,11 +55,11 @@ def standing_text(history: History, record: ObjectHistory, end: Offset) -> str:
     since = _missing_since(record, end)
     if since is not None:
         looked = record.looked_for(end)
-        looks = 0 if looked is None else looked.looks
+        misses = 0 if looked is None else looked.misses
         cause = history.cause_at(since)
         text += (
             f"; missing since offset {since:,} ({cause.title}): "
-            f"not seen in {counted(looks, 'keyframe')} that should show it"
+            f"not seen in {counted(misses, 'keyframe')} that should show it"
         )
     return text
 
@@ -86,7 +86,7 @@ def evidence_facts(record: ObjectHistory, votes: Counter[str], end: Offset) -> d
         },
         "class_counts": dict(_ordered(votes)),
         "missing": looked is not None and looked.missing,
-        "looks": 0 if looked is None else looked.looks,
+        "misses": 0 if looked is None else looked.misses,
     }
 
 
@@ -120,8 +120,8 @@ def evidence_entries(
     for offset, looked in _presence(record):
         is_missing = looked is not None and looked.missing
         if looked is not None and is_missing and not was_missing:
-            text = f"missing: not seen in {counted(looked.looks, 'keyframe')} that should show it"
-            yield offset, "missing", text, {"looks": looked.looks}
+            text = f"missing: not seen in {counted(looked.misses, 'keyframe')} that should show it"
+            yield offset, "missing", text, {"misses": looked.misses}
         elif looked is not None and was_missing and not is_missing:
             yield offset, "back", "seen where it was missing", {}
         was_missing = is_missing
@@ -141,7 +141,7 @@ def evidence_entries(
 def _presence(record: ObjectHistory) -> list[tuple[Offset, ObjectMissing | None]]:
     """When it was looked for, and (None) when it turned out to stand elsewhere, in order."""
     moved = [(each.offset, None) for each in record.relocations]
-    looked = [(each.offset, each) for each in record.looks]
+    looked = [(each.offset, each) for each in record.misses]
     return sorted([*moved, *looked], key=lambda event: event[0])
 
 

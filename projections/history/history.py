@@ -216,7 +216,7 @@ class History:
         self.objects[delta.object].classes.append(delta)
 
     def _object_missing(self, delta: ObjectMissing, _: Cause) -> None:
-        self.objects[delta.object].looks.append(delta)
+        self.objects[delta.object].misses.append(delta)
 
     def _object_relocated(self, delta: ObjectRelocated, _: Cause) -> None:
         self.objects[delta.object].relocations.append(delta)

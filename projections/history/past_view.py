@@ -159,7 +159,7 @@ def _object(history: ObjectHistory, end: Offset) -> ObjectRecord:
         _, _, *values = astuple(estimated)
         record.estimate = Estimate(*values)
     if (looked := history.looked_for(end)) is not None:
-        record.looks = looked.looks
+        record.misses = looked.misses
         record.missing_in = looked.run if looked.missing else None
     for moved in history.relocations[: count_before(history.relocations, end)]:
         offset, _, *values = astuple(moved)

@@ -225,7 +225,7 @@ class ObjectHistory:
     """The merge that ended it."""
     estimates: list[ObjectEstimated] = field(default_factory=list)
     classes: list[ObjectClassified] = field(default_factory=list)
-    looks: list[ObjectMissing] = field(default_factory=list)
+    misses: list[ObjectMissing] = field(default_factory=list)
     relocations: list[ObjectRelocated] = field(default_factory=list)
 
     @property
@@ -258,7 +258,7 @@ class ObjectHistory:
     def looked_for(self, end: Offset) -> ObjectMissing | None:
         """In how many keyframes it was looked for and not seen, after the events below ``end``;
         None if it has stood elsewhere since."""
-        looked, moved = last_before(self.looks, end), last_before(self.relocations, end)
+        looked, moved = last_before(self.misses, end), last_before(self.relocations, end)
         if looked is None or (moved is not None and moved.offset > looked.offset):
             return None
         return looked

@@ -86,7 +86,7 @@ def _evidence(view: MapView) -> Iterator[str]:
             (r.offset, r.observation, r.from_x_um, r.from_y_um, r.to_x_um, r.to_y_um)
             for r in o.relocations
         ]
-        yield _line((o.ordinal, estimate, o.looks, o.missing_in, relocations))
+        yield _line((o.ordinal, estimate, o.misses, o.missing_in, relocations))
 
 
 def _number(value: int | None) -> str:

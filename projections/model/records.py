@@ -159,7 +159,7 @@ class ObjectRecord:
     """A landmark. ``observations`` are ordinals in the order in which they were fused.
 
     `MapView.objects` lists those that were not absorbed. The fields after ``observations`` are
-    those of fusion by evidence: ``looks`` is in how many keyframes of a run it should have been
+    those of fusion by evidence: ``misses`` is in how many keyframes of a run it should have been
     seen and was not, ``missing_in`` the run in which that was often enough to call it missing.
     """
 
@@ -174,7 +174,7 @@ class ObjectRecord:
     place: PlaceOrdinal | None = None
     observations: list[ObservationOrdinal] = field(default_factory=list)
     estimate: Estimate | None = None
-    looks: int = 0
+    misses: int = 0
     missing_in: RunOrdinal | None = None
     relocations: list[Relocation] = field(default_factory=list)
 

@@ -267,7 +267,7 @@ def _dump_evidence(view: MapView) -> State:
         "estimates": [
             [o.ordinal, *astuple(o.estimate)] for o in view.all_objects if o.estimate is not None
         ],
-        "presence": [[o.looks, o.missing_in] for o in view.all_objects],
+        "presence": [[o.misses, o.missing_in] for o in view.all_objects],
         "relocations": [[o.ordinal, *astuple(r)] for o in view.all_objects for r in o.relocations],
     }
 
@@ -276,8 +276,8 @@ def _load_evidence(view: MapView, state: State) -> None:
     objects = view.all_objects
     for ordinal, *estimate in state["estimates"]:
         objects[ordinal].estimate = Estimate(*estimate)
-    for record, (looks, missing_in) in zip(objects, state["presence"], strict=True):
-        record.looks, record.missing_in = looks, missing_in
+    for record, (misses, missing_in) in zip(objects, state["presence"], strict=True):
+        record.misses, record.missing_in = misses, missing_in
     for ordinal, *relocation in state["relocations"]:
         objects[ordinal].relocations.append(Relocation(*relocation))
 

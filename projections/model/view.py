@@ -257,12 +257,12 @@ class MapView:
 
     def _object_missing(self, delta: ObjectMissing) -> None:
         found = self.all_objects[delta.object]
-        found.looks = delta.looks
+        found.misses = delta.misses
         found.missing_in = delta.run if delta.missing else None
 
     def _object_relocated(self, delta: ObjectRelocated) -> None:
         found = self.all_objects[delta.object]
-        found.looks, found.missing_in = 0, None
+        found.misses, found.missing_in = 0, None
         moved = Relocation(
             delta.offset,
             delta.observation,

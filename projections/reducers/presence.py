@@ -13,7 +13,7 @@ every sighting by `_SEEN`, within bounds: sightings of something else that took 
 assigned to it now and then, so one alone does not outweigh many misses. A new run starts with what
 was left, or with 1 if it was surely there.
 
-It is *missing* when the odds fall below `_MISSING` with `_LEAST_LOOKS` misses in the run, and no
+It is *missing* when the odds fall below `_MISSING` with `_LEAST_MISSES` misses in the run, and no
 longer when they rise above that.
 
 Distances are metres in float64; with +, −, ×, ÷ only, in one order, so everything is bit-exact.
@@ -54,14 +54,14 @@ _TURN2 = 0.87 * 0.87
 _PRIOR = 4.0
 _SEEN, _SURE, _FLOOR = 8.0, 512.0, 1.0 / 1024.0
 _MISSING = 0.07
-_LEAST_LOOKS, _LEAST_HITS = 2, 1
+_LEAST_MISSES, _LEAST_HITS = 2, 1
 _Cell = tuple[int, int]
 
 
 @dataclass(slots=True, eq=False)
 class Attendance:
     """What is known of one Object. ``hits`` and ``misses`` are those of all looks while it was not
-    missing; ``odds`` and ``looks`` (the misses) of ``run``, the last run that saw or missed it.
+    missing; ``odds`` and ``run_misses`` those of ``run``, the last run that saw or missed it.
     ``confirmed`` is the last run before ``run`` that it surely was there in."""
 
     home: RunOrdinal
@@ -72,7 +72,7 @@ class Attendance:
     hits: int = 0
     misses: int = 0
     odds: float = 1.0
-    looks: int = 0
+    run_misses: int = 0
     is_missing: bool = False
     cells: set[_Cell] = field(default_factory=set)
 
@@ -81,7 +81,7 @@ class Attendance:
         if run != self.run:
             if self.odds >= 1.0:
                 self.confirmed, self.odds = self.run, 1.0
-            self.run, self.looks = run, 0
+            self.run, self.run_misses = run, 0
 
 
 class Presence:
@@ -114,7 +114,7 @@ class Presence:
                     changed.append(ordinal)
             self._add_vantage(ordinal, known, pose)
         return [
-            ObjectMissing(offset, ordinal, run, known.looks, known.is_missing)
+            ObjectMissing(offset, ordinal, run, known.run_misses, known.is_missing)
             for ordinal in sorted(changed)
             for known in (self.attendance[ordinal],)
         ]
@@ -137,7 +137,7 @@ class Presence:
         return {
             "looks": [self._hits, self._misses],
             "objects": [
-                [o, k.home, k.run, k.confirmed, k.hits, k.misses, k.looks, int(k.is_missing)]
+                [o, k.home, k.run, k.confirmed, k.hits, k.misses, k.run_misses, int(k.is_missing)]
                 for o, k in known
             ],
             "numbers": np.array([(k.x, k.y, k.odds) for _, k in known]).reshape(-1, 3),
@@ -149,11 +149,10 @@ class Presence:
         """Take over what `dump` gave."""
         self._hits, self._misses = state["looks"]
         numbers = state["numbers"].tolist()
-        for (ordinal, home, run, confirmed, hits, misses, looks, is_missing), (x, y, odds) in zip(
-            state["objects"], numbers, strict=True
-        ):
+        for (ordinal, *known), (x, y, odds) in zip(state["objects"], numbers, strict=True):
+            home, run, confirmed, hits, misses, run_misses, is_missing = known
             self.attendance[ordinal] = Attendance(
-                home, run, confirmed, x, y, hits, misses, odds, looks, bool(is_missing)
+                home, run, confirmed, x, y, hits, misses, odds, run_misses, bool(is_missing)
             )
         for (column, row, ordinal), at in zip(state["cells"], state["poses"].tolist(), strict=True):
             self._list(ordinal, (column, row), (at[0], at[1]))
@@ -219,13 +218,14 @@ class Presence:
                 known.enter(run)
                 share = (usual + known.misses) / (_PRIOR + known.hits + known.misses)
                 known.odds = max(known.odds * share, _FLOOR)
-                known.looks += 1
+                known.run_misses += 1
                 self.missed.append(ordinal)
             if known.is_missing:
                 continue
             known.misses += 1
             misses += 1
-            if known.odds < _MISSING and known.looks >= _LEAST_LOOKS and known.hits >= _LEAST_HITS:
+            enough = known.run_misses >= _LEAST_MISSES and known.hits >= _LEAST_HITS
+            if enough and known.odds < _MISSING:
                 known.is_missing = True
                 missing.append(ordinal)
         self._hits += hits

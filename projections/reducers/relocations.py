@@ -88,8 +88,8 @@ class Relocations:
         pairs: list[Moved] = []
         due = self._take_in(fused)
         for ordinal in self._presence.missed:
-            looks = self._presence.attendance[ordinal].looks
-            if looks & (looks - 1) == 0:
+            misses = self._presence.attendance[ordinal].run_misses
+            if misses & (misses - 1) == 0:
                 due += self._newcomers_like(ordinal)
         for newcomer in dict.fromkeys(due):
             best = self._best(newcomer)

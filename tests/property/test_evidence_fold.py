@@ -352,7 +352,7 @@ def test_maps_of_things_carried_away_are_the_same_whichever_way_they_are_made(se
                 history.objects[found.ordinal],
                 Offset(end),
             ).document()
-            assert (told["missing"], told["looks"]) == (found.missing_in is not None, found.looks)
+            assert (told["missing"], told["misses"]) == (found.missing_in is not None, found.misses)
             moved = [each["offset"] for each in told["entries"] if each["what"] == "moved"]
             own = [delta.offset for delta in history.objects[found.ordinal].relocations]
             assert moved == [offset for offset in own if offset < end]

@@ -130,7 +130,7 @@ ESTIMATE = Estimate(1, 2, 30, 4, 50, 3)
             for field in dataclasses.fields(Estimate)
         ),
         lambda o: setattr(o, "estimate", None),
-        lambda o: setattr(o, "looks", 7),
+        lambda o: setattr(o, "misses", 7),
         lambda o: setattr(o, "missing_in", 0),
         lambda o: setattr(o, "class_name", "sofa"),
         lambda o: o.relocations.append(Relocation(Offset(3), d.ObservationOrdinal(1), 0, 0, 1, 1)),

@@ -47,12 +47,12 @@ class Known:
     hits: int = 0
     misses: int = 0
     odds: Fraction = Fraction(1)
-    looks: int = 0
+    run_misses: int = 0
     is_missing: bool = False
 
     def enter(self, run: int) -> None:
         if run != self.run:
-            self.run, self.looks, self.odds = run, 0, min(self.odds, Fraction(1))
+            self.run, self.run_misses, self.odds = run, 0, min(self.odds, Fraction(1))
 
 
 class Oracle:
@@ -87,7 +87,7 @@ class Oracle:
                 known.odds = min(known.odds * 8, Fraction(512))
                 known.is_missing = known.is_missing and known.odds <= Fraction(0.07)
         return [
-            ObjectMissing(offset, ObjectOrdinal(o), RunOrdinal(run), k.looks, k.is_missing)
+            ObjectMissing(offset, ObjectOrdinal(o), RunOrdinal(run), k.run_misses, k.is_missing)
             for o, k in sorted(self.known.items())
             if k.is_missing != before[o]
         ]
@@ -131,11 +131,12 @@ class Oracle:
             known.enter(run)
             missed = (4 * share + known.misses) / (4 + known.hits + known.misses)
             known.odds = max(known.odds * missed, Fraction(1, 1024))
-            known.looks += 1
+            known.run_misses += 1
         if not known.is_missing:
             known.misses += 1
             self.looks.append(False)
-            known.is_missing = known.odds < Fraction(0.07) and known.looks >= 2 and known.hits >= 1
+            enough = known.run_misses >= 2 and known.hits >= 1
+            known.is_missing = enough and known.odds < Fraction(0.07)
 
 
 class Step(NamedTuple):

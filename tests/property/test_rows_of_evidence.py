@@ -135,7 +135,7 @@ def test_applying_events_twice_changes_no_object(steps: list[Step]) -> None:
     for ordinal, found in once.objects.items():
         other = twice.objects[ordinal]
         fields = (
-            "class_name", "obs_count", "observations", "estimate", "looks", "missing_in",
+            "class_name", "obs_count", "observations", "estimate", "misses", "missing_in",
             "relocations", "place",
         )  # fmt: skip
         assert [getattr(found, f) for f in fields] == [getattr(other, f) for f in fields]

@@ -159,7 +159,7 @@ def test_why_gives_the_same_as_json() -> None:
     assert document["class_name"] == "stool"
     assert document["class_counts"] == {"stool": 2, "chair": 1}
     assert document["estimate"] == {"x": 1.2, "y": 2.0, "sigma_m": 0.12, "spots": 3}
-    assert (document["missing"], document["looks"]) == (True, 5)
+    assert (document["missing"], document["misses"]) == (True, 5)
     (fused,) = (e for e in document["entries"] if e["what"] == "fused")
     assert fused["evidence"] == {
         "distance_m": 0.34,

@@ -89,7 +89,7 @@ def test_a_chair_that_is_carried_away_is_missing_until_it_is_back():
     folded.extend(run("b", without))
     (chair,) = of_class(folded, "chair")
     assert folded.view.runs[chair.missing_in].run_id == "b"
-    assert chair.looks >= 2
+    assert chair.misses >= 2
     assert [found.class_name for found in folded.view.objects.values() if found.missing_in] == [
         "chair"
     ]
