@@ -23,6 +23,7 @@ from eventsrc.envelope import ANGLE_RAD, HFOV_DEG, PIXELS, Text, describe_error
 from .errors import SettingsError
 from .evidence import EvidenceConstants
 from .localizer import LocalizerConstants
+from .rooms import RoomsConstants
 
 _MAX_SHOWN = 80
 _MOST_CONSTANTS = 4
@@ -40,7 +41,12 @@ class Camera(BaseModel):
     yaw_rad: Annotated[float, ANGLE_RAD] = 0.0
 
 
-_YOUNGER = ("fusion", "camera", "evidence", "localizer")
+_YOUNGER = {
+    "fusion": ("fusion", "camera", "evidence"),
+    "places": ("places", "rooms"),
+    "localizer": ("localizer",),
+}
+"""Settings that older versions did not have, by the one that brings them into force."""
 
 
 class Settings(BaseModel):
@@ -72,19 +78,23 @@ class Settings(BaseModel):
     """The constants of fusion by evidence."""
     localizer: LocalizerConstants = LocalizerConstants()
     """The corrections of re-localisation's numbers; the fold does not use them."""
+    places: Literal["page", "rooms"] = "page"
+    """The rule that groups poses into places: DBSCAN by ``eps_m`` and ``min_samples``, or rooms."""
+    rooms: RoomsConstants = RoomsConstants()
+    """The constants of places by rooms."""
 
     @model_serializer(mode="wrap")
     def _without_younger_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out younger settings that have their default, so that older fingerprints hold; for
-        fusion by evidence name all that it uses, so that its fingerprint tells when a default has
-        changed."""
+        """Leave out younger settings that have their default, so that older fingerprints hold; of
+        a rule that is in force name all, so that the fingerprint tells when a default changes."""
         values: dict[str, Any] = handler(self)
-        left_out = ("localizer",) if self.fusion == "evidence" else _YOUNGER
-        return {
-            name: value
-            for name, value in values.items()
-            if name not in left_out or getattr(self, name) != Settings.model_fields[name].default
-        }
+        defaults = {name: Settings.model_fields[name].default for name in values}
+        for rule, names in _YOUNGER.items():
+            if getattr(self, rule) == defaults[rule]:
+                for name in names:
+                    if name in values and getattr(self, name) == defaults[name]:
+                        del values[name]
+        return values
 
     def __hash__(self) -> int:
         return hash(self.fingerprint())
@@ -216,6 +226,7 @@ def _tree(settings: Settings) -> dict[str, Any]:
 _SIZES = "evidence.sizes_m."
 _EXAMPLES = {
     "camera": "camera.hfov_deg=90",
+    "rooms": "rooms.cell_m=0.5",
     "evidence": "evidence.range_m=1.3",
     "evidence.sizes_m": f"{_SIZES}chair=0.9",
 }

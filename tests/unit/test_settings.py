@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from projections.errors import SettingsError
 from projections.evidence import EvidenceConstants
 from projections.localizer import LocalizerConstants
+from projections.rooms import RoomsConstants
 from projections.settings import Camera, Settings, assignment_texts, settings_by_name
 
 
@@ -133,7 +134,7 @@ def test_dotted_names_change_one_value_of_a_group() -> None:
         ("evidence.sizes_m.=1", "--set evidence.sizes_m.=: is empty"),
         ("evidence.reach=1", ", evidence.sizes_m.CLASS"),
         ("eps_m.x=1", "no setting 'eps_m.x'; there are embedding_dim, embedding_model, eps_m"),
-        ("where=1", "min_samples, camera.NAME, evidence.NAME"),
+        ("where=1", "min_samples, places, camera.NAME, evidence.NAME, localizer.NAME, rooms.NAME"),
         ("eps_m.neighbourhood=x", "no setting 'eps_m.neighbourhood'"),
     ],
 )
@@ -175,6 +176,8 @@ _CHANGED = st.builds(
     localizer=st.builds(
         LocalizerConstants, known_shift=st.floats(-9.0, 9.0), known_count=st.integers(0, 99)
     ),
+    places=st.sampled_from(["page", "rooms"]),
+    rooms=st.builds(RoomsConstants, cell_m=st.floats(0.1, 9.0)),
 )
 
 
@@ -192,7 +195,7 @@ def test_changed_settings_by_name_are_the_assignments_between_two(
 
 
 def test_documents_of_page_maps_name_no_younger_setting() -> None:
-    younger = {"fusion", "camera", "evidence", "localizer"}
+    younger = {"fusion", "camera", "evidence", "localizer", "places", "rooms"}
     assert not younger & Settings(eps_m=1.0).model_dump().keys()
     assert Settings(camera=Camera(yaw_rad=1.0)).model_dump()["camera"]["yaw_rad"] == 1.0
 
@@ -202,6 +205,7 @@ def test_documents_of_evidence_maps_name_every_constant() -> None:
     document = Settings(fusion="evidence").model_dump()
     assert document["evidence"] == EvidenceConstants().model_dump()
     assert document["camera"] == Camera().model_dump()
+    assert not {"places", "rooms"} & document.keys()
 
 
 @pytest.mark.parametrize("fusion", ["page", "evidence"])
@@ -218,3 +222,18 @@ def test_many_constants_are_told_by_their_number() -> None:
     changed = {f"localizer.c{n}": n for n in range(5)} | {"eps_m": 1, "evidence.range_m": 2}
     texts = ["eps_m=1", "evidence.range_m=2", "5 constants of localizer"]
     assert assignment_texts(changed) == texts
+
+
+def test_documents_of_maps_by_rooms_name_every_constant() -> None:
+    """And none of fusion by evidence, unless that is in force too."""
+    document = Settings(places="rooms").model_dump()
+    assert document["rooms"] == RoomsConstants().model_dump()
+    assert document["places"] == "rooms"
+    assert not {"fusion", "camera", "evidence"} & document.keys()
+    both = Settings(places="rooms", fusion="evidence").model_dump()
+    assert {"rooms", "camera", "evidence"} <= both.keys()
+
+
+def test_fingerprints_of_evidence_maps_are_those_of_versions_without_rooms() -> None:
+    assert Settings(fusion="evidence").fingerprint() == "74343062d28faa20"
+    assert Settings(fusion="evidence", eps_m=0.75).fingerprint() == "9d6c33759e6735bc"

@@ -1,7 +1,7 @@
 """One table: Objects by the page's rule and by evidence, side by side, against the truth.
 
 python -m tests.bench.truth [--half develop|validate] [--quick] [--world W…] [--profile P…]
-    [--moved FRACTION] [--calibrated] [--limit N] [--set NAME=VALUE…]
+    [--moved FRACTION] [--calibrated] [--places] [--limit N] [--set NAME=VALUE…]
     [--worlds DIR] [--cache DIR] [--json FILE]
 
 A line for each robot (profile) in a building (world), runs a, b and c in one log; the worst last.
@@ -11,7 +11,7 @@ import argparse
 import dataclasses
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from projections.errors import SettingsError
@@ -21,6 +21,7 @@ from . import tables
 from .calibrating import calibrated_settings, calibration_table
 from .folding import fold_timed
 from .moving import score_moved
+from .places import RULES, PlacesRow, places_row, places_table
 from .scoring import score_objects
 from .worlds import (
     CACHE,
@@ -44,19 +45,31 @@ def main() -> None:
         chosen = pairs(generator, options.half, options.world, options.profile, quick=options.quick)
         limit = options.limit or (QUICK_LIMIT if options.quick else LIMIT)
         cases = _cases(generator, chosen, options, limit)
-        rows = [_row(case, options) for case in cases]
+        if options.places:
+            rules = {**RULES, "rooms": RULES["rooms"].with_assignments(options.set)}
+            places = [places_row(case, rules) for case in cases]
+        else:
+            rows = [_row(case, options) for case in cases]
     except (NoWorldsError, SettingsError) as error:
         sys.exit(str(error))
     print(
         f"{options.half} half, {len(chosen)} of world × profile, at most {limit} keyframes a run"
         + (f", {options.moved:g} of the movable things moved" if options.moved else "")
     )
+    if options.places:
+        print(places_table(places))
+        _write(options.json, places)
+        return
     if options.calibrated:
         print(calibration_table(rows))
     print(tables.moved_table(rows) if options.moved else tables.objects_table(rows))
-    if options.json:
+    _write(options.json, rows)
+
+
+def _write(path: Path | None, rows: Sequence[tables.Row | PlacesRow]) -> None:
+    if path is not None:
         document = [dataclasses.asdict(row) for row in rows]
-        options.json.write_text(json.dumps(document, indent=1) + "\n")
+        path.write_text(json.dumps(document, indent=1) + "\n")
 
 
 def _options() -> argparse.Namespace:
@@ -73,9 +86,10 @@ def _options() -> argparse.Namespace:
     parser.add_argument(
         "--calibrated", action="store_true", help="the map's own constants beside the priors"
     )
+    parser.add_argument("--places", action="store_true", help="places against rooms, no Objects")
     parser.add_argument("--limit", type=int, help=f"most keyframes a run ({LIMIT})")
     parser.add_argument(
-        "--set", nargs="+", default=[], metavar="NAME=VALUE", help="settings of the evidence rule"
+        "--set", nargs="+", default=[], metavar="NAME=VALUE", help="settings of the rule measured"
     )
     parser.add_argument("--worlds", type=Path, default=WORLDS, help="folder of make_worlds.py")
     parser.add_argument("--cache", type=Path, default=CACHE, help="where generated runs are kept")
