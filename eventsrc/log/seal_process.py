@@ -4,8 +4,8 @@ Sealing takes half a processor at 20,000 events a second, and the thread that re
 the interpreter lock of a thread that seals. So the process reads a finished segment and writes the
 sealed one beside it, under a name with its own process id. Nothing else: the writer, which holds
 the lock of the log, gives the file its name. When the writer dies, the process finishes its
-segment, finds that nobody waits for it, deletes its file and ends. So no process of a dead writer
-changes a log that the next one holds.
+segment, cannot send its answer, deletes its file and ends. So no process of a dead writer changes a
+log that the next writer holds.
 
 One JSON document a line: a plan goes in, ``{"sha256": …, "temporary": …}`` or an error comes out.
 

@@ -63,8 +63,8 @@ def calibrate(
     progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> Calibration:
     """Calibrate the map of a log's first ``until`` events, all of them for None; folded by
-    evidence whatever rule the settings name. ``progress`` is told how many events of how many are
-    folded, over all rounds. Raises FoldError, LogDamaged."""
+    evidence whatever rule the settings name. ``progress`` is called with the number of events
+    folded and the number to fold, both over all rounds. Raises FoldError, LogDamaged."""
     end = reader.next_offset if until is None else min(until, reader.next_offset)
     before = 0
 

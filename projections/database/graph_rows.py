@@ -47,8 +47,8 @@ CHANGING: Final[tuple[Label, ...]] = (
 class GraphRows:
     """Rows to insert (never seen before), to upsert, and graphids to delete, by label.
 
-    ``replaced`` are edges to delete and insert anew, of labels that cannot be upserted; no other
-    edge of the label starts where one of them does.
+    ``replaced`` are edges to delete and insert again, of labels without upsert. They are deleted by
+    their start vertices, so each must be the only edge of its label that starts at its vertex.
     """
 
     inserted: dict[Label, list[Any]]

@@ -61,10 +61,11 @@ def tail(
     """Follow ``log`` until ``stop`` is set, or with ``once`` only to its present end.
 
     ``settings`` may depend on the log's corrections. ``on_batch`` is called after each commit;
-    ``on_fold`` is told how many events are folded and written, at the start of a pass and after
-    each batch of it; ``on_refold`` is told how many of how many events a refold has folded;
-    ``note`` is told of snapshots that could not be used or kept, which costs time and nothing else,
-    and of a command that a refold cannot obey, which with ``once`` is raised (ImpossibleCommand).
+    ``on_fold`` is called with the number of events folded and written, at the start of a pass and
+    after each batch of it; ``on_refold`` with the number of events that a refold has folded and the
+    number that it has to fold. ``note`` is called with a message for each snapshot that could not
+    be used or kept, which costs time and nothing else, and for a command that a refold cannot obey;
+    with ``once`` such a command is raised (ImpossibleCommand).
     Raises ProjectionMismatch when the databases were made from another log or with other settings,
     ProjectionBusy, CheckpointMoved.
     """

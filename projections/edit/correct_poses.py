@@ -47,7 +47,8 @@ def by_trajectory(
     ignore_missing: bool = False,
     note: Callable[[str], None] = lambda _: None,
 ) -> CorrectPoses:
-    """The poses of a file for the keyframes of a run. ``note`` is told which stay as they are."""
+    """The poses of a file for the keyframes of a run. ``note`` is called with a message if
+    the file may be cut off, keyframes or poses are left out, or poses are interpolated."""
     keyframes = _keyframes(current, run_id, span)
     laid = lay(trajectory, keyframes, slack_s)
     in_run = {k.keyframe_id for k in current.run(run_id)}

@@ -31,9 +31,9 @@ SettingsOf = Callable[[Corrections], Settings]
 class CurrentMap:
     """A log, the commands in it, and the map that it is folded to under ``settings_of`` these.
 
-    With ``until`` it is the log as of its first ``until`` events. ``note`` is told of snapshots
-    that could not be used. ``commands`` are those before ``until`` and ``corrections`` what they
-    compile to, where the caller has them.
+    With ``until`` it is the log as of its first ``until`` events. ``note`` is called with a
+    message for each snapshot that could not be used. ``commands`` are those before ``until`` and
+    ``corrections`` what they compile to, where the caller has them.
     """
 
     def __init__(

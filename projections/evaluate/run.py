@@ -59,7 +59,7 @@ def evaluate(
     """Score the map of ``map_log`` (folded to ``until`` under its corrections) and questions from
     ``query_logs``. ``settings`` may depend on the log's corrections.
 
-    ``note`` is told what the user should know about ``until`` (`eventsrc.log.seek.resolve`).
+    ``note`` is called with what the user should know about ``until`` (`eventsrc.log.seek.resolve`).
     Deterministic but for ``latency_ms``, which is of exact search in memory plus the ranking.
     """
     with LogReader(map_log) as reader:

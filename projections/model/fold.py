@@ -120,8 +120,8 @@ def fold_log_cached(
 ) -> tuple[SemanticMap, MapView]:
     """`fold_log` without embeddings, from the nearest snapshot beside the log.
 
-    Keeps a snapshot of the result if it had to fold `SNAPSHOT_MIN_EVENTS` or more. ``note`` is told
-    of snapshots that could not be used or kept; the result is the same.
+    Keeps a snapshot of the result if it had to fold `SNAPSHOT_MIN_EVENTS` or more. ``note`` is
+    called with a message for each snapshot that could not be used or kept; the result is the same.
     """
     end = reader.next_offset if until is None else min(until, reader.next_offset)
     cache = SnapshotCache(

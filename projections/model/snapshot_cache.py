@@ -28,8 +28,8 @@ _MAX_KEPT = 6
 
 
 class SnapshotCache:
-    """Snapshots of one log under one set of settings and corrections; ``note`` is told of those not
-    usable. Other names of places need no other snapshots."""
+    """Snapshots of one log under one set of settings and corrections; ``note`` is called with a
+    message for each that is not usable. Other names of places need no other snapshots."""
 
     def __init__(
         self,

@@ -75,7 +75,8 @@ class LookRatios:
         self._best = [-log(shares[0]) for shares in _SHARES]
 
     def at_best(self, labels_agree: NDArray[np.bool_]) -> Floats:
-        """What no ratio is above."""
+        """The largest ratio at likenesses that occur. Far below those, where the likelihood of one
+        thing is cut off at `_WORST` and that of two is not, ratios are larger."""
         best: Floats = np.where(labels_agree, self._best[1], self._best[0])
         return best
 

@@ -86,7 +86,7 @@ def search_log(
 ) -> Candidates:
     """Candidates from the map as of ``point`` of a log: offset, ISO time, run:keyframe or end.
 
-    ``note`` is told what the user should know about ``point`` (`eventsrc.log.seek.resolve`).
+    ``note`` is called with what the user should know about ``point`` (`eventsrc.log.seek.resolve`).
     """
     with LogReader(log) as reader:
         _, view = fold_log(

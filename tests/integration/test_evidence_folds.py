@@ -16,9 +16,7 @@ from projections.database.check import check
 from projections.database.connection import Targets
 from projections.database.graph_render import expected_rows
 from projections.database.labels import LABELS
-from projections.database.live_fold import LiveFold, batches
 from projections.database.loader import LoaderName
-from projections.database.memory_sink import MemorySink, MemoryTables
 from projections.model.fold import fold_events, fold_log
 from projections.model.log_commands import read_corrections
 from projections.model.snapshot_cache import SnapshotCache
@@ -28,6 +26,7 @@ from projections.settings import Settings
 from tests.commands_in_logs import append_command, command, forget_keyframes, undo
 from tests.flickering_house import flickering_house
 from tests.integration.test_projections import parsed
+from tests.live_rows import followed_and_rebuilt
 from tests.logs import write_log
 from tests.rows import all_rows, expected_graph, graph_rows
 
@@ -70,17 +69,7 @@ def test_the_log_has_what_these_tests_are_about(log: Path) -> None:
 
 @pytest.mark.parametrize("size", [1, 17])
 def test_batches_of_any_size_give_the_rows_of_the_fold(log: Path, size: int) -> None:
-    live, anew = MemoryTables(), MemoryTables()
-    following, folding = LiveFold(EVIDENCE), LiveFold(EVIDENCE)
-    sink, shadow = MemorySink(), MemorySink().shadow()
-    with LogReader(log) as reader:
-        for batch in batches(reader.read(FIRST_OFFSET), size):
-            assert not any(following.feed(batch))
-            sink.prepare(following.tracker.drain(), following.view).send(live)
-            assert not any(folding.feed(batch))
-            shadow.load(folding.tracker.drain(), folding.view)(anew)
-    shadow.finish(folding.view)(anew)
-    shadow.swap_in(anew)
+    live, anew = followed_and_rebuilt(log, EVIDENCE, size)
     assert live.graph == anew.graph
     view = view_of(log)
     for label in LABELS:

@@ -20,6 +20,7 @@ from projections.settings import Settings
 from tests.commands_in_logs import append_command, command
 from tests.envelopes import detection, envelope
 from tests.integration.test_refold import parsed
+from tests.live_rows import followed_and_rebuilt
 from tests.logs import walk, write_log
 from tests.rows import all_rows, expected_graph
 
@@ -65,17 +66,7 @@ def test_live_rows_and_a_rebuild_are_what_the_view_says(
 @pytest.mark.parametrize("size", [1, 7, 1_000])
 def test_batches_of_any_size_give_the_rows_of_a_rebuild(log: Path, size: int) -> None:
     _, corrections = fold(log)
-    live, anew = MemoryTables(), MemoryTables()
-    following, folding = (LiveFold(SETTINGS, corrections=corrections) for _ in range(2))
-    sink, shadow = MemorySink(), MemorySink().shadow()
-    with LogReader(log) as reader:
-        for batch in batches(reader.read(FIRST_OFFSET), size):
-            assert not any(following.feed(batch))
-            sink.prepare(following.tracker.drain(), following.view).send(live)
-            assert not any(folding.feed(batch))
-            shadow.load(folding.tracker.drain(), folding.view)(anew)
-    shadow.finish(folding.view)(anew)
-    shadow.swap_in(anew)
+    live, anew = followed_and_rebuilt(log, SETTINGS, size, corrections)
     assert live.graph == anew.graph
 
 
