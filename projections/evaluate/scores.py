@@ -12,6 +12,8 @@ from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
+
 from projections.model.partitions import adjusted_rand_of_pairs
 from projections.model.view import MapView
 
@@ -134,6 +136,23 @@ def expected_calibration_error(confidence: Sequence[float], right: Sequence[bool
         for members in bins(confidence)
     ]
     return sum(gaps) / len(confidence) if confidence else 0.0
+
+
+def calibration_floor(confidence: Sequence[float]) -> float:
+    """The calibration error to expect if every confidence were the true probability.
+
+    So many answers right in a bin are a sum of independent yes or no; the mean gap between that
+    number and its expectation is computed from the distribution of the number.
+    """
+    gaps = []
+    for members in bins(confidence):
+        chances = np.ones(1)
+        for i in members:
+            p = confidence[i]
+            chances = np.append(chances * (1.0 - p), 0.0) + np.append(0.0, chances * p)
+        expected = math.fsum(confidence[i] for i in members)
+        gaps.append(float(chances @ np.abs(np.arange(len(chances)) - expected)))
+    return math.fsum(gaps) / len(confidence) if confidence else 0.0
 
 
 def reliability(confidence: Sequence[float], right: Sequence[bool]) -> list[dict[str, float]]:

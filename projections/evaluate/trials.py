@@ -12,6 +12,7 @@ from eventsrc.ingest import Accepted
 from projections.model.view import MapView
 from projections.relocalize import Answer, Camera, ExactIndex, Method, rank
 
+from .baselines import best_cosine, plain_position
 from .questions import Question
 from .scores import instances_of
 from .truth import Key, Truth
@@ -63,7 +64,8 @@ class Trial:
     when most of its keyframes are in it, and *contains* it when any is. ``room_has_place`` says
     that some place contains the true room: without one no place can be the right answer.
     ``room_of_pose`` is the room of the mapped keyframe nearest to the pose, ``room_at_pose`` the
-    room there by the `RoomIndex`, None without one.
+    room there by the `RoomIndex`, None without one. ``plain_error_m`` and ``best_cosine`` are those
+    of `baselines`; ``plain_place_error_m`` is the plain method's, a place's centroid.
     """
 
     question: Question
@@ -78,6 +80,9 @@ class Trial:
     rooms_of_places: tuple[str | None, ...]
     contains: tuple[bool, ...]
     nearest_place: bool | None
+    plain_error_m: float | None
+    plain_place_error_m: float | None
+    best_cosine: float
     seconds: float
 
     @property
@@ -126,6 +131,7 @@ class TrialRunner:
         candidates = self._index.search(question.crops)
         answer = rank(question.crops, candidates, top=3, method=self._method, camera=self._camera)
         seconds = time.perf_counter() - began
+        plain = rank(question.crops, candidates, top=1, method="plain")
         pose, places = answer.pose, answer.places
         known = any(i in self._instances for i in question.instances if i is not None)
         true_place = self._nearest(question.x, question.y)[3]
@@ -133,11 +139,9 @@ class TrialRunner:
             question,
             answer,
             known,
-            None if pose is None else math.hypot(pose.x - question.x, pose.y - question.y),
+            _distance(None if pose is None else (pose.x, pose.y), question),
             None if pose is None or pose.yaw is None else _angle_size(pose.yaw - question.yaw),
-            math.hypot(places[0].centroid_x - question.x, places[0].centroid_y - question.y)
-            if places
-            else None,
+            _distance((places[0].centroid_x, places[0].centroid_y) if places else None, question),
             None if pose is None else self._nearest(pose.x, pose.y)[2],
             None
             if pose is None or self._room_index is None
@@ -146,6 +150,9 @@ class TrialRunner:
             tuple(self._room_of(place.place_id) for place in places),
             tuple((question.room or "") in self._rooms[place.place_id] for place in places),
             None if true_place is None or not places else places[0].place_id == true_place,
+            _distance(plain_position(candidates.matches), question),
+            _distance(None if plain.pose is None else (plain.pose.x, plain.pose.y), question),
+            best_cosine(candidates.matches),
             seconds,
         )
 
@@ -158,6 +165,13 @@ class TrialRunner:
     def _room_of(self, place_id: str) -> str | None:
         rooms = self._rooms[place_id]
         return max(sorted(rooms), key=rooms.__getitem__) if rooms else None
+
+
+def _distance(position: tuple[float, float] | None, question: Question) -> float | None:
+    """Metres from where the question was asked."""
+    if position is None:
+        return None
+    return math.hypot(position[0] - question.x, position[1] - question.y)
 
 
 def _angle_size(angle: float) -> float:

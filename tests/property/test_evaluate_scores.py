@@ -1,5 +1,6 @@
 """Scores against scikit-learn's and against counting pairs by hand."""
 
+import itertools
 import math
 
 import pytest
@@ -7,7 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn import metrics
 
-from projections.evaluate.scores import agreement, auroc, expected_calibration_error, percentile
+from projections.evaluate.scores import (
+    agreement,
+    auroc,
+    calibration_floor,
+    expected_calibration_error,
+    percentile,
+)
 
 LABELS = st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4)), max_size=40)
 SCORES = st.lists(st.sampled_from([0.0, 0.1, 0.25, 0.5, 0.75, 1.0]), max_size=15)
@@ -57,3 +64,20 @@ def test_percentiles_interpolate() -> None:
     assert percentile([1.0, 2.0], 0.9) == pytest.approx(1.9)
     assert percentile([], 0.5) is None
     assert not math.isnan(percentile([5.0], 0.99) or 0.0)
+
+
+@given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=7))
+def test_the_floor_is_the_mean_error_over_all_outcomes(p: list[float]) -> None:
+    """Oracle: every combination of right and wrong, with its probability."""
+    expected = 0.0
+    for outcome in itertools.product([False, True], repeat=len(p)):
+        chance = math.prod(c if y else 1.0 - c for c, y in zip(p, outcome, strict=True))
+        expected += chance * expected_calibration_error(p, outcome)
+    assert calibration_floor(p) == pytest.approx(expected, abs=1e-9)
+
+
+def test_the_floor_falls_with_the_number_of_questions() -> None:
+    assert calibration_floor([]) == calibration_floor([0.0, 1.0]) == 0.0
+    many, few = calibration_floor([0.5] * 400), calibration_floor([0.5] * 4)
+    assert many == pytest.approx(0.5 * math.sqrt(2 / math.pi / 400), rel=0.01)
+    assert few == pytest.approx(0.1875)  # of 0 … 4 right: 0.5, 0.25, 0, 0.25, 0.5 by 1 4 6 4 1

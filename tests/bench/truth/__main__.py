@@ -3,16 +3,22 @@
 python -m tests.bench.truth [--half develop|validate] [--quick] [--world W…] [--profile P…]
     [--moved FRACTION] [--calibrated] [--places] [--limit N] [--set NAME=VALUE…]
     [--worlds DIR] [--cache DIR] [--json FILE]
+python -m tests.bench.truth --localise [--every N] [--map page|evidence] [--brief] [--jobs N] …
+
+With --localise another table: where the robot is, asked of the map of run a.
 
 A line for each robot (profile) in a building (world), runs a, b and c in one log; the worst last.
 """
 
 import argparse
 import dataclasses
+import functools
 import json
 import sys
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from types import ModuleType
 
 from projections.errors import SettingsError
 from projections.settings import Settings
@@ -20,6 +26,8 @@ from projections.settings import Settings
 from . import tables
 from .calibrating import calibrated_settings, calibration_table
 from .folding import fold_timed
+from .localising import MAPS, LocaliseRow, localise, stranger_of
+from .localising_table import localise_table
 from .moving import score_moved
 from .places import RULES, PlacesRow, places_row, places_table
 from .scoring import score_objects
@@ -44,6 +52,9 @@ def main() -> None:
         generator = load_generator(options.worlds)
         chosen = pairs(generator, options.half, options.world, options.profile, quick=options.quick)
         limit = options.limit or (QUICK_LIMIT if options.quick else LIMIT)
+        if options.localise:
+            _localise(generator, chosen, options, limit)
+            return
         cases = _cases(generator, chosen, options, limit)
         if options.places:
             rules = {**RULES, "rooms": RULES["rooms"].with_assignments(options.set)}
@@ -72,6 +83,39 @@ def _write(path: Path | None, rows: Sequence[tables.Row | PlacesRow]) -> None:
         path.write_text(json.dumps(document, indent=1) + "\n")
 
 
+def _localise(
+    generator: ModuleType, chosen: list[tuple[str, str]], options: argparse.Namespace, limit: int
+) -> None:
+    make = functools.partial(make_case, generator, limit=limit, cache=options.cache)
+    rows: list[LocaliseRow] = []
+    cases = [(p, w, stranger_of(generator, options.half, w)) for p, w in chosen]
+    for profile, *worlds in cases:
+        for world in worlds:
+            make(profile, world)  # so that no two processes generate the same
+    with ProcessPoolExecutor(options.jobs) as pool:
+        for found in pool.map(functools.partial(_localised, limit, options), cases):
+            rows += found
+    print(
+        f"{options.half} half, {len(chosen)} of world × profile, at most {limit} keyframes a run, "
+        f"every {options.every}. question of runs b and c, as many of another building"
+    )
+    print(localise_table(rows, lines=not options.brief))
+    if options.json:
+        options.json.write_text(json.dumps([row.document() for row in rows], indent=1) + "\n")
+
+
+def _localised(
+    limit: int, options: argparse.Namespace, case: tuple[str, str, str]
+) -> list[LocaliseRow]:
+    profile, world, other = case
+    generator = load_generator(options.worlds)
+    own, stranger = (
+        make_case(generator, profile, each, limit=limit, cache=options.cache)
+        for each in (world, other)
+    )
+    return localise(own, stranger, options.map, options.every)
+
+
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="scripts/bench_truth", description=(__doc__ or "").partition("\n")[0]
@@ -87,6 +131,11 @@ def _options() -> argparse.Namespace:
         "--calibrated", action="store_true", help="the map's own constants beside the priors"
     )
     parser.add_argument("--places", action="store_true", help="places against rooms, no Objects")
+    parser.add_argument("--localise", action="store_true", help="where the robot is, instead")
+    parser.add_argument("--every", type=int, default=1, metavar="N", help="ask every N-th question")
+    parser.add_argument("--map", nargs="+", choices=MAPS, default=MAPS, help="rules of the maps")
+    parser.add_argument("--brief", action="store_true", help="with --localise: means only")
+    parser.add_argument("--jobs", type=int, default=1, help="with --localise: processes")
     parser.add_argument("--limit", type=int, help=f"most keyframes a run ({LIMIT})")
     parser.add_argument(
         "--set", nargs="+", default=[], metavar="NAME=VALUE", help="settings of the rule measured"
