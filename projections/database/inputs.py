@@ -22,9 +22,10 @@ from projections.settings import Settings
 SettingsOf: TypeAlias = Callable[[Corrections], Settings]
 """The settings that a map is made with under a log's corrections, which may name some."""
 _PAGE_FUSION: Final = {
-    name: Settings.model_fields[name].default for name in ("fusion", "camera", "evidence")
+    name: Settings.model_fields[name].default
+    for name in ("fusion", "camera", "evidence", "localizer")
 }
-"""The settings that change Objects alone, with their defaults."""
+"""The settings that change Objects alone, or nothing in the map, with their defaults."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,8 +33,8 @@ class MapInputs:
     """``corrections`` are of the commands before the offset ``known_at``.
 
     ``fingerprint`` identifies settings and corrections. ``observed`` leaves out the corrections of
-    places and Objects, and the settings of fusion by evidence: maps with the same one have the same
-    observations, so vectors of one and a graph of the other go together.
+    places and Objects, and the settings of fusion by evidence and re-localisation: maps with the
+    same one have the same observations, so vectors of one and a graph of the other go together.
     """
 
     settings: Settings

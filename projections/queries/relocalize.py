@@ -250,7 +250,7 @@ def _properties(agtype: str) -> dict[str, Any]:
 def _check_spaces(crops: Sequence[Crop], rows: Sequence[Sequence[Any]]) -> None:
     model = next((row[_NEAR_COLUMNS - 2] for row in rows), None)
     for crop in crops:
-        check_space(crop, len(crop.vector), model)
+        check_space(crop, 0 if crop.vector is None else len(crop.vector), model)
 
 
 @contextlib.contextmanager

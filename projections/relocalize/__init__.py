@@ -5,8 +5,17 @@
 """
 
 from .camera import Camera
-from .candidates import NEIGHBOURS, CandidatePlace, Candidates, ExactIndex, Match, search_log
-from .question import Crop, describe_value, parse_json, parse_question, read_crops
+from .candidates import (
+    NEIGHBOURS,
+    CandidatePlace,
+    Candidates,
+    ExactIndex,
+    Match,
+    Stand,
+    search_log,
+)
+from .constants import MapConstants
+from .question import Crop, Question, View, describe_value, parse_json, parse_question, read_crops
 from .ranking import (
     DEFAULT_CAMERA,
     UNKNOWN_BELOW,
@@ -29,10 +38,14 @@ __all__ = [
     "Crop",
     "Evidence",
     "ExactIndex",
+    "MapConstants",
     "Match",
     "Method",
     "PoseHypothesis",
+    "Question",
     "RankedPlace",
+    "Stand",
+    "View",
     "describe_value",
     "parse_json",
     "parse_question",

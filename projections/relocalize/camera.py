@@ -25,11 +25,13 @@ _FARTHEST_PX = 1e6
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """Picture size in pixels and horizontal field of view in degrees."""
+    """Picture size in pixels, horizontal field of view in degrees, and the angle from the robot's
+    heading to where the camera looks, radians to the left."""
 
     width_px: float = 640.0
     height_px: float = 400.0
     hfov_deg: float = 69.4
+    yaw_rad: float = 0.0
 
     def __post_init__(self) -> None:
         if not (self.width_px > 0 and self.height_px > 0 and 1.0 <= self.hfov_deg <= 170.0):

@@ -10,7 +10,7 @@ last bit.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -22,11 +22,13 @@ from eventsrc.text import counted
 from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.deltas import ObservationOrdinal, PlaceOrdinal
 from projections.errors import QuestionError
-from projections.exact import Q40, quantise
+from projections.exact import Q40, UM_PER_M, quantise
 from projections.model.fold import fold_log
+from projections.model.records import Estimate
 from projections.model.view import MapView
 from projections.settings import Settings
 
+from .constants import FOLLOWERS, Cosines, MapConstants, Sample
 from .question import Box, Crop
 
 NEIGHBOURS = 64
@@ -34,6 +36,20 @@ NEIGHBOURS = 64
 fewer leave too few directions to triangulate an object from."""
 
 Pose = tuple[float, float, float]
+UM2_PER_M2 = UM_PER_M * UM_PER_M
+
+
+@dataclass(frozen=True, slots=True)
+class Stand:
+    """Where an Object of fusion by evidence stands, in metres, with its covariance in m²; seen from
+    ``spots`` places to stand."""
+
+    x: float
+    y: float
+    xx: float
+    xy: float
+    yy: float
+    spots: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +59,7 @@ class Match:
     ``pose`` is that of its keyframe in metres and radians, None if the robot had none.
     ``object_place`` is where its Object is located and ``keyframe_place`` where the robot was:
     ordinals of Places, None for noise. ``class_name`` is the Object's if there is one.
+    ``object_stand`` is where the Object stands, None on maps of the page's rule.
     """
 
     observation: ObservationOrdinal
@@ -55,6 +72,7 @@ class Match:
     object_id: str | None = None
     object_place: PlaceOrdinal | None = None
     keyframe_place: PlaceOrdinal | None = None
+    object_stand: Stand | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +91,7 @@ class Candidates:
 
     matches: tuple[tuple[Match, ...], ...]
     places: Mapping[PlaceOrdinal, CandidatePlace]
+    constants: MapConstants = field(default_factory=MapConstants)
 
 
 def search_log(
@@ -113,16 +132,40 @@ class ExactIndex:
         self.model = next(
             (o.embedding_model for o in view.observations if o.embedding is not None), None
         )
+        self.constants = MapConstants.of(view.settings, self._different())
+
+    def _different(self) -> Cosines:
+        """The cosines of different things in one picture, of a sample of the observations."""
+        ordinals = self._ordinals
+        sample = Sample.of(int(ordinals[-1]) + 1 if len(ordinals) else 0)
+        rows = np.flatnonzero((ordinals < sample.limit) & ((ordinals + 1) % sample.stride == 0))
+        products = []
+        for row in rows.tolist():
+            one = self._view.observations[ordinals[row]]
+            for other in range(row + 1, min(row + 1 + FOLLOWERS, len(ordinals))):
+                second = self._view.observations[ordinals[other]]
+                if (
+                    second.keyframe == one.keyframe
+                    and second.ordinal <= one.ordinal + FOLLOWERS
+                    and second.class_name != one.class_name
+                ):
+                    products.append(float(self._matrix[row] @ self._matrix[other]) / Q40)
+        if not products:
+            return Cosines()
+        return Cosines(len(products), float(np.mean(products)), float(np.std(products)))
 
     def search(self, crops: Sequence[Crop], neighbours: int = NEIGHBOURS) -> Candidates:
         """The nearest observations of each crop. Raises QuestionError for another space."""
         if not len(self._ordinals):
-            return Candidates(tuple(() for _ in crops), self.places)
+            return Candidates(tuple(() for _ in crops), self.places, self.constants)
         for crop in crops:
             check_space(crop, self._matrix.shape[1], self.model)
-        return Candidates(tuple(self._nearest(crop, neighbours) for crop in crops), self.places)
+        matches = tuple(self._nearest(crop, neighbours) for crop in crops)
+        return Candidates(matches, self.places, self.constants)
 
     def _nearest(self, crop: Crop, neighbours: int) -> tuple[Match, ...]:
+        if crop.vector is None:
+            return ()
         products = self._matrix @ quantise(crop.vector).astype(np.float64)
         order = np.argsort(-products, kind="stable")[:neighbours]
         return tuple(
@@ -146,11 +189,27 @@ class ExactIndex:
             None if found is None else found.object_id,
             None if found is None else found.place,
             keyframe.place,
+            None if found is None else _stand(found.estimate),
         )
+
+
+def _stand(estimate: Estimate | None) -> Stand | None:
+    if estimate is None:
+        return None
+    return Stand(
+        estimate.est_x,
+        estimate.est_y,
+        estimate.var_xx_um2 / UM2_PER_M2,
+        estimate.var_xy_um2 / UM2_PER_M2,
+        estimate.var_yy_um2 / UM2_PER_M2,
+        estimate.spots,
+    )
 
 
 def check_space(crop: Crop, dimension: int, model: str | None) -> None:
     """Raise QuestionError when the crop is not of the map's embedding space."""
+    if crop.vector is None:
+        return
     if len(crop.vector) != dimension:
         raise QuestionError(
             f"the question's embeddings have {counted(len(crop.vector), 'dimension')}, the"

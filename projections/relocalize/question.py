@@ -39,19 +39,51 @@ Box = tuple[float, float, float, float]
 class Crop:
     """One crop: a unit vector, float32 of shape (dim,), and what else is known about it.
 
-    ``bbox`` is x_min, y_min, x_max, y_max in pixels of the whole picture, None when unknown.
+    ``vector`` is None when only the class is known; ``is_text`` says that it is the embedding of a
+    text. ``bbox`` is x_min, y_min, x_max, y_max in pixels of the whole picture, None when unknown.
     """
 
-    vector: Vector
+    vector: Vector | None
     bbox: Box | None = None
     class_name: str | None = None
     det_id: str | None = None
     model: str | None = None
+    is_text: bool = False
 
     @property
-    def sort_key(self) -> tuple[bytes, Box, str]:
+    def sort_key(self) -> tuple[bytes, Box, str, str]:
         """Puts crops into one order, whatever order they came in."""
-        return self.vector.tobytes(), self.bbox or (0.0, 0.0, 0.0, 0.0), self.det_id or ""
+        look = b"" if self.vector is None else self.vector.tobytes()
+        box = self.bbox or (0.0, 0.0, 0.0, 0.0)
+        return look, box, self.det_id or "", self.class_name or ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """The crops of one picture, and how the robot moved since the view before: metres ahead and to
+    the left, and radians to the left, in its frame there; all 0 in the first view."""
+
+    dx: float
+    dy: float
+    dyaw: float
+    crops: tuple[Crop, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Question:
+    """Views of a robot one after the other; the answer is where it is at the last one."""
+
+    views: tuple[View, ...]
+
+    @property
+    def crops(self) -> tuple[Crop, ...]:
+        """The crops of all views, in order."""
+        return tuple(crop for view in self.views for crop in view.crops)
+
+    @classmethod
+    def of(cls, crops: Sequence[Crop]) -> "Question":
+        """The question of one picture."""
+        return cls((View(0.0, 0.0, 0.0, tuple(crops)),))
 
 
 # A list ends at its first wrong item: pydantic would collect an error of 2 kB for each of them.
@@ -190,7 +222,7 @@ def _floats(index: int, model: _CropModel) -> Vector:
 
 
 def _check_one_space(crops: Sequence[Crop]) -> None:
-    dims = {len(crop.vector) for crop in crops}
+    dims = {len(crop.vector) for crop in crops if crop.vector is not None}
     models = {crop.model for crop in crops} - {None}
     if len(dims) > 1 or len(models) > 1:
         what = sorted(map(str, dims if len(dims) > 1 else models))

@@ -12,7 +12,7 @@ sum wins; the pose is its centroid.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -23,7 +23,7 @@ from .camera import Camera
 from .candidates import Candidates, Match
 from .model import MODEL, Model
 from .pose import Posterior, locate
-from .question import Crop
+from .question import Crop, Question
 
 Method = Literal["joint", "plain"]
 DEFAULT_CAMERA: Final = Camera()
@@ -102,7 +102,7 @@ class Answer:
 
 
 def rank(
-    crops: Sequence[Crop],
+    question: Question | Sequence[Crop],
     candidates: Candidates,
     *,
     top: int = 3,
@@ -110,10 +110,12 @@ def rank(
     camera: Camera = DEFAULT_CAMERA,
     model: Model = MODEL,
 ) -> Answer:
-    """The answer to a question; ``candidates.matches`` run parallel to ``crops``."""
+    """The answer to a question, or to the crops of one picture; ``candidates.matches`` run parallel
+    to the crops."""
+    crops = question.crops if isinstance(question, Question) else question
     order = sorted(range(len(crops)), key=lambda index: crops[index].sort_key)
     crops = [crops[index] for index in order]
-    candidates = Candidates(tuple(candidates.matches[i] for i in order), candidates.places)
+    candidates = replace(candidates, matches=tuple(candidates.matches[i] for i in order))
     if method == "plain":
         return _rank_plain(candidates, top)
     posterior = locate(crops, candidates.matches, camera, model)
