@@ -28,6 +28,7 @@ COMMANDS: "Mapping[str, str]" = {
     "evaluate": "projections.cli.evaluate",
     "query": "projections.cli.query",
     "serve": "projections.cli.serve",
+    "ui": "projections.cli.ui",
     "draw": "projections.cli.draw",
     "merges": "projections.cli.time_travel",
     "why": "projections.cli.time_travel",

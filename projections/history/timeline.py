@@ -41,7 +41,8 @@ class Timeline:
 
     ``settings`` are those of every fold, or a function of what is known; by default those that the
     log names. ``progress`` is called while events are folded, ``note`` with a line about each
-    snapshot that could not be used.
+    snapshot that could not be used. ``reader`` reads ``log`` instead of a new reader; the timeline
+    closes it. At most ``histories`` are kept.
     """
 
     def __init__(
@@ -51,9 +52,12 @@ class Timeline:
         *,
         progress: Progress | None = None,
         note: Callable[[str], None] = lambda _: None,
+        reader: LogReader | None = None,
+        histories: int = _MOST_HISTORIES,
     ) -> None:
         self._settings = settings
-        self.reader = LogReader(log)
+        self.reader = LogReader(log) if reader is None else reader
+        self._most = histories
         self._progress = progress
         self._note = note
         self._read: list[RecordedCommand] | None = None
@@ -106,7 +110,7 @@ class Timeline:
             self.reader, settings, corrections, progress=self._progress, note=self._note
         )
         self._histories[key] = found  # the last one asked is the last one to go
-        for old in list(self._histories)[:-_MOST_HISTORIES]:
+        for old in list(self._histories)[: -self._most]:
             del self._histories[old]
         return found
 

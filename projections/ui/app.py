@@ -1,0 +1,106 @@
+"""The page and its interface as an ASGI app.
+
+Needs the extra ``mapfold[ui]`` (fastapi, uvicorn). The event loop only reads requests; the threads
+of `UiService` answer them.
+"""
+
+import asyncio
+import json
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.responses import JSONResponse, Response
+from starlette.exceptions import HTTPException
+
+from eventsrc.errors import MapfoldError
+from eventsrc.text import visible
+
+from .answers import digest_answer, history_answer
+from .log_map import LogMap
+from .requests import assignments_of, refusal
+from .service import UiService
+from .static_files import static_files
+
+_BINARY = "application/octet-stream"
+_MAX_SHOWN = 200
+
+
+def create_app(service: UiService) -> FastAPI:
+    """The ASGI application. The caller closes the service."""
+    app = FastAPI(title="mapfold ui", docs_url=None, redoc_url=None, redirect_slashes=False)
+    _add_error_handlers(app)
+    files = static_files()
+
+    @app.get("/api/log", summary="The log, its runs and settings, and what is wrong with it")
+    async def log() -> Response:
+        return _json(service.log_document())
+
+    @app.get("/api/history", summary="Everything that happened to the map, as binary arrays")
+    async def history(request: Request) -> Response:
+        query = request.query_params
+
+        def work(shown: LogMap, refold_s: float) -> bytes:
+            return history_answer(shown, query, refold_s)
+
+        future = service.ask(assignments_of(query), work)
+        return Response(await asyncio.wrap_future(future), media_type=_BINARY)
+
+    def answers(path: str, summary: str, answer: Callable[..., dict[str, Any]]) -> None:
+        """Add a question about the map that is answered with a document."""
+
+        @app.get(f"/api/{path}", summary=summary, name=path)
+        async def answered(request: Request) -> Response:
+            query = request.query_params
+
+            def work(shown: LogMap, refold_s: float) -> bytes:
+                document = answer(shown, query)
+                more = {"refold_ms": round(refold_s * 1e3, 1)} if assignments_of(query) else {}
+                return encoded({"through": shown.through, **document, **more})
+
+            future: Future[bytes] = service.ask(assignments_of(query), work)
+            return Response(await asyncio.wrap_future(future), media_type="application/json")
+
+    answers("digest", "The digest of the map at W", digest_answer)
+
+    @app.get("/{path:path}", include_in_schema=False)
+    async def static(request: Request) -> Response:
+        found = files.get(request.scope["path"])
+        if found is None:
+            raise HTTPException(404)
+        headers = {"ETag": found.etag, "Cache-Control": "no-cache"}
+        if request.headers.get("if-none-match") == found.etag:
+            return Response(status_code=304, headers=headers)
+        return Response(found.content, media_type=found.media_type, headers=headers)
+
+    return app
+
+
+def encoded(document: Mapping[str, Any]) -> bytes:
+    """Compact UTF-8 JSON; text from logs stays text, whatever it is."""
+    return json.dumps(document, ensure_ascii=False, allow_nan=False).encode("utf-8", "replace")
+
+
+def _json(document: Mapping[str, Any], status: int = 200) -> Response:
+    return Response(encoded(document), status, media_type="application/json")
+
+
+def _add_error_handlers(app: FastAPI) -> None:
+    """Give all refusals, also those of FastAPI, the same JSON form."""
+
+    @app.exception_handler(MapfoldError)
+    async def refuse(_: Request, error: MapfoldError) -> Response:
+        status, document = refusal(error)
+        return _json(document, status)
+
+    @app.exception_handler(HTTPException)
+    async def refuse_path(request: Request, error: HTTPException) -> Response:
+        asked = visible(f"{request.method} {request.scope['path']}"[:_MAX_SHOWN])
+        document = {"error": {"kind": "bad_question", "message": f"{asked}: {error.detail}"}}
+        return JSONResponse(document, error.status_code, headers=error.headers)
+
+    @app.exception_handler(Exception)
+    async def failed(_: Request, __: Exception) -> Response:  # uvicorn logs the exception
+        message = "failed; see the program's stderr"
+        return _json({"error": {"kind": "failed", "message": message}}, 500)

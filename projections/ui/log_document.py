@@ -1,0 +1,71 @@
+"""What a page shows of a log as a whole."""
+
+import resource
+import sys
+from dataclasses import dataclass
+from typing import Any, Final
+
+from projections.corrections import Corrections
+from projections.settings import Settings
+
+from .log_map import MOST_ALTERNATIVES, MOST_HISTORIES, LogMap
+
+_KIB: Final = 1 if sys.platform == "darwin" else 1024
+"""What ``ru_maxrss`` counts in."""
+
+
+@dataclass(frozen=True, slots=True)
+class Access:
+    """``edits``: the log may be changed. ``token_needed``: every question needs the token."""
+
+    edits: bool = False
+    token_needed: bool = False
+
+
+def log_document(access: Access, shown: LogMap, *, folded: bool = True) -> dict[str, Any]:
+    """JSON. Before the log is ``folded`` it names no runs and no problems."""
+    corrections = shown.timeline.corrections() if folded else Corrections()
+    settings = shown.timeline.settings if folded else Settings()
+    return {
+        "name": shown.reader.path.name,
+        "path": str(shown.reader.path),
+        "log_id": shown.log_id,
+        "events": shown.reader.next_offset,
+        "through": shown.through if folded else 0,
+        "state": shown.key if folded else "",
+        "runs": _runs(shown) if folded else [],
+        "settings": settings.by_name(),
+        "changed_settings": settings.changed_from(Settings()),
+        "fingerprint": settings.fingerprint(),
+        "corrections": corrections.fingerprint(),
+        "fusion": settings.fusion,
+        "places_rule": settings.places,
+        "edits_allowed": access.edits,
+        "token_needed": access.token_needed,
+        "problems": shown.problems if folded else [],
+        "memory": memory_document(),
+    }
+
+
+def memory_document() -> dict[str, Any]:
+    """How much memory the server has used at most, and how many maps it keeps."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * _KIB
+    most = MOST_HISTORIES + MOST_ALTERNATIVES
+    return {
+        "peak_bytes": peak,
+        "most_maps": most,
+        "text": f"{peak / 2**20:,.0f} MiB at most so far; at most {most} maps are kept",
+    }
+
+
+def _runs(shown: LogMap) -> list[dict[str, Any]]:
+    history = shown.timeline.history
+    keyframes = [0] * len(history.runs)
+    first: dict[int, int] = {}
+    for keyframe in history.keyframes:
+        keyframes[keyframe.run] += 1
+        first.setdefault(keyframe.run, keyframe.offset)
+    return [
+        {"run_id": seen[0].run_id, "first_offset": first[run], "keyframes": keyframes[run]}
+        for run, seen in enumerate(history.runs)
+    ]

@@ -1,0 +1,167 @@
+"""What a timeline marks: keyframes, places founded and merged, commands, rejected payloads, losses.
+
+Places and objects are marked by their history. Commands, rejected payloads and losses are mapfold's
+own events in the log, which change nothing in a fold; they are read from the log by their keys.
+"""
+
+import json
+from bisect import bisect_left
+from collections.abc import Iterator
+from itertools import chain
+from operator import itemgetter
+from typing import Any, Final
+
+import numpy as np
+from pydantic import ValidationError
+
+from eventsrc.commands import InvalidCommand, UnknownKind, parse_command
+from eventsrc.envelope import FIRST_OFFSET, Offset
+from eventsrc.log import Event, LogReader
+from eventsrc.system_events import COMMAND_KEY, LOSS_KEY, REJECTED_KEY, Loss
+from projections.history.history import History
+from projections.model.command_text import command_title
+
+from .binary import Column
+
+KINDS: Final = (
+    "keyframe",
+    "run_began",
+    "place_founded",
+    "place_merged",
+    "merge_refused",
+    "objects_merged",
+    "object_missing",
+    "object_moved",
+    "skipped",
+    "correction",
+    "rejected",
+    "loss",
+)
+"""``ev_kind`` is an index of these."""
+_NUMBER: Final = {kind: number for number, kind in enumerate(KINDS)}
+_SYSTEM_KEYS: Final = {COMMAND_KEY: "correction", REJECTED_KEY: "rejected", LOSS_KEY: "loss"}
+_MAX_TEXT: Final = 300
+_Mark = tuple[int, int, float, int]
+"""Offset, number of the kind, stamp in seconds, and what it refers to."""
+
+
+class LogEvents:
+    """mapfold's own events of a log, read once; `read_on` adds those recorded since."""
+
+    def __init__(self) -> None:
+        self.through = FIRST_OFFSET
+        self.events: list[dict[str, Any]] = []
+
+    def read_on(self, reader: LogReader, end: Offset) -> None:
+        """Read those below ``end``. Raises LogDamaged."""
+        for event in reader.read(self.through, end, keys=tuple(_SYSTEM_KEYS)):
+            self.events.append(_document(event))
+        self.through = end
+
+    def count_before(self, offset: int) -> int:
+        """How many are of events below ``offset``."""
+        return bisect_left(self.events, offset, key=itemgetter("offset"))
+
+
+def _document(event: Event) -> dict[str, Any]:
+    kind = _SYSTEM_KEYS[event.key]
+    told = _command(event) if kind == "correction" else _TELL[kind](event.payload)
+    return {
+        "offset": event.offset,
+        "kind": kind,
+        "stamp": event.stamp_ns / 1e9,
+        **told,
+        "text": told["text"][:_MAX_TEXT],
+    }
+
+
+def _command(event: Event) -> dict[str, Any]:
+    try:
+        command = parse_command(event.payload)
+    except (InvalidCommand, UnknownKind) as error:
+        return {"text": str(error), "command_id": None, "what": None}
+    return {
+        "text": command_title(command),
+        "command_id": command.command_id,
+        "what": command.kind,
+    }
+
+
+def _loss(payload: bytes) -> dict[str, Any]:
+    try:
+        loss = Loss.model_validate_json(payload)
+    except ValidationError:
+        return {"text": "a loss that this version cannot read", "count": None}
+    span = "" if loss.first is None else f", {loss.first} to {loss.last}"
+    return {"text": f"{loss.count} lost of {loss.publisher}{span} ({loss.cause})"} | {
+        "count": loss.count
+    }
+
+
+def _rejected(payload: bytes) -> dict[str, Any]:
+    try:
+        found = json.loads(payload)
+        return {"text": f"{found['key']}: {found['reason']}"}
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return {"text": "a rejected payload that this version cannot read"}
+
+
+_TELL: Final = {"loss": _loss, "rejected": _rejected}
+
+
+def event_columns(
+    history: History, start: Offset, log_events: LogEvents
+) -> tuple[dict[str, Column], dict[str, Any]]:
+    """The columns ``ev_`` from ``start`` on, and what the header says about them.
+
+    ``ev_ref`` is a keyframe, run, place or object; of ``place_merged`` and ``objects_merged`` the
+    one that was absorbed; of ``merge_refused`` an index of ``refusals``; of mapfold's own events an
+    index of ``system``.
+    """
+    system = log_events.events[log_events.count_before(start) :]
+    own = log_events.count_before(start)
+    marks: list[_Mark] = [
+        (each["offset"], _NUMBER[each["kind"]], each["stamp"], own + index)
+        for index, each in enumerate(system)
+    ]
+    marks += (mark for mark in _history_marks(history) if mark[0] >= start)
+    marks.sort(key=itemgetter(0, 1))
+    refused = [r for r in history.refusals if r.cause.offset >= start]
+    header = {
+        "kinds": list(KINDS),
+        "system": [{k: v for k, v in each.items() if k != "stamp"} for each in system],
+        "refusals": [{"offset": r.cause.offset, "a": r.a, "b": r.b} for r in refused],
+    }
+    return {
+        "ev_offset": np.array([mark[0] for mark in marks], "<i4"),
+        "ev_stamp": np.array([mark[2] for mark in marks], "<f8"),
+        "ev_kind": np.array([mark[1] for mark in marks], "|u1"),
+        "ev_ref": np.array([mark[3] for mark in marks], "<i4"),
+    }, header
+
+
+def _history_marks(history: History) -> Iterator[_Mark]:
+    stamps = {k.offset: k.timestamp for k in history.keyframes}
+    found = chain(
+        (("keyframe", k.offset, k.keyframe) for k in history.keyframes),
+        (("run_began", seen[0].offset, number) for number, seen in enumerate(history.runs)),
+        (("place_founded", p.formed.offset, p.formed.place) for p in history.places),
+        (("place_merged", m.cause.offset, p) for m in history.merges for p in m.absorbed),
+        (("merge_refused", r.cause.offset, i) for i, r in enumerate(history.refusals)),
+        (("objects_merged", m.offset, m.absorbed) for m in history.object_merges),
+        (
+            ("object_missing", miss.offset, miss.object)
+            for each in history.objects
+            for before, miss in zip([None, *each.misses], each.misses, strict=False)
+            if miss.missing and not (before is not None and before.missing)
+        ),
+        (("object_moved", r.offset, r.object) for o in history.objects for r in o.relocations),
+        (("skipped", s.offset, -1) for s in history.skipped),
+    )
+    offsets = history.keyframe_offsets
+    for kind, offset, ref in found:
+        stamp = stamps.get(offset)
+        if stamp is None:  # no keyframe: the stamp of the last one before
+            number = bisect_left(offsets, offset)
+            stamp = history.keyframes[number - 1].timestamp if number else np.nan
+        yield offset, _NUMBER[kind], stamp, ref

@@ -1,0 +1,138 @@
+"""One log under one choice of settings, as far as it can be read and folded.
+
+What cannot be read or folded is a sentence in ``problems``, and the map ends before it. The history
+is folded once and then look-ups answer; new events are folded when `refresh` finds them. Not for
+several threads at once.
+"""
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from eventsrc.envelope import Offset
+from eventsrc.errors import LogDamaged, LogError, MapfoldError
+from eventsrc.log.seek import resolve
+from eventsrc.text import counted
+from projections.corrections import map_fingerprint
+from projections.errors import FoldError
+from projections.history import KnownHistory, Progress, Timeline
+from projections.history.timeline import SettingsChoice
+from projections.settings import Settings
+
+from .log_events import LogEvents
+from .log_prefix import PrefixReader
+
+MOST_HISTORIES: Final = 4
+"""Histories of the log's own settings that are kept: one for each set of commands asked about."""
+MOST_ALTERNATIVES: Final = 2
+"""Maps under other settings that are kept, each with one history."""
+
+
+class LogMap:
+    """A context manager over an existing log. Raises LogError when there is none.
+
+    ``settings`` as for a `Timeline`. ``progress`` is called while events are folded.
+    """
+
+    def __init__(
+        self,
+        log: Path,
+        settings: Settings | SettingsChoice | None = None,
+        *,
+        progress: Progress | None = None,
+        histories: int = MOST_HISTORIES,
+    ) -> None:
+        self.reader = PrefixReader(log)
+        self.timeline = Timeline(
+            log, settings, progress=progress, reader=self.reader, histories=histories
+        )
+        self.log_events = LogEvents()
+        self.log_id = self.reader.log_id
+        self._stopped: str | None = None
+        self._lost: str | None = None
+
+    def __enter__(self) -> "LogMap":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.reader.close()
+
+    @property
+    def through(self) -> Offset:
+        """The number of events that every answer covers."""
+        return self.timeline.end
+
+    @property
+    def problems(self) -> list[str]:
+        """Why the map may not be what a person expects: sentences."""
+        found = [problem for problem in (self._lost, self._stopped) if problem is not None]
+        if self.through == 0 and not found:
+            return ["the log has no events yet; this page shows them as they are recorded"]
+        history = self.timeline.history
+        if self.through and not history.keyframes:
+            found.append(
+                f"none of the {counted(self.through, 'event')} is a keyframe, so there is no map"
+            )
+        elif history.keyframes and all(k.pose is None for k in history.keyframes):
+            found.append(
+                f"none of the {counted(len(history.keyframes), 'keyframe')} has a pose, so there"
+                " are no places and there is nothing to draw"
+            )
+        return found
+
+    @property
+    def key(self) -> str:
+        """Equal while the map only grows: another one means that the past is another too."""
+        known = self.timeline.corrections()
+        offsets = ",".join(str(command.offset) for command in known.in_force)
+        made = f"{map_fingerprint(self.timeline.settings, known)} {offsets} {self._stopped}"
+        return hashlib.sha256(made.encode()).hexdigest()[:16]
+
+    def refresh(self, end: Offset | None = None) -> bool:
+        """Fold the events recorded since, at most to ``end``; whether anything is new.
+
+        Raises nothing for a log that is damaged, gone or cannot be folded: `problems` says it.
+        """
+        before = self.through, self._lost, self._stopped
+        if end is not None:
+            self.reader.limit = end
+        self._lost = None
+        try:
+            if end is None:
+                self.reader.check_end()
+            self.timeline.refresh()
+        except LogError as error:
+            self._lost = str(error)
+        self._fold()
+        return before != (self.through, self._lost, self._stopped)
+
+    def known(self, end: Offset, known_at: Offset | None) -> KnownHistory:
+        """The history under the commands before ``known_at``, ``end`` for None."""
+        return self.timeline.knowing(end if known_at is None else known_at)
+
+    def point(self, text: str, note: Callable[[str], None] | None = None) -> Offset:
+        """The number of events that W means, as for ``--at``."""
+        return resolve(self.reader, text, note=note)
+
+    def _fold(self) -> None:
+        """Fold to the end, or to where that is not possible."""
+        while True:
+            try:
+                _ = self.timeline.history
+                self.log_events.read_on(self.reader, self.through)
+            except LogDamaged as error:
+                stop = self.reader.first_unreadable()
+                self._stop_at(stop, error)
+            except FoldError as error:
+                self._stop_at(error.offset, error)
+            else:
+                return
+
+    def _stop_at(self, offset: Offset | None, error: MapfoldError) -> None:
+        """End the map before the event at ``offset``."""
+        if offset is None or offset >= self.reader.next_offset:
+            raise error
+        self.reader.limit = offset
+        self._stopped = f"{error}. The map shown ends before it, after {counted(offset, 'event')}"
+        self.timeline.refresh()

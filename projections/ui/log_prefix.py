@@ -1,0 +1,56 @@
+"""A reader of the first events of a log, up to where it can be read and folded."""
+
+import sys
+from collections.abc import Collection, Iterator
+
+from eventsrc.envelope import FIRST_OFFSET, Offset
+from eventsrc.log import Event, LogReader, Unreadable
+from eventsrc.log.reader import OnGap
+
+_NO_LIMIT = Offset(sys.maxsize)
+
+
+class PrefixReader(LogReader):
+    """A `LogReader` that takes a log to end at ``limit``, if it has as many events.
+
+    Nothing behind the limit is read, so damage there is no error.
+    """
+
+    limit = _NO_LIMIT
+
+    @property
+    def next_offset(self) -> Offset:
+        """The number of events up to the limit."""
+        return min(super().next_offset, self.limit)
+
+    @property
+    def is_limited(self) -> bool:
+        """Whether the log has events behind the limit."""
+        return self._last.next_offset > self.limit
+
+    def refresh(self) -> Offset:
+        """Find what was committed since; the new `next_offset`."""
+        if not self.is_limited:
+            super().refresh()
+        return self.next_offset
+
+    def read(
+        self,
+        start: Offset = FIRST_OFFSET,
+        end: Offset | None = None,
+        *,
+        keys: Collection[str] | None = None,
+        on_gap: OnGap | None = None,
+    ) -> Iterator[Event]:
+        """Events from ``start`` to before ``end``, at most to the limit."""
+        if self.is_limited:
+            end = self.next_offset if end is None else min(end, self.next_offset)
+        return super().read(start, end, keys=keys, on_gap=on_gap)
+
+    def first_unreadable(self) -> Offset | None:
+        """The first offset whose event cannot be read; None if all can. Reads the whole log."""
+        found: list[Unreadable] = []
+        for _ in super().read(on_gap=found.append):
+            if found:
+                break
+        return found[0].first if found else None

@@ -1,0 +1,113 @@
+"""The arrays of the web debugger, replayed row by row by a slow client, are the map at W."""
+
+import math
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, event, given, settings
+from hypothesis import strategies as st
+
+from eventsrc.commands import Command
+from eventsrc.log import LogReader
+from projections.corrections import Corrections
+from projections.model.fold import fold_log
+from projections.model.log_commands import read_corrections
+from projections.model.view import MapView
+from projections.settings import Settings
+from projections.ui.binary import packed_arrays
+from projections.ui.columns import history_columns
+from projections.ui.log_map import LogMap
+from tests.fixtures_corrections import corrected_walks, write_mixed_log
+from tests.thorough import examples
+from tests.ui_client import ReplayedMap, as_float32, read_arrays, replay
+
+PAGE = Settings(eps_m=0.7, min_samples=3, fusion_radius_m=1.0)
+EVIDENCE = PAGE.with_assignments(["fusion=evidence"])
+Items = list[dict[str, Any] | Command]
+slow = settings(
+    deadline=None, max_examples=examples(150), suppress_health_check=[HealthCheck.too_slow]
+)
+
+
+def answer(shown: LogMap, start: int = 0) -> tuple[dict[str, Any], dict[str, list[Any]]]:
+    header, columns = history_columns(shown.timeline.history, start, shown.log_events)
+    return read_arrays(packed_arrays(header, columns))
+
+
+def folded(path: Path, rules: Settings, end: int, known_at: int) -> MapView:
+    with LogReader(path) as reader:
+        corrections = read_corrections(reader, known_at)
+        chosen = corrections.settings or rules
+        return fold_log(reader, chosen, end, keep_embeddings=False, corrections=corrections)[1]
+
+
+def check_same(found: ReplayedMap, view: MapView) -> None:
+    """The replayed map has the view's keyframes, places, names, objects and adjacency."""
+    assert found.keyframes == [(k.run_id, k.keyframe_id, k.place) for k in view.keyframes]
+    assert found.poses == [
+        None
+        if (p := k.pose) is None
+        else (as_float32(p.x_m), as_float32(p.y_m), as_float32(p.yaw_rad))
+        for k in view.keyframes
+    ]
+    assert found.places == {p.ordinal: sorted(p.members) for p in view.places.values() if p.members}
+    assert found.place_ids == {p.ordinal: p.place_id for p in view.places.values()}
+    assert found.names == {p.ordinal: p.name for p in view.places.values() if p.name is not None}
+    assert found.adjacency == view.adjacency
+    assert found.objects.keys() == view.objects.keys()
+    for ordinal, o in view.objects.items():
+        at, shown = o.estimate, found.objects[ordinal]
+        x, y = (o.mean_x, o.mean_y) if at is None else (at.est_x, at.est_y)
+        assert (shown["x"], shown["y"]) == (as_float32(x), as_float32(y))
+        if at is None:
+            assert all(math.isnan(shown[name]) for name in ("xx", "xy", "yy"))
+        else:
+            variances = (at.var_xx_um2, at.var_xy_um2, at.var_yy_um2)
+            assert [shown[name] for name in ("xx", "xy", "yy")] == [
+                as_float32(variance / 1e12) for variance in variances
+            ]
+        assert shown["id"] == o.object_id
+        assert shown["count"] == o.obs_count
+        assert shown["class_name"] == o.class_name
+        assert shown["place"] == o.place
+        assert shown["missing"] == (o.missing_in is not None)
+
+
+@pytest.mark.parametrize("rules", [PAGE, EVIDENCE], ids=["page", "evidence"])
+@slow
+@given(items=corrected_walks(), data=st.data())
+def test_replayed_arrays_are_the_map(rules: Settings, items: Items, data: st.DataObject) -> None:
+    """At any W, under all commands of the log, loaded at once or in two parts."""
+
+    def chosen(corrections: Corrections) -> Settings:
+        return corrections.settings or rules
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = write_mixed_log(Path(folder) / "log", items)
+        with LogMap(path, chosen) as shown:
+            shown.refresh()
+            assert shown.through == len(items)
+            header, arrays = answer(shown)
+            split = data.draw(st.integers(0, len(items)))
+            later_header, later = answer(shown, split)
+            for end in data.draw(st.lists(st.integers(0, len(items)), min_size=1, max_size=4)):
+                found = replay(header, arrays, end)
+                view = folded(path, rules, end, len(items))
+                check_same(found, view)
+                event(f"merged: {bool(view.survivors.absorbed_by)}")
+            for name, values in arrays.items():
+                both = rows(arrays, name, split) + later[name]
+                assert list(map(repr, both)) == list(map(repr, values)), name  # NaN too
+            for kind in ("place_id", "object_id", "place_founder"):
+                known = later_header["first"].get(kind, later_header["first"]["place_id"])
+                whole = header["strings"][kind]
+                assert whole[:known] + later_header["strings"][kind] == whole
+            assert later_header["strings"]["class"] == header["strings"]["class"]
+
+
+def rows(arrays: dict[str, list[Any]], name: str, split: int) -> list[Any]:
+    """The rows of events below ``split``."""
+    offsets = arrays[f"{name.partition('_')[0]}_offset"]
+    return [value for value, at in zip(arrays[name], offsets, strict=True) if at < split]
