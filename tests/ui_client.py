@@ -13,15 +13,13 @@ def read_arrays(answer: bytes) -> tuple[dict[str, Any], dict[str, list[Any]]]:
     """The header and the arrays of ``/api/history``, by the description in docs/ui.md."""
     (length,) = struct.unpack_from("<I", answer)
     header = json.loads(answer[4 : 4 + length])
-    start = 4 + length
-    while start % 8:
-        assert answer[start] == 0
-        start += 1
-    arrays = {}
+    arrays, end = {}, 4 + length
     for each in header["arrays"]:
         assert each["offset"] % 8 == 0
+        assert set(answer[end : each["offset"]]) <= {0}  # nothing but padding in between
         code = f"<{each['length']}{_CODES[each['dtype']]}"
-        arrays[each["name"]] = list(struct.unpack_from(code, answer, start + each["offset"]))
+        arrays[each["name"]] = list(struct.unpack_from(code, answer, each["offset"]))
+        end = each["offset"] + struct.calcsize(code)
     return header, arrays
 
 

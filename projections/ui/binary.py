@@ -1,9 +1,9 @@
 """Arrays as one binary answer: a JSON header, then the arrays back to back.
 
 The answer is the length of the header in bytes (uint32, little-endian), the header as UTF-8 JSON,
-zeros up to a multiple of 8, and the data: the arrays in the order of ``arrays`` in the header. Each
-array starts at a multiple of 8; its ``offset`` counts bytes from the start of the data. All numbers
-are little-endian, so a browser makes typed arrays of them without copying.
+zeros up to the first array, and the arrays in the order of ``arrays`` in the header. Each array
+starts at a multiple of 8; its ``offset`` counts bytes from the start of the answer. All numbers are
+little-endian, so a browser makes typed arrays of them without copying.
 """
 
 import json
@@ -19,23 +19,30 @@ DTYPES: Final = {"f8": "<f8", "f4": "<f4", "i4": "<i4", "u4": "<u4", "u1": "|u1"
 _NAMES: Final = {np.dtype(code): name for name, code in DTYPES.items()}
 _ALIGNED: Final = 8
 _LENGTH_BYTES: Final = 4
+_OFFSET_DIGITS: Final = 12
 
 
 def packed_arrays(header: Mapping[str, Any], columns: Mapping[str, Column]) -> bytes:
     """The binary answer; ``arrays`` is added to the header."""
-    placed, size = [], 0
-    for name, column in columns.items():
-        dtype = _NAMES[column.dtype]
-        placed.append({"name": name, "dtype": dtype, "length": len(column), "offset": size})
-        size += _aligned(column.nbytes)
-    document = {**header, "arrays": placed}
-    head = json.dumps(document, ensure_ascii=False, allow_nan=False).encode()
-    start = _aligned(_LENGTH_BYTES + len(head))
+    # The header names offsets, which depend on its length: room is kept for the longest ones.
+    longest = _encoded(header, columns, 10**_OFFSET_DIGITS)
+    start = _aligned(_LENGTH_BYTES + len(longest))
+    head = _encoded(header, columns, start)
     parts = [len(head).to_bytes(_LENGTH_BYTES, "little"), head]
     parts.append(bytes(start - _LENGTH_BYTES - len(head)))
     for column in columns.values():
         parts += (column.tobytes(), bytes(_aligned(column.nbytes) - column.nbytes))
     return b"".join(parts)
+
+
+def _encoded(header: Mapping[str, Any], columns: Mapping[str, Column], start: int) -> bytes:
+    """The header of arrays that begin at ``start``."""
+    placed = []
+    for name, column in columns.items():
+        dtype = _NAMES[column.dtype]
+        placed.append({"name": name, "dtype": dtype, "length": len(column), "offset": start})
+        start += _aligned(column.nbytes)
+    return json.dumps({**header, "arrays": placed}, ensure_ascii=False, allow_nan=False).encode()
 
 
 def _aligned(length: int) -> int:
