@@ -1,8 +1,10 @@
 """``mapfold ui``: the web debugger of a log, until a signal."""
 
+import dataclasses
 import secrets
 import webbrowser
 from contextlib import ExitStack, closing
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -27,6 +29,10 @@ def ui(
     allow_edits: Annotated[
         bool, typer.Option("--allow-edits", help="Let the page record corrections in the log.")
     ] = False,
+    truth: Annotated[
+        list[Path] | None,
+        typer.Option("--truth", metavar="FILE", help="Score other settings against this truth."),
+    ] = None,
     set_: SetOption = None,
     settings_file: SettingsOption = None,
 ) -> None:
@@ -47,16 +53,26 @@ def ui(
         raise MisuseError(
             f"mapfold ui needs {error.name}, which is not installed; pip install 'mapfold[ui]'"
         ) from None
-    from projections.ui.log_document import Access
+    from projections.evaluate.truth import read_truth
+    from projections.ui.opened import Opened
     from projections.ui.service import UiService
+
+    opened = Opened(
+        log,
+        settings,
+        sets=tuple(set_ or ()),
+        settings_file=settings_file,
+        truth=read_truth(truth) if truth else None,
+        edits=allow_edits,
+    )
 
     with ExitStack() as stack:
         listener = stack.enter_context(closing(bind(host, port)))
         stop = stack.enter_context(stop_on_signals())
         local = is_loopback(listener)
         token = None if local and not allow_edits else secrets.token_urlsafe(24)
-        access = Access(edits=allow_edits, token_needed=not local)
-        service = stack.enter_context(UiService(log, settings, access))
+        opened = dataclasses.replace(opened, token_needed=not local)
+        service = stack.enter_context(UiService(opened))
         guarded = SafeHeaders(Guard(create_app(service), None if local else token, (host,)))
         bound = stack.enter_context(serving(guarded, listener, tell=say))
         shown = f"[{host}]" if ":" in host else host

@@ -83,6 +83,12 @@ class KnownHistory:
                 self._fold_to(self.end)
         return self._history
 
+    @property
+    def latest(self) -> MapView:
+        """The map up to `end`, not to be changed; its observations carry no embeddings."""
+        _ = self.history
+        return self._latest
+
     def at(self, end: Offset | None = None) -> MapView:
         """The map after the first ``end`` events, all of them for None; the caller may change it.
 

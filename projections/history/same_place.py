@@ -24,7 +24,9 @@ def explain_same_place(
     together = since is not None and since < end
     until = Offset(since + 1) if since is not None and together else end
     entries = [
-        _placed_entry(history, k) for k in (first, second) if history.placed_offsets[k] < end
+        _placed_entry(history, k)
+        for k in dict.fromkeys((first, second))
+        if history.placed_offsets[k] < end
     ]
     entries += [
         _merged_entry(history, merge) for merge in _merges_of(history, (first, second), until)

@@ -18,10 +18,14 @@ from eventsrc.errors import MapfoldError
 from eventsrc.text import visible
 
 from .answers import digest_answer, history_answer
+from .comparisons import bisect_answer, conditions_answer, diff_answer, merges_answer
 from .log_map import LogMap
 from .requests import assignments_of, refusal
+from .search import keyframe_answer, search_answer
 from .service import UiService
 from .static_files import static_files
+from .stories import why_answer
+from .whatif_answer import whatif_answer
 
 _BINARY = "application/octet-stream"
 _MAX_SHOWN = 200
@@ -63,6 +67,19 @@ def create_app(service: UiService) -> FastAPI:
             return Response(await asyncio.wrap_future(future), media_type="application/json")
 
     answers("digest", "The digest of the map at W", digest_answer)
+    answers("why", "Why a place, object or keyframe is what it is; why places merged", why_answer)
+    answers("merges", "Every merge of places up to W", merges_answer)
+    answers("diff", "What changed from one moment to another", diff_answer)
+    answers("bisect", "The event that made a condition true", bisect_answer)
+    answers("conditions", "The functions of a condition, its fault", conditions_answer)
+    answers("search", "Things that are called so", search_answer)
+    answers("keyframe", "A keyframe and its detections", keyframe_answer)
+
+    @app.get("/api/whatif", summary="The map under other settings, or without a command")
+    async def whatif(request: Request) -> Response:
+        query = request.query_params
+        future = service.ask_apart(lambda end: encoded(whatif_answer(service.opened, end, query)))
+        return Response(await asyncio.wrap_future(future), media_type="application/json")
 
     @app.get("/{path:path}", include_in_schema=False)
     async def static(request: Request) -> Response:

@@ -2,27 +2,19 @@
 
 import resource
 import sys
-from dataclasses import dataclass
 from typing import Any, Final
 
 from projections.corrections import Corrections
 from projections.settings import Settings
 
 from .log_map import MOST_ALTERNATIVES, MOST_HISTORIES, LogMap
+from .opened import Opened
 
 _KIB: Final = 1 if sys.platform == "darwin" else 1024
 """What ``ru_maxrss`` counts in."""
 
 
-@dataclass(frozen=True, slots=True)
-class Access:
-    """``edits``: the log may be changed. ``token_needed``: every question needs the token."""
-
-    edits: bool = False
-    token_needed: bool = False
-
-
-def log_document(access: Access, shown: LogMap, *, folded: bool = True) -> dict[str, Any]:
+def log_document(opened: Opened, shown: LogMap, *, folded: bool = True) -> dict[str, Any]:
     """JSON. Before the log is ``folded`` it names no runs and no problems."""
     corrections = shown.timeline.corrections() if folded else Corrections()
     settings = shown.timeline.settings if folded else Settings()
@@ -40,8 +32,8 @@ def log_document(access: Access, shown: LogMap, *, folded: bool = True) -> dict[
         "corrections": corrections.fingerprint(),
         "fusion": settings.fusion,
         "places_rule": settings.places,
-        "edits_allowed": access.edits,
-        "token_needed": access.token_needed,
+        "edits_allowed": opened.edits,
+        "token_needed": opened.token_needed,
         "problems": shown.problems if folded else [],
         "memory": memory_document(),
     }

@@ -6,22 +6,21 @@ several threads at once.
 """
 
 import hashlib
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from eventsrc.envelope import Offset
 from eventsrc.errors import LogDamaged, LogError, MapfoldError
 from eventsrc.log.seek import resolve
 from eventsrc.text import counted
-from projections.corrections import map_fingerprint
+from projections.corrections import Corrections, map_fingerprint
 from projections.errors import FoldError
-from projections.history import KnownHistory, Progress, Timeline
-from projections.history.timeline import SettingsChoice
+from projections.history import Progress, Timeline
 from projections.settings import Settings
 
 from .log_events import LogEvents
 from .log_prefix import PrefixReader
+from .opened import Opened
 
 MOST_HISTORIES: Final = 4
 """Histories of the log's own settings that are kept: one for each set of commands asked about."""
@@ -32,20 +31,26 @@ MOST_ALTERNATIVES: Final = 2
 class LogMap:
     """A context manager over an existing log. Raises LogError when there is none.
 
-    ``settings`` as for a `Timeline`. ``progress`` is called while events are folded.
+    ``sets`` (``name=value``) change the settings that it was opened with. ``progress`` is called
+    while events are folded.
     """
 
     def __init__(
         self,
-        log: Path,
-        settings: Settings | SettingsChoice | None = None,
+        opened: Opened,
+        sets: Sequence[str] = (),
         *,
         progress: Progress | None = None,
         histories: int = MOST_HISTORIES,
     ) -> None:
-        self.reader = PrefixReader(log)
+        self.opened = opened
+
+        def settings(corrections: Corrections) -> Settings:
+            return opened.settings(corrections).with_assignments(sets, "set")
+
+        self.reader = PrefixReader(opened.log)
         self.timeline = Timeline(
-            log, settings, progress=progress, reader=self.reader, histories=histories
+            opened.log, settings, progress=progress, reader=self.reader, histories=histories
         )
         self.log_events = LogEvents()
         self.log_id = self.reader.log_id
@@ -106,10 +111,6 @@ class LogMap:
             self._lost = str(error)
         self._fold()
         return before != (self.through, self._lost, self._stopped)
-
-    def known(self, end: Offset, known_at: Offset | None) -> KnownHistory:
-        """The history under the commands before ``known_at``, ``end`` for None."""
-        return self.timeline.knowing(end if known_at is None else known_at)
 
     def point(self, text: str, note: Callable[[str], None] | None = None) -> Offset:
         """The number of events that W means, as for ``--at``."""

@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Collection, Iterator
+from pathlib import Path
 
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.log import Event, LogReader, Unreadable
@@ -16,7 +17,9 @@ class PrefixReader(LogReader):
     Nothing behind the limit is read, so damage there is no error.
     """
 
-    limit = _NO_LIMIT
+    def __init__(self, path: Path, limit: Offset = _NO_LIMIT) -> None:
+        self.limit = limit
+        super().__init__(path)
 
     @property
     def next_offset(self) -> Offset:

@@ -8,17 +8,16 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack
-from pathlib import Path
 from time import perf_counter
 from typing import Any, Final, Self, TypeVar
 
-from projections.corrections import Corrections
-from projections.history.timeline import SettingsChoice
+from eventsrc.envelope import FIRST_OFFSET, Offset
+from eventsrc.errors import MapfoldError
 from projections.serve import FairQueue
-from projections.settings import Settings
 
-from .log_document import Access, log_document
+from .log_document import log_document
 from .log_map import MOST_ALTERNATIVES, LogMap
+from .opened import Opened
 from .progress import Loading
 
 Result = TypeVar("Result")
@@ -29,23 +28,19 @@ _PEER: Final = "page"
 
 
 class UiService:
-    """Opens a log and answers about it; use it in a ``with`` block. Raises LogError.
+    """Opens a log and answers about it; use it in a ``with`` block. Raises LogError."""
 
-    ``settings`` gives the settings under some corrections.
-    """
-
-    def __init__(self, log: Path, settings: SettingsChoice, access: Access) -> None:
-        self.path = log
-        self.access = access
+    def __init__(self, opened: Opened) -> None:
+        self.opened = opened
         self.loading = Loading()
-        self._settings = settings
         self._stack = ExitStack()
         self._alternatives: OrderedDict[tuple[str, ...], LogMap] = OrderedDict()
-        self._map = self._stack.enter_context(LogMap(log, settings, progress=self.loading.show))
-        self._document = log_document(self.access, self._map, folded=False)
+        self._map = self._stack.enter_context(LogMap(opened, progress=self.loading.show))
+        self._document = log_document(self.opened, self._map, folded=False)
+        self._through = FIRST_OFFSET
         self._own = self._stack.enter_context(FairQueue(1, max_wait_s=_MAX_WAIT_S))
         self._others = self._stack.enter_context(FairQueue(1, max_wait_s=_MAX_WAIT_S))
-        self._own.submit(_PEER, self._load)
+        self._loaded = self._own.submit(_PEER, self._load)
 
     def __enter__(self) -> Self:
         return self
@@ -67,33 +62,46 @@ class UiService:
             return self._own.submit(_PEER, lambda: work(self._map, 0.0))
         return self._others.submit(_PEER, lambda: work(*self._alternative(key)))
 
+    def ask_apart(self, work: Callable[[Offset], Result]) -> "Future[Result]":
+        """``work`` that reads the log itself and takes long, with the number of events that answers
+        cover."""
+
+        def asked() -> Result:
+            self._loaded.result()
+            return work(self._through)
+
+        return self._others.submit(_PEER, asked)
+
     def refresh(self) -> "Future[bool]":
         """Look for events recorded since; whether there are any, or another problem."""
         return self._own.submit(_PEER, self._refresh)
 
     def _load(self) -> None:
-        self._map.refresh()
-        self._document = log_document(self.access, self._map)
-        self.loading.finish()
+        try:
+            self._refresh()
+        finally:
+            self.loading.finish()
 
     def _refresh(self) -> bool:
-        changed = self._map.refresh()
-        if changed:
-            self._document = log_document(self.access, self._map)
+        try:
+            changed = self._map.refresh()
+            if changed or not self.loading.is_done:
+                self._document = log_document(self.opened, self._map)
+                self._through = self._map.through
+        except MapfoldError as error:
+            self._document |= {"problems": [str(error)]}
+            raise
         return changed
 
     def _alternative(self, sets: tuple[str, ...]) -> tuple[LogMap, float]:
         """The map under other settings, as far as the log's own map is."""
+        self._loaded.result()
         started = perf_counter()
         found = self._alternatives.pop(sets, None)
         if found is None:
-
-            def settings(corrections: Corrections) -> Settings:
-                return self._settings(corrections).with_assignments(sets, "set")
-
-            found = LogMap(self.path, settings, histories=1)
+            found = LogMap(self.opened, sets, histories=1)
         self._alternatives[sets] = found
         while len(self._alternatives) > MOST_ALTERNATIVES:
             self._alternatives.popitem(last=False)[1].reader.close()
-        found.refresh(self._map.through)
+        found.refresh(self._through)
         return found, perf_counter() - started

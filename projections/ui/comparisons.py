@@ -1,0 +1,93 @@
+"""Two moments compared, and the event that made a condition true."""
+
+from typing import Any, Final
+
+from starlette.datastructures import QueryParams
+
+from projections.history import Expression, ExpressionError
+from projections.history.condition_functions import FUNCTIONS
+from projections.history.merges import merge_document
+from projections.history.rendering import difference_text, search_text
+
+from .log_map import LogMap
+from .moment import Moment, command_line
+from .requests import assignments_of, text_of
+
+MOST_LINES: Final = 200
+_FLAGS: Final = ("1", "true", "yes")
+_WORDS: Final = ("and", "or", "not", "true", "false", "none")
+
+
+def diff_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
+    """What changed from ``from`` to ``to``, each map under the commands before it, or both under
+    those before ``known_at``."""
+    start, end = (shown.point(text_of(query, name)) for name in ("from", "to"))
+    known_at = shown.point(query["known_at"]) if query.get("known_at") else None
+    found = shown.timeline.diff(start, end, known_at=known_at)
+    words = [str(start), str(end)]
+    if known_at is not None:
+        words += ["--known-at", str(known_at)]
+    settings = shown.opened.words(*assignments_of(query))
+    return {
+        **found.document(),
+        "known_at": known_at,
+        "lines": difference_text(found, most=MOST_LINES).splitlines(),
+        "command": command_line(shown.opened, "diff", *words, *settings),
+    }
+
+
+def bisect_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
+    """When ``condition`` became true between ``from`` (default: the start) and ``to`` (default: the
+    end); with ``scan=1`` every turn."""
+    expression = Expression(text_of(query, "condition"))
+    moment = Moment.of(shown, query, "to")
+    start = shown.point(text_of(query, "from", "0"))
+    scan = query.get("scan", "") in _FLAGS
+    found = moment.known.bisect(expression, start, moment.end, scan=scan)
+    words = [expression.source, *(["--from", str(start)] if start else [])]
+    words += ["--to", str(moment.end), *(["--scan"] if scan else [])]
+    return {
+        **found.document(),
+        "known_at": moment.known_at,
+        "lines": search_text(found, most=MOST_LINES).splitlines(),
+        "command": moment.command("bisect", *words, asked_at=False),
+    }
+
+
+def conditions_answer(_: LogMap, query: QueryParams) -> dict[str, Any]:
+    """The functions of conditions, for completion; and what is wrong with ``text``, at which
+    column."""
+    return {
+        "functions": [
+            {
+                "name": function.name,
+                "signature": function.signature,
+                "parameters": [parameter.value for parameter in function.parameters],
+                "optional": function.optional,
+                "result": function.result.value,
+                "says": function.says,
+            }
+            for function in FUNCTIONS.values()
+        ],
+        "words": list(_WORDS),
+        "error": _error(query["text"]) if query.get("text") else None,
+    }
+
+
+def _error(text: str) -> dict[str, Any] | None:
+    try:
+        Expression(text)
+    except ExpressionError as error:
+        return {"column": error.column, "message": error.reason}
+    return None
+
+
+def merges_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
+    """Every merge of places up to W."""
+    moment = Moment.of(shown, query)
+    known = moment.known
+    return {
+        **moment.document(),
+        "merges": [merge_document(known.history, merge) for merge in known.merges(moment.end)],
+        "command": moment.command("merges"),
+    }

@@ -1,0 +1,53 @@
+"""What a question about the map names: W, what is known, and the command that asks the same."""
+
+import shlex
+from dataclasses import dataclass
+
+from starlette.datastructures import QueryParams
+
+from eventsrc.envelope import Offset
+from projections.history import KnownHistory
+
+from .log_map import LogMap
+from .opened import Opened
+from .requests import assignments_of, text_of
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """The map after ``end`` events, under the commands before ``known_at``."""
+
+    shown: LogMap
+    query: QueryParams
+    end: Offset
+    known_at: Offset
+
+    @classmethod
+    def of(cls, shown: LogMap, query: QueryParams, name: str = "at") -> "Moment":
+        """From the parameters ``at`` (default: the end) and ``known_at`` (default: there)."""
+        end = shown.point(text_of(query, name, "end"))
+        return cls(shown, query, end, shown.point(text_of(query, "known_at", str(end))))
+
+    @property
+    def known(self) -> KnownHistory:
+        """The history under what is known."""
+        return self.shown.timeline.knowing(self.known_at)
+
+    def document(self) -> dict[str, int]:
+        """The fields that say which map an answer is about."""
+        return {"at": self.end, "known_at": self.known_at}
+
+    def command(self, name: str, *arguments: object, asked_at: bool = True) -> str:
+        """The command line that gives the same answer; with ``asked_at`` it has ``--at``."""
+        words = [*map(str, arguments)]
+        if asked_at:
+            words += ["--at", str(self.end)]
+        if self.end != self.known_at:
+            words += ["--known-at", str(self.known_at)]
+        settings = self.shown.opened.words(*assignments_of(self.query))
+        return command_line(self.shown.opened, name, *words, *settings)
+
+
+def command_line(opened: Opened, name: str, *words: str) -> str:
+    """``mapfold NAME LOG …``, quoted for a shell."""
+    return shlex.join(["mapfold", name, str(opened.log), *words])

@@ -1,0 +1,35 @@
+"""What a page was started with."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from projections.evaluate.truth import Truth
+from projections.history.timeline import SettingsChoice
+
+
+@dataclass(frozen=True, slots=True)
+class Opened:
+    """A log and how it is looked at.
+
+    ``settings`` gives those of the map under some corrections: of ``settings_file`` or the log,
+    changed by ``sets`` (``name=value``). ``truth`` scores what-ifs. ``edits``: the log may be
+    changed. ``token_needed``: every question needs the token.
+    """
+
+    log: Path
+    settings: SettingsChoice
+    sets: tuple[str, ...] = ()
+    settings_file: Path | None = None
+    truth: Truth | None = None
+    edits: bool = False
+    token_needed: bool = False
+
+    def words(self, *sets: str) -> list[str]:
+        """The options that give a command the same settings, changed by ``sets``."""
+        words = [] if self.settings_file is None else ["--settings", str(self.settings_file)]
+        return words + [word for text in (*self.sets, *sets) for word in ("--set", text)]
+
+    def base_words(self) -> list[str]:
+        """The options that give ``mapfold whatif`` the same base."""
+        words = [] if self.settings_file is None else ["--settings", str(self.settings_file)]
+        return words + (["--base", " ".join(self.sets)] if self.sets else [])

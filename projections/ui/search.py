@@ -1,0 +1,160 @@
+"""Finding things by their names: places, objects, classes, detections, keyframes and runs."""
+
+from collections.abc import Collection, Iterator
+from typing import Any, Final
+
+from starlette.datastructures import QueryParams
+
+from eventsrc.envelope import Offset
+from projections.deltas import KeyframeOrdinal, ObjectOrdinal, ObservationOrdinal
+from projections.errors import QuestionError
+from projections.history import NoSuchThing
+from projections.history.history import History
+from projections.history.names import find_keyframe, keyframe_name
+from projections.model.records import ObservationRecord
+from projections.model.view import MapView
+
+from .log_map import LogMap
+from .moment import Moment
+from .requests import text_of
+
+MOST_FOUND: Final = 50
+_MOST_TEXT: Final = 300
+_Found = tuple[int, int, dict[str, Any]]
+
+
+def search_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
+    """What is called like ``q``, best first: the same name, then names that begin or end so, then
+    names that contain it. Letter case does not matter. ``kind`` asks for one kind only."""
+    moment = Moment.of(shown, query)
+    wanted = text_of(query, "q")[:_MOST_TEXT].casefold().strip()
+    kind = query.get("kind")
+    known = moment.known
+    found: list[_Found] = []
+    for number, each in enumerate(_named(known.history, known.latest, moment)):
+        rank = min(_rank(name.casefold(), wanted) for name in each.pop("names"))
+        if rank < _NOT and kind in (None, each["kind"]):
+            found.append((rank, number, each))
+    found.sort(key=lambda item: item[:2])
+    return {
+        **moment.document(),
+        "found": [each for _, _, each in found[:MOST_FOUND]],
+        "more": max(0, len(found) - MOST_FOUND),
+    }
+
+
+_NOT: Final = 4
+
+
+def _rank(name: str, wanted: str) -> int:
+    if not wanted or wanted not in name:
+        return _NOT
+    if name == wanted:
+        return 0
+    tail = name.rpartition("_")[2]
+    return 1 if tail == wanted or name.startswith(wanted) else 2 if name.endswith(wanted) else 3
+
+
+def _named(history: History, latest: MapView, moment: Moment) -> Iterator[dict[str, Any]]:
+    """Everything that has a name, with its ``names``; ``offset`` is the event that brought it."""
+    for place in history.places:
+        called = [named.name for named in place.names if named.name is not None]
+        yield {
+            "kind": "place", "id": place.place_id, "number": place.formed.place,
+            "offset": place.formed.offset, "stands": place.stands(moment.end),
+            "text": place.name(moment.end) or "", "names": [place.place_id, *called],
+        }  # fmt: skip
+    for each in history.objects:
+        class_name = each.class_name(moment.end)
+        yield {
+            "kind": "object", "id": each.object_id, "number": each.found.object,
+            "offset": each.found.offset, "stands": each.stands(moment.end), "text": class_name,
+            "names": [each.object_id, class_name],
+        }  # fmt: skip
+    for number, seen in enumerate(history.runs):
+        yield {
+            "kind": "run", "id": seen[0].run_id, "number": number, "offset": seen[0].offset,
+            "stands": seen[0].offset < moment.end, "text": "", "names": [seen[0].run_id],
+        }  # fmt: skip
+    for keyframe in history.keyframes:
+        name = keyframe_name(history, keyframe.keyframe)
+        yield {
+            "kind": "keyframe", "id": f"{keyframe.run_id}/{keyframe.keyframe_id}",
+            "number": keyframe.keyframe, "offset": keyframe.offset,
+            "stands": keyframe.offset < moment.end, "text": "", "names": [name],
+        }  # fmt: skip
+    for seen_ in latest.observations:
+        keyframe = history.keyframes[seen_.keyframe]
+        yield {
+            "kind": "detection", "id": seen_.det_id, "number": seen_.keyframe,
+            "offset": keyframe.offset, "stands": keyframe.offset < moment.end,
+            "text": f"{seen_.class_name}, {keyframe_name(history, keyframe.keyframe)}",
+            "names": [seen_.det_id],
+        }  # fmt: skip
+
+
+def keyframe_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
+    """A keyframe, by its row of ``kf_`` (``number``) or by ``run`` and ``id``, with its
+    detections."""
+    moment = Moment.of(shown, query)
+    history = moment.known.history
+    ordinal = _ordinal(history, query)
+    view = moment.known.latest
+    record = view.keyframes[ordinal]
+    pose = record.pose
+    place = history.place_at(ordinal, moment.end)
+    objects = _objects_of(history, record.observations, moment.end)
+    return {
+        **moment.document(),
+        "number": ordinal,
+        "run_id": record.run_id,
+        "keyframe_id": record.keyframe_id,
+        "name": keyframe_name(history, ordinal),
+        "offset": record.offset,
+        "stamp": record.timestamp,
+        "pose": None if pose is None else [pose.x_m, pose.y_m, pose.yaw_rad],
+        "place": place,
+        "detections": [
+            _detection(history, view.observations[number], objects.get(number))
+            for number in record.observations
+        ],
+    }
+
+
+def _objects_of(
+    history: History, observations: Collection[ObservationOrdinal], end: Offset
+) -> dict[int, ObjectOrdinal]:
+    """By observation the object that it is of after ``end`` events."""
+    return {
+        seen.observation: history.object_survivor(each.found.object, end)
+        for each in history.objects
+        for seen in each.sightings
+        if seen.observation in observations and seen.offset < end
+    }
+
+
+def _detection(
+    history: History, seen: ObservationRecord, found: ObjectOrdinal | None
+) -> dict[str, Any]:
+    return {
+        "det_id": seen.det_id,
+        "class_name": seen.class_name,
+        "confidence": seen.confidence,
+        "bbox": list(seen.bbox),
+        "embedding": seen.embedding_crc is not None,
+        "object": found,
+        "object_id": None if found is None else history.objects[found].object_id,
+    }
+
+
+def _ordinal(history: History, query: QueryParams) -> KeyframeOrdinal:
+    number = query.get("number")
+    if number is None:
+        text = text_of(query, "keyframe")
+        run, slash, id_ = text.rpartition("/")
+        return find_keyframe(history, f"{run}:{id_}" if slash else text)
+    if not (number.isascii() and number.isdecimal() and len(number) < 18):
+        raise QuestionError(f"number is {number[:40]!r}; give the row of a keyframe")
+    if int(number) >= len(history.keyframes):
+        raise NoSuchThing("keyframe number", number, [])
+    return KeyframeOrdinal(int(number))
