@@ -134,8 +134,7 @@ def _merge_ref(history: History, number: Any) -> tuple[str, str]:
 
 
 def _keyframe_ref(_: History, name: Any) -> tuple[str, str]:
-    run, _, number = str(name).rpartition(":")
-    return "keyframe", f"{run}/{number}"
+    return "keyframe", "/".join(str(name).rsplit(":", 1))
 
 
 def _place_ref(_: History, name: Any) -> tuple[str, str]:
