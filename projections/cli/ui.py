@@ -1,20 +1,34 @@
 """``mapfold ui``: the web debugger of a log, until a signal."""
 
-import dataclasses
+import functools
 import secrets
 import webbrowser
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 
-from .options import LogArgument, SetOption, SettingsOption, settings_of
+from .options import (
+    ConfigOption,
+    ConnectOption,
+    LogArgument,
+    SetOption,
+    SettingsOption,
+    settings_of,
+    zenoh_options,
+)
 from .signals import stop_on_signals
 from .terminal import say
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from projections.ui.edits import Editor
+    from projections.ui.opened import Opened
 
 
 def ui(
@@ -33,6 +47,24 @@ def ui(
         list[Path] | None,
         typer.Option("--truth", metavar="FILE", help="Score other settings against this truth."),
     ] = None,
+    allow_host: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--allow-host",
+            metavar="NAME",
+            help="Name by which browsers call this machine, beside its addresses; may be repeated.",
+        ),
+    ] = None,
+    db: Annotated[
+        str | None,
+        typer.Option(metavar="URL", help="Show how far the tail of this database is."),
+    ] = None,
+    vector_db: Annotated[
+        str | None,
+        typer.Option("--vector-db", metavar="URL", help="The vectors' one [default: --db]."),
+    ] = None,
+    connect: ConnectOption = None,
+    zenoh_config: ConfigOption = None,
     set_: SetOption = None,
     settings_file: SettingsOption = None,
 ) -> None:
@@ -49,40 +81,75 @@ def ui(
         from projections.serve.listening import bind, is_loopback, serving
         from projections.ui.app import create_app
         from projections.ui.headers import SafeHeaders
+        from projections.ui.token_gate import TokenGate
     except ModuleNotFoundError as error:
         raise MisuseError(
             f"mapfold ui needs {error.name}, which is not installed; pip install 'mapfold[ui]'"
         ) from None
     from projections.evaluate.truth import read_truth
+    from projections.ui.live import LiveWatch
     from projections.ui.opened import Opened
     from projections.ui.service import UiService
 
-    opened = Opened(
-        log,
-        settings,
-        sets=tuple(set_ or ()),
-        settings_file=settings_file,
-        truth=read_truth(truth) if truth else None,
-        edits=allow_edits,
-    )
-
+    scored = read_truth(truth) if truth else None
     with ExitStack() as stack:
-        listener = stack.enter_context(closing(bind(host, port)))
-        stop = stack.enter_context(stop_on_signals())
+        listener = stack.enter_context(closing(bind(host, port, "--host and --port")))
         local = is_loopback(listener)
-        token = None if local and not allow_edits else secrets.token_urlsafe(24)
-        opened = dataclasses.replace(opened, token_needed=not local)
+        stop = stack.enter_context(stop_on_signals())
+        tails = None if db is None and vector_db is None else _tails(stack, log, db, vector_db)
+        opened = Opened(
+            log, settings, tuple(set_ or ()), settings_file, scored, allow_edits, not local
+        )
         service = stack.enter_context(UiService(opened))
-        guarded = SafeHeaders(Guard(create_app(service), None if local else token, (host,)))
+        watch = stack.enter_context(LiveWatch(service, tails))
+        token = None if local and not allow_edits else secrets.token_urlsafe(24)
+        editor = _editor(opened, connect, zenoh_config) if allow_edits else None
+        app = create_app(service, watch, editor)
+        gate = TokenGate(app, token, everything=not local)
+        guarded = SafeHeaders(Guard(gate, hosts=(host, *(allow_host or ()))))
         bound = stack.enter_context(serving(guarded, listener, tell=say))
+        stack.callback(watch.close)  # before the server, which waits for its streams to end
         shown = f"[{host}]" if ":" in host else host
-        url = f"http://{shown}:{bound}/" + ("" if token is None else f"#token={token}")
+        url = f"http://{shown}:{bound}/" + ("" if token is None else f"?token={token}")
+        if not local:
+            say(f"warning: others can reach {host}; who has the link below can read the log")
         say(f"showing {log} at {url}")
         say("Ctrl-C ends it")
         if open_:
             webbrowser.open(url)
         stop.wait()
     say("page closed")
+
+
+def _editor(opened: "Opened", connect: list[str] | None, config: Path | None) -> "Editor":
+    """Records commands, through a recorder where one holds the log."""
+    from eventsrc.transport.session import open_session
+    from projections.ui.edits import Editor
+
+    from .edit_command import user_at_host
+
+    options = zenoh_options(connect, None, config)
+    session = functools.partial(open_session, options, mode=options.mode)
+    return Editor(opened, session, user_at_host())
+
+
+def _tails(
+    stack: ExitStack, log: Path, db: str | None, vector_db: str | None
+) -> "Callable[[], list[dict[str, Any]]]":
+    """What the databases' sinks do, asked anew at each call."""
+    from projections.database.connection import open_targets
+    from projections.database.status import projection_status
+
+    targets = stack.enter_context(open_targets(db, vector_db))
+
+    def ask() -> list[dict[str, Any]]:
+        found = projection_status(log, targets, settings_of(None, None))
+        return [
+            {"sink": s.sink, "condition": s.condition, "lag": s.lag, "note": s.note}
+            for s in found.sinks
+        ]
+
+    return ask
 
 
 def register(app: typer.Typer) -> None:

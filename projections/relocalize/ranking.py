@@ -12,7 +12,7 @@ sum wins; the pose is its centroid.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -80,11 +80,17 @@ class PoseHypothesis:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """``confidence`` is the calibrated probability that the pose is right within 1.5 m."""
+    """``confidence`` is the calibrated probability that the pose is right within 1.5 m.
+
+    ``poses`` are all poses that were weighed, likeliest first: x, y, yaw and weight.
+    """
 
     places: tuple[RankedPlace, ...]
     pose: PoseHypothesis | None
     confidence: float
+    poses: tuple[tuple[float, float, float, float], ...] = field(
+        default=(), compare=False, repr=False
+    )
 
     @property
     def unknown(self) -> bool:
@@ -132,7 +138,9 @@ def _answer(candidates: Candidates, posterior: Posterior | None, top: int) -> An
     if posterior is None:
         return Answer(places, None, 0.0)
     pose = PoseHypothesis(posterior.x, posterior.y, posterior.yaw, posterior.spread_m)
-    return Answer(places, pose, posterior.confidence)
+    rows = zip(posterior.poses.tolist(), posterior.weights.tolist(), strict=True)
+    poses = tuple((x, y, yaw, weight) for (x, y, yaw), weight in rows)
+    return Answer(places, pose, posterior.confidence, poses=poses)
 
 
 def _place_shares(candidates: Candidates, posterior: Posterior) -> dict[PlaceOrdinal, float]:

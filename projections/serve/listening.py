@@ -31,8 +31,8 @@ _AT_ONCE: Final = 32
 answered: with one a turn a newcomer waited four seconds behind a thousand others."""
 
 
-def bind(host: str, port: int) -> socket.socket:
-    """A socket bound to the address, not listening yet. Raises TransportError."""
+def bind(host: str, port: int, option: str = "--http") -> socket.socket:
+    """A socket bound to the address of ``option``, not listening yet. Raises TransportError."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listener = socket.socket(family)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -41,7 +41,7 @@ def bind(host: str, port: int) -> socket.socket:
     except OSError as error:
         listener.close()
         raise TransportError(
-            f"http {host}:{port}: {error.strerror or error}; give --http another"
+            f"http {host}:{port}: {error.strerror or error}; give {option} another"
         ) from None
     return listener
 

@@ -11,7 +11,7 @@ from concurrent.futures import Future
 from typing import Any
 
 from fastapi import FastAPI, Request
-from fastapi.responses import JSONResponse, Response
+from fastapi.responses import JSONResponse, Response, StreamingResponse
 from starlette.exceptions import HTTPException
 
 from eventsrc.errors import MapfoldError
@@ -19,20 +19,27 @@ from eventsrc.text import visible
 
 from .answers import digest_answer, history_answer
 from .comparisons import bisect_answer, conditions_answer, diff_answer, merges_answer
+from .corrections import corrections_answer
+from .edits import MOST_BYTES as MOST_EDIT_BYTES
+from .edits import Editor
+from .live import LiveWatch
+from .localizing import MOST_BYTES, question_answer
 from .log_map import LogMap
-from .requests import assignments_of, refusal
+from .requests import assignments_of, read_body, refusal
 from .search import keyframe_answer, search_answer
 from .service import UiService
 from .static_files import static_files
 from .stories import why_answer
+from .token_gate import EDIT_PATH
 from .whatif_answer import whatif_answer
 
 _BINARY = "application/octet-stream"
 _MAX_SHOWN = 200
 
 
-def create_app(service: UiService) -> FastAPI:
-    """The ASGI application. The caller closes the service."""
+def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = None) -> FastAPI:
+    """The ASGI application. The caller closes the service and the watch. `TokenGate` guards what
+    the ``editor`` may do."""
     app = FastAPI(title="mapfold ui", docs_url=None, redoc_url=None, redirect_slashes=False)
     _add_error_handlers(app)
     files = static_files()
@@ -72,6 +79,7 @@ def create_app(service: UiService) -> FastAPI:
     answers("diff", "What changed from one moment to another", diff_answer)
     answers("bisect", "The event that made a condition true", bisect_answer)
     answers("conditions", "The functions of a condition, its fault", conditions_answer)
+    answers("corrections", "The commands of the log, and what is undone", corrections_answer)
     answers("search", "Things that are called so", search_answer)
     answers("keyframe", "A keyframe and its detections", keyframe_answer)
 
@@ -80,6 +88,31 @@ def create_app(service: UiService) -> FastAPI:
         query = request.query_params
         future = service.ask_apart(lambda end: encoded(whatif_answer(service.opened, end, query)))
         return Response(await asyncio.wrap_future(future), media_type="application/json")
+
+    answers("question", "A mapped keyframe's crops as a question", question_answer)
+
+    @app.post("/api/relocalize", summary="Where a robot is that sees some crops, by the map at W")
+    async def relocalize(request: Request) -> Response:
+        query, payload = request.query_params, await read_body(request, MOST_BYTES)
+        ask = service.localizer.answer
+        future = service.ask_apart(lambda end: encoded(ask(end, query, payload)))
+        return Response(await asyncio.wrap_future(future), media_type="application/json")
+
+    if editor is not None:
+
+        @app.post(EDIT_PATH, summary="Give a command, or see what it would change")
+        async def edit(request: Request) -> Response:
+            payload = await read_body(request, MOST_EDIT_BYTES)
+            future = service.ask_apart(lambda end: editor.answer(end, payload))
+            document = await asyncio.wrap_future(future)
+            if document["recorded"]:
+                await asyncio.wrap_future(service.refresh())
+                document["through"] = service.log_document()["through"]
+            return _json(document)
+
+    @app.get("/api/live", summary="Server-sent events: what is new in the log")
+    async def live() -> Response:
+        return StreamingResponse(watch.stream(), media_type="text/event-stream")
 
     @app.get("/{path:path}", include_in_schema=False)
     async def static(request: Request) -> Response:

@@ -18,6 +18,7 @@ def log_document(opened: Opened, shown: LogMap, *, folded: bool = True) -> dict[
     """JSON. Before the log is ``folded`` it names no runs and no problems."""
     corrections = shown.timeline.corrections() if folded else Corrections()
     settings = shown.timeline.settings if folded else Settings()
+    own = shown.log_events.events
     return {
         "name": shown.reader.path.name,
         "path": str(shown.reader.path),
@@ -34,6 +35,8 @@ def log_document(opened: Opened, shown: LogMap, *, folded: bool = True) -> dict[
         "places_rule": settings.places,
         "edits_allowed": opened.edits,
         "token_needed": opened.token_needed,
+        "losses": sum(each.get("count") or 0 for each in own if each["kind"] == "loss"),
+        "rejected": sum(each["kind"] == "rejected" for each in own),
         "problems": shown.problems if folded else [],
         "memory": memory_document(),
     }

@@ -98,7 +98,7 @@ def keyframe_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
     detections."""
     moment = Moment.of(shown, query)
     history = moment.known.history
-    ordinal = _ordinal(history, query)
+    ordinal = keyframe_of(history, query)
     view = moment.known.latest
     record = view.keyframes[ordinal]
     pose = record.pose
@@ -147,7 +147,9 @@ def _detection(
     }
 
 
-def _ordinal(history: History, query: QueryParams) -> KeyframeOrdinal:
+def keyframe_of(history: History, query: QueryParams) -> KeyframeOrdinal:
+    """The keyframe of ``number``, its row of ``kf_``, or of ``keyframe``, ``RUN/ID``. Raises
+    NoSuchThing."""
     number = query.get("number")
     if number is None:
         text = text_of(query, "keyframe")

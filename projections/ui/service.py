@@ -15,6 +15,7 @@ from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.errors import MapfoldError
 from projections.serve import FairQueue
 
+from .localizing import Localizer
 from .log_document import log_document
 from .log_map import MOST_ALTERNATIVES, LogMap
 from .opened import Opened
@@ -33,6 +34,7 @@ class UiService:
     def __init__(self, opened: Opened) -> None:
         self.opened = opened
         self.loading = Loading()
+        self.localizer = Localizer(opened)
         self._stack = ExitStack()
         self._alternatives: OrderedDict[tuple[str, ...], LogMap] = OrderedDict()
         self._map = self._stack.enter_context(LogMap(opened, progress=self.loading.show))
