@@ -19,6 +19,7 @@ from projections.settings import Settings
 from projections.ui.binary import packed_arrays
 from projections.ui.columns import history_columns
 from projections.ui.log_map import LogMap
+from projections.ui.opened import Opened
 from tests.fixtures_corrections import corrected_walks, write_mixed_log
 from tests.thorough import examples
 from tests.ui_client import ReplayedMap, as_float32, read_arrays, replay
@@ -86,7 +87,7 @@ def test_replayed_arrays_are_the_map(rules: Settings, items: Items, data: st.Dat
 
     with tempfile.TemporaryDirectory() as folder:
         path = write_mixed_log(Path(folder) / "log", items)
-        with LogMap(path, chosen) as shown:
+        with LogMap(Opened(path, chosen)) as shown:
             shown.refresh()
             assert shown.through == len(items)
             header, arrays = answer(shown)

@@ -1,0 +1,243 @@
+"""`mapfold ui` over HTTP against the commands, which are asked as a person would."""
+
+import json
+import random
+import shlex
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.commands import Commands
+from tests.logs import write_log
+from tests.shared_data import ROOT, shared_run
+from tests.thorough import rounds
+from tests.ui_client import read_arrays, replay
+from tests.ui_server import UiServer, showing
+
+WIDE = ("eps_m=1.0", "min_samples=8")
+SETS = [word for text in WIDE for word in ("--set", text)]
+
+
+@pytest.fixture(scope="module")
+def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy: snapshots and effects are kept beside a log."""
+    return Path(
+        shutil.copytree(ROOT / "logs" / "sample", tmp_path_factory.mktemp("sample") / "log")
+    )
+
+
+@pytest.fixture(scope="module")
+def mapfold(tmp_path_factory: pytest.TempPathFactory) -> Commands:
+    return Commands.in_folder(tmp_path_factory.mktemp("mapfold"))
+
+
+@pytest.fixture(scope="module")
+def server(mapfold: Commands, sample: Path) -> Iterator[UiServer]:
+    with showing(mapfold, sample) as started:
+        yield started
+
+
+def run(mapfold: Commands, command: str, *more: str) -> str:
+    """What the command line of an answer prints."""
+    program, *words = shlex.split(command)
+    assert program == "mapfold"
+    return mapfold(*words, *more).out
+
+
+def moments(end: int) -> list[int]:
+    chosen = random.Random(19)
+    return sorted({0, 1, end, *(chosen.randrange(end) for _ in range(rounds(60, 12)))})
+
+
+def check_digests_and_arrays(mapfold: Commands, server: UiServer, log: Path, *sets: str) -> None:
+    """At many W the digest and the replayed arrays are what ``state --at W`` prints."""
+    header, arrays = read_arrays(server.ask("/api/history", set=sets).body)
+    words = [word for text in sets for word in ("--set", text)]
+    for at in moments(header["through"]):
+        answer = server.api("digest", at=at, set=sets)
+        state = mapfold("state", log, "--at", str(at), "--json", *words).json
+        assert answer["digest"] == state["digest"], at
+        found = replay(header, arrays, at)
+        assert [[*k[:2], found.place_ids.get(k[2])] for k in found.keyframes] == [
+            [k["run_id"], k["keyframe_id"], k["place_id"]] for k in state["keyframes"]
+        ]
+        assert {found.place_ids[p]: len(m) for p, m in found.places.items()} == {
+            p["place_id"]: p["keyframe_count"] for p in state["places"]
+        }
+        assert {
+            (o["id"], o["class_name"], o["count"], found.place_ids.get(o["place"]))
+            for o in found.objects.values()
+        } == {
+            (o["object_id"], o["class_name"], o["obs_count"], o["place_id"])
+            for o in state["objects"]
+        }
+        assert {
+            (found.place_ids[a], found.place_ids[b], n) for (a, b), n in found.adjacency.items()
+        } == {(e["a"], e["b"], e["shared_transitions"]) for e in state["adjacency"]}
+
+
+def test_digests_and_arrays_are_those_of_state(
+    mapfold: Commands, server: UiServer, sample: Path
+) -> None:
+    check_digests_and_arrays(mapfold, server, sample)
+
+
+def test_under_other_settings_too(mapfold: Commands, server: UiServer, sample: Path) -> None:
+    check_digests_and_arrays(mapfold, server, sample, *WIDE)
+
+
+def test_on_a_real_house(mapfold: Commands, tmp_path: Path) -> None:
+    house = [json.loads(line) for line in shared_run("house-a")]
+    log = write_log(tmp_path / "log", house)
+    with showing(mapfold, log) as server:
+        check_digests_and_arrays(mapfold, server, log)
+        check_digests_and_arrays(mapfold, server, log, "fusion=evidence")
+
+
+class TestTexts:
+    """``lines`` are what ``command`` prints."""
+
+    def same(self, mapfold: Commands, answer: dict[str, Any]) -> dict[str, Any]:
+        printed = run(mapfold, answer["command"])
+        assert answer["lines"] == printed.splitlines()
+        return answer
+
+    def test_why(self, mapfold: Commands, server: UiServer) -> None:
+        answer = server.api("why", what="place:sim-7-a_p7", set=WIDE)
+        self.same(mapfold, answer)
+        assert answer["steps"][-1]["offset"] == 348
+        refs = answer["steps"][-1]["refs"]
+        assert {"kind": "merge", "id": "348"} in refs
+        assert {"kind": "place", "id": "sim-7-a_p0"} in refs
+        assert {"kind": "keyframe", "id": "sim-7-a/349"} in refs
+        for ref in refs:  # each leads on
+            assert server.api("why", what=f"{ref['kind']}:{ref['id']}", set=WIDE)["lines"]
+        self.same(mapfold, server.api("why", what="object:obj-49730e517b887909", at=349, set=WIDE))
+        pair = {"what": "keyframe:sim-7-a/10", "other": "keyframe:sim-7-a/310"}
+        assert self.same(mapfold, server.api("why", **pair, set=WIDE))["facts"]["since"] == 348
+
+    def test_a_merge_and_its_bridge(self, mapfold: Commands, server: UiServer) -> None:
+        answer = self.same(mapfold, server.api("why", what="merge:348", set=WIDE))
+        (merge,) = answer["merges"]
+        assert merge["eps_m"] == 1.0
+        assert [side["place_id"] for side in merge["sides"]] == ["sim-7-a_p0", "sim-7-a_p7"]
+        assert [side["keyframes"] for side in merge["sides"]] == [32, 101]
+        header, arrays = read_arrays(server.ask("/api/history", set=WIDE).body)
+        names = {p["keyframe"]: p["name"] for p in merge["positions"]}
+        assert [[names[k] for k in chain] for chain in merge["chain_points"]] == [
+            chain["points"] for chain in merge["chains"]
+        ]
+        before, after = (replay(header, arrays, at) for at in (348, 349))
+        first, last = merge["chain_points"][0][0], merge["chain_points"][0][-1]
+        assert before.keyframes[first][2] != before.keyframes[last][2]
+        assert after.keyframes[first][2] == after.keyframes[last][2]
+        assert set(merge["made_core"]) <= set(merge["core"])
+        where = {p["keyframe"]: (p["x"], p["y"]) for p in merge["positions"]}
+        posed = [pose for pose in after.poses if pose is not None]
+        for core in merge["core"]:  # counted by hand
+            x, y = where[core]
+            near = [p for p in posed if (p[0] - x) ** 2 + (p[1] - y) ** 2 <= 1.0 + 1e-5]
+            assert len(near) >= 8
+
+    def test_diff(self, mapfold: Commands, server: UiServer) -> None:
+        answer = server.api("diff", **{"from": 348, "to": 349}, set=WIDE)
+        assert answer["lines"] == run(mapfold, answer["command"], "--all").splitlines()
+        assert answer["places"]["gone"][0]["into"] == "sim-7-a_p0"
+
+    def test_bisect(self, mapfold: Commands, server: UiServer) -> None:
+        condition = "same_place('sim-7-a:10', 'sim-7-a:310')"
+        answer = self.same(mapfold, server.api("bisect", condition=condition, set=WIDE))
+        assert answer["found"]["offset"] == 348
+        scanned = server.api("bisect", condition="place_count() > 6", scan=1, set=WIDE)
+        assert scanned["lines"] == run(mapfold, scanned["command"], "--all").splitlines()
+        assert len(scanned["turns"]) > 1
+
+    def test_a_condition_with_a_fault(self, server: UiServer) -> None:
+        got = server.ask("/api/bisect", condition="size('sim-7-a_p0') >")
+        assert got.status == 400
+        assert got.json["error"]["column"] == 21
+        answer = server.api("conditions", text="size(")
+        assert answer["error"]["column"] == 6
+        assert server.api("conditions", text="place_count() < 3")["error"] is None
+        assert {f["name"] for f in answer["functions"]} >= {"same_place", "size", "located_in"}
+
+    def test_whatif(self, mapfold: Commands, server: UiServer) -> None:
+        answer = server.api("whatif", set="eps_m=0.6", grid=["min_samples=3,8"])
+        assert answer["lines"] == run(mapfold, answer["command"], "--all").splitlines()
+        assert answer["seconds"] > 0
+        assert all(each["fold_seconds"] > 0 for each in answer["alternatives"])
+        for each in answer["alternatives"]:
+            sets = [f"{name}={value}" for name, value in each["set"].items()]
+            assert server.api("digest", set=sets)["digest"] == each["digest"]
+
+    def test_relocalize(self, mapfold: Commands, server: UiServer) -> None:
+        seen = [server.api("keyframe", number=number) for number in range(400, 445)]
+        number = max(seen, key=lambda k: len(k["detections"]))["number"]
+        question = server.api("question", number=number)
+        assert len(question["question"]["crops"]) > 1
+        assert "pose" not in json.dumps(question["question"])
+        body = json.dumps(question["question"]).encode()
+        answer = server.ask("/api/relocalize?at=400", method="POST", body=body).json
+        (mapfold.folder / "question.json").write_bytes(body)
+        printed = json.loads(run(mapfold, answer["command"], "--json"))
+        assert {name: answer[name] for name in printed} == printed
+        assert len(answer["crops"]) == len(question["question"]["crops"])
+        whole = server.ask("/api/relocalize", method="POST", body=body).json
+        x, y, _ = question["truth"]  # the map has the very picture
+        pose = whole["pose"]
+        assert (pose["x"] - x) ** 2 + (pose["y"] - y) ** 2 < 1.5**2
+        assert sum(weight for *_, weight in whole["poses"]) == pytest.approx(1.0)
+
+
+def test_search(server: UiServer) -> None:
+    found = server.api("search", q="p3", set=WIDE)["found"]
+    assert [each["id"] for each in found] == ["sim-7-a_p3"]
+    chairs = server.api("search", q="Chair")["found"]
+    assert {each["text"] for each in chairs[:3]} == {"chair"}
+    (keyframe,) = server.api("search", q="sim-7-a:310", kind="keyframe")["found"]
+    assert (keyframe["id"], keyframe["number"]) == ("sim-7-a/310", 309)
+    assert server.api("search", q="sim-7-a_kf310_d0")["found"][0]["kind"] == "detection"
+    shown = server.api("keyframe", number=309)
+    assert shown == server.api("keyframe", keyframe="sim-7-a/310")
+    assert [each["det_id"] for each in shown["detections"]] == ["sim-7-a_kf310_d0"]
+    assert server.api("search", q="no such thing")["found"] == []
+
+
+@pytest.mark.parametrize(
+    ("path", "status", "kind", "said"),
+    [
+        ("digest?at=446", 400, "bad_question", "446"),
+        ("digest?at=tomorrow", 400, "bad_question", "tomorrow"),
+        ("digest?at=-1", 400, "bad_question", "-1"),
+        ("digest?set=eps=1", 400, "bad_settings", "no setting 'eps'"),
+        ("digest?eps_m=nan", 400, "bad_settings", "eps_m"),
+        ("history?from=x", 400, "bad_question", "from is 'x'"),
+        ("why", 400, "bad_question", "what is missing"),
+        ("why?what=chair:1", 400, "bad_question", "chair:1"),
+        ("why?what=place:sim-7-a_p99", 404, "not_found", "sim-7-a_p0"),
+        ("why?what=merge:5", 404, "not_found", "5"),
+        ("why?what=merge:x", 400, "bad_question", "merge:x"),
+        ("why?what=keyframe:sim-7-a/9999", 404, "not_found", "near it: sim-7-a:445"),
+        ("keyframe?number=445", 404, "not_found", "445"),
+        ("whatif", 400, "bad_question", "nothing to try"),
+        ("whatif?without=nothing", 404, "not_found", "no command"),
+        ("diff?from=1", 400, "bad_question", "to is missing"),
+        ("nothing", 404, "bad_question", "/api/nothing"),
+    ],
+)
+def test_a_wrong_question_gets_a_sentence(
+    server: UiServer, path: str, status: int, kind: str, said: str
+) -> None:
+    got = server.ask(f"/api/{path}")
+    assert got.error[:2] == (status, kind)
+    assert said in got.error[2]
+
+
+def test_the_schema_names_every_question(server: UiServer) -> None:
+    paths = json.loads(server.ask("/openapi.json").body)["paths"]
+    page = (ROOT / "docs" / "ui.md").read_text("utf-8")
+    for path in paths:
+        assert f"{path}" in page, path

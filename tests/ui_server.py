@@ -1,0 +1,140 @@
+"""``mapfold ui`` in a process of its own, and what it answers."""
+
+import http.client
+import json
+import os
+import re
+import signal
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlencode
+
+from tests.commands import Commands
+
+WAIT_S = 60.0
+
+
+@dataclass(frozen=True)
+class Answered:
+    """A status, headers in lower case, and the body."""
+
+    status: int
+    headers: Mapping[str, str]
+    body: bytes
+
+    @property
+    def json(self) -> Any:
+        """The body as JSON, of UTF-8."""
+        return json.loads(self.body.decode("utf-8"))
+
+    @property
+    def error(self) -> tuple[int, str, str]:
+        """Status, kind and message of a refusal."""
+        error = self.json["error"]
+        return self.status, error["kind"], error["message"]
+
+
+class UiServer:
+    """A running server; what it says to people is in ``said``."""
+
+    def __init__(self, mapfold: Commands, *args: str | Path) -> None:
+        read, write = os.pipe()
+        self.program = mapfold.start("ui", *args, stderr=write)
+        os.close(write)
+        self._stderr = os.fdopen(read)
+        self.said: list[str] = []
+        self._ready = threading.Event()
+        self._reader = threading.Thread(target=self._read)
+        self._reader.start()
+        assert self._ready.wait(WAIT_S), self.text
+        found = re.search(r"showing .* at http://(\S+?):(\d+)/(?:\?token=(\S+))?", self.text)
+        assert found, self.text
+        self.host, self.port, self.token = found[1], int(found[2]), found[3]
+
+    @property
+    def text(self) -> str:
+        """What it has said to people."""
+        return "\n".join(self.said)
+
+    def _read(self) -> None:
+        with self._stderr:
+            for line in self._stderr:
+                self.said.append(line.rstrip("\n"))
+                if "Ctrl-C" in line:
+                    self._ready.set()
+        self._ready.set()
+
+    def ask(
+        self,
+        path: str,
+        *,
+        method: str = "GET",
+        body: bytes | None = None,
+        headers: Mapping[str, str] | None = None,
+        **query: Any,
+    ) -> Answered:
+        """One request on a connection of its own."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=WAIT_S)
+        target = f"{path}?{urlencode(query, doseq=True)}" if query else path
+        try:
+            connection.request(method, target, body, dict(headers or {}))
+            got = connection.getresponse()
+            found = {name.lower(): value for name, value in got.getheaders()}
+            return Answered(got.status, found, got.read())
+        finally:
+            connection.close()
+
+    def api(self, path: str, **query: Any) -> Any:
+        """The JSON of a question that must be answered."""
+        got = self.ask(f"/api/{path}", **query)
+        assert got.status == 200, got.body
+        return got.json
+
+    def edit(self, kind: str, *arguments: str, **more: Any) -> Answered:
+        """An edit with the token."""
+        body = json.dumps({"kind": kind, "arguments": arguments, **more}).encode()
+        bearer = {"Authorization": f"Bearer {self.token}"}
+        return self.ask("/api/edit", method="POST", body=body, headers=bearer)
+
+    @contextmanager
+    def live(self) -> Iterator[Iterator[dict[str, Any]]]:
+        """The events of ``/api/live``, as they come."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=WAIT_S)
+        try:
+            connection.request("GET", "/api/live")
+            got = connection.getresponse()
+            assert got.status == 200
+            assert got.getheader("content-type", "").startswith("text/event-stream")
+            yield (
+                json.loads(line.removeprefix(b"data: "))
+                for line in iter(got.readline, b"")
+                if line.startswith(b"data: ")
+            )
+        finally:
+            connection.close()
+
+    def end(self) -> int:
+        """SIGTERM; its exit code."""
+        self.program.send_signal(signal.SIGTERM)
+        try:
+            return self.program.wait(WAIT_S)
+        finally:
+            self.program.kill()
+            self._reader.join()
+
+
+@contextmanager
+def showing(mapfold: Commands, *args: str | Path) -> Iterator[UiServer]:
+    """A server that must end well and without a traceback."""
+    server = UiServer(mapfold, *args)
+    try:
+        yield server
+    finally:
+        code = server.end()
+    assert "Traceback" not in server.text, server.text
+    assert code == 0, server.text
+    assert server.said[-1] == "page closed"
