@@ -17,7 +17,7 @@ _KIB: Final = 1 if sys.platform == "darwin" else 1024
 def log_document(opened: Opened, shown: LogMap, *, folded: bool = True) -> dict[str, Any]:
     """JSON. Before the log is ``folded`` it names no runs and no problems."""
     corrections = shown.timeline.corrections() if folded else Corrections()
-    settings = shown.timeline.settings if folded else Settings()
+    settings = opened.settings(corrections)
     own = shown.log_events.events
     return {
         "name": shown.reader.path.name,
