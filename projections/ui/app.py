@@ -7,12 +7,12 @@ of `UiService` answer them.
 import asyncio
 import json
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future
 from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse, Response, StreamingResponse
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from eventsrc.errors import MapfoldError
 from eventsrc.text import visible
@@ -55,8 +55,8 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
         def work(shown: LogMap, refold_s: float) -> bytes:
             return history_answer(shown, query, refold_s)
 
-        future = service.ask(assignments_of(query), work)
-        return Response(await asyncio.wrap_future(future), media_type=_BINARY)
+        content = await _answer(service, request, work)
+        return Response(content, media_type=_BINARY)
 
     def answers(path: str, summary: str, answer: Callable[..., dict[str, Any]]) -> None:
         """Add a question about the map that is answered with a document."""
@@ -70,8 +70,8 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
                 more = {"refold_ms": round(refold_s * 1e3, 1)} if assignments_of(query) else {}
                 return encoded({"through": shown.through, **document, **more})
 
-            future: Future[bytes] = service.ask(assignments_of(query), work)
-            return Response(await asyncio.wrap_future(future), media_type="application/json")
+            content = await _answer(service, request, work)
+            return Response(content, media_type="application/json")
 
     answers("digest", "The digest of the map at W", digest_answer)
     answers("why", "Why a place, object or keyframe is what it is; why places merged", why_answer)
@@ -127,6 +127,30 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
     return app
 
 
+async def _answer(
+    service: UiService, request: Request, work: Callable[[LogMap, float], bytes]
+) -> bytes:
+    """The answer of ``work`` under the settings of the request. When the page leaves, work that has
+    not begun is dropped and a fold under other settings is given up."""
+    left = False
+    future = service.ask(assignments_of(request.query_params), work, lambda: not left)
+    answered = asyncio.ensure_future(asyncio.wrap_future(future))
+    leaving = asyncio.ensure_future(_disconnect(request))
+    await asyncio.wait((answered, leaving), return_when=asyncio.FIRST_COMPLETED)
+    left = not answered.done()
+    leaving.cancel()
+    if left:
+        answered.cancel()
+        raise ClientDisconnect
+    return answered.result()
+
+
+async def _disconnect(request: Request) -> None:
+    """Return when the client is gone."""
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
+
+
 def encoded(document: Mapping[str, Any]) -> bytes:
     """Compact UTF-8 JSON; text from logs stays text, whatever it is."""
     return json.dumps(document, ensure_ascii=False, allow_nan=False).encode("utf-8", "replace")
@@ -149,6 +173,10 @@ def _add_error_handlers(app: FastAPI) -> None:
         asked = visible(f"{request.method} {request.scope['path']}"[:_MAX_SHOWN])
         document = {"error": {"kind": "bad_question", "message": f"{asked}: {error.detail}"}}
         return JSONResponse(document, error.status_code, headers=error.headers)
+
+    @app.exception_handler(ClientDisconnect)
+    async def disconnected(_: Request, __: ClientDisconnect) -> Response:
+        return Response(status_code=400)
 
     @app.exception_handler(Exception)
     async def failed(_: Request, __: Exception) -> Response:  # uvicorn logs the exception

@@ -54,6 +54,8 @@ class LogMap:
         )
         self.log_events = LogEvents()
         self.log_id = self.reader.log_id
+        self.packed: tuple[object, bytes] | None = None
+        """The last whole history as an answer, and what it is of."""
         self._stopped: str | None = None
         self._lost: str | None = None
 

@@ -147,9 +147,11 @@ class _State:
         x = y = xx = xy = yy = nan
         if (at := self._estimate) is not None:
             x, y = at.x_um / UM_PER_M, at.y_um / UM_PER_M
-            xx, xy, yy = (v / _UM2_PER_M2 for v in (at.var_xx_um2, at.var_xy_um2, at.var_yy_um2))
+            xx, xy = at.var_xx_um2 / _UM2_PER_M2, at.var_xy_um2 / _UM2_PER_M2
+            yy = at.var_yy_um2 / _UM2_PER_M2
         elif values is not None:
-            x, y = (mean_m(s, values.obs_count) for s in (values.sum_x_um, values.sum_y_um))
+            x = mean_m(values.sum_x_um, values.obs_count)
+            y = mean_m(values.sum_y_um, values.obs_count)
         count = 0 if values is None else values.obs_count
         missing = self._missing and self._moved_at <= self._missing_at
         return ObjectRow(

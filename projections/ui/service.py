@@ -28,6 +28,10 @@ _MAX_WAIT_S: Final = 900.0
 _PEER: Final = "page"
 
 
+class GivenUp(MapfoldError):
+    """A fold was given up because the page asked for something else."""
+
+
 class UiService:
     """Opens a log and answers about it; use it in a ``with`` block. Raises LogError."""
 
@@ -40,6 +44,7 @@ class UiService:
         self._map = self._stack.enter_context(LogMap(opened, progress=self.loading.show))
         self._document = log_document(self.opened, self._map, folded=False)
         self._through = FIRST_OFFSET
+        self._wanted: Callable[[], bool] = lambda: True
         self._own = self._stack.enter_context(FairQueue(1, max_wait_s=_MAX_WAIT_S))
         self._others = self._stack.enter_context(FairQueue(1, max_wait_s=_MAX_WAIT_S))
         self._loaded = self._own.submit(_PEER, self._load)
@@ -56,13 +61,19 @@ class UiService:
         """What ``/api/log`` answers, at once: as of the last refresh."""
         return self._document | {"loading": self.loading.document()}
 
-    def ask(self, sets: Sequence[str], work: Callable[[LogMap, float], Result]) -> "Future[Result]":
+    def ask(
+        self,
+        sets: Sequence[str],
+        work: Callable[[LogMap, float], Result],
+        wanted: Callable[[], bool] = lambda: True,
+    ) -> "Future[Result]":
         """``work`` with the map under the log's settings, changed by ``sets``, and the seconds that
-        folding it took just now."""
+        folding it took just now. A fold under other settings is given up, to be continued when it
+        is asked for again, once the answer is not ``wanted`` any more."""
         key = tuple(sets)
         if not key:
             return self._own.submit(_PEER, lambda: work(self._map, 0.0))
-        return self._others.submit(_PEER, lambda: work(*self._alternative(key)))
+        return self._others.submit(_PEER, lambda: work(*self._alternative(key, wanted)))
 
     def ask_apart(self, work: Callable[[Offset], Result]) -> "Future[Result]":
         """``work`` that reads the log itself and takes long, with the number of events that answers
@@ -95,15 +106,24 @@ class UiService:
             raise
         return changed
 
-    def _alternative(self, sets: tuple[str, ...]) -> tuple[LogMap, float]:
+    def _alternative(
+        self, sets: tuple[str, ...], wanted: Callable[[], bool]
+    ) -> tuple[LogMap, float]:
         """The map under other settings, as far as the log's own map is."""
         self._loaded.result()
         started = perf_counter()
         found = self._alternatives.pop(sets, None)
         if found is None:
-            found = LogMap(self.opened, sets, histories=1)
+            found = LogMap(self.opened, sets, progress=self._go_on, histories=1)
         self._alternatives[sets] = found
         while len(self._alternatives) > MOST_ALTERNATIVES:
             self._alternatives.popitem(last=False)[1].reader.close()
+        self._wanted = wanted
+        self._go_on(0, 0)
         found.refresh(self._through)
         return found, perf_counter() - started
+
+    def _go_on(self, _folded: int, _events: int) -> None:
+        """Called while a map under other settings is folded."""
+        if not self._wanted():
+            raise GivenUp("nobody waits for the answer any more")
