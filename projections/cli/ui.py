@@ -74,6 +74,8 @@ def ui(
     settings. Only this machine can connect unless --host says otherwise. Ctrl-C ends it.
     """
     settings = settings_of(settings_file, set_)
+    if vector_db is not None and db is None:
+        raise MisuseError("--vector-db is for the lag of the tails; give --db URL too")
     with LogReader(log):  # a log that cannot be opened is an error before anything is served
         pass
     try:
@@ -96,9 +98,16 @@ def ui(
         listener = stack.enter_context(closing(bind(host, port, "--host and --port")))
         local = is_loopback(listener)
         stop = stack.enter_context(stop_on_signals())
-        tails = None if db is None and vector_db is None else _tails(stack, log, db, vector_db)
+        tails = None if db is None else _tails(stack, log, db, vector_db)
         opened = Opened(
-            log, settings, tuple(set_ or ()), settings_file, scored, allow_edits, not local
+            log,
+            settings,
+            sets=tuple(set_ or ()),
+            settings_file=settings_file,
+            truth_files=tuple(truth or ()),
+            truth=scored,
+            edits=allow_edits,
+            token_needed=not local,
         )
         service = stack.enter_context(UiService(opened))
         watch = stack.enter_context(LiveWatch(service, tails))
@@ -134,7 +143,7 @@ def _editor(opened: "Opened", connect: list[str] | None, config: Path | None) ->
 
 
 def _tails(
-    stack: ExitStack, log: Path, db: str | None, vector_db: str | None
+    stack: ExitStack, log: Path, db: str, vector_db: str | None
 ) -> "Callable[[], list[dict[str, Any]]]":
     """What the databases' sinks do, asked anew at each call."""
     from projections.database.connection import open_targets

@@ -20,6 +20,7 @@ from eventsrc.text import visible
 from .answers import digest_answer, history_answer
 from .comparisons import bisect_answer, conditions_answer, diff_answer, merges_answer
 from .corrections import corrections_answer
+from .docs_page import docs_page
 from .edits import MOST_BYTES as MOST_EDIT_BYTES
 from .edits import Editor
 from .live import LiveWatch
@@ -113,6 +114,10 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
     @app.get("/api/live", summary="Server-sent events: what is new in the log")
     async def live() -> Response:
         return StreamingResponse(watch.stream(), media_type="text/event-stream")
+
+    @app.get("/docs", include_in_schema=False)
+    async def docs() -> Response:
+        return Response(docs_page(app.openapi()), media_type="text/html")
 
     @app.get("/{path:path}", include_in_schema=False)
     async def static(request: Request) -> Response:

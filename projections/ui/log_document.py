@@ -38,7 +38,6 @@ def log_document(opened: Opened, shown: LogMap, *, folded: bool = True) -> dict[
         "losses": sum(each.get("count") or 0 for each in own if each["kind"] == "loss"),
         "rejected": sum(each["kind"] == "rejected" for each in own),
         "problems": shown.problems if folded else [],
-        "memory": memory_document(),
     }
 
 

@@ -12,14 +12,15 @@ class Opened:
     """A log and how it is looked at.
 
     ``settings`` gives those of the map under some corrections: of ``settings_file`` or the log,
-    changed by ``sets`` (``name=value``). ``truth`` scores what-ifs. ``edits``: the log may be
-    changed. ``token_needed``: every question needs the token.
+    changed by ``sets`` (``name=value``). ``truth``, of ``truth_files``, scores what-ifs. ``edits``:
+    the log may be changed. ``token_needed``: every question needs the token.
     """
 
     log: Path
     settings: SettingsChoice
     sets: tuple[str, ...] = ()
     settings_file: Path | None = None
+    truth_files: tuple[Path, ...] = ()
     truth: Truth | None = None
     edits: bool = False
     token_needed: bool = False
@@ -32,4 +33,5 @@ class Opened:
     def base_words(self) -> list[str]:
         """The options that give ``mapfold whatif`` the same base."""
         words = [] if self.settings_file is None else ["--settings", str(self.settings_file)]
-        return words + (["--base", " ".join(self.sets)] if self.sets else [])
+        words += ["--base", " ".join(self.sets)] if self.sets else []
+        return words + [word for file in self.truth_files for word in ("--truth", str(file))]

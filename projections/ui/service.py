@@ -16,7 +16,7 @@ from eventsrc.errors import MapfoldError
 from projections.serve import FairQueue
 
 from .localizing import Localizer
-from .log_document import log_document
+from .log_document import log_document, memory_document
 from .log_map import MOST_ALTERNATIVES, LogMap
 from .opened import Opened
 from .progress import Loading
@@ -59,7 +59,8 @@ class UiService:
 
     def log_document(self) -> dict[str, Any]:
         """What ``/api/log`` answers, at once: as of the last refresh."""
-        return self._document | {"loading": self.loading.document()}
+        now = {"memory": memory_document(), "loading": self.loading.document()}
+        return self._document | now
 
     def ask(
         self,

@@ -1,6 +1,7 @@
 """`mapfold ui` on a log that grows, is corrected, is damaged or vanishes."""
 
 import json
+import shlex
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -351,6 +352,18 @@ def test_settings_of_the_command_line(mapfold: Commands, tmp_path: Path) -> None
         whatif = server.api("whatif", set="min_samples=3")
         assert whatif["base"]["digest"] == answer["digest"]
         assert "--base eps_m=0.9" in whatif["command"]
+
+
+def test_truth_scores_other_settings(mapfold: Commands, tmp_path: Path) -> None:
+    log, run = tmp_path / "log", tmp_path / "run.jsonl"
+    mapfold("simulate", "--out", run)
+    mapfold("import", log, run)
+    with showing(mapfold, log, "--truth", tmp_path / "run.truth.jsonl") as server:
+        answer = server.api("whatif", set=["eps_m=0.6", "min_samples=8"])
+        (alternative,) = answer["alternatives"]
+        assert 0.8 < alternative["truth"]["places"]["v_measure"] < 0.9
+        words = shlex.split(answer["command"])[1:]
+        assert mapfold(*words, "--all").out.splitlines() == answer["lines"]
 
 
 def test_a_correction_of_the_log_is_marked(mapfold: Commands, tmp_path: Path) -> None:
