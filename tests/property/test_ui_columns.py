@@ -12,17 +12,21 @@ from hypothesis import strategies as st
 from eventsrc.commands import Command
 from eventsrc.log import LogReader
 from projections.corrections import Corrections
-from projections.model.fold import fold_log
+from projections.deltas import ObjectMissing, ObjectRelocated
+from projections.model.fold import fold_events, fold_log
 from projections.model.log_commands import read_corrections
 from projections.model.view import MapView
+from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 from projections.ui.binary import packed_arrays
 from projections.ui.columns import history_columns
 from projections.ui.log_map import LogMap
 from projections.ui.opened import Opened
 from tests.fixtures_corrections import corrected_walks, write_mixed_log
+from tests.logs import write_log
 from tests.thorough import examples
 from tests.ui_client import ReplayedMap, as_float32, read_arrays, replay
+from tests.unit.test_moved_things import ROOM, run
 
 PAGE = Settings(eps_m=0.7, min_samples=3, fusion_radius_m=1.0)
 EVIDENCE = PAGE.with_assignments(["fusion=evidence"])
@@ -106,6 +110,32 @@ def test_replayed_arrays_are_the_map(rules: Settings, items: Items, data: st.Dat
                 whole = header["strings"][kind]
                 assert whole[:known] + later_header["strings"][kind] == whole
             assert later_header["strings"]["class"] == header["strings"]["class"]
+
+
+def test_things_that_go_missing_and_move(tmp_path: Path) -> None:
+    """At many W of a log in which things are carried away and come back."""
+    moved = {**ROOM, "chair": (5.0, 1.6)}
+    gone = {name: where for name, where in ROOM.items() if name != "plant"}
+    rooms = {"run-a": ROOM, "run-b": moved, "run-c": gone, "run-d": ROOM}
+    documents = [each for name, room in rooms.items() for each in run(name, room)]
+    path = write_log(tmp_path / "log", documents)
+    rules = Settings(fusion="evidence")
+    with LogMap(Opened(path, lambda _: rules)) as shown, LogReader(path) as reader:
+        shown.refresh()
+        header, arrays = answer(shown)
+        view = MapView(rules, keep_embeddings=False)
+        missing = located = 0
+        for folded_event in fold_events(reader.read(), SemanticMap(rules)):
+            view.apply_event(folded_event.offset, folded_event.deltas)
+            kinds = {type(delta) for delta in folded_event.deltas}
+            if kinds & {ObjectMissing, ObjectRelocated} or folded_event.offset % 50 == 0:
+                check_same(replay(header, arrays, view.next_offset), view)
+                missing += any(o.missing_in is not None for o in view.objects.values())
+                located += ObjectRelocated in kinds
+        assert missing
+        assert located
+        kinds = {header["kinds"][kind] for kind in arrays["ev_kind"]}
+        assert {"object_missing", "object_moved", "run_began"} <= kinds
 
 
 def rows(arrays: dict[str, list[Any]], name: str, split: int) -> list[Any]:
