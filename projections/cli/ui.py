@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from projections.ui.edits import Editor
-    from projections.ui.opened import Opened
+    from projections.ui.service import UiService
 
 
 def ui(
@@ -112,7 +112,7 @@ def ui(
         service = stack.enter_context(UiService(opened))
         watch = stack.enter_context(LiveWatch(service, tails))
         token = None if local and not allow_edits else secrets.token_urlsafe(24)
-        editor = _editor(opened, connect, zenoh_config) if allow_edits else None
+        editor = _editor(service, connect, zenoh_config) if allow_edits else None
         app = create_app(service, watch, editor)
         gate = TokenGate(app, token, everything=not local)
         guarded = SafeHeaders(Guard(gate, hosts=(host, *(allow_host or ()))))
@@ -130,7 +130,7 @@ def ui(
     say("page closed")
 
 
-def _editor(opened: "Opened", connect: list[str] | None, config: Path | None) -> "Editor":
+def _editor(service: "UiService", connect: list[str] | None, config: Path | None) -> "Editor":
     """Records commands, through a recorder where one holds the log."""
     from eventsrc.transport.session import open_session
     from projections.ui.edits import Editor
@@ -139,7 +139,7 @@ def _editor(opened: "Opened", connect: list[str] | None, config: Path | None) ->
 
     options = zenoh_options(connect, None, config)
     session = functools.partial(open_session, options, mode=options.mode)
-    return Editor(opened, session, user_at_host())
+    return Editor(service.opened, service.log_id, session, user_at_host())
 
 
 def _tails(

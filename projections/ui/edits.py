@@ -12,11 +12,13 @@ from typing import Annotated, Any, Final
 
 from pydantic import BaseModel, ConfigDict, Field, StrictStr, ValidationError
 
+from eventsrc.commands import Command
 from eventsrc.envelope import describe_error
-from eventsrc.errors import MisuseError
+from eventsrc.errors import LogError, MisuseError
 from eventsrc.text import counted
 from projections.edit import make
 from projections.edit.correct_poses import Span, by_transform
+from projections.edit.current import CurrentMap
 from projections.edit.effect import EffectCache
 from projections.edit.make import Stamp
 from projections.edit.outcome import void_text
@@ -123,15 +125,18 @@ def edit_kinds() -> list[dict[str, Any]]:
 class Editor:
     """Makes and records commands. Not for several threads at once."""
 
-    def __init__(self, opened: Opened, open_session: OpenSession, issued_by: str) -> None:
-        self._opened, self._open_session, self._issued_by = opened, open_session, issued_by
+    def __init__(
+        self, opened: Opened, log_id: str, open_session: OpenSession, issued_by: str
+    ) -> None:
+        self._opened, self._log_id = opened, log_id
+        self._open_session, self._issued_by = open_session, issued_by
 
     def answer(self, through: int, payload: bytes) -> dict[str, Any]:
         """What the command would change, or did."""
         asked = _read(payload)
         if asked.kind not in KINDS:
             raise QuestionError(f"no edit {asked.kind[:40]!r}; there are {', '.join(KINDS)}")
-        make_ = KINDS[asked.kind].command(asked.kind, asked.arguments)
+        make_ = self._checked(KINDS[asked.kind].command(asked.kind, asked.arguments))
         if not asked.reason.strip() and not asked.dry_run:
             raise MisuseError("the reason is missing: say why, for whoever reads the log later")
         stamp = Stamp(asked.command_id or uuid.uuid4().hex, self._issued_by, asked.reason)
@@ -147,6 +152,16 @@ class Editor:
         if effect is not None and made.offset == made.current.end:
             EffectCache(made.current).put(made.outcome.change, effect)
         return self._document(through, asked, made, notes)
+
+    def _checked(self, make_: MakeCommand) -> MakeCommand:
+        """``make_``, which refuses another log than the one that the page shows."""
+
+        def checked(current: CurrentMap, stamp: Stamp) -> Command:
+            if current.reader.log_id != self._log_id:
+                raise LogError(f"there is another log at {self._opened.log} now")
+            return make_(current, stamp)
+
+        return checked
 
     def _document(self, through: int, asked: Edit, made: Made, notes: list[str]) -> dict[str, Any]:
         outcome = made.outcome

@@ -7,10 +7,13 @@ several threads at once.
 
 import hashlib
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Final
 
 from eventsrc.envelope import Offset
-from eventsrc.errors import LogDamaged, LogError, MapfoldError
+from eventsrc.errors import LogDamaged, LogError, LogNotFound, MapfoldError
+from eventsrc.log import LogReader
+from eventsrc.log.format import list_growing
 from eventsrc.log.seek import resolve
 from eventsrc.text import counted
 from projections.corrections import Corrections, map_fingerprint
@@ -56,6 +59,7 @@ class LogMap:
         self.log_id = self.reader.log_id
         self.packed: tuple[object, bytes] | None = None
         """The last whole history as an answer, and what it is of."""
+        self._files = _files(opened.log)
         self._stopped: str | None = None
         self._lost: str | None = None
 
@@ -69,6 +73,11 @@ class LogMap:
     def through(self) -> Offset:
         """The number of events that every answer covers."""
         return self.timeline.end
+
+    @property
+    def lost(self) -> str | None:
+        """Why the log cannot be read any more, as far as it was; None if it can."""
+        return self._lost
 
     @property
     def problems(self) -> list[str]:
@@ -107,6 +116,7 @@ class LogMap:
         self._lost = None
         try:
             if end is None:
+                self._check_same()
                 self.reader.check_end()
             self.timeline.refresh()
         except LogError as error:
@@ -117,6 +127,26 @@ class LogMap:
     def point(self, text: str, note: Callable[[str], None] | None = None) -> Offset:
         """The number of events that W means, as for ``--at``."""
         return resolve(self.reader, text, note=note)
+
+    def _check_same(self) -> None:
+        """Raises LogError if there is no log any more where it was, or another one."""
+        path, files = self.reader.path, _files(self.reader.path)
+        if files == self._files:
+            return
+        if not path.exists():
+            raise LogNotFound(f"the log at {path} is gone; this page shows what was read before")
+        with LogReader(path) as reader:
+            if reader.log_id != self.log_id:
+                raise LogError(
+                    f"there is another log at {path} now; this page shows the one that was there."
+                    " Start mapfold ui again"
+                )
+            if reader.next_offset < self.through:
+                raise LogError(
+                    f"the log at {path} has {counted(reader.next_offset, 'event')} now, fewer than"
+                    f" the {self.through} that this page shows. Start mapfold ui again"
+                )
+        self._files = files
 
     def _fold(self) -> None:
         """Fold to the end, or to where that is not possible."""
@@ -139,3 +169,12 @@ class LogMap:
         self.reader.limit = offset
         self._stopped = f"{error}. The map shown ends before it, after {counted(offset, 'event')}"
         self.timeline.refresh()
+
+
+def _files(path: Path) -> tuple[int, ...]:
+    """Tells another folder, or another last segment, from those that were there."""
+    try:
+        status = [path.stat(), *(entry.path.stat() for entry in list_growing(path)[-1:])]
+    except OSError:
+        return ()
+    return tuple(number for each in status for number in (each.st_dev, each.st_ino))

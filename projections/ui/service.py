@@ -12,7 +12,7 @@ from time import perf_counter
 from typing import Any, Final, Self, TypeVar
 
 from eventsrc.envelope import FIRST_OFFSET, Offset
-from eventsrc.errors import MapfoldError
+from eventsrc.errors import LogError, MapfoldError
 from projections.serve import FairQueue
 
 from .localizing import Localizer
@@ -57,6 +57,11 @@ class UiService:
         for each in self._alternatives.values():
             each.reader.close()
 
+    @property
+    def log_id(self) -> str:
+        """The log's id."""
+        return self._map.log_id
+
     def log_document(self) -> dict[str, Any]:
         """What ``/api/log`` answers, at once: as of the last refresh."""
         now = {"memory": memory_document(), "loading": self.loading.document()}
@@ -82,6 +87,8 @@ class UiService:
 
         def asked() -> Result:
             self._loaded.result()
+            if self._map.lost is not None:
+                raise LogError(self._map.lost)
             return work(self._through)
 
         return self._others.submit(_PEER, asked)

@@ -327,8 +327,38 @@ class TestProblems:
             assert server.api("digest", at=7)["at"] == 7
             got = server.ask("/api/whatif", set="eps_m=1")
             assert got.error[1] == "log"
-            write_log(log, walk(20))  # another log in its place
-            assert server.ask("/api/log").status == 200
+
+    @pytest.mark.parametrize("events", [3, 20, 40])
+    def test_another_log_in_its_place(self, mapfold: Commands, tmp_path: Path, events: int) -> None:
+        log = write_log(tmp_path / "log", walk(20))
+        before = digest(mapfold, log)
+        with showing(mapfold, log, "--allow-edits") as server, server.live() as heard:
+            until(heard, lambda d: d["through"] == 20)
+            shutil.rmtree(log)
+            write_log(log, walk(events, seed=9, run_id="other"))
+            told = until(heard, lambda d: "another log" in " ".join(d["problems"]))
+            assert told["through"] == 20
+            assert server.api("digest")["digest"] == before
+            for got in (
+                server.edit("forget-run", "other", reason="x", dry_run=False),
+                server.ask("/api/whatif", set="eps_m=1"),
+            ):
+                assert got.error[1] == "log"
+        assert mapfold("edits", log, "--json").json == []
+
+    def test_a_log_that_was_put_back_to_an_older_state(
+        self, mapfold: Commands, tmp_path: Path
+    ) -> None:
+        log = write_log(tmp_path / "log", walk(20))
+        older = shutil.copytree(log, tmp_path / "older")
+        write_log(log, walk(10, first=20))
+        with showing(mapfold, log) as server, server.live() as heard:
+            until(heard, lambda d: d["through"] == 30)
+            shutil.rmtree(log)
+            older.rename(log)
+            told = until(heard, lambda d: d["problems"])
+            assert "has 20 events now, fewer than the 30" in " ".join(told["problems"])
+            assert server.api("digest")["at"] == 30
 
     def test_no_log_is_an_error_of_the_command(self, mapfold: Commands, tmp_path: Path) -> None:
         assert "no log at" in mapfold("ui", tmp_path / "none", code=2).err
