@@ -1,0 +1,39 @@
+/** The answers of the server that the page reads; docs/ui.md has them in full. */
+
+export interface LogInfo {
+  name: string;
+  path?: string;
+  log_id: string;
+  events: number;
+  through: number;
+  state?: string;
+  runs: { run_id: string; first_offset: number; keyframes: number }[];
+  settings: Record<string, unknown>;
+  changed_settings?: Record<string, unknown>;
+  fingerprint: string;
+  fusion: string;
+  places_rule: string;
+  edits_allowed: boolean;
+  token_needed: boolean;
+  problems: string[];
+  walls?: [number, number, number, number][];
+  loading?: { done: boolean; folded: number; events: number };
+}
+
+export interface Ref {
+  kind: "place" | "object" | "keyframe" | "merge" | string;
+  id: string;
+}
+
+export interface Step {
+  offset: number;
+  text: string;
+  time?: string | null;
+  what?: string;
+  refs?: Ref[];
+}
+
+export interface Answer {
+  lines?: string[];
+  command?: string;
+}

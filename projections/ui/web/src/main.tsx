@@ -1,0 +1,24 @@
+import "uplot/dist/uPlot.min.css";
+import "./styles/base.css";
+import "./styles/layout.css";
+import "./styles/panels.css";
+import { render } from "preact";
+import { keepBench } from "./bench";
+import { keepLive } from "./panels/Live";
+import { load } from "./state/loading";
+import { keepPlaying, keepRested } from "./state/playing";
+import { keepTheme } from "./state/theme";
+import { keepAddress } from "./state/url";
+import { App } from "./ui/App";
+import { keepKeys } from "./ui/keyboard";
+
+keepTheme();
+render(<App />, document.getElementById("app") as HTMLElement);
+keepKeys();
+keepPlaying();
+keepRested();
+keepBench();
+void load().then(() => {
+  keepAddress();
+  keepLive();
+});

@@ -1,0 +1,205 @@
+/** A map on a canvas: drawn once a frame when something changed; pan, zoom, hover, select. */
+
+import { effect } from "@preact/signals";
+import { select as d3select } from "d3-selection";
+import { type D3ZoomEvent, type ZoomBehavior, zoom, zoomIdentity } from "d3-zoom";
+import { useEffect, useRef } from "preact/hooks";
+import { select } from "../state/actions";
+import { shownBridge, shownLost } from "../state/overlays";
+import { menu, tip } from "../state/pointer";
+import * as store from "../state/store";
+import { summary } from "../ui/summary";
+import { type Side, currentScene } from "./current_scene";
+import { DotLayer } from "./dots";
+import { dotRadius } from "./keyframes";
+import { paint } from "./paint";
+import { DARK, LIGHT } from "./palette";
+import { type Picked, pick } from "./pick";
+import { fitted } from "./view";
+
+type Zoomed = ZoomBehavior<HTMLCanvasElement, unknown>;
+
+/** Called after a frame of the main map is drawn. */
+export const painted = new Set<() => void>();
+let moved = false;
+
+/** The view that shows the whole map. */
+export function fitView() {
+  const canvas = document.querySelector<HTMLCanvasElement>("canvas.map");
+  const bounds = store.bounds.value;
+  if (canvas === null || bounds === null || canvas.clientWidth === 0) return;
+  moved = false;
+  store.view.value = fitted(bounds, canvas.clientWidth, canvas.clientHeight);
+}
+
+/** Zooms about the middle, or moves by pixels. */
+export function changeView(factor: number, dx = 0, dy = 0) {
+  const canvas = document.querySelector<HTMLCanvasElement>("canvas.map");
+  const view = store.view.value;
+  if (canvas === null || view === null) return;
+  moved = true;
+  const [cx, cy] = [canvas.clientWidth / 2, canvas.clientHeight / 2];
+  store.view.value = {
+    k: view.k * factor,
+    x: cx + (view.x - cx) * factor + dx,
+    y: cy + (view.y - cy) * factor + dy,
+  };
+}
+
+/** Moves the view so that a point of the map is in the middle, unless it is well inside already. */
+export function bringIntoView(x: number, y: number) {
+  const canvas = document.querySelector<HTMLCanvasElement>("canvas.map");
+  const view = store.view.value;
+  if (canvas === null || view === null) return;
+  const [sx, sy] = [x * view.k + view.x, view.y - y * view.k];
+  const [w, h] = [canvas.clientWidth, canvas.clientHeight];
+  if (sx > 60 && sy > 60 && sx < w - 60 && sy < h - 60) return;
+  moved = true;
+  store.view.value = { k: view.k, x: view.x + w / 2 - sx, y: view.y + h / 2 - sy };
+}
+
+export function MapCanvas({ side }: { side: Side }) {
+  const ref = useRef<HTMLCanvasElement>(null);
+  useEffect(() => {
+    const canvas = ref.current as HTMLCanvasElement;
+    const stops = [keepDrawn(canvas, side), keepZoomed(canvas), followPointer(canvas, side)];
+    return () => stops.forEach((stop) => stop());
+  }, [side]);
+  const text = summary(side === "main" ? store.map.value : store.otherMap.value, store.history.value);
+  return <canvas ref={ref} class="map" role="img" aria-label={text} data-side={side} />;
+}
+
+function keepDrawn(canvas: HTMLCanvasElement, side: Side): () => void {
+  const context = canvas.getContext("2d") as CanvasRenderingContext2D;
+  const dots = new DotLayer();
+  let frame = 0;
+  let width = 0;
+  const draw = () => {
+    frame = 0;
+    const ratio = window.devicePixelRatio || 1;
+    const [w, h] = [canvas.clientWidth, canvas.clientHeight];
+    if (w === 0 || h === 0) return;
+    if (canvas.width !== Math.round(w * ratio) || canvas.height !== Math.round(h * ratio)) {
+      canvas.width = Math.round(w * ratio);
+      canvas.height = Math.round(h * ratio);
+    }
+    const palette = store.dark.value ? DARK : LIGHT;
+    context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    context.fillStyle = palette.ground;
+    context.fillRect(0, 0, w, h);
+    const scene = currentScene(side, w, h);
+    if (scene !== null) {
+      scene.dots = () => {
+        const radius = dotRadius(scene.view.k) * 0.8;
+        const layer = dots.draw(scene.history, scene.map, scene.view, palette, canvas.width, canvas.height, ratio, radius);
+        context.setTransform(1, 0, 0, 1, 0, 0);
+        context.drawImage(layer, 0, 0);
+        context.setTransform(ratio, 0, 0, ratio, 0, 0);
+      };
+      paint(context, scene);
+    }
+    if (side === "main") for (const each of painted) each();
+  };
+  const schedule = () => {
+    if (frame === 0) frame = requestAnimationFrame(draw);
+  };
+  const observer = new ResizeObserver(() => {
+    const now = canvas.clientWidth;
+    const view = store.view.value;
+    if (side === "main" && now > 0) {
+      if (view === null || !moved) fitView();
+      else if (width > 0) store.view.value = { ...view, x: view.x + (now - width) / 2 };
+    }
+    width = now;
+    schedule();
+  });
+  observer.observe(canvas);
+  const stopFitting = effect(() => {
+    if (side === "main" && store.bounds.value !== null && !moved) queueMicrotask(fitView);
+  });
+  const stop = effect(() => {
+    for (const each of inputs(side)) void each.value;
+    schedule();
+  });
+  return () => {
+    observer.disconnect();
+    stop();
+    stopFitting();
+    cancelAnimationFrame(frame);
+  };
+}
+
+/** The signals that a drawing depends on; the map itself is computed once a frame, in it. */
+function inputs(side: Side) {
+  return [
+    store.at, store.view, store.layers, store.selection, store.hovered, store.dark, store.log,
+    side === "main" ? store.history : store.otherHistory,
+    store.panel, store.compareMode, store.compareWith, shownBridge, shownLost,
+  ];
+}
+
+function keepZoomed(canvas: HTMLCanvasElement): () => void {
+  const behaviour: Zoomed = zoom<HTMLCanvasElement, unknown>()
+    .scaleExtent([0.02, 4000])
+    .clickDistance(4)
+    .duration(0)
+    .filter((event: MouseEvent) => event.button === 0 && !(event.ctrlKey && event.type !== "wheel"))
+    .on("zoom", ({ transform, sourceEvent }: D3ZoomEvent<HTMLCanvasElement, unknown>) => {
+      if (sourceEvent === null) return;
+      moved = true;
+      store.view.value = { k: transform.k, x: transform.x, y: transform.y };
+    });
+  const selected = d3select(canvas).call(behaviour).on("dblclick.zoom", null); // it would animate
+  const stop = effect(() => {
+    const view = store.view.value;
+    if (view !== null) selected.property("__zoom", zoomIdentity.translate(view.x, view.y).scale(view.k));
+  });
+  return () => {
+    stop();
+    selected.on(".zoom", null);
+  };
+}
+
+function followPointer(canvas: HTMLCanvasElement, side: Side): () => void {
+  const at = (event: MouseEvent): Picked | null => {
+    const history = side === "main" ? store.history.value : store.otherHistory.value;
+    const map = side === "main" ? store.map.value : store.otherMap.value;
+    const view = store.view.value;
+    if (history === null || map === null || view === null) return null;
+    const regions = side === "main" ? store.regions.value : store.otherRegions.value;
+    const box = canvas.getBoundingClientRect();
+    return pick(history, map, regions, view, event.clientX - box.left, event.clientY - box.top, store.layers.value.objects);
+  };
+  const move = (event: PointerEvent) => {
+    if (event.buttons !== 0) return;
+    const found = at(event);
+    canvas.classList.toggle("over-thing", found !== null);
+    store.hovered.value = found?.thing ?? null;
+    tip.value = found === null ? null : { x: event.clientX, y: event.clientY, side, ...found };
+  };
+  const leave = () => {
+    store.hovered.value = null;
+    tip.value = null;
+  };
+  const click = (event: MouseEvent) => {
+    menu.value = null;
+    select(at(event)?.thing ?? null, true);
+  };
+  const context = (event: MouseEvent) => {
+    event.preventDefault();
+    const found = at(event);
+    tip.value = null;
+    if (found !== null) select(found.thing);
+    menu.value = { x: event.clientX, y: event.clientY, thing: found?.thing ?? null };
+  };
+  canvas.addEventListener("pointermove", move);
+  canvas.addEventListener("pointerleave", leave);
+  canvas.addEventListener("click", click);
+  canvas.addEventListener("contextmenu", context);
+  return () => {
+    canvas.removeEventListener("pointermove", move);
+    canvas.removeEventListener("pointerleave", leave);
+    canvas.removeEventListener("click", click);
+    canvas.removeEventListener("contextmenu", context);
+  };
+}

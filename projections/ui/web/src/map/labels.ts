@@ -1,0 +1,176 @@
+/**
+ * Labels that do not cover each other: the most important first, each at the first free spot
+ * around its anchor; one for which there is none is left out.
+ */
+
+import { isolated, label, objectClass, placeTitle } from "../model/names";
+import { isPlaceLit, litObject } from "./lit";
+import { placeColour, withAlpha } from "./palette";
+import type { Scene } from "./scene";
+import type { Surface } from "./surface";
+import { objectRadius } from "./things";
+import { screenX, screenY } from "./view";
+
+export const FONT = 'system-ui, "Segoe UI", Roboto, "Helvetica Neue", "Noto Sans", Arial, sans-serif';
+const PLACE_FONT = `600 13px ${FONT}`;
+const SMALL_FONT = `11px ${FONT}`;
+const LIT_FONT = `600 12px ${FONT}`;
+const MOST = 400;
+
+interface Wanted {
+  x: number;
+  y: number;
+  /** Pixels from the anchor at which the label begins; 0 puts it on the anchor. */
+  away: number;
+  text: string;
+  second?: string;
+  font: string;
+  colour: string;
+  chip?: string;
+  always?: boolean;
+}
+
+interface Box {
+  x: number;
+  y: number;
+  width: number;
+  height: number;
+}
+
+export function drawLabels(on: Surface, scene: Scene) {
+  const taken: Box[] = [];
+  for (const wanted of [...placeLabels(scene), ...edgeLabels(scene), ...objectLabels(scene)].slice(0, MOST)) {
+    draw(on, scene, wanted, taken);
+  }
+}
+
+function placeLabels(scene: Scene): Wanted[] {
+  const { history, map, view, palette } = scene;
+  const order = [...map.places].sort((a, b) => map.size[b] - map.size[a]);
+  return order.map((place) => ({
+    x: screenX(view, map.x[place]),
+    y: screenY(view, map.y[place]),
+    away: 0,
+    text: isolated(label(placeTitle(history, map, place))),
+    second: String(map.size[place]),
+    font: PLACE_FONT,
+    colour: palette.ink,
+    chip: placeColour(palette, history, place),
+    always: isPlaceLit(scene, place),
+  }));
+}
+
+function edgeLabels(scene: Scene): Wanted[] {
+  const { map, view, palette } = scene;
+  if (!scene.layers.edges) return [];
+  return map.edges.map(({ a, b, count }) => ({
+    x: screenX(view, (map.x[a] + map.x[b]) / 2),
+    y: screenY(view, (map.y[a] + map.y[b]) / 2),
+    away: 0,
+    text: `${count}×`,
+    font: SMALL_FONT,
+    colour: palette.dim,
+  }));
+}
+
+function objectLabels(scene: Scene): Wanted[] {
+  const { history, map, view, palette } = scene;
+  if (!scene.layers.objects) return [];
+  const lit = [litObject(scene, scene.selection), litObject(scene, scene.hovered)];
+  const { x, y, count, missing } = history.changes;
+  const rank = (object: number) => (lit.includes(object) ? 1e9 : 0) + count[map.objectRow[object]];
+  return [...map.objects]
+    .sort((a, b) => rank(b) - rank(a))
+    .map((object) => {
+      const row = map.objectRow[object];
+      const name = isolated(label(objectClass(history, map, object), 22));
+      return {
+        x: screenX(view, x[row]),
+        y: screenY(view, y[row]),
+        away: objectRadius(view.k) + 4,
+        text: missing[row] ? `${name} missing` : name,
+        font: lit.includes(object) ? LIT_FONT : SMALL_FONT,
+        colour: lit.includes(object) ? palette.accent : missing[row] ? palette.removed : palette.dim,
+        always: lit.includes(object),
+      };
+    });
+}
+
+const DIRECTIONS: readonly (readonly [number, number])[] = [
+  [1, 0], [-1, 0], [0, 1], [0, -1], [0.8, 0.8], [0.8, -0.8], [-0.8, 0.8], [-0.8, -0.8],
+];
+const NUDGES: readonly (readonly [number, number])[] = [
+  [0, 0], [0, -24], [0, 24], [44, 0], [-44, 0], [44, -24], [-44, 24], [0, -48], [0, 48],
+];
+
+function draw(on: Surface, scene: Scene, wanted: Wanted, taken: Box[]) {
+  if (!(wanted.x > -20 && wanted.y > -20 && wanted.x < scene.width + 20 && wanted.y < scene.height + 20)) return;
+  on.font = wanted.font;
+  const main = on.measureText(wanted.text).width;
+  on.font = SMALL_FONT;
+  const second = wanted.second === undefined ? 0 : on.measureText(wanted.second).width + 6;
+  const width = main + second + (wanted.chip === undefined ? 4 : 24);
+  const height = wanted.chip === undefined ? 15 : 21;
+  const spots = candidates(wanted, width, height);
+  const free = spots.find(
+    (box) =>
+      box.x >= 2 && box.y >= 2 && box.x + width <= scene.width - 2 && box.y + height <= scene.height - 2 &&
+      !taken.some((other) => overlap(box, other)),
+  );
+  const box = free ?? (wanted.always ? spots[0] : undefined);
+  if (box === undefined) return;
+  taken.push(box);
+  write(on, scene, wanted, box, main);
+}
+
+function candidates({ x, y, away }: Wanted, width: number, height: number): Box[] {
+  if (away === 0) {
+    return NUDGES.map(([dx, dy]) => ({ x: x - width / 2 + dx, y: y - height / 2 + dy, width, height }));
+  }
+  return DIRECTIONS.map(([dx, dy]) => ({
+    x: x + dx * (away + width / 2) - width / 2,
+    y: y + dy * (away + height / 2) - height / 2,
+    width,
+    height,
+  }));
+}
+
+function overlap(a: Box, b: Box): boolean {
+  return a.x < b.x + b.width && b.x < a.x + a.width && a.y < b.y + b.height && b.y < a.y + a.height;
+}
+
+function write(on: Surface, scene: Scene, wanted: Wanted, box: Box, main: number) {
+  const { palette } = scene;
+  const middle = box.y + box.height / 2;
+  let x = box.x + 2;
+  if (wanted.chip !== undefined) {
+    on.beginPath();
+    on.rect(box.x, box.y, box.width, box.height);
+    on.fillStyle = withAlpha(palette.ground, 0.88);
+    on.fill();
+    on.strokeStyle = withAlpha(wanted.chip, 0.9);
+    on.lineWidth = 1;
+    on.stroke();
+    on.beginPath();
+    on.rect(box.x, box.y, 4, box.height);
+    on.fillStyle = wanted.chip;
+    on.fill();
+    x = box.x + 11;
+  }
+  on.textAlign = "left";
+  on.textBaseline = "middle";
+  on.font = wanted.font;
+  if (wanted.chip === undefined) {
+    on.strokeStyle = palette.halo;
+    on.lineWidth = 3;
+    on.lineJoin = "round";
+    on.strokeText(wanted.text, x, middle);
+  }
+  on.fillStyle = wanted.colour;
+  on.fillText(wanted.text, x, middle + 0.5);
+  if (wanted.second !== undefined) {
+    on.font = SMALL_FONT;
+    on.fillStyle = palette.dim;
+    on.fillText(wanted.second, x + main + 6, middle + 0.5);
+  }
+}

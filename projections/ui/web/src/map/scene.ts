@@ -1,0 +1,45 @@
+/** All that a picture of a map is made of. */
+
+import type { History } from "../history/types";
+import type { MapDifference } from "../model/compare";
+import type { MapState } from "../model/map_at";
+import type { Regions } from "../model/regions";
+import type { LayerName, Thing } from "../state/store";
+import type { Palette } from "./palette";
+import type { View } from "./view";
+
+/** Core points that joined two places: each within ε of the next. Positions in metres. */
+export interface Bridge {
+  epsM: number;
+  /** Keyframes near the chain that are core points. */
+  core: number[];
+  chains: { points: { x: number; y: number; name: string; madeCore: boolean }[]; distances: number[] }[];
+}
+
+/** Where a lost robot may be: cells of probability, its pose, landmarks that speak for it. */
+export interface LostOverlay {
+  cells: { x: number; y: number; size: number; share: number }[];
+  pose: { x: number; y: number; yaw: number | null; spread: number } | null;
+  truth: { x: number; y: number; yaw: number | null } | null;
+  evidence: { x: number; y: number; text: string; place: number }[];
+  places: Set<number>;
+}
+
+export interface Scene {
+  history: History;
+  map: MapState;
+  regions: Regions | null;
+  view: View;
+  palette: Palette;
+  width: number;
+  height: number;
+  layers: Record<LayerName, boolean>;
+  walls: readonly (readonly [number, number, number, number])[];
+  selection: Thing | null;
+  hovered: Thing | null;
+  difference: { before: MapState; difference: MapDifference } | null;
+  bridge: Bridge | null;
+  lost: LostOverlay | null;
+  /** Draws many keyframes at once, on a canvas only. */
+  dots: (() => void) | null;
+}

@@ -1,0 +1,43 @@
+/** The map at W as JSON. */
+
+import type { History } from "../history/types";
+import { placeNow } from "./compare";
+import type { MapState } from "./map_at";
+import { keyframeId } from "./names";
+
+export function stateDocument(history: History, map: MapState) {
+  const place = (number: number) => (number < 0 ? null : history.placeIds[number]);
+  const [ox, oy] = history.origin;
+  const { keyframes, changes } = history;
+  return {
+    at: map.at,
+    known_at: history.knownAt,
+    settings: history.settings,
+    places: map.places.map((each) => ({
+      place_id: history.placeIds[each],
+      name: map.name[each],
+      keyframes: map.size[each],
+      centroid_x: map.x[each] + ox,
+      centroid_y: map.y[each] + oy,
+    })),
+    objects: map.objects.map((each) => {
+      const row = map.objectRow[each];
+      return {
+        object_id: history.objectIds[each],
+        class_name: history.classes[changes.class[row]],
+        x: changes.x[row] + ox,
+        y: changes.y[row] + oy,
+        observations: changes.count[row],
+        place_id: place(placeNow(history, map, row)),
+        missing: changes.missing[row] === 1,
+      };
+    }),
+    keyframes: Array.from({ length: map.keyframeCount }, (_, each) => ({
+      keyframe: keyframeId(history, each),
+      offset: keyframes.offset[each],
+      pose: Number.isNaN(keyframes.x[each]) ? null : [keyframes.x[each] + ox, keyframes.y[each] + oy, keyframes.yaw[each]],
+      place_id: place(map.placeOf[each]),
+    })),
+    adjacency: map.edges.map(({ a, b, count }) => ({ a: history.placeIds[a], b: history.placeIds[b], shared_transitions: count })),
+  };
+}

@@ -1,0 +1,79 @@
+/** Names of things as people read them, and things by their names. */
+
+import type { History } from "../history/types";
+import type { MapState } from "./map_at";
+
+/** RUN/ID of a keyframe. */
+export function keyframeId(history: History, keyframe: number): string {
+  const { run, number } = history.keyframes;
+  return `${history.runIds[run[keyframe]]}/${number[keyframe]}`;
+}
+
+/** The ordinal of a keyframe given as RUN/ID, RUN:ID, or ID alone where there is one run; or -1. */
+export function findKeyframe(history: History, text: string): number {
+  const parts = /^(?:(.*)[/:])?(\d+)$/s.exec(text);
+  if (parts === null) return -1;
+  const run = parts[1] === undefined ? (history.runIds.length === 1 ? 0 : -1) : history.runIds.indexOf(parts[1]);
+  const wanted = Number(parts[2]);
+  const { run: runs, number } = history.keyframes;
+  for (let each = 0; each < runs.length; each++) {
+    if (number[each] === wanted && runs[each] === run) return each;
+  }
+  return -1;
+}
+
+const placeNumbers = new WeakMap<History, Map<string, number>>();
+const objectNumbers = new WeakMap<History, Map<string, number>>();
+
+function numberOf(cache: WeakMap<History, Map<string, number>>, history: History, ids: string[], id: string): number {
+  let numbers = cache.get(history);
+  if (numbers === undefined) {
+    numbers = new Map(ids.map((each, number) => [each, number]));
+    cache.set(history, numbers);
+  }
+  return numbers.get(id) ?? -1;
+}
+
+export const findPlace = (history: History, id: string) => numberOf(placeNumbers, history, history.placeIds, id);
+export const findObject = (history: History, id: string) => numberOf(objectNumbers, history, history.objectIds, id);
+
+const commonRun = new WeakMap<History, string | null>();
+
+/** `p7` where one run founded every place, else the whole id. */
+export function shortPlace(history: History, place: number): string {
+  let run = commonRun.get(history);
+  if (run === undefined) {
+    const prefixes = new Set(history.placeIds.map((id) => id.replace(/_p\d+$/, "")));
+    run = prefixes.size === 1 ? [...prefixes][0] : null;
+    commonRun.set(history, run);
+  }
+  const id = history.placeIds[place];
+  return run !== null && id.startsWith(`${run}_`) ? id.slice(run.length + 1) : id;
+}
+
+/** What a place is called, or its short id. */
+export function placeTitle(history: History, map: MapState, place: number): string {
+  return map.name[place] ?? shortPlace(history, place);
+}
+
+export function objectClass(history: History, map: MapState, object: number): string {
+  const row = map.objectRow[object];
+  return row < 0 ? "" : (history.classes[history.changes.class[row]] ?? "");
+}
+
+const PLAIN = /[\u0000-\u001f\u007f-\u009f\u2028\u2029]/g;
+
+/** A text of the log on one line, short enough for a label; control characters become visible. */
+export function label(text: string, most = 28): string {
+  const plain = text.replace(PLAIN, "\ufffd");
+  const characters = Array.from(plain.slice(0, 4 * most));
+  return characters.length <= most ? plain : `${characters.slice(0, most - 1).join("")}…`;
+}
+
+/** Isolated, so that a text written from right to left does not turn what stands beside it. */
+export function isolated(text: string): string {
+  return `\u2068${text}\u2069`;
+}
+
+export const counted = (count: number, what: string, many = `${what}s`) =>
+  `${count.toLocaleString("en")} ${count === 1 ? what : many}`;

@@ -1,0 +1,78 @@
+/** Follows a log that grows: server-sent events tell when there is more. */
+
+import { signal } from "@preact/signals";
+import { liveEvents } from "../api/client";
+import { counted } from "../model/names";
+import { goLive } from "../state/actions";
+import { grow } from "../state/loading";
+import * as store from "../state/store";
+
+interface Sink {
+  name?: string;
+  sink?: string;
+  lag?: number | null;
+  lag_events?: number | null;
+}
+
+interface LiveNews {
+  through: number;
+  state: string;
+  events: number;
+  lag: number;
+  losses?: number | { count: number } | null;
+  rejected?: number | null;
+  problems?: string[];
+  sinks?: Sink[] | null;
+  database_problem?: string | null;
+}
+
+const news = signal<LiveNews | null>(null);
+const AGAIN_MS = 1500;
+
+export function keepLive() {
+  const listen = async () => {
+    for (;;) {
+      try {
+        for await (const heard of liveEvents("/api/live", new AbortController().signal)) hear(heard as LiveNews);
+      } catch {
+        // The banner tells that the server does not answer; it is asked again.
+      }
+      await new Promise((resolve) => setTimeout(resolve, AGAIN_MS));
+    }
+  };
+  void listen();
+}
+
+function hear(heard: LiveNews) {
+  const before = store.history.value;
+  const problems = JSON.stringify(heard.problems ?? []);
+  const known = JSON.stringify(store.log.value?.problems ?? []);
+  news.value = heard;
+  if (before === null || heard.through !== before.through || heard.state !== before.state || problems !== known) void grow();
+}
+
+export function LiveState() {
+  const heard = news.value;
+  const on = store.live.value;
+  const lost = typeof heard?.losses === "number" ? heard.losses : (heard?.losses?.count ?? 0);
+  const parts = [
+    ...(lost > 0 ? [`${lost.toLocaleString("en")} lost`] : []),
+    ...((heard?.rejected ?? 0) > 0 ? [`${(heard?.rejected ?? 0).toLocaleString("en")} rejected`] : []),
+    ...((heard?.lag ?? 0) > 0 ? [`${counted(heard?.lag ?? 0, "event")} not folded yet`] : []),
+    ...(heard?.sinks ?? []).map((sink) => `${sink.name ?? sink.sink ?? "database"}: ${sink.lag ?? sink.lag_events ?? 0} behind`),
+    ...(heard?.database_problem ? ["database does not answer"] : []),
+  ];
+  return (
+    <div class="live">
+      {parts.length > 0 && (
+        <span class="lag" title={heard?.database_problem ?? parts.join(", ")}>
+          {parts.join(", ")}
+        </span>
+      )}
+      <button type="button" class={on ? "button live-on" : "button quiet"} aria-pressed={on} title={on ? "The page follows the log; a click keeps this moment (L)" : "Follow the end of the log (L)"} onClick={() => goLive(!on)}>
+        <i class="lamp" aria-hidden="true" />
+        Live
+      </button>
+    </div>
+  );
+}

@@ -1,0 +1,131 @@
+/** Parts that several panels are made of: states of an answer, steps, links to things. */
+
+import type { ComponentChildren } from "preact";
+import type { Ref, Step } from "../api/types";
+import { bringIntoView } from "../map/MapCanvas";
+import { isolated, label } from "../model/names";
+import { positionOf, select, showEvent } from "../state/actions";
+import type { Asked } from "../state/answers";
+import { tell } from "../state/pointer";
+import * as store from "../state/store";
+import { Icon } from "../ui/icons";
+
+const KINDS: readonly string[] = ["place", "object", "keyframe", "merge"];
+
+/** The answer, or a sentence about why there is none. */
+export function Told<T>({ asked, children }: { asked: Asked<T>; children: (value: T) => ComponentChildren }) {
+  if (asked.error !== null) return <p class="told error" role="alert">{asked.error.message}</p>;
+  if (asked.value === null) return asked.loading ? <p class="told dim" role="status">Asking …</p> : null;
+  return <div class={asked.loading ? "told stale" : "told"} aria-busy={asked.loading}>{children(asked.value)}</div>;
+}
+
+/** A thing that can be clicked: it is selected, and brought into view. */
+export function ThingLink({ thing, children }: { thing: store.Thing; children?: ComponentChildren }) {
+  const go = () => {
+    if (thing.kind === "merge") showEvent(Number(thing.id));
+    select(thing, true);
+    const at = positionOf(thing);
+    if (at !== null) bringIntoView(...at);
+  };
+  return (
+    <button
+      type="button"
+      class="link"
+      onClick={go}
+      onMouseEnter={() => (store.hovered.value = thing)}
+      onMouseLeave={() => (store.hovered.value = null)}
+    >
+      <bdi>{children ?? label(thing.id, 40)}</bdi>
+    </button>
+  );
+}
+
+/** The moment after an event, to click. */
+export function Moment({ offset }: { offset: number }) {
+  const now = store.at.value === offset + 1;
+  return (
+    <button type="button" class={now ? "moment-link now" : "moment-link"} aria-current={now ? "step" : undefined} title="Show the map after this event" onClick={() => showEvent(offset)}>
+      {offset}
+    </button>
+  );
+}
+
+export function Steps({ steps }: { steps: readonly Step[] }) {
+  return (
+    <ol class="steps">
+      {steps.map((step, index) => (
+        <li key={index} class={step.offset < store.at.value ? "past" : "ahead"}>
+          <Moment offset={step.offset} />
+          <div>
+            <p>
+              <Linked text={step.text} refs={step.refs ?? []} />
+            </p>
+            {step.time !== undefined && step.time !== null && <time>{step.time.replace("T", " ").replace("Z", "")}</time>}
+          </div>
+        </li>
+      ))}
+    </ol>
+  );
+}
+
+/** A sentence in which the things it names can be clicked. */
+export function Linked({ text, refs }: { text: string; refs: readonly Ref[] }) {
+  const names = new Map<string, store.Thing>();
+  for (const { kind, id } of refs) {
+    if (!KINDS.includes(kind) || kind === "merge") continue;
+    const thing = { kind, id } as store.Thing;
+    names.set(id, thing);
+    if (kind === "keyframe") names.set(id.replace(/\/(?=[^/]*$)/, ":"), thing);
+  }
+  const parts: ComponentChildren[] = [];
+  let rest = text;
+  while (rest !== "") {
+    const next = firstName(rest, names);
+    if (next === null) break;
+    parts.push(rest.slice(0, next.at), <ThingLink thing={next.thing}>{label(next.name, 60)}</ThingLink>);
+    rest = rest.slice(next.at + next.name.length);
+  }
+  return (
+    <>
+      {parts}
+      {rest}
+    </>
+  );
+}
+
+function firstName(text: string, names: ReadonlyMap<string, store.Thing>) {
+  let found: { at: number; name: string; thing: store.Thing } | null = null;
+  for (const [name, thing] of names) {
+    let at = text.indexOf(name);
+    while (at >= 0 && /[\w]/.test(text[at + name.length] ?? "")) at = text.indexOf(name, at + 1);
+    if (at < 0) continue;
+    if (found === null || at < found.at || (at === found.at && name.length > found.name.length)) found = { at, name, thing };
+  }
+  return found;
+}
+
+/** The command line that gives the same answer, to copy. */
+export function CommandLine({ command }: { command: string | null | undefined }) {
+  if (command === null || command === undefined) return null;
+  return (
+    <div class="command">
+      <code tabIndex={0} aria-label="Command line of this answer">{command}</code>
+      <button type="button" class="icon" aria-label="Copy as command" title="Copy as command" onClick={() => void copy(command, "the command line")}>
+        <Icon name="copy" />
+      </button>
+    </div>
+  );
+}
+
+export async function copy(text: string, what: string) {
+  try {
+    await navigator.clipboard.writeText(text);
+    tell(`Copied ${what}.`);
+  } catch {
+    tell(`The browser does not let this page copy. Here it is: ${text}`);
+  }
+}
+
+export function Lines({ lines }: { lines: readonly string[] }) {
+  return <pre class="lines" tabIndex={0} aria-label="Answer as text">{lines.map((line) => isolated(line)).join("\n")}</pre>;
+}

@@ -1,0 +1,99 @@
+/** What a person does: go to a moment, select, step, open a panel. */
+
+import { batch } from "@preact/signals";
+import { findKeyframe, findObject, findPlace } from "../model/names";
+import { rowsBefore } from "../model/map_at";
+import { neighbour, stepEvent } from "../model/moments";
+import * as store from "./store";
+
+export function goTo(at: number) {
+  const through = store.history.value?.through ?? 0;
+  const wanted = Math.max(0, Math.min(through, Math.round(at)));
+  batch(() => {
+    store.at.value = wanted;
+    if (wanted < through) store.live.value = false;
+  });
+}
+
+/** The moment at which what the event at `offset` did shows. */
+export function showEvent(offset: number) {
+  store.playing.value = false;
+  goTo(offset + 1);
+}
+
+export function stepBy(kind: "event" | "change" | "merge", direction: 1 | -1): boolean {
+  const { history, moments, at } = store;
+  if (history.value === null || moments.value === null) return false;
+  store.playing.value = false;
+  const wanted =
+    kind === "event"
+      ? stepEvent(history.value, at.value, direction)
+      : neighbour(kind === "merge" ? moments.value.merges : moments.value.changes, at.value, direction);
+  if (wanted === null || wanted === at.value) return false;
+  goTo(wanted);
+  if (kind === "merge") select({ kind: "merge", id: String(wanted - 1) });
+  return true;
+}
+
+export function select(thing: store.Thing | null, open = false) {
+  batch(() => {
+    store.selection.value = thing;
+    if (open && thing !== null) store.panel.value = "why";
+  });
+}
+
+export function openPanel(name: store.PanelName | null) {
+  store.panel.value = name;
+}
+
+export function togglePlay() {
+  const through = store.history.value?.through ?? 0;
+  batch(() => {
+    if (!store.playing.value && store.at.value >= through) store.at.value = 0;
+    store.playing.value = !store.playing.value;
+    if (store.playing.value) store.live.value = false;
+  });
+}
+
+export function goLive(on: boolean) {
+  batch(() => {
+    store.live.value = on;
+    if (on) {
+      store.playing.value = false;
+      store.at.value = store.history.value?.through ?? 0;
+    }
+  });
+}
+
+/** Where a thing is in the map now, metres; null where it is not. */
+export function positionOf(thing: store.Thing): [number, number] | null {
+  const [history, map] = [store.history.value, store.map.value];
+  if (history === null || map === null) return null;
+  switch (thing.kind) {
+    case "place": {
+      const place = findPlace(history, thing.id);
+      const now = place < 0 ? -1 : map.standsAs[place];
+      return now < 0 ? null : [map.x[now], map.y[now]];
+    }
+    case "object": {
+      const object = findObject(history, thing.id);
+      const row = object < 0 || map.objectStandsAs[object] < 0 ? -1 : map.objectRow[map.objectStandsAs[object]];
+      return row < 0 ? null : [history.changes.x[row], history.changes.y[row]];
+    }
+    case "keyframe": {
+      const keyframe = findKeyframe(history, thing.id);
+      return keyframe < 0 ? null : pose(history.keyframes, keyframe);
+    }
+    case "merge": {
+      const row = rowsBefore(history.merges.offset, Number(thing.id));
+      return history.merges.offset[row] === Number(thing.id)
+        ? pose(history.keyframes, history.merges.keyframe[row])
+        : null;
+    }
+  }
+}
+
+function pose(keyframes: { x: Float32Array; y: Float32Array }, keyframe: number): [number, number] | null {
+  const [x, y] = [keyframes.x[keyframe], keyframes.y[keyframe]];
+  return Number.isNaN(x) ? null : [x, y];
+}

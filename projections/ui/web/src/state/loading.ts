@@ -1,0 +1,94 @@
+/** Loads the log and its history, again when it grows; whatever goes wrong becomes a sentence. */
+
+import { batch, signal } from "@preact/signals";
+import { ApiError, LOST, address, getBinary, getJson, watchServer } from "../api/client";
+import type { LogInfo } from "../api/types";
+import { decodeHistory } from "../history/decode";
+import * as store from "./store";
+import { applyAddress } from "./url";
+
+const AGAIN_MS = 1500;
+
+export const progress = signal<{ folded: number; events: number } | null>(null);
+
+export async function load() {
+  watchServer((reached) => {
+    store.serverLost.value = !reached;
+  });
+  const watching = watchFold();
+  try {
+    const answer = await getBinary("/api/history");
+    const info = await getJson<LogInfo>("/api/log");
+    batch(() => {
+      store.log.value = info;
+      store.history.value = decodeHistory(answer);
+      store.failure.value = null;
+      applyAddress(location.hash);
+    });
+  } catch (error) {
+    store.failure.value = sentence(error);
+    if (error instanceof ApiError && error.kind === LOST) setTimeout(() => void load(), AGAIN_MS);
+  } finally {
+    watching();
+  }
+}
+
+/** While the server folds the log for the first time, how far it is. */
+function watchFold(): () => void {
+  let on = true;
+  const look = async () => {
+    if (!on) return;
+    try {
+      const info = await getJson<LogInfo>("/api/log");
+      if (!on) return;
+      store.log.value ??= info;
+      const { loading } = info;
+      progress.value = loading === undefined || loading.done ? null : loading;
+    } catch {
+      // `load` itself tells it.
+    }
+    setTimeout(() => void look(), 400);
+  };
+  void look();
+  return () => {
+    on = false;
+    progress.value = null;
+  };
+}
+
+let growing = false;
+let again = false;
+
+/** Adds what was recorded since; loads all anew if the past has changed. */
+export async function grow() {
+  const before = store.history.value;
+  if (before === null) return load();
+  if (growing) {
+    again = true;
+    return;
+  }
+  growing = true;
+  try {
+    let next = decodeHistory(await getBinary(address("/api/history", { from: before.through })), before);
+    if (next.state !== before.state || next.through < before.through) next = decodeHistory(await getBinary("/api/history"));
+    const info = await getJson<LogInfo>("/api/log");
+    batch(() => {
+      store.history.value = next;
+      store.log.value = info;
+      if (store.live.value) store.at.value = next.through;
+      else store.at.value = Math.min(store.at.value, next.through);
+    });
+  } catch (error) {
+    if (!(error instanceof ApiError && error.kind === LOST)) store.failure.value = sentence(error);
+  } finally {
+    growing = false;
+    if (again) {
+      again = false;
+      void grow();
+    }
+  }
+}
+
+export function sentence(error: unknown): string {
+  return error instanceof Error ? error.message : String(error);
+}

@@ -1,0 +1,28 @@
+/** What the pointer has opened: the tooltip of the thing under it, the context menu. */
+
+import { signal } from "@preact/signals";
+import type { Side } from "../map/current_scene";
+import type { Thing } from "./store";
+
+export interface Tip {
+  x: number;
+  y: number;
+  side: Side;
+  thing: Thing;
+  number: number;
+}
+
+export const tip = signal<Tip | null>(null);
+export const markTip = signal<{ x: number; y: number; lines: string[] } | null>(null);
+export const menu = signal<{ x: number; y: number; thing: Thing | null } | null>(null);
+/** A line that tells what just happened, such as "copied". */
+export const notice = signal<string | null>(null);
+
+let timer = 0;
+export function tell(text: string) {
+  notice.value = text;
+  clearTimeout(timer);
+  timer = window.setTimeout(() => {
+    notice.value = null;
+  }, 3500);
+}

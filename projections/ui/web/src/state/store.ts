@@ -1,0 +1,107 @@
+/** What the page shows, as signals. Panels and the canvas read them; actions.ts changes them. */
+
+import { computed, signal } from "@preact/signals";
+import type { LogInfo } from "../api/types";
+import type { History } from "../history/types";
+import { type MapState, mapAt } from "../model/map_at";
+import { type Moments, Stamps, momentsOf } from "../model/moments";
+import { type Bounds, type Grid, type Regions, boundsOf, gridOf, regionsOf } from "../model/regions";
+import type { View } from "../map/view";
+
+export type ThingKind = "place" | "object" | "keyframe" | "merge";
+
+/** `id` is that of a place or object, RUN/ID of a keyframe, the offset of a merge. */
+export interface Thing {
+  kind: ThingKind;
+  id: string;
+}
+
+export type PanelName = "why" | "compare" | "find" | "lost" | "correct";
+export const PANELS: readonly PanelName[] = ["why", "compare", "find", "lost", "correct"];
+
+export type CompareMode = "moments" | "settings";
+export type Theme = "auto" | "light" | "dark";
+
+export const log = signal<LogInfo | null>(null);
+export const history = signal<History | null>(null);
+/** Why there is no map to show: a sentence. */
+export const failure = signal<string | null>(null);
+export const serverLost = signal(false);
+
+/** W: the map after the first `at` events. */
+export const at = signal(0);
+/** W when dragging and playing have rested: what the server is asked about. */
+export const restedAt = signal(0);
+export const playing = signal(false);
+export const speed = signal(10);
+export const byTime = signal(false);
+/** Whether the page follows the end of the log. */
+export const live = signal(false);
+
+export const selection = signal<Thing | null>(null);
+export const hovered = signal<Thing | null>(null);
+export const panel = signal<PanelName | null>("why");
+export const compareMode = signal<CompareMode>("moments");
+/** The other moment of a comparison; null until one is chosen. */
+export const compareWith = signal<number | null>(null);
+/** The other settings of a comparison; null for those of the log. */
+export const otherEps = signal<number | null>(null);
+export const otherMinSamples = signal<number | null>(null);
+export const otherHistory = signal<History | null>(null);
+export const foundAt = signal<{ offset: number; becomes: boolean }[]>([]);
+
+export const theme = signal<Theme>("auto");
+export const systemDark = signal(false);
+export const dark = computed(() => (theme.value === "auto" ? systemDark.value : theme.value === "dark"));
+
+export const view = signal<View | null>(null);
+
+export const layers = signal({
+  regions: true,
+  path: true,
+  keyframes: true,
+  objects: true,
+  ellipses: true,
+  edges: true,
+  walls: true,
+  labels: true,
+});
+export type LayerName = keyof (typeof layers)["value"];
+
+export const map = computed<MapState | null>(() =>
+  history.value === null ? null : mapAt(history.value, at.value),
+);
+export const otherMap = computed<MapState | null>(() =>
+  otherHistory.value === null ? null : mapAt(otherHistory.value, at.value),
+);
+export const moments = computed<Moments | null>(() => (history.value === null ? null : momentsOf(history.value)));
+export const stamps = computed<Stamps | null>(() => (history.value === null ? null : new Stamps(history.value)));
+export const bounds = computed<Bounds | null>(() => {
+  const found = history.value === null ? null : boundsOf(history.value);
+  if (found === null) return null;
+  for (const [x0, y0, x1, y1] of log.value?.walls ?? []) {
+    found.x0 = Math.min(found.x0, x0, x1);
+    found.x1 = Math.max(found.x1, x0, x1);
+    found.y0 = Math.min(found.y0, y0, y1);
+    found.y1 = Math.max(found.y1, y0, y1);
+  }
+  return found;
+});
+const grid = computed<Grid | null>(() => (bounds.value === null ? null : gridOf(bounds.value)));
+
+function regionsIn(shown: History | null, state: MapState | null): Regions | null {
+  return shown === null || state === null || grid.value === null ? null : regionsOf(shown, state, grid.value);
+}
+export const regions = computed(() => regionsIn(history.value, map.value));
+export const otherRegions = computed(() => regionsIn(otherHistory.value, otherMap.value));
+
+/** The map at the other moment of a comparison, while its panel is open. */
+export const comparedMap = computed<MapState | null>(() =>
+  panel.value === "compare" && compareMode.value === "moments" && compareWith.value !== null && history.value !== null
+    ? mapAt(history.value, Math.min(compareWith.value, history.value.through))
+    : null,
+);
+/** Whether two maps are shown side by side. */
+export const twoMaps = computed(
+  () => panel.value === "compare" && compareMode.value === "settings" && otherHistory.value !== null,
+);

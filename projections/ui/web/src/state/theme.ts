@@ -1,0 +1,21 @@
+/** Light or dark: as the system says, until somebody chooses. */
+
+import { effect } from "@preact/signals";
+import * as store from "./store";
+
+const KEY = "mapfold theme";
+
+export function keepTheme() {
+  const query = window.matchMedia("(prefers-color-scheme: dark)");
+  store.systemDark.value = query.matches;
+  query.addEventListener("change", () => {
+    store.systemDark.value = query.matches;
+  });
+  const kept = localStorage.getItem(KEY);
+  if (kept === "light" || kept === "dark") store.theme.value = kept;
+  effect(() => {
+    document.documentElement.dataset["theme"] = store.dark.value ? "dark" : "light";
+    if (store.theme.value === "auto") localStorage.removeItem(KEY);
+    else localStorage.setItem(KEY, store.theme.value);
+  });
+}
