@@ -65,12 +65,12 @@ export function MapCanvas({ side }: { side: Side }) {
     const stops = [keepDrawn(canvas, side), keepZoomed(canvas), followPointer(canvas, side)];
     return () => stops.forEach((stop) => stop());
   }, [side]);
-  const text = summary(side === "main" ? store.map.value : store.otherMap.value, store.history.value);
+  const text = summary(side === "main" ? store.restedMap.value : store.otherMap.value, store.history.value);
   return <canvas ref={ref} class="map" role="img" aria-label={text} data-side={side} />;
 }
 
 function keepDrawn(canvas: HTMLCanvasElement, side: Side): () => void {
-  const context = canvas.getContext("2d") as CanvasRenderingContext2D;
+  const context = canvas.getContext("2d", { alpha: false }) as CanvasRenderingContext2D;
   const dots = new DotLayer();
   let frame = 0;
   let width = 0;

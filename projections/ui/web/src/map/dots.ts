@@ -10,6 +10,8 @@ import type { View } from "./view";
 
 /** From how many keyframes on they are drawn so. */
 export const MANY = 2500;
+/** Of how many keyframes at most the path is drawn, the last ones: more cover each other. */
+const MOST_PATH = 20_000;
 const SUBPIXELS = 4;
 
 export class DotLayer {
@@ -48,24 +50,43 @@ function packed(colour: string, alpha: number): number {
   return ((alpha << 24) | (b << 16) | (g << 8) | r) >>> 0;
 }
 
+const previous = new WeakMap<History, Int32Array>();
+
+/** By keyframe the one with a pose before it in its run, or -1. */
+function previousOf(history: History): Int32Array {
+  let found = previous.get(history);
+  if (found === undefined) {
+    const { x, run } = history.keyframes;
+    const last = new Int32Array(history.runIds.length).fill(-1);
+    found = new Int32Array(x.length).fill(-1);
+    for (let each = 0; each < x.length; each++) {
+      if (Number.isNaN(x[each])) continue;
+      found[each] = last[run[each]];
+      last[run[each]] = each;
+    }
+    previous.set(history, found);
+  }
+  return found;
+}
+
 function drawPaths(pixels: Uint32Array, history: History, map: MapState, screen: Screen, colour: number) {
-  const { x: xs, y: ys, run } = history.keyframes;
+  const { x: xs, y: ys } = history.keyframes;
   const { k, width, height } = screen;
-  const last = new Map<number, number>();
-  for (let each = 0; each < map.keyframeCount; each++) {
-    if (xs[each] !== xs[each]) continue;
-    const before = last.get(run[each]);
-    last.set(run[each], each);
-    if (before === undefined) continue;
-    const [x0, y0] = [xs[before] * k + screen.x, screen.y - ys[before] * k];
-    const [x1, y1] = [xs[each] * k + screen.x, screen.y - ys[each] * k];
-    if (Math.max(x0, x1) < 0 || Math.min(x0, x1) > width) continue;
-    if (Math.max(y0, y1) < 0 || Math.min(y0, y1) > height) continue;
-    const steps = Math.ceil(Math.max(Math.abs(x1 - x0), Math.abs(y1 - y0)));
+  const before = previousOf(history);
+  for (let each = Math.max(0, map.keyframeCount - MOST_PATH); each < map.keyframeCount; each++) {
+    const last = before[each];
+    if (last < 0) continue;
+    const x0 = xs[last] * k + screen.x;
+    const y0 = screen.y - ys[last] * k;
+    const dx = xs[each] * k + screen.x - x0;
+    const dy = screen.y - ys[each] * k - y0;
+    if (Math.max(x0, x0 + dx) < 0 || Math.min(x0, x0 + dx) > width) continue;
+    if (Math.max(y0, y0 + dy) < 0 || Math.min(y0, y0 + dy) > height) continue;
+    const steps = Math.ceil(Math.max(Math.abs(dx), Math.abs(dy)));
     if (steps > 4 * (width + height)) continue;
-    for (let step = 0; step <= steps; step++) {
-      const share = steps === 0 ? 0 : step / steps;
-      const [px, py] = [(x0 + (x1 - x0) * share) | 0, (y0 + (y1 - y0) * share) | 0];
+    for (let step = 0; step < steps; step++) {
+      const px = (x0 + (dx * step) / steps) | 0;
+      const py = (y0 + (dy * step) / steps) | 0;
       if (px >= 0 && py >= 0 && px < width && py < height) pixels[py * width + px] = colour;
     }
   }
@@ -76,17 +97,15 @@ function drawDots(pixels: Uint32Array, history: History, map: MapState, screen: 
   const { k, width, height } = screen;
   const masks = discs(radius);
   const edge = Math.ceil(radius) + 1;
-  const colours = new Map<number, number>();
+  // By place, and before them that of noise.
+  const colours = Uint32Array.from([-1, ...history.placeIds.keys()], (place) => packed(placeColour(palette, history, place), 0));
   for (let each = 0; each < map.keyframeCount; each++) {
-    const [x, y] = [xs[each] * k + screen.x, screen.y - ys[each] * k];
+    const x = xs[each] * k + screen.x;
+    const y = screen.y - ys[each] * k;
     if (!(x > edge && y > edge && x < width - edge && y < height - edge)) continue; // NaN too
-    const place = map.placeOf[each];
-    let colour = colours.get(place);
-    if (colour === undefined) {
-      colour = packed(placeColour(palette, history, place), 0);
-      colours.set(place, colour);
-    }
-    const [left, top] = [x | 0, y | 0];
+    const colour = colours[map.placeOf[each] + 1];
+    const left = x | 0;
+    const top = y | 0;
     const mask = masks[(((y - top) * SUBPIXELS) | 0) * SUBPIXELS + (((x - left) * SUBPIXELS) | 0)];
     const base = top * width + left;
     for (let i = 0; i < mask.length; i += 3) {

@@ -30,7 +30,7 @@ interface Wanted {
   always?: boolean;
 }
 
-interface Box {
+export interface Box {
   x: number;
   y: number;
   width: number;
@@ -38,10 +38,19 @@ interface Box {
 }
 
 export function drawLabels(on: Surface, scene: Scene) {
-  const taken: Box[] = [];
+  const taken = reserved(scene);
   for (const wanted of [...placeLabels(scene), ...edgeLabels(scene), ...objectLabels(scene)].slice(0, MOST)) {
     draw(on, scene, wanted, taken);
   }
+}
+
+/** Where an answer is drawn that labels must not cover. */
+function reserved({ bridge, lost, view }: Scene): Box[] {
+  const spots = [
+    ...(bridge?.chains.flatMap((chain) => chain.points) ?? []),
+    ...(lost === null ? [] : [lost.pose, lost.truth, ...lost.evidence]),
+  ];
+  return spots.flatMap((spot) => (spot === null ? [] : [{ x: screenX(view, spot.x) - 12, y: screenY(view, spot.y) - 24, width: 24, height: 48 }]));
 }
 
 function placeLabels(scene: Scene): Wanted[] {
@@ -135,7 +144,7 @@ function candidates({ x, y, away }: Wanted, width: number, height: number): Box[
   }));
 }
 
-function overlap(a: Box, b: Box): boolean {
+export function overlap(a: Box, b: Box): boolean {
   return a.x < b.x + b.width && b.x < a.x + a.width && a.y < b.y + b.height && b.y < a.y + a.height;
 }
 

@@ -2,7 +2,7 @@
 
 import { isolated, label } from "../model/names";
 import { drawArrow, dotRadius } from "./keyframes";
-import { FONT } from "./labels";
+import { type Box, FONT, overlap } from "./labels";
 import { withAlpha } from "./palette";
 import type { Bridge, Scene } from "./scene";
 import type { Surface } from "./surface";
@@ -132,7 +132,8 @@ function writeDistances(on: Surface, scene: Scene, at: (readonly [number, number
   });
 }
 
-export function drawLost(on: Surface, scene: Scene) {
+/** The heat map of where the robot may be, below everything with a name. */
+export function drawLikely(on: Surface, scene: Scene) {
   const { lost, view, palette } = scene;
   if (lost === null) return;
   const most = Math.max(1e-12, ...lost.cells.map((cell) => cell.share));
@@ -143,7 +144,13 @@ export function drawLost(on: Surface, scene: Scene) {
     on.fillStyle = withAlpha(palette.accent, 0.06 + 0.74 * Math.sqrt(share / most));
     on.fill();
   }
+}
+
+export function drawLost(on: Surface, scene: Scene) {
+  const { lost, view, palette } = scene;
+  if (lost === null) return;
   const { pose, truth } = lost;
+  const taken: Box[] = [];
   if (pose !== null) {
     const [px, py] = [screenX(view, pose.x), screenY(view, pose.y)];
     for (const { x, y, text: says, place } of lost.evidence) {
@@ -164,7 +171,7 @@ export function drawLost(on: Surface, scene: Scene) {
       on.strokeStyle = withAlpha(palette.ink, 0.65);
       on.lineWidth = 1.4;
       on.stroke();
-      text(on, scene, ex, ey - 14, says, palette.ink);
+      text(on, scene, ex, ey - 14, says, palette.ink, taken);
     }
     on.beginPath();
     on.arc(px, py, Math.max(9, pose.spread * view.k), 0, ROUND);
@@ -172,17 +179,23 @@ export function drawLost(on: Surface, scene: Scene) {
     on.lineWidth = 1.6;
     on.stroke();
     if (pose.yaw !== null) drawArrow(on, px, py, pose.yaw, 13, palette.accent, palette.ground);
-    text(on, scene, px, py + 22, "answer", palette.accent);
+    text(on, scene, px, py + 24, "answer", palette.accent, taken);
   }
   if (truth !== null) {
     const [tx, ty] = [screenX(view, truth.x), screenY(view, truth.y)];
     if (truth.yaw !== null) drawArrow(on, tx, ty, truth.yaw, 12, palette.added, palette.ground);
-    text(on, scene, tx, ty - 20, "true pose", palette.added);
+    text(on, scene, tx, ty - 22, "true pose", palette.added, taken);
   }
 }
 
-function text(on: Surface, scene: Scene, x: number, y: number, says: string, colour: string) {
+/** Writes about (x, y), further up where one of `taken` is in the way. */
+function text(on: Surface, scene: Scene, x: number, wanted: number, says: string, colour: string, taken: Box[] = []) {
   on.font = `600 11px ${FONT}`;
+  const width = on.measureText(says).width + 6;
+  const at = (y: number) => ({ x: x - width / 2, y: y - 8, width, height: 16 });
+  let y = wanted;
+  while (taken.some((box) => overlap(box, at(y))) && y > wanted - 120) y -= 15;
+  taken.push(at(y));
   on.textAlign = "center";
   on.textBaseline = "middle";
   on.strokeStyle = scene.palette.halo;

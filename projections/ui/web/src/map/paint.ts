@@ -3,7 +3,7 @@
 import { drawGrid, drawRegions, drawWalls } from "./ground";
 import { drawKeyframes, drawRobot } from "./keyframes";
 import { drawLabels } from "./labels";
-import { drawBridge, drawDifference, drawLost } from "./overlays";
+import { drawBridge, drawDifference, drawLikely, drawLost } from "./overlays";
 import type { Scene } from "./scene";
 import type { Surface } from "./surface";
 import { drawEdges, drawObjects } from "./things";
@@ -12,6 +12,7 @@ export function paint(on: Surface, scene: Scene) {
   drawGrid(on, scene);
   if (scene.layers.regions) drawRegions(on, scene);
   if (scene.layers.walls && scene.walls.length > 0) drawWalls(on, scene);
+  drawLikely(on, scene);
   if (scene.layers.edges) drawEdges(on, scene);
   if (scene.layers.path || scene.layers.keyframes) drawKeyframes(on, scene);
   if (scene.layers.objects) drawObjects(on, scene);

@@ -86,30 +86,38 @@ function nearest(history: History, map: MapState, grid: Grid) {
   const { columns, rows, step, x0, y0 } = grid;
   const owner = new Int32Array(columns * rows).fill(NONE);
   const far = reachOf(step) + 1.5 * step;
-  const distance = new Float32Array(columns * rows).fill(far);
+  const distance = new Float32Array(columns * rows);
   const stamped = new Int32Array(columns * rows).fill(NONE);
   const { x: xs, y: ys } = history.keyframes;
   const reach = Math.ceil(far / step);
+  // Squares of distances in steps, and no temporary arrays: this loop runs while dragging.
+  const squares = new Float32Array(columns * rows).fill((far / step) ** 2);
   for (let each = 0; each < map.keyframeCount; each++) {
     const place = map.placeOf[each];
     if (place === NONE) continue;
-    const [x, y] = [(xs[each] - x0) / step, (ys[each] - y0) / step];
-    const [column, row] = [Math.round(x), Math.round(y)];
+    const x = (xs[each] - x0) / step;
+    const y = (ys[each] - y0) / step;
+    const column = Math.round(x);
+    const row = Math.round(y);
     const cell = row * columns + column;
     if (stamped[cell] === place) continue; // another of this place is at most a step away
     stamped[cell] = place;
-    for (let r = Math.max(0, row - reach); r <= Math.min(rows - 1, row + reach); r++) {
-      for (let c = Math.max(0, column - reach); c <= Math.min(columns - 1, column + reach); c++) {
-        const [dx, dy] = [c - x, r - y];
-        const metres = Math.sqrt(dx * dx + dy * dy) * step;
-        const point = r * columns + c;
-        if (metres < distance[point]) {
-          distance[point] = metres;
+    const left = Math.max(0, column - reach);
+    const right = Math.min(columns - 1, column + reach);
+    const top = Math.min(rows - 1, row + reach);
+    for (let r = Math.max(0, row - reach); r <= top; r++) {
+      const dy = r - y;
+      for (let c = left, point = r * columns + left; c <= right; c++, point++) {
+        const dx = c - x;
+        const square = dx * dx + dy * dy;
+        if (square < squares[point]) {
+          squares[point] = square;
           owner[point] = place;
         }
       }
     }
   }
+  for (let point = 0; point < squares.length; point++) distance[point] = Math.sqrt(squares[point]) * step;
   return { owner, distance };
 }
 
@@ -143,14 +151,11 @@ function outlines(grid: Grid, owner: Int32Array, distance: Float32Array, reach: 
   for (let row = 0; row + 1 < rows; row++) {
     for (let column = 0; column + 1 < columns; column++) {
       const base = row * columns + column;
-      const points = [base, base + 1, base + columns + 1, base + columns];
-      let [first, same] = [0, true];
-      for (let k = 0; k < 4; k++) {
-        corners[k] = distance[points[k]] < reach ? owner[points[k]] : NONE;
-        if (k === 0) first = corners[0];
-        else if (corners[k] !== first) same = false;
-      }
-      if (same) continue;
+      corners[0] = distance[base] < reach ? owner[base] : NONE;
+      corners[1] = distance[base + 1] < reach ? owner[base + 1] : NONE;
+      corners[2] = distance[base + columns + 1] < reach ? owner[base + columns + 1] : NONE;
+      corners[3] = distance[base + columns] < reach ? owner[base + columns] : NONE;
+      if (corners[0] === corners[1] && corners[1] === corners[2] && corners[2] === corners[3]) continue;
       for (let k = 0; k < 4; k++) {
         const place = corners[k];
         if (place === NONE || corners.indexOf(place) !== k) continue;

@@ -121,9 +121,9 @@ function Form() {
         void send(preview === null);
       }}
     >
-      <label>
+      <label for="correction-kind">
         Correction
-        <select value={wanted.kind} onChange={(event) => (proposal.value = { kind: event.currentTarget.value, arguments: sameKind(wanted, event.currentTarget.value) })}>
+        <select id="correction-kind" value={wanted.kind} onChange={(event) => (proposal.value = { kind: event.currentTarget.value, arguments: sameKind(wanted, event.currentTarget.value) })}>
           {Object.entries(KINDS).map(([name, { says }]) => (
             <option key={name} value={name}>
               {says}

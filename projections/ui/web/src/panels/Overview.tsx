@@ -9,7 +9,7 @@ import { Moment, ThingLink } from "./Told";
 const MOST = 300;
 
 export function Overview({ history }: { history: History }) {
-  const map = store.map.value;
+  const map = store.restedMap.value;
   if (map === null) return null;
   const { offset, survivor, absorbed, keyframe } = history.merges;
   const places = [...map.places].sort((a, b) => map.size[b] - map.size[a]);
@@ -21,7 +21,7 @@ export function Overview({ history }: { history: History }) {
       ) : (
         <ol class="merges">
           {Array.from(offset.slice(0, MOST), (at, row) => (
-            <li key={row} class={at < store.at.value ? "past" : "ahead"}>
+            <li key={row} class={at < map.at ? "past" : "ahead"}>
               <Moment offset={at} />
               <ThingLink thing={{ kind: "merge", id: String(at) }}>
                 {label(shortPlace(history, survivor[row]))} ← {label(shortPlace(history, absorbed[row]))}

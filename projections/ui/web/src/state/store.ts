@@ -71,6 +71,10 @@ export type LayerName = keyof (typeof layers)["value"];
 export const map = computed<MapState | null>(() =>
   history.value === null ? null : mapAt(history.value, at.value),
 );
+/** The map when dragging has rested, for what need not follow every move. */
+export const restedMap = computed<MapState | null>(() =>
+  history.value === null ? null : mapAt(history.value, Math.min(restedAt.value, history.value.through)),
+);
 export const otherMap = computed<MapState | null>(() =>
   otherHistory.value === null ? null : mapAt(otherHistory.value, at.value),
 );

@@ -1,0 +1,123 @@
+import { describe, expect, it } from "vitest";
+import { escaped } from "../src/map/surface";
+import { decodeHistory } from "../src/history/decode";
+import { placeColours } from "../src/model/colours";
+import { compareMoments } from "../src/model/compare";
+import { mapAt } from "../src/model/map_at";
+import { Stamps, momentsOf, neighbour, playedTo } from "../src/model/moments";
+import { findKeyframe, keyframeId, label } from "../src/model/names";
+import { searchLocally } from "../src/model/search";
+import { completions } from "../src/panels/completion";
+import { encoded, randomTables } from "./histories";
+
+const history = decodeHistory(encoded(randomTables(5)));
+
+describe("moments", () => {
+  const moments = momentsOf(history);
+  it("steps to the next and the previous change, each once, and no further", () => {
+    const changes = [...moments.changes];
+    expect(changes).toEqual([...new Set(changes)].sort((a, b) => a - b));
+    for (let at = 0; at <= history.through; at++) {
+      expect(neighbour(moments.changes, at, 1)).toBe(changes.find((each) => each > at) ?? null);
+      expect(neighbour(moments.changes, at, -1)).toBe(changes.filter((each) => each < at).at(-1) ?? null);
+    }
+  });
+  it("plays on without stepping back, to the end", () => {
+    let [at, seconds] = [0, 0];
+    while (at < history.through && seconds < 1000) {
+      const next = playedTo(history, moments, 0, (seconds += 0.7));
+      expect(next).toBeGreaterThanOrEqual(at);
+      at = next;
+    }
+    expect(at).toBe(history.through);
+  });
+  it("takes a time as all events up to the last one stamped then or earlier", () => {
+    const stamps = new Stamps(history);
+    const { offset, stamp } = history.events;
+    for (let time = stamps.first - 1; time <= stamps.last + 1; time += 0.25) {
+      const last = Math.max(-1, ...Array.from(offset).filter((_, row) => stamp[row] <= time));
+      expect(stamps.at(time)).toBe(time >= stamps.last ? history.through : last + 1);
+    }
+  });
+});
+
+describe("compareMoments", () => {
+  it("finds nothing between a moment and itself, and the turned difference the other way", () => {
+    for (const [from, to] of [[20, 20], [10, 60], [60, 119]]) {
+      const [a, b] = [mapAt(history, from), mapAt(history, to)];
+      const there = compareMoments(history, a, b);
+      const back = compareMoments(history, b, a);
+      if (from === to) expect([there.newKeyframes, there.movedKeyframes, there.places.size, there.objects.size]).toEqual([[], [], 0, 0]);
+      expect(there.newKeyframes.length).toBe(b.keyframeCount - a.keyframeCount);
+      const turned = { new: "gone", gone: "new", moved: "moved", changed: "changed" } as const;
+      expect(new Map([...there.places].map(([place, change]) => [place, turned[change]]))).toEqual(back.places);
+      for (const [place, change] of there.places) {
+        expect(change === "new").toBe(a.standsAs[place] !== place && b.standsAs[place] === place);
+        expect(change === "gone").toBe(a.standsAs[place] === place && b.standsAs[place] !== place);
+      }
+    }
+  });
+});
+
+describe("names", () => {
+  it("finds each keyframe by its name, with a slash or a colon", () => {
+    for (let each = 0; each < history.keyframes.offset.length; each += 5) {
+      const id = keyframeId(history, each);
+      expect(findKeyframe(history, id)).toBe(each);
+      expect(findKeyframe(history, id.replace("/", ":"))).toBe(each);
+    }
+    expect(findKeyframe(history, "a/99999")).toBe(-1);
+    expect(findKeyframe(history, "<script>")).toBe(-1);
+  });
+  it("shortens by characters, not by halves of them, and shows control characters", () => {
+    expect(label("☕🤖".repeat(40), 5)).toBe("☕🤖☕🤖…");
+    expect(label("a\u0000b\nc")).toBe("a\ufffdb\ufffdc");
+    expect(label("x".repeat(256)).length).toBe(28);
+  });
+  it("searches places, objects and keyframes", () => {
+    const map = mapAt(history, history.through);
+    expect(searchLocally(history, map, "p0")[0].thing).toEqual({ kind: "place", id: "r_p0" });
+    expect(searchLocally(history, map, "OBJ-1")[0].thing.kind).toBe("object");
+    expect(searchLocally(history, map, keyframeId(history, 3))[0].thing).toEqual({ kind: "keyframe", id: keyframeId(history, 3) });
+    expect(searchLocally(history, map, "  ")).toEqual([]);
+  });
+});
+
+describe("colours", () => {
+  it("differ for places that were adjacent or became one", () => {
+    const colours = placeColours(history, 10);
+    const near = new Map<number, Set<number>>();
+    const pairs = [...history.pairs.a.keys()].map((row) => [history.pairs.a[row], history.pairs.b[row]]);
+    pairs.push(...[...history.merges.survivor.keys()].map((row) => [history.merges.survivor[row], history.merges.absorbed[row]]));
+    for (const [a, b] of pairs) near.set(a, (near.get(a) ?? new Set()).add(b));
+    for (const [a, b] of pairs) if ((near.get(a)?.size ?? 0) < 9) expect(colours[a]).not.toBe(colours[b]);
+  });
+});
+
+describe("completions", () => {
+  const functions = [
+    { name: "size", signature: "size(place)", parameters: ["place"], result: "a number", says: "" },
+    { name: "same_place", signature: "same_place(keyframe, keyframe)", parameters: ["keyframe", "keyframe"], result: "", says: "" },
+    { name: "place_count", signature: "place_count()", parameters: [], result: "a number", says: "" },
+  ];
+  const titles = (text: string) => completions(text, text.length, functions, history).map((each) => each.title);
+  const completed = (text: string) => {
+    const [first] = completions(text, text.length, functions, history);
+    return text.slice(0, first.from) + first.insert;
+  };
+  it("offers functions, then names of the kind that the argument takes", () => {
+    expect(titles("s")).toEqual(["size(place)", "same_place(keyframe, keyframe)"]);
+    expect(titles("not pl")).toEqual(["place_count()"]);
+    expect(completed("size('r_p")).toBe("size('r_p0')");
+    expect(completed("same_place('a:")).toMatch(/^same_place\('a:\d+', '$/);
+    expect(completed(`${completed("same_place('a:")}b`)).toMatch(/^same_place\('a:\d+', 'b:\d+'\)$/);
+    expect(titles("size('r_p0') >")).toEqual([]);
+  });
+});
+
+describe("escaped", () => {
+  it("leaves no markup and nothing that XML forbids", () => {
+    expect(escaped(`<script>"'&`)).not.toMatch(/[<>"']|&(?!#\d+;)/);
+    expect(escaped("\u0000\u0007")).toBe("\ufffd\ufffd");
+  });
+});

@@ -1,0 +1,47 @@
+"""A headless chromium that asks nobody but the server under test."""
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from playwright.sync_api import Browser, Page, sync_playwright
+
+ARGUMENTS = (
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
+WAIT_MS = 30_000
+
+
+def program() -> str | None:
+    """Where chromium is: what ``MAPFOLD_CHROMIUM`` names, else Debian's."""
+    return os.environ.get("MAPFOLD_CHROMIUM") or shutil.which("chromium")
+
+
+@contextmanager
+def browser(folder: Path) -> Iterator[Browser]:
+    """A browser of its own, whose home is in ``folder``."""
+    with sync_playwright() as playwright:
+        home = {**os.environ, "HOME": str(folder), "XDG_CONFIG_HOME": str(folder / "config")}
+        started = playwright.chromium.launch(
+            executable_path=program(), args=list(ARGUMENTS), env=home
+        )
+        try:
+            yield started
+        finally:
+            started.close()
+
+
+def opened(page: Page, url: str) -> Page:
+    """The page at ``url``, when its map is drawn."""
+    page.goto("about:blank")
+    page.goto(url)
+    page.wait_for_selector("html[data-painted]", timeout=WAIT_MS)
+    return page
