@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 ARGUMENTS = (
     "--no-sandbox",
@@ -18,6 +18,7 @@ ARGUMENTS = (
     "--disable-sync",
 )
 WAIT_MS = 30_000
+expect.set_options(timeout=WAIT_MS)
 
 
 def program() -> str | None:

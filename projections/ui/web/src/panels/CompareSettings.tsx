@@ -101,12 +101,12 @@ export function CompareSettings() {
 
 function Slider({ name, value, own, least, most, step, onChange }: { name: string; value: number; own: number | undefined; least: number; most: number; step: number; onChange: (value: number) => void }) {
   return (
-    <label class="slider">
-      <span>
-        {name} <output>{value}</output> {own !== undefined && own !== value && <span class="dim">log: {own}</span>}
+    <div class="slider">
+      <span aria-hidden="true">
+        {name} <b>{value}</b> {own !== undefined && own !== value && <span class="dim">log: {own}</span>}
       </span>
-      <input type="range" min={least} max={most} step={step} value={value} onInput={(event) => onChange(Number(event.currentTarget.value))} />
-    </label>
+      <input type="range" aria-label={name} min={least} max={most} step={step} value={value} onInput={(event) => onChange(Number(event.currentTarget.value))} />
+    </div>
   );
 }
 

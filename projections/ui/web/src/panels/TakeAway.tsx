@@ -100,7 +100,11 @@ function saveJson() {
 /** The command line of the panel's answer, or of the map at W. */
 export function copyCommand(): Promise<void> {
   const answer = document.querySelector("#panel .command code")?.textContent;
-  const log = store.log.value?.path ?? store.log.value?.name ?? "LOG";
-  const quoted = /^[\w@%+=:,./-]+$/.test(log) ? log : `'${log.replaceAll("'", "'\"'\"'")}'`;
-  return copy(answer ?? `mapfold state ${quoted} --at ${store.at.value}`, "the command line");
+  const shown = store.stateCommand.value;
+  const state = shown?.at === store.at.value ? shown.command : null;
+  if (answer === undefined && state === null) {
+    tell("The server has not yet told the command of this moment; try again.");
+    return Promise.resolve();
+  }
+  return copy(answer ?? state ?? "", "the command line");
 }

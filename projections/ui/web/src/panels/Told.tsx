@@ -60,6 +60,11 @@ export function Steps({ steps }: { steps: readonly Step[] }) {
             <p>
               <Linked text={step.text} refs={step.refs ?? []} />
             </p>
+            {step.refs?.filter(({ kind }) => kind === "merge").map(({ id }) => (
+              <p key={id}>
+                <ThingLink thing={{ kind: "merge", id }}>see the merge</ThingLink>
+              </p>
+            ))}
             {step.time !== undefined && step.time !== null && <time>{step.time.replace("T", " ").replace("Z", "")}</time>}
           </div>
         </li>

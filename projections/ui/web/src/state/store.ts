@@ -30,6 +30,8 @@ export const serverLost = signal(false);
 
 /** W: the map after the first `at` events. */
 export const at = signal(0);
+/** The command line that gives the map last asked about, and its W. */
+export const stateCommand = signal<{ at: number; command: string } | null>(null);
 /** W when dragging and playing have rested: what the server is asked about. */
 export const restedAt = signal(0);
 export const playing = signal(false);

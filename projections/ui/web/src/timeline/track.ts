@@ -4,6 +4,7 @@ import uPlot from "uplot";
 import type { History } from "../history/types";
 import type { Palette } from "../map/palette";
 import type { Mark, Moments, Stamps } from "../model/moments";
+import { when } from "../ui/summary";
 import { densityOf } from "./density";
 import { ROWS_HEIGHT, ROW_HEIGHT, drawMark, rowOf } from "./marks";
 
@@ -18,6 +19,12 @@ export interface TrackData {
   byTime: boolean;
   palette: Palette;
   found: readonly { offset: number; becomes: boolean }[];
+}
+
+/** Times of ticks in UTC, with the day where they span several. */
+function timeTexts(stamps: number[]): string[] {
+  const days = (stamps[stamps.length - 1] ?? 0) - (stamps[0] ?? 0) > 86_400;
+  return stamps.map((stamp) => when(stamp).slice(days ? 5 : 11, days ? 16 : 19));
 }
 
 export class Track {
@@ -57,7 +64,6 @@ export class Track {
           ],
         },
         legend: { show: false },
-        tzDate: (stamp) => uPlot.tzDate(new Date(stamp * 1000), "Etc/UTC"),
         scales: { x: { time: byTime, range }, y: { range: (_, __, most) => [0, Math.max(1, most)] } },
         axes: [
           {
@@ -66,6 +72,7 @@ export class Track {
             font: "11px system-ui, sans-serif",
             stroke: palette.dim,
             grid: { show: false },
+            ...(byTime ? { space: 76, values: (_: uPlot, at: number[]) => timeTexts(at) } : {}),
             ticks: { stroke: palette.faint, size: 4, width: 1 },
           },
           { show: false },

@@ -1,5 +1,6 @@
 /** What the map holds at W, and its digest. */
 
+import { useEffect } from "preact/hooks";
 import { address } from "../api/client";
 import { counted } from "../model/names";
 import { useAnswer } from "../state/answers";
@@ -10,6 +11,10 @@ export function Digest() {
   const at = store.restedAt.value;
   const path = history === null || at > history.through ? null : address("/api/digest", { at, known_at: history.knownAt });
   const asked = useAnswer<{ at: number; digest: string; command: string }>(path);
+  useEffect(() => {
+    const found = asked.value;
+    store.stateCommand.value = found === null ? null : { at: found.at, command: found.command.replace(/ --digest\b/, "") };
+  }, [asked.value]);
   if (map === null || history === null) return null;
   const current = asked.value !== null && asked.value.at === store.at.value;
   return (

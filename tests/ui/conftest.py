@@ -1,0 +1,95 @@
+"""The browser and the pages of these tests; without chromium or playwright they are left out."""
+
+import importlib.util
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.commands import Commands
+from tests.shared_data import ROOT
+from tests.ui_server import UiServer, showing
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+
+if importlib.util.find_spec("playwright") is None:
+    collect_ignore_glob = ["test_*.py"]
+else:
+    from tests.ui.browser import browser, opened, program
+
+    if program() is None:
+        collect_ignore_glob = ["test_*.py"]
+
+WIDE = ("--set", "eps_m=1.0", "--set", "min_samples=8")
+SAMPLE = ROOT / "logs" / "sample"
+Visit = Callable[..., "Page"]
+
+
+@pytest.fixture(scope="session")
+def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator["Browser"]:
+    with browser(tmp_path_factory.mktemp("chromium")) as started:
+        yield started
+
+
+@pytest.fixture(scope="session")
+def mapfold(tmp_path_factory: pytest.TempPathFactory) -> Commands:
+    return Commands.in_folder(tmp_path_factory.mktemp("mapfold"))
+
+
+@pytest.fixture(scope="session")
+def sample(mapfold: Commands) -> Iterator[UiServer]:
+    """The sample log under the settings of docs/time-travel.md."""
+    with showing(mapfold, SAMPLE, *WIDE) as server:
+        yield server
+
+
+@pytest.fixture
+def visit(chromium: "Browser") -> Iterator[Visit]:
+    """Opens a server's page; at the end nothing must have gone wrong in it: no error in the
+    console, nothing asked of another host."""
+    faults: list[str] = []
+    with ExitStack() as stack:
+
+        def visited(
+            server: UiServer, moment: str = "", *, wait: bool = True, **options: object
+        ) -> "Page":
+            origin = f"http://127.0.0.1:{server.port}"
+            options.setdefault("viewport", {"width": 1280, "height": 720})
+            context = chromium.new_context(accept_downloads=True, **options)  # type: ignore[arg-type]
+            stack.callback(context.close)
+            page = context.new_page()
+            page.on("pageerror", lambda error: faults.append(f"error: {error}"))
+            page.on("console", lambda said: faults.append(said.text) if _is_fault(said) else None)
+            page.on("request", lambda r: None if _is_own(r.url, origin) else faults.append(r.url))
+            query = "" if server.token is None else f"?token={server.token}"
+            url = f"{origin}/{query}{moment}"
+            if wait:
+                return opened(page, url)
+            page.goto(url)
+            return page
+
+        yield visited
+        assert faults == []
+
+
+def _is_fault(said: object) -> bool:
+    # A refused question is told to the person; the console names it too.
+    text = getattr(said, "text", "")
+    return (
+        getattr(said, "type", "") in ("error", "warning") and "Failed to load resource" not in text
+    )
+
+
+def _is_own(url: str, origin: str) -> bool:
+    return url.startswith((f"{origin}/", f"blob:{origin}/", "about:"))
+
+
+@pytest.fixture
+def pictures(tmp_path: Path) -> Path:
+    """Where screenshots go: ``build/ui-pictures``, where a person may look at them."""
+    folder = ROOT / "build" / "ui-pictures"
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder

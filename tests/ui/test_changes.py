@@ -1,0 +1,160 @@
+"""Points 7 to 9: corrections, a log that grows, and what can be taken away."""
+
+import json
+import shlex
+import shutil
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from eventsrc.log import LogReader
+from tests.commands import Commands
+from tests.logs import append_raw
+from tests.ui.conftest import SAMPLE, WIDE, Visit
+from tests.ui.test_moments import moment
+from tests.ui_server import UiServer, showing
+
+
+@pytest.fixture
+def edited(mapfold: Commands, tmp_path: Path) -> Iterator[tuple[Path, UiServer]]:
+    log = Path(shutil.copytree(SAMPLE, tmp_path / "log"))
+    with showing(mapfold, log, *WIDE, "--allow-edits") as server:
+        yield log, server
+
+
+def record(page: Page, reason: str) -> None:
+    page.get_by_role("button", name="Preview").click()
+    expect(page.locator(".preview")).to_contain_text("Would change")
+    expect(page.get_by_role("button", name="Record it")).to_be_disabled()
+    page.get_by_label("Reason").fill(reason)
+    page.get_by_role("button", name="Record it").click()
+    expect(page.get_by_role("status").filter(has_text="Recorded at offset")).to_be_visible()
+
+
+def test_a_place_is_renamed_from_the_context_menu_and_the_name_undone(
+    edited: tuple[Path, UiServer], visit: Visit, mapfold: Commands
+) -> None:
+    log, server = edited
+    page = visit(server, "#panel=why")
+    box = page.locator("canvas.map").bounding_box()
+    assert box is not None
+    page.mouse.click(box["x"] + box["width"] * 0.72, box["y"] + box["height"] * 0.4, button="right")
+    page.get_by_role("menuitem", name="Rename this place").click()
+    page.get_by_role("textbox", name="Name").fill("<b>guests</b>")
+    record(page, "a bed for guests")
+    corrections = page.locator(".corrections > li")
+    expect(corrections).to_have_count(1)
+    expect(corrections).to_contain_text("<b>guests</b>")
+    expect(corrections).to_contain_text("a bed for guests")
+    given = mapfold("edits", log, "--json").json
+    assert [(each["kind"], each["reason"]) for each in given] == [
+        ("name-place", "a bed for guests")
+    ]
+    page.get_by_role("tab", name="Why").click()
+    page.keyboard.press("End")
+    page.keyboard.press("Escape")
+    expect(page.locator("ol.places")).to_contain_text("<b>guests</b>")
+    page.get_by_role("tab", name="Correct").click()
+    corrections.get_by_role("button", name="Undo").click()
+    record(page, "not asked")
+    expect(corrections).to_have_count(2)
+    expect(corrections.first).to_contain_text("undone by")
+
+
+def test_a_merge_is_undone_with_a_preview_of_what_changes(
+    edited: tuple[Path, UiServer], visit: Visit, mapfold: Commands
+) -> None:
+    log, server = edited
+    said = mapfold("edit", log, "undo-merge", "348", "--dry-run", *WIDE).out
+    page = visit(server, "#panel=correct")
+    page.locator("#correction-kind").select_option("undo-merge")
+    page.get_by_label("Offset of the merge").fill("348")
+    page.get_by_role("button", name="Preview").click()
+    expect(page.locator(".preview b")).to_have_text(
+        "Would change 2 places, 18 objects, 102 keyframes"
+    )
+    assert "102 changed place" in said
+    expect(page.locator(".preview .lines")).to_contain_text("102 changed place")
+    assert len(mapfold("edits", log, "--json").json) == 0
+    page.get_by_label("Reason").fill("a door")
+    page.get_by_role("button", name="Record it").click()
+    expect(page.locator(".corrections > li")).to_have_count(1)
+    page.keyboard.press("Escape")
+    page.locator("body").press("End")
+    expect(page.locator(".facts")).to_contain_text("7 places")
+    page.get_by_label("Offset of the merge").or_(page.get_by_label("Place")).first.wait_for()
+    page.locator("#correction-kind").select_option("undo-merge")
+    page.get_by_label("Offset of the merge").fill("3")
+    page.get_by_role("button", name="Preview").click()
+    expect(page.locator(".correction .error")).to_contain_text("merge")
+
+
+def test_without_leave_the_page_only_looks(sample: UiServer, visit: Visit) -> None:
+    page = visit(sample, "#panel=correct")
+    expect(page.locator(".note")).to_contain_text("--allow-edits")
+    expect(page.locator("form.correction")).to_have_count(0)
+    page.locator("canvas.map").click(button="right", position={"x": 300, "y": 240})
+    expect(page.get_by_role("menuitem", name="Rename")).to_have_count(0)
+
+
+def test_a_growing_log_is_followed_and_a_moment_kept(
+    mapfold: Commands, visit: Visit, tmp_path: Path
+) -> None:
+    with LogReader(SAMPLE) as reader:
+        payloads = [bytes(event.payload) for event in reader.read()]
+    log = tmp_path / "log"
+    for payload in payloads[:100]:
+        append_raw(log, payload)
+    with showing(mapfold, log, *WIDE) as server:
+        page = visit(server)
+        page.get_by_role("button", name="Live").click()
+        expect(page.locator(".facts")).to_contain_text("100 keyframes")
+        for payload in payloads[100:180]:
+            append_raw(log, payload)
+        expect(page.locator(".facts")).to_contain_text("180 keyframes")
+        assert moment(page) == 180
+        page.get_by_role("button", name="Live").click()
+        for payload in payloads[180:200]:
+            append_raw(log, payload)
+        expect(page.locator(".moment")).to_contain_text("of 200 events")
+        expect(page.locator(".facts")).to_contain_text("180 keyframes")
+        page.keyboard.press("l")
+        expect(page.locator(".facts")).to_contain_text("200 keyframes")
+
+
+def test_the_view_is_taken_away_as_picture_state_and_command(
+    sample: UiServer, visit: Visit, mapfold: Commands, tmp_path: Path
+) -> None:
+    page = visit(sample, "#at=349", permissions=["clipboard-read", "clipboard-write"])
+
+    def taken(item: str) -> bytes:
+        page.get_by_role("button", name="Take away").click()
+        with page.expect_download() as waiting:
+            page.get_by_role("menuitem", name=item).click()
+        path = tmp_path / waiting.value.suggested_filename
+        waiting.value.save_as(path)
+        assert path.name.startswith("sample-349.")
+        return path.read_bytes()
+
+    assert taken("Picture as PNG").startswith(b"\x89PNG\r\n\x1a\n")
+    svg = ET.fromstring(taken("Picture as SVG"))
+    texts = {
+        "".join(text.itertext()).strip("\u2068\u2069")
+        for text in svg.iter()
+        if text.tag.endswith("}text")
+    }
+    assert {"p0", "p6", "134"} <= texts
+    saved = json.loads(taken("State as JSON"))
+    wanted = mapfold("state", SAMPLE, *WIDE, "--at", "349", "--json").json
+    places = {p["place_id"]: p["keyframe_count"] for p in wanted["places"]}
+    assert {p["place_id"]: p["keyframes"] for p in saved["places"]} == places
+    assert len(saved["objects"]) == wanted["counts"]["objects"]
+    page.get_by_role("button", name="Take away").click()
+    page.get_by_role("menuitem", name="Copy as command").click()
+    command = page.evaluate("() => navigator.clipboard.readText()")
+    program, *words = shlex.split(command)
+    assert program == "mapfold"
+    assert wanted["digest"] in mapfold(*words).out

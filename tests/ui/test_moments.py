@@ -1,0 +1,200 @@
+"""Points 1 and 2: the map at W, and dragging, playing and stepping through time."""
+
+import json
+import random
+from typing import Any
+
+from playwright.sync_api import Page, expect
+
+from tests.commands import Commands
+from tests.thorough import rounds
+from tests.ui.conftest import SAMPLE, WIDE, Visit
+from tests.ui_server import UiServer
+
+
+def state(mapfold: Commands, at: int) -> dict[str, Any]:
+    return mapfold("state", SAMPLE, *WIDE, "--at", str(at), "--json").json  # type: ignore[no-any-return]
+
+
+def go(page: Page, at: int) -> None:
+    page.get_by_label("Moment: number of events").fill(str(at))
+    page.get_by_label("Moment: number of events").press("Enter")
+
+
+def moment(page: Page) -> int:
+    return int(page.get_by_role("slider", name="Moment").get_attribute("aria-valuenow") or "-1")
+
+
+def digest(page: Page) -> str:
+    """The digest shown, when the page has it."""
+    shown = page.locator(".digest code[data-digest]:not([data-digest=''])")
+    shown.wait_for()
+    return shown.get_attribute("data-digest") or ""
+
+
+def test_the_map_at_a_moment_is_that_of_state(
+    sample: UiServer, visit: Visit, mapfold: Commands
+) -> None:
+    """Counts, places, digest, what is under the pointer, and search."""
+    page = visit(sample, "#at=349")
+    expect(page.locator(".facts")).to_contain_text("7 places")
+    expect(page.locator(".facts")).to_contain_text("349 keyframes")
+    expect(page.locator(".facts")).to_contain_text("71 objects")
+    named = page.locator("ol.places li")
+    sizes = {p["place_id"]: p["keyframe_count"] for p in state(mapfold, 349)["places"]}
+    shown = [row.split("\n") for row in named.all_inner_texts()]
+    assert {f"sim-7-a_{name}": int(n.split()[0]) for name, n in shown} == sizes
+    expect(page.get_by_role("img", name="Map after 349 events: 349 keyframes")).to_be_visible()
+
+    page.keyboard.press("/")
+    page.keyboard.type("p5")
+    page.keyboard.press("Enter")
+    expect(page.locator(".thing h2")).to_have_text("sim-7-a_p5")
+    assert "select=place%3Asim-7-a_p5" in _address(page)
+    box = page.locator("canvas.map").bounding_box()
+    assert box is not None
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.get_by_label("Search places").fill("bathtub")
+    expect(page.get_by_role("option").first).to_contain_text("bathtub")
+
+
+def test_hovering_tells_what_is_there_and_a_click_selects_it(
+    sample: UiServer, visit: Visit
+) -> None:
+    page = visit(sample)
+    canvas = page.locator("canvas.map")
+    box = canvas.bounding_box()
+    assert box is not None
+    found: dict[str, int] = {}
+    for x in range(40, int(box["width"]) - 40, 12):
+        canvas.hover(position={"x": x, "y": int(box["height"] * 0.44)})
+        if page.locator(".tip").count():
+            first = page.locator(".tip").inner_text().split("\n")[0]
+            found[first.strip("\u2068\u2069")] = x
+    assert {"sim-7-a_p0", "sim-7-a_p6"} <= set(found)
+    canvas.click(position={"x": found["sim-7-a_p6"], "y": int(box["height"] * 0.44)})
+    expect(page.locator(".thing h2")).to_have_text("sim-7-a_p6")
+
+
+def test_zooming_and_panning_move_the_map_and_the_whole_map_comes_back(
+    sample: UiServer, visit: Visit
+) -> None:
+    page = visit(sample)
+    whole = page.locator("canvas.map").screenshot()
+    page.locator("canvas.map").hover(position={"x": 300, "y": 200})
+    page.mouse.wheel(0, -600)
+    page.wait_for_timeout(100)
+    near = page.locator("canvas.map").screenshot()
+    assert near != whole
+    page.mouse.down()
+    page.mouse.move(500, 300, steps=4)
+    page.mouse.up()
+    page.wait_for_timeout(100)
+    assert page.locator("canvas.map").screenshot() not in (whole, near)
+    page.keyboard.press("Alt+ArrowLeft")
+    page.keyboard.press("f")
+    page.mouse.move(2, 2)
+    page.wait_for_timeout(100)
+    assert page.locator("canvas.map").screenshot() == whole
+
+
+def test_dragging_the_timeline_shows_each_moment_as_state_does(
+    sample: UiServer, visit: Visit, mapfold: Commands
+) -> None:
+    page = visit(sample)
+    track = page.get_by_role("slider", name="Moment")
+    box = track.bounding_box()
+    assert box is not None
+    y = box["y"] + box["height"] * 0.6
+    page.mouse.move(box["x"] + box["width"] - 14, y)
+    page.mouse.down()
+    seen = []
+    for share in (0.8, 0.55, 0.3, 0.62):
+        page.mouse.move(box["x"] + box["width"] * share, y, steps=5)
+        seen.append(moment(page))
+    page.mouse.up()
+    assert seen[:3] == sorted(seen[:3], reverse=True)
+    assert seen[2] < seen[3] < seen[0]
+    assert digest(page) == state(mapfold, seen[3])["digest"]
+    expect(page.locator(".facts")).to_contain_text(f"{seen[3]} keyframes")
+    assert f"at={seen[3]}&" in _address(page)
+
+
+def test_the_digest_shown_is_that_of_state_at_many_moments(
+    sample: UiServer, visit: Visit, mapfold: Commands
+) -> None:
+    page = visit(sample)
+    chosen = random.Random(19)
+    for at in [0, 1, *(chosen.randrange(446) for _ in range(rounds(200, 12)))]:
+        go(page, at)
+        expect(page.locator(".facts")).to_contain_text(f"{at:,} keyframe")
+        page.wait_for_selector(".digest code:not([data-digest=''])")
+        wanted = mapfold("state", SAMPLE, *WIDE, "--at", str(at), "--digest").out.strip()
+        expect(page.locator(".digest code")).to_have_attribute("data-digest", wanted)
+
+
+def test_keys_and_buttons_step_by_event_change_and_merge(
+    sample: UiServer, visit: Visit, mapfold: Commands
+) -> None:
+    merges = [m["offset"] + 1 for m in mapfold("merges", SAMPLE, *WIDE, "--json").json]
+    page = visit(sample, "#at=340&panel=why")
+    page.keyboard.press("ArrowRight")
+    assert moment(page) == 341
+    page.get_by_role("button", name="Previous event").click()
+    assert moment(page) == 340
+    for wanted in (m for m in merges if m > 340):
+        page.keyboard.press("m")
+        assert moment(page) == wanted
+    page.keyboard.press("Shift+M")
+    assert moment(page) == merges[-2]
+    expect(page.locator(".thing h2")).to_have_text(f"Merge by event {merges[-2] - 1}")
+    page.keyboard.press("Home")
+    assert moment(page) == 0
+    page.keyboard.press("Shift+ArrowRight")
+    assert moment(page) == 8  # the first place is founded by the event at 7
+    page.keyboard.press("End")
+    assert moment(page) == 445
+
+
+def test_playing_goes_on_to_the_end_and_stops(sample: UiServer, visit: Visit) -> None:
+    page = visit(sample, "#at=0")
+    page.get_by_label("Speed of playing").select_option("100")
+    page.keyboard.press(" ")
+    expect(page.get_by_role("button", name="Pause")).to_be_visible()
+    slider = page.get_by_role("slider", name="Moment")
+    expect(slider).to_have_attribute("aria-valuenow", "445", timeout=30_000)
+    expect(page.get_by_role("button", name="Play", exact=True)).to_be_visible()
+
+
+def test_a_mark_on_the_timeline_leads_to_its_moment(
+    sample: UiServer, visit: Visit, mapfold: Commands
+) -> None:
+    """By time too: the axis has another scale, the marks lead to the same moments."""
+    offset = mapfold("merges", SAMPLE, *WIDE, "--json").json[2]["offset"]
+    for clock in ("", "&clock=time"):
+        page = visit(sample, f"#at=100{clock}")
+        box = page.get_by_role("slider", name="Moment").bounding_box()
+        assert box is not None
+        for x in range(int(box["width"] * 0.5), int(box["width"]), 5):
+            page.mouse.move(box["x"] + x, box["y"] + 9)
+            if page.locator(".tip").count() and str(offset) in page.locator(".tip").inner_text():
+                page.mouse.click(box["x"] + x, box["y"] + 9)
+                break
+        assert moment(page) == offset + 1
+        expect(page.locator(".thing h2")).to_have_text(f"Merge by event {offset}")
+
+
+def test_the_address_shows_a_colleague_the_same_moment(sample: UiServer, visit: Visit) -> None:
+    first = visit(sample)
+    go(first, 300)
+    first.get_by_role("tab", name="Find").click()
+    address = _address(first)
+    second = visit(sample, f"#{address.partition('#')[2]}")
+    assert moment(second) == 300
+    expect(second.get_by_role("tab", name="Find")).to_have_attribute("aria-selected", "true")
+
+
+def _address(page: Page) -> str:
+    """The address, when it has been written."""
+    page.wait_for_timeout(400)
+    return str(json.loads(page.evaluate("() => JSON.stringify(location.href)")))

@@ -1,0 +1,197 @@
+"""The page as a whole: hostile names, logs that show no map, a server that is gone, access by
+keyboard and by reading aloud, its size, and that its bundle asks nobody else."""
+
+import gzip
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import expect
+
+from eventsrc.commands import Anchor, NamePlace, encode_command
+from eventsrc.log import NEVER, LogWriter
+from eventsrc.system_events import COMMAND_KEY
+from tests.commands import Commands
+from tests.envelopes import detection, envelope
+from tests.logs import append_raw, write_log
+from tests.shared_data import ROOT, shared_run
+from tests.ui.conftest import SAMPLE, WIDE, Visit
+from tests.ui_server import UiServer, showing
+
+WEB = ROOT / "projections" / "ui" / "web"
+STATIC = ROOT / "projections" / "ui" / "static"
+MOST_SCRIPT = 80_000
+HOSTILE = (
+    "<script>document.title='owned'</script>",
+    "<img src=x onerror=document.title='owned'>",
+    "\u202eright to left \u05d0\u05d1\u05d2",
+    "x" * 256,
+    "\U0001f9f8☕ emoji",
+    "'\"`${1}{{}}",
+)
+
+
+@pytest.fixture(scope="module")
+def hostile(mapfold: Commands, tmp_path_factory: pytest.TempPathFactory) -> Iterator[UiServer]:
+    """Six runs and classes with such names, each a place of its own, one of them named so too."""
+    folder = tmp_path_factory.mktemp("hostile")
+    runs = [name[:128] for name in HOSTILE]
+    documents = []
+    for number, run in enumerate(runs):
+        for k in range(1, 7):
+            seen = detection(HOSTILE[number], [1.0, 0.1 * number, 0.0], det_id=f"{number}-{k}")
+            x, y = 4.0 * number + 0.2 * k, float(number % 2)
+            documents.append(envelope(k, x=x, y=y, run_id=run, detections=[seen]))
+    log = write_log(folder / "log", documents)
+    with LogWriter(log, fsync=NEVER) as writer:
+        anchor = Anchor(run_id=runs[0], keyframe_id=1)
+        named = NamePlace(
+            command_id="c1", issued_by="ann", reason=HOSTILE[1], place=anchor, name=HOSTILE[1]
+        )
+        writer.append(COMMAND_KEY, encode_command(named), logged_ns=10**18)
+    with showing(mapfold, log) as server:
+        yield server
+
+
+def test_hostile_names_are_text_everywhere(hostile: UiServer, visit: Visit, pictures: Path) -> None:
+    page = visit(hostile, "#panel=why")
+    expect(page.locator("ol.places > li")).to_have_count(6)
+    expect(page.locator("ol.places")).to_contain_text(HOSTILE[1][:39])
+    page.screenshot(path=pictures / "hostile.png")
+    page.get_by_label("Search places").fill("script")
+    expect(page.get_by_role("option").first).to_contain_text("<script>")
+    page.get_by_role("option").first.click()
+    expect(page.locator(".thing")).to_contain_text("<script>")
+    expect(page.locator(".told")).to_be_visible()
+    for panel in ("Compare", "Find", "Correct"):
+        page.get_by_role("tab", name=panel).click()
+    expect(page.locator(".corrections")).to_contain_text("<img src=x")
+    canvas = page.locator("canvas.map")
+    box = canvas.bounding_box()
+    assert box is not None
+    for x in range(20, int(box["width"]), 30):
+        canvas.hover(position={"x": x, "y": box["height"] / 2})
+    page.get_by_role("button", name="Take away").click()
+    with page.expect_download() as waiting:
+        page.get_by_role("menuitem", name="Picture as SVG").click()
+    svg = Path(waiting.value.path()).read_text()
+    assert "<script" not in svg
+    assert "<img" not in svg
+    assert page.title() == "mapfold"
+    assert page.evaluate("() => document.querySelectorAll('img, body script').length") == 0
+    wide = page.evaluate("() => document.documentElement.scrollWidth > window.innerWidth")
+    assert not wide
+
+
+def test_a_log_without_events_says_so(mapfold: Commands, visit: Visit, tmp_path: Path) -> None:
+    log = write_log(tmp_path / "log", [])
+    with showing(mapfold, log) as server:
+        page = visit(server, wait=False)
+        expect(page.locator(".no-map")).to_contain_text("no events yet")
+        for panel in ("Compare", "Find", "Lost", "Correct", "Why"):
+            page.get_by_role("tab", name=panel).click()
+        page.keyboard.press("ArrowRight")
+        page.keyboard.press(" ")
+
+
+def test_a_log_without_poses_says_so(mapfold: Commands, visit: Visit, tmp_path: Path) -> None:
+    log = write_log(tmp_path / "log", [envelope(k, x=None) for k in range(1, 6)])
+    with showing(mapfold, log) as server:
+        page = visit(server, wait=False)
+        expect(page.locator(".no-map")).to_contain_text("pose")
+        expect(page.locator(".facts")).to_contain_text("5 keyframes")
+
+
+def test_a_damaged_log_is_shown_as_far_as_it_goes(
+    mapfold: Commands, visit: Visit, tmp_path: Path
+) -> None:
+    log = Path(shutil.copytree(SAMPLE, tmp_path / "log"))
+    append_raw(log, b"{not an envelope")
+    with showing(mapfold, log, *WIDE) as server:
+        page = visit(server)
+        expect(page.get_by_role("alert")).to_contain_text("445")
+        expect(page.locator(".facts")).to_contain_text("445 keyframes")
+
+
+def test_a_server_that_is_gone_is_told_and_the_map_stays(mapfold: Commands, visit: Visit) -> None:
+    with showing(mapfold, SAMPLE, *WIDE) as server:
+        page = visit(server, "#at=300")
+    expect(page.get_by_role("alert")).to_contain_text("The server does not answer")
+    page.keyboard.press("ArrowLeft")
+    expect(page.locator(".facts")).to_contain_text("299 keyframes")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_finds_nothing_serious(sample: UiServer, visit: Visit, scheme: str) -> None:
+    axe = WEB / "node_modules" / "axe-core" / "axe.min.js"
+    if not axe.exists():
+        pytest.skip("axe-core is not installed; scripts/test_ui installs it")
+    page = visit(sample, "#at=349", color_scheme=scheme)
+    states = {
+        "overview": lambda: None,
+        "merge": lambda: page.get_by_role("button", name="p0 ← p7").click(),
+        "compare": lambda: page.get_by_role("tab", name="Compare").click(),
+        "settings": lambda: page.get_by_text("Two settings").click(),
+        "find": lambda: page.get_by_role("tab", name="Find").click(),
+        "lost": lambda: page.get_by_role("tab", name="Lost").click(),
+        "correct": lambda: page.get_by_role("tab", name="Correct").click(),
+        "help": lambda: page.get_by_role("button", name="Help").click(),
+    }
+    page.evaluate(axe.read_text())
+    for state, reach in states.items():
+        reach()
+        page.wait_for_timeout(300)
+        found = page.evaluate("() => axe.run()")
+        serious = [
+            (each["id"], [node["html"] for node in each["nodes"]])
+            for each in found["violations"]
+            if each["impact"] in ("serious", "critical")
+        ]
+        assert serious == [], state
+
+
+def test_everything_is_reached_with_the_keyboard(sample: UiServer, visit: Visit) -> None:
+    page = visit(sample)
+    reached = set()
+    for _ in range(60):
+        page.keyboard.press("Tab")
+        reached.add(
+            page.evaluate(
+                "() => document.activeElement.getAttribute('aria-label')"
+                " || document.activeElement.innerText || document.activeElement.id"
+            )
+        )
+    wanted = {"Live", "Take away", "Help", "Zoom in", "Why", "Play", "Next merge", "Moment"}
+    assert wanted <= reached
+    page.keyboard.press("?")
+    expect(page.get_by_role("dialog")).to_be_visible()
+    page.keyboard.press("Escape")
+    expect(page.get_by_role("dialog")).to_be_hidden()
+
+
+def test_the_house_is_drawn_within_a_second(
+    mapfold: Commands, visit: Visit, tmp_path: Path
+) -> None:
+    """From asking for the page to its first map, once the log is folded."""
+    lines = shared_run("house-a")
+    (tmp_path / "house-a.jsonl").write_bytes(b"\n".join(lines))
+    mapfold("import", tmp_path / "log", tmp_path / "house-a.jsonl")
+    with showing(mapfold, tmp_path / "log") as server:
+        server.ask("/api/history")
+        taken = []
+        for _ in range(3):
+            page = visit(server)
+            taken.append(float(page.locator("html").get_attribute("data-painted") or "inf"))
+            expect(page.locator(".facts")).to_contain_text(f"{len(lines)} keyframes")
+        assert min(taken) <= 1000, taken
+
+
+def test_the_bundle_is_small_and_names_no_other_host() -> None:
+    scripts = sorted(STATIC.glob("*.js"))
+    assert scripts
+    assert sum(len(gzip.compress(each.read_bytes(), 9)) for each in scripts) <= MOST_SCRIPT
+    page = (STATIC / "index.html").read_text()
+    assert "<style" not in page
+    assert "style=" not in page
+    assert page.count("<script") == page.count('src="./mapfold.js"') == 1

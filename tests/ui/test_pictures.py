@@ -1,0 +1,49 @@
+"""Pictures of the page in its states, to be looked at: ``build/ui-pictures``. Each must show
+something: no error, nothing wider than the window."""
+
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from tests.ui.conftest import Visit
+from tests.ui_server import UiServer
+
+STATES = {
+    "whole": "",
+    "merge": "#at=349&select=merge:348&panel=why",
+    "drag": "#at=200&panel=why&clock=time",
+    "why": "#at=445&select=place:sim-7-a_p7&panel=why",
+    "diff": "#at=349&panel=compare&with=348",
+    "whatif": "#at=445&panel=compare&eps_m=0.75&min_samples=8",
+    "find": "#panel=find",
+    "lost": "#panel=lost",
+    "correct": "#panel=correct",
+    "closed": "#panel=none",
+}
+SIZES = {"wide": (1440, 900), "small": (1280, 720), "tablet": (820, 1180)}
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", SIZES)
+def test_pictures(sample: UiServer, visit: Visit, pictures: Path, size: str, scheme: str) -> None:
+    width, height = SIZES[size]
+    page = visit(sample, viewport={"width": width, "height": height}, color_scheme=scheme)
+    origin = page.url.partition("#")[0]
+    for state, address in STATES.items():
+        page.goto("about:blank")
+        page.goto(origin + address)
+        page.wait_for_selector("html[data-painted]")
+        page.wait_for_selector(".digest code:not([data-digest=''])")
+        _settled(page, state)
+        page.screenshot(path=pictures / f"{state}-{size}-{scheme}.png")
+        assert page.evaluate("() => document.documentElement.scrollWidth") <= width
+        expect(page.locator("#panel .error")).to_have_count(0)
+
+
+def _settled(page: Page, state: str) -> None:
+    if state in ("merge", "why", "diff"):
+        page.locator("#panel .command").wait_for()
+    if state == "whatif":
+        page.locator("table").wait_for()
+    page.wait_for_timeout(250)

@@ -1,0 +1,192 @@
+"""Points 3 to 6: why, compare, find, lost; the answers are those of the commands."""
+
+import json
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from tests.commands import Commands
+from tests.ui.conftest import SAMPLE, WIDE, Visit
+from tests.ui.test_moments import moment
+from tests.ui_server import UiServer, showing
+
+
+def run_shown(page: Page, mapfold: Commands, *more: str) -> str:
+    """What the command line that the panel shows prints."""
+    line = page.locator("#panel .command code").first.inner_text()
+    program, *words = shlex.split(line)
+    assert program == "mapfold"
+    return mapfold(*words, *more).out
+
+
+def words(text: str) -> str:
+    """Without the isolates around names, and spaces alike."""
+    return " ".join(text.replace("\u2068", "").replace("\u2069", "").split())
+
+
+def test_why_tells_the_story_of_a_place_step_by_step(
+    sample: UiServer, visit: Visit, mapfold: Commands
+) -> None:
+    page = visit(sample, "#at=445&select=place:sim-7-a_p7&panel=why")
+    steps = page.locator(".steps > li")
+    expect(steps).to_have_count(7)
+    told = words(run_shown(page, mapfold))
+    for step in steps.all():
+        offset = step.locator(".moment-link").inner_text()
+        assert offset in told
+        assert words(step.locator("p").first.inner_text()) in told
+    steps.nth(0).locator(".moment-link").click()
+    assert moment(page) == 255
+    steps.nth(0).get_by_role("button", name="sim-7-a:249").first.click()
+    expect(page.locator(".thing h2")).to_have_text("sim-7-a/249")
+
+
+def test_why_draws_the_bridge_of_a_merge_before_and_after(
+    sample: UiServer, visit: Visit, mapfold: Commands
+) -> None:
+    page = visit(sample, "#at=349&panel=why")
+    plain = page.locator("canvas.map").screenshot()
+    page.get_by_role("button", name="p0 ← p7").click()
+    expect(page.locator(".summary")).to_have_text("sim-7-a_p0 absorbed sim-7-a_p7")
+    minis = page.locator(".mini canvas")
+    expect(minis).to_have_count(2)
+    assert minis.nth(0).screenshot() != minis.nth(1).screenshot()
+    expect(page.locator(".bridge figcaption")).to_contain_text("ε = 1 m")
+    page.mouse.move(2, 2)
+    page.wait_for_timeout(150)
+    assert page.locator("canvas.map").screenshot() != plain
+    said = mapfold("merges", SAMPLE, *WIDE, "--show", "2").out
+    assert words(page.locator(".lines").inner_text()) == words(said)
+
+
+def test_comparing_two_moments_says_and_draws_what_changed(
+    sample: UiServer, visit: Visit, mapfold: Commands
+) -> None:
+    page = visit(sample, "#at=348&panel=compare")
+    page.get_by_role("button", name="Take 348").click()
+    page.keyboard.press("Escape")
+    page.locator("canvas.map").focus()
+    plain = page.locator("canvas.map").screenshot()
+    page.get_by_role("button", name="Next event").click()
+    expect(page.locator(".changes")).to_contain_text("1 place gone")
+    expect(page.locator(".changes")).to_contain_text("19 objects moved")
+    expect(page.locator(".summary").first).to_have_text(
+        "1 new keyframe, 101 keyframes in another place"
+    )
+    expect(page.locator(".lines")).to_contain_text("digest 1a57d958a6bbab51 → 081f0c5b26250711")
+    assert words(page.locator(".lines").inner_text()) == words(run_shown(page, mapfold, "--all"))
+    assert page.locator("canvas.map").screenshot() != plain
+    page.get_by_role("button", name="Swap").click()
+    assert moment(page) == 348
+    expect(page.locator(".changes")).to_contain_text("1 new place")
+
+
+def test_comparing_two_settings_shows_two_maps_with_one_view(
+    sample: UiServer, visit: Visit, mapfold: Commands
+) -> None:
+    page = visit(sample, "#at=445&panel=compare")
+    page.get_by_text("Two settings").click()
+    slider = page.get_by_role("slider", name="ε, metres")
+    slider.fill("0.75")
+    expect(page.locator("canvas.map")).to_have_count(2)
+    expect(page.locator(".panel")).to_contain_text("Folded in")
+    expect(page.locator(".pane-title").nth(1)).to_contain_text("ε 0.75 m, 8 neighbours: 10 places")
+    expect(page.locator(".panel")).to_contain_text("The places part ways at event 31")
+    assert "places differ from offset 31 on" in run_shown(page, mapfold)
+    page.wait_for_timeout(200)
+    main, other = page.locator("canvas[data-side=main]"), page.locator("canvas[data-side=other]")
+    before = main.screenshot(), other.screenshot()
+    main.hover(position={"x": 100, "y": 200})
+    page.mouse.wheel(0, -400)
+    page.wait_for_timeout(150)
+    after = main.screenshot(), other.screenshot()
+    assert before[0] != after[0]
+    assert before[1] != after[1]
+    expect(page.locator("table")).to_contain_text("agreement of places (ARI)")
+    page.get_by_role("button", name="Back to the log’s settings").click()
+    expect(page.locator("canvas.map")).to_have_count(1)
+
+
+def test_finding_the_event_that_made_a_condition_true(
+    sample: UiServer, visit: Visit, mapfold: Commands
+) -> None:
+    page = visit(sample, "#panel=find")
+    field = page.get_by_role("combobox", name="Condition over the map")
+    field.click()
+    page.keyboard.type("same")
+    page.keyboard.press("Tab")
+    page.keyboard.type("sim-7-a:10")
+    expect(page.get_by_role("option").first).to_contain_text("sim-7-a:10")
+    page.keyboard.press("Tab")
+    page.keyboard.type("sim-7-a:310")
+    page.keyboard.press("Tab")
+    expect(field).to_have_value("same_place('sim-7-a:10', 'sim-7-a:310')")
+    page.keyboard.press("Enter")
+    expect(page.locator(".summary")).to_contain_text("Became true by event 348")
+    assert moment(page) == 349
+    assert "became true at offset 348" in run_shown(page, mapfold)
+
+
+def test_a_wrong_condition_is_shown_at_its_column(sample: UiServer, visit: Visit) -> None:
+    page = visit(sample, "#panel=find")
+    page.get_by_role("combobox", name="Condition over the map").fill("place_count() > 'x'")
+    page.get_by_role("button", name="Find", exact=True).click()
+    expect(page.get_by_role("alert")).to_contain_text("cannot compare a number with a text")
+    assert page.locator(".pointer").inner_text().split("\n")[1] == " " * 14 + "^"
+
+
+@pytest.fixture(scope="module")
+def two_runs(mapfold: Commands, tmp_path_factory: pytest.TempPathFactory) -> Iterator[UiServer]:
+    """The sample's run, and another drive through the same house."""
+    folder = tmp_path_factory.mktemp("two")
+    for run in ("a", "b"):
+        mapfold("simulate", "--run", run, "--out", folder / f"{run}.jsonl")
+    mapfold("import", folder / "log", folder / "a.jsonl", folder / "b.jsonl")
+    with showing(
+        mapfold, folder / "log", "--set", "eps_m=0.75", "--set", "min_samples=8"
+    ) as server:
+        yield server
+
+
+def test_a_lost_robot_is_found_by_the_map_before_its_run(two_runs: UiServer, visit: Visit) -> None:
+    page = visit(two_runs, "#panel=lost")
+    plain = page.locator("canvas.map").screenshot()
+    keyframe, question = _question(two_runs)
+    page.get_by_label("A keyframe whose crops").fill(keyframe)
+    page.get_by_role("button", name="Where is it?").click()
+    expect(page.locator(".ranked > li")).not_to_have_count(0)
+    assert moment(page) == 445  # the map of the first run only
+    got = two_runs.ask("/api/relocalize", method="POST", body=json.dumps(question).encode(), at=445)
+    found = got.json
+    expect(page.locator(".ranked > li").first).to_contain_text(f"{found['places'][0]['score']:.3f}")
+    expect(page.locator(".summary")).to_contain_text("The true pose is")
+    page.mouse.move(2, 2)
+    page.wait_for_timeout(150)
+    assert page.locator("canvas.map").screenshot() != plain
+
+
+def _question(server: UiServer) -> tuple[str, Any]:
+    """A keyframe of the second run that saw three things, and its question."""
+    for number in range(100, 300):
+        got = server.ask("/api/question", keyframe=f"sim-7-b/{number}")
+        if got.status == 200 and len(got.json["question"]["crops"]) > 2:
+            return f"sim-7-b/{number}", got.json["question"]
+    raise AssertionError("no keyframe saw three things")
+
+
+def test_a_question_in_a_file_is_asked_and_one_that_is_none_refused(
+    two_runs: UiServer, visit: Visit, tmp_path: Path
+) -> None:
+    question = tmp_path / "question.json"
+    question.write_text(json.dumps(_question(two_runs)[1]))
+    page = visit(two_runs, "#at=445&panel=lost")
+    page.set_input_files("input[type=file]", question)
+    expect(page.locator(".ranked > li")).not_to_have_count(0)
+    bad = tmp_path / "bad.json"
+    bad.write_text("{not json")
+    page.set_input_files("input[type=file]", bad)
+    expect(page.get_by_role("alert")).to_contain_text("bad.json is not JSON")
