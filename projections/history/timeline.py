@@ -60,7 +60,8 @@ class Timeline:
         self._most = histories
         self._progress = progress
         self._note = note
-        self._read: list[RecordedCommand] | None = None
+        self._commands: list[RecordedCommand] = []
+        self._commands_end: Offset | None = None
         self._compiled: dict[int, Corrections] = {}
         self._histories: dict[tuple[str, tuple[Offset, ...]], KnownHistory] = {}
 
@@ -77,18 +78,18 @@ class Timeline:
 
     def refresh(self) -> Offset:
         """Include events recorded since; returns the new `end`."""
-        self._read = None
-        self._compiled.clear()
         return self.reader.refresh()
 
     def commands(
         self, start: Offset = FIRST_OFFSET, end: Offset | None = None
     ) -> list[RecordedCommand]:
         """The commands recorded from ``start`` to before ``end``, undone ones too."""
-        if self._read is None:
-            self._read = read_commands(self.reader)
+        if self._commands_end is None or self._commands_end < self.end:
+            known = self.end
+            self._commands += read_commands(self.reader, start=self._commands_end or FIRST_OFFSET)
+            self._commands_end = known
         last = self.end if end is None else end
-        return [recorded for recorded in self._read if start <= recorded.offset < last]
+        return [recorded for recorded in self._commands if start <= recorded.offset < last]
 
     def corrections(self, known_at: Offset | None = None) -> Corrections:
         """What the commands before ``known_at`` compile to; all of them for None."""

@@ -38,9 +38,12 @@ def _before(offset: Offset) -> str:
     return f"`mapfold state LOG --at {offset}`"
 
 
-def read_commands(reader: LogReader, until: Offset | None = None) -> list[RecordedCommand]:
-    """The commands before ``until``, all for None, in order. Raises FoldError, LogDamaged."""
-    events = reader.read(FIRST_OFFSET, until, keys=(COMMAND_KEY,))
+def read_commands(
+    reader: LogReader, until: Offset | None = None, start: Offset = FIRST_OFFSET
+) -> list[RecordedCommand]:
+    """The commands from ``start`` to before ``until``, all for None, in order. Raises FoldError,
+    LogDamaged."""
+    events = reader.read(start, until, keys=(COMMAND_KEY,))
     return [read_command(event) for event in events]
 
 
