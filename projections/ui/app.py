@@ -7,6 +7,7 @@ of `UiService` answer them.
 import asyncio
 import json
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -88,7 +89,7 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
     async def whatif(request: Request) -> Response:
         query = request.query_params
         future = service.ask_apart(lambda end: encoded(whatif_answer(service.opened, end, query)))
-        return Response(await asyncio.wrap_future(future), media_type="application/json")
+        return Response(await _awaited(request, future), media_type="application/json")
 
     answers("question", "A mapped keyframe's crops as a question", question_answer)
 
@@ -97,7 +98,7 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
         query, payload = request.query_params, await read_body(request, MOST_BYTES)
         ask = service.localizer.answer
         future = service.ask_apart(lambda end: encoded(ask(end, query, payload)))
-        return Response(await asyncio.wrap_future(future), media_type="application/json")
+        return Response(await _awaited(request, future), media_type="application/json")
 
     if editor is not None:
 
@@ -135,16 +136,23 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
 async def _answer(
     service: UiService, request: Request, work: Callable[[LogMap, float], bytes]
 ) -> bytes:
-    """The answer of ``work`` under the settings of the request. When the page leaves, work that has
-    not begun is dropped and a fold under other settings is given up."""
-    left = False
-    future = service.ask(assignments_of(request.query_params), work, lambda: not left)
+    """The answer of ``work`` under the settings of the request. A fold under other settings is
+    given up when the page leaves."""
+    here = True
+    try:
+        sets = assignments_of(request.query_params)
+        return await _awaited(request, service.ask(sets, work, lambda: here))
+    finally:
+        here = False
+
+
+async def _awaited(request: Request, future: Future[bytes]) -> bytes:
+    """The result. When the page leaves, work that has not begun is dropped."""
     answered = asyncio.ensure_future(asyncio.wrap_future(future))
     leaving = asyncio.ensure_future(_disconnect(request))
     await asyncio.wait((answered, leaving), return_when=asyncio.FIRST_COMPLETED)
-    left = not answered.done()
     leaving.cancel()
-    if left:
+    if not answered.done():
         answered.cancel()
         raise ClientDisconnect
     return answered.result()

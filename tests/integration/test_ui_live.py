@@ -3,6 +3,7 @@
 import json
 import shlex
 import shutil
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from eventsrc.system_events import COMMAND_KEY, LOSS_KEY, REJECTED_KEY, Rejected
 from tests.commands import Commands
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import BY_HAND, KEY, flip
+from tests.http_attacks import connect, request
 from tests.logs import append_raw, bridge, walk, write_log
 from tests.shared_data import ROOT
 from tests.ui_client import read_arrays, replay
@@ -367,6 +369,20 @@ class TestProblems:
         log = write_log(tmp_path / "log", walk(2))
         assert "eps_m" in mapfold("ui", log, "--set", "eps_m=x", code=2).err
         assert "--port" in mapfold("ui", log, "--host", "192.0.2.7", code=1).err
+
+
+def test_pages_that_leave_do_not_delay_others(mapfold: Commands, tmp_path: Path) -> None:
+    """Hundreds of folds are asked for and abandoned; the next answer comes soon."""
+    log = write_log(tmp_path / "log", walk(1300, seed=5, detections=1))
+    with showing(mapfold, log) as server:
+        one = server.api("digest", eps_m=2.0)["refold_ms"] / 1e3
+        for number in range(60):
+            path = f"/api/history?eps_m={1 + number / 100}"
+            with connect(server.port) as connection:
+                connection.sendall(request("GET", path))
+        started = time.monotonic()
+        assert server.api("digest", eps_m=2.5)["at"] == 1300
+        assert time.monotonic() - started < max(15 * one, 5.0)  # not 60 folds
 
 
 def test_settings_of_the_command_line(mapfold: Commands, tmp_path: Path) -> None:
