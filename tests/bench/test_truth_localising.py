@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from projections import relocalize
 from projections.evaluate.questions import Question
 from projections.evaluate.trials import Trial
 from projections.relocalize import Answer, PoseHypothesis
@@ -21,11 +22,15 @@ from tests.bench.truth.worlds import WORLDS, load_generator, make_case
 HALVES = SimpleNamespace(DEVELOP=["w1", "w2", "w3"], VALIDATE=["v1", "v2"])
 
 
+def _question(keyframe: int) -> Question:
+    return Question(("q", keyframe), relocalize.Question(()), 0.0, 0.0, 0.0, None, ())
+
+
 def _trial(
     confidence: float, cosine: float, *, known: bool, error: float | None, plain: float
 ) -> Trial:
     pose = None if error is None else PoseHypothesis(error, 0.0, None, 0.0)
-    question = Question(("q", 1), (), 0.0, 0.0, 0.0, None, ())
+    question = _question(1)
     answer = Answer((), pose, confidence)
     return Trial(
         question,
@@ -102,7 +107,9 @@ def test_the_worst_beside_the_plain_recipe_stands_last_below_the_means() -> None
 
 
 def test_as_many_questions_of_another_building_are_spread_evenly() -> None:
-    of_ten = [Question(("q", n), (), 0.0, 0.0, 0.0, None, ()) for n in range(10)]
+    of_ten = [
+        Question(("q", n), relocalize.Question(()), 0.0, 0.0, 0.0, None, ()) for n in range(10)
+    ]
     assert [q.key[1] for q in spread(of_ten, 4)] == [0, 2, 5, 7]
     assert spread(of_ten, 20) == of_ten
     assert spread(of_ten, 0) == []
@@ -130,7 +137,7 @@ def test_a_building_is_mapped_by_both_rules_and_asked_with_known_and_unknown_thi
         ("rover tb3_house", "evidence"),
     ]
     for row in rows:
-        assert list(row.scores) == ["1 crop", "3 crops"]
+        assert list(row.scores) == ["1 crop", "3 crops", "1 view", "3 views", "5 views"]
         for scores in row.scores.values():
             assert 0 < scores.known < scores.questions
             assert scores.p50_m is not None

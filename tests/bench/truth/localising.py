@@ -12,7 +12,8 @@ from types import ModuleType
 from typing import Any
 
 from eventsrc.ingest import Accepted
-from projections.evaluate.questions import Question, make_questions
+from eventsrc.text import counted
+from projections.evaluate.questions import Question, make_questions, make_view_questions
 from projections.evaluate.scores import (
     auroc,
     calibration_floor,
@@ -31,7 +32,7 @@ from .worlds import Case
 PLACES = {"eps_m": 0.75, "min_samples": 8}
 """Settings of the places: with the defaults most buildings are one place."""
 MAPS = ("page", "evidence")
-CROPS = (1, 3)
+CROPS, VIEWS = (1, 3), (1, 3, 5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,10 +113,14 @@ def make_map(case: Case, rule: str) -> MapView:
 def asked(case: Case, stranger: Case, every: int) -> dict[str, tuple[list[Question], ...]]:
     """By kind: every n-th question of the case's later runs, and as many of the stranger's."""
     found = {}
-    for crops in CROPS:
-        own = make_questions(later_runs(case), case.truth, crops)[::every]
-        others = make_questions(later_runs(stranger), stranger.truth, crops)
-        found[f"{crops} crop{'s' if crops > 1 else ''}"] = own, spread(others, len(own))
+    for word, make, counts in (
+        ("crop", make_questions, CROPS),
+        ("view", make_view_questions, VIEWS),
+    ):
+        for count in counts:
+            own = make(later_runs(case), case.truth, count)[::every]
+            others = make(later_runs(stranger), stranger.truth, count)
+            found[counted(count, word)] = own, spread(others, len(own))
     return found
 
 
