@@ -75,7 +75,8 @@ class RunSeen(msgspec.Struct, frozen=True, gc=False):
 
 
 class KeyframeAdded(msgspec.Struct, frozen=True, gc=False):
-    """A new keyframe; ``pose`` is None when the envelope has none."""
+    """A new keyframe; ``pose`` is None when the envelope has none. ``floor`` is the name of the
+    floor that the pose is on, None if the envelope tells none."""
 
     offset: Offset
     keyframe: KeyframeOrdinal
@@ -84,6 +85,7 @@ class KeyframeAdded(msgspec.Struct, frozen=True, gc=False):
     keyframe_id: KeyframeId
     timestamp: float
     pose: Pose | None
+    floor: str | None = None
 
 
 class ObservationAdded(msgspec.Struct, frozen=True, eq=False, gc=False):

@@ -45,6 +45,7 @@ _YOUNGER = {
     "fusion": ("fusion", "camera", "evidence"),
     "places": ("places", "rooms"),
     "localizer": ("localizer",),
+    "floor_height_m": ("floor_height_m",),
 }
 """Settings that older versions did not have, by the one that brings them into force."""
 
@@ -82,6 +83,9 @@ class Settings(BaseModel):
     """The rule that groups poses into places: DBSCAN by ``eps_m`` and ``min_samples``, or rooms."""
     rooms: RoomsConstants = RoomsConstants()
     """The constants of places by rooms."""
+    floor_height_m: Annotated[float, Field(ge=0.5, le=1000.0)] = 3.0
+    """From floor to floor: of envelopes with a height ``map_z`` but no ``floor``, the floor is the
+    number of these that is nearest to the height."""
 
     @model_serializer(mode="wrap")
     def _without_younger_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:

@@ -40,6 +40,9 @@ def view_at(history: History, latest: MapView, end: Offset) -> MapView:
     absorbed_by = view.survivors.absorbed_by
     view.places = {p.ordinal: p for p in view.all_places if p.ordinal not in absorbed_by}
     view.keyframes = _keyframes(history, latest, view.survivors, end)
+    for keyframe in view.keyframes:
+        if keyframe.floor is not None:
+            view.floors.setdefault(keyframe.floor, len(view.floors))
     view.observations = _observations(history, latest, end)
     view.all_objects = _objects(history, end)
     for merge in history.object_merges[: count_before(history.object_merges, end)]:
@@ -109,6 +112,7 @@ def _keyframes(
             survivors,
             k.observations,
             place if placed < end else None,
+            k.floor,
         )
         for k, placed, place in zip(
             latest.keyframes[:count], history.placed_offsets, history.placed_in, strict=False

@@ -71,7 +71,8 @@ class PlaceRecord:
 class KeyframeRecord:
     """One keyframe. ``offset`` is its event's; ``pose`` is None when the robot had none.
 
-    ``joined`` is the place it joined, as of then; ``survivors`` are the view's.
+    ``joined`` is the place it joined, as of then; ``survivors`` are the view's. ``floor`` is the
+    name of the floor that the pose is on, where the log tells it.
     """
 
     ordinal: KeyframeOrdinal
@@ -84,6 +85,7 @@ class KeyframeRecord:
     survivors: PlaceSurvivors
     observations: list[ObservationOrdinal] | tuple[()] = ()
     joined: PlaceOrdinal | None = None
+    floor: str | None = None
 
     @property
     def place(self) -> PlaceOrdinal | None:

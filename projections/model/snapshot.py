@@ -163,7 +163,10 @@ def _dump_keyframes(view: MapView) -> State:
     ]
     poses = [(k.ordinal, k.pose.x_um, k.pose.y_um) for k in view.keyframes if k.pose is not None]
     yaws = [k.pose.yaw_rad for k in view.keyframes if k.pose is not None]
+    floors = [_NONE if k.floor is None else view.floors[k.floor] for k in view.keyframes]
     return {
+        "floors": list(view.floors),
+        "keyframe_floors": np.array(floors if view.floors else (), np.int32),
         "keyframes": np.array(rows, np.int64).reshape(-1, 4),
         "timestamps": np.array([k.timestamp for k in view.keyframes], np.float64),
         "poses": np.array(poses, np.int64).reshape(-1, 3),
@@ -179,6 +182,9 @@ def _load_keyframes(view: MapView, state: State) -> None:
         )
     }
     rows = zip(state["keyframes"].tolist(), state["timestamps"].tolist(), strict=True)
+    names = state.get("floors", [])
+    view.floors = {name: number for number, name in enumerate(names)}
+    floors = state["keyframe_floors"].tolist() if names else ()
     for i, ((offset, run, keyframe_id, place), timestamp) in enumerate(rows):
         ordinal, run_id, pose = KeyframeOrdinal(i), view.runs[run].run_id, poses.get(i)
         record = KeyframeRecord(
@@ -187,6 +193,8 @@ def _load_keyframes(view: MapView, state: State) -> None:
         if place != _NONE:
             record.joined = place
             view.all_places[place].unordered_members.append(ordinal)
+        if names and floors[i] != _NONE:
+            record.floor = names[floors[i]]
         view.keyframes.append(record)
 
 

@@ -61,6 +61,7 @@ class MapView:
     not absorbed, by ordinal, ascending; ``all_places`` also the absorbed, and ``survivors`` what
     these are part of now. So are ``objects``, ``all_objects`` and ``object_survivors``.
     ``adjacency`` maps (a, b), a founded before b, to shared transitions above 0; `edges` sorts it.
+    ``floors`` numbers the floors that have a name by their first keyframe.
     ``next_offset`` is the number of events that went into the view; ``corrections`` are those they
     were folded under.
     """
@@ -86,6 +87,7 @@ class MapView:
         self.places: dict[PlaceOrdinal, PlaceRecord] = {}
         self.survivors = PlaceSurvivors()
         self.adjacency: dict[tuple[PlaceOrdinal, PlaceOrdinal], int] = {}
+        self.floors: dict[str, int] = {}
         self.skipped: dict[SkipKind, int] = {"duplicate": 0, "conflict": 0, "det_id_reused": 0}
 
     def apply(self, delta: Delta) -> None:
@@ -106,6 +108,14 @@ class MapView:
     def place_id(self, place: PlaceOrdinal | None) -> str | None:
         """The id of a place, absorbed ones too; None for None."""
         return None if place is None else self.all_places[place].place_id
+
+    def floor_of(self, place: PlaceOrdinal) -> str | None:
+        """The name of the floor that a place is on; None if the log tells none."""
+        return self.keyframes[self.all_places[place].founder].floor
+
+    def is_between_floors(self, a: PlaceOrdinal, b: PlaceOrdinal) -> bool:
+        """Whether two places are on two floors, so that a way between them is stairs or a lift."""
+        return bool(self.floors) and self.floor_of(a) != self.floor_of(b)
 
     def class_counts(self, found: ObjectRecord) -> dict[str, int]:
         """How many observations of an Object are of each class, most first; ties by name."""
@@ -136,8 +146,11 @@ class MapView:
                 delta.timestamp,
                 delta.pose,
                 self.survivors,
+                floor=delta.floor,
             )
         )
+        if delta.floor is not None:
+            self.floors.setdefault(delta.floor, len(self.floors))
 
     def _observation_added(self, delta: ObservationAdded) -> None:
         if delta.observation < len(self.observations):

@@ -12,8 +12,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from projections.deltas import Pose
+from projections.errors import SettingsError
 from projections.exact import Neighbourhood
 from projections.reducers import State
+from projections.settings import Settings
 
 
 class RuleCoreIndex:
@@ -119,3 +121,14 @@ class RuleCoreIndex:
                 for other in self._cells.get((column + dx, row + dy), ()):
                     if other != point and self.are_neighbours(point, other):
                         yield other
+
+
+def check_named(settings: Settings, neighbourhood: Neighbourhood | None) -> None:
+    """Raise SettingsError unless the rule is the one that the settings name."""
+    given = None if neighbourhood is None else neighbourhood.name
+    if given != settings.neighbourhood:
+        raise SettingsError(
+            f"the settings name the neighbourhood {settings.neighbourhood!r}, the fold was given "
+            f"{given!r}; write SemanticMap(Settings(neighbourhood=rule.name), rule), "
+            "or neither for plain distance"
+        )

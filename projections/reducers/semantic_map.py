@@ -9,7 +9,7 @@ Per keyframe, in this order:
     keyframe has is left out and reported.
 3.  With a pose, the keyframe goes to places, and its observations in the map's embedding space go
     to landmarks: one by one under the page's rule, all together under fusion by evidence. A
-    keyframe without a pose is only kept.
+    keyframe without a pose is only kept. Floors are laid out beside each other (`floors`).
 4.  Names of places, located-in and adjacency are told what places and landmarks changed, in order,
     and give the deltas that follow from it.
 
@@ -56,16 +56,25 @@ from .constrained_places import ConstrainedPlaces
 from .core_index import CoreIndex
 from .edited_events import edit_event, edits_events
 from .embedding_space import Space
-from .envelope_evidence import FusibleObservation, camera_of, sightings_of, with_small_yaw
+from .envelope_evidence import (
+    FusibleObservation,
+    camera_of,
+    pose_of,
+    sightings_of,
+    with_small_yaw,
+)
 from .evidence_fusion import EvidenceFusion
+from .floors import Floors
 from .folded_ids import FoldedIds, content_digest
 from .landmarks import Landmarks
 from .located_in import LocatedIn
 from .place_names import PlaceNames
 from .places import Places
-from .rule_index import RuleCoreIndex
+from .rule_index import RuleCoreIndex, check_named
 
-Reducer: TypeAlias = FoldedIds | Places | Landmarks | EvidenceFusion | LocatedIn | Adjacency
+Reducer: TypeAlias = (
+    FoldedIds | Floors | Places | Landmarks | EvidenceFusion | LocatedIn | Adjacency
+)
 
 
 class SemanticMap:
@@ -82,7 +91,7 @@ class SemanticMap:
         neighbourhood: Neighbourhood | None = None,
         corrections: Corrections = NO_CORRECTIONS,
     ) -> None:
-        _check_named(settings, neighbourhood)
+        check_named(settings, neighbourhood)
         if settings.places == "rooms":
             raise SettingsError("places=rooms is not there yet; leave it out")
         self.settings = settings
@@ -93,6 +102,7 @@ class SemanticMap:
         self._is_corrected = self._edits_events or bool(self._anchors)
         self.next_offset = FIRST_OFFSET
         self.folded_ids = FoldedIds()
+        self.floors = Floors(settings.floor_height_m)
         self.space = Space(settings)
         core_index = (
             CoreIndex(metres_to_um(settings.eps_m), settings.min_samples)
@@ -100,11 +110,12 @@ class SemanticMap:
             else RuleCoreIndex(neighbourhood, settings.min_samples)
         )
         self._anchored = None
-        if corrections.joined or corrections.apart:
-            groups = PairGroups(corrections.joined, corrections.apart)
-            self._anchored = ConstrainedPlaces(core_index, groups)
+        self._grouped = PairGroups(corrections.joined, corrections.apart)
+        if self._grouped.group_of:
+            self._anchored = ConstrainedPlaces(core_index, self._grouped)
         self.places = self._anchored or Places(core_index)
-        self.landmarks = _landmarks(settings, corrections)
+        self._named = PairGroups(corrections.same, corrections.different)
+        self.landmarks = _landmarks(settings, self._named)
         self.located_in = LocatedIn()
         self.adjacency = Adjacency()
         self.observation_count = 0
@@ -144,9 +155,11 @@ class SemanticMap:
         if is_news:
             deltas.append(RunSeen(offset, run, envelope.run_id, envelope.timestamp))
         keyframe = folded_ids.add_keyframe(run, envelope.keyframe_id, offset, digest)
+        pose = pose_of(envelope)
+        floor, ground = (None, 0) if pose is None else self.floors.enter(envelope)
         if is_corrected and self._anchors:
-            self._add_anchor(keyframe, Keyframe(envelope.run_id, envelope.keyframe_id))
-        pose = _pose(accepted)
+            anchor = Keyframe(envelope.run_id, envelope.keyframe_id)
+            self._add_anchor(keyframe, anchor, None if pose is None else ground)
         deltas.append(
             KeyframeAdded(
                 offset,
@@ -156,6 +169,7 @@ class SemanticMap:
                 envelope.keyframe_id,
                 envelope.timestamp,
                 pose,
+                floor,
             )
         )
         if units is None:
@@ -165,20 +179,23 @@ class SemanticMap:
             deltas += [EventSkipped(offset, "dropped", run_id, keyframe_id, d) for d in dropped]
         fusible = self._observe(offset, keyframe, accepted, units, deltas)
         if pose is not None:
+            pose = self.floors.laid_out(pose, ground)
+            for seen in fusible if self._named.group_of else ():
+                self.floors.settle(self._named, seen[1], "object", ground)
             place = self._place(offset, keyframe, run, envelope.run_id, pose, deltas)
             landmarks, timestamp = self.landmarks, envelope.timestamp
             if isinstance(landmarks, EvidenceFusion):
                 camera = camera_of(envelope, self.settings.camera)
-                seen = sightings_of(accepted, fusible)
+                sights = self.floors.sightings(sightings_of(accepted, fusible), ground)
                 facing = with_small_yaw(pose)
-                fused = landmarks.fold(offset, run, timestamp, facing, camera, seen)
+                fused = landmarks.fold(offset, run, timestamp, facing, camera, sights)
                 self._locate(fused, keyframe, place)
                 deltas += fused
             else:
                 self._fuse(landmarks, offset, keyframe, place, pose, fusible, timestamp, deltas)
             deltas += self.located_in.collect_moves(offset)
             deltas += self.adjacency.collect_changes(offset)
-        return deltas
+        return self.floors.put_back(deltas)
 
     def use_names(self, offset: Offset, corrections: Corrections) -> list[PlaceNamed]:
         """Replace the names of places, as if they had been known from the start; what changes.
@@ -224,6 +241,7 @@ class SemanticMap:
     def _parts(self) -> tuple[tuple[str, Reducer], ...]:
         return (
             ("seen", self.folded_ids),
+            ("floors", self.floors),
             ("places", self.places),
             ("landmarks", self.landmarks),
             ("located_in", self.located_in),
@@ -234,10 +252,12 @@ class SemanticMap:
         pairs = (*self.corrections.apart, *self.corrections.joined)
         return frozenset(self.names.newest).union(*pairs)
 
-    def _add_anchor(self, keyframe: KeyframeOrdinal, anchor: Keyframe) -> None:
+    def _add_anchor(self, keyframe: KeyframeOrdinal, anchor: Keyframe, floor: int | None) -> None:
         if anchor in self._anchors:
             self.names.add_anchor(keyframe, anchor)
             if self._anchored is not None:
+                if floor is not None:
+                    self.floors.settle(self._grouped, anchor, "place", floor)
                 self._anchored.add_anchor(keyframe, anchor)
 
     def _observe(
@@ -368,29 +388,9 @@ class SemanticMap:
                 self.located_in.objects_merged(delta.survivor, delta.absorbed)
 
 
-def _landmarks(settings: Settings, corrections: Corrections) -> Landmarks | EvidenceFusion:
-    named = None
-    if corrections.same or corrections.different:
-        named = PairGroups(corrections.same, corrections.different)
+def _landmarks(settings: Settings, named: PairGroups[DetId]) -> Landmarks | EvidenceFusion:
+    groups = named if named.group_of else None
     if settings.fusion == "evidence":
-        return EvidenceFusion(settings.evidence, named)
+        return EvidenceFusion(settings.evidence, groups)
     limits = settings.fusion_radius_m, settings.fusion_similarity
-    return Landmarks(*limits) if named is None else ConstrainedLandmarks(*limits, named)
-
-
-def _check_named(settings: Settings, neighbourhood: Neighbourhood | None) -> None:
-    given = None if neighbourhood is None else neighbourhood.name
-    if given != settings.neighbourhood:
-        raise SettingsError(
-            f"the settings name the neighbourhood {settings.neighbourhood!r}, the fold was given "
-            f"{given!r}; write SemanticMap(Settings(neighbourhood=rule.name), rule), "
-            "or neither for plain distance"
-        )
-
-
-def _pose(accepted: Accepted) -> Pose | None:
-    envelope = accepted.envelope
-    x, y, yaw = envelope.map_x, envelope.map_y, envelope.map_yaw
-    if x is None or y is None or yaw is None:
-        return None
-    return Pose(metres_to_um(x), metres_to_um(y), yaw)
+    return Landmarks(*limits) if groups is None else ConstrainedLandmarks(*limits, groups)
