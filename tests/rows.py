@@ -135,6 +135,12 @@ def _expect_landmarks(view: MapView, rows: dict[str, list[tuple[Any, ...]]]) -> 
             if (at := obj.estimate) is not None:
                 properties |= {"est_x": at.x_um / 1e6, "est_y": at.y_um / 1e6}
                 properties["est_sigma_m"] = at.est_sigma_m
+                properties |= {
+                    "est_xx": at.var_xx_um2 / 1e12,
+                    "est_xy": at.var_xy_um2 / 1e12,
+                    "est_yy": at.var_yy_um2 / 1e12,
+                    "est_spots": at.spots,
+                }
         rows["Object"].append((gid("Object", n), properties))
         if obj.place is not None:
             ends = gid("Object", n), gid("Place", obj.place + 1)

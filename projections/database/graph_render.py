@@ -130,12 +130,14 @@ def object_rows(view: MapView, objects: Iterable[int]) -> Iterator[VertexRow]:
 def _evidence(found: ObjectRecord) -> str:
     """More properties of an Object; one without an estimate has no position."""
     at, missing = found.estimate, "false" if found.missing_in is None else "true"
-    position = (
-        ""
-        if at is None
-        else f', "est_x": {at.est_x!r}, "est_y": {at.est_y!r}, "est_sigma_m": {at.est_sigma_m!r}'
+    if at is None:
+        return f', "missing": {missing}'
+    xx, xy, yy = at.covariance_m2
+    return (
+        f', "est_x": {at.est_x!r}, "est_y": {at.est_y!r}, "est_sigma_m": {at.est_sigma_m!r},'
+        f' "est_xx": {xx!r}, "est_xy": {xy!r}, "est_yy": {yy!r}, "est_spots": {at.spots},'
+        f' "missing": {missing}'
     )
-    return f'{position}, "missing": {missing}'
 
 
 def place_rows(view: MapView, places: Iterable[int]) -> Iterator[VertexRow]:

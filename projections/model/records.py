@@ -21,6 +21,8 @@ from projections.deltas import (
 from projections.exact import UM_PER_M, mean_m
 from projections.reducers.survivors import PlaceSurvivors
 
+_UM2_PER_M2 = UM_PER_M * UM_PER_M
+
 
 @dataclass(slots=True, eq=False)
 class RunRecord:
@@ -135,6 +137,15 @@ class Estimate:
     def est_y(self) -> float:
         """Metres."""
         return self.y_um / UM_PER_M
+
+    @property
+    def covariance_m2(self) -> tuple[float, float, float]:
+        """Its xx, xy and yy in m²."""
+        return (
+            self.var_xx_um2 / _UM2_PER_M2,
+            self.var_xy_um2 / _UM2_PER_M2,
+            self.var_yy_um2 / _UM2_PER_M2,
+        )
 
     @property
     def est_sigma_m(self) -> float:

@@ -22,7 +22,7 @@ from eventsrc.text import counted
 from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.deltas import ObservationOrdinal, PlaceOrdinal
 from projections.errors import QuestionError
-from projections.exact import Q40, UM_PER_M, quantise
+from projections.exact import Q40, quantise
 from projections.model.fold import fold_log
 from projections.model.records import Estimate
 from projections.model.view import MapView
@@ -36,7 +36,6 @@ NEIGHBOURS = 64
 fewer leave too few directions to triangulate an object from."""
 
 Pose = tuple[float, float, float]
-UM2_PER_M2 = UM_PER_M * UM_PER_M
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,9 +198,7 @@ def _stand(estimate: Estimate | None) -> Stand | None:
     return Stand(
         estimate.est_x,
         estimate.est_y,
-        estimate.var_xx_um2 / UM2_PER_M2,
-        estimate.var_xy_um2 / UM2_PER_M2,
-        estimate.var_yy_um2 / UM2_PER_M2,
+        *estimate.covariance_m2,
         estimate.spots,
     )
 
