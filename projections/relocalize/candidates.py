@@ -9,8 +9,9 @@ whatever BLAS does (see `projections.exact`). The same map and crops give the sa
 last bit.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
@@ -29,11 +30,16 @@ from projections.model.view import MapView
 from projections.settings import Settings
 
 from .constants import FOLLOWERS, Cosines, MapConstants, Sample
-from .question import Box, Crop
+from .question import Box, Crop, describe_value
 
 NEIGHBOURS = 64
 """Observations fetched per crop. From 48 on, the measures in docs/relocalization.md stay the same;
 fewer leave too few directions to triangulate an object from."""
+
+OBJECTS_OF_A_CLASS = 96
+"""For a crop of which only the class is known: so many Objects, those seen most often …"""
+OBSERVATIONS_OF_EACH = 4
+"""… and of each so many observations, spread evenly over all."""
 
 Pose = tuple[float, float, float]
 
@@ -86,7 +92,11 @@ class CandidatePlace:
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
-    """``matches[i]`` are those of crop i, most similar first, ties by ordinal."""
+    """``matches[i]`` are those of crop i, most similar first, ties by ordinal.
+
+    Those of a crop without an embedding are observations of Objects of its class, with the
+    similarity 1.
+    """
 
     matches: tuple[tuple[Match, ...], ...]
     places: Mapping[PlaceOrdinal, CandidatePlace]
@@ -155,15 +165,18 @@ class ExactIndex:
 
     def search(self, crops: Sequence[Crop], neighbours: int = NEIGHBOURS) -> Candidates:
         """The nearest observations of each crop. Raises QuestionError for another space."""
-        if not len(self._ordinals):
-            return Candidates(tuple(() for _ in crops), self.places, self.constants)
-        for crop in crops:
-            check_space(crop, self._matrix.shape[1], self.model)
+        if len(self._ordinals):
+            for crop in crops:
+                check_space(crop, self._matrix.shape[1], self.model)
         matches = tuple(self._nearest(crop, neighbours) for crop in crops)
+        names = {found.class_name for found in self._view.objects.values()}
+        refuse_unknown_classes(crops, matches, lambda: names)
         return Candidates(matches, self.places, self.constants)
 
     def _nearest(self, crop: Crop, neighbours: int) -> tuple[Match, ...]:
         if crop.vector is None:
+            return self._of_class(crop.class_name)
+        if not len(self._ordinals):
             return ()
         products = self._matrix @ quantise(crop.vector).astype(np.float64)
         order = np.argsort(-products, kind="stable")[:neighbours]
@@ -171,6 +184,18 @@ class ExactIndex:
             self._match(ObservationOrdinal(int(self._ordinals[i])), float(products[i]) / Q40)
             for i in order
         )
+
+    def _of_class(self, class_name: str | None) -> tuple[Match, ...]:
+        things = [o for o in self._view.objects.values() if o.class_name == class_name]
+        most = sorted(things, key=lambda o: (-o.obs_count, o.ordinal))[:OBJECTS_OF_A_CLASS]
+        picked = [
+            seen[position]
+            for seen in (sorted(thing.observations) for thing in most)
+            for position in range(len(seen))
+            if (position + 1) * OBSERVATIONS_OF_EACH // len(seen)
+            > position * OBSERVATIONS_OF_EACH // len(seen)
+        ]
+        return tuple(self._match(ordinal, 1.0) for ordinal in sorted(picked))
 
     def _match(self, ordinal: ObservationOrdinal, similarity: float) -> Match:
         observation = self._view.observations[ordinal]
@@ -201,6 +226,34 @@ def _stand(estimate: Estimate | None) -> Stand | None:
         *estimate.covariance_m2,
         estimate.spots,
     )
+
+
+def refuse_unknown_classes(
+    crops: Sequence[Crop],
+    matches: Sequence[Sequence[Match]],
+    class_names: Callable[[], Iterable[str]],
+) -> None:
+    """Raise QuestionError for a class that the map does not have, where nothing but classes is
+    asked with. ``class_names`` gives the classes of all Objects."""
+    if any(crop.vector is not None for crop in crops):
+        return
+    for crop, row in zip(crops, matches, strict=True):
+        if not row:
+            names = sorted(class_names())
+            near = get_close_matches(crop.class_name or "", names, 3, 0.5)
+            there = (
+                f"the nearest are {', '.join(near)}"
+                if near
+                else f"there are {', '.join(names[:_SHOWN])}{', …' if len(names) > _SHOWN else ''}"
+                if names
+                else "it has none"
+            )
+            raise QuestionError(
+                f"the map has no object of class {describe_value(crop.class_name)}; {there}"
+            )
+
+
+_SHOWN = 12
 
 
 def check_space(crop: Crop, dimension: int, model: str | None) -> None:

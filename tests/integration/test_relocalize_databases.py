@@ -14,8 +14,9 @@ from projections.errors import ProjectionMismatch, ProjectionMissing, QuestionEr
 from projections.model.fold import fold_log
 from projections.model.view import MapView
 from projections.queries.relocalize import CandidateReader, relocalize
-from projections.relocalize import Candidates, Crop, ExactIndex, rank, read_crops
+from projections.relocalize import Crop, ExactIndex, rank, read_crops
 from projections.settings import Settings
+from tests.candidates import assert_equal, found
 from tests.commands import Commands
 from tests.envelopes import detection
 from tests.logs import walk, write_log
@@ -58,39 +59,14 @@ def questions() -> Iterator[tuple[Crop, ...]]:
             yield read_crops(document)
 
 
-def found(candidates: Candidates) -> list[list[tuple[object, ...]]]:
-    return [
-        [
-            (
-                m.det_id,
-                m.run_id,
-                m.pose,
-                m.bbox,
-                m.class_name,
-                m.object_id,
-                m.object_place,
-                m.keyframe_place,
-            )
-            for m in sorted(row, key=lambda m: m.observation)
-        ]
-        for row in candidates.matches
-    ]
-
-
 def test_candidates_are_those_of_exact_search(targets: Targets, view: MapView) -> None:
     index = ExactIndex(view)
     with CandidateReader(targets) as reader:
         asked = 0
         for crops in questions():
             live, exact = reader.candidates(crops, 200), index.search(crops, 200)
-            assert found(live) == found(exact)
+            assert_equal(live, exact)
             assert {m.run_id for row in live.matches for m in row} == {"run-a", "run-c"}
-            places = {m.object_place for row in live.matches for m in row} - {None}
-            assert all(live.places[p] == exact.places[p] for p in places if p is not None)
-            for ours, theirs in zip(live.matches, exact.matches, strict=True):
-                assert [m.similarity for m in ours] == pytest.approx(
-                    [m.similarity for m in theirs], abs=1e-5
-                )
             asked += 1
         assert asked > 5
 
