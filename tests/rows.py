@@ -17,8 +17,9 @@ from projections.model.view import MapView
 ORDER = (
     "Run", "Keyframe", "Pose", "Observation", "Object", "Place", "HAS_KEYFRAME", "HAS_POSE",
     "HAS_OBSERVATION", "OBSERVES", "LOCATED_IN", "IN_PLACE", "ADJACENT_TO",
+    "Floor", "Building", "PART_OF",
 )  # fmt: skip
-VERTICES = ORDER[:6]
+VERTICES = (*ORDER[:6], "Floor", "Building")
 
 
 def gid(label: str, number: int) -> str:
@@ -71,7 +72,8 @@ def expected_graph(view: MapView) -> dict[str, list[tuple[Any, ...]]]:
         run_end = gid("Run", k.run + 1)
         rows["HAS_KEYFRAME"].append((gid("HAS_KEYFRAME", n), run_end, gid("Keyframe", n), {}))
         if k.pose is not None:
-            at = {"map_x": k.pose.x_um / 1e6, "map_y": k.pose.y_um / 1e6, "map_yaw": k.pose.yaw_rad}
+            at: dict[str, Any] = {"map_x": k.pose.x_um / 1e6, "map_y": k.pose.y_um / 1e6}
+            at |= {"map_yaw": k.pose.yaw_rad} | ({} if k.floor is None else {"floor": k.floor})
             rows["Pose"].append((gid("Pose", n), {**name, **at}))
             rows["HAS_POSE"].append((gid("HAS_POSE", n), gid("Keyframe", n), gid("Pose", n), {}))
         if k.place is not None:
@@ -87,13 +89,28 @@ def expected_graph(view: MapView) -> dict[str, list[tuple[Any, ...]]]:
         }
         if p.name is not None:
             properties["name"] = p.name
+        floor = view.keyframes[p.founder].floor
+        whole = gid("Building", 1)
+        if floor is not None:
+            properties["floor"] = floor
+            whole = gid("Floor", 1 + list(view.floors).index(floor))
+        n = p.ordinal + 1
+        rows["PART_OF"].append((gid("PART_OF", n), gid("Place", n), whole, {}))
         rows["Place"].append((gid("Place", p.ordinal + 1), properties))
     for a, b, shared in view.edges():
         ends = gid("Place", a + 1), gid("Place", b + 1)
         number = (a + 1) << 24 | (b + 1)
-        rows["ADJACENT_TO"].append(
-            (gid("ADJACENT_TO", number), *ends, {"shared_transitions": shared})
-        )
+        properties = {"shared_transitions": shared}
+        founders = (view.keyframes[view.all_places[place].founder] for place in (a, b))
+        if len({k.floor for k in founders}) > 1:
+            properties["between_floors"] = True
+        rows["ADJACENT_TO"].append((gid("ADJACENT_TO", number), *ends, properties))
+    for number, floor in enumerate(view.floors, 1):
+        rows["Floor"].append((gid("Floor", number), {"floor": floor}))
+        ends = gid("Floor", number), gid("Building", 1)
+        rows["PART_OF"].append((gid("PART_OF", 2**40 + number), *ends, {}))
+    if view.floors or view.all_places:
+        rows["Building"].append((gid("Building", 1), {"building_id": "building"}))
     return {label: sorted(found, key=lambda row: int(row[0])) for label, found in rows.items()}
 
 

@@ -52,7 +52,8 @@ class BatchChanges:
     `MapView.places` any more was absorbed. ``located`` are objects that moved to another place or
     out of one, absorbed ones among them. ``links`` are pairs of places whose shared transitions
     changed; one that is not in `MapView.adjacency` any more is gone. ``embedded`` is in the order
-    of the observations.
+    of the observations. ``formed`` are the places that are new, ``floors`` the numbers of new
+    floors.
     """
 
     keyframes: range
@@ -65,6 +66,8 @@ class BatchChanges:
     placed: list[KeyframeOrdinal]
     links: list[tuple[PlaceOrdinal, PlaceOrdinal]]
     reassigned: list[ObservationOrdinal]
+    formed: list[PlaceOrdinal]
+    floors: range
 
 
 class ChangeTracker:
@@ -110,6 +113,8 @@ class ChangeTracker:
             sorted(self._placed),
             sorted(self._links),
             sorted(self._reassigned),
+            sorted(self._formed),
+            range(self._floors, len(self.view.floors)),
         )
         self._start()
         return changes
@@ -125,6 +130,12 @@ class ChangeTracker:
         self._placed: set[KeyframeOrdinal] = set()
         self._links: set[tuple[PlaceOrdinal, PlaceOrdinal]] = set()
         self._reassigned: set[ObservationOrdinal] = set()
+        self._formed: set[PlaceOrdinal] = set()
+        self._floors = len(self.view.floors)
+
+    def _place_formed(self, delta: PlaceFormed) -> None:
+        self._places.add(delta.place)
+        self._formed.add(delta.place)
 
     def _places_merged(self, delta: PlacesMerged) -> None:
         self._places.add(delta.survivor)
@@ -152,7 +163,7 @@ class ChangeTracker:
         ObjectMissing: lambda self, d: self._objects.add(d.object),
         ObjectRelocated: lambda self, d: self._objects.add(d.object),
         ObjectMoved: lambda self, d: self._located.add(d.object),
-        PlaceFormed: lambda self, d: self._places.add(d.place),
+        PlaceFormed: _place_formed,
         PlaceChanged: lambda self, d: self._places.add(d.place),
         PlaceNamed: lambda self, d: self._places.add(d.place),
         KeyframePlaced: lambda self, d: self._placed.add(d.keyframe),

@@ -321,7 +321,7 @@ class MapView:
     }
 
     def counts(self) -> dict[str, int]:
-        """How many of everything; the seven in capitals are the graph's edges by label. What
+        """How many of everything; the eight in capitals are the graph's edges by label. What
         corrections leave out is counted at the end, where there is any."""
         posed = sum(k.pose is not None for k in self.keyframes)
         placed = sum(p.keyframe_count for p in self.places.values())
@@ -346,4 +346,7 @@ class MapView:
             "LOCATED_IN": sum(o.place is not None for o in self.objects.values()),
             "IN_PLACE": placed,
             "ADJACENT_TO": len(self.adjacency),
+            "floors": len(self.floors),
+            "buildings": int(bool(self.all_places or self.floors)),
+            "PART_OF": len(self.places) + len(self.floors),
         } | {kind: self.skipped[kind] for kind in _BY_CORRECTION if kind in self.skipped}
