@@ -122,9 +122,11 @@ def counts(connection: Connection, graph: str) -> dict[str, int]:
 
 
 def lock(connection: Connection, graph: str) -> None:
-    """Lock all tables of a graph exclusively, if it is there."""
+    """Lock all tables of a graph exclusively, if it is there; an older version's has fewer."""
     if exists(connection, graph):
-        tables = sql.SQL(", ").join(sql.Identifier(graph, name) for name in (*PARENTS, *LABELS))
+        there = _label_ids(connection, graph)
+        names = [*PARENTS, *filter(there.__contains__, LABELS)]
+        tables = sql.SQL(", ").join(sql.Identifier(graph, name) for name in names)
         connection.execute(statements("graph")["lock"].format(tables=tables))
 
 
