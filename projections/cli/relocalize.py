@@ -112,8 +112,10 @@ def _first_line(answer: Answer) -> str:
 
 
 def _place_text(place: RankedPlace) -> str:
-    """A Place's id, and beside it its name if it has one."""
-    return place.place_id if place.name is None else f"{place.place_id} “{place.name}”"
+    """A Place's id, and beside it its name and its floor if it has them."""
+    name = "" if place.name is None else f" “{place.name}”"
+    floor = "" if place.floor is None else f" on floor {place.floor}"
+    return f"{place.place_id}{name}{floor}"
 
 
 def _pose_line(answer: Answer) -> str:
@@ -121,7 +123,8 @@ def _pose_line(answer: Answer) -> str:
     if pose is None:
         return ""
     yaw = "" if pose.yaw is None else f", facing {math.degrees(pose.yaw):.0f}°"
-    return f"pose ({pose.x:.2f}, {pose.y:.2f}) m{yaw}, spread {pose.spread_m:.2f} m"
+    floor = "" if pose.floor is None else f" on floor {pose.floor}"
+    return f"pose ({pose.x:.2f}, {pose.y:.2f}) m{floor}{yaw}, spread {pose.spread_m:.2f} m"
 
 
 def _place_lines(number: int, place: RankedPlace) -> list[str]:

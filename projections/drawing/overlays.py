@@ -35,11 +35,13 @@ _RINGS_M = tuple(0.07 * 1.28**step for step in range(15))
 
 
 def draw_adjacency(canvas: Canvas, view: MapView) -> None:
-    """A dashed line between neighbouring places and the number of transitions on it."""
+    """A dashed line between neighbouring places and the number of transitions on it; a dotted one
+    between two floors."""
     for a, b, count in view.edges():
         one, other = view.places[a], view.places[b]
         start, end = (one.centroid_x, one.centroid_y), (other.centroid_x, other.centroid_y)
-        line = {"arrowstyle": "-", "color": palette.INK, "lw": 1.2, "ls": (0, (4, 3))}
+        dashes = (1, 2) if view.is_between_floors(a, b) else (4, 3)
+        line = {"arrowstyle": "-", "color": palette.INK, "lw": 1.2, "ls": (0, dashes)}
         canvas.axes.annotate("", end, start, zorder=8, arrowprops=line)
         middle = (start[0] + end[0]) / 2, (start[1] + end[1]) / 2
         _draw_badge(

@@ -102,8 +102,9 @@ def compose(
 def _numbers(view: MapView, min_observations: int) -> str:
     counts, settings = view.counts(), view.settings
     shown = sum(found.obs_count >= min_observations for found in view.objects.values())
+    keyframes = counts["poses" if view.floors else "keyframes"]
     return (
-        f"{counted(counts['keyframes'], 'keyframe')} ({counts['noise']} in no place)  ·  "
+        f"{counted(keyframes, 'keyframe')} ({counts['noise']} in no place)  ·  "
         f"{counted(counts['places'], 'place')}  ·  "
         f"{counted(counts['objects'], 'object')}, {shown} of them shown: seen "
         f"{counted(min_observations, 'time')} or more  ·  ε {settings.eps_m:g} m, "

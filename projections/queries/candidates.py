@@ -226,7 +226,11 @@ def _spot(
     if ordinal not in places:
         place = _properties(properties)
         places[ordinal] = CandidatePlace(
-            place["place_id"], place["centroid_x"], place["centroid_y"], place.get("name")
+            place["place_id"],
+            place["centroid_x"],
+            place["centroid_y"],
+            place.get("name"),
+            place.get("floor"),
         )
     return ordinal
 

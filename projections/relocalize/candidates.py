@@ -82,12 +82,14 @@ class Match:
 
 @dataclass(frozen=True, slots=True)
 class CandidatePlace:
-    """A Place that a match belongs to: id, centroid in metres, name if it has one."""
+    """A Place that a match belongs to: id, centroid in metres, name if it has one, and the floor it
+    is on if the log names that."""
 
     place_id: str
     x: float
     y: float
     name: str | None = None
+    floor: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +136,11 @@ class ExactIndex:
         self._matrix = np.array(vectors, dtype=np.float64)
         self.places = {
             place.ordinal: CandidatePlace(
-                place.place_id, place.centroid_x, place.centroid_y, place.name
+                place.place_id,
+                place.centroid_x,
+                place.centroid_y,
+                place.name,
+                view.floor_of(place.ordinal),
             )
             for place in view.places.values()
         }

@@ -21,6 +21,7 @@ from projections.deltas import PlaceOrdinal
 
 from .camera import Camera
 from .candidates import Candidates, Match
+from .floors import Layout
 from .model import MODEL, Model
 from .pose import Posterior, locate
 from .question import Crop, Question
@@ -47,7 +48,7 @@ class RankedPlace:
     """A Place and its score: the share of the poses' weight that lies in it.
 
     With the plain method the score is the sum of similarities. The centroid is in metres.
-    ``name`` is None where nobody named the Place.
+    ``name`` is None where nobody named the Place, ``floor`` where the log names no floor.
     """
 
     place_id: str
@@ -56,12 +57,14 @@ class RankedPlace:
     centroid_y: float
     evidence: tuple[Evidence, ...]
     name: str | None = None
+    floor: str | None = None
 
     def document(self) -> dict[str, Any]:
-        """As JSON; only a Place that has a name has that key."""
+        """As JSON; only a Place that has a name or a floor has that key."""
         document = asdict(self) | {"evidence": [asdict(evidence) for evidence in self.evidence]}
-        if self.name is None:
-            del document["name"]
+        for key in ("name", "floor"):
+            if document[key] is None:
+                del document[key]
         return document
 
 
@@ -69,13 +72,22 @@ class RankedPlace:
 class PoseHypothesis:
     """Metres and radians in the map frame; ``yaw`` is None when the evidence leaves it open.
 
-    ``spread_m`` is the root mean square distance of all weighed poses from this one.
+    ``spread_m`` is the root mean square distance of all weighed poses from this one, of those on
+    its floor. ``floor`` is the floor it is on, None where the log names none.
     """
 
     x: float
     y: float
     yaw: float | None
     spread_m: float
+    floor: str | None = None
+
+    def document(self) -> dict[str, Any]:
+        """As JSON; only a pose on a floor with a name has that key."""
+        document = asdict(self)
+        if self.floor is None:
+            del document["floor"]
+        return document
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +107,7 @@ class Answer:
         """The answer as JSON, in the shape of ``relocalize --json``."""
         return {
             "places": [place.document() for place in self.places],
-            "pose": None if self.pose is None else asdict(self.pose),
+            "pose": None if self.pose is None else self.pose.document(),
             "confidence": self.confidence,
             "unknown": self.unknown,
         }
@@ -118,11 +130,15 @@ def rank(
     candidates = replace(candidates, matches=tuple(candidates.matches[i] for i in order))
     if method == "plain":
         return _rank_plain(candidates, top)
+    floors = Layout.of(candidates.places)
+    candidates = floors.laid_out(candidates)
     posterior = locate(crops, candidates.matches, camera, model)
-    return _answer(candidates, posterior, top)
+    return _answer(candidates, posterior, top, floors)
 
 
-def _answer(candidates: Candidates, posterior: Posterior | None, top: int) -> Answer:
+def _answer(
+    candidates: Candidates, posterior: Posterior | None, top: int, floors: Layout
+) -> Answer:
     sums = _similarity_sums(candidates.matches)
     shares = {} if posterior is None else _place_shares(candidates, posterior)
     known = sorted(shares.keys() | sums.keys())
@@ -131,7 +147,9 @@ def _answer(candidates: Candidates, posterior: Posterior | None, top: int) -> An
     places = _ranked_places(candidates, order[:top], scores)
     if posterior is None:
         return Answer(places, None, 0.0)
-    pose = PoseHypothesis(posterior.x, posterior.y, posterior.yaw, posterior.spread_m)
+    x, floor = floors.put_back(posterior.x), floors.floor_at(posterior.x)
+    spread = floors.spread_m(posterior)
+    pose = PoseHypothesis(x, posterior.y, posterior.yaw, spread, floor)
     return Answer(places, pose, posterior.confidence)
 
 
@@ -168,7 +186,15 @@ def _ranked_places(
         place = candidates.places[ordinal]
         evidence = _evidence(candidates.matches, ordinal)
         ranked.append(
-            RankedPlace(place.place_id, scores[ordinal], place.x, place.y, evidence, place.name)
+            RankedPlace(
+                place.place_id,
+                scores[ordinal],
+                place.x,
+                place.y,
+                evidence,
+                place.name,
+                place.floor,
+            )
         )
     return tuple(ranked)
 
@@ -193,9 +219,8 @@ def _rank_plain(candidates: Candidates, top: int) -> Answer:
     share = sums[order[0]] / math.fsum(sums.values())
     places = _ranked_places(candidates, order[:top], sums)
     spread = _spread(candidates, order[0], winner.x, winner.y)
-    return Answer(
-        places, PoseHypothesis(winner.x, winner.y, None, spread), max(0.0, min(1.0, share))
-    )
+    pose = PoseHypothesis(winner.x, winner.y, None, spread, winner.floor)
+    return Answer(places, pose, max(0.0, min(1.0, share)))
 
 
 def _similarity_sums(matches: Sequence[Sequence[Match]]) -> dict[PlaceOrdinal, float]:
