@@ -18,7 +18,7 @@ The deltas of one event come in this order: RunSeen, KeyframeAdded, ObservationA
 (ObjectFound / ObjectSeen, ObjectsMerged / ObjectRelocated, ObjectClassified, ObjectEstimated,
 ObjectMissing), located-in (ObjectMoved), adjacency (PlacesLinked). An ObjectRelocated stands right
 after the ObjectsMerged that makes the Object found elsewhere part of the one that moved. A delta
-names only things that deltas before it have introduced.
+names only things that deltas before it have introduced. MapGiven is the only one of its event.
 
 Deltas are frozen msgspec structs: a fold makes some ten a keyframe, and a struct takes a third of
 the time of a frozen dataclass to make. ``gc=False`` keeps them out of the garbage collector, which
@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eventsrc.envelope import DetId, KeyframeId, Offset, RunId
+from eventsrc.occupancy_map import OccupancyMap
 
 RunOrdinal = NewType("RunOrdinal", int)
 KeyframeOrdinal = NewType("KeyframeOrdinal", int)
@@ -352,6 +353,13 @@ class PlacesLinked(msgspec.Struct, frozen=True, gc=False):
     shared_transitions: int
 
 
+class MapGiven(msgspec.Struct, frozen=True, eq=False, gc=False):
+    """An occupancy map holds for all events after this one, which is a map and no keyframe."""
+
+    offset: Offset
+    map: OccupancyMap
+
+
 Delta: TypeAlias = (
     RunSeen
     | KeyframeAdded
@@ -372,4 +380,5 @@ Delta: TypeAlias = (
     | ObjectRelocated
     | ObjectMoved
     | PlacesLinked
+    | MapGiven
 )

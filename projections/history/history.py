@@ -22,6 +22,7 @@ from projections.deltas import (
     KeyframeAdded,
     KeyframeOrdinal,
     KeyframePlaced,
+    MapGiven,
     MergeRefused,
     ObjectClassified,
     ObjectEstimated,
@@ -91,6 +92,7 @@ class History:
         self.object_merges: list[ObjectMerge] = []
         self.runs: list[list[RunSeen]] = []
         self.skipped: list[EventSkipped] = []
+        self.maps: list[MapGiven] = []
         self.edges: dict[tuple[PlaceOrdinal, PlaceOrdinal], list[PlacesLinked]] = {}
         self.keyframe_ordinals: dict[tuple[RunId, KeyframeId], KeyframeOrdinal] = {}
         self.place_ordinals: dict[str, PlaceOrdinal] = {}
@@ -177,6 +179,9 @@ class History:
     def _event_skipped(self, delta: EventSkipped, _: Cause) -> None:
         self.skipped.append(delta)
 
+    def _map_given(self, delta: MapGiven, _: Cause) -> None:
+        self.maps.append(delta)
+
     def _place_formed(self, delta: PlaceFormed, cause: Cause) -> None:
         self.place_ordinals[delta.place_id] = delta.place
         self.places.append(PlaceHistory(delta, cause))
@@ -226,6 +231,7 @@ class History:
         RunSeen: _run_seen,
         KeyframeAdded: _keyframe_added,
         EventSkipped: _event_skipped,
+        MapGiven: _map_given,
         PlaceFormed: _place_formed,
         KeyframePlaced: _keyframe_placed,
         PlaceChanged: _place_changed,

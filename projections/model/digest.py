@@ -6,7 +6,8 @@ names it, an embedding enters by its checksum. Settings and the number of events
 the same map reached another way has the same digest. Under corrections there are two more sections:
 the places' names, and the corrections' fingerprint. Under fusion by evidence there is one more
 before them: of each Object its estimate, whether it is missing, and its relocations. Where any
-keyframe's floor has a name there is one before that: of each of these keyframes the floor.
+keyframe's floor has a name there is one before that: of each of these keyframes the floor. With an
+occupancy map there is one more, of its cells and where they lie, before those of corrections.
 """
 
 import hashlib
@@ -37,6 +38,8 @@ def map_digest(view: MapView) -> str:
         digest.update(b"evidence\n")
         for line in _evidence(view):
             digest.update(line.encode())
+    if view.map is not None:
+        digest.update(f"map\n{_line(view.map.map.digest())}".encode())
     if own := view.corrections.fingerprint():
         names = [_line((p.ordinal, p.name)) for p in view.places.values() if p.name is not None]
         digest.update(f"names\n{''.join(names)}corrections\n{_line(own)}".encode())

@@ -33,7 +33,27 @@ def state_document(view: MapView, digest: str, known_at: Offset | None = None) -
             for a, b, transitions in view.edges()
         ],
         **({"floors": list(view.floors)} if view.floors else {}),
+        **_map(view),
         **_corrections(view, known_at),
+    }
+
+
+def _map(view: MapView) -> dict[str, Any]:
+    """The occupancy map in force; nothing where there is none."""
+    if view.map is None:
+        return {}
+    given = view.map.map
+    return {
+        "map": {
+            "offset": view.map.offset,
+            "map_id": given.map_id,
+            "source": given.source,
+            "resolution": given.resolution,
+            "origin": list(given.origin),
+            "width": given.width,
+            "height": given.height,
+            "digest": given.digest(),
+        }
     }
 
 
@@ -136,6 +156,10 @@ def state_text(view: MapView, digest: str, known_at: Offset | None = None) -> st
     ]
     if view.settings.fusion == "evidence":
         lines.append(f"objects  {_standing(view)}")
+    if view.map is not None:
+        given = view.map.map
+        size = f"{given.width:,} × {given.height:,} cells of {given.resolution:g} m"
+        lines.append(f"walls    {size}, from {given.source} at offset {view.map.offset:,}")
     if in_force := view.corrections.in_force:
         known = view.next_offset if known_at is None else known_at
         lines.append(f"commands {len(in_force):,} in force, of those before {known:,}")

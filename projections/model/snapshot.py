@@ -359,6 +359,7 @@ def restore(
         _check_signatures(about["segments"], signatures_at(about["offset"]))
         semantic_map.load(part("map", state))
         load_view(view, part("view", state))
+        view.map = semantic_map.current_map.given
         for delta in semantic_map.use_names(semantic_map.next_offset, corrections):
             view.apply(delta)
     except (MalformedSnapshot, zlib.error) as error:

@@ -18,6 +18,7 @@ from projections.deltas import (
     EventSkipped,
     KeyframeAdded,
     KeyframePlaced,
+    MapGiven,
     MergeRefused,
     ObjectClassified,
     ObjectEstimated,
@@ -61,7 +62,8 @@ class MapView:
     not absorbed, by ordinal, ascending; ``all_places`` also the absorbed, and ``survivors`` what
     these are part of now. So are ``objects``, ``all_objects`` and ``object_survivors``.
     ``adjacency`` maps (a, b), a founded before b, to shared transitions above 0; `edges` sorts it.
-    ``floors`` numbers the floors that have a name by their first keyframe.
+    ``floors`` numbers the floors that have a name by their first keyframe. ``map`` is the occupancy
+    map in force and the offset of its event.
     ``next_offset`` is the number of events that went into the view; ``corrections`` are those they
     were folded under.
     """
@@ -88,6 +90,7 @@ class MapView:
         self.survivors = PlaceSurvivors()
         self.adjacency: dict[tuple[PlaceOrdinal, PlaceOrdinal], int] = {}
         self.floors: dict[str, int] = {}
+        self.map: MapGiven | None = None
         self.skipped: dict[SkipKind, int] = {"duplicate": 0, "conflict": 0, "det_id_reused": 0}
 
     def apply(self, delta: Delta) -> None:
@@ -296,6 +299,9 @@ class MapView:
         else:
             self.adjacency.pop((delta.a, delta.b), None)
 
+    def _map_given(self, delta: MapGiven) -> None:
+        self.map = delta
+
     # Functions of the class, not bound methods: a view that refers to itself would stay in memory,
     # once it is no longer used, until Python looks for cycles.
     _APPLIERS: ClassVar[dict[type, Callable[["MapView", Any], None]]] = {
@@ -318,6 +324,7 @@ class MapView:
         ObjectRelocated: _object_relocated,
         ObjectMoved: _object_moved,
         PlacesLinked: _places_linked,
+        MapGiven: _map_given,
     }
 
     def counts(self) -> dict[str, int]:

@@ -24,6 +24,7 @@ from typing import TypeAlias
 
 from eventsrc.envelope import FIRST_OFFSET, DetId, Offset, RunId
 from eventsrc.ingest import Accepted
+from eventsrc.occupancy_map import OccupancyMap
 from projections.corrections import NO_CORRECTIONS, Corrections, Keyframe
 from projections.deltas import (
     Delta,
@@ -54,6 +55,7 @@ from .adjacency import Adjacency
 from .constrained_landmarks import ConstrainedLandmarks
 from .constrained_places import ConstrainedPlaces
 from .core_index import CoreIndex
+from .current_map import CurrentMap
 from .edited_events import edit_event, edits_events
 from .embedding_space import Space
 from .envelope_evidence import (
@@ -73,7 +75,7 @@ from .places import Places
 from .rule_index import RuleCoreIndex, check_named
 
 Reducer: TypeAlias = (
-    FoldedIds | Floors | Places | Landmarks | EvidenceFusion | LocatedIn | Adjacency
+    FoldedIds | Floors | Places | Landmarks | EvidenceFusion | LocatedIn | Adjacency | CurrentMap
 )
 
 
@@ -118,7 +120,13 @@ class SemanticMap:
         self.landmarks = _landmarks(settings, self._named)
         self.located_in = LocatedIn()
         self.adjacency = Adjacency()
+        self.current_map = CurrentMap(settings)
         self.observation_count = 0
+
+    def use_map(self, offset: Offset, given: OccupancyMap) -> list[Delta]:
+        """Take over an occupancy map, which holds for the events after it; what changed."""
+        self.next_offset = Offset(offset + 1)
+        return [self.current_map.fold(offset, given)]
 
     def skip(self, offset: Offset) -> None:
         """Pass over an event that does not change the map."""
@@ -246,6 +254,7 @@ class SemanticMap:
             ("landmarks", self.landmarks),
             ("located_in", self.located_in),
             ("adjacency", self.adjacency),
+            ("current_map", self.current_map),
         )
 
     def _all_anchors(self) -> frozenset[Keyframe]:
