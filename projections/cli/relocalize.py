@@ -91,7 +91,7 @@ def _print_answer(answer: Answer, as_json: bool) -> None:
         return
     emit(answer.document())
     if answer.unknown:
-        say(f"unknown: confidence {answer.confidence:.2f} is below {UNKNOWN_BELOW}")
+        say(f"unknown: {_known_text(answer)} is below {UNKNOWN_BELOW}")
 
 
 def answer_text(answer: Answer) -> str:
@@ -103,12 +103,18 @@ def answer_text(answer: Answer) -> str:
 
 
 def _first_line(answer: Answer) -> str:
-    confidence = f"confidence {answer.confidence:.2f}"
     if not answer.places:
-        return f"unknown: nothing in the map looks like these crops ({confidence})"
+        return f"unknown: nothing in the map looks like these crops ({_known_text(answer)})"
     if answer.unknown:
-        return f"unknown: {confidence} is below {UNKNOWN_BELOW}; the likeliest places would be"
-    return f"{_place_text(answer.places[0])} ({confidence})"
+        below = f"{_known_text(answer)} is below {UNKNOWN_BELOW}"
+        return f"unknown: {below}; the likeliest places would be"
+    confidence = f"confidence {answer.confidence:.2f}"
+    return f"{_place_text(answer.places[0])} ({confidence}, {_known_text(answer)})"
+
+
+def _known_text(answer: Answer) -> str:
+    """How likely the things shown are in the map."""
+    return f"known {answer.known:.2f}"
 
 
 def _place_text(place: RankedPlace) -> str:

@@ -160,7 +160,7 @@ def _pose(asked: AskedQuestion) -> str:
     off = "no pose" if asked.error_m is None else f"{asked.error_m:.2f} m off"
     sure = f"confidence {answer.confidence:.2f}"
     if answer.unknown:
-        sure += f", below {UNKNOWN_BELOW:g}: unknown"
+        sure += f", known {answer.known:.2f}, below {UNKNOWN_BELOW:g}: unknown"
     return f"pose {off}, {sure}, {1000 * asked.seconds:.0f} ms"
 
 

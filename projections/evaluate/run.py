@@ -111,9 +111,7 @@ def _summarise(trials: Sequence[Trial]) -> dict[str, Any]:
         "within_1_5_m": _share(known, lambda t: t.correct),
         "known_called_unknown": _share(known, lambda t: t.answer.unknown),
         "unknown_called_unknown": _share(unknown, lambda t: t.answer.unknown),
-        "auroc": auroc(
-            [t.answer.confidence for t in known], [t.answer.confidence for t in unknown]
-        ),
+        "auroc": auroc([t.answer.known for t in known], [t.answer.known for t in unknown]),
         "ece": expected_calibration_error(confidence, correct),
         "reliability": reliability(confidence, correct),
         "latency_ms": _latency(trials),

@@ -14,11 +14,11 @@ from .candidates import (
     Stand,
     search_log,
 )
+from .certainty import UNKNOWN_BELOW
 from .constants import MapConstants
 from .question import Crop, Question, View, describe_value, parse_json, parse_question, read_crops
 from .ranking import (
     DEFAULT_CAMERA,
-    UNKNOWN_BELOW,
     Answer,
     Evidence,
     Method,

@@ -21,6 +21,7 @@ from projections.deltas import PlaceOrdinal
 
 from .camera import Camera
 from .candidates import Candidates, Match
+from .certainty import UNKNOWN_BELOW, known_probability
 from .floors import Layout
 from .model import MODEL, Model
 from .pose import Posterior, locate
@@ -29,8 +30,6 @@ from .question import Crop, Question
 Method = Literal["joint", "plain"]
 DEFAULT_CAMERA: Final = Camera()
 PLAIN_NEIGHBOURS: Final = 10
-UNKNOWN_BELOW: Final = 0.3
-"""Below this confidence the answer is 'unknown'."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,16 +91,18 @@ class PoseHypothesis:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """``confidence`` is the calibrated probability that the pose is right within 1.5 m."""
+    """Two calibrated probabilities: ``known`` that the map has one of the things shown,
+    ``confidence`` that the pose is right within 1.5 m."""
 
     places: tuple[RankedPlace, ...]
     pose: PoseHypothesis | None
     confidence: float
+    known: float = 0.0
 
     @property
     def unknown(self) -> bool:
-        """Whether the confidence is too low to name a Place."""
-        return self.confidence < UNKNOWN_BELOW
+        """Whether the things shown are more likely not in the map."""
+        return self.known < UNKNOWN_BELOW
 
     def document(self) -> dict[str, Any]:
         """The answer as JSON, in the shape of ``relocalize --json``."""
@@ -109,6 +110,7 @@ class Answer:
             "places": [place.document() for place in self.places],
             "pose": None if self.pose is None else self.pose.document(),
             "confidence": self.confidence,
+            "known": self.known,
             "unknown": self.unknown,
         }
 
@@ -128,12 +130,13 @@ def rank(
     order = sorted(range(len(crops)), key=lambda index: crops[index].sort_key)
     crops = [crops[index] for index in order]
     candidates = replace(candidates, matches=tuple(candidates.matches[i] for i in order))
+    known = known_probability(crops, candidates.matches, candidates.constants)
     if method == "plain":
-        return _rank_plain(candidates, top)
+        return replace(_rank_plain(candidates, top), known=known)
     floors = Layout.of(candidates.places)
     candidates = floors.laid_out(candidates)
     posterior = locate(crops, candidates.matches, camera, model)
-    return _answer(candidates, posterior, top, floors)
+    return replace(_answer(candidates, posterior, top, floors), known=known)
 
 
 def _answer(

@@ -27,11 +27,17 @@ def _question(keyframe: int) -> Question:
 
 
 def _trial(
-    confidence: float, cosine: float, *, known: bool, error: float | None, plain: float
+    confidence: float,
+    in_map: float,
+    cosine: float,
+    *,
+    known: bool,
+    error: float | None,
+    plain: float,
 ) -> Trial:
     pose = None if error is None else PoseHypothesis(error, 0.0, None, 0.0)
     question = _question(1)
-    answer = Answer((), pose, confidence)
+    answer = Answer((), pose, confidence, in_map)
     return Trial(
         question,
         answer,
@@ -55,20 +61,20 @@ def _trial(
 def test_scores_are_those_computed_by_hand() -> None:
     found = score(
         [
-            _trial(0.95, 0.9, known=True, error=0.5, plain=1.0),
-            _trial(0.15, 0.6, known=True, error=2.5, plain=2.0),
-            _trial(0.85, 0.7, known=False, error=0.1, plain=9.0),
-            _trial(0.05, 0.5, known=False, error=None, plain=9.0),
+            _trial(0.95, 0.65, 0.9, known=True, error=0.5, plain=1.0),
+            _trial(0.15, 0.45, 0.6, known=True, error=2.5, plain=2.0),
+            _trial(0.85, 0.55, 0.7, known=False, error=0.1, plain=9.0),
+            _trial(0.05, 0.05, 0.5, known=False, error=None, plain=9.0),
         ]
     )
     assert (found.questions, found.known) == (4, 2)
     assert (found.p50_m, found.plain_p50_m, found.place_p50_m) == (1.5, 1.5, 9.0)
     assert (found.within, found.plain_within) == (0.5, 0.5)
-    assert found.auroc == 0.75  # of the four pairs only 0.15 against 0.85 is in the wrong order
+    assert found.auroc == 0.75  # of the four pairs only 0.45 against 0.55 is in the wrong order
     assert found.cosine_auroc == 0.75
     assert (found.known_called_unknown, found.unknown_called_known) == (0.5, 0.5)
     assert found.confidence_ece == pytest.approx((0.05 + 0.15 + 0.85 + 0.05) / 4)
-    assert found.known_ece == pytest.approx((0.05 + 0.85 + 0.85 + 0.05) / 4)
+    assert found.known_ece == pytest.approx((0.35 + 0.55 + 0.55 + 0.05) / 4)
     # One answer a bin: |y - p| is 1 - p with probability p, and p with 1 - p.
     expected = sum(2 * p * (1 - p) for p in (0.95, 0.15, 0.85, 0.05)) / 4
     assert found.confidence_floor == pytest.approx(expected)

@@ -153,7 +153,7 @@ def score(trials: Sequence[Trial], cpu_ms: float = 0.0) -> Scores:
     known = [trial for trial in trials if trial.known]
     unknown = [trial for trial in trials if not trial.known]
     sure = [trial.answer.confidence for trial in trials]
-    in_map = [_known(trial) for trial in trials]
+    in_map = [trial.answer.known for trial in trials]
     return Scores(
         len(trials),
         len(known),
@@ -164,7 +164,7 @@ def score(trials: Sequence[Trial], cpu_ms: float = 0.0) -> Scores:
         percentile(_present(t.plain_place_error_m for t in known), 0.5),
         _share(t.correct for t in known),
         _share(t.plain_error_m is not None and t.plain_error_m <= RIGHT_WITHIN_M for t in known),
-        auroc([_known(t) for t in known], [_known(t) for t in unknown]),
+        auroc([t.answer.known for t in known], [t.answer.known for t in unknown]),
         auroc([t.best_cosine for t in known], [t.best_cosine for t in unknown]),
         _share(t.answer.unknown for t in known),
         _share(not t.answer.unknown for t in unknown),
@@ -174,11 +174,6 @@ def score(trials: Sequence[Trial], cpu_ms: float = 0.0) -> Scores:
         calibration_floor(sure),
         cpu_ms,
     )
-
-
-def _known(trial: Trial) -> float:
-    """The probability that the map knows the things shown."""
-    return trial.answer.confidence
 
 
 def _present(values: Iterable[float | None]) -> list[float]:
