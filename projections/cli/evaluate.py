@@ -65,8 +65,8 @@ def evaluate(
     ] = "end",
     method: Annotated[str, typer.Option("--method", help="joint or plain.")] = "joint",
     seed: Annotated[int, typer.Option("--seed", help="Draws the crops asked with.")] = DEFAULT_SEED,
-    hfov: HfovOption = 69.4,
-    image: ImageOption = "640x400",
+    hfov: HfovOption = None,
+    image: ImageOption = None,
     picture: Annotated[
         Path | None,
         typer.Option("--picture", metavar="FILE", help="Draw where three crops fail."),

@@ -59,7 +59,7 @@ def similar(
     json_: JsonOption = False,
 ) -> None:
     """Objects that look most like the crops of QUERY."""
-    crops = question_from(query)
+    crops = question_from(query).crops
     with databases(db, vector_db) as targets, CandidateReader(targets) as reader:
         found = similar_objects(crops, reader.candidates(crops), top)
     _print(found, json_)

@@ -1,4 +1,4 @@
-"""`mapfold relocalize`: which Place is this, from a few object crops."""
+"""`mapfold relocalize`: which Place is this, from a few object crops or classes."""
 
 import math
 from pathlib import Path
@@ -9,14 +9,23 @@ import typer
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 from projections.model.log_commands import read_corrections
-from projections.relocalize import UNKNOWN_BELOW, Answer, Method, RankedPlace, rank, search_log
+from projections.relocalize import (
+    UNKNOWN_BELOW,
+    Answer,
+    Method,
+    Question,
+    RankedPlace,
+    rank,
+    read_question,
+    search_log,
+)
 
 from .options import (
     DbOption,
     HfovOption,
     ImageOption,
     JsonOption,
-    QuestionArgument,
+    OptionalQuestion,
     SetOption,
     SettingsOption,
     VectorDbOption,
@@ -32,7 +41,15 @@ from .terminal import display, emit, say
 
 
 def relocalize(
-    query: QuestionArgument,
+    query: OptionalQuestion = None,
+    classes: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--class",
+            metavar="CLASS",
+            help="Where is a thing of this class near? May be repeated; takes the place of QUERY.",
+        ),
+    ] = None,
     top: Annotated[int, typer.Option("--top", min=1, max=100, help="Places to list.")] = 3,
     as_of: Annotated[
         str | None,
@@ -45,19 +62,20 @@ def relocalize(
     method: Annotated[
         str, typer.Option("--method", help="joint, or plain: similarities summed per Place.")
     ] = "joint",
-    hfov: HfovOption = 69.4,
-    image: ImageOption = "640x400",
+    hfov: HfovOption = None,
+    image: ImageOption = None,
     db: DbOption = None,
     vector_db: VectorDbOption = None,
     set_: SetOption = None,
     settings_file: SettingsOption = None,
     json_: JsonOption = False,
 ) -> None:
-    """Where a robot is, from a few object crops.
+    """Where a robot is, from a few object crops, or what it sees by name.
 
     Ranked Places with evidence, a pose hypothesis and a confidence.
     """
-    how, camera, crops = method_from(method), camera_from(hfov, image), question_from(query)
+    how, camera = method_from(method), camera_from(hfov, image)
+    question = _question(query, classes)
     if as_of is not None and log is None:
         raise MisuseError("--as-of asks a past map, which only the log knows; give --log LOG too")
     if log is None:
@@ -66,16 +84,25 @@ def relocalize(
             # Here: `evaluate` and `whatif` import this module and ask no database.
             from projections.queries.relocalize import relocalize as ask_databases
 
-            answer = ask_databases(targets, crops, top=top, method=how, camera=camera)
+            answer = ask_databases(targets, question, top=top, method=how, camera=camera)
     else:
         with LogReader(log) as reader:
             end = point(reader, as_of or "end")
             corrections = read_corrections(reader, end)
         settings = past_settings(log, settings_file, set_, corrections)
-        candidates = search_log(log, str(end), settings, crops, corrections=corrections)
-        answer = rank(crops, candidates, top=top, method=how, camera=camera)
+        candidates = search_log(log, str(end), settings, question.crops, corrections=corrections)
+        answer = rank(question, candidates, top=top, method=how, camera=camera)
         say_defaults(settings)
     _print_answer(answer, json_)
+
+
+def _question(query: str | None, classes: list[str] | None) -> Question:
+    """What is asked: QUERY, or things of the classes in one picture. Raises MisuseError."""
+    if (query is None) == (not classes):
+        raise MisuseError("give either QUERY, the crops that the robot sees, or --class CLASS")
+    if query is not None:
+        return question_from(query)
+    return read_question([{"class": name} for name in classes or ()])
 
 
 def method_from(text: str) -> Method:

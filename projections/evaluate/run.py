@@ -17,7 +17,7 @@ from projections.corrections import Corrections
 from projections.model.fold import fold_log
 from projections.model.log_commands import read_corrections
 from projections.model.view import MapView
-from projections.relocalize import DEFAULT_CAMERA, Camera, Method
+from projections.relocalize import Camera, Method
 from projections.settings import Settings
 
 from .questions import DEFAULT_SEED, check_truth, make_questions, read_keyframes
@@ -52,7 +52,7 @@ def evaluate(
     *,
     until: str = "end",
     method: Method = "joint",
-    camera: Camera = DEFAULT_CAMERA,
+    camera: Camera | None = None,
     seed: int = DEFAULT_SEED,
     note: Note | None = None,
 ) -> Evaluation:

@@ -99,7 +99,7 @@ class TrialRunner:
         view: MapView,
         truth: Truth,
         *,
-        camera: Camera,
+        camera: Camera | None,
         method: Method,
         room_index: RoomIndex | None = None,
     ) -> None:

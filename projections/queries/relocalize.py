@@ -20,7 +20,6 @@ from projections.database.connection import (
 )
 from projections.errors import ExtensionMissing
 from projections.relocalize import (
-    DEFAULT_CAMERA,
     NEIGHBOURS,
     Answer,
     Camera,
@@ -43,7 +42,7 @@ def relocalize(
     *,
     top: int = 3,
     method: Method = "joint",
-    camera: Camera = DEFAULT_CAMERA,
+    camera: Camera | None = None,
 ) -> Answer:
     """Where a robot is that asks this, from the databases as they are now."""
     crops = question.crops if isinstance(question, Question) else question

@@ -16,7 +16,7 @@ from .candidates import (
 )
 from .certainty import UNKNOWN_BELOW
 from .constants import MapConstants
-from .question import Crop, Question, View, describe_value, parse_json, parse_question, read_crops
+from .question import Crop, Question, View, describe_value
 from .ranking import (
     DEFAULT_CAMERA,
     Answer,
@@ -26,6 +26,7 @@ from .ranking import (
     RankedPlace,
     rank,
 )
+from .reading import parse_json, parse_question, question_schema, read_crops, read_question
 
 __all__ = [
     "DEFAULT_CAMERA",
@@ -49,7 +50,9 @@ __all__ = [
     "describe_value",
     "parse_json",
     "parse_question",
+    "question_schema",
     "rank",
     "read_crops",
+    "read_question",
     "search_log",
 ]

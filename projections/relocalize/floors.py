@@ -14,10 +14,21 @@ import numpy as np
 
 from projections.deltas import PlaceOrdinal
 
+from .camera import Floats
 from .candidates import CandidatePlace, Candidates, Match, Stand
 from .pose import Posterior
 
 STEP_M = 1e8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hypotheses:
+    """Poses (n, 3) in the map frame with weights (n,) that add up to 1, likeliest first, and the
+    name of each one's floor."""
+
+    poses: Floats
+    weights: Floats
+    floors: tuple[str | None, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +73,16 @@ class Layout:
         dx, dy = posterior.poses[:, 0] - posterior.x, posterior.poses[:, 1] - posterior.y
         weights = posterior.weights * (np.abs(dx) < STEP_M / 2)
         return math.sqrt(float(weights @ (dx * dx + dy * dy)) / float(weights.sum()))
+
+    def hypotheses(self, posterior: Posterior) -> Hypotheses:
+        """The poses of a posterior, as they are on their floors."""
+        if not self.has_several:
+            floor = next(iter(self.numbers), None)
+            return Hypotheses(posterior.poses, posterior.weights, (floor,) * len(posterior.poses))
+        poses = posterior.poses.copy()
+        floors = tuple(self.floor_at(x) for x in poses[:, 0].tolist())
+        poses[:, 0] -= np.round(poses[:, 0] / STEP_M) * STEP_M
+        return Hypotheses(poses, posterior.weights, floors)
 
     def _moved(self, match: Match, places: Mapping[PlaceOrdinal, CandidatePlace]) -> Match:
         place = match.object_place if match.keyframe_place is None else match.keyframe_place

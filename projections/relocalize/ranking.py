@@ -12,7 +12,7 @@ sum wins; the pose is its centroid.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -22,7 +22,7 @@ from projections.deltas import PlaceOrdinal
 from .camera import Camera
 from .candidates import Candidates, Match
 from .certainty import UNKNOWN_BELOW, known_probability
-from .floors import Layout
+from .floors import Hypotheses, Layout
 from .model import MODEL, Model
 from .pose import Posterior, locate
 from .question import Crop, Question
@@ -92,12 +92,17 @@ class PoseHypothesis:
 @dataclass(frozen=True, slots=True)
 class Answer:
     """Two calibrated probabilities: ``known`` that the map has one of the things shown,
-    ``confidence`` that the pose is right within 1.5 m."""
+    ``confidence`` that the pose is right within 1.5 m.
+
+    ``hypotheses`` are what the pose was chosen from; None where there is no pose, and with the
+    plain method.
+    """
 
     places: tuple[RankedPlace, ...]
     pose: PoseHypothesis | None
     confidence: float
     known: float = 0.0
+    hypotheses: Hypotheses | None = field(default=None, compare=False, repr=False)
 
     @property
     def unknown(self) -> bool:
@@ -121,12 +126,15 @@ def rank(
     *,
     top: int = 3,
     method: Method = "joint",
-    camera: Camera = DEFAULT_CAMERA,
+    camera: Camera | None = None,
     model: Model = MODEL,
 ) -> Answer:
     """The answer to a question, or to the crops of one picture; ``candidates.matches`` run parallel
-    to the crops."""
-    crops = question.crops if isinstance(question, Question) else question
+    to the crops. The camera is that of the question, else ``camera``, else that of the map."""
+    if not isinstance(question, Question):
+        question = Question.of(question)
+    crops: Sequence[Crop] = question.crops
+    camera = question.camera or camera or candidates.constants.camera
     order = sorted(range(len(crops)), key=lambda index: crops[index].sort_key)
     crops = [crops[index] for index in order]
     candidates = replace(candidates, matches=tuple(candidates.matches[i] for i in order))
@@ -153,7 +161,7 @@ def _answer(
     x, floor = floors.put_back(posterior.x), floors.floor_at(posterior.x)
     spread = floors.spread_m(posterior)
     pose = PoseHypothesis(x, posterior.y, posterior.yaw, spread, floor)
-    return Answer(places, pose, posterior.confidence)
+    return Answer(places, pose, posterior.confidence, hypotheses=floors.hypotheses(posterior))
 
 
 def _place_shares(candidates: Candidates, posterior: Posterior) -> dict[PlaceOrdinal, float]:

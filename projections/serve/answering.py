@@ -1,6 +1,6 @@
 """Answers to questions over any transport: JSON in, JSON out, rate limited, errors as replies.
 
-A question is what ``mapfold relocalize`` takes; an object with crops may also have ``top`` and
+A question is what ``mapfold relocalize`` takes; an object may also have ``top`` and
 ``method``. Every refusal is ``{"error": {"kind", "message"}}`` with one of the kinds in ``_KINDS``.
 """
 
@@ -22,14 +22,13 @@ from projections.errors import (
 )
 from projections.queries.graph_reads import objects_near, places_near
 from projections.relocalize import (
-    DEFAULT_CAMERA,
     Camera,
-    Crop,
     Method,
+    Question,
     describe_value,
     parse_json,
     rank,
-    read_crops,
+    read_question,
 )
 
 from .pools import Pools
@@ -125,7 +124,7 @@ class Answerer:
         *,
         per_second: float,
         max_bytes: int = DEFAULT_MAX_BYTES,
-        camera: Camera = DEFAULT_CAMERA,
+        camera: Camera | None = None,
         tell: Callable[[str], None] = lambda _: None,
     ) -> None:
         self._pools, self._bucket, self._camera = pools, TokenBucket(per_second), camera
@@ -142,11 +141,11 @@ class Answerer:
                 f"the question has {len(payload)} bytes, more than {self.max_bytes}"
             )
         with self._parsing:
-            crops, top, method = _read(payload, options)
+            question, top, method = _read(payload, options)
         with self._reporting_errors():
             self._bucket.take_token()
-            candidates = self._pools.candidates(crops)
-        return rank(crops, candidates, top=top, method=method, camera=self._camera).document()
+            candidates = self._pools.candidates(question.crops)
+        return rank(question, candidates, top=top, method=method, camera=self._camera).document()
 
     def state(self, what: str, options: Mapping[str, str]) -> dict[str, Any]:
         """``places`` or ``objects`` near a pose: x, y and radius in metres."""
@@ -189,12 +188,12 @@ def encode(document: Mapping[str, Any]) -> bytes:
     return json.dumps(document, ensure_ascii=False, allow_nan=False).encode()
 
 
-def _read(payload: bytes, options: Mapping[str, str]) -> tuple[tuple[Crop, ...], int, Method]:
+def _read(payload: bytes, options: Mapping[str, str]) -> tuple[Question, int, Method]:
     document = parse_json(payload)
     fields = document if isinstance(document, dict) else {}
     top = _top(options.get("top", fields.get("top", 3)))
     method = _method(options.get("method", fields.get("method", "joint")))
-    return read_crops(document), top, method
+    return read_question(document), top, method
 
 
 def _top(value: Any) -> int:

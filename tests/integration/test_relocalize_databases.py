@@ -19,7 +19,7 @@ from projections.settings import Settings
 from tests.candidates import assert_equal, found
 from tests.commands import Commands
 from tests.envelopes import detection
-from tests.logs import walk, write_log
+from tests.logs import WEIRD, walk, write_log
 
 SETTINGS = Settings()
 
@@ -185,6 +185,34 @@ class TestCommand:
         assert "default settings" in plain.err
         assert "default settings" not in given.err
 
+    def test_classes_take_the_place_of_a_question(
+        self, mapfold: Commands, log: Path, tmp_path: Path
+    ) -> None:
+        first, second = WEIRD[:2]
+        asked = ("relocalize", "--log", log, "--json")
+        said = mapfold(*asked, "--class", first, "--class", second).json
+        assert {e["class_name"] for place in said["places"] for e in place["evidence"]} == {
+            first,
+            second,
+        }
+        file = tmp_path / "classes.json"
+        file.write_text(json.dumps([{"class": first}, {"class": second}]))
+        assert mapfold(*asked, file).json == said
+        refused = mapfold("relocalize", "--log", log, "--class", "bakers rack", code=2)
+        assert "the nearest are baker's rack" in refused.err
+
+    def test_a_question_of_several_views(
+        self, mapfold: Commands, log: Path, tmp_path: Path
+    ) -> None:
+        seen = [d["detections"] for d in walk(60, seed=3) if d["detections"]][:2]
+        moved = {"dx": 0.25, "dy": 0.0, "dyaw": 0.5, "crops": seen[1]}
+        file = tmp_path / "views.json"
+        file.write_text(json.dumps({"views": [{"crops": seen[0]}, moved]}))
+        assert mapfold("relocalize", file, "--log", log, "--json").json["pose"]
+        file.write_text(json.dumps({"views": [{"crops": seen[0]}, {"crops": seen[1]}]}))
+        refused = mapfold("relocalize", file, "--log", log, code=2)
+        assert "views.1.dx: is missing" in refused.err
+
     def test_plain_and_text(self, mapfold: Commands, log: Path, question: Path) -> None:
         said = mapfold("relocalize", question, "--log", log, "--as-of", "end", "--method", "plain")
         assert "run-a_p" in said.out
@@ -193,6 +221,7 @@ class TestCommand:
         ("arguments", "said"),
         [
             (["--as-of", "end"], "--log"),
+            (["--class", "cup"], "give either QUERY"),
             (["--set", "eps_m=1.0"], "--log LOG"),
             (["--method", "magic"], "joint and plain"),
             (["--image", "big"], "--image"),
