@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from eventsrc.errors import MisuseError
 from eventsrc.ingest import Accepted, ingest
@@ -28,6 +29,7 @@ from .truth import Key, Truth
 DEFAULT_SEED = 20260321
 
 
+T = TypeVar("T")
 VIEW_CROPS = 3
 """Crops of a view at most."""
 _NEAR_BY = 4
@@ -104,6 +106,13 @@ def make_view_questions(
     return found
 
 
+def spread(items: Sequence[T], most: int) -> list[T]:
+    """``most`` of the items, evenly; all if there are no more."""
+    if len(items) <= most:
+        return list(items)
+    return [items[i * len(items) // most] for i in range(most)]
+
+
 def check_truth(keyframes: Iterable[Accepted], truth: Truth) -> None:
     """Raise MisuseError when no keyframe of the query logs has truth: nothing could be scored."""
     runs = set()
@@ -124,10 +133,11 @@ def _key(keyframe: Accepted) -> Key:
 def _draw(keyframe: Accepted, most: int, seed: int) -> list[int]:
     """Up to ``most`` of the detections that have an embedding."""
     usable = [i for i, vector in enumerate(keyframe.vectors) if vector is not None]
-    return sorted(usable, key=lambda i: _draw_key(seed, keyframe.det_ids[i]))[:most]
+    return sorted(usable, key=lambda i: draw_key(seed, keyframe.det_ids[i]))[:most]
 
 
-def _draw_key(seed: int, det_id: str) -> bytes:
+def draw_key(seed: int, det_id: str) -> bytes:
+    """Orders the crops of a keyframe: the first are asked with."""
     return hashlib.sha256(f"{seed}:{det_id}".encode()).digest()
 
 

@@ -9,12 +9,13 @@ whatever BLAS does (see `projections.exact`). The same map and crops give the sa
 last bit.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from eventsrc.envelope import RunId
 from eventsrc.log import LogReader
@@ -169,22 +170,34 @@ class ExactIndex:
             return Cosines()
         return Cosines(len(products), float(np.mean(products)), float(np.std(products)))
 
-    def search(self, crops: Sequence[Crop], neighbours: int = NEIGHBOURS) -> Candidates:
-        """The nearest observations of each crop. Raises QuestionError for another space."""
+    def search(
+        self,
+        crops: Sequence[Crop],
+        neighbours: int = NEIGHBOURS,
+        without: Collection[ObservationOrdinal] = (),
+    ) -> Candidates:
+        """The nearest observations of each crop, as if the map had none of those ``without``.
+        Raises QuestionError for another space."""
         if len(self._ordinals):
             for crop in crops:
                 check_space(crop, self._matrix.shape[1], self.model)
-        matches = tuple(self._nearest(crop, neighbours) for crop in crops)
+        dropped = np.isin(self._ordinals, list(without)) if without else None
+        matches = tuple(self._nearest(crop, neighbours, dropped) for crop in crops)
         names = {found.class_name for found in self._view.objects.values()}
         refuse_unknown_classes(crops, matches, lambda: names)
         return Candidates(matches, self.places, self.constants)
 
-    def _nearest(self, crop: Crop, neighbours: int) -> tuple[Match, ...]:
+    def _nearest(
+        self, crop: Crop, neighbours: int, dropped: NDArray[np.bool_] | None
+    ) -> tuple[Match, ...]:
         if crop.vector is None:
             return self._of_class(crop.class_name)
         if not len(self._ordinals):
             return ()
         products = self._matrix @ quantise(crop.vector).astype(np.float64)
+        if dropped is not None:
+            products[dropped] = -np.inf
+            neighbours = min(neighbours, len(dropped) - int(dropped.sum()))
         order = np.argsort(-products, kind="stable")[:neighbours]
         return tuple(
             self._match(ObservationOrdinal(int(self._ordinals[i])), float(products[i]) / Q40)

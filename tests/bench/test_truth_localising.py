@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from projections import relocalize
-from projections.evaluate.questions import Question
+from projections.evaluate.questions import Question, spread
 from projections.evaluate.trials import Trial
 from projections.relocalize import Answer, PoseHypothesis
 from tests.bench.truth.localising import (
@@ -13,7 +13,6 @@ from tests.bench.truth.localising import (
     Scores,
     localise,
     score,
-    spread,
     stranger_of,
 )
 from tests.bench.truth.localising_table import against_plain, localise_table

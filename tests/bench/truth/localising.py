@@ -13,7 +13,7 @@ from typing import Any
 
 from eventsrc.ingest import Accepted
 from eventsrc.text import counted
-from projections.evaluate.questions import Question, make_questions, make_view_questions
+from projections.evaluate.questions import Question, make_questions, make_view_questions, spread
 from projections.evaluate.scores import (
     auroc,
     calibration_floor,
@@ -122,13 +122,6 @@ def asked(case: Case, stranger: Case, every: int) -> dict[str, tuple[list[Questi
             others = make(later_runs(stranger), stranger.truth, count)
             found[counted(count, word)] = own, spread(others, len(own))
     return found
-
-
-def spread(questions: Sequence[Question], count: int) -> list[Question]:
-    """``count`` of the questions, or all if there are fewer, evenly."""
-    if len(questions) <= count:
-        return list(questions)
-    return [questions[i * len(questions) // count] for i in range(count)]
 
 
 def localise(case: Case, stranger: Case, rules: Sequence[str], every: int) -> list[LocaliseRow]:
