@@ -141,11 +141,24 @@ class PlaceFormed(msgspec.Struct, frozen=True, gc=False):
 
 
 class Link(msgspec.Struct, frozen=True, gc=False):
-    """Two core points within ε of each other that joined two places; keyframe ordinals, µm."""
+    """Two core points within ε of each other that joined two places; keyframe ordinals, µm.
+
+    Of places by rooms: the founders of the two places' cells that are the shortest drive apart,
+    and the length of that drive.
+    """
 
     core: KeyframeOrdinal
     neighbour: KeyframeOrdinal
     distance_um: int
+
+
+class MeanDrive(msgspec.Struct, frozen=True, gc=False):
+    """Why places by rooms became one: the mean driven distance, rounded down, between the ``cells``
+    of the survivor and the ``absorbed_cells`` of the other."""
+
+    mean_um: int
+    cells: int
+    absorbed_cells: int
 
 
 class PlacesMerged(msgspec.Struct, frozen=True, gc=False):
@@ -155,7 +168,8 @@ class PlacesMerged(msgspec.Struct, frozen=True, gc=False):
     keyframe whose arrival did it, ``links`` the pairs of core points that join the parts, one pair
     for each absorbed place. ``survivor_count`` and ``absorbed_counts`` are members before
     the merge. ``joined`` are those absorbed by a ``join`` command; their link is of the command's
-    two anchors, at whatever distance.
+    two anchors, at whatever distance. ``drives`` are there for places by rooms, one for each
+    absorbed place but those in ``joined``.
     """
 
     offset: Offset
@@ -166,6 +180,7 @@ class PlacesMerged(msgspec.Struct, frozen=True, gc=False):
     survivor_count: int
     absorbed_counts: tuple[int, ...]
     joined: tuple[PlaceOrdinal, ...] = ()
+    drives: tuple[MeanDrive, ...] = ()
 
 
 class MergeRefused(msgspec.Struct, frozen=True, gc=False):

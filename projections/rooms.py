@@ -15,7 +15,5 @@ class RoomsConstants(BaseModel):
 
     cell_m: _Length = 0.75
     """A pose farther than this from all anchors becomes the anchor of a new cell."""
-    drive_m: Annotated[float, Field(ge=0.0, le=100.0)] = 2.0
+    drive_m: _Length = 4.0
     """Places join up to this mean driven distance between their cells."""
-    shared_m: Annotated[float, Field(ge=0.0, le=100.0)] = 1.0
-    """What landmarks that both saw take off that distance at most."""

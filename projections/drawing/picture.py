@@ -109,8 +109,7 @@ def _numbers(view: MapView, min_observations: int) -> str:
         f"{counted(keyframes, 'keyframe')} ({counts['noise']} in no place)  ·  "
         f"{counted(counts['places'], 'place')}  ·  "
         f"{counted(counts['objects'], 'object')}, {shown} of them shown: seen "
-        f"{counted(min_observations, 'time')} or more  ·  ε {settings.eps_m:g} m, "
-        f"min_samples {settings.min_samples}"
+        f"{counted(min_observations, 'time')} or more  ·  {settings.places_text()}"
     )
 
 

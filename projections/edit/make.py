@@ -229,7 +229,7 @@ def use_settings(current: CurrentMap, stamp: Stamp, settings: Settings) -> UseSe
     """The map has these settings from here on."""
     if settings == (current.corrections.settings or Settings()):
         raise EditRefused("these are the settings of the log already")
-    plain = settings.model_dump(exclude={"neighbourhood"})
+    plain = settings.model_dump()
     return build(UseSettings, stamp, settings=plain)
 
 

@@ -16,7 +16,7 @@ from eventsrc.upcast import read_envelopes
 from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.deltas import Delta
 from projections.errors import FoldError
-from projections.exact import Neighbourhood, Units, unit_vectors
+from projections.exact import Units, unit_vectors
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 
@@ -112,11 +112,10 @@ def fold_log(
     until: Offset | None = None,
     *,
     keep_embeddings: bool = True,
-    neighbourhood: Neighbourhood | None = None,
     corrections: Corrections = NO_CORRECTIONS,
 ) -> tuple[SemanticMap, MapView]:
     """Fold the first ``until`` events of a log, all of them for None."""
-    semantic_map = SemanticMap(settings, neighbourhood, corrections)
+    semantic_map = SemanticMap(settings, corrections)
     view = MapView(settings, keep_embeddings=keep_embeddings, corrections=corrections)
     _fold_into(reader, semantic_map, view, until)
     return semantic_map, view
@@ -128,7 +127,6 @@ def fold_log_cached(
     until: Offset | None = None,
     *,
     note: Callable[[str], None] = lambda _: None,
-    neighbourhood: Neighbourhood | None = None,
     corrections: Corrections = NO_CORRECTIONS,
 ) -> tuple[SemanticMap, MapView]:
     """`fold_log` without embeddings, from the nearest snapshot beside the log.
@@ -137,11 +135,9 @@ def fold_log_cached(
     called with a message for each snapshot that could not be used or kept; the result is the same.
     """
     end = reader.next_offset if until is None else min(until, reader.next_offset)
-    cache = SnapshotCache(
-        reader.path, reader.log_id, settings, note, neighbourhood, corrections=corrections
-    )
+    cache = SnapshotCache(reader.path, reader.log_id, settings, note, corrections=corrections)
     semantic_map, view = cache.latest(end) or (
-        SemanticMap(settings, neighbourhood, corrections),
+        SemanticMap(settings, corrections),
         MapView(settings, keep_embeddings=False, corrections=corrections),
     )
     start = semantic_map.next_offset

@@ -27,7 +27,6 @@ from projections.deltas import (
     Pose,
     RunOrdinal,
 )
-from projections.exact import Neighbourhood
 from projections.reducers import State, part, prefixed
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
@@ -340,7 +339,6 @@ def restore(
     data: bytes,
     settings: Settings,
     log_id: str,
-    neighbourhood: Neighbourhood | None = None,
     signatures_at: Callable[[int], Sequence[str]] = lambda _: (),
     *,
     corrections: Corrections = NO_CORRECTIONS,
@@ -350,7 +348,7 @@ def restore(
     ``signatures_at`` gives the log's `eventsrc.log.segment_signatures` up to an offset, as it is
     now. Raises SnapshotRefused, and what ``signatures_at`` raises.
     """
-    semantic_map = SemanticMap(settings, neighbourhood, corrections)
+    semantic_map = SemanticMap(settings, corrections)
     view = MapView(settings, keep_embeddings=False, corrections=corrections)
     try:
         state = unpack(data)

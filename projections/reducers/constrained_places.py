@@ -5,10 +5,10 @@ The rules of `projections.reducers.places` hold, which these places take the cod
 7.  *Anchors* are the keyframes that the commands name. An anchor is in the place that it belongs to
     by the rules. Places with anchors that are kept apart *conflict*; they are never merged. Which
     points are core does not depend on it, nor who founds a place that nothing older touches.
-8.  Core points that share a cell of the grid (side ε/√2, `core_index`) are always of one place;
-    under another rule than plain distance each core point is a cell of its own. So cells with core
-    points are what is clustered. A cell keeps its place once it has one. Two anchors in one cell
-    cannot be kept apart, nor can one that arrives in a cell of the other's place.
+8.  Core points that share a cell of the grid (side ε/√2, `core_index`) are always of one place. So
+    cells with core points are what is clustered. A cell keeps its place once it has one. Two
+    anchors in one cell cannot be kept apart, nor can one that arrives in a cell of the other's
+    place.
 9.  Where fresh core points touch places that conflict, their cells are taken in like this. A fresh
     cell with points that are in a place already is of that place, of the one founded first if there
     are several. Then the links between cells that fresh core points make are followed: those of the
@@ -47,8 +47,8 @@ from projections.pair_groups import PairGroups
 from projections.reducers import State
 
 from .core_index import CoreIndex
-from .places import NOISE, Part, Places
-from .rule_index import RuleCoreIndex
+from .place_members import NOISE
+from .places import Part, Places
 
 Anchors: TypeAlias = dict[int, KeyframeOrdinal]
 """The groups of anchors in a place, with the earliest anchor of each."""
@@ -76,7 +76,7 @@ class Refusal(NamedTuple):
 class ConstrainedPlaces(Places):
     """The reducer under pairs of anchors. Tell it of an anchor's keyframe before it is folded."""
 
-    def __init__(self, core_index: CoreIndex | RuleCoreIndex, groups: PairGroups[Keyframe]) -> None:
+    def __init__(self, core_index: CoreIndex, groups: PairGroups[Keyframe]) -> None:
         super().__init__(core_index)
         self._groups = groups
         self._anchors: dict[KeyframeOrdinal, int] = {}  # those that have come → group
@@ -103,17 +103,12 @@ class ConstrainedPlaces(Places):
         run_id: RunId,
         x_um: int,
         y_um: int,
-        yaw: float,
     ) -> list[Delta]:
         """As `Places.fold`."""
         if keyframe not in self._anchors:
-            return super().fold(offset, keyframe, run, run_id, x_um, y_um, yaw)
-        point = len(self.joined)
-        self.joined.append(NOISE)
-        self.keyframes.append(keyframe)
-        self.runs.append(run)
-        self.run_ids[run] = run_id
-        return self._fold_changes(offset, point, self.core_index.insert(x_um, y_um, yaw))
+            return super().fold(offset, keyframe, run, run_id, x_um, y_um)
+        point = self.add_point(keyframe, run, run_id)
+        return self._fold_changes(offset, point, self.core_index.insert(x_um, y_um))
 
     def dump(self) -> State:
         """Everything, for a snapshot."""
@@ -139,7 +134,7 @@ class ConstrainedPlaces(Places):
                 place = self.survivors.find(self.joined[older])
                 self._join(newcomer, place)
                 placed = KeyframePlaced(offset, self.keyframes[newcomer], place)
-                return [placed, self._place_changed(offset, place)]
+                return [placed, self.place_changed(offset, place)]
         return super()._fold_changes(offset, newcomer, fresh)
 
     def _joining(
@@ -316,7 +311,7 @@ class ConstrainedPlaces(Places):
             place = self.survivors.find(entered)
             if other == place or other in self.survivors.absorbed_by:
                 continue
-            pair = point, self._point_of(self._inside[other][group])
+            pair = point, self.point_of(self._inside[other][group])
             apart = self._apart(self._inside[place], self._inside[other])
             if apart is None:
                 first, second = sorted((place, other))

@@ -45,8 +45,7 @@ from projections.deltas import (
     RunSeen,
     SkipKind,
 )
-from projections.errors import SettingsError
-from projections.exact import Neighbourhood, Units, metres_to_um, unit_vectors
+from projections.exact import Units, unit_vectors
 from projections.pair_groups import PairGroups
 from projections.reducers import State, part, prefixed
 from projections.settings import Settings
@@ -54,7 +53,6 @@ from projections.settings import Settings
 from .adjacency import Adjacency
 from .constrained_landmarks import ConstrainedLandmarks
 from .constrained_places import ConstrainedPlaces
-from .core_index import CoreIndex
 from .current_map import CurrentMap
 from .edited_events import edit_event, edits_events
 from .embedding_space import Space
@@ -72,30 +70,33 @@ from .landmarks import Landmarks
 from .located_in import LocatedIn
 from .place_names import PlaceNames
 from .places import Places
-from .rule_index import RuleCoreIndex, check_named
+from .rooms import Rooms
+from .rules import landmarks_by, places_by
 
 Reducer: TypeAlias = (
-    FoldedIds | Floors | Places | Landmarks | EvidenceFusion | LocatedIn | Adjacency | CurrentMap
+    FoldedIds
+    | Floors
+    | Places
+    | Rooms
+    | Landmarks
+    | EvidenceFusion
+    | LocatedIn
+    | Adjacency
+    | CurrentMap
 )
 
 
 class SemanticMap:
     """The fold's state. `fold` changes it in place and is otherwise pure.
 
-    ``next_offset`` is one past the last event folded or skipped. Another ``neighbourhood`` than
-    plain distance must be the one that the settings name, so that whatever is kept under their
-    fingerprint (a snapshot, a checkpoint) is of that rule and no other. Raises SettingsError.
+    ``next_offset`` is one past the last event folded or skipped.
     """
 
     def __init__(
         self,
         settings: Settings,
-        neighbourhood: Neighbourhood | None = None,
         corrections: Corrections = NO_CORRECTIONS,
     ) -> None:
-        check_named(settings, neighbourhood)
-        if settings.places == "rooms":
-            raise SettingsError("places=rooms is not there yet; leave it out")
         self.settings = settings
         self.corrections = corrections
         self._edits_events = edits_events(corrections)
@@ -106,18 +107,10 @@ class SemanticMap:
         self.folded_ids = FoldedIds()
         self.floors = Floors(settings.floor_height_m)
         self.space = Space(settings)
-        core_index = (
-            CoreIndex(metres_to_um(settings.eps_m), settings.min_samples)
-            if neighbourhood is None
-            else RuleCoreIndex(neighbourhood, settings.min_samples)
-        )
-        self._anchored = None
         self._grouped = PairGroups(corrections.joined, corrections.apart)
-        if self._grouped.group_of:
-            self._anchored = ConstrainedPlaces(core_index, self._grouped)
-        self.places = self._anchored or Places(core_index)
+        self.places = places_by(settings, self._grouped)
         self._named = PairGroups(corrections.same, corrections.different)
-        self.landmarks = _landmarks(settings, self._named)
+        self.landmarks = landmarks_by(settings, self._named)
         self.located_in = LocatedIn()
         self.adjacency = Adjacency()
         self.current_map = CurrentMap(settings)
@@ -264,10 +257,10 @@ class SemanticMap:
     def _add_anchor(self, keyframe: KeyframeOrdinal, anchor: Keyframe, floor: int | None) -> None:
         if anchor in self._anchors:
             self.names.add_anchor(keyframe, anchor)
-            if self._anchored is not None:
+            if isinstance(self.places, ConstrainedPlaces | Rooms):
                 if floor is not None:
                     self.floors.settle(self._grouped, anchor, "place", floor)
-                self._anchored.add_anchor(keyframe, anchor)
+                self.places.add_anchor(keyframe, anchor)
 
     def _observe(
         self,
@@ -337,9 +330,7 @@ class SemanticMap:
     ) -> PlaceOrdinal | None:
         """Run places and tell located-in and adjacency; the keyframe's own place."""
         folded_ids, place = self.folded_ids, None
-        changes = self.places.fold(
-            offset, keyframe, run, run_id, pose.x_um, pose.y_um, pose.yaw_rad
-        )
+        changes = self.places.fold(offset, keyframe, run, run_id, pose.x_um, pose.y_um)
         for delta in changes:
             deltas.append(delta)
             if type(delta) is KeyframePlaced:
@@ -395,11 +386,3 @@ class SemanticMap:
                 if type(following) is ObjectRelocated and following.object == delta.survivor:
                     self.located_in.object_left(delta.survivor)
                 self.located_in.objects_merged(delta.survivor, delta.absorbed)
-
-
-def _landmarks(settings: Settings, named: PairGroups[DetId]) -> Landmarks | EvidenceFusion:
-    groups = named if named.group_of else None
-    if settings.fusion == "evidence":
-        return EvidenceFusion(settings.evidence, groups)
-    limits = settings.fusion_radius_m, settings.fusion_similarity
-    return Landmarks(*limits) if groups is None else ConstrainedLandmarks(*limits, groups)

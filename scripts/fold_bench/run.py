@@ -39,7 +39,7 @@ def fold_places(points: list[tuple[int, int]]) -> tuple[float, list[int | None]]
     places = Places(CoreIndex(EPS_UM, LEAST))
     start = clock()
     for n, (x, y) in enumerate(points):
-        places.fold(n, n, 0, "r", x, y, 0.0)
+        places.fold(n, n, 0, "r", x, y)
     return clock() - start, [places.label(n) for n in range(len(points))]
 
 
@@ -84,7 +84,7 @@ def lifelong() -> None:
 
     def fold_one(at: tuple[float, float]) -> None:
         nonlocal number
-        places.fold(number, number, 0, "r", round(at[0] * 1e6), round(at[1] * 1e6), 0.0)
+        places.fold(number, number, 0, "r", round(at[0] * 1e6), round(at[1] * 1e6))
         number += 1
 
     _tenths("places alone", house_walk(count), count, fold_one)
