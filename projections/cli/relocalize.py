@@ -1,5 +1,6 @@
 """`mapfold relocalize`: which Place is this, from a few object crops or classes."""
 
+import contextlib
 import math
 from pathlib import Path
 from typing import Annotated, cast, get_args
@@ -12,12 +13,12 @@ from projections.model.log_commands import read_corrections
 from projections.relocalize import (
     UNKNOWN_BELOW,
     Answer,
+    ExactIndex,
     Method,
     Question,
     RankedPlace,
     rank,
     read_question,
-    search_log,
 )
 
 from .options import (
@@ -38,10 +39,19 @@ from .options import (
     say_defaults,
 )
 from .terminal import display, emit, say
+from .tracking import Search, print_tracked, question_lines
 
 
 def relocalize(
     query: OptionalQuestion = None,
+    track: Annotated[
+        bool,
+        typer.Option(
+            "--track",
+            help="Follow a robot: QUERY (else stdin) has one question a line, with dx, dy and dyaw"
+            " since the one before; each is answered with a line of JSON.",
+        ),
+    ] = False,
     classes: Annotated[
         list[str] | None,
         typer.Option(
@@ -70,30 +80,46 @@ def relocalize(
     settings_file: SettingsOption = None,
     json_: JsonOption = False,
 ) -> None:
-    """Where a robot is, from a few object crops, or what it sees by name.
+    """Where a robot is, from a few object crops or classes.
 
     Ranked Places with evidence, a pose hypothesis and a confidence.
     """
     how, camera = method_from(method), camera_from(hfov, image)
-    question = _question(query, classes)
     if as_of is not None and log is None:
         raise MisuseError("--as-of asks a past map, which only the log knows; give --log LOG too")
-    if log is None:
-        past_settings(log, settings_file, set_)
-        with databases(db, vector_db) as targets:
+    with contextlib.ExitStack() as stack:
+        if track:
+            _refuse_to_track(classes, how)
+            lines = stack.enter_context(question_lines(query or "-"))
+        else:
+            question = _question(query, classes)
+        if log is None:
+            past_settings(log, settings_file, set_)
             # Here: `evaluate` and `whatif` import this module and ask no database.
-            from projections.queries.relocalize import relocalize as ask_databases
+            from projections.queries.relocalize import CandidateReader
 
-            answer = ask_databases(targets, question, top=top, method=how, camera=camera)
-    else:
-        with LogReader(log) as reader:
-            end = point(reader, as_of or "end")
-            corrections = read_corrections(reader, end)
-        settings = past_settings(log, settings_file, set_, corrections)
-        candidates = search_log(log, str(end), settings, question.crops, corrections=corrections)
-        answer = rank(question, candidates, top=top, method=how, camera=camera)
-        say_defaults(settings)
-    _print_answer(answer, json_)
+            targets = stack.enter_context(databases(db, vector_db))
+            search: Search = stack.enter_context(CandidateReader(targets)).candidates
+        else:
+            with LogReader(log) as reader:
+                end = point(reader, as_of or "end")
+                corrections = read_corrections(reader, end)
+            settings = past_settings(log, settings_file, set_, corrections)
+            search = ExactIndex.of_log(log, str(end), settings, corrections=corrections).search
+            say_defaults(settings)
+        if track:
+            print_tracked(lines, search, top=top, camera=camera)
+        else:
+            answer = rank(question, search(question.crops), top=top, method=how, camera=camera)
+            _print_answer(answer, json_)
+
+
+def _refuse_to_track(classes: list[str] | None, method: Method) -> None:
+    """Raise MisuseError for options that do not go with ``--track``."""
+    if classes:
+        raise MisuseError("--track reads questions from QUERY or stdin; ask without --class")
+    if method != "joint":
+        raise MisuseError("--track follows the poses of --method joint; ask without --method plain")
 
 
 def _question(query: str | None, classes: list[str] | None) -> Question:

@@ -1,7 +1,7 @@
 """Re-localisation: ranked Places and a pose from a few object crops, as a pure ranking.
 
 `rank` turns crops (`question`) and candidates into an `Answer`; candidates come from the databases
-(`projections.queries.relocalize`) or from a folded map (`ExactIndex`, `search_log`).
+(`projections.queries.relocalize`) or from a folded map (`ExactIndex`).
 """
 
 from .camera import Camera
@@ -12,7 +12,6 @@ from .candidates import (
     ExactIndex,
     Match,
     Stand,
-    search_log,
 )
 from .certainty import UNKNOWN_BELOW
 from .constants import MapConstants
@@ -26,7 +25,15 @@ from .ranking import (
     RankedPlace,
     rank,
 )
-from .reading import parse_json, parse_question, question_schema, read_crops, read_question
+from .reading import (
+    parse_json,
+    parse_question,
+    question_schema,
+    read_crops,
+    read_moved,
+    read_question,
+)
+from .track import Track, Tracked, movement_of
 
 __all__ = [
     "DEFAULT_CAMERA",
@@ -46,13 +53,16 @@ __all__ = [
     "Question",
     "RankedPlace",
     "Stand",
+    "Track",
+    "Tracked",
     "View",
     "describe_value",
+    "movement_of",
     "parse_json",
     "parse_question",
     "question_schema",
     "rank",
     "read_crops",
+    "read_moved",
     "read_question",
-    "search_log",
 ]

@@ -13,6 +13,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,26 +107,6 @@ class Candidates:
     constants: MapConstants = field(default_factory=MapConstants)
 
 
-def search_log(
-    log: Path,
-    point: str,
-    settings: Settings,
-    crops: Sequence[Crop],
-    *,
-    note: Note | None = None,
-    corrections: Corrections = NO_CORRECTIONS,
-) -> Candidates:
-    """Candidates from the map as of ``point`` of a log: offset, ISO time, run:keyframe or end.
-
-    ``note`` is called with what the user should know about ``point`` (`eventsrc.log.seek.resolve`).
-    """
-    with LogReader(log) as reader:
-        _, view = fold_log(
-            reader, settings, resolve(reader, point, note=note), corrections=corrections
-        )
-    return ExactIndex(view).search(crops)
-
-
 class ExactIndex:
     """The observations of a view that have an embedding, as one matrix, for many searches."""
 
@@ -149,6 +130,25 @@ class ExactIndex:
             (o.embedding_model for o in view.observations if o.embedding is not None), None
         )
         self.constants = MapConstants.of(view.settings, self._different())
+
+    @classmethod
+    def of_log(
+        cls,
+        log: Path,
+        point: str,
+        settings: Settings,
+        *,
+        note: Note | None = None,
+        corrections: Corrections = NO_CORRECTIONS,
+    ) -> Self:
+        """That of the map as of ``point`` of a log: offset, ISO time, run:keyframe or end.
+
+        ``note`` is called with what the user should know about ``point``
+        (`eventsrc.log.seek.resolve`).
+        """
+        with LogReader(log) as reader:
+            end = resolve(reader, point, note=note)
+            return cls(fold_log(reader, settings, end, corrections=corrections)[1])
 
     def _different(self) -> Cosines:
         """The cosines of different things in one picture, of a sample of the observations."""

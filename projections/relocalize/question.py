@@ -20,6 +20,9 @@ _MAX_DESCRIBED: Final = 80
 
 Vector = NDArray[np.float32]
 Box = tuple[float, float, float, float]
+Movement = tuple[float, float, float]
+"""Metres ahead and to the left and radians to the left, in the robot's frame before it."""
+STILL: Final[Movement] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,12 +3,12 @@
 A question is an envelope, a JSON list of detections, ``{"crops": [...]}``, or several pictures,
 ``{"views": [{"dx", "dy", "dyaw", "crops": [...]}, ...]}``, where a view's movement is that since
 the view before, in metres ahead and to the left and radians to the left; that of the first view is
-not read. A crop has an ``embedding``, base64 of little-endian float32 as in an envelope, or a JSON
-list of numbers; or else a ``class``, and then things of that class are meant. ``"text": true`` says
-that the embedding is one of a text. ``class``, ``bbox``, ``det_id`` and ``embedding_model`` are
-optional, and so is the question's ``camera``, as in an envelope. Crops with neither embedding nor
-class are left out, because nothing can be searched with them. The pose in an envelope is *not*
-read: it is what is being asked.
+read only where questions are tracked. A crop has an ``embedding``, base64 of little-endian float32
+as in an envelope, or a JSON list of numbers; or else a ``class``, and then things of that class are
+meant. ``"text": true`` says that the embedding is one of a text. ``class``, ``bbox``, ``det_id``
+and ``embedding_model`` are optional, and so is the question's ``camera``, as in an envelope. Crops
+with neither embedding nor class are left out, because nothing can be searched with them. The pose
+in an envelope is *not* read: it is what is being asked.
 """
 
 import binascii
@@ -26,7 +26,7 @@ from projections.errors import QuestionError
 from projections.exact import quantise, to_float32
 
 from .camera import Camera
-from .question import MAX_CROPS, MAX_VIEWS, Crop, Question, Vector, View
+from .question import MAX_CROPS, MAX_VIEWS, STILL, Crop, Movement, Question, Vector, View
 
 MAX_MARKS: Final = 20_000
 """More of ``[``, ``{`` and ``:`` than this are refused before the JSON is parsed. Empty lists and
@@ -132,7 +132,7 @@ def _read_views(items: Any) -> Question:
         name = f"views.{index}"
         if not isinstance(item, dict):
             raise QuestionError(f"{name}: should be a JSON object")
-        moved = _movement(item, name) if index else (0.0, 0.0, 0.0)
+        moved = _movement(item, name) if index else STILL
         view = View(*moved, _read_crops(item, f"{name}.crops"))
         crops += len(view.crops)
         if crops > MAX_CROPS:
@@ -143,12 +143,19 @@ def _read_views(items: Any) -> Question:
     return Question(tuple(views))
 
 
-def _movement(view: dict[str, Any], name: str) -> tuple[float, float, float]:
-    return read_movement({key: view[key] for key in ("dx", "dy", "dyaw") if key in view}, name)
+def read_moved(document: Any) -> Movement:
+    """How a robot whose questions are tracked has moved since the one before: ``dx``, ``dy`` and
+    ``dyaw`` of the question, or of its first view; not at all if there is none of them."""
+    if not isinstance(document, dict):
+        return STILL
+    views = document.get("views")
+    name, found = "", document
+    if isinstance(views, list) and views and isinstance(views[0], dict):
+        name, found = "views.0", views[0]
+    return _movement(found, name) if found.keys() & {"dx", "dy", "dyaw"} else STILL
 
 
-def read_movement(document: Any, name: str) -> tuple[float, float, float]:
-    """dx, dy and dyaw of an object. Raises QuestionError that begins with ``name``."""
+def _movement(document: dict[str, Any], name: str) -> Movement:
     try:
         moved = _Movement.model_validate(document)
     except ValidationError as error:

@@ -79,9 +79,10 @@ def create_app(answerer: Answerer, queue: FairQueue) -> FastAPI:
         request: Request,
         top: int | None = Query(None, ge=1, le=MAX_TOP),
         method: str | None = None,
+        session: str | None = Query(None, description="Track the questions of this name."),
     ) -> Response:
         payload = await _read_body(request, answerer.max_bytes)
-        given = {"top": top, "method": method}
+        given = {"top": top, "method": method, "session": session}
         options = {name: str(value) for name, value in given.items() if value is not None}
         return await answered(request, lambda: answerer.relocalize(payload, options))
 

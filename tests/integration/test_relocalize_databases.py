@@ -14,7 +14,7 @@ from projections.errors import ProjectionMismatch, ProjectionMissing, QuestionEr
 from projections.model.fold import fold_log
 from projections.model.view import MapView
 from projections.queries.relocalize import CandidateReader, relocalize
-from projections.relocalize import Crop, ExactIndex, rank, read_crops
+from projections.relocalize import Crop, ExactIndex, Track, rank, read_crops
 from projections.settings import Settings
 from tests.candidates import assert_equal, found
 from tests.commands import Commands
@@ -213,6 +213,33 @@ class TestCommand:
         refused = mapfold("relocalize", file, "--log", log, code=2)
         assert "views.1.dx: is missing" in refused.err
 
+    def test_a_stream_of_questions_is_tracked(
+        self, mapfold: Commands, log: Path, tmp_path: Path
+    ) -> None:
+        index, track = ExactIndex(view_of(log, SETTINGS)), Track("relocalize --track")
+        lines, expected = [], []
+        for number, document in enumerate(walk(14, seed=3)):
+            if not document["detections"]:
+                continue
+            moved = {"dx": 0.25 * number, "dy": 0.0, "dyaw": 0.5}
+            asked = {"crops": document["detections"], **moved}
+            answer = rank(crops := read_crops(asked), index.search(crops))
+            found = track.step((0.25 * number, 0.0, 0.5), answer.hypotheses, answer.confidence)
+            lines.append(json.dumps(asked))
+            expected.append(answer.document() | {"track": found.document()})
+        file = tmp_path / "questions.jsonl"
+        file.write_text("\n\n".join(lines) + "\n")
+        asked_log = ("relocalize", "--track", "--log", log)
+        assert len(expected) > 5
+        assert expected[-1]["track"]["questions"] == len(expected)
+        assert [json.loads(line) for line in mapfold(*asked_log, file).out.splitlines()] == expected
+        file.write_text("\n".join([lines[0], "nonsense", lines[1]]))
+        said = mapfold(*asked_log, file, code=2)
+        first, error, second = map(json.loads, said.out.splitlines())
+        assert [first, second] == expected[:2]
+        assert error["error"]["kind"] == "bad_question"
+        assert "1 of 3 questions could not be answered" in said.err
+
     def test_plain_and_text(self, mapfold: Commands, log: Path, question: Path) -> None:
         said = mapfold("relocalize", question, "--log", log, "--as-of", "end", "--method", "plain")
         assert "run-a_p" in said.out
@@ -222,6 +249,8 @@ class TestCommand:
         [
             (["--as-of", "end"], "--log"),
             (["--class", "cup"], "give either QUERY"),
+            (["--track", "--class", "cup"], "--track reads questions"),
+            (["--track", "--method", "plain"], "--track follows the poses"),
             (["--set", "eps_m=1.0"], "--log LOG"),
             (["--method", "magic"], "joint and plain"),
             (["--image", "big"], "--image"),

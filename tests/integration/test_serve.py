@@ -22,7 +22,7 @@ from projections.database.connection import Connection, Targets, connect
 from projections.database.embedded import EmbeddedServer
 from projections.errors import DatabaseUnavailable, ProjectionMissing
 from projections.queries.relocalize import relocalize
-from projections.relocalize import parse_question, question_schema
+from projections.relocalize import Track, parse_question, question_schema
 from projections.serve import Answerer, FairQueue, Pools, ZenohService
 from projections.serve.answering import TokenBucket, TooMuchError
 from projections.serve.guard import Guard
@@ -70,6 +70,13 @@ def http_at(answerer: Answerer, queue: FairQueue, port: int = 0) -> Iterator[int
 def question(number: int = 0) -> bytes:
     documents = [d for d in walk(30, seed=9, run_id="run-b") if d["detections"]]
     return json.dumps(documents[number % len(documents)]).encode()
+
+
+def tracked_question(number: int, moved: tuple[float, float, float], name: str) -> bytes:
+    crops = json.loads(question(number))["detections"]
+    dx, dy, dyaw = moved
+    asked = {"dx": dx, "dy": dy, "dyaw": dyaw, "crops": crops, "session": name}
+    return json.dumps(asked).encode()
 
 
 def _forms() -> dict[str, bytes]:
@@ -123,6 +130,21 @@ class TestZenoh:
         assert answer["places"]
 
     @pytest.mark.usefixtures("service")
+    def test_a_session_is_tracked(self, connected: Callable[[], Session], targets: Targets) -> None:
+        track, session = Track("robot-7"), connected()
+        for number in range(4):
+            moved = (0.25 * number, 0.0, 0.125)
+            asked = tracked_question(number, moved, "robot-7")
+            answer = relocalize(targets, parse_question(asked))
+            tracked = track.step(moved, answer.hypotheses, answer.confidence)
+            expected = answer.document() | {"track": tracked.document()}
+            assert ask(session, "mapfold/relocalize", asked) == (True, expected)
+        assert expected["track"]["questions"] == 4
+        good, other = ask(session, "mapfold/relocalize?session=robot-8", question())
+        assert good
+        assert other["track"]["questions"] == 1
+
+    @pytest.mark.usefixtures("service")
     def test_an_unknown_class_is_named_with_the_nearest(
         self, connected: Callable[[], Session]
     ) -> None:
@@ -137,6 +159,13 @@ class TestZenoh:
             ("mapfold/relocalize", b"nonsense", "bad_question"),
             ("mapfold/relocalize", None, "bad_question"),
             ("mapfold/relocalize?top=0", question(), "bad_question"),
+            ("mapfold/relocalize?session=a;method=plain", question(), "bad_question"),
+            ("mapfold/relocalize", b'{"session": 7, "crops": [{"class": "a"}]}', "bad_question"),
+            (
+                "mapfold/relocalize?session=a",
+                b'{"dx": 1, "dy": NaN, "dyaw": 0, "crops": [{"class": "a"}]}',
+                "bad_question",
+            ),
             ("mapfold/relocalize", b"[" * 2_000_000, "bad_question"),
             (
                 "mapfold/relocalize",
@@ -275,6 +304,14 @@ class TestHttp:
     ) -> None:
         expected = relocalize(targets, parse_question(FORMS[form])).document()
         assert fetch(f"{http}/relocalize", FORMS[form]) == (200, expected)
+
+    def test_a_session_is_tracked(self, http: str) -> None:
+        for number in range(3):
+            asked = tracked_question(number, (0.5, 0.0, 0.0), "robot-7")
+            status, answer = fetch(f"{http}/relocalize", asked)
+            assert (status, answer["track"]["questions"]) == (200, number + 1)
+        _, answer = fetch(f"{http}/relocalize?session=robot-7", question())
+        assert answer["track"]["questions"] == 4
 
     def test_it_describes_itself(self, http: str) -> None:
         _, document = fetch(f"{http}/openapi.json")
