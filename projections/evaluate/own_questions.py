@@ -5,8 +5,9 @@ what was observed in its run within `VISIT` keyframes of it. A robot that comes 
 things less alike than within one run, so the cosines to the rest of its own run are lowered by the
 map's session shift. Asked so, a thing that was seen at another time too is *known*.
 
-Asked again with the things shown taken out, as the fold knows them, the same question is
-one that the map cannot know.
+Asked again with the things shown taken out, as the fold knows them, the same question is one that
+the map cannot know. What stands beside them and is of the same class is taken out too: the fold may
+have split it off.
 """
 
 import math
@@ -17,7 +18,7 @@ from dataclasses import dataclass, replace
 from eventsrc.envelope import RunId
 from projections.deltas import ObservationOrdinal
 from projections.exact import to_float32
-from projections.model.records import KeyframeRecord, ObservationRecord
+from projections.model.records import KeyframeRecord, ObjectRecord, ObservationRecord
 from projections.model.view import MapView
 from projections.relocalize import Answer, Crop, ExactIndex, Match, rank
 
@@ -27,6 +28,10 @@ from .trials import RIGHT_WITHIN_M
 
 VISIT = 20
 """Keyframes of a run before and after one that are of the same visit."""
+STAND_APART_M, SEEN_APART_M = 2.0, 3.0
+"""Objects of one class are taken out together if they stand nearer to each other, or within twice
+that where one was seen from a single spot; on maps of the page's rule, if the positions they were
+seen from are."""
 MOST = 100
 """Keyframes asked from at most, spread evenly over the map."""
 
@@ -61,7 +66,7 @@ def ask_own_questions(
     index = ExactIndex(view)
     constants = index.constants
     lowered = constants.evidence.session_shift * (1.0 - constants.different)
-    runs = _by_run(view)
+    runs, by_class = _by_run(view), _by_class(view)
     askable = [
         (keyframe, seen)
         for keyframe in view.keyframes
@@ -70,7 +75,7 @@ def ask_own_questions(
     for keyframe, seen in spread(askable, most):
         asked = [_crop(view.observations[ordinal]) for ordinal in seen]
         visit = _visit(runs, keyframe)
-        shown = _observations_of_things(view, seen)
+        shown = _observations_of_things(view, by_class, seen)
         for taken_out, without in ((False, visit), (True, visit | shown)):
             found = index.search(asked, without=without)
             rows = tuple(_another_day(row, keyframe.run_id, lowered) for row in found.matches)
@@ -96,6 +101,13 @@ def _by_run(view: MapView) -> dict[RunId, list[KeyframeRecord]]:
     return runs
 
 
+def _by_class(view: MapView) -> dict[str, list[ObjectRecord]]:
+    classes: dict[str, list[ObjectRecord]] = {}
+    for thing in view.objects.values():
+        classes.setdefault(thing.class_name, []).append(thing)
+    return classes
+
+
 def _visit(
     runs: dict[RunId, list[KeyframeRecord]], keyframe: KeyframeRecord
 ) -> set[ObservationOrdinal]:
@@ -115,12 +127,28 @@ def _drawn(
 
 
 def _observations_of_things(
-    view: MapView, seen: Sequence[ObservationOrdinal]
+    view: MapView, by_class: dict[str, list[ObjectRecord]], seen: Sequence[ObservationOrdinal]
 ) -> set[ObservationOrdinal]:
-    """These and the others of their Objects."""
-    things = {view.observations[ordinal].object for ordinal in seen}
-    others = {o for thing in things if thing is not None for o in view.objects[thing].observations}
-    return {*seen, *others}
+    """These, the others of their Objects, and those of Objects that may be the same thing."""
+    found = set(seen)
+    for ordinal in seen:
+        number = view.observations[ordinal].object
+        if number is not None:
+            thing = view.objects[number]
+            for other in by_class[thing.class_name]:
+                if other is thing or _may_be_one(thing, other):
+                    found.update(other.observations)
+    return found
+
+
+def _may_be_one(one: ObjectRecord, other: ObjectRecord) -> bool:
+    """Whether two Objects of one class are so near each other that they may be one thing."""
+    if one.estimate is not None and other.estimate is not None:
+        dx = one.estimate.est_x - other.estimate.est_x
+        dy = one.estimate.est_y - other.estimate.est_y
+        unsure = min(one.estimate.spots, other.estimate.spots) < 2
+        return math.hypot(dx, dy) < STAND_APART_M * (1 + unsure)
+    return math.hypot(one.mean_x - other.mean_x, one.mean_y - other.mean_y) < SEEN_APART_M
 
 
 def _crop(observation: ObservationRecord) -> Crop:

@@ -110,7 +110,10 @@ def test_write_with_set_switches_the_rule_in_one_command(mapfold: Commands) -> N
     )
     assert mapfold("edits", "log", "--json").json[0]["reason"] == "try it"
     listed = mapfold("edits", "log").out
-    assert re.search(r"use-settings fusion=evidence, \d+ constants of evidence  ", listed)
+    assert re.search(
+        r"use-settings fusion=evidence, \d+ constants of evidence, 6 constants of localizer  ",
+        listed,
+    )
 
 
 def test_what_is_in_the_log_already_is_not_recorded_again(tmp_path: Path) -> None:
@@ -187,11 +190,11 @@ def test_a_correction_counts(mapfold: Commands) -> None:
     assert (found["keyframes"], found["runs"]) == (80, 1)
 
 
-def test_progress_counts_the_events_of_both_rounds(mapfold: Commands) -> None:
+def test_progress_counts_the_events_of_all_folds(mapfold: Commands) -> None:
     told: list[tuple[int, int]] = []
     with LogReader(mapfold.folder / "log") as reader:
         calibrate(reader, Settings(), progress=lambda done, total: told.append((done, total)))
-    assert {total for _, total in told} == {320}
+    assert {total for _, total in told} == {480}
     assert [done for done, _ in told] == sorted(done for done, _ in told)
     assert told[-1] == (320, 320)
 

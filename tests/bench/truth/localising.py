@@ -103,7 +103,7 @@ def make_map(case: Case, rule: str) -> MapView:
     settings = Settings(camera=case.camera, **PLACES)
     if rule == "evidence":
         settings = settings.model_copy(update={"fusion": "evidence"})
-        settings, _ = calibrated_settings(events, settings)
+        settings, _ = calibrated_settings(events, settings, ask=True)
     view = MapView(settings)
     for _ in fold_into(view, events):
         pass
