@@ -1,6 +1,7 @@
 """The rules of `projections.reducers.rooms`, word by word, from scratch at every keyframe."""
 
 import math
+from collections.abc import Hashable
 from fractions import Fraction
 from itertools import combinations
 
@@ -25,7 +26,7 @@ class NaiveRooms:
         self.anchors: list[tuple[int, int]] = []
         self.links: set[tuple[int, int]] = set()
         self.points: list[int] = []  # the cell of each
-        self.last: dict[int, int] = {}
+        self.last: dict[Hashable, int] = {}
         self.place_of: list[int] = []  # of each cell
         self.founders: list[int] = []
         self.refused: set[tuple[int, int]] = set()
@@ -35,7 +36,7 @@ class NaiveRooms:
     def labels(self) -> list[int]:
         return [self.place_of[cell] for cell in self.points]
 
-    def add(self, run: int, x: int, y: int) -> None:
+    def add(self, run: Hashable, x: int, y: int) -> None:
         point, self.merges = len(self.points), []
         cell = self._nearest(x, y)
         if cell is not None and self._conflict([point], self._anchors_in(self.place_of[cell])):

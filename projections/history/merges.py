@@ -140,19 +140,17 @@ def _chain_of(
 
 
 def merge_reason(history: History, merge: Merge) -> str:
-    """The bridging keyframe, the core points it made, and the chain to each absorbed place."""
+    """The bridging keyframe, the core points it made, and the chain to each absorbed place; of
+    places by rooms how long the drive between them is."""
     if merge.cause.kind != "keyframe":
         return merge.cause.name
     commanded = "; ".join(_join_text(history, link) for link in join_links(merge))
     chains = chains_of(history, merge)
     bridge = keyframe_name(history, merge.bridge)
+    if merge.drives:
+        return f"{bridge} brought them near: {_drive_text(history, merge)}"
     if not chains:
-        if commanded:
-            return commanded
-        if merge.drives:
-            return f"{bridge} brought them near: {_drive_text(history, merge)}"
-        links = "; ".join(_link_text(history, link) for link in merge.links)
-        return f"{bridge} bridged them: {links}"
+        return commanded
     made = dict.fromkeys(point for chain in chains for point in chain.made_core)
     names = ["itself" if k == merge.bridge else keyframe_name(history, k) for k in made]
     what = "a core point" if len(made) == 1 else "core points"
@@ -163,12 +161,14 @@ def merge_reason(history: History, merge: Merge) -> str:
 
 def _drive_text(history: History, merge: Merge) -> str:
     """``5 cells of a_p0 and 7 of a_p3 are a drive of 3.812 m apart on the mean, at most 4 m joins
-    them; nearest are those of run:2 and run:8, 0.900 m; both saw couch-7 and tv-2``."""
+    them; nearest are those of run:2 and run:8, 0.900 m; both saw couch obj-7 and tv obj-2``."""
     (drive,), (link,) = merge.drives, merge.links
     survivor, absorbed = (place_name(history, place) for place in merge.places)
     core, neighbour = keyframe_name(history, link.core), keyframe_name(history, link.neighbour)
     cells = counted(drive.cells, "cell")
-    seen = [history.objects[each].object_id for each in seen_from_both(history, merge)]
+    at = merge.cause.offset
+    both = [history.objects[each] for each in seen_from_both(history, merge)]
+    seen = [f"{each.class_name(at)} {each.object_id}" for each in both]
     if len(seen) > _MOST_SEEN:
         seen = [*seen[: _MOST_SEEN - 1], f"{len(seen) - _MOST_SEEN + 1} more"]
     return (

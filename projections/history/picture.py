@@ -6,6 +6,7 @@ Each map is a panel of one figure, drawn with `projections.drawing`.
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import fill
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -36,6 +37,8 @@ _ROOMS_LEGEND = (
     "★ bridging keyframe    red: the two cells with the shortest drive between them    "
     "■ start of the run"
 )
+_HEADER_WIDTH = 170
+"""Characters in a line of the header."""
 _AROUND_EPS = 4.0
 """The least margin around the core points of a merge, in ε."""
 
@@ -59,7 +62,7 @@ def draw_merge(known: KnownHistory, merge: Merge, out: Path) -> None:
     history = known.history
     header = f"merge {merge.number}, {merge.cause.when}: {merge_reason(history, merge)}"
     legend = _ROOMS_LEGEND if known.settings.places == "rooms" else _LEGEND
-    figure.suptitle(f"{header}\n{legend}", fontsize=9.5)
+    figure.suptitle(f"{fill(header, _HEADER_WIDTH)}\n{legend}", fontsize=9.5)
     _save(figure, out)
 
 

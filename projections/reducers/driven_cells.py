@@ -8,9 +8,10 @@ The driven distance of two cells is the length of the shortest way over links; f
 it is not known and counts as ``reach_um``. It only ever gets shorter.
 
 There are at most some 2.3 anchors a ``cell_um``², so a cell has a bounded number of others within
-reach, however often the robot comes. A keyframe that makes no new link costs a look at nine squares
-of the grid of anchors. A new link is taken into the distances of all pairs that it brings nearer:
-exactly those (a, b) with a nearer to one end through the link than around it, and b to the other.
+reach, however often the robot comes. A keyframe that makes no new link costs a look at the anchors
+in nine squares of a grid. A new link is taken into the distances of all pairs that it brings
+nearer: exactly those (a, b) with a nearer to one end through the link than around it, and b to the
+other.
 
 Distances are integer micrometres, those of two anchors rounded down.
 """
@@ -46,40 +47,34 @@ class DrivenCells:
         self.reach_um = reach_um
         self.passable = passable
         self.anchors: list[tuple[int, int]] = []
+        # By square of the grid of side ``cell_um``: the cells with their anchors in it, and the
+        # cells that a position in it may belong to, with their anchors.
         self._squares: dict[tuple[int, int], list[int]] = {}
+        self._around: dict[tuple[int, int], list[tuple[int, int, int]]] = {}
         # Per cell: the cells within reach, without itself, with their driven distances.
         self.near: list[dict[int, int]] = []
         self._linked: list[set[int]] = []
 
     def find(self, x_um: int, y_um: int) -> int | None:
         """The cell of a position; None if no anchor is near enough."""
-        column, row = x_um // self._cell_um, y_um // self._cell_um
-        best, least = None, self._cell2
-        squares, anchors = self._squares, self.anchors
-        for key in (
-            (column, row),
-            (column - 1, row),
-            (column + 1, row),
-            (column, row - 1),
-            (column, row + 1),
-            (column - 1, row - 1),
-            (column - 1, row + 1),
-            (column + 1, row - 1),
-            (column + 1, row + 1),
-        ):
-            for cell in squares.get(key, ()):
-                x, y = anchors[cell]
-                squared = (x - x_um) ** 2 + (y - y_um) ** 2
-                if squared < least or (squared == least and (best is None or cell < best)):
-                    best, least = cell, squared
+        best, least = None, self._cell2 + 1
+        key = x_um // self._cell_um, y_um // self._cell_um
+        for cell, x, y in self._around.get(key, ()):  # ascending
+            squared = (x - x_um) ** 2 + (y - y_um) ** 2
+            if squared < least:
+                best, least = cell, squared
         return best
 
     def add(self, x_um: int, y_um: int) -> int:
         """A new cell with its anchor here, linked to none."""
         cell = len(self.anchors)
         self.anchors.append((x_um, y_um))
-        square = x_um // self._cell_um, y_um // self._cell_um
-        self._squares.setdefault(square, []).append(cell)
+        column, row = x_um // self._cell_um, y_um // self._cell_um
+        self._squares.setdefault((column, row), []).append(cell)
+        for dx in (-1, 0, 1):
+            for dy in (-1, 0, 1):
+                key = column + dx, row + dy
+                self._around.setdefault(key, []).append((cell, x_um, y_um))
         self.near.append({})
         self._linked.append(set())
         return cell

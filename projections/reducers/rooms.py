@@ -102,16 +102,22 @@ class Rooms(PlaceMembers):
         """Add a keyframe with a pose; what it changed, in the order of the delta contract."""
         point = self.add_point(keyframe, run, run_id)
         cell, last = self._cells.find(x_um, y_um), self._last_cells.get(run)
-        if cell is not None and (keyframe not in self._anchors or self._may_enter(keyframe, cell)):
+        is_anchor = keyframe in self._anchors
+        if cell is not None and (not is_anchor or self._may_enter(keyframe, cell)):
             deltas = list[Delta]()
             if last is not None and not self._cells.is_linked(last, cell):
                 deltas = self._merge_all(offset, keyframe, self._link(last, cell))
+            elif not is_anchor:  # nearly always
+                self._last_cells[run] = cell
+                place = self._place_of_cell(cell)
+                self.join_place(point, place, x_um, y_um)
+                return [KeyframePlaced(offset, keyframe, place), self.place_changed(offset, place)]
         else:
             cell = self._cells.add(x_um, y_um)
             deltas = self._settle(offset, point, cell, last)
         self._last_cells[run] = cell
         place = self._place_of_cell(cell)
-        if keyframe in self._anchors:
+        if is_anchor:
             place = self._enter(offset, keyframe, place, (x_um, y_um), deltas)
         self.join_place(point, place, x_um, y_um)
         changed = {place, *(d.survivor for d in deltas if type(d) is PlacesMerged)}

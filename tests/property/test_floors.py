@@ -69,7 +69,8 @@ class NaiveFloors(NaiveMap):
             near_matrix(
                 len(points),
                 lambda i, j: (
-                    posed[i]["floor"] == posed[j]["floor"] and self.rule(points[i], points[j])
+                    posed[i]["floor"] == posed[j]["floor"]
+                    and self.is_within_eps(points[i], points[j])
                 ),
             )
         )

@@ -65,6 +65,19 @@ def test_after_every_event_the_digest_is_that_of_the_naive_map(
     check_every_prefix(Folded.start(Settings(**settings)), NaiveMap(settings), documents)
 
 
+@given(
+    world=worlds(),
+    cell_m=st.sampled_from([0.2, 0.25, 0.6]),
+    drive_m=st.sampled_from([0.5, 1.0, 2.0]),
+)
+def test_the_digest_is_that_of_the_naive_map_of_places_by_rooms(
+    world: tuple[dict[str, Any], list[dict[str, Any]]], cell_m: float, drive_m: float
+) -> None:
+    settings, documents = world
+    settings |= {"places": "rooms", "rooms": {"cell_m": cell_m, "drive_m": drive_m}}
+    check_every_prefix(Folded.start(Settings(**settings)), NaiveMap(settings), documents)
+
+
 @given(world=worlds())
 def test_the_digest_is_that_of_the_naive_map_when_every_event_is_folded_by_a_restored_map(
     world: tuple[dict[str, Any], list[dict[str, Any]]],
