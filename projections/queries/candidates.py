@@ -24,9 +24,9 @@ from projections.deltas import ObservationOrdinal, PlaceOrdinal
 from projections.errors import ProjectionMismatch, ProjectionMissing, QuestionError
 from projections.relocalize import NEIGHBOURS, CandidatePlace, Candidates, Crop, Match, Stand
 from projections.relocalize.candidates import (
-    OBJECTS_OF_A_CLASS,
     OBSERVATIONS_OF_EACH,
     check_space,
+    objects_of_a_class,
     refuse_unknown_classes,
 )
 
@@ -108,7 +108,7 @@ class CandidateSearch:
         names = sorted({crops[number].class_name or "" for number in named})
         values: dict[str, Any] = {
             "patterns": [f'{{"class_name": {text(name)}}}' for name in names],
-            "objects": OBJECTS_OF_A_CLASS,
+            "objects": objects_of_a_class(crops),
             "of_each": OBSERVATIONS_OF_EACH,
         }
         with _query_errors(self._graph):

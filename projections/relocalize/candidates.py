@@ -32,7 +32,7 @@ from projections.model.view import MapView
 from projections.settings import Settings
 
 from .constants import FOLLOWERS, Cosines, MapConstants, Sample
-from .question import Box, Crop, describe_value
+from .question import Box, Crop, Vector, describe_value
 
 NEIGHBOURS = 64
 """Observations fetched per crop. From 48 on, the measures in docs/relocalization.md stay the same;
@@ -40,6 +40,8 @@ fewer leave too few directions to triangulate an object from."""
 
 OBJECTS_OF_A_CLASS = 96
 """For a crop of which only the class is known: so many Objects, those seen most often …"""
+MOST_OBJECTS = 512
+"""… with several classes at most so many in all …"""
 OBSERVATIONS_OF_EACH = 4
 """… and of each so many observations, spread evenly over all."""
 
@@ -182,19 +184,22 @@ class ExactIndex:
             for crop in crops:
                 check_space(crop, self._matrix.shape[1], self.model)
         dropped = np.isin(self._ordinals, list(without)) if without else None
-        matches = tuple(self._nearest(crop, neighbours, dropped) for crop in crops)
-        names = {found.class_name for found in self._view.objects.values()}
-        refuse_unknown_classes(crops, matches, lambda: names)
+        objects = objects_of_a_class(crops)
+        matches = tuple(
+            self._of_class(crop.class_name, objects)
+            if crop.vector is None
+            else self._nearest(crop.vector, neighbours, dropped)
+            for crop in crops
+        )
+        refuse_unknown_classes(crops, matches, self._class_names)
         return Candidates(matches, self.places, self.constants)
 
     def _nearest(
-        self, crop: Crop, neighbours: int, dropped: NDArray[np.bool_] | None
+        self, vector: Vector, neighbours: int, dropped: NDArray[np.bool_] | None
     ) -> tuple[Match, ...]:
-        if crop.vector is None:
-            return self._of_class(crop.class_name)
         if not len(self._ordinals):
             return ()
-        products = self._matrix @ quantise(crop.vector).astype(np.float64)
+        products = self._matrix @ quantise(vector).astype(np.float64)
         if dropped is not None:
             products[dropped] = -np.inf
             neighbours = min(neighbours, len(dropped) - int(dropped.sum()))
@@ -204,9 +209,9 @@ class ExactIndex:
             for i in order
         )
 
-    def _of_class(self, class_name: str | None) -> tuple[Match, ...]:
+    def _of_class(self, class_name: str | None, objects: int) -> tuple[Match, ...]:
         things = [o for o in self._view.objects.values() if o.class_name == class_name]
-        most = sorted(things, key=lambda o: (-o.obs_count, o.ordinal))[:OBJECTS_OF_A_CLASS]
+        most = sorted(things, key=lambda o: (-o.obs_count, o.ordinal))[:objects]
         picked = [
             seen[position]
             for seen in (sorted(thing.observations) for thing in most)
@@ -215,6 +220,9 @@ class ExactIndex:
             > position * OBSERVATIONS_OF_EACH // len(seen)
         ]
         return tuple(self._match(ordinal, 1.0) for ordinal in sorted(picked))
+
+    def _class_names(self) -> set[str]:
+        return {found.class_name for found in self._view.objects.values()}
 
     def _match(self, ordinal: ObservationOrdinal, similarity: float) -> Match:
         observation = self._view.observations[ordinal]
@@ -245,6 +253,12 @@ def _stand(estimate: Estimate | None) -> Stand | None:
         *estimate.covariance_m2,
         estimate.spots,
     )
+
+
+def objects_of_a_class(crops: Sequence[Crop]) -> int:
+    """How many Objects are taken for each crop of which only the class is known."""
+    classes = {crop.class_name for crop in crops if crop.vector is None}
+    return min(OBJECTS_OF_A_CLASS, MOST_OBJECTS // max(len(classes), 1))
 
 
 def refuse_unknown_classes(

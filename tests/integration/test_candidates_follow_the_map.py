@@ -117,13 +117,18 @@ class TestClasses:
     def log(self, tmp_path: Path, documents: list[dict[str, Any]]) -> Path:
         return write_log(tmp_path / "log", documents)
 
+    @pytest.mark.parametrize(("bound", "value"), [("OBJECTS_OF_A_CLASS", 2), ("MOST_OBJECTS", 5)])
     def test_they_are_bounded_and_those_seen_most(
-        self, log: Path, targets: Targets, monkeypatch: pytest.MonkeyPatch
+        self,
+        log: Path,
+        targets: Targets,
+        monkeypatch: pytest.MonkeyPatch,
+        bound: str,
+        value: int,
     ) -> None:
-        for module in (candidates_module, "projections.queries.candidates"):
-            name = module if isinstance(module, str) else module.__name__
-            monkeypatch.setattr(f"{name}.OBJECTS_OF_A_CLASS", 2)
-            monkeypatch.setattr(f"{name}.OBSERVATIONS_OF_EACH", 3)
+        monkeypatch.setattr(candidates_module, bound, value)
+        for module in (candidates_module.__name__, "projections.queries.candidates"):
+            monkeypatch.setattr(f"{module}.OBSERVATIONS_OF_EACH", 3)
         rebuild(log, targets, Settings())
         view = view_under_commands(log)
         with CandidateReader(targets) as reader:
