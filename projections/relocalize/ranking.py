@@ -23,9 +23,10 @@ from .camera import Camera
 from .candidates import Candidates, Match
 from .certainty import UNKNOWN_BELOW, known_probability
 from .floors import Hypotheses, Layout
+from .likelihood import Scene
 from .model import MODEL, Model
 from .pose import Posterior, locate
-from .question import Crop, Question
+from .question import Crop, Question, View
 
 Method = Literal["joint", "plain"]
 DEFAULT_CAMERA: Final = Camera()
@@ -131,20 +132,29 @@ def rank(
 ) -> Answer:
     """The answer to a question, or to the crops of one picture; ``candidates.matches`` run parallel
     to the crops. The camera is that of the question, else ``camera``, else that of the map."""
-    if not isinstance(question, Question):
-        question = Question.of(question)
-    crops: Sequence[Crop] = question.crops
-    camera = question.camera or camera or candidates.constants.camera
-    order = sorted(range(len(crops)), key=lambda index: crops[index].sort_key)
-    crops = [crops[index] for index in order]
-    candidates = replace(candidates, matches=tuple(candidates.matches[i] for i in order))
+    asked = question if isinstance(question, Question) else Question.of(question)
+    views, candidates = _in_order(asked, candidates)
+    crops = [crop for view in views for crop in view.crops]
     known = known_probability(crops, candidates.matches, candidates.constants)
     if method == "plain":
         return replace(_rank_plain(candidates, top), known=known)
     floors = Layout.of(candidates.places)
     candidates = floors.laid_out(candidates)
-    posterior = locate(crops, candidates.matches, camera, model)
+    camera = asked.camera or camera or candidates.constants.camera
+    posterior = locate(views, candidates.matches, Scene(candidates.constants, camera, model))
     return replace(_answer(candidates, posterior, top, floors), known=known)
+
+
+def _in_order(question: Question, candidates: Candidates) -> tuple[list[View], Candidates]:
+    """Views whose crops are in one order, whatever order they came in, and their candidates."""
+    views, rows, start = [], [], 0
+    for view in question.views:
+        crops = view.crops
+        order = sorted(range(len(crops)), key=lambda index: crops[index].sort_key)
+        views.append(replace(view, crops=tuple(crops[index] for index in order)))
+        rows += [candidates.matches[start + index] for index in order]
+        start += len(crops)
+    return views, replace(candidates, matches=tuple(rows))
 
 
 def _answer(

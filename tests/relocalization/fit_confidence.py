@@ -1,4 +1,4 @@
-"""Fit the weights of `projections.relocalize.pose` on generated buildings; print them.
+"""Fit the weights of `projections.relocalize.features` on generated buildings; print them.
 
 Buildings 0 … 9 are fitted on; 10 … 13 are held out and reported beside them. Each is asked with one
 to three crops, mapped whole and by its first third only, by its own second session and by another
@@ -11,14 +11,17 @@ import argparse
 import math
 import sys
 from collections.abc import Sequence
+from dataclasses import astuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from projections.evaluate.scores import auroc, expected_calibration_error
-from projections.relocalize import Camera, ExactIndex
+from projections.relocalize import Camera, ExactIndex, Question
+from projections.relocalize.features import WEIGHTS
+from projections.relocalize.likelihood import Scene
 from projections.relocalize.model import MODEL
-from projections.relocalize.pose import WEIGHTS, locate
+from projections.relocalize.pose import locate
 from tests.relocalization.buildings import Building, Keyframe
 from tests.relocalization.drives import drive
 from tests.relocalization.rooms import crops_of, fold
@@ -63,12 +66,13 @@ def _row(index: ExactIndex, instances: set[str], keyframe: Keyframe, drawn: list
     seen = crops_of(keyframe)
     crops = sorted((seen[i] for i in drawn), key=lambda crop: crop.sort_key)
     known = any(keyframe.instances[i] in instances for i in drawn)
-    posterior = locate(crops, index.search(crops).matches, Camera(), MODEL)
+    scene = Scene(index.constants, Camera(), MODEL)
+    posterior = locate(Question.of(crops).views, index.search(crops).matches, scene)
     if posterior is None:
         return (0.0,) * (len(WEIGHTS) - 1), False, known, len(crops)
     envelope = keyframe.accepted.envelope
     error = math.hypot(posterior.x - (envelope.map_x or 0), posterior.y - (envelope.map_y or 0))
-    return posterior.features, known and error <= WITHIN_M, known, len(crops)
+    return astuple(posterior.features), known and error <= WITHIN_M, known, len(crops)
 
 
 def fit(x: NDArray[np.float64], y: NDArray[np.bool_]) -> NDArray[np.float64]:
