@@ -184,15 +184,13 @@ def poses_at_views(poses: Floats, movements: Sequence[tuple[float, float, float]
 
 def _distinct(points: Floats, grid_m: float) -> Floats:
     """The points, those in one square of a grid once."""
-    cells = np.rint(points / grid_m).astype(np.int64)
-    return _unique_cells(cells) * grid_m
+    return _unique(np.rint(points / grid_m)) * grid_m
 
 
-def _unique_cells(cells: NDArray[np.int64]) -> Floats:
-    low = cells.min(0)
-    wide = int(cells[:, 1].max() - low[1]) + 1
-    keys = np.unique((cells[:, 0] - low[0]) * wide + (cells[:, 1] - low[1]))
-    return np.column_stack((keys // wide + low[0], keys % wide + low[1])).astype(np.float64)
+def _unique(cells: Floats) -> Floats:
+    """Each pair of whole numbers once, in order."""
+    pairs = np.unique(np.ascontiguousarray(cells).view(np.complex128))
+    return np.column_stack((pairs.real, pairs.imag))
 
 
 def _cells_near(points: Floats, cell_m: float, reach_m: float) -> Floats:
@@ -205,10 +203,10 @@ def _cells_near(points: Floats, cell_m: float, reach_m: float) -> Floats:
             for y in range(-most, most + 1)
             if math.hypot(x, y) * cell_m <= reach_m + cell_m / 2
         ],
-        dtype=np.int64,
+        dtype=np.float64,
     )
-    cells = np.rint(points / cell_m).astype(np.int64)
-    return _unique_cells((cells[:, None] + steps[None]).reshape(-1, 2)) * cell_m
+    cells = np.rint(points / cell_m)
+    return _unique((cells[:, None] + steps[None]).reshape(-1, 2)) * cell_m
 
 
 def _log_prior(xy: Floats, been: Floats, scene: Scene) -> Floats:
