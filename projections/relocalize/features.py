@@ -20,7 +20,7 @@ from .model import Model
 
 _ELSEWHERE_M: Final = 2.5
 _MOST_MARGIN: Final = 0.5
-WEIGHTS: Final = (-2.801, 14.182, 0.836, -3.983, -3.642, -0.331, 0.331)
+WEIGHTS: Final = (-3.454, 11.484, 1.241, -2.767, -3.119, -0.271, 0.436)
 """Intercept, then one for each of `Features`."""
 
 
