@@ -11,10 +11,9 @@
     region's own width, or if the region is narrower than `MIN_WIDTH_M` and so no room. Else the
     passage is a *narrow place*, and the two stay apart.
 
-So a door of 0.9 m parts a room of 3 m from a corridor of 2 m, and a corridor of 1.2 m goes through
-doors of 1 m. It depends on the building and not on a fixed width of doors: passages between open
-rooms may be two metres wide. Everything is counted in integers, and ties go by index: the regions
-are the same on every machine.
+So what counts is not a fixed width of doors: a door of 0.9 m parts a room from a corridor of 1.2 m,
+a passage of two metres parts two halls, and a corridor is one region from end to end. Everything is
+counted in integers, and ties go by index: the regions are the same on every machine.
 """
 
 import math
@@ -28,10 +27,10 @@ Walls = NDArray[np.bool_]
 """Shape (rows, columns), true where a cell is wall."""
 Labels = NDArray[np.int32]
 
-PASSAGE: Final = (3, 4)
+PASSAGE: Final = (7, 8)
 """A passage of this share of a region's width is no narrow place; docs/places.md says what it was
 chosen on."""
-CAP_M: Final = 3.0
+CAP_M: Final = 2.0
 MIN_WIDTH_M: Final = 0.4
 NOWHERE: Final = -1
 """The region of wall cells."""

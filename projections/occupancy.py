@@ -20,7 +20,7 @@ import numpy as np
 from eventsrc.occupancy_map import MIN_WALL, OCCUPIED, OccupancyMap
 
 from .clearance import NOWHERE, Labels, Walls, regions
-from .exact import metres_to_um
+from .exact import UM_PER_M, distance_um, metres_to_um
 from .exact_functions import cos_sin
 
 LEAST_WALL_M: Final = 0.5
@@ -30,6 +30,10 @@ MAX_BLOCKS: Final = 400_000
 """Regions are worked out on blocks of cells, a side of which is at least ``LEAST_BLOCK_M``, and as
 many cells as it takes for a map to have at most so many blocks: that bounds the time, which is two
 microseconds a block."""
+SMALL_M2: Final = 110
+SMALL_SHARE: Final = 4
+"""A region of up to so many square metres is one room, or nearly: a way in it counts as a quarter.
+Both were chosen on buildings with walls; docs/places.md has the figures."""
 _SPREAD: Final = 5
 """Blocks: so far into a wall its cells are of the region beside it."""
 _TURN_BITS: Final = 30
@@ -54,7 +58,9 @@ class OccupancyGrid:
         kept = _without_small(blocks, max(1, math.ceil(LEAST_WALL_M / block_m)))
         self.walls = occupied & _cells(kept, self.block, occupied.shape)
         self._rows = [row.tobytes() for row in self.walls.astype(np.uint8)]
-        self.regions: Labels = _spread(regions(kept, block_m), _SPREAD)
+        inside = regions(kept, block_m)
+        self._small = _small_regions(inside, self.block * self.side_um)
+        self.regions: Labels = _spread(inside, _SPREAD)
 
     def cell(self, point: Point) -> tuple[int, int]:
         """Column and row of a point; they may lie outside the grid."""
@@ -76,6 +82,14 @@ class OccupancyGrid:
     def passable(self, a: Point, b: Point) -> bool:
         """Whether two poses may be neighbours; symmetric."""
         return self.region(a) == self.region(b) and self.is_free_line(a, b)
+
+    def straight_way_um(self, a: Point, b: Point) -> int | None:
+        """How far the straight way between two poses counts as for ``places = "rooms"``; None where
+        they are not `passable`. A way in a region that is as small as a room counts less."""
+        if not self.passable(a, b):
+            return None
+        length = distance_um(*a, *b)
+        return length // SMALL_SHARE if self.region(a) in self._small else length
 
     def is_free_line(self, a: Point, b: Point) -> bool:
         """Whether the line from a to b meets no wall but those that it begins and ends in."""
@@ -178,6 +192,13 @@ def _without_small(walls: Walls, least: int) -> Walls:
         if max(rows) - min(rows) < least and max(columns) - min(columns) < least:
             kept[rows, columns] = False
     return kept
+
+
+def _small_regions(labels: Labels, side_um: int) -> frozenset[int]:
+    """The regions of at most ``SMALL_M2``, of blocks with sides of ``side_um``."""
+    sizes = np.bincount(labels[labels != NOWHERE]).tolist()
+    most_um2 = SMALL_M2 * UM_PER_M * UM_PER_M
+    return frozenset(r for r, size in enumerate(sizes) if size * side_um * side_um <= most_um2)
 
 
 def _spread(labels: Labels, steps: int) -> Labels:

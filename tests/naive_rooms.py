@@ -19,12 +19,12 @@ class NaiveRooms:
         drive_um: int,
         joined: list[Anchored] = [],  # noqa: B006
         apart: list[Anchored] = [],  # noqa: B006
-        is_passable=None,
+        way=None,
     ) -> None:
         self.cell_um, self.drive_um = cell_um, drive_um
-        self.joined, self.apart, self.is_passable = joined, apart, is_passable
+        self.joined, self.apart, self.way = joined, apart, way
         self.anchors: list[tuple[int, int]] = []
-        self.links: set[tuple[int, int]] = set()
+        self.links: dict[tuple[int, int], int | None] = {}  # how far, None for barred
         self.points: list[int] = []  # the cell of each
         self.last: dict[Hashable, int] = {}
         self.place_of: list[int] = []  # of each cell
@@ -45,10 +45,10 @@ class NaiveRooms:
         if cell is None:
             cell = len(self.anchors)
             self.anchors.append((x, y))
-            if self.is_passable is not None:
-                self._link_passable(cell)
+            if self.way is not None:
+                self._link_by_ways(cell)
         if run in self.last and self.last[run] != cell:
-            self.links.add((min(cell, self.last[run]), max(cell, self.last[run])))
+            self._link(self.last[run], cell)
         self.last[run] = cell
         drives = self._drives()
         if is_new:
@@ -58,27 +58,42 @@ class NaiveRooms:
         self._obey_joins(point, drives)
 
     def _nearest(self, x: int, y: int) -> int | None:
-        near = [((ax - x) ** 2 + (ay - y) ** 2, i) for i, (ax, ay) in enumerate(self.anchors)]
+        near = [
+            ((ax - x) ** 2 + (ay - y) ** 2, i)
+            for i, (ax, ay) in enumerate(self.anchors)
+            if self._way((ax, ay), (x, y)) is not None
+        ]
         return min(near)[1] if near and min(near)[0] <= self.cell_um**2 else None
 
-    def _link_passable(self, cell: int) -> None:
+    def _way(self, a: tuple[int, int], b: tuple[int, int]) -> int | None:
+        return (
+            math.isqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2)
+            if self.way is None
+            else self.way(a, b)
+        )
+
+    def _link(self, a: int, b: int) -> None:
+        """How far it is counts as of now, whatever walls there will be."""
+        a, b = sorted((a, b))
+        if (a, b) not in self.links:
+            self.links[a, b] = self._way(self.anchors[a], self.anchors[b])
+
+    def _link_by_ways(self, cell: int) -> None:
         for other in range(cell):
             squared = sum(
                 (a - b) ** 2 for a, b in zip(self.anchors[other], self.anchors[cell], strict=True)
             )
-            is_free = self.is_passable(self.anchors[other], self.anchors[cell])
-            if squared <= 4 * self.cell_um**2 and is_free:
-                self.links.add((other, cell))
+            way = self._way(self.anchors[other], self.anchors[cell])
+            if squared <= 4 * self.cell_um**2 and way is not None:
+                self._link(other, cell)
 
     def _drives(self) -> list[list[int]]:
         """Floyd and Warshall: the shortest drive from each cell to each, at most twice the
         limit."""
         n, reach = len(self.anchors), 2 * self.drive_um
         drives = [[0 if i == j else reach for j in range(n)] for i in range(n)]
-        for i, j in self.links:
-            (ax, ay), (bx, by) = self.anchors[i], self.anchors[j]
-            if self.is_passable is None or self.is_passable((ax, ay), (bx, by)):
-                length = math.isqrt((ax - bx) ** 2 + (ay - by) ** 2)
+        for (i, j), length in self.links.items():
+            if length is not None:
                 drives[i][j] = drives[j][i] = min(length, reach)
         for k in range(n):
             for i in range(n):

@@ -2,8 +2,12 @@
 
 A pose farther than ``cell_um`` from all anchors becomes the anchor of a new cell; every other
 belongs to the cell of the nearest anchor, of equally near ones to the earliest. Anchors never move.
+Where walls are known, only anchors count that a straight way leads to.
 
 Two cells with one pose after the other in some run are *linked*, at the distance of their anchors.
+Where walls are known, it is how far the straight way between them counts as, and cells whose
+anchors are up to two cells' radii apart are linked, too, if there is such a way: the robot could
+drive it. What is linked stays as it is when walls become known, or others.
 The driven distance of two cells is the length of the shortest way over links; from ``reach_um`` on
 it is not known and counts as ``reach_um``. It only ever gets shorter.
 
@@ -24,8 +28,8 @@ import numpy as np
 from projections.exact import distance_um
 from projections.reducers import State
 
-Passable: TypeAlias = Callable[[tuple[int, int], tuple[int, int]], bool]
-"""Whether the straight line between two positions, µm, is free of walls and wide enough."""
+StraightWay: TypeAlias = Callable[[tuple[int, int], tuple[int, int]], int | None]
+"""How far the straight way between two positions counts as, all in µm; None where walls bar it."""
 
 
 class Nearer(NamedTuple):
@@ -41,11 +45,13 @@ class Nearer(NamedTuple):
 class DrivenCells:
     """Cells are numbered as they are made."""
 
-    def __init__(self, cell_um: int, reach_um: int, passable: Passable | None = None) -> None:
+    def __init__(
+        self, cell_um: int, reach_um: int, straight_way: StraightWay | None = None
+    ) -> None:
         self._cell_um = cell_um
         self._cell2 = cell_um * cell_um
         self.reach_um = reach_um
-        self.passable = passable
+        self.straight_way = straight_way
         self.anchors: list[tuple[int, int]] = []
         # By square of the grid of side ``cell_um``: the cells with their anchors in it, and the
         # cells that a position in it may belong to, with their anchors.
@@ -57,6 +63,8 @@ class DrivenCells:
 
     def find(self, x_um: int, y_um: int) -> int | None:
         """The cell of a position; None if no anchor is near enough."""
+        if self.straight_way is not None:
+            return self._find_between_walls((x_um, y_um), self.straight_way)
         best, least = None, self._cell2 + 1
         key = x_um // self._cell_um, y_um // self._cell_um
         for cell, x, y in self._around.get(key, ()):  # ascending
@@ -64,6 +72,16 @@ class DrivenCells:
             if squared < least:
                 best, least = cell, squared
         return best
+
+    def _find_between_walls(self, at: tuple[int, int], way: StraightWay) -> int | None:
+        around = self._around.get((at[0] // self._cell_um, at[1] // self._cell_um), ())
+        near = sorted(((x - at[0]) ** 2 + (y - at[1]) ** 2, cell) for cell, x, y in around)
+        for squared, cell in near:
+            if squared > self._cell2:
+                break
+            if way(self.anchors[cell], at) is not None:
+                return cell
+        return None
 
     def add(self, x_um: int, y_um: int) -> int:
         """A new cell with its anchor here, linked to none."""
@@ -86,14 +104,15 @@ class DrivenCells:
     def link(self, a: int, b: int) -> Iterator[Nearer]:
         """Link two cells; the pairs that come nearer by it, each once, in no order.
 
-        Where walls are known a link that passes one is made too, and brings nothing nearer.
+        A link that walls bar is made too, and brings nothing nearer.
         """
         self._linked[a].add(b)
         self._linked[b].add(a)
-        length = distance_um(*self.anchors[a], *self.anchors[b])
-        if length >= self.near[a].get(b, self.reach_um):
-            return
-        if self.passable is not None and not self.passable(self.anchors[a], self.anchors[b]):
+        if self.straight_way is None:
+            length: int | None = distance_um(*self.anchors[a], *self.anchors[b])
+        else:
+            length = self.straight_way(self.anchors[a], self.anchors[b])
+        if length is None or length >= self.near[a].get(b, self.reach_um):
             return
         # The ends' own sides: nearer to the far end through the link than they were to it.
         sources = [(a, length), *self._through(a, b, length)]
@@ -114,27 +133,24 @@ class DrivenCells:
             if cell != far and distance + length < known.get(cell, reach):
                 yield cell, distance + length
 
-    def passable_around(self, cell: int) -> list[int]:
-        """Where walls are known, the cells whose anchors are up to two cells' radii away in a line
-        that nothing bars: the robot could drive it."""
-        passable = self.passable
-        if passable is None:
+    def with_a_way_to(self, cell: int) -> list[int]:
+        """Where walls are known, the cells that are linked to a new one without being driven."""
+        way, at = self.straight_way, self.anchors[cell]
+        if way is None:
             return []
-        (x_um, y_um), least = self.anchors[cell], 4 * self._cell2
-        column, row = x_um // self._cell_um, y_um // self._cell_um
-        around = (
+        column, row = at[0] // self._cell_um, at[1] // self._cell_um
+        around = sorted(
             other
             for dx in range(-2, 3)
             for dy in range(-2, 3)
             for other in self._squares.get((column + dx, row + dy), ())
+            if other != cell and self._is_within_two_radii(other, at)
         )
-        return sorted(
-            other
-            for other in around
-            if other != cell
-            and (self.anchors[other][0] - x_um) ** 2 + (self.anchors[other][1] - y_um) ** 2 <= least
-            and passable(self.anchors[other], self.anchors[cell])
-        )
+        return [other for other in around if way(self.anchors[other], at) is not None]
+
+    def _is_within_two_radii(self, cell: int, at: tuple[int, int]) -> bool:
+        x, y = self.anchors[cell]
+        return (x - at[0]) ** 2 + (y - at[1]) ** 2 <= 4 * self._cell2
 
     def dump(self) -> State:
         """Everything, for a snapshot."""

@@ -44,7 +44,7 @@ from projections.exact import distance_um
 from projections.pair_groups import PairGroups
 from projections.reducers import State, part, prefixed
 
-from .driven_cells import DrivenCells, Passable
+from .driven_cells import DrivenCells, StraightWay
 from .place_anchors import Apart, PlaceAnchors
 from .place_members import PlaceMembers
 
@@ -66,11 +66,11 @@ class Rooms(PlaceMembers):
         cell_um: int,
         drive_um: int,
         groups: PairGroups[Keyframe] = _NO_GROUPS,
-        passable: Passable | None = None,
+        straight_way: StraightWay | None = None,
     ) -> None:
         super().__init__()
         self._drive_um = drive_um
-        self._cells = DrivenCells(cell_um, 2 * drive_um, passable)
+        self._cells = DrivenCells(cell_um, 2 * drive_um, straight_way)
         self._anchors = PlaceAnchors(groups)
         # Per cell: the place it joined, as of then, and the point that founded it.
         self._cell_places: list[PlaceOrdinal] = []
@@ -86,9 +86,9 @@ class Rooms(PlaceMembers):
         """A keyframe that may be an anchor."""
         self._anchors.add(keyframe, anchor)
 
-    def use_walls(self, passable: Passable | None) -> None:
-        """From now on new links are judged by these walls; those made before stay as they are."""
-        self._cells.passable = passable
+    def use_walls(self, straight_way: StraightWay | None) -> None:
+        """From now on cells and links are made by these walls; what was made stays as it is."""
+        self._cells.straight_way = straight_way
 
     def fold(
         self,
@@ -183,7 +183,7 @@ class Rooms(PlaceMembers):
     def _settle(self, offset: Offset, founder: int, cell: int, last: int | None) -> list[Delta]:
         """Give a new cell its place (rule 3), and merge what comes closer by it."""
         closer = set[Pair]()
-        around = self._cells.passable_around(cell)
+        around = self._cells.with_a_way_to(cell)
         for other in around if last is None else (last, *around):
             if not self._cells.is_linked(other, cell):
                 for one, another, before_um, distance in self._cells.link(other, cell):

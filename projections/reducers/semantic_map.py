@@ -119,7 +119,14 @@ class SemanticMap:
     def use_map(self, offset: Offset, given: OccupancyMap) -> list[Delta]:
         """Take over an occupancy map, which holds for the events after it; what changed."""
         self.next_offset = Offset(offset + 1)
-        return [self.current_map.fold(offset, given)]
+        given_map = self.current_map.fold(offset, given)
+        self._use_walls()
+        return [given_map]
+
+    def _use_walls(self) -> None:
+        grid = self.current_map.grid
+        if grid is not None and isinstance(self.places, Rooms):
+            self.places.use_walls(grid.straight_way_um)
 
     def skip(self, offset: Offset) -> None:
         """Pass over an event that does not change the map."""
@@ -238,6 +245,7 @@ class SemanticMap:
             self.space.decide(*state["space"])
         for name, reducer in self._parts():
             reducer.load(part(name, state))
+        self._use_walls()
 
     def _parts(self) -> tuple[tuple[str, Reducer], ...]:
         return (

@@ -13,7 +13,7 @@ from eventsrc.system_events import MAP_KEY
 from projections.errors import FoldError
 from projections.history import Timeline
 from projections.model.digest import map_digest
-from projections.model.fold import fold_log
+from projections.model.fold import fold_events, fold_log
 from projections.model.snapshot import restore, snapshot
 from projections.model.view import MapView
 from projections.settings import Settings
@@ -66,6 +66,48 @@ def test_only_the_digest_tells_a_map_under_the_pages_rule(tmp_path: Path) -> Non
     assert len({map_digest(view) for view in (plain, mapped, other)}) == 3
     mapped.map = None
     assert map_digest(mapped) == map_digest(plain)
+
+
+ROOM_RULE = Settings(places="rooms")
+
+
+def _places(log: Path, settings: Settings = ROOM_RULE) -> list[int | None]:
+    with LogReader(log) as reader:
+        return [k.place for k in fold_log(reader, settings)[1].keyframes]
+
+
+def test_places_by_rooms_do_not_reach_through_a_wall(tmp_path: Path) -> None:
+    east = [envelope(k, 4.0 - 0.25 * (k % 4), 0.0) for k in range(8)]
+    west = [envelope(k, 1.7 - 0.25 * (k % 4), 0.0) for k in range(8, 16)]
+    assert len(set(_places(_write(tmp_path / "plain", *east, *west)))) == 1
+    assert len(set(_places(_write(tmp_path / "hall", HALL, *east, *west)))) == 1
+    apart = _places(_write(tmp_path / "rooms", ROOMS, *east, *west))
+    assert apart == [0] * 8 + [1] * 8
+    assert None not in apart
+
+
+def test_a_map_holds_for_what_comes_after_it_only(tmp_path: Path) -> None:
+    """What was one place before the map stays one; new ground is judged by it."""
+    both = [envelope(k, 0.2 + 0.4 * k, 0.0) for k in range(12)]
+    before = _write(tmp_path / "before", *both, ROOMS)
+    assert len(set(_places(before))) == 1
+    after = _write(tmp_path / "after", ROOMS, *both)
+    assert len(set(_places(after))) == 2
+    lifted = _write(tmp_path / "lifted", ROOMS, HALL, *both)
+    assert len(set(_places(lifted))) == 1
+
+
+def test_a_fold_goes_on_from_a_snapshot_with_the_same_walls(tmp_path: Path) -> None:
+    items = [*DRIVE[:3], ROOMS, *DRIVE[3:], *(envelope(k, 0.3 * k, 0.5) for k in range(20, 34))]
+    log = _write(tmp_path / "L", *items)
+    with LogReader(log) as reader:
+        _, whole = fold_log(reader, ROOM_RULE)
+        for until in range(2, len(items), 3):
+            kept = snapshot(*fold_log(reader, ROOM_RULE, until), reader.log_id)
+            semantic_map, view = restore(kept, ROOM_RULE, reader.log_id)
+            for event in fold_events(reader.read(until), semantic_map):
+                view.apply_event(event.offset, event.deltas)
+            assert map_digest(view) == map_digest(whole)
 
 
 def test_a_snapshot_has_the_map(tmp_path: Path) -> None:

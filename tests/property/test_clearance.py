@@ -104,7 +104,7 @@ def test_a_door_parts_two_rooms(door: int) -> None:
 
 def test_a_wide_opening_parts_nothing() -> None:
     walls = np.concatenate([_room(30, 30), _room(40, 30)[:, 1:]], axis=1)
-    walls[3:29, 31] = False
+    walls[2:30, 31] = False
     assert set(regions(walls, 0.1)[~walls].tolist()) == {0}
 
 

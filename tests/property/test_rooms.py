@@ -1,5 +1,6 @@
 """Places by rooms equal their rules, done naively, after every keyframe."""
 
+import math
 import random
 
 import pytest
@@ -66,12 +67,12 @@ def told(seed: int, count: int) -> Statements:
     return [(pair, True) for pair in joined] + [(pair, False) for pair in apart]
 
 
-def rooms_of(statements: Statements, passable=None) -> Rooms:
+def rooms_of(statements: Statements, way=None) -> Rooms:
     joined, apart = (
         [(Keyframe("r", a), Keyframe("r", b)) for (a, b), is_same in statements if is_same is want]
         for want in (True, False)
     )
-    return Rooms(CELL_UM, DRIVE_UM, PairGroups(joined, apart), passable)
+    return Rooms(CELL_UM, DRIVE_UM, PairGroups(joined, apart), way)
 
 
 def fold_one(rooms: Rooms, n: int, at: At) -> list:
@@ -80,13 +81,19 @@ def fold_one(rooms: Rooms, n: int, at: At) -> list:
     return rooms.fold(n, n, run, f"r{run}", x, y)
 
 
-def check_every_prefix(points: list[At], statements: Statements, passable=None) -> None:
-    rooms = rooms_of(statements, passable)
+def check_every_prefix(
+    points: list[At], statements: Statements, way=None, known_from: int = 0
+) -> None:
+    """Walls are known from a point on."""
+    rooms = rooms_of(statements)
     joined, apart = ([p for p, is_same in statements if is_same is w] for w in (True, False))
-    naive = NaiveRooms(CELL_UM, DRIVE_UM, joined, apart, passable)
+    naive = NaiveRooms(CELL_UM, DRIVE_UM, joined, apart)
     founders: list[int] = []
     refused: set[tuple[int, int]] = set()
     for n, at in enumerate(points):
+        if n == known_from:
+            rooms.use_walls(way)
+            naive.way = way
         deltas = fold_one(rooms, n, at)
         naive.add(*at)
         ours = [rooms.label(i) for i in range(n + 1)]
@@ -109,7 +116,7 @@ def check_every_prefix(points: list[At], statements: Statements, passable=None) 
             sums = sum(x for _, x, _ in own), sum(y for _, _, y in own)
             assert (d.keyframe_count, d.sum_x_um, d.sum_y_um) == (len(own), *sums)
         if n % 3 == 0:
-            restored = rooms_of(statements, passable)
+            restored = rooms_of(statements, way if n >= known_from else None)
             restored.load(rooms.dump())
             rooms = restored
 
@@ -146,14 +153,30 @@ def test_buildings_equal_the_naive_rules(seed: int) -> None:
     check_every_prefix(points, told(seed, len(points)) if seed % 2 else [])
 
 
-def _no_wall(a: tuple[int, int], b: tuple[int, int]) -> bool:
-    """A wall along x = 1,500 with a door at y = 0."""
-    return (a[0] < 1500) == (b[0] < 1500) or a[1] == b[1] == 0
+def _way(a: tuple[int, int], b: tuple[int, int]) -> int | None:
+    """A wall along x = 1,500 with a door at y = 0; beyond it ways count as a third."""
+    length = math.isqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2)
+    if (a[0] < 1500) != (b[0] < 1500):
+        return length if a[1] == b[1] == 0 else None
+    return length if a[0] < 1500 else length // 3
 
 
 @given(points=drives())
 def test_drives_between_walls_equal_the_naive_rules(points: list[At]) -> None:
-    check_every_prefix(points, [], _no_wall)
+    check_every_prefix(points, [], _way)
+
+
+@given(points=drives(), seed=st.integers(0, 2**32), known_from=st.integers(0, 30))
+def test_walls_that_become_known_count_from_then_on(
+    points: list[At], seed: int, known_from: int
+) -> None:
+    check_every_prefix(points, told(seed, len(points)), _way, known_from)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_buildings_with_walls_equal_the_naive_rules(seed: int) -> None:
+    points = building(seed)
+    check_every_prefix(points, told(seed, len(points)) if seed % 2 else [], _way, 20 * (seed % 3))
 
 
 def test_buildings_have_merges_and_refusals() -> None:

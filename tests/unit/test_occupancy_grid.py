@@ -39,6 +39,15 @@ def test_poses_beside_a_door_are_of_their_own_room(resolution: float) -> None:
     assert not grid.is_free_line((M, M // 2), (5 * M, M // 2)), "the line meets the wall"
 
 
+def test_a_way_in_a_small_region_counts_as_a_quarter_and_through_a_door_as_none() -> None:
+    hall = np.zeros((160, 160))
+    hall[[0, -1], :] = hall[:, [0, -1]] = 100
+    large, small = OccupancyGrid(_map(hall)), OccupancyGrid(_map(_two_rooms()))
+    assert large.straight_way_um((M, M), (2 * M, M)) == M
+    assert small.straight_way_um((M, M), (2 * M, M)) == M // 4
+    assert small.straight_way_um((2 * M, int(1.5 * M)), (int(4.1 * M), int(1.5 * M))) is None
+
+
 def test_a_wall_parts_what_one_region_holds() -> None:
     cells = np.zeros((60, 60))
     cells[10:50, 30] = 100

@@ -1,7 +1,8 @@
 """One table: Objects by the page's rule and by evidence, side by side, against the truth.
 
 python -m tests.bench.truth [--half develop|validate] [--quick] [--world W…] [--profile P…]
-    [--moved FRACTION] [--calibrated] [--places] [--limit N] [--set NAME=VALUE…]
+    [--moved FRACTION] [--calibrated] [--places [--walls]]
+    [--limit N] [--set NAME=VALUE…]
     [--worlds DIR] [--cache DIR] [--json FILE]
 python -m tests.bench.truth --localise [--every N] [--map page|evidence] [--brief] [--jobs N] …
 
@@ -31,6 +32,7 @@ from .localising_table import localise_table
 from .moving import score_moved
 from .places import RULES, PlacesRow, places_row, places_table
 from .scoring import score_objects
+from .walls import Walls, world_names, world_walls
 from .worlds import (
     CACHE,
     LIMIT,
@@ -58,7 +60,10 @@ def main() -> None:
         cases = _cases(generator, chosen, options, limit)
         if options.places:
             rules = {**RULES, "rooms": RULES["rooms"].with_assignments(options.set)}
-            places = [places_row(case, rules) for case in cases]
+            places = [
+                places_row(case, rules, _walls(generator, case) if options.walls else None)
+                for case in cases
+            ]
         else:
             rows = [_row(case, options) for case in cases]
     except (NoWorldsError, SettingsError) as error:
@@ -75,6 +80,12 @@ def main() -> None:
         print(calibration_table(rows))
     print(tables.moved_table(rows) if options.moved else tables.objects_table(rows))
     _write(options.json, rows)
+
+
+def _walls(generator: ModuleType, case: Case) -> Walls | None:
+    """The walls of a generated building; None for house-a, which has none."""
+    world = case.name.rpartition(" ")[2]
+    return world_walls(generator, world) if world in world_names(generator) else None
 
 
 def _write(path: Path | None, rows: Sequence[tables.Row | PlacesRow]) -> None:
@@ -131,6 +142,9 @@ def _options() -> argparse.Namespace:
         "--calibrated", action="store_true", help="the map's own constants beside the priors"
     )
     parser.add_argument("--places", action="store_true", help="places against rooms, no Objects")
+    parser.add_argument(
+        "--walls", action="store_true", help="with --places: rooms with an occupancy map, too"
+    )
     parser.add_argument("--localise", action="store_true", help="where the robot is, instead")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="ask every N-th question")
     parser.add_argument("--map", nargs="+", choices=MAPS, default=MAPS, help="rules of the maps")
