@@ -196,7 +196,7 @@ def test_progress_counts_the_events_of_all_folds(mapfold: Commands) -> None:
         calibrate(reader, Settings(), progress=lambda done, total: told.append((done, total)))
     assert {total for _, total in told} == {480}
     assert [done for done, _ in told] == sorted(done for done, _ in told)
-    assert told[-1] == (320, 320)
+    assert told[-1] == (480, 480)
 
 
 Start = Callable[..., Program]
