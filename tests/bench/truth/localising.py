@@ -97,13 +97,14 @@ def later_runs(case: Case) -> list[Accepted]:
     return [each for each in case.events if each.envelope.run_id != case.first_run]
 
 
-def make_map(case: Case, rule: str) -> MapView:
-    """Run a by the page's rule, uncalibrated, or by evidence with the map's own constants."""
+def make_map(case: Case, rule: str, *, ask: bool = True) -> MapView:
+    """Run a by the page's rule, uncalibrated, or by evidence with the map's own constants; those of
+    re-localisation too, unless the map is not to be asked."""
     events = first_run(case)
     settings = Settings(camera=case.camera, **PLACES)
     if rule == "evidence":
         settings = settings.model_copy(update={"fusion": "evidence"})
-        settings, _ = calibrated_settings(events, settings, ask=True)
+        settings, _ = calibrated_settings(events, settings, ask=ask)
     view = MapView(settings)
     for _ in fold_into(view, events):
         pass
