@@ -22,7 +22,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from projections.relocalize.likelihood import Scene
 
 from projections.calibrate.localiser import Line, fit_line, logit
 from projections.evaluate.own_questions import ask_own_questions
@@ -36,6 +35,7 @@ from projections.evaluate.scores import (
 from projections.evaluate.trials import RIGHT_WITHIN_M
 from projections.model.view import MapView
 from projections.relocalize import ExactIndex, certainty, features
+from projections.relocalize.likelihood import Scene
 from projections.relocalize.model import MODEL
 from projections.relocalize.pose import locate
 from tests.bench.truth.localising import later_runs, make_map, stranger_of
