@@ -13,6 +13,7 @@ from psycopg import sql
 from projections.database.connection import Targets
 from projections.exact import Q40
 from projections.model.view import MapView
+from projections.place_types import place_type
 
 ORDER = (
     "Run", "Keyframe", "Pose", "Observation", "Object", "Place", "HAS_KEYFRAME", "HAS_POSE",
@@ -94,6 +95,9 @@ def expected_graph(view: MapView) -> dict[str, list[tuple[Any, ...]]]:
         if floor is not None:
             properties["floor"] = floor
             whole = gid("Floor", 1 + list(view.floors).index(floor))
+        kind = place_type(recounted_contents(view, p.ordinal), p.name)
+        if kind is not None and kind.type is not None:
+            properties |= {"type": kind.type, "type_probability": kind.probability}
         n = p.ordinal + 1
         rows["PART_OF"].append((gid("PART_OF", n), gid("Place", n), whole, {}))
         rows["Place"].append((gid("Place", p.ordinal + 1), properties))
@@ -112,6 +116,16 @@ def expected_graph(view: MapView) -> dict[str, list[tuple[Any, ...]]]:
     if view.floors or view.all_places:
         rows["Building"].append((gid("Building", 1), {"building_id": "building"}))
     return {label: sorted(found, key=lambda row: int(row[0])) for label, found in rows.items()}
+
+
+def recounted_contents(view: MapView, place: int) -> dict[str, float]:
+    """The weight of each class in a place: a quarter for an Object that was observed once."""
+    counted: dict[str, float] = {}
+    for found in view.objects.values():
+        if found.place == place:
+            weight = 1.0 if len(found.observations) > 1 else 0.25
+            counted[found.class_name] = counted.get(found.class_name, 0.0) + weight
+    return counted
 
 
 def _expect_landmarks(view: MapView, rows: dict[str, list[tuple[Any, ...]]]) -> None:

@@ -147,13 +147,17 @@ def _evidence(found: ObjectRecord) -> str:
 
 
 def place_rows(view: MapView, places: Iterable[int]) -> Iterator[VertexRow]:
-    """Places, also those that were absorbed; only those that have a name or a floor have the
-    property."""
+    """Places, also those that were absorbed. Only those that have a name, a floor or a type that is
+    sure have these properties."""
     base = BASE["Place"]
     for i in places:
         p = view.all_places[i]
         name = "" if p.name is None else f', "name": {text(p.name)}'
         name += _floor(view.floor_of(p.ordinal))
+        kind = view.type_of(p.ordinal)
+        if kind is not None and kind.type is not None:
+            probability = number(kind.probability)
+            name += f', "type": {text(kind.type)}, "type_probability": {probability}'
         properties = (
             f'{{"place_id": {text(p.place_id)}, "centroid_x": {number(p.centroid_x)},'
             f' "centroid_y": {number(p.centroid_y)}, "keyframe_count": {p.keyframe_count}{name}}}'

@@ -36,5 +36,5 @@ def view_of_floor(view: MapView, floor: str) -> MapView:
         for (a, b), count in view.adjacency.items()
         if a in found.places and b in found.places
     }
-    found.floors = view.floors
+    found.floors, found.contents = view.floors, view.contents
     return found

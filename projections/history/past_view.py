@@ -49,6 +49,8 @@ def view_at(history: History, latest: MapView, end: Offset) -> MapView:
         view.object_survivors.merge(merge.survivor, (merge.absorbed,))
     absorbed = view.object_survivors.absorbed_by
     view.objects = {o.ordinal: o for o in view.all_objects if o.ordinal not in absorbed}
+    for found in view.objects.values():
+        view.contents.update(found)
     view.runs = _runs(history, view.keyframes, end)
     view.adjacency = _adjacency(history, end)
     for skipped in history.skipped[: count_before(history.skipped, end)]:

@@ -48,12 +48,12 @@ class BatchChanges:
     ``keyframes`` and ``observations`` are new. They never change later, except for the place of a
     keyframe and the object of an observation: ``placed`` are the keyframes that joined a place or
     whose place was absorbed, ``reassigned`` the observations whose object was absorbed. ``runs``,
-    ``objects`` and ``places`` are new or changed; one that is not in `MapView.objects` or
-    `MapView.places` any more was absorbed. ``located`` are objects that moved to another place or
-    out of one, absorbed ones among them. ``links`` are pairs of places whose shared transitions
-    changed; one that is not in `MapView.adjacency` any more is gone. ``embedded`` is in the order
-    of the observations. ``formed`` are the places that are new, ``floors`` the numbers of new
-    floors.
+    ``objects`` and ``places`` are new or changed, places also by what is in them; one that is not
+    in `MapView.objects` or `MapView.places` any more was absorbed. ``located`` are objects that
+    moved to another place or out of one, absorbed ones among them. ``links`` are pairs of places
+    whose shared transitions changed; one that is not in `MapView.adjacency` any more is gone.
+    ``embedded`` is in the order of the observations. ``formed`` are the places that are new,
+    ``floors`` the numbers of new floors.
     """
 
     keyframes: range
@@ -102,6 +102,7 @@ class ChangeTracker:
 
     def drain(self) -> BatchChanges:
         """All changes since the last drain."""
+        self._places.update(filter(self.view.places.__contains__, self.view.contents.touched))
         changes = BatchChanges(
             range(self._keyframes, len(self.view.keyframes)),
             range(self._observations, len(self.view.observations)),
@@ -132,6 +133,7 @@ class ChangeTracker:
         self._reassigned: set[ObservationOrdinal] = set()
         self._formed: set[PlaceOrdinal] = set()
         self._floors = len(self.view.floors)
+        self.view.contents.touched.clear()
 
     def _place_formed(self, delta: PlaceFormed) -> None:
         self._places.add(delta.place)

@@ -7,6 +7,7 @@ from eventsrc.envelope import Offset
 from eventsrc.text import counted, visible
 from projections.deltas import PlaceOrdinal
 from projections.exact import UM_PER_M
+from projections.place_types import PlaceType
 from projections.settings import Settings, assignment_texts
 
 from .command_text import command_document
@@ -95,6 +96,7 @@ def _places(view: MapView) -> list[dict[str, Any]]:
             "keyframe_count": p.keyframe_count,
             **({} if p.name is None else {"name": p.name}),
             **_floor(view.floor_of(p.ordinal)),
+            **_type(view.type_of(p.ordinal)),
         }
         for p in view.places.values()
     ]
@@ -103,6 +105,17 @@ def _places(view: MapView) -> list[dict[str, Any]]:
 def _floor(name: str | None) -> dict[str, str]:
     """The floor's name, where the log tells it."""
     return {} if name is None else {"floor": name}
+
+
+def _type(found: PlaceType | None) -> dict[str, Any]:
+    """What kind of room it is; None where unsure. Nothing where nothing tells."""
+    if found is None:
+        return {}
+    return {
+        "type": found.type,
+        "type_probability": found.probability,
+        "type_candidates": [{"type": t, "probability": p} for t, p in found.candidates],
+    }
 
 
 def _objects(view: MapView) -> list[dict[str, Any]]:
@@ -212,6 +225,13 @@ def _settings(settings: Settings) -> str:
     return text if changed else f"default: {text}"
 
 
+def _shown_type(found: PlaceType | None) -> str:
+    """``kitchen 87 %``; empty where unsure."""
+    if found is None or found.type is None:
+        return ""
+    return found.type if found.named else f"{found.type} {found.probability:.0%}".replace("%", " %")
+
+
 def _shown_floor(name: str | None) -> str:
     return "-" if name is None else visible(name)
 
@@ -234,11 +254,15 @@ def _place_lines(view: MapView) -> list[str]:
     floors = {ordinal: _shown_floor(view.floor_of(ordinal)) for ordinal, _ in shown}
     floor_width = max(5, *map(len, floors.values())) if view.floors else 0
     named += f"  {'floor':<{floor_width}}" if floor_width else ""
+    types = {ordinal: _shown_type(view.type_of(ordinal)) for ordinal, _ in shown}
+    type_width = max(4, *map(len, types.values())) if any(types.values()) else 0
+    named += f"  {'type':<{type_width}}" if type_width else ""
     lines = [f"{'place':<{width}}{named}  keyframes  objects  centroid (m)        next to"]
     for ordinal, place in shown:
         centroid = f"({place.centroid_x:.2f}, {place.centroid_y:.2f})"
         name = f"  {place.name or '':<{max(name_width, 4)}}" if name_width else ""
         name += f"  {floors[ordinal]:<{floor_width}}" if floor_width else ""
+        name += f"  {types[ordinal]:<{type_width}}" if type_width else ""
         lines.append(
             f"{place.place_id:<{width}}{name}  {place.keyframe_count:>9}  {objects[ordinal]:>7}  "
             f"{centroid:<18}  {', '.join(neighbours[ordinal])}".rstrip()

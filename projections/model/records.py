@@ -174,6 +174,7 @@ class ObjectRecord:
     `MapView.objects` lists those that were not absorbed. The fields after ``observations`` are
     those of fusion by evidence: ``misses`` is in how many keyframes of a run it should have been
     seen and was not, ``missing_in`` the run in which that was often enough to call it missing.
+    ``counted_as`` is how `PlaceContents` counts it.
     """
 
     ordinal: ObjectOrdinal
@@ -190,6 +191,7 @@ class ObjectRecord:
     misses: int = 0
     missing_in: RunOrdinal | None = None
     relocations: list[Relocation] = field(default_factory=list)
+    counted_as: tuple[PlaceOrdinal, str, bool] | None = None
 
     @property
     def mean_x(self) -> float:

@@ -264,6 +264,8 @@ def _load_objects(view: MapView, state: State) -> None:
     view.objects = {o.ordinal: o for o in view.all_objects if o.ordinal not in absorbed_by}
     if view.settings.fusion == "evidence":
         _load_evidence(view, state)
+    for found in view.objects.values():
+        view.contents.update(found)
 
 
 def _dump_evidence(view: MapView) -> State:

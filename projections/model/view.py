@@ -39,9 +39,11 @@ from projections.deltas import (
     RunSeen,
     SkipKind,
 )
+from projections.place_types import PlaceType, place_type
 from projections.reducers.survivors import ObjectSurvivors, PlaceSurvivors
 from projections.settings import Settings
 
+from .place_contents import PlaceContents
 from .records import (
     Estimate,
     KeyframeRecord,
@@ -90,6 +92,7 @@ class MapView:
         self.survivors = PlaceSurvivors()
         self.adjacency: dict[tuple[PlaceOrdinal, PlaceOrdinal], int] = {}
         self.floors: dict[str, int] = {}
+        self.contents = PlaceContents()
         self.map: MapGiven | None = None
         self.skipped: dict[SkipKind, int] = {"duplicate": 0, "conflict": 0, "det_id_reused": 0}
 
@@ -119,6 +122,10 @@ class MapView:
     def is_between_floors(self, a: PlaceOrdinal, b: PlaceOrdinal) -> bool:
         """Whether two places are on two floors, so that a way between them is stairs or a lift."""
         return bool(self.floors) and self.floor_of(a) != self.floor_of(b)
+
+    def type_of(self, place: PlaceOrdinal) -> PlaceType | None:
+        """What kind of room a place is, by its Objects or its name; None if nothing tells."""
+        return place_type(self.contents.of(place), self.all_places[place].name)
 
     def class_counts(self, found: ObjectRecord) -> dict[str, int]:
         """How many observations of an Object are of each class, most first; ties by name."""
@@ -240,6 +247,7 @@ class MapView:
         found.sum_y_um = delta.sum_y_um
         found.first_seen = delta.first_seen
         found.last_seen = delta.last_seen
+        self.contents.update(found)
 
     def _objects_merged(self, delta: ObjectsMerged) -> None:
         survivor = self.all_objects[delta.survivor]
@@ -251,12 +259,14 @@ class MapView:
             relocations = survivor.relocations + absorbed.relocations
             survivor.relocations = sorted(relocations, key=lambda r: (r.offset, r.observation))
             absorbed.observations, absorbed.relocations, absorbed.place = [], [], None
+            self.contents.update(absorbed)
             self.object_survivors.merge(delta.survivor, (delta.absorbed,))
         survivor.obs_count = delta.obs_count
         survivor.sum_x_um = delta.sum_x_um
         survivor.sum_y_um = delta.sum_y_um
         survivor.first_seen = delta.first_seen
         survivor.last_seen = delta.last_seen
+        self.contents.update(survivor)
 
     def _object_estimated(self, delta: ObjectEstimated) -> None:
         self.all_objects[delta.object].estimate = Estimate(
@@ -269,7 +279,9 @@ class MapView:
         )
 
     def _object_classified(self, delta: ObjectClassified) -> None:
-        self.all_objects[delta.object].class_name = delta.class_name
+        found = self.all_objects[delta.object]
+        found.class_name = delta.class_name
+        self.contents.update(found)
 
     def _object_missing(self, delta: ObjectMissing) -> None:
         found = self.all_objects[delta.object]
@@ -291,7 +303,9 @@ class MapView:
             found.relocations.append(moved)
 
     def _object_moved(self, delta: ObjectMoved) -> None:
-        self.all_objects[delta.object].place = delta.place
+        found = self.all_objects[delta.object]
+        found.place = delta.place
+        self.contents.update(found)
 
     def _places_linked(self, delta: PlacesLinked) -> None:
         if delta.shared_transitions:

@@ -136,14 +136,14 @@ def test_snapshots_with_floors_go_on_as_the_fold_does(
         assert restored.view.floors == whole.view.floors
 
 
-@given(documents=drives(), seed=st.integers(0, 2**32))
-def test_fusion_by_evidence_keeps_floors_apart_too(
-    documents: list[dict[str, Any]], seed: int
+@given(documents=drives(), seed=st.integers(0, 2**32), places=st.sampled_from(["page", "rooms"]))
+def test_fusion_by_evidence_and_rooms_keep_floors_apart_too(
+    documents: list[dict[str, Any]], seed: int, places: Any
 ) -> None:
     rng = random.Random(seed)
     few = rng.sample(FLOORS, 3)
     documents = [{**document, **rng.choice(few)} for document in documents]
-    settings = Settings(fusion="evidence", eps_m=1.0)
+    settings = Settings(fusion="evidence", eps_m=1.0, places=places)
     whole, restored = Folded.start(settings), Folded.start(settings)
     for document in documents:
         whole.extend([document])
