@@ -139,6 +139,8 @@ def method_from(text: str) -> Method:
 
 
 def _print_answer(answer: Answer, as_json: bool) -> None:
+    if answer.thin is not None:
+        say(f"the map is thin, {answer.thin}: do not trust the answer until it has seen more")
     if not as_json:
         display(answer_text(answer))
         return

@@ -27,6 +27,7 @@ from .likelihood import Scene
 from .model import MODEL, Model
 from .pose import Posterior, locate
 from .question import Crop, Question, View
+from .thin import thinness
 
 Method = Literal["joint", "plain"]
 DEFAULT_CAMERA: Final = Camera()
@@ -96,7 +97,8 @@ class Answer:
     ``confidence`` that the pose is right within 1.5 m.
 
     ``hypotheses`` are what the pose was chosen from; None where there is no pose, and with the
-    plain method.
+    plain method. ``thin`` says what there is too little of in the map (`thin.thinness`), None where
+    there is enough.
     """
 
     places: tuple[RankedPlace, ...]
@@ -104,6 +106,7 @@ class Answer:
     confidence: float
     known: float = 0.0
     hypotheses: Hypotheses | None = field(default=None, compare=False, repr=False)
+    thin: str | None = None
 
     @property
     def unknown(self) -> bool:
@@ -118,6 +121,7 @@ class Answer:
             "confidence": self.confidence,
             "known": self.known,
             "unknown": self.unknown,
+            "thin": self.thin,
         }
 
 
@@ -136,13 +140,14 @@ def rank(
     views, candidates = _in_order(asked, candidates)
     crops = [crop for view in views for crop in view.crops]
     known = known_probability(crops, candidates.matches, candidates.constants)
+    thin = thinness(crops, candidates.matches)
     if method == "plain":
-        return replace(_rank_plain(candidates, top), known=known)
+        return replace(_rank_plain(candidates, top), known=known, thin=thin)
     floors = Layout.of(candidates.places)
     candidates = floors.laid_out(candidates)
     camera = asked.camera or camera or candidates.constants.camera
     posterior = locate(views, candidates.matches, Scene(candidates.constants, camera, model))
-    return replace(_answer(candidates, posterior, top, floors), known=known)
+    return replace(_answer(candidates, posterior, top, floors), known=known, thin=thin)
 
 
 def _in_order(question: Question, candidates: Candidates) -> tuple[list[View], Candidates]:
