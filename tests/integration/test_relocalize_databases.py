@@ -171,7 +171,12 @@ class TestCommand:
         evidence = answer["places"][0]["evidence"][0]
         assert set(evidence) == {"det_id", "object_id", "class_name", "similarity"}
         assert set(answer["pose"]) == {"x", "y", "yaw", "spread_m"}
-        nothing = mapfold("relocalize", question, "--log", log, "--as-of", "0", "--json").json
+        assert 0.0 <= answer["known"] <= 1.0
+        empty = mapfold("relocalize", question, "--log", log, "--as-of", "0", "--json")
+        nothing = empty.json
+        assert nothing["thin"] == "0 observations from 0 spots"
+        assert "the map is thin, 0 observations from 0 spots: do not trust" in empty.err
+        assert nothing["unknown"] is True
         assert nothing["places"] == []
         assert nothing["pose"] is None
         assert nothing["confidence"] == 0.0
