@@ -95,10 +95,10 @@ class NaiveRooms:
         for (i, j), length in self.links.items():
             if length is not None:
                 drives[i][j] = drives[j][i] = min(length, reach)
-        for k in range(n):
-            for i in range(n):
-                for j in range(n):
-                    drives[i][j] = min(drives[i][j], drives[i][k] + drives[k][j])
+        for k, through in enumerate(drives):
+            for row in drives:
+                if row[k] < reach:
+                    row[:] = [min(d, row[k] + more) for d, more in zip(row, through, strict=True)]
         return drives
 
     def _cells(self, place: int) -> list[int]:

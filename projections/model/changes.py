@@ -143,8 +143,10 @@ class ChangeTracker:
         self._places.add(delta.survivor)
         self._places.update(delta.absorbed)
         for place in delta.absorbed:
-            # Before the view applies it: afterwards they are members of the survivor.
-            self._placed.update(self.view.all_places[place].unordered_members)
+            # Before the view applies it: afterwards they are members of the survivor. A place that
+            # this event has formed is not there yet; a command may join it at once.
+            if place < len(self.view.all_places):
+                self._placed.update(self.view.all_places[place].unordered_members)
 
     def _objects_merged(self, delta: ObjectsMerged) -> None:
         self._objects.update((delta.survivor, delta.absorbed))
