@@ -98,7 +98,7 @@ class CandidateReader:
 
     def candidates(self, crops: Sequence[Crop], neighbours: int = NEIGHBOURS) -> Candidates:
         """The ``neighbours`` observations most similar to each crop, with their Places."""
-        search = CandidateSearch(self._vectors, self._graph, self._memory)
+        search = CandidateSearch(self._targets, self._vectors, self._graph, self._memory)
         return search.candidates(crops, neighbours)
 
     def disable_index(self) -> None:

@@ -126,9 +126,12 @@ class Pools:
     def _candidates(self, crops: Sequence[Crop], wait_s: float) -> Candidates:
         with self._borrow(self._vectors, self._targets.vector_url, wait_s) as vectors:
             if self._graph is self._vectors:
-                return CandidateSearch(vectors, vectors, self._memory).candidates(crops)
+                return self._search(vectors, vectors).candidates(crops)
             with self._borrow(self._graph, self._targets.graph_url, wait_s) as graph:
-                return CandidateSearch(vectors, graph, self._memory).candidates(crops)
+                return self._search(vectors, graph).candidates(crops)
+
+    def _search(self, vectors: Connection, graph: Connection) -> CandidateSearch:
+        return CandidateSearch(self._targets, vectors, graph, self._memory)
 
     def _ask(self, ask: Callable[[float], Result]) -> Result:
         if self._outage.is_on:

@@ -3,7 +3,7 @@
 -- so every step but the search is a look-up of an indexed id. `{questions}` is a VALUES list of (crop,
 -- vector) bind parameters. `origin` is log id, and fingerprint of settings and of what the observations
 -- depend on (through JSON, as a table of an older version has no column for it).
--- `{cosines}`, `{settings}` and `{followed}` are the parts of these names below.
+-- Other words in braces are the parts of these names below.
 
 -- name: cosines
 -- Key, number, mean and deviation of the cosines of different things in one picture, of the sample of
@@ -36,6 +36,28 @@
     THEN json_build_array(fingerprint, settings) END
  FROM mapfold.checkpoint WHERE sink = 'graph')
 
+-- name: of_vectors
+-- What is to know of the vectors as a whole, in one of the rows.
+CASE WHEN row_number() OVER () = 1 THEN json_build_array({cosines}, (
+    SELECT log_id || ' ' || coalesce(to_jsonb(c) ->> 'observed', fingerprint)
+    FROM mapfold.checkpoint c WHERE sink = 'vectors')) END
+
+-- name: of_graph
+-- The same of the graph.
+CASE WHEN row_number() OVER () = 1 THEN json_build_array({settings}, (
+    SELECT log_id || ' ' || coalesce(to_jsonb(c) ->> 'observed', fingerprint)
+    FROM mapfold.checkpoint c WHERE sink = 'graph')) END
+
+-- name: observed
+near.det_pk, near.det_id, near.run_id, near.class_name, near.bbox, near.map_x, near.map_y, near.map_yaw,
+near.embedding_model
+
+-- name: along
+-- Ids of Object, its Place and the keyframe's Place; the properties of each only once, as they are long.
+near.det_pk, thing.id, CASE WHEN row_number() OVER (PARTITION BY thing.id) = 1 THEN thing.properties END,
+its.id, CASE WHEN row_number() OVER (PARTITION BY its.id) = 1 THEN its.properties END,
+there.id, CASE WHEN row_number() OVER (PARTITION BY there.id) = 1 THEN there.properties END
+
 -- name: followed
 -- Joins from `near.det_pk` along the graph.
 LEFT JOIN {observes} AS observes
@@ -52,10 +74,7 @@ LEFT JOIN {place} AS there ON there.id = in_place.end_id
 -- The nearest `%(neighbours)s` observations of each crop, from the vectors' database; at least one row,
 -- of nulls if there is no observation.
 WITH question (crop, wanted) AS ({questions})
-SELECT {cosines}, (SELECT log_id || ' ' || coalesce(to_jsonb(c) ->> 'observed', fingerprint)
-                   FROM mapfold.checkpoint c WHERE sink = 'vectors'),
-       question.crop, 1 - near.distance, near.det_pk, near.det_id, near.run_id, near.class_name,
-       near.bbox, near.map_x, near.map_y, near.map_yaw, near.embedding_model
+SELECT {of_vectors}, question.crop, 1 - near.distance, {observed}
 FROM question LEFT JOIN LATERAL (
     SELECT det_pk, det_id, run_id, class_name, bbox, map_x, map_y, map_yaw, embedding_model,
            embedding <=> question.wanted AS distance
@@ -64,19 +83,14 @@ FROM question LEFT JOIN LATERAL (
 
 -- name: described
 -- These observations, from the vectors' database; at least one row.
-SELECT {cosines}, (SELECT log_id || ' ' || coalesce(to_jsonb(c) ->> 'observed', fingerprint)
-                   FROM mapfold.checkpoint c WHERE sink = 'vectors'),
-       0, 1.0, near.det_pk, near.det_id, near.run_id, near.class_name,
-       near.bbox, near.map_x, near.map_y, near.map_yaw, near.embedding_model
+SELECT {of_vectors}, 0, 1.0, {observed}
 FROM (SELECT 1) AS one
 LEFT JOIN public.detection_embeddings AS near ON near.det_pk = ANY(%(det_pks)s::bigint[])
 
 -- name: graph
 -- Object, its Place and the keyframe's Place of each observation, from the graph's database; at least
 -- one row.
-SELECT {settings}, (SELECT log_id || ' ' || coalesce(to_jsonb(c) ->> 'observed', fingerprint)
-                    FROM mapfold.checkpoint c WHERE sink = 'graph'),
-       near.det_pk, thing.properties, its.id, its.properties, there.id, there.properties
+SELECT {of_graph}, {along}
 FROM (SELECT 1) AS one
 LEFT JOIN unnest(%(det_pks)s::bigint[]) AS near (det_pk) ON true
 {followed}
@@ -84,13 +98,7 @@ LEFT JOIN unnest(%(det_pks)s::bigint[]) AS near (det_pk) ON true
 -- name: near_and_graph
 -- Both in one round trip and one snapshot, when they share a database.
 WITH question (crop, wanted) AS ({questions})
-SELECT {cosines}, (SELECT log_id || ' ' || coalesce(to_jsonb(c) ->> 'observed', fingerprint)
-                   FROM mapfold.checkpoint c WHERE sink = 'vectors'),
-       question.crop, 1 - near.distance, near.det_pk, near.det_id, near.run_id, near.class_name,
-       near.bbox, near.map_x, near.map_y, near.map_yaw, near.embedding_model,
-       {settings}, (SELECT log_id || ' ' || coalesce(to_jsonb(c) ->> 'observed', fingerprint)
-                    FROM mapfold.checkpoint c WHERE sink = 'graph'),
-       near.det_pk, thing.properties, its.id, its.properties, there.id, there.properties
+SELECT {of_vectors}, question.crop, 1 - near.distance, {observed}, {of_graph}, {along}
 FROM question LEFT JOIN LATERAL (
     SELECT det_pk, det_id, run_id, class_name, bbox, map_x, map_y, map_yaw, embedding_model,
            embedding <=> question.wanted AS distance

@@ -38,7 +38,9 @@ def cases() -> Iterator[bytes]:
         yield _question_with(b'"session":' + value)
         yield _question_with(b'"session":"robot","dy":0,"dyaw":0,"dx":' + value)
         yield _question_with(b'"views":' + value)
-        yield b'{"views":[{"crops":[{"class":"cup"}]},{"dx":0,"dy":0,"dyaw":%b,"crops":[]}]}' % value
+        yield (
+            b'{"views":[{"crops":[{"class":"cup"}]},{"dx":0,"dy":0,"dyaw":%b,"crops":[]}]}' % value
+        )
         yield b'{"crops":[{"class":"cup","text":%b}],"camera":%b}' % (value, value)
     yield b"[" * 900_000
     yield b'{"a":' * 150_000
