@@ -4,7 +4,7 @@ Anchors that are one by command are a group. Places with anchors of groups that 
 *conflict*: they are never merged. A refusal is told once for each pair of places.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import TypeAlias
 
 from projections.corrections import Keyframe
@@ -32,6 +32,11 @@ class PlaceAnchors:
         group = self._groups.group_of.get(anchor)
         if group is not None:
             self._group_of[keyframe] = group
+
+    @property
+    def have_come(self) -> bool:
+        """Whether any has."""
+        return bool(self._group_of)
 
     def __contains__(self, keyframe: KeyframeOrdinal) -> bool:
         return keyframe in self._group_of
@@ -76,16 +81,18 @@ class PlaceAnchors:
 
     def dump(self) -> State:
         """Everything, for a snapshot."""
-        places = sorted(self._inside.items())
         return {
-            "groups": [[keyframe, group] for keyframe, group in self._group_of.items()],
-            "inside": [[p, g, k] for p, inside in places for g, k in sorted(inside.items())],
+            "anchors": [[keyframe, group] for keyframe, group in self._group_of.items()],
             "refused": sorted(map(list, self._refused)),
         }
 
-    def load(self, state: State) -> None:
-        """Take over what `dump` gave."""
-        self._group_of = dict(state["groups"])
-        for place, group, keyframe in state["inside"]:
-            self.enter(PlaceOrdinal(place), {group: KeyframeOrdinal(keyframe)})
+    def load(
+        self, state: State, place_of: Callable[[KeyframeOrdinal], PlaceOrdinal | None]
+    ) -> None:
+        """Take over what `dump` gave; ``place_of`` tells the place of a keyframe."""
+        self._group_of = dict(state["anchors"])
+        for keyframe in self._group_of:
+            place = place_of(keyframe)
+            if place is not None:
+                self.enter(place, self.own(keyframe))
         self._refused = {(a, b) for a, b in state["refused"]}

@@ -141,7 +141,7 @@ class Rooms(PlaceMembers):
         """Take over what `dump` gave. Closeness is added up anew."""
         super().load(state)
         self._cells.load(part("cells", state))
-        self._anchors.load(part("anchors", state))
+        self._anchors.load(part("anchors", state), self.place_of)
         self._cell_places = state["cell_places"]
         self._founders = state["cell_founders"]
         self._last_cells = dict(state["last_cells"])
