@@ -5,7 +5,8 @@ the place says how much likelier it is in a room of one type than of another. Of
 class the √n-th power of that counts, since six chairs are hardly more telling than three; an Object
 that was observed once is often a phantom or a wrong label and counts a quarter. What is *not* there
 says nothing, for nobody knows what the robot has not looked at. The sum is tempered by `_TEMPER`,
-because classes are not independent: it makes probabilities as high as types are right.
+and more where there is more than `_MOST_WEIGHT` of it, because classes are not independent: it
+makes probabilities as high as types are right.
 
 Below `UNSURE` the answer is unsure. A name given to the place by a command that has a type's name
 in it ("kitchen", "2nd floor office") decides, whatever is in the place.
@@ -27,7 +28,9 @@ from .place_type_table import NAMES, SYNONYMS, TABLE, TYPES
 UNSURE: Final = 0.5
 ONCE: Final = 0.25
 """What an Object with one observation counts."""
-_TEMPER: Final = 0.5
+_TEMPER: Final = 0.6
+_MOST_WEIGHT: Final = 4.0
+"""What all classes count together at most: what has everything is no room."""
 _MOST_SHOWN: Final = 3
 _LEAST_SHOWN: Final = 0.05
 
@@ -56,13 +59,15 @@ def place_type(counts: Mapping[str, float], name: str | None = None) -> PlaceTyp
             by_class[known] = by_class.get(known, 0.0) + count
     if not by_class:
         return None
-    scores = [0.0] * len(TYPES)
+    scores, total = [0.0] * len(TYPES), 0.0
     for known in sorted(by_class):
         count = by_class[known]
-        weight = _TEMPER * (count if count < 1.0 else math.sqrt(count))
+        weight = count if count < 1.0 else math.sqrt(count)
+        total += weight
         for number, ratio in enumerate(_LOGS[known]):
             scores[number] += weight * ratio
-    return _answer(scores)
+    temper = _TEMPER * min(1.0, _MOST_WEIGHT / total)
+    return _answer([temper * score for score in scores])
 
 
 def _answer(scores: list[float]) -> PlaceType:

@@ -6,6 +6,7 @@ refused, not mixed.
 
 import hashlib
 from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -164,6 +165,12 @@ class Settings(BaseModel):
                 raise SettingsError(_no_setting(name)) from None
             raise SettingsError(f"{name} is {_shown(first['input'])}: {_rule(first)}") from None
         return settings
+
+
+PRESETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {"page": ("places=page", "eps_m=1.5", "min_samples=3"), "rooms": ("places=rooms",)}
+)
+"""Settings by name, as assignments for `Settings.with_assignments`."""
 
 
 def _rule(error: ErrorDetails) -> str:

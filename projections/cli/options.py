@@ -123,8 +123,8 @@ def past_settings(
     """
     if log is None and (file is not None or assignments):
         raise MisuseError(
-            "--set and --settings are for folding a log, and the live map keeps the settings it was"
-            " made with; give --log LOG too, or run mapfold replay with them"
+            "--preset, --set and --settings are for folding a log, and the live map keeps the"
+            " settings it was made with; give --log LOG too, or run mapfold replay with them"
         )
     return settings_from(file, assignments, corrections)
 

@@ -148,8 +148,10 @@ def test_the_answer_is_that_of_bayes_written_out(counts: dict[str, float]) -> No
             known[table_name] = known.get(table_name, 0.0) + count
     if found is None:
         return
+    weights = {name: min(n, math.sqrt(n)) for name, n in known.items()}
+    temper = 0.6 if sum(weights.values()) <= 4.0 else 0.6 * 4.0 / sum(weights.values())
     likelihood = [
-        sum(0.5 * min(n, math.sqrt(n)) * math.log(TABLE[name][column]) for name, n in known.items())
+        sum(temper * weight * math.log(TABLE[name][column]) for name, weight in weights.items())
         for column in range(len(TYPES))
     ]
     most = max(likelihood)
