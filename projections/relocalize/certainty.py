@@ -16,15 +16,13 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-import numpy as np
-
 from .candidates import Match
 from .constants import MapConstants
 from .question import Crop
 
 UNKNOWN_BELOW: Final = 0.5
 """Below this probability of `known` the answer is 'unknown'."""
-KNOWN_WEIGHTS: Final[tuple[float, ...]] = (-16.648, 14.547, -6.977, 2.906, 16.684, -1.482)
+KNOWN_WEIGHTS: Final[tuple[float, ...]] = (-15.095, 19.053, 4.775, 10.356, -1.612)
 """Intercept, then one for each of `known_features`."""
 _NEAREST: Final = 4
 _LEAST: Final = 0.4
@@ -49,9 +47,11 @@ def known_probability(
 def known_features(
     crops: Sequence[Crop], matches: Sequence[Sequence[Match]], constants: MapConstants
 ) -> tuple[float, ...] | None:
-    """Of the crops' relative likenesses to the most similar observation, and to the four most
-    similar in the mean: the greatest of each; the mean of both over the crops, and the second
-    greatest mean of four, all three at least 0.4. None if no crop has an embedding and matches."""
+    """The greatest relative likeness of any crop to an observation, and the mean over the crops of
+    each one's greatest. Then of each crop's mean likeness to the four most similar: by how much the
+    mean over the crops is below the greatest, and the second greatest; both are 0 for one crop. In
+    all but the first a likeness counts as at least 0.4. None if no crop has an embedding and
+    matches."""
     zero, localizer = constants.different, constants.localizer
     best, mean = [], []
     for crop, row in zip(crops, matches, strict=True):
@@ -63,13 +63,12 @@ def known_features(
         mean.append(min(math.fsum(likeness) / len(likeness), 1.0))
     if not best:
         return None
-    alike = np.maximum(mean, _LEAST)
+    alike = sorted((max(each, _LEAST) for each in mean), reverse=True)
     return (
         max(best),
-        max(mean),
-        math.fsum(alike) / len(alike),
-        math.fsum(np.maximum(best, _LEAST)) / len(best),
-        float(np.sort(alike)[-2:][0]),
+        math.fsum(max(each, _LEAST) for each in best) / len(best),
+        math.fsum(alike) / len(alike) - alike[0],
+        alike[min(1, len(alike) - 1)] - alike[0],
     )
 
 

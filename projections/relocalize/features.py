@@ -20,7 +20,7 @@ from .model import Model
 
 _ELSEWHERE_M: Final = 2.5
 _MOST_MARGIN: Final = 0.5
-WEIGHTS: Final = (-3.454, 11.484, 1.241, -2.767, -3.119, -0.271, 0.436)
+WEIGHTS: Final = (-10.01, 18.17, 1.607, -0.882, -2.168, -0.407, 0.406)
 """Intercept, then one for each of `Features`."""
 
 
