@@ -32,12 +32,13 @@ class Line(NamedTuple):
     shift: float
 
 
-KNOWN_USUAL = Line(0.77, 0.25)
-CONFIDENCE_USUAL = Line(1.0, 0.0)
+KNOWN_USUAL = Line(0.81, 0.62)
+CONFIDENCE_USUAL = Line(0.93, -0.24)
 """Of the own questions of the maps that the weights were fitted on (`scripts/fit_confidence`)."""
-_PRIOR = 2.0
+KNOWN_FIRMNESS, CONFIDENCE_FIRMNESS = 12.0, 128.0
 """How firmly a map's line is drawn towards the usual one: the precision of its shift, of its scale
-four times as much. Some ten questions whose logit is near 0 tell as much."""
+four times as much. A question whose logit is near 0 has a precision of a quarter. How near poses
+are on own questions hangs on the tour as much as on the map, so that line hardly moves."""
 _FIRM = 1e-9
 _ROUNDS = 60
 _BOUNDS = (Line(0.25, -4.0), Line(4.0, 4.0))
@@ -75,8 +76,10 @@ def correction(answers: Sequence[OwnAnswer]) -> LocalizerConstants:
     """The constants with which the map's probabilities are right; the defaults without answers."""
     said, is_known = [logit(a.answer.known) for a in answers], [a.known for a in answers]
     sure, is_right = [logit(a.answer.confidence) for a in answers], [a.correct for a in answers]
-    known = _beyond(fit_line(said, is_known, KNOWN_USUAL), KNOWN_USUAL)
-    confidence = _beyond(fit_line(sure, is_right, CONFIDENCE_USUAL), CONFIDENCE_USUAL)
+    known = _beyond(fit_line(said, is_known, KNOWN_USUAL, KNOWN_FIRMNESS), KNOWN_USUAL)
+    confidence = _beyond(
+        fit_line(sure, is_right, CONFIDENCE_USUAL, CONFIDENCE_FIRMNESS), CONFIDENCE_USUAL
+    )
     return LocalizerConstants(
         known_scale=known.scale,
         known_shift=known.shift,
@@ -87,13 +90,13 @@ def correction(answers: Sequence[OwnAnswer]) -> LocalizerConstants:
     )
 
 
-def fit_line(logits: Sequence[float], right: Sequence[bool], usual: Line) -> Line:
+def fit_line(logits: Sequence[float], right: Sequence[bool], usual: Line, firmness: float) -> Line:
     """The line that fits best, drawn towards the usual one."""
     z = np.array(logits, dtype=np.float64)
     y = np.array(right, dtype=np.float64)
     x = np.stack([np.ones(len(z)), z], axis=1)
     start = np.array([usual.shift, usual.scale])
-    weight = np.diag([_PRIOR, 4.0 * _PRIOR])
+    weight = np.diag([firmness, 4.0 * firmness])
     line = start.copy()
     for _ in range(_ROUNDS):
         p = 1.0 / (1.0 + np.exp(-np.clip(x @ line, -30.0, 30.0)))

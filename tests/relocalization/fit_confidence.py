@@ -203,8 +203,8 @@ def main() -> None:
     print(f"KNOWN_WEIGHTS = {weights.known}", file=sys.stdout)
     print(f"WEIGHTS = {weights.confidence}")
     flat = Line(1.0, 0.0)
-    known = fit_line([each[0] for each in own], [each[1] for each in own], flat)
-    sure = fit_line([each[2] for each in own], [each[3] for each in own], flat)
+    known = fit_line([each[0] for each in own], [each[1] for each in own], flat, 1.0)
+    sure = fit_line([each[2] for each in own], [each[3] for each in own], flat, 1.0)
     print(f"KNOWN_USUAL = Line({known.scale:.2f}, {known.shift:.2f})")
     print(f"CONFIDENCE_USUAL = Line({sure.scale:.2f}, {sure.shift:.2f})")
 

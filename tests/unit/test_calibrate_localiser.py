@@ -44,7 +44,7 @@ def _spread_logits(count: int) -> list[float]:
 
 def test_without_questions_nothing_is_corrected() -> None:
     assert correction([]) == LocalizerConstants()
-    assert fit_line([], [], Line(0.7, 0.2)) == pytest.approx(Line(0.7, 0.2))
+    assert fit_line([], [], Line(0.7, 0.2), 1.0) == pytest.approx(Line(0.7, 0.2))
 
 
 def test_a_map_like_those_of_the_weights_is_hardly_corrected() -> None:
@@ -67,16 +67,18 @@ def test_the_correction_makes_the_probabilities_those_of_the_other_maps(off: Lin
 def test_few_questions_leave_it_near_what_is_usual() -> None:
     """All are known, whatever is said: the more of them, the further the shift goes."""
     shifts = [
-        correction([_answer(True, 0.5, 0.5)] * count).known_shift for count in (0, 1, 4, 16, 64)
+        correction([_answer(True, 0.5, 0.5)] * count).known_shift for count in (0, 1, 8, 64, 512)
     ]
     assert shifts[0] == 0.0
     assert shifts == sorted(set(shifts))
     assert shifts[1] < 0.3
     assert shifts[4] > 1.5
+    sure = correction([_answer(True, 0.5, 0.5)] * 64).confidence_shift
+    assert 0.0 < sure < 0.5 * shifts[3]
 
 
 def test_nonsense_is_bounded() -> None:
-    wrong = [_answer(z < 0, probability(z), 0.5, None) for z in _spread_logits(4000)]
+    wrong = [_answer(z < 0, probability(z), 0.5, None) for z in _spread_logits(40_000)]
     constants = correction(wrong)
     assert constants.known_scale == 0.25
     assert -4.0 <= constants.known_shift <= 4.0
@@ -92,9 +94,9 @@ def test_the_line_is_the_most_probable_one(pairs: list[tuple[float, bool]]) -> N
         likelihood = sum(
             math.log1p(math.exp(-(scale * z + shift) * (1 if y else -1))) for z, y in pairs
         )
-        return likelihood + (shift - usual.shift) ** 2 + 4.0 * (scale - usual.scale) ** 2
+        return likelihood + 1.5 * (shift - usual.shift) ** 2 + 6.0 * (scale - usual.scale) ** 2
 
-    found = fit_line([z for z, _ in pairs], [y for _, y in pairs], usual)
+    found = fit_line([z for z, _ in pairs], [y for _, y in pairs], usual, 3.0)
     best = cost(*found)
     for angle in range(8):
         off = 0.05 * math.cos(angle * math.pi / 4), 0.05 * math.sin(angle * math.pi / 4)
