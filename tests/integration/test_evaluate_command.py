@@ -166,5 +166,6 @@ def test_the_trial_house_is_found_again(mapfold: Commands) -> None:
     assert scores["1"]["pose_error_m"]["p50"] <= 1.0
     assert scores["3"]["auroc"] >= 0.95
     assert scores["3"]["known_called_unknown"] <= 0.05
-    # The confidence of all maps is too low on this easy one, most with one crop.
-    assert [scores[n]["ece"] for n in "123"] == pytest.approx([0.0] * 3, abs=0.2)
+    # Uncalibrated, the confidence is too low on this easy map, most with one crop.
+    assert [scores[n]["ece"] for n in "123"] == pytest.approx([0.0] * 3, abs=0.25)
+    assert [scores[n]["known_ece"] for n in "123"] == pytest.approx([0.0] * 3, abs=0.12)
