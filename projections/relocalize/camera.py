@@ -116,11 +116,13 @@ class Sights:
 
 
 def sights(camera: Camera, boxes: Sequence[tuple[float, float, float, float] | None]) -> Sights:
-    """Read boxes as `views` does."""
+    """Read boxes as `views` does; what is farther outside the picture than the picture is large is
+    left out."""
     rows = np.array(
         [(0.0, 0.0, 0.0, 0.0) if box is None else box for box in boxes], dtype=np.float64
     ).reshape(-1, 4)
-    x0, y0, x1, y1 = np.minimum(np.maximum(rows, -_FARTHEST_PX), _FARTHEST_PX).T
+    most = np.array((camera.width_px, camera.height_px) * 2)
+    x0, y0, x1, y1 = np.minimum(np.maximum(rows, -most), 2.0 * most).T
     known = (x1 > x0) & (y1 > y0)
     tangent = (camera.width_px / 2.0 - (x0 + x1) / 2.0) / camera.focal_px
     per_px = 1.0 / (camera.focal_px * np.sqrt(1.0 + tangent * tangent))

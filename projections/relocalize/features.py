@@ -29,8 +29,8 @@ class Features:
     """``likeness`` is the greatest relative likeness of any crop's match, ``margin`` what it is
     above that of a landmark more than 2.5 m away, the greatest of any crop and at most 0.5.
 
-    ``mass`` is the weight within 1.5 m of the answer, ``loss`` the expected error in metres, 3 m at
-    most. ``best_crop`` and ``mean_crop`` are log-likelihood ratios of the crops at the likeliest
+    ``mass`` is the weight within 1.5 m of the answer, ``loss`` the expected error in metres, 2.5 m
+    at most. ``best_crop`` and ``mean_crop`` are log-likelihood ratios of the crops at the likeliest
     pose; a crop without evidence counts as explained by nothing.
     """
 

@@ -7,7 +7,8 @@ For a robot at a pose the crop's likelihood, as a ratio against a thing that the
 
 looks       ratio by appearance, from the direction in which the robot looks (`appearance`)
 seen_from   exp(−d² / 2 σ²), d the distance from the nearest position that saw the landmark
-box         ratio by the bearing of the box's middle, and by its height and edges (`landmarks`)
+box         ratio by the bearing of the box's middle, and by its height and edges (`landmarks`);
+            without a box, by the usual distance and whether the landmark is in the field of view
 in_front    1 if the landmark is in the field of view and within twice the usual distance
 
 The last term is a heavy tail: what looks like a landmark and is near where that was seen counts
@@ -89,8 +90,11 @@ def terms_at(crop: CropEvidence, xy: Floats, error_m2: float, scene: Scene) -> T
     across = (xx * uy * uy - 2.0 * xy_ * ux * uy + yy * ux * ux + pose_m2) / square
     bearing = evidence.bearing_cut_rad if crop.sight.cut[0] else evidence.bearing_rad
     seen = -0.5 * _nearest(marks.seen_from, marks.starts, xy) / (model.seen_from_m**2 + error_m2)
-    box = np.zeros_like(reach)
-    if crop.bearing is not None:
+    if crop.bearing is None:
+        off = (np.log(reach) - math.log(evidence.range_m)) / evidence.range_spread
+        box = np.maximum(-0.5 * off * off, -_MOST_BY_SIZE)
+    else:
+        box = np.zeros_like(reach)
         offset = (ux, uy, reach, pose_m2, (xx, xy_, yy))
         box += _by_size(crop, offset, model)
         for edge in (UPPER, LOWER):
@@ -202,6 +206,13 @@ def log_likelihood_of_place(crop: CropEvidence, terms: Terms, scene: Scene) -> F
         wide = terms.variance + _ROUGH_BEARING
         rough = 2.0 * scene.camera.half_field_rad / np.sqrt(_TURN * wide)
     return _mixture(terms, rough * terms.box + scene.model.tail * terms.near, scene)
+
+
+def log_likelihood_unaimed(terms: Terms, scene: Scene) -> Floats:
+    """About the logarithm of the mixture at headings that no landmark's bearing fits."""
+    in_view = scene.camera.half_field_rad / math.pi
+    tail: Floats = scene.model.tail * in_view * terms.near.astype(np.float64)
+    return _mixture(terms, tail, scene)
 
 
 def _mixture(terms: Terms, fit: Floats, scene: Scene) -> Floats:

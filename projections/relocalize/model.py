@@ -14,7 +14,7 @@ class Model:
     """Lengths in metres, angles in radians; likeness is relative (`projections.evidence`)."""
 
     # How a crop is explained: see `likelihood`.
-    in_map: float = 0.7
+    in_map: float = 0.85
     """Probability beforehand that a crop's thing is in the map."""
     share: float = 0.5
     """Of a landmark that fits as well as a thing anywhere would."""
@@ -29,9 +29,9 @@ class Model:
     # Where robots are: see `pose`.
     driven_m: float = 0.6
     driven_far_m: float = 1.5
-    driven_share: float = 0.5
+    driven_share: float = 0.4
     """Distances from poses that saw a landmark: a mixture of two normal distributions."""
-    reach_m: float = 1.2
+    reach_m: float = 1.6
     """No pose farther than this from all of those is considered."""
 
     # Looks: see `appearance`.
@@ -51,7 +51,7 @@ class Model:
     """Part of their variance that is not common to all likenesses of a landmark with a crop."""
     independent: float = 6.0
     """Likenesses of a landmark are related: no more than this many count."""
-    side_weight: float = 0.7
+    side_weight: float = 0.85
     """How much of the log-likelihood by the side of view counts."""
     same_picture: float = 0.98
     """A likeness above this is to the very crop asked with; the robot then looks from there, as
@@ -68,7 +68,7 @@ class Model:
     """Of the logarithm of a landmark's height in a box, beside what is common to all boxes."""
     other_sizes: float = 0.7
     """… of any other thing."""
-    edge_m: float = 0.1
+    edge_m: float = 0.08
     edge_part: float = 0.1
     """Standard error of an edge's elevation, and what a part of the elevation adds."""
     edge_rise: float = 0.02

@@ -1,16 +1,16 @@
 """Poses: weigh where the robot may be, at the last view of a question, and choose.
 
 The posterior is a grid of cells of 0.35 m near positions from which a landmark was seen, times
-headings. Of all cells within 1.2 m those are kept that fit best whatever the heading, by cells of
+headings. Of all cells within 1.6 m those are kept that fit best whatever the heading, by cells of
 0.7 m first. In each, the headings are those that put one of the likeliest landmarks of a crop where
 the crop shows it: nodes of an integral over all headings, each weighing its likelihood divided by
-how densely they lie. A pose's likelihood is the product over crops of their mixtures
-(`likelihood`); the prior is that robots drive where robots have driven.
+how densely they lie. What holds for every heading is taken off at the nodes, and added once. A
+pose's likelihood is the product over crops of their mixtures (`likelihood`); the prior is that
+robots drive where robots have driven (`grid`).
 
-Several views: the robot's movement between them is known but for a small error that grows with it,
-so each pose at the last view gives a pose at every view before.
+Several views: each pose at the last view gives a pose at every view before (`movements`).
 
-The answer is the cell with the least expected error, errors above 3 m counting as 3 m (like a
+The answer is the cell with the least expected error, errors above 2.5 m counting as 2.5 m (like a
 median; a mean could lie between two look-alike spots), moved to the mean of the weights near it,
 which is then computed anew on a grid of 0.12 m.
 """
@@ -27,6 +27,7 @@ from .appearance import usual_likeness
 from .camera import Floats
 from .candidates import Match
 from .features import Features, confidence_of, features_of
+from .grid import cells_near, distinct, log_prior
 from .landmarks import CropEvidence, crop_evidence, likeness_of
 from .likelihood import (
     Scene,
@@ -34,8 +35,10 @@ from .likelihood import (
     headings,
     log_likelihood,
     log_likelihood_of_place,
+    log_likelihood_unaimed,
     terms_at,
 )
+from .movements import Behind, Movement, behind_last, poses_at_views
 from .question import View
 from .sessions import session_shifts
 
@@ -43,24 +46,19 @@ Indices = NDArray[np.intp]
 _TermsOfViews = Sequence[Sequence[Terms]]
 
 CELL_M: Final = 0.35
-_COARSE_KEPT: Final = 60
-_KEPT: Final = 150
+_COARSE_KEPT, _COARSE_IN_ALL = 40, 96
+_KEPT, _IN_ALL = 100, 240
+"""So many cells are kept, and with few crops, which leave more open, so many for all together."""
 _HEADINGS: Final = 8
 _TURN: Final = 2.0 * math.pi
-_HEADING_FLOOR: Final = 0.05 / _TURN
 _FINE_M: Final = 0.12
 _FINE: Final = np.arange(-3, 4) * _FINE_M
 _FINE_YAW: Final = np.array([-0.16, -0.08, 0.0, 0.08, 0.16])
-_MAX_ERROR_M: Final = 3.0
+_MAX_ERROR_M: Final = 2.5
 _NEAR_M: Final = 1.0
 _MIN_YAW_AGREEMENT: Final = 0.8
-_LEAST_PRIOR: Final = 1e-9
 _SAME_SPOT_M: Final = 0.05
 _LEAST_WEIGHT: Final = 1e-12
-
-STEP_M, STEP_PART = 0.02, 0.05
-TURN_RAD, TURN_PART = 0.01, 0.05
-"""Standard error of a movement between two views: of its length, and of its turn."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,19 +84,7 @@ class _Sighted:
     """The crops of a view that have evidence, and the movement since the view before."""
 
     crops: tuple[CropEvidence, ...]
-    dx: float
-    dy: float
-    dyaw: float
-
-
-@dataclass(frozen=True, slots=True)
-class _Behind:
-    """How sure the pose at a view is, given that at the last one, and how far it lies from it."""
-
-    m2: float
-    yaw2: float
-    away_m: float
-    turn: float
+    movement: Movement
 
 
 def locate(
@@ -110,16 +96,16 @@ def locate(
     crops = [crop for view in sighted for crop in view.crops]
     if not crops:
         return None
-    behind = _behind(sighted)
-    been = _distinct(np.concatenate([crop.landmarks.seen_from for crop in crops]), CELL_M / 2)
-    coarse = _cells_near(been, 2.0 * CELL_M, scene.model.reach_m)
+    behind = behind_last([view.movement for view in sighted])
+    been = distinct(np.concatenate([crop.landmarks.seen_from for crop in crops]), CELL_M / 2)
+    coarse = cells_near(been, 2.0 * CELL_M, scene.model.reach_m)
     score, _ = _score_places(coarse, sighted, behind, been, 2.0 * CELL_M, scene)
-    kept = _best(score, _COARSE_KEPT)
+    kept = _best(score, max(_COARSE_KEPT, _COARSE_IN_ALL // len(crops)))
     quarter = CELL_M / 2
     corners = np.array([(x, y) for x in (-quarter, quarter) for y in (-quarter, quarter)])
     cells = (coarse[kept][:, None] + corners[None]).reshape(-1, 2)
     score, terms = _score_places(cells, sighted, behind, been, CELL_M, scene)
-    kept = _best(score, _KEPT)
+    kept = _best(score, max(_KEPT, _IN_ALL // len(crops)))
     terms = [[each.take(kept) for each in of_view] for of_view in terms]
     return _weigh(cells[kept], terms, sighted, behind, been, len(matches), scene)
 
@@ -151,87 +137,21 @@ def _sighted(
             for crop in view.crops
         ]
         present = tuple(crop for crop in of_view if crop is not None)
-        found.append(_Sighted(present, view.dx, view.dy, view.dyaw))
-    return found
-
-
-def _behind(sighted: Sequence[_Sighted]) -> list[_Behind]:
-    """Of each view, what lies between it and the last one."""
-    m2 = yaw2 = turn = 0.0
-    x = y = 0.0
-    found = [_Behind(0.0, 0.0, 0.0, 0.0)]
-    for view in reversed(sighted[1:]):
-        length = math.hypot(view.dx, view.dy)
-        yaw2 += TURN_RAD**2 + (TURN_PART * view.dyaw) ** 2
-        m2 += STEP_M**2 + (STEP_PART * length) ** 2 + yaw2 * length * length
-        turn += view.dyaw
-        cos, sin = math.cos(-turn), math.sin(-turn)
-        x, y = x - (cos * view.dx - sin * view.dy), y - (sin * view.dx + cos * view.dy)
-        found.append(_Behind(m2, yaw2, math.hypot(x, y), turn))
-    return found[::-1]
-
-
-def poses_at_views(poses: Floats, movements: Sequence[tuple[float, float, float]]) -> list[Floats]:
-    """Poses (h, 3) at every view from those at the last one; ``movements`` as in `View`."""
-    found = [poses]
-    for dx, dy, dyaw in reversed(movements[1:]):
-        x, y, yaw = found[-1].T
-        yaw = yaw - dyaw
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        found.append(np.column_stack((x - (cos * dx - sin * dy), y - (sin * dx + cos * dy), yaw)))
-    return found[::-1]
-
-
-def _distinct(points: Floats, grid_m: float) -> Floats:
-    """The points, those in one square of a grid once."""
-    return _unique(np.rint(points / grid_m)) * grid_m
-
-
-def _unique(cells: Floats) -> Floats:
-    """Each pair of whole numbers once, in order."""
-    pairs = np.unique(np.ascontiguousarray(cells).view(np.complex128))
-    return np.column_stack((pairs.real, pairs.imag))
-
-
-def _cells_near(points: Floats, cell_m: float, reach_m: float) -> Floats:
-    """Middles of the cells of a grid within reach of a point."""
-    most = math.ceil(reach_m / cell_m)
-    steps = np.array(
-        [
-            (x, y)
-            for x in range(-most, most + 1)
-            for y in range(-most, most + 1)
-            if math.hypot(x, y) * cell_m <= reach_m + cell_m / 2
-        ],
-        dtype=np.float64,
-    )
-    cells = np.rint(points / cell_m)
-    return _unique((cells[:, None] + steps[None]).reshape(-1, 2)) * cell_m
-
-
-def _log_prior(xy: Floats, been: Floats, scene: Scene) -> Floats:
-    """How likely a robot is there: by the distance from where robots have been."""
-    model = scene.model
-    dx = xy[:, 0, None] - been[None, :, 0]
-    dy = xy[:, 1, None] - been[None, :, 1]
-    squared = -0.5 * (dx * dx + dy * dy).min(1)
-    near = model.driven_share * np.exp(squared / model.driven_m**2)
-    far = (1.0 - model.driven_share) * np.exp(squared / model.driven_far_m**2)
-    found: Floats = np.log(near + far + _LEAST_PRIOR)
+        found.append(_Sighted(present, (view.dx, view.dy, view.dyaw)))
     return found
 
 
 def _score_places(
     xy: Floats,
     sighted: Sequence[_Sighted],
-    behind: Sequence[_Behind],
+    behind: Sequence[Behind],
     been: Floats,
     cell_m: float,
     scene: Scene,
 ) -> tuple[Floats, _TermsOfViews]:
     """The log-likelihood of cells whatever the heading, and the terms there. A view from elsewhere
     counts as one from here with a larger error."""
-    total = _log_prior(xy, been, scene)
+    total = log_prior(xy, been, scene.model)
     found = []
     for view, back in zip(sighted, behind, strict=True):
         error = cell_m * cell_m / 12.0 + back.m2 + 0.5 * back.away_m**2
@@ -250,30 +170,37 @@ def _weigh(
     cells: Floats,
     terms: _TermsOfViews,
     sighted: Sequence[_Sighted],
-    behind: Sequence[_Behind],
+    behind: Sequence[Behind],
     been: Floats,
     asked: int,
     scene: Scene,
 ) -> Posterior:
-    prior = _log_prior(cells, been, scene)
+    prior = log_prior(cells, been, scene.model)
     error = CELL_M * CELL_M / 12.0
     which, yaw, density = _hypotheses(sighted, behind, terms, scene)
     poses = np.column_stack((cells[which], yaw))
     each = np.stack(list(_crop_likelihoods(poses, which, sighted, behind, terms, error, scene)))
-    score = each.sum(0) + prior[which] - density
-    weights = np.exp(score - score.max())
-    weights /= weights.sum()
-    return _choose(cells, poses, which, weights, each, sighted, behind, been, asked, scene)
+    anywhere = prior.copy()
+    for of_view in terms:
+        for there in of_view:
+            anywhere += log_likelihood_unaimed(there, scene)
+    score = each.sum(0) + prior[which]
+    most = max(float(score.max()), float(anywhere.max()))
+    rest = np.exp(anywhere - most)
+    weights = np.maximum(np.exp(score - most) - rest[which], 0.0) / density
+    of_cell = weights.reshape(-1, len(cells)).sum(0) + _TURN * (len(which) // len(cells)) * rest
+    weights, of_cell = weights / of_cell.sum(), of_cell / of_cell.sum()
+    return _choose(cells, of_cell, poses, which, weights, each, sighted, behind, been, asked, scene)
 
 
 def _hypotheses(
     sighted: Sequence[_Sighted],
-    behind: Sequence[_Behind],
+    behind: Sequence[Behind],
     terms: _TermsOfViews,
     scene: Scene,
 ) -> tuple[Indices, Floats, Floats]:
-    """Headings at the cells: the cell's index, the heading at the last view, and the logarithm of
-    how densely the headings of that cell lie there."""
+    """Headings at the cells: the cell's index, the heading at the last view, and how densely the
+    headings of that cell lie there."""
     found = []
     for view, back, of_view in zip(sighted, behind, terms, strict=True):
         for crop, each in zip(view.crops, of_view, strict=True):
@@ -286,24 +213,23 @@ def _hypotheses(
     off = yaw[:, None] - yaw[None]
     off -= _TURN * np.rint(off / _TURN)
     bells = np.exp(-0.5 * np.minimum(off * off / variance[None], 40.0))
-    density = (bells / np.sqrt(_TURN * variance)[None]).mean(1) + _HEADING_FLOOR
+    density = (bells / np.sqrt(_TURN * variance)[None]).mean(1)
     which = np.tile(np.arange(yaw.shape[1]), len(yaw))
-    return which, yaw.ravel(), np.log(density).ravel()
+    return which, yaw.ravel(), density.ravel()
 
 
 def _crop_likelihoods(
     poses: Floats,
     which: Indices,
     sighted: Sequence[_Sighted],
-    behind: Sequence[_Behind],
+    behind: Sequence[Behind],
     terms: _TermsOfViews,
     error: float,
     scene: Scene,
 ) -> Iterator[Floats]:
     """The log-likelihood of each crop at poses of the last view. ``terms`` at the positions that
     ``which`` names serve the views from the same spot."""
-    movements = [(view.dx, view.dy, view.dyaw) for view in sighted]
-    at_views = poses_at_views(poses, movements)
+    at_views = poses_at_views(poses, [view.movement for view in sighted])
     for number, (view, back, here) in enumerate(zip(sighted, behind, at_views, strict=True)):
         for index, crop in enumerate(view.crops):
             if back.away_m < _SAME_SPOT_M:
@@ -315,17 +241,17 @@ def _crop_likelihoods(
 
 def _choose(
     cells: Floats,
+    of_cell: Floats,
     poses: Floats,
     which: Indices,
     weights: Floats,
     each: Floats,
     sighted: Sequence[_Sighted],
-    behind: Sequence[_Behind],
+    behind: Sequence[Behind],
     been: Floats,
     asked: int,
     scene: Scene,
 ) -> Posterior:
-    of_cell: Floats = weights.reshape(-1, len(cells)).sum(0)
     apart = np.sqrt(
         (cells[:, 0, None] - cells[None, :, 0]) ** 2 + (cells[:, 1, None] - cells[None, :, 1]) ** 2
     )
@@ -366,7 +292,7 @@ def _refine(
     y: float,
     yaw: float,
     sighted: Sequence[_Sighted],
-    behind: Sequence[_Behind],
+    behind: Sequence[Behind],
     been: Floats,
     scene: Scene,
 ) -> tuple[float, float]:
@@ -381,7 +307,7 @@ def _refine(
         else []
         for view, back in zip(sighted, behind, strict=True)
     ]
-    score = _log_prior(at, been, scene)[which]
+    score = log_prior(at, been, scene.model)[which]
     for one in _crop_likelihoods(poses, which, sighted, behind, terms, error, scene):
         score = score + one
     weights = np.exp(score - score.max())
