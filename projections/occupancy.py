@@ -51,11 +51,9 @@ class OccupancyGrid:
         self._x0, self._y0 = (metres_to_um(metres) for metres in source.origin[:2])
         cos, sin = cos_sin(source.origin[2])
         self._cos, self._sin = (round(math.ldexp(part, _TURN_BITS)) for part in (cos, sin))
-        occupied = (source.cells >= MIN_WALL) & (source.cells <= OCCUPIED)
-        self.block = _block_side(source)
-        blocks = _blocks(occupied, self.block)
+        occupied = _occupied(source)
+        self.block, kept = wall_blocks(source)
         block_m = self.block * source.resolution
-        kept = _without_small(blocks, max(1, math.ceil(LEAST_WALL_M / block_m)))
         self.walls = occupied & _cells(kept, self.block, occupied.shape)
         self._rows = [row.tobytes() for row in self.walls.astype(np.uint8)]
         inside = regions(kept, block_m)
@@ -146,6 +144,19 @@ class OccupancyGrid:
             if first <= last:
                 found.append((row, first, last))
         return found
+
+
+def wall_blocks(source: OccupancyMap) -> tuple[int, Walls]:
+    """How many cells the side of a block has, and which blocks of a map have a wall in them."""
+    side = _block_side(source)
+    blocks = _blocks(_occupied(source), side)
+    least = max(1, math.ceil(LEAST_WALL_M / (side * source.resolution)))
+    return side, _without_small(blocks, least)
+
+
+def _occupied(source: OccupancyMap) -> Walls:
+    occupied: Walls = (source.cells >= MIN_WALL) & (source.cells <= OCCUPIED)
+    return occupied
 
 
 def _block_side(source: OccupancyMap) -> int:

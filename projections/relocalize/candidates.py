@@ -33,6 +33,7 @@ from projections.settings import Settings
 
 from .constants import FOLLOWERS, Cosines, MapConstants, Sample
 from .question import Box, Crop, Vector, describe_value
+from .walls import WallMap
 
 NEIGHBOURS = 64
 """Observations fetched per crop. From 48 on, the measures in docs/relocalization.md stay the same;
@@ -101,12 +102,13 @@ class Candidates:
     """``matches[i]`` are those of crop i, most similar first, ties by ordinal.
 
     Those of a crop without an embedding are observations of Objects of its class, with the
-    similarity 1.
+    similarity 1. ``walls`` are those of the occupancy map in force, None without one.
     """
 
     matches: tuple[tuple[Match, ...], ...]
     places: Mapping[PlaceOrdinal, CandidatePlace]
     constants: MapConstants = field(default_factory=MapConstants)
+    walls: WallMap | None = None
 
 
 class ExactIndex:
@@ -132,6 +134,7 @@ class ExactIndex:
             (o.embedding_model for o in view.observations if o.embedding is not None), None
         )
         self.constants = MapConstants.of(view.settings, self._different())
+        self._walls = None if view.map is None else WallMap(view.map.map)
 
     @classmethod
     def of_log(
@@ -192,7 +195,7 @@ class ExactIndex:
             for crop in crops
         )
         refuse_unknown_classes(crops, matches, self._class_names)
-        return Candidates(matches, self.places, self.constants)
+        return Candidates(matches, self.places, self.constants, self._walls)
 
     def _nearest(
         self, vector: Vector, neighbours: int, dropped: NDArray[np.bool_] | None

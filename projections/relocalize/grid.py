@@ -7,6 +7,7 @@ import numpy as np
 
 from .camera import Floats
 from .model import Model
+from .walls import WallMap
 
 _LEAST_PRIOR: Final = 1e-9
 
@@ -38,12 +39,15 @@ def cells_near(points: Floats, cell_m: float, reach_m: float) -> Floats:
     return _unique((cells[:, None] + steps[None]).reshape(-1, 2)) * cell_m
 
 
-def log_prior(xy: Floats, been: Floats, model: Model) -> Floats:
-    """How likely a robot is there: by the distance from where robots have been."""
+def log_prior(xy: Floats, been: Floats, model: Model, walls: WallMap | None = None) -> Floats:
+    """How likely a robot is there: by the distance from where robots have been; inside a wall less
+    so."""
     dx = xy[:, 0, None] - been[None, :, 0]
     dy = xy[:, 1, None] - been[None, :, 1]
     squared = -0.5 * (dx * dx + dy * dy).min(1)
     near = model.driven_share * np.exp(squared / model.driven_m**2)
     far = (1.0 - model.driven_share) * np.exp(squared / model.driven_far_m**2)
     found: Floats = np.log(near + far + _LEAST_PRIOR)
+    if walls is not None:
+        found[walls.contains(xy)] += math.log(model.in_walls)
     return found

@@ -6,7 +6,8 @@ For a robot at a pose the crop's likelihood, as a ratio against a thing that the
                        landmarks
 
 looks       ratio by appearance, from the direction in which the robot looks (`appearance`)
-seen_from   exp(−d² / 2 σ²), d the distance from the nearest position that saw the landmark
+seen_from   exp(−d² / 2 σ²), d the distance from the nearest position that saw the landmark; less
+            where a wall of the occupancy map is between
 box         ratio by the bearing of the box's middle, and by its height and edges (`landmarks`);
             without a box, by the usual distance and whether the landmark is in the field of view
 in_front    1 if the landmark is in the field of view and within twice the usual distance
@@ -31,6 +32,7 @@ from .camera import LOWER, UPPER, Camera, Floats
 from .constants import MapConstants
 from .landmarks import CropEvidence, Cue
 from .model import Model
+from .walls import WallMap
 
 Indices = NDArray[np.intp]
 
@@ -39,6 +41,8 @@ _NEAREST_M2: Final = 0.09
 _MOST_BY_SIZE: Final = 6.0
 _MOST_BY_EDGE: Final = 4.0
 _MOST_CHI2: Final = 40.0
+_LEAST_LOOKS: Final = 0.02
+"""Part of the largest from which it is worth to look whether a wall is between."""
 _ROUGH_BEARING: Final = 0.05
 """Variance added to bearings where no heading is considered."""
 
@@ -73,6 +77,7 @@ class Scene:
     constants: MapConstants
     camera: Camera
     model: Model
+    walls: WallMap | None = None
 
 
 def terms_at(crop: CropEvidence, xy: Floats, error_m2: float, scene: Scene) -> Terms:
@@ -100,8 +105,12 @@ def terms_at(crop: CropEvidence, xy: Floats, error_m2: float, scene: Scene) -> T
         for edge in (UPPER, LOWER):
             if crop.sight.whole[edge, 0]:
                 box += _by_edge(marks.edges[edge], float(crop.sight.rise[edge, 0]), offset, model)
+    looks = _ratio_towards(crop, towards, scene) * np.exp(seen)
+    if scene.walls is not None:
+        counts = looks > _LEAST_LOOKS * looks.max(initial=0.0)
+        looks[scene.walls.hides(marks.xy, xy, counts)] *= model.through_walls
     return Terms(
-        _ratio_towards(crop, towards, scene) * np.exp(seen),
+        looks,
         np.exp(box),
         towards,
         across + bearing * bearing,

@@ -26,6 +26,11 @@ class Model:
     """Standard deviation of the distance to the nearest pose that saw the landmark: walls are not
     in the map."""
 
+    through_walls: float = 0.3
+    """What is left of a landmark with a wall between: where it stands is an estimate."""
+    in_walls: float = 0.1
+    """… and of a pose inside a wall: poses are a little off."""
+
     # Where robots are: see `pose`.
     driven_m: float = 0.6
     driven_far_m: float = 1.5

@@ -151,7 +151,7 @@ def _score_places(
 ) -> tuple[Floats, _TermsOfViews]:
     """The log-likelihood of cells whatever the heading, and the terms there. A view from elsewhere
     counts as one from here with a larger error."""
-    total = log_prior(xy, been, scene.model)
+    total = log_prior(xy, been, scene.model, scene.walls)
     found = []
     for view, back in zip(sighted, behind, strict=True):
         error = cell_m * cell_m / 12.0 + back.m2 + 0.5 * back.away_m**2
@@ -175,7 +175,7 @@ def _weigh(
     asked: int,
     scene: Scene,
 ) -> Posterior:
-    prior = log_prior(cells, been, scene.model)
+    prior = log_prior(cells, been, scene.model, scene.walls)
     error = CELL_M * CELL_M / 12.0
     which, yaw, density = _hypotheses(sighted, behind, terms, scene)
     poses = np.column_stack((cells[which], yaw))
@@ -307,7 +307,7 @@ def _refine(
         else []
         for view, back in zip(sighted, behind, strict=True)
     ]
-    score = log_prior(at, been, scene.model)[which]
+    score = log_prior(at, been, scene.model, scene.walls)[which]
     for one in _crop_likelihoods(poses, which, sighted, behind, terms, error, scene):
         score = score + one
     weights = np.exp(score - score.max())

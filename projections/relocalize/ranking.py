@@ -146,7 +146,9 @@ def rank(
     floors = Layout.of(candidates.places)
     candidates = floors.laid_out(candidates)
     camera = asked.camera or camera or candidates.constants.camera
-    posterior = locate(views, candidates.matches, Scene(candidates.constants, camera, model))
+    walls = None if floors.has_several else candidates.walls
+    scene = Scene(candidates.constants, camera, model, walls)
+    posterior = locate(views, candidates.matches, scene)
     return replace(_answer(candidates, posterior, top, floors), known=known, thin=thin)
 
 
