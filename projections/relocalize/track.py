@@ -10,8 +10,9 @@ the second says how many particles are drawn anew from the posterior: few while 
 explain what is seen, nearly all once they do not and another place does. So a kidnapped robot is
 found again after a few questions, and a single wrong answer moves little.
 
-Questions from one spot share their errors: the less the robot has moved since the last one, the
-smaller is the power to which a likelihood is taken.
+Questions from places near each other share their errors, and a look-alike deceives several in a
+row: a likelihood is taken to a power that is the smaller, the less the robot has moved since the
+last question, and 1 after 3 m or most of a turn.
 
 The filter is a pure function of the session's name and its questions: no clock, and the random
 numbers follow from the name and the number of the question. Floors lie side by side, as in
@@ -55,9 +56,9 @@ _LEAST_SURE, _MOST_SURE = 0.02, 0.95
 _SLIP_M, _SLIP_PER_M, _SLIP_M_PER_RAD = 0.01, 0.1, 0.02
 _SLIP_RAD, _SLIP_RAD_PER_M, _SLIP_PER_RAD = 0.01, 0.04, 0.1
 _MOST_SLIP_M, _MOST_SLIP_RAD = 5.0, math.pi
-_INDEPENDENT_M: Final = 0.6
-_INDEPENDENT_RAD: Final = 0.8
-_LEAST_COUNT: Final = 0.2
+_INDEPENDENT_M: Final = 3.0
+_INDEPENDENT_RAD: Final = 5.0
+_LEAST_COUNT: Final = 0.1
 _WITHIN_M: Final = 1.5
 _AROUND_M: Final = 1.0
 _TRIED: Final = 80
@@ -153,9 +154,10 @@ class Track:
         lost = self.lost
         ratios = _likelihood(self.particles, poses, shares, sure) / _ANYWHERE
         stayed = np.power(ratios, power) * ((1.0 - lost) / max(len(self.particles), 1))
-        # The likelihood's integral over all poses: near those of the posterior, and elsewhere.
-        found = lost * sure**power * (_ANYWHERE / _HEIGHT) ** (1.0 - power)
-        elsewhere = lost * (1.0 - sure) ** power
+        # The likelihood's integral over all poses: near those of the posterior, and elsewhere; of a
+        # share that is new.
+        found = lost * sure * power
+        elsewhere = lost - found
         weights = np.concatenate((stayed, np.full(len(fresh), found / len(fresh))))
         total = float(weights.sum())
         self.lost = max(elsewhere / (elsewhere + total), _LEAST_LOST)
