@@ -82,7 +82,8 @@ def relocalize(
 ) -> None:
     """Where a robot is, from a few object crops or classes.
 
-    Ranked Places with evidence, a pose hypothesis and a confidence.
+    Ranked Places with evidence, a pose hypothesis, how likely it is right (confidence) and how
+    likely the map has the things shown (known).
     """
     how, camera = method_from(method), camera_from(hfov, image)
     if as_of is not None and log is None:
