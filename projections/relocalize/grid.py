@@ -1,15 +1,36 @@
 """Grids of positions, and how likely robots are there before any crop is seen."""
 
 import math
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
 
 from .camera import Floats
+from .landmarks import Landmarks
 from .model import Model
 from .walls import WallMap
 
 _LEAST_PRIOR: Final = 1e-9
+_LANDMARKS, _LEAST_LANDMARKS = 48, 3
+_MOST_SPOTS: Final = 600
+
+
+def likely_spots(marks: Sequence[Landmarks], grid_m: float) -> Floats:
+    """Positions that saw a landmark, those in one square of a grid once: of all landmarks, or with
+    many crops of each crop's best by looks, so that a question of many views costs no more for each
+    of them. There are at most `_MOST_SPOTS`."""
+    most = max(_LEAST_LANDMARKS, _LANDMARKS // len(marks))
+    found = []
+    for each in marks:
+        looks = each.ratios.max(1)
+        chosen = np.argsort(-looks, kind="stable")
+        ends = np.append(each.starts[1:], len(each.seen_from))
+        for rank, landmark in enumerate(chosen.tolist()):
+            if rank < most or looks[landmark] == looks[chosen[0]]:
+                found.append(each.seen_from[each.starts[landmark] : ends[landmark]])
+    spots = distinct(np.concatenate(found), grid_m)
+    return spots[:: -(-len(spots) // _MOST_SPOTS)]
 
 
 def distinct(points: Floats, grid_m: float) -> Floats:

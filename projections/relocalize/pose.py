@@ -27,7 +27,7 @@ from .appearance import usual_likeness
 from .camera import Floats
 from .candidates import Match
 from .features import Features, confidence_of, features_of
-from .grid import cells_near, distinct, log_prior
+from .grid import cells_near, likely_spots, log_prior
 from .landmarks import CropEvidence, crop_evidence, likeness_of
 from .likelihood import (
     Scene,
@@ -97,7 +97,7 @@ def locate(
     if not crops:
         return None
     behind = behind_last([view.movement for view in sighted])
-    been = distinct(np.concatenate([crop.landmarks.seen_from for crop in crops]), CELL_M / 2)
+    been = likely_spots([crop.landmarks for crop in crops], CELL_M / 2)
     coarse = cells_near(been, 2.0 * CELL_M, scene.model.reach_m)
     score, _ = _score_places(coarse, sighted, behind, been, 2.0 * CELL_M, scene)
     kept = _best(score, max(_COARSE_KEPT, _COARSE_IN_ALL // len(crops)))
