@@ -20,7 +20,9 @@ from pydantic import (
     ConfigDict,
     FailFast,
     Field,
+    PlainValidator,
     StringConstraints,
+    WithJsonSchema,
     model_validator,
 )
 from pydantic_core import ErrorDetails
@@ -34,15 +36,15 @@ KeyframeId = NewType("KeyframeId", int)
 """The number a robot gives a keyframe within its run."""
 DetId = NewType("DetId", str)
 
-ENVELOPE_VERSION = 3
+ENVELOPE_VERSION = 4
 """The version of the models below; `eventsrc.upcast` converts older ones to it."""
 FIRST_ENVELOPE_VERSION = 2
 """Since this version payloads are envelopes, with a run, a keyframe id and a time."""
 
 MAX_ID_LENGTH = 256
 MAX_POSITION_M = 1e7
-"""Bound of map_x and map_y, ±10,000 km: the fold computes in integer micrometres and is exact
-within it (see `projections.exact`)."""
+"""Bound of map_x, map_y and map_z, ±10,000 km: the fold computes in integer micrometres and is
+exact within it (see `projections.exact`)."""
 MAX_TIMESTAMP_S = 9_000_000_000.0
 """Bound of a timestamp: int nanoseconds must fit 63 bits."""
 MAX_DIMENSION = 16_000
@@ -80,6 +82,31 @@ MAX_DEPTH_M = 1000.0
 
 INT64 = Field(ge=-(2**63), lt=2**63)
 Int64 = Annotated[int, INT64]
+
+
+def _floor_name(value: object) -> str | None:
+    """A floor's name: the text itself, or an integer's digits."""
+    if value is None:
+        return None
+    if type(value) is int and -(2**63) <= value < 2**63:
+        return str(value)
+    if isinstance(value, str) and 1 <= len(value) <= MAX_ID_LENGTH:
+        if all(unicodedata.category(char) != "Cc" for char in value):
+            return value
+        raise ValueError("has a control character; name the floor by a text without one")
+    raise ValueError(f"is no floor; give an integer or a text of 1 to {MAX_ID_LENGTH} characters")
+
+
+_FLOOR_SCHEMA = {
+    "anyOf": [
+        {"type": "string", "minLength": 1, "maxLength": MAX_ID_LENGTH},
+        {"type": "integer"},
+        {"type": "null"},
+    ]
+}
+Floor = Annotated[str | None, PlainValidator(_floor_name), WithJsonSchema(_FLOOR_SCHEMA)]
+"""The name of a floor; an integer is its decimal digits, so 2 and "2" are one floor."""
+
 Position = Annotated[float, Field(ge=-MAX_POSITION_M, le=MAX_POSITION_M)]
 
 
@@ -160,7 +187,8 @@ class Envelope(_Model):
 
     ``timestamp`` is the robot's time in seconds since the Unix epoch, ``map_x`` and ``map_y`` are
     metres and ``map_yaw`` radians in the map frame; all three are None when the robot has no pose.
-    Without ``camera`` it is the one of the map's settings.
+    Without ``camera`` it is the one of the map's settings. ``floor`` names the floor that the robot
+    is on; without it the height ``map_z``, metres, tells which one it is.
     """
 
     run_id: Annotated[RunId, TEXT]
@@ -170,6 +198,8 @@ class Envelope(_Model):
     map_y: Position | None = None
     map_yaw: float | None = None
     camera: EnvelopeCamera | None = None
+    floor: Floor = None
+    map_z: Position | None = None
     detections: Annotated[tuple[Detection, ...], Field(max_length=MAX_DETECTIONS), FailFast()]
 
     @model_validator(mode="after")
@@ -196,6 +226,11 @@ def has_evidence(envelope: Envelope) -> bool:
         if detection.depth_m is not None or detection.position is not None:
             return True
     return False
+
+
+def has_floor(envelope: Envelope) -> bool:
+    """Whether it says which floor the robot is on."""
+    return envelope.floor is not None or envelope.map_z is not None
 
 
 def has_keyframe_id(version: int) -> bool:

@@ -11,7 +11,8 @@ current one and validates it like a new one.
         observations without a place. ``class_name`` became ``class``.
     2   the envelope before it had a camera, and detections a depth or a position. It may have had
         unknown fields of these names, with any content: they are dropped.
-    3   the envelope of `eventsrc.envelope`.
+    3   the envelope before it had a floor or a height; unknown fields of these names are dropped.
+    4   the envelope of `eventsrc.envelope`.
 
 To change the envelope: raise ENVELOPE_VERSION, add the upcaster from the version before to
 ``UPCASTERS``, and a log of that version to the tests. Never change a released upcaster.
@@ -30,6 +31,7 @@ from .envelope import (
     Offset,
     contains_non_finite,
     has_evidence,
+    has_floor,
 )
 from .ingest import (
     DEFAULT_MAX_PAYLOAD_BYTES,
@@ -159,44 +161,54 @@ def _upcast_detection(detection: dict[str, Any]) -> dict[str, Any]:
     return known
 
 
-_NEW_IN_ENVELOPE = frozenset({"camera"})
+_NEW_IN_ENVELOPE: Mapping[int, frozenset[str]] = MappingProxyType(
+    {2: frozenset({"camera"}), 3: frozenset({"floor", "map_z"})}
+)
+"""Fields of an envelope that these versions did not know and the next one does."""
 _NEW_IN_DETECTION = frozenset({"depth_m", "depth_sigma_m", "position", "position_sigma_m"})
-_SAME_BUT_FOR_NEW_FIELDS = (2, 3)
+"""Fields of a detection that version 2 did not know."""
+_SAME_BUT_FOR_NEW_FIELDS = (2, 3, 4)
 
 
 def _must_convert(event: VersionedEvent, read: Accepted | Rejected) -> bool:
-    """Whether an envelope of version 2 that was read as one of version 3 must be converted first:
-    if it is none of version 3, or has fields that version 2 did not know. Hardly any has, and to
-    parse each twice would take far longer."""
+    """Whether an older envelope that was read as a current one must be converted first: if it is no
+    current one, or has fields that its version did not know. Hardly any has, and to parse each
+    twice would take far longer."""
     if event.version == ENVELOPE_VERSION:
         return False
     if isinstance(read, Rejected):
-        return _has_new_fields(event.payload)
-    return has_evidence(read.envelope)
+        return _has_new_fields(event)
+    return has_floor(read.envelope) or (event.version == 2 and has_evidence(read.envelope))
 
 
-def _has_new_fields(payload: bytes) -> bool:
+def _has_new_fields(event: VersionedEvent) -> bool:
     try:
-        document = json.loads(payload)
-        return bool(_drop_new_fields(document, None) != document)
+        document = converted = json.loads(event.payload)
+        for version in range(event.version, ENVELOPE_VERSION):
+            converted = UPCASTERS[version](converted, event)
+        return bool(converted != document)
     except (ValueError, RecursionError):
         return False
 
 
-def _drop_new_fields(document: Any, _event: VersionedEvent | None) -> Any:
-    if not isinstance(document, dict):
-        return document
-    older = {name: value for name, value in document.items() if name not in _NEW_IN_ENVELOPE}
-    if isinstance(older.get("detections"), list):
-        older["detections"] = [_older_detection(each) for each in older["detections"]]
+def _drop_camera(document: Any, _event: VersionedEvent) -> Any:
+    older = _without(document, _NEW_IN_ENVELOPE[2])
+    if isinstance(older, dict) and isinstance(older.get("detections"), list):
+        older["detections"] = [_without(each, _NEW_IN_DETECTION) for each in older["detections"]]
     return older
 
 
-def _older_detection(detection: Any) -> Any:
-    if not isinstance(detection, dict):
-        return detection
-    return {name: value for name, value in detection.items() if name not in _NEW_IN_DETECTION}
+def _drop_floor(document: Any, _event: VersionedEvent) -> Any:
+    return _without(document, _NEW_IN_ENVELOPE[3])
 
 
-UPCASTERS: Mapping[int, Upcaster] = MappingProxyType({1: _upcast_bare_list, 2: _drop_new_fields})
+def _without(document: Any, names: frozenset[str]) -> Any:
+    if not isinstance(document, dict):
+        return document
+    return {name: value for name, value in document.items() if name not in names}
+
+
+UPCASTERS: Mapping[int, Upcaster] = MappingProxyType(
+    {1: _upcast_bare_list, 2: _drop_camera, 3: _drop_floor}
+)
 """From each older version to the next."""

@@ -18,7 +18,7 @@ The deltas of one event come in this order: RunSeen, KeyframeAdded, ObservationA
 (ObjectFound / ObjectSeen, ObjectsMerged / ObjectRelocated, ObjectClassified, ObjectEstimated,
 ObjectMissing), located-in (ObjectMoved), adjacency (PlacesLinked). An ObjectRelocated stands right
 after the ObjectsMerged that makes the Object found elsewhere part of the one that moved. A delta
-names only things that deltas before it have introduced.
+names only things that deltas before it have introduced. MapGiven is the only one of its event.
 
 Deltas are frozen msgspec structs: a fold makes some ten a keyframe, and a struct takes a third of
 the time of a frozen dataclass to make. ``gc=False`` keeps them out of the garbage collector, which
@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eventsrc.envelope import DetId, KeyframeId, Offset, RunId
+from eventsrc.occupancy_map import OccupancyMap
 
 RunOrdinal = NewType("RunOrdinal", int)
 KeyframeOrdinal = NewType("KeyframeOrdinal", int)
@@ -75,7 +76,8 @@ class RunSeen(msgspec.Struct, frozen=True, gc=False):
 
 
 class KeyframeAdded(msgspec.Struct, frozen=True, gc=False):
-    """A new keyframe; ``pose`` is None when the envelope has none."""
+    """A new keyframe; ``pose`` is None when the envelope has none. ``floor`` is the name of the
+    floor that the pose is on, None if the envelope tells none."""
 
     offset: Offset
     keyframe: KeyframeOrdinal
@@ -84,6 +86,7 @@ class KeyframeAdded(msgspec.Struct, frozen=True, gc=False):
     keyframe_id: KeyframeId
     timestamp: float
     pose: Pose | None
+    floor: str | None = None
 
 
 class ObservationAdded(msgspec.Struct, frozen=True, eq=False, gc=False):
@@ -138,11 +141,24 @@ class PlaceFormed(msgspec.Struct, frozen=True, gc=False):
 
 
 class Link(msgspec.Struct, frozen=True, gc=False):
-    """Two core points within ε of each other that joined two places; keyframe ordinals, µm."""
+    """Two core points within ε of each other that joined two places; keyframe ordinals, µm.
+
+    Of places by rooms: the founders of the two places' cells that are the shortest drive apart,
+    and the length of that drive.
+    """
 
     core: KeyframeOrdinal
     neighbour: KeyframeOrdinal
     distance_um: int
+
+
+class MeanDrive(msgspec.Struct, frozen=True, gc=False):
+    """Why places by rooms became one: the mean driven distance, rounded down, between the ``cells``
+    of the survivor and the ``absorbed_cells`` of the other."""
+
+    mean_um: int
+    cells: int
+    absorbed_cells: int
 
 
 class PlacesMerged(msgspec.Struct, frozen=True, gc=False):
@@ -152,7 +168,8 @@ class PlacesMerged(msgspec.Struct, frozen=True, gc=False):
     keyframe whose arrival did it, ``links`` the pairs of core points that join the parts, one pair
     for each absorbed place. ``survivor_count`` and ``absorbed_counts`` are members before
     the merge. ``joined`` are those absorbed by a ``join`` command; their link is of the command's
-    two anchors, at whatever distance.
+    two anchors, at whatever distance. ``drives`` are there for places by rooms, one for each
+    absorbed place but those in ``joined``.
     """
 
     offset: Offset
@@ -163,6 +180,7 @@ class PlacesMerged(msgspec.Struct, frozen=True, gc=False):
     survivor_count: int
     absorbed_counts: tuple[int, ...]
     joined: tuple[PlaceOrdinal, ...] = ()
+    drives: tuple[MeanDrive, ...] = ()
 
 
 class MergeRefused(msgspec.Struct, frozen=True, gc=False):
@@ -350,6 +368,13 @@ class PlacesLinked(msgspec.Struct, frozen=True, gc=False):
     shared_transitions: int
 
 
+class MapGiven(msgspec.Struct, frozen=True, eq=False, gc=False):
+    """An occupancy map holds for all events after this one, which is a map and no keyframe."""
+
+    offset: Offset
+    map: OccupancyMap
+
+
 Delta: TypeAlias = (
     RunSeen
     | KeyframeAdded
@@ -370,4 +395,5 @@ Delta: TypeAlias = (
     | ObjectRelocated
     | ObjectMoved
     | PlacesLinked
+    | MapGiven
 )

@@ -20,14 +20,13 @@ unless the caller has bounded the difference first.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .deltas import Pose, UnitVector
+from .deltas import UnitVector
 
 Units: TypeAlias = tuple[NDArray[np.float64], UnitVector, int]
 """A unit vector in float64 and in int32, the same multiples of 2⁻²⁰, and its exact squared norm, a
@@ -129,22 +128,6 @@ def long_dot(vector_sum: NDArray[np.float64], unit: NDArray[np.float64]) -> int:
     high = np.floor(np.ldexp(vector_sum, -_HALF_BITS))
     low = vector_sum - np.ldexp(high, _HALF_BITS)
     return (int(high.dot(unit)) << _HALF_BITS) + int(low.dot(unit))
-
-
-@dataclass(frozen=True, slots=True)
-class Neighbourhood:
-    """A rule other than plain distance: ``holds(a, b)`` says whether two poses are neighbours.
-
-    It must be symmetric and pure. It is called only for two different poses that differ by at most
-    ``reach_um`` in x and in y; others are not neighbours, and a pose is its own.
-
-    ``name`` identifies the rule in `Settings.neighbourhood`, and so in the fingerprint: a rule that
-    gives another result for any two poses needs another name.
-    """
-
-    name: str
-    reach_um: int
-    holds: Callable[[Pose, Pose], bool]
 
 
 def distance_um(ax: int, ay: int, bx: int, by: int) -> int:

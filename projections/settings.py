@@ -6,6 +6,7 @@ refused, not mixed.
 
 import hashlib
 from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -15,6 +16,7 @@ from pydantic import (
     SerializerFunctionWrapHandler,
     ValidationError,
     model_serializer,
+    model_validator,
 )
 from pydantic_core import ErrorDetails
 
@@ -45,6 +47,7 @@ _YOUNGER = {
     "fusion": ("fusion", "camera", "evidence"),
     "places": ("places", "rooms"),
     "localizer": ("localizer",),
+    "floor_height_m": ("floor_height_m",),
 }
 """Settings that older versions did not have, by the one that brings them into force."""
 
@@ -66,9 +69,6 @@ class Settings(BaseModel):
     """The map's embedding model; None takes that of the first embedded detection."""
     embedding_dim: Annotated[int, Field(ge=1, le=16_000)] | None = None
     """The map's embedding dimension; None takes that of the first embedded detection."""
-    neighbourhood: str | None = None
-    """The name of the `projections.exact.Neighbourhood` that takes the place of plain distance,
-    and of ``eps_m``. A rule is code: only a program can give one, no command."""
     fusion: Literal["page", "evidence"] = "page"
     """The rule that fuses observations into Objects: by ``fusion_radius_m`` and
     ``fusion_similarity``, or by the evidence of bearings and looks."""
@@ -82,6 +82,17 @@ class Settings(BaseModel):
     """The rule that groups poses into places: DBSCAN by ``eps_m`` and ``min_samples``, or rooms."""
     rooms: RoomsConstants = RoomsConstants()
     """The constants of places by rooms."""
+    floor_height_m: Annotated[float, Field(ge=0.5, le=1000.0)] = 3.0
+    """From floor to floor: of envelopes with a height ``map_z`` but no ``floor``, the floor is the
+    number of these that is nearest to the height."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_a_removed_setting(cls, values: Any) -> Any:
+        """Documents of older versions may have ``"neighbourhood": null``, which meant nothing."""
+        if isinstance(values, dict) and values.get("neighbourhood", 0) is None:
+            return {name: value for name, value in values.items() if name != "neighbourhood"}
+        return values
 
     @model_serializer(mode="wrap")
     def _without_younger_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -101,9 +112,14 @@ class Settings(BaseModel):
 
     def fingerprint(self) -> str:
         """16 hex digits that are equal exactly when every setting is."""
-        plain = {"neighbourhood"} if self.neighbourhood is None else None
-        canonical = self.model_dump_json(exclude=plain)  # fingerprints older than the setting hold
+        canonical = self.model_dump_json()
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
+
+    def places_text(self) -> str:
+        """The rule of places in short: ``ε 1.5 m, min_samples 3``."""
+        if self.places == "rooms":
+            return f"rooms: cells of {self.rooms.cell_m:g} m, {self.rooms.drive_m:g} m of driving"
+        return f"ε {self.eps_m:g} m, min_samples {self.min_samples}"
 
     def by_name(self) -> dict[str, Any]:
         """All settings, those with their default too, by the names that ``--set`` takes:
@@ -148,9 +164,13 @@ class Settings(BaseModel):
             if first["type"] == "extra_forbidden":
                 raise SettingsError(_no_setting(name)) from None
             raise SettingsError(f"{name} is {_shown(first['input'])}: {_rule(first)}") from None
-        if settings.neighbourhood is not None:
-            raise SettingsError(_no_setting("neighbourhood"))
         return settings
+
+
+PRESETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {"page": ("places=page", "eps_m=1.5", "min_samples=3"), "rooms": ("places=rooms",)}
+)
+"""Settings by name, as assignments for `Settings.with_assignments`."""
 
 
 def _rule(error: ErrorDetails) -> str:
@@ -177,7 +197,7 @@ def _dotted(error: ErrorDetails) -> str:
 
 def _no_setting(name: str) -> str:
     """``no setting 'eps'; there are …``: those of its group, else the plain ones and groups."""
-    every = [name for name in Settings().by_name() if name != "neighbourhood"]
+    every = list(Settings().by_name())
     group = name.partition(".")[0] + "."
     names = sorted(each for each in every if each.startswith(group))
     if names:
@@ -248,7 +268,7 @@ def _assign(values: dict[str, Any], text: str) -> None:
     group, dot, last = name.partition(".")
     inner = values.get(group) if dot else values
     key = last if dot else name
-    if not isinstance(inner, dict) or key not in inner or key == "neighbourhood":
+    if not isinstance(inner, dict) or key not in inner:
         raise SettingsError(_no_setting(name))
     if isinstance(inner[key], dict):
         raise SettingsError(f"it has several values; give one of them, such as {_EXAMPLES[name]}")

@@ -12,7 +12,6 @@ from sklearn.cluster import DBSCAN
 from eventsrc.ingest import Accepted, ingest
 from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.deltas import Delta
-from projections.exact import Neighbourhood
 from projections.model.view import MapView
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
@@ -41,13 +40,11 @@ class Folded:
     def start(
         cls,
         settings: Settings | None = None,
-        neighbourhood: Neighbourhood | None = None,
         corrections: Corrections = NO_CORRECTIONS,
     ) -> "Folded":
         """Nothing folded yet."""
-        named = None if neighbourhood is None else neighbourhood.name
-        settings = (settings or Settings()).model_copy(update={"neighbourhood": named})
-        semantic_map = SemanticMap(settings, neighbourhood, corrections)
+        settings = settings or Settings()
+        semantic_map = SemanticMap(settings, corrections)
         return cls(semantic_map, MapView(settings, corrections=corrections), [])
 
     def extend(self, documents: Iterable[dict[str, Any]]) -> "Folded":
@@ -76,7 +73,7 @@ def batch_dbscan(are_near: np.ndarray, min_samples: int) -> tuple[np.ndarray, se
 
 
 def near_matrix(n: int, is_near: NearTest) -> np.ndarray:
-    """The neighbourhood as a matrix; every point is its own neighbour."""
+    """Who is near whom as a matrix; every point is its own neighbour."""
     return np.array([[i == j or is_near(i, j) for j in range(n)] for i in range(n)]).reshape(n, n)
 
 

@@ -13,17 +13,16 @@ import math
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Callable
 from fractions import Fraction
 from itertools import pairwise
 from typing import Any
 
 from .folds import NaivePlaces, near_matrix
+from .naive_rooms import NaiveRooms
 
 Q40 = 2**40
 
 Posed = tuple[int, int, float]
-Rule = Callable[[Posed, Posed], bool]
 
 
 def micrometres(metres: float) -> int:
@@ -49,21 +48,20 @@ def cosine_q40(members: list[list[int]], unit: list[int]) -> int:
 
 
 class NaiveMap:
-    """Feed it documents; ask for the map's digest and what was left out.
+    """Feed it documents; ask for the map's digest and what was left out."""
 
-    ``rule`` takes the place of plain distance; it is asked for two (x_um, y_um, yaw).
-    """
-
-    def __init__(self, settings: dict[str, Any], rule: Rule | None = None) -> None:
+    def __init__(self, settings: dict[str, Any]) -> None:
         self.settings = settings
-        self.rule = rule or self._is_within_eps
         self.space = None, settings.get("embedding_dim")
         self.is_space_decided = False
         self.runs: dict[str, list[float]] = {}
         self.keyframes: list[dict[str, Any]] = []
         self.observations: list[dict[str, Any]] = []
         self.objects: list[list[dict[str, Any]]] = []
-        self.places = NaivePlaces(settings["min_samples"])
+        self.places: NaivePlaces | NaiveRooms = NaivePlaces(settings["min_samples"])
+        if settings.get("places") == "rooms":
+            constants = settings["rooms"]["cell_m"], settings["rooms"]["drive_m"]
+            self.places = NaiveRooms(*map(micrometres, constants))
         self.left_out: Counter[str] = Counter()
 
     def fold(self, document: dict[str, Any]) -> None:
@@ -94,11 +92,14 @@ class NaiveMap:
     def _cluster(self, pose: tuple[int, int] | None) -> None:
         if pose is None:
             return
+        if isinstance(self.places, NaiveRooms):
+            self.places.add(self.keyframes[-1]["run"], *pose)
+            return
         points = [(*k["pose"], k["yaw"]) for k in self.keyframes if k["pose"] is not None]
-        near = near_matrix(len(points), lambda i, j: self.rule(points[i], points[j]))
+        near = near_matrix(len(points), lambda i, j: self.is_within_eps(points[i], points[j]))
         self.places.add(near)
 
-    def _is_within_eps(self, a: Posed, b: Posed) -> bool:
+    def is_within_eps(self, a: Posed, b: Posed) -> bool:
         eps = micrometres(self.settings["eps_m"])
         return (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 <= eps**2
 

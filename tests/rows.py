@@ -13,12 +13,14 @@ from psycopg import sql
 from projections.database.connection import Targets
 from projections.exact import Q40
 from projections.model.view import MapView
+from projections.place_types import place_type
 
 ORDER = (
     "Run", "Keyframe", "Pose", "Observation", "Object", "Place", "HAS_KEYFRAME", "HAS_POSE",
     "HAS_OBSERVATION", "OBSERVES", "LOCATED_IN", "IN_PLACE", "ADJACENT_TO",
+    "Floor", "Building", "PART_OF",
 )  # fmt: skip
-VERTICES = ORDER[:6]
+VERTICES = (*ORDER[:6], "Floor", "Building")
 
 
 def gid(label: str, number: int) -> str:
@@ -71,7 +73,8 @@ def expected_graph(view: MapView) -> dict[str, list[tuple[Any, ...]]]:
         run_end = gid("Run", k.run + 1)
         rows["HAS_KEYFRAME"].append((gid("HAS_KEYFRAME", n), run_end, gid("Keyframe", n), {}))
         if k.pose is not None:
-            at = {"map_x": k.pose.x_um / 1e6, "map_y": k.pose.y_um / 1e6, "map_yaw": k.pose.yaw_rad}
+            at: dict[str, Any] = {"map_x": k.pose.x_um / 1e6, "map_y": k.pose.y_um / 1e6}
+            at |= {"map_yaw": k.pose.yaw_rad} | ({} if k.floor is None else {"floor": k.floor})
             rows["Pose"].append((gid("Pose", n), {**name, **at}))
             rows["HAS_POSE"].append((gid("HAS_POSE", n), gid("Keyframe", n), gid("Pose", n), {}))
         if k.place is not None:
@@ -87,14 +90,42 @@ def expected_graph(view: MapView) -> dict[str, list[tuple[Any, ...]]]:
         }
         if p.name is not None:
             properties["name"] = p.name
+        floor = view.keyframes[p.founder].floor
+        whole = gid("Building", 1)
+        if floor is not None:
+            properties["floor"] = floor
+            whole = gid("Floor", 1 + list(view.floors).index(floor))
+        kind = place_type(recounted_contents(view, p.ordinal), p.name)
+        if kind is not None and kind.type is not None:
+            properties |= {"type": kind.type, "type_probability": kind.probability}
+        n = p.ordinal + 1
+        rows["PART_OF"].append((gid("PART_OF", n), gid("Place", n), whole, {}))
         rows["Place"].append((gid("Place", p.ordinal + 1), properties))
     for a, b, shared in view.edges():
         ends = gid("Place", a + 1), gid("Place", b + 1)
         number = (a + 1) << 24 | (b + 1)
-        rows["ADJACENT_TO"].append(
-            (gid("ADJACENT_TO", number), *ends, {"shared_transitions": shared})
-        )
+        properties = {"shared_transitions": shared}
+        founders = (view.keyframes[view.all_places[place].founder] for place in (a, b))
+        if len({k.floor for k in founders}) > 1:
+            properties["between_floors"] = True
+        rows["ADJACENT_TO"].append((gid("ADJACENT_TO", number), *ends, properties))
+    for number, floor in enumerate(view.floors, 1):
+        rows["Floor"].append((gid("Floor", number), {"floor": floor}))
+        ends = gid("Floor", number), gid("Building", 1)
+        rows["PART_OF"].append((gid("PART_OF", 2**40 + number), *ends, {}))
+    if view.floors or view.all_places:
+        rows["Building"].append((gid("Building", 1), {"building_id": "building"}))
     return {label: sorted(found, key=lambda row: int(row[0])) for label, found in rows.items()}
+
+
+def recounted_contents(view: MapView, place: int) -> dict[str, float]:
+    """The weight of each class in a place: a quarter for an Object that was observed once."""
+    counted: dict[str, float] = {}
+    for found in view.objects.values():
+        if found.place == place:
+            weight = 1.0 if len(found.observations) > 1 else 0.25
+            counted[found.class_name] = counted.get(found.class_name, 0.0) + weight
+    return counted
 
 
 def _expect_landmarks(view: MapView, rows: dict[str, list[tuple[Any, ...]]]) -> None:
@@ -135,6 +166,12 @@ def _expect_landmarks(view: MapView, rows: dict[str, list[tuple[Any, ...]]]) -> 
             if (at := obj.estimate) is not None:
                 properties |= {"est_x": at.x_um / 1e6, "est_y": at.y_um / 1e6}
                 properties["est_sigma_m"] = at.est_sigma_m
+                properties |= {
+                    "est_xx": at.var_xx_um2 / 1e12,
+                    "est_xy": at.var_xy_um2 / 1e12,
+                    "est_yy": at.var_yy_um2 / 1e12,
+                    "est_spots": at.spots,
+                }
         rows["Object"].append((gid("Object", n), properties))
         if obj.place is not None:
             ends = gid("Object", n), gid("Place", obj.place + 1)

@@ -251,6 +251,10 @@ def _properties(
                     "est_x": delta.x_um / 1e6,
                     "est_y": delta.y_um / 1e6,
                     "est_sigma_m": _largest(delta),
+                    "est_xx": delta.var_xx_um2 / 1e12,
+                    "est_xy": delta.var_xy_um2 / 1e12,
+                    "est_yy": delta.var_yy_um2 / 1e12,
+                    "est_spots": delta.spots,
                 }
             case _:
                 pass

@@ -11,12 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from eventsrc.append import append_payload
+from eventsrc.append import NewMap, append_payload, rejected_event
 from eventsrc.envelope import Offset
 from eventsrc.errors import MisuseError
 from eventsrc.ingest import Rejected
 from eventsrc.log import FsyncPolicy, LogWriter
-from eventsrc.system_events import LOSS_KEY, REJECTED_KEY
+from eventsrc.occupancy_map import InvalidMap, OccupancyMap, decode_map
+from eventsrc.system_events import LOSS_KEY, MAP_KEY, REJECTED_KEY
 from eventsrc.upcast import UPCASTERS
 
 from .json_lines import JsonLines
@@ -42,10 +43,12 @@ class ImportReport:
     accepted: int
     rejected: int
     system: int
-    """Rejected payloads and losses of another mapfold log, copied unchanged."""
+    """Rejected payloads, losses and maps of another mapfold log, copied unchanged."""
     skipped: int
     first_offset: Offset
     next_offset: Offset
+    maps: int = 0
+    """Occupancy maps, given or among the messages."""
 
 
 class ImportInterrupted(KeyboardInterrupt):
@@ -66,14 +69,18 @@ def import_files(
     progress: Progress | None = None,
     on_reject: OnReject | None = None,
     step: AbstractContextManager[object] | None = None,
+    given_map: OccupancyMap | None = None,
 ) -> ImportReport:
-    """Append every message of ``names`` in order. Messages without a key get ``key``.
+    """Append ``given_map``, if there is one, then every message of ``names`` in order. Messages
+    without a key get ``key``.
 
     ``step`` is entered for each message; one that defers Ctrl-C makes `ImportInterrupted` exact.
     Raises MisuseError and MapfoldError for files that cannot be read.
     """
     run = _Import(writer, key, on_reject or (lambda _place, _reason: None))
     try:
+        if given_map is not None:
+            run.append_map(given_map)
         with ExitStack() as files:
             for name in names:
                 source = open_source(name, files)
@@ -97,15 +104,39 @@ class _Import:
         self._on_reject = on_reject
         self._first = writer.next_offset
         self._last: tuple[Source, int | None] | None = None
-        self.accepted = self.rejected = self.system = self.skipped = 0
+        self.accepted = self.rejected = self.system = self.skipped = self.maps = 0
 
     def append(self, source: Source, message: ImportedMessage) -> None:
         """Append one message: a system event unchanged, anything else after validation."""
         if message.key == REJECTED_KEY or message.key == LOSS_KEY:
             self._append_system_event(message.key, message)
+        elif message.key == MAP_KEY:
+            self._append_map_event(source, message)
         else:
             self._append_envelope(source, message)
         self._last = source, source.at
+
+    def append_map(self, given: OccupancyMap) -> None:
+        """Append a map that comes from no message."""
+        self._writer.append(MAP_KEY, given.encode())
+        self.maps += 1
+
+    def _append_map_event(self, source: Source, message: ImportedMessage) -> None:
+        """Append the map of another log, or its rejection."""
+        try:
+            decode_map(message.payload)
+        except InvalidMap as error:
+            logged_ns = self._writer.now_ns() if message.logged_ns is None else message.logged_ns
+            event = rejected_event(MAP_KEY, message.payload, str(error), logged_ns)
+            self._writer.append_all([event])
+            self._count_rejected(source, str(error))
+        else:
+            self._append_system_event(MAP_KEY, message)
+            self.maps += 1
+
+    def _count_rejected(self, source: Source, reason: str) -> None:
+        self.rejected += 1
+        self._on_reject(f"{source.name}: {source.unit} {source.at}", reason)
 
     def _append_system_event(self, key: str, message: ImportedMessage) -> None:
         self._writer.append(
@@ -122,8 +153,9 @@ class _Import:
             version=message.version if message.version in UPCASTERS else None,
         )
         if isinstance(outcome, Rejected):
-            self.rejected += 1
-            self._on_reject(f"{source.name}: {source.unit} {source.at}", outcome.reason)
+            self._count_rejected(source, outcome.reason)
+        elif isinstance(outcome, NewMap):
+            self.maps += 1
         else:
             self.accepted += 1
 
@@ -138,7 +170,7 @@ class _Import:
     def report(self) -> ImportReport:
         """Sync the log and count what was appended."""
         counts = (self.accepted, self.rejected, self.system, self.skipped)
-        return ImportReport(*counts, self._first, self._writer.sync())
+        return ImportReport(*counts, self._first, self._writer.sync(), self.maps)
 
 
 def check_sources(names: Sequence[str]) -> None:

@@ -26,7 +26,15 @@ from pydantic import BaseModel
 
 from eventsrc.envelope import ENVELOPE_VERSION, Envelope, Offset
 from eventsrc.errors import LogDamaged, NotALog
-from eventsrc.system_events import LOSS_KEY, REJECTED_KEY, Loss, RejectedPayload, is_system_key
+from eventsrc.system_events import (
+    LOSS_KEY,
+    MAP_KEY,
+    REJECTED_KEY,
+    Loss,
+    OccupancyMapEvent,
+    RejectedPayload,
+    is_system_key,
+)
 
 from . import mcap_records as _mcap
 from .mcap_records import BadRecord, Channel, Header, Metadata, Opcode
@@ -140,7 +148,11 @@ UNREADABLE_VERSION = 0
 not folded."""
 _A_VERSION = re.compile(r"[0-9]{1,9}")
 
-_SYSTEM_MODELS: dict[str, type[BaseModel]] = {REJECTED_KEY: RejectedPayload, LOSS_KEY: Loss}
+_SYSTEM_MODELS: dict[str, type[BaseModel]] = {
+    REJECTED_KEY: RejectedPayload,
+    LOSS_KEY: Loss,
+    MAP_KEY: OccupancyMapEvent,
+}
 
 
 def schema_of(key: str) -> tuple[str, bytes]:

@@ -27,9 +27,11 @@ from eventsrc.commands import InvalidCommand, encode_command, parse_command
 from eventsrc.envelope import KeyframeId, Offset, RunId, has_keyframe_id
 from eventsrc.gaps import Gap, GapLedger, gap_of
 from eventsrc.ingest import Accepted
+from eventsrc.occupancy_map import InvalidMap, decode_map
 from eventsrc.system_events import (
     COMMAND_KEY,
     LOSS_KEY,
+    MAP_KEY,
     REJECTED_KEY,
     Loss,
     RejectedPayload,
@@ -196,6 +198,8 @@ class EventFindings:
             self._parse(RejectedPayload, event)
         elif event.key == COMMAND_KEY:
             self._check_command(event)
+        elif event.key == MAP_KEY:
+            self._check_map(event)
         elif not is_system_key(event.key):
             self._check_envelope(event)
 
@@ -214,6 +218,13 @@ class EventFindings:
                 f"command {visible(command_id)} has the id of another one, at offset {first}, and "
                 "does not count"
             )
+            self._add("schema", what, event.offset, what)
+
+    def _check_map(self, event: Event) -> None:
+        try:
+            decode_map(event.payload)
+        except InvalidMap as error:
+            what = f"{event.key} event cannot be read: {error}"
             self._add("schema", what, event.offset, what)
 
     def _check_loss(self, event: Event) -> None:

@@ -9,11 +9,12 @@ came.
 from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
-from eventsrc.append import check_payloads, rejected_event
+from eventsrc.append import NewMap, check_payloads, map_event, rejected_event
 from eventsrc.envelope import KeyframeId, RunId, has_keyframe_id
 from eventsrc.ingest import Rejected
 from eventsrc.log import LogWriter, NewEvent
 from eventsrc.robot.acks import SENT_SUFFIX, Refusal, payload_sha256
+from eventsrc.system_events import MAP_KEY
 from eventsrc.transport.session import Received
 
 from .edit_requests import EditRequest
@@ -27,7 +28,8 @@ _CHECKED_TOGETHER_BYTES: Final = 1024 * 1024
 
 
 class CheckedMessage(NamedTuple):
-    """A message, and what the writer thread needs of the envelope in it.
+    """A message, and what the writer thread needs of the envelope in it. A map is already the
+    event that it becomes, under its key; from the network nothing else can come under that.
 
     ``run_id``, ``keyframe_id`` and ``stamp_ns`` are None for a rejected payload and for a form
     older than the envelope. ``refusal`` is the reply to a rejected payload; ``sha256`` is that of
@@ -48,6 +50,8 @@ class CheckedMessage(NamedTuple):
         key, payload, version, refusal, _, _, stamp_ns, _ = self
         if refusal is not None:
             return rejected_event(key, payload, refusal.reason, logged_ns)
+        if key == MAP_KEY:
+            return map_event(payload, logged_ns)
         return NewEvent(
             key, payload, logged_ns, logged_ns if stamp_ns is None else stamp_ns, version
         )
@@ -140,6 +144,8 @@ class Checker:
             if isinstance(result, Rejected):
                 refusal = Refusal.of(payload, result.reason)
                 yield CheckedMessage(key, payload, version, refusal)
+            elif isinstance(result, NewMap):
+                yield CheckedMessage(MAP_KEY, result.event, version, None)
             elif not has_keyframe_id(version):
                 yield CheckedMessage(key, payload, version, None)
             else:

@@ -6,6 +6,7 @@ from typing import Any
 from eventsrc.text import counted, visible
 from projections.history.rendering import table
 
+from .localiser_text import localiser_document, localiser_text
 from .looks import FEWEST_DIFFERENT
 from .rounds import Calibration
 from .shrinking import Reading
@@ -50,6 +51,7 @@ def document(calibration: Calibration) -> dict[str, Any]:
             }
             for each in readings(calibration)
         ],
+        "localiser": localiser_document(calibration.own),
         "hints": list(hints(calibration)),
     }
 
@@ -76,6 +78,7 @@ def text(calibration: Calibration, *, all_: bool = False) -> str:
     ).splitlines()
     if len(shown) < len(sizes):
         lines.append(f"… and the sizes of {len(sizes) - len(shown):,} more (--all shows them)")
+    lines += localiser_text(calibration.own).splitlines()
     return "".join(f"{line}\n" for line in [*lines, *hints(calibration)])
 
 

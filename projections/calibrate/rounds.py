@@ -2,7 +2,8 @@
 
 The first fold uses the priors, and both readings are drawn towards them, never towards constants
 read before: what a map shows counts once, and a map that was calibrated gives the same constants
-again.
+again. Then the map as its settings make it, with the constants read, is asked its own questions
+(`localiser`).
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -15,12 +16,14 @@ from eventsrc.log import LogReader
 from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.deltas import Delta, KeyframeAdded, KeyframeOrdinal
 from projections.evidence import EvidenceConstants
+from projections.localizer import LocalizerConstants
 from projections.model.fold import READ_AHEAD, fold_parsed, gc_paused, parse_events
 from projections.model.view import MapView
 from projections.reducers.envelope_evidence import camera_of
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Camera, Settings
 
+from .localiser import NOT_ASKED, OwnScores, read_localiser
 from .reading import Round, read
 from .sightings import Row, sightings_of
 
@@ -32,7 +35,7 @@ class Calibration:
     """What a log shows. ``settings`` are those that it was calibrated under; `calibrated` are the
     same with its constants. Counts are of the last fold: keyframes with a pose, observations that
     were fused, Objects, runs. ``unboxed`` observations have an empty box; ``beyond`` boxes reach
-    beyond the picture."""
+    beyond the picture. ``own`` is what its own questions show."""
 
     settings: Settings
     last: Round
@@ -42,11 +45,15 @@ class Calibration:
     objects: int
     unboxed: int
     beyond: int
+    own: OwnScores
 
     @property
     def calibrated(self) -> Settings:
         """The settings with the constants that were read."""
-        return self.settings.model_copy(update={"evidence": self.last.constants})
+        text_shift = self.settings.localizer.text_shift
+        localizer = self.own.constants.model_copy(update={"text_shift": text_shift})
+        changed = {"evidence": self.last.constants, "localizer": localizer}
+        return self.settings.model_copy(update=changed)
 
 
 Cameras = dict[KeyframeOrdinal, Camera]
@@ -80,15 +87,16 @@ def calibrate(
                     view.apply_event(event.offset, deltas)
                     if isinstance(event.parsed, Accepted):
                         note_camera(cameras, event.parsed.envelope, deltas, used.camera)
-                progress(before + view.next_offset, ROUNDS * end)
+                progress(before + view.next_offset, (ROUNDS + 1) * end)
         before += end
         return view, cameras
 
     return calibrate_by(fold, settings)
 
 
-def calibrate_by(fold: Fold, settings: Settings) -> Calibration:
-    """Calibrate what ``fold`` folds, in rounds."""
+def calibrate_by(fold: Fold, settings: Settings, *, ask: bool = True) -> Calibration:
+    """Calibrate what ``fold`` folds, in rounds. Without ``ask`` the map is asked nothing, and
+    re-localisation keeps its defaults."""
     constants = prior = EvidenceConstants()
     for _ in range(ROUNDS):
         view, cameras = fold(
@@ -97,6 +105,9 @@ def calibrate_by(fold: Fold, settings: Settings) -> Calibration:
         seen = sightings_of(_rows(view, cameras, settings.camera))
         last = read(seen, constants, prior)
         constants = last.constants
+    plain = LocalizerConstants(text_shift=settings.localizer.text_shift)
+    changed = {"evidence": constants, "localizer": plain}
+    own = read_localiser(fold(settings.model_copy(update=changed))[0]) if ask else NOT_ASKED
     return Calibration(
         settings,
         last,
@@ -106,6 +117,7 @@ def calibrate_by(fold: Fold, settings: Settings) -> Calibration:
         objects=len(view.objects),
         unboxed=int((~seen.boxed).sum()),
         beyond=seen.beyond,
+        own=own,
     )
 
 

@@ -93,6 +93,9 @@ def calibrate_command(
     other days; pairs in one picture tell how alike different things look. Each constant is drawn
     towards its prior until some hundred observations stand for it.
 
+    Then the map is asked about its own keyframes, as if it had not been there then: how far off
+    re-localisation would be, and how much its two probabilities have to be corrected on this map.
+
     With --write every fold of the log uses them from then on, with the other settings in force and
     those of --set; `mapfold edit LOG undo` takes it back.
     """

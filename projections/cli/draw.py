@@ -7,7 +7,7 @@ import typer
 
 from eventsrc.envelope import FIRST_OFFSET
 from eventsrc.log import LogReader
-from eventsrc.text import counted
+from eventsrc.text import counted, visible
 from projections.model.fold import fold_events
 from projections.model.log_commands import read_corrections
 from projections.model.view import MapView
@@ -42,6 +42,12 @@ def draw(
     min_observations: Annotated[
         int, typer.Option(metavar="N", help="Leave out objects seen less often.", min=1)
     ] = 2,
+    floor: Annotated[
+        str | None,
+        typer.Option(
+            "--floor", metavar="NAME", help="Draw this floor only; - is that without a name."
+        ),
+    ] = None,
     merges: Annotated[
         bool, typer.Option("--merges", help="Mark the keyframes that merged places.")
     ] = False,
@@ -56,6 +62,7 @@ def draw(
     # Imported here: matplotlib takes longer to import than most commands take to run.
     from eventsrc.sim import build_house
     from projections.drawing import draw_map, floor_of
+    from projections.drawing.one_floor import view_of_floor
     from projections.drawing.picture import bridges_of, fold_with_merges
 
     check_picture(out)
@@ -67,10 +74,15 @@ def draw(
         view = MapView(settings, keep_embeddings=False, corrections=corrections)
         fold = SemanticMap(settings, corrections=corrections)
         merged = fold_with_merges(fold_events(reader.read(FIRST_OFFSET, end), fold), view)
+    title = f"{log.resolve().name} after {counted(view.next_offset, 'event')}"
+    if floor is not None:
+        view, title = view_of_floor(view, floor), f"{title}, floor {visible(floor)}"
+    elif len(floors := {k.floor for k in view.keyframes if k.pose is not None}) > 1:
+        say(f"{out} shows {len(floors)} floors, one above the other; --floor NAME draws one")
     draw_map(
         view,
         out,
-        title=f"{log.resolve().name} after {counted(view.next_offset, 'event')}",
+        title=title,
         floor=None if house is None else floor_of(build_house(house)),
         bridges=bridges_of(view, merged) if merges else (),
         min_observations=min_observations,

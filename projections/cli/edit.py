@@ -211,10 +211,10 @@ def _use_settings(
 ) -> MakeCommand:
     """The map has other settings from here on.
 
-    Those of FILE, else those it has now, changed by --set.
+    Those of FILE, else those it has now, changed by --preset and --set.
     """
     if file is None and not set_:
-        raise MisuseError("give FILE or --set NAME=VALUE")
+        raise MisuseError("give FILE, --preset NAME or --set NAME=VALUE")
 
     def command(current: CurrentMap, stamp: Stamp) -> Command:
         return make.use_settings(current, stamp, settings_from(file, set_, current.corrections))

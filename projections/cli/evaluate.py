@@ -1,11 +1,13 @@
 """`mapfold evaluate`: how good are the places, the objects and the re-localisation."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from eventsrc.errors import MisuseError
+from eventsrc.text import counted
 from projections.evaluate import evaluate as score
 from projections.evaluate import read_truth
 from projections.evaluate.picture import draw_failures
@@ -37,21 +39,49 @@ _ROWS = (
     ("room_ceiling", "… could: room was mapped"),
     ("pose_error_m.p50", "pose error p50, m"),
     ("pose_error_m.p90", "pose error p90, m"),
+    ("plain.pose_error_m.p50", "… of the plain recipe, p50"),
+    ("plain.pose_error_m.p90", "… of the plain recipe, p90"),
     ("yaw_error_rad.p50", "yaw error p50, rad"),
     ("centroid_error_m.p50", "place's centroid p50, m"),
     ("centroid_error_m.p90", "place's centroid p90, m"),
     ("within_1_5_m", "pose within 1.5 m"),
+    ("plain.within_1_5_m", "… of the plain recipe"),
     ("known_called_unknown", "known called unknown"),
     ("unknown_called_unknown", "unknown called unknown"),
     ("auroc", "AUROC known / unknown"),
-    ("ece", "calibration error"),
+    ("best_cosine.auroc", "… of the best cosine"),
+    ("known_ece", "calib. error of known"),
+    ("known_ece_floor", "… expected if all true"),
+    ("ece", "calib. error of confidence"),
+    ("ece_floor", "… expected if all true"),
     ("latency_ms.p50", "latency p50, ms"),
     ("latency_ms.p99", "latency p99, ms"),
 )
+_OWN_ROWS = (
+    ("questions", "questions"),
+    ("known", "… of things seen before"),
+    ("pose_error_m.p50", "pose error p50, m"),
+    ("pose_error_m.p90", "pose error p90, m"),
+    ("plain.pose_error_m.p50", "… of the plain recipe, p50"),
+    ("plain.pose_error_m.p90", "… of the plain recipe, p90"),
+    ("within_1_5_m", "pose within 1.5 m"),
+    ("known_called_unknown", "known called unknown"),
+    ("taken_out_called_known", "taken out, called known"),
+    ("auroc", "AUROC known / unknown"),
+    ("best_cosine.auroc", "… of the best cosine"),
+    ("known_ece", "calib. error of known"),
+    ("known_ece_floor", "… expected if all true"),
+    ("ece", "calib. error of confidence"),
+    ("ece_floor", "… expected if all true"),
+)
+_LABEL = 30
 
 
 def evaluate(
-    map_log: Annotated[Path, typer.Option("--map", metavar="LOG", help="Log the map is made of.")],
+    map_logs: Annotated[
+        list[Path],
+        typer.Option("--map", metavar="LOG", help="Log the map is made of; several are maps each."),
+    ],
     query_logs: Annotated[
         list[Path] | None,
         typer.Option("--query", metavar="LOG", help="Log to ask from; several are fine."),
@@ -65,8 +95,12 @@ def evaluate(
     ] = "end",
     method: Annotated[str, typer.Option("--method", help="joint or plain.")] = "joint",
     seed: Annotated[int, typer.Option("--seed", help="Draws the crops asked with.")] = DEFAULT_SEED,
-    hfov: HfovOption = 69.4,
-    image: ImageOption = "640x400",
+    hfov: HfovOption = None,
+    image: ImageOption = None,
+    self_: Annotated[
+        bool,
+        typer.Option("--self", help="Ask the map about its own keyframes too; needs no truth."),
+    ] = False,
     picture: Annotated[
         Path | None,
         typer.Option("--picture", metavar="FILE", help="Draw where three crops fail."),
@@ -77,27 +111,87 @@ def evaluate(
 ) -> None:
     """How good places, objects and re-localisation are.
 
-    Scores against the truth, of re-localisation with one, two and three crops a question.
+    Scores against the truth, of re-localisation with one to five crops a question, and with one to
+    five pictures (views) of up to three crops. Beside them what the plain recipe does (the median
+    position of the ten most similar observations) and the best cosine alone. With several maps
+    each is asked every question, and the worst one is named.
+
+    With --self the map is asked about its own keyframes, as if it had not been there then.
     """
     check_picture(picture)
-    result = score(
-        map_log,
-        query_logs or [],
-        read_truth(truth_files or []),
-        settings_of(settings_file, set_),
-        until=until,
-        method=method_from(method),
-        camera=camera_from(hfov, image),
-        seed=seed,
-        note=say,
-    )
-    warn_of_no_truth(map_log, result.scores)
+    if picture is not None and len(map_logs) > 1:
+        raise MisuseError("--picture draws one map; give one --map")
+    truth, settings = read_truth(truth_files or []), settings_of(settings_file, set_)
+    asked = bool(query_logs or truth_files) or not self_
+    found = []
+    for map_log in map_logs:
+        result = score(
+            map_log,
+            query_logs or [],
+            truth,
+            settings,
+            until=until,
+            method=method_from(method),
+            camera=camera_from(hfov, image),
+            seed=seed,
+            own=self_,
+            note=say,
+        )
+        if asked:
+            warn_of_no_truth(map_log, result.scores)
+        found.append((map_log, result.scores))
+        if picture is not None:
+            draw_failures(result.view, result.trials[3], picture)
     if json_:
-        emit(result.scores)
-    else:
-        display(scores_text(result.scores))
-    if picture is not None:
-        draw_failures(result.view, result.trials[3], picture)
+        emit(_document(found))
+        return
+    for map_log, scores in found:
+        title = f"{map_log}\n" if len(found) > 1 else ""
+        display(title + (scores_text(scores) if asked else "") + own_text(scores))
+    if len(found) > 1:
+        display(worst_text(found))
+
+
+_Scored = Sequence[tuple[Path, Mapping[str, Any]]]
+_JUDGED_BY = "3"
+"""Crops of the questions by which the worst map is found."""
+
+
+def _document(found: _Scored) -> Mapping[str, Any]:
+    """One map's scores; of several those of each, and the worst."""
+    if len(found) == 1:
+        return found[0][1]
+    worst = worst_of(found)
+    return {
+        "maps": [{"map": str(log), **scores} for log, scores in found],
+        "worst": None if worst is None else str(worst[0]),
+    }
+
+
+def worst_of(found: _Scored) -> tuple[Path, Mapping[str, Any], Mapping[str, Any]] | None:
+    """The map whose median error is greatest beside the plain recipe's, with both errors."""
+    compared = []
+    for log, scores in found:
+        column = scores["relocalization"][_JUDGED_BY]
+        ours, plain = column["pose_error_m"], column["plain"]["pose_error_m"]
+        if ours["p50"] is not None and plain["p50"]:
+            compared.append((ours["p50"] / plain["p50"], log, ours, plain))
+    if not compared:
+        return None
+    _, log, ours, plain = max(compared, key=lambda each: each[0])
+    return log, ours, plain
+
+
+def worst_text(found: _Scored) -> str:
+    """A line that names the worst map."""
+    worst = worst_of(found)
+    if worst is None:
+        return "no map was asked about things that it has\n"
+    log, ours, plain = worst
+    return (
+        f"worst map: {log}, {_JUDGED_BY} crops: pose error p50 {ours['p50']:.2f} m,"
+        f" the plain recipe's {plain['p50']:.2f} m\n"
+    )
 
 
 def warn_of_no_truth(log: Path, scores: Mapping[str, Any] | None) -> None:
@@ -111,15 +205,31 @@ def warn_of_no_truth(log: Path, scores: Mapping[str, Any] | None) -> None:
 
 
 def scores_text(scores: Mapping[str, Any]) -> str:
-    """The scores as a table: places, objects, then re-localisation by number of crops."""
+    """The scores as a table: places, objects, then re-localisation by number of crops and views."""
     lines = [_score_line("places", scores["places"]), _score_line("objects", scores["objects"]), ""]
-    by_crops = scores["relocalization"]
-    heads = [f"{n} crop{'s' if n != '1' else ''}" for n in by_crops]
-    lines.append(f"re-localisation ({scores['method']})".ljust(28) + _cells(heads))
-    for path, label in _ROWS:
-        values = [_cell(_value_at(column, path)) for column in by_crops.values()]
-        lines.append("  " + label.ljust(26) + _cells(values))
+    columns = {
+        counted(int(n), word): column
+        for word, group in (("crop", "relocalization"), ("view", "views"))
+        for n, column in scores[group].items()
+    }
+    lines.append(f"re-localisation ({scores['method']})".ljust(_LABEL) + _cells(list(columns)))
+    lines += _rows(_ROWS, columns)
     return "\n".join(lines) + "\n"
+
+
+def own_text(scores: Mapping[str, Any]) -> str:
+    """The scores of the map's own questions as a table, if it was asked any."""
+    if "self" not in scores:
+        return ""
+    columns = {counted(int(n), "crop"): column for n, column in scores["self"].items()}
+    lines = ["the map's own questions".ljust(_LABEL) + _cells(list(columns))]
+    return "\n".join([*lines, *_rows(_OWN_ROWS, columns)]) + "\n"
+
+
+def _rows(rows: Sequence[tuple[str, str]], columns: Mapping[str, Any]) -> Iterator[str]:
+    for path, label in rows:
+        values = [_cell(_value_at(column, path)) for column in columns.values()]
+        yield "  " + label.ljust(_LABEL - 2) + _cells(values)
 
 
 def _score_line(title: str, scores: Mapping[str, Any]) -> str:

@@ -16,6 +16,7 @@ from rich.progress import (
     TransferSpeedColumn,
 )
 
+from eventsrc.errors import MisuseError
 from eventsrc.importers import (
     DEFAULT_KEY,
     IMPORT_FSYNC,
@@ -24,6 +25,7 @@ from eventsrc.importers import (
     check_sources,
     import_files,
 )
+from eventsrc.importers.map_yaml import read_map_yaml
 from eventsrc.importers.source import Source
 from eventsrc.log import LogWriter
 from eventsrc.text import counted, visible
@@ -42,30 +44,48 @@ def import_(
         Path, typer.Argument(metavar="LOG", help="The log to append to; created if there is none.")
     ],
     files: Annotated[
-        list[str],
+        list[str] | None,
         typer.Argument(
-            metavar="FILE",
+            metavar="[FILE]...",
             help="JSON lines (plain or gzip), logger records, MCAP files, other logs; - is stdin.",
         ),
-    ],
+    ] = None,
     key: Annotated[str, typer.Option(help="Key for messages without one.")] = DEFAULT_KEY,
+    map_: Annotated[
+        Path | None,
+        typer.Option(
+            "--map",
+            metavar="FILE",
+            help="The map.yaml of a map server; its walls hold from here on, for the files too.",
+        ),
+    ] = None,
     json_: JsonOption = False,
 ) -> None:
-    """Append recorded envelopes to a log, in the order of the files.
+    """Append recorded envelopes to a log, in the order of the files, after an occupancy map.
 
-    A message that is no valid envelope is kept with its bytes and the reason under
-    mapfold/rejected, and the command exits with 3. Ctrl-C keeps what is in the log and says how far
-    it got.
+    A message that is neither a valid envelope nor an occupancy grid is kept with its bytes and the
+    reason under mapfold/rejected, and the command exits with 3. Ctrl-C keeps what is in the log and
+    says how far it got.
     """
-    check_sources(files)
+    names = files or []
+    if not names and map_ is None:
+        raise MisuseError("nothing to import; give a FILE, or a map by --map")
+    check_sources(names)
     check_key(key, "--key")
+    given_map = None if map_ is None else read_map_yaml(map_)
     rejects = _RejectPrinter()
     try:
         with LogWriter(log, fsync=IMPORT_FSYNC) as writer, _progress() as show:
             say_restart(log, writer)
             with ctrl_c_between_steps() as step:
                 report = import_files(
-                    writer, files, key=key, progress=show, on_reject=rejects.say, step=step
+                    writer,
+                    names,
+                    key=key,
+                    progress=show,
+                    on_reject=rejects.say,
+                    step=step,
+                    given_map=given_map,
                 )
     except ImportInterrupted as interrupted:
         rejects.say_rest()
@@ -109,6 +129,8 @@ def _summary(log: Path, report: ImportReport) -> str:
     parts = [f"imported {counted(report.accepted, 'envelope')} into {log}"]
     if report.next_offset > report.first_offset:
         parts.append(f"offsets {report.first_offset} to {report.next_offset - 1}")
+    if report.maps:
+        parts.insert(1, counted(report.maps, "map"))
     if report.system:
         parts.append(f"{counted(report.system, 'event')} of mapfold's own taken over")
     if report.skipped:

@@ -27,7 +27,8 @@ from eventsrc.log.reader import OnGap
 from eventsrc.log.recover import DEFAULT_MAX_LOSSES
 from eventsrc.log.seek import resolve, resolve_start, time_of
 from eventsrc.log_info import LogInfo, SegmentInfo, log_info
-from eventsrc.system_events import is_system_key
+from eventsrc.occupancy_map import InvalidMap, read_map_head
+from eventsrc.system_events import MAP_KEY, OccupancyMapEvent, is_system_key
 from eventsrc.text import counted, visible
 
 from .options import JsonOption, LogArgument
@@ -83,6 +84,9 @@ def event_line(event: Event) -> str:
 
 
 def _summary(event: Event) -> str:
+    if event.key == MAP_KEY:
+        with contextlib.suppress(InvalidMap):  # `log verify` names it
+            return _map_text(read_map_head(event.payload))
     value = _value(event.payload.decode(errors="replace"))
     if isinstance(value, dict) and isinstance(value.get("detections"), list):
         classes = [str(d.get("class", "?")) for d in value["detections"] if isinstance(d, dict)]
@@ -90,6 +94,16 @@ def _summary(event: Event) -> str:
         return f"{value.get('run_id')}:{value.get('keyframe_id')} saw {seen}"
     text = event.payload.decode(errors="replace").replace("\n", " ")
     return text if len(text) <= _SUMMARY_CHARS else text[: _SUMMARY_CHARS - 1] + "…"
+
+
+def _map_text(head: OccupancyMapEvent) -> str:
+    name = "" if head.map_id is None else f" {head.map_id}"
+    x, y, yaw = head.origin
+    turned = f", turned by {yaw:g} rad" if yaw else ""
+    return (
+        f"map{name} of {head.width:,} × {head.height:,} cells of {head.resolution:g} m from "
+        f"({x:g}, {y:g}){turned}, from {head.source}"
+    )
 
 
 class RangeNotes:

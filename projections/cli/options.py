@@ -28,7 +28,7 @@ from .terminal import say
 
 if TYPE_CHECKING:
     from projections.database.connection import Targets
-    from projections.relocalize import Camera, Crop
+    from projections.relocalize import Camera, Question
 
 JsonOption = Annotated[bool, typer.Option("--json", help="JSON on stdout.")]
 LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="The log's folder.")]
@@ -123,8 +123,8 @@ def past_settings(
     """
     if log is None and (file is not None or assignments):
         raise MisuseError(
-            "--set and --settings are for folding a log, and the live map keeps the settings it was"
-            " made with; give --log LOG too, or run mapfold replay with them"
+            "--preset, --set and --settings are for folding a log, and the live map keeps the"
+            " settings it was made with; give --log LOG too, or run mapfold replay with them"
         )
     return settings_from(file, assignments, corrections)
 
@@ -211,20 +211,41 @@ QuestionArgument = Annotated[
     typer.Argument(
         metavar="QUERY",
         help="JSON file with the crops: an envelope, a list of detections, or an object with"
-        " crops; - reads stdin.",
+        " crops or views; - reads stdin.",
+    ),
+]
+OptionalQuestion = Annotated[
+    str | None,
+    typer.Argument(
+        metavar="QUERY",
+        help="JSON file with the crops: an envelope, a list of detections, or an object with"
+        " crops or views; - reads stdin.",
+        show_default=False,
     ),
 ]
 HfovOption = Annotated[
-    float, typer.Option("--hfov", help="Horizontal field of view of the robot's camera, degrees.")
+    float | None,
+    typer.Option(
+        "--hfov",
+        help="Horizontal field of view of the robot's camera, degrees [default: that of the map's"
+        " settings].",
+        show_default=False,
+    ),
 ]
 ImageOption = Annotated[
-    str, typer.Option("--image", metavar="WxH", help="Size of the camera's pictures in pixels.")
+    str | None,
+    typer.Option(
+        "--image",
+        metavar="WxH",
+        help="Size of the camera's pictures in pixels [default: that of the map's settings].",
+        show_default=False,
+    ),
 ]
 _MAX_QUESTION_BYTES = 16 * 1024 * 1024
 
 
-def question_from(query: str) -> "tuple[Crop, ...]":
-    """The crops of a file or of stdin. Raises QuestionError that names the file."""
+def question_from(query: str) -> "Question":
+    """The question of a file or of stdin. Raises QuestionError that names the file."""
     from projections.relocalize import parse_question
 
     try:
@@ -246,10 +267,16 @@ def _read_question(query: str) -> bytes:
         return file.read(_MAX_QUESTION_BYTES + 1)
 
 
-def camera_from(hfov: float, image: str) -> "Camera":
-    """The camera that ``--hfov`` and ``--image`` describe. Raises QuestionError for a bad size."""
-    from projections.relocalize import Camera
+def camera_from(hfov: float | None, image: str | None) -> "Camera | None":
+    """The camera that ``--hfov`` and ``--image`` describe; None without either of them, and with
+    one alone the other is that of mapfold's defaults. Raises QuestionError for a bad size."""
+    from projections.relocalize import DEFAULT_CAMERA, Camera
 
+    if hfov is None and image is None:
+        return None
+    hfov = DEFAULT_CAMERA.hfov_deg if hfov is None else hfov
+    if image is None:
+        return Camera(DEFAULT_CAMERA.width_px, DEFAULT_CAMERA.height_px, hfov)
     width, _, height = image.lower().partition("x")
     try:
         return Camera(float(width), float(height), hfov)

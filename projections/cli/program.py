@@ -33,6 +33,7 @@ from typer.core import TyperGroup
 
 from eventsrc.errors import MapfoldError
 
+from .presets import add_presets
 from .terminal import EXIT_FAILED, say
 
 if TYPE_CHECKING:
@@ -104,6 +105,7 @@ def compose(names: Iterable[str], modules: Mapping[str, str]) -> typer.Typer:
     app.callback()(_main_options)
     for module in dict.fromkeys(modules[name] for name in names):
         importlib.import_module(module).register(app)
+    add_presets(app)
     return app
 
 

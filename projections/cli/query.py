@@ -59,14 +59,19 @@ def similar(
     json_: JsonOption = False,
 ) -> None:
     """Objects that look most like the crops of QUERY."""
-    crops = question_from(query)
+    crops = question_from(query).crops
     with databases(db, vector_db) as targets, CandidateReader(targets) as reader:
         found = similar_objects(crops, reader.candidates(crops), top)
     _print(found, json_)
 
 
 def where(
-    object_id: Annotated[str, typer.Argument(metavar="OBJECT", help="An object's id.")],
+    wanted: Annotated[
+        str,
+        typer.Argument(
+            metavar="WHAT", help="An object's id, a kind of room such as kitchen, a place's name."
+        ),
+    ],
     at: AtOption = None,
     log: LogOption = None,
     set_: SetOption = None,
@@ -74,9 +79,13 @@ def where(
     db: DbOption = None,
     json_: JsonOption = False,
 ) -> None:
-    """Where an object is, or was at a point of the log."""
+    """Where an object is, or which places are kitchens.
+
+    What kind of room a place is follows from the objects in it, or from its name. With --at as it
+    was at a point of the log.
+    """
     with _map_source(db, log, at, settings_file, set_) as source:
-        _print(where_is(source, object_id), json_)
+        _print(where_is(source, wanted), json_)
 
 
 def contents(

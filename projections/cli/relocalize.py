@@ -1,5 +1,6 @@
-"""`mapfold relocalize`: which Place is this, from a few object crops."""
+"""`mapfold relocalize`: which Place is this, from a few object crops or classes."""
 
+import contextlib
 import math
 from pathlib import Path
 from typing import Annotated, cast, get_args
@@ -9,14 +10,23 @@ import typer
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 from projections.model.log_commands import read_corrections
-from projections.relocalize import UNKNOWN_BELOW, Answer, Method, RankedPlace, rank, search_log
+from projections.relocalize import (
+    UNKNOWN_BELOW,
+    Answer,
+    ExactIndex,
+    Method,
+    Question,
+    RankedPlace,
+    rank,
+    read_question,
+)
 
 from .options import (
     DbOption,
     HfovOption,
     ImageOption,
     JsonOption,
-    QuestionArgument,
+    OptionalQuestion,
     SetOption,
     SettingsOption,
     VectorDbOption,
@@ -29,10 +39,27 @@ from .options import (
     say_defaults,
 )
 from .terminal import display, emit, say
+from .tracking import Search, print_tracked, question_lines
 
 
 def relocalize(
-    query: QuestionArgument,
+    query: OptionalQuestion = None,
+    track: Annotated[
+        bool,
+        typer.Option(
+            "--track",
+            help="Follow a robot: QUERY (else stdin) has one question a line, with dx, dy and dyaw"
+            " since the one before; each is answered with a line of JSON.",
+        ),
+    ] = False,
+    classes: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--class",
+            metavar="CLASS",
+            help="Where is a thing of this class near? May be repeated; takes the place of QUERY.",
+        ),
+    ] = None,
     top: Annotated[int, typer.Option("--top", min=1, max=100, help="Places to list.")] = 3,
     as_of: Annotated[
         str | None,
@@ -45,37 +72,64 @@ def relocalize(
     method: Annotated[
         str, typer.Option("--method", help="joint, or plain: similarities summed per Place.")
     ] = "joint",
-    hfov: HfovOption = 69.4,
-    image: ImageOption = "640x400",
+    hfov: HfovOption = None,
+    image: ImageOption = None,
     db: DbOption = None,
     vector_db: VectorDbOption = None,
     set_: SetOption = None,
     settings_file: SettingsOption = None,
     json_: JsonOption = False,
 ) -> None:
-    """Where a robot is, from a few object crops.
+    """Where a robot is, from a few object crops or classes.
 
-    Ranked Places with evidence, a pose hypothesis and a confidence.
+    Ranked Places with evidence, a pose hypothesis, how likely it is right (confidence) and how
+    likely the map has the things shown (known).
     """
-    how, camera, crops = method_from(method), camera_from(hfov, image), question_from(query)
+    how, camera = method_from(method), camera_from(hfov, image)
     if as_of is not None and log is None:
         raise MisuseError("--as-of asks a past map, which only the log knows; give --log LOG too")
-    if log is None:
-        past_settings(log, settings_file, set_)
-        with databases(db, vector_db) as targets:
+    with contextlib.ExitStack() as stack:
+        if track:
+            _refuse_to_track(classes, how)
+            lines = stack.enter_context(question_lines(query or "-"))
+        else:
+            question = _question(query, classes)
+        if log is None:
+            past_settings(log, settings_file, set_)
             # Here: `evaluate` and `whatif` import this module and ask no database.
-            from projections.queries.relocalize import relocalize as ask_databases
+            from projections.queries.relocalize import CandidateReader
 
-            answer = ask_databases(targets, crops, top=top, method=how, camera=camera)
-    else:
-        with LogReader(log) as reader:
-            end = point(reader, as_of or "end")
-            corrections = read_corrections(reader, end)
-        settings = past_settings(log, settings_file, set_, corrections)
-        candidates = search_log(log, str(end), settings, crops, corrections=corrections)
-        answer = rank(crops, candidates, top=top, method=how, camera=camera)
-        say_defaults(settings)
-    _print_answer(answer, json_)
+            targets = stack.enter_context(databases(db, vector_db))
+            search: Search = stack.enter_context(CandidateReader(targets)).candidates
+        else:
+            with LogReader(log) as reader:
+                end = point(reader, as_of or "end")
+                corrections = read_corrections(reader, end)
+            settings = past_settings(log, settings_file, set_, corrections)
+            search = ExactIndex.of_log(log, str(end), settings, corrections=corrections).search
+            say_defaults(settings)
+        if track:
+            print_tracked(lines, search, top=top, camera=camera)
+        else:
+            answer = rank(question, search(question.crops), top=top, method=how, camera=camera)
+            _print_answer(answer, json_)
+
+
+def _refuse_to_track(classes: list[str] | None, method: Method) -> None:
+    """Raise MisuseError for options that do not go with ``--track``."""
+    if classes:
+        raise MisuseError("--track reads questions from QUERY or stdin; ask without --class")
+    if method != "joint":
+        raise MisuseError("--track follows the poses of --method joint; ask without --method plain")
+
+
+def _question(query: str | None, classes: list[str] | None) -> Question:
+    """What is asked: QUERY, or things of the classes in one picture. Raises MisuseError."""
+    if (query is None) == (not classes):
+        raise MisuseError("give either QUERY, the crops that the robot sees, or --class CLASS")
+    if query is not None:
+        return question_from(query)
+    return read_question([{"class": name} for name in classes or ()])
 
 
 def method_from(text: str) -> Method:
@@ -86,12 +140,14 @@ def method_from(text: str) -> Method:
 
 
 def _print_answer(answer: Answer, as_json: bool) -> None:
+    if answer.thin is not None:
+        say(f"the map is thin, {answer.thin}: do not trust the answer until it has seen more")
     if not as_json:
         display(answer_text(answer))
         return
     emit(answer.document())
     if answer.unknown:
-        say(f"unknown: confidence {answer.confidence:.2f} is below {UNKNOWN_BELOW}")
+        say(f"unknown: {_known_text(answer)} is below {UNKNOWN_BELOW}")
 
 
 def answer_text(answer: Answer) -> str:
@@ -103,17 +159,25 @@ def answer_text(answer: Answer) -> str:
 
 
 def _first_line(answer: Answer) -> str:
-    confidence = f"confidence {answer.confidence:.2f}"
     if not answer.places:
-        return f"unknown: nothing in the map looks like these crops ({confidence})"
+        return f"unknown: nothing in the map looks like these crops ({_known_text(answer)})"
     if answer.unknown:
-        return f"unknown: {confidence} is below {UNKNOWN_BELOW}; the likeliest places would be"
-    return f"{_place_text(answer.places[0])} ({confidence})"
+        below = f"{_known_text(answer)} is below {UNKNOWN_BELOW}"
+        return f"unknown: {below}; the likeliest places would be"
+    confidence = f"confidence {answer.confidence:.2f}"
+    return f"{_place_text(answer.places[0])} ({confidence}, {_known_text(answer)})"
+
+
+def _known_text(answer: Answer) -> str:
+    """How likely the things shown are in the map."""
+    return f"known {answer.known:.2f}"
 
 
 def _place_text(place: RankedPlace) -> str:
-    """A Place's id, and beside it its name if it has one."""
-    return place.place_id if place.name is None else f"{place.place_id} “{place.name}”"
+    """A Place's id, and beside it its name and its floor if it has them."""
+    name = "" if place.name is None else f" “{place.name}”"
+    floor = "" if place.floor is None else f" on floor {place.floor}"
+    return f"{place.place_id}{name}{floor}"
 
 
 def _pose_line(answer: Answer) -> str:
@@ -121,7 +185,8 @@ def _pose_line(answer: Answer) -> str:
     if pose is None:
         return ""
     yaw = "" if pose.yaw is None else f", facing {math.degrees(pose.yaw):.0f}°"
-    return f"pose ({pose.x:.2f}, {pose.y:.2f}) m{yaw}, spread {pose.spread_m:.2f} m"
+    floor = "" if pose.floor is None else f" on floor {pose.floor}"
+    return f"pose ({pose.x:.2f}, {pose.y:.2f}) m{floor}{yaw}, spread {pose.spread_m:.2f} m"
 
 
 def _place_lines(number: int, place: RankedPlace) -> list[str]:

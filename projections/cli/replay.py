@@ -14,6 +14,7 @@ from projections.database import ForeignEmbedding, RebuildReport, rebuild
 from projections.database.loader import LoaderName
 from projections.database.origin import command_line
 from projections.database.sink import SinkName
+from projections.model.advice import places_advice
 from projections.model.log_commands import read_corrections
 from projections.settings import Settings
 
@@ -182,6 +183,6 @@ def _print(log: Path, settings: Settings, report: RebuildReport, logged: Setting
     say(", ".join(counted(counts[f"{word}s"], word) for word in words))
     if report.hnsw is not None:
         say(f"vector search: {report.hnsw.reason}")
-    missing = left_out(log, settings, report, logged)
-    if missing is not None:
-        say(missing)
+    for line in (left_out(log, settings, report, logged), places_advice(counts, settings)):
+        if line is not None:
+            say(line)

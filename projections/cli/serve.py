@@ -165,8 +165,8 @@ def serve(
     max_bytes: Annotated[
         int, typer.Option("--max-bytes", min=1000, help="Longer questions are refused.")
     ] = DEFAULT_MAX_BYTES,
-    hfov: HfovOption = 69.4,
-    image: ImageOption = "640x400",
+    hfov: HfovOption = None,
+    image: ImageOption = None,
     db: DbOption = None,
     vector_db: VectorDbOption = None,
 ) -> None:

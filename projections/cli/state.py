@@ -7,6 +7,7 @@ import typer
 
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
+from projections.model.advice import places_advice
 from projections.model.digest import map_digest
 from projections.model.export import state_document, state_text
 from projections.model.fold import fold_log_cached
@@ -57,6 +58,9 @@ def state(
         display(f"{hexdigits}\n")
     else:
         display(state_text(view, hexdigits, known))
+    advice = None if digest else places_advice(view.counts(), settings)
+    if advice is not None:
+        say(advice)
 
 
 def register(app: typer.Typer) -> None:

@@ -20,7 +20,7 @@ from projections.exact import Q40, UM_PER_M
 from projections.model.records import KeyframeRecord, ObjectRecord
 from projections.model.view import MapView
 
-from .labels import LABELS, Label, adjacency_number, graphid_base
+from .labels import LABELS, Label, adjacency_number, floor_part_number, graphid_base
 
 
 def text(value: str) -> str:
@@ -43,6 +43,8 @@ EdgeRow = tuple[int, int, int, str]
 Row = VertexRow | EdgeRow
 
 _NONE: Final = "{}"
+BUILDING_ID: Final = "building"
+"""A map is of one building."""
 BASE: Final = {label: graphid_base(label) + 1 for label in LABELS}
 """The graphid of ordinal 0 of each label."""
 
@@ -65,6 +67,9 @@ def expected_rows(view: MapView, label: Label) -> Iterator[Row]:
         "LOCATED_IN": lambda: located_in_rows(view, objects),
         "IN_PLACE": lambda: in_place_rows(view, keyframes),
         "ADJACENT_TO": lambda: adjacent_to_rows(view, sorted(view.adjacency)),
+        "Floor": lambda: floor_rows(view, range(len(view.floors))),
+        "Building": lambda: building_rows(view),
+        "PART_OF": lambda: part_of_rows(view, sorted(view.places), range(len(view.floors))),
     }
     return rows[label]()
 
@@ -93,7 +98,8 @@ def pose_rows(view: MapView, keyframes: Iterable[int]) -> Iterator[VertexRow]:
         if (pose := k.pose) is not None:
             properties = (
                 f'{{{_keyframe_key(k)}, "map_x": {pose.x_um / UM_PER_M!r},'
-                f' "map_y": {pose.y_um / UM_PER_M!r}, "map_yaw": {pose.yaw_rad!r}}}'
+                f' "map_y": {pose.y_um / UM_PER_M!r}, "map_yaw": {pose.yaw_rad!r}'
+                f"{_floor(k.floor)}}}"
             )
             yield base + i, properties
 
@@ -130,20 +136,28 @@ def object_rows(view: MapView, objects: Iterable[int]) -> Iterator[VertexRow]:
 def _evidence(found: ObjectRecord) -> str:
     """More properties of an Object; one without an estimate has no position."""
     at, missing = found.estimate, "false" if found.missing_in is None else "true"
-    position = (
-        ""
-        if at is None
-        else f', "est_x": {at.est_x!r}, "est_y": {at.est_y!r}, "est_sigma_m": {at.est_sigma_m!r}'
+    if at is None:
+        return f', "missing": {missing}'
+    xx, xy, yy = at.covariance_m2
+    return (
+        f', "est_x": {at.est_x!r}, "est_y": {at.est_y!r}, "est_sigma_m": {at.est_sigma_m!r},'
+        f' "est_xx": {xx!r}, "est_xy": {xy!r}, "est_yy": {yy!r}, "est_spots": {at.spots},'
+        f' "missing": {missing}'
     )
-    return f'{position}, "missing": {missing}'
 
 
 def place_rows(view: MapView, places: Iterable[int]) -> Iterator[VertexRow]:
-    """Places, also those that were absorbed; only those that have a name have the property."""
+    """Places, also those that were absorbed. Only those that have a name, a floor or a type that is
+    sure have these properties."""
     base = BASE["Place"]
     for i in places:
         p = view.all_places[i]
         name = "" if p.name is None else f', "name": {text(p.name)}'
+        name += _floor(view.floor_of(p.ordinal))
+        kind = view.type_of(p.ordinal)
+        if kind is not None and kind.type is not None:
+            probability = number(kind.probability)
+            name += f', "type": {text(kind.type)}, "type_probability": {probability}'
         properties = (
             f'{{"place_id": {text(p.place_id)}, "centroid_x": {number(p.centroid_x)},'
             f' "centroid_y": {number(p.centroid_y)}, "keyframe_count": {p.keyframe_count}{name}}}'
@@ -207,9 +221,40 @@ def adjacent_to_rows(
     for a, b in links:
         shared = view.adjacency.get((a, b))
         if shared is not None:
-            properties = f'{{"shared_transitions": {shared}}}'
+            mark = ', "between_floors": true' if view.is_between_floors(a, b) else ""
+            properties = f'{{"shared_transitions": {shared}{mark}}}'
             edge = base + adjacency_number(a, b)
             yield edge, BASE["Place"] + a, BASE["Place"] + b, properties
+
+
+def floor_rows(view: MapView, floors: Iterable[int]) -> Iterator[VertexRow]:
+    """Floors that have a name."""
+    names = list(view.floors)
+    return ((BASE["Floor"] + i, f'{{"floor": {text(names[i])}}}') for i in floors)
+
+
+def building_rows(view: MapView) -> Iterator[VertexRow]:
+    """The building, once it has a place or a floor."""
+    if view.all_places or view.floors:
+        yield BASE["Building"], f'{{"building_id": {text(BUILDING_ID)}}}'
+
+
+def part_of_rows(
+    view: MapView, places: Iterable[PlaceOrdinal], floors: Iterable[int]
+) -> Iterator[EdgeRow]:
+    """Edges from places to their floor, or to the building where the floor has no name; and from
+    floors to the building."""
+    base, building = graphid_base("PART_OF"), BASE["Building"]
+    for p in places:
+        floor = view.floor_of(p)
+        whole = building if floor is None else BASE["Floor"] + view.floors[floor]
+        yield base + p + 1, BASE["Place"] + p, whole, _NONE
+    for f in floors:
+        yield base + floor_part_number(f), BASE["Floor"] + f, building, _NONE
+
+
+def _floor(name: str | None) -> str:
+    return "" if name is None else f', "floor": {text(name)}'
 
 
 def _keyframe_key(keyframe: KeyframeRecord) -> str:

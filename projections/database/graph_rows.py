@@ -2,9 +2,9 @@
 
 Two kinds of rows. *Fixed* ones are written once, when their event is folded: Keyframe, Pose,
 Observation and the edges HAS_KEYFRAME, HAS_POSE, HAS_OBSERVATION, OBSERVES (an observation is fused
-by the event that adds it, or never). *Changing* ones can get other values later: Run, Object, Place
-and the edges LOCATED_IN, IN_PLACE, ADJACENT_TO. Where two Objects may become one, by a correction
-or under fusion by evidence, OBSERVES is a changing one too.
+by the event that adds it, or never). *Changing* ones can get other values later: Run, Object,
+Place, Floor, Building and the edges LOCATED_IN, IN_PLACE, ADJACENT_TO, PART_OF. Where two Objects
+may become one, by a correction or under fusion by evidence, OBSERVES is a changing one too.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,9 @@ from projections.model.view import MapView
 from .graph_render import (
     BASE,
     adjacent_to_rows,
+    building_rows,
     expected_rows,
+    floor_rows,
     has_keyframe_rows,
     has_observation_rows,
     has_pose_rows,
@@ -27,6 +29,7 @@ from .graph_render import (
     object_rows,
     observation_rows,
     observes_rows,
+    part_of_rows,
     place_rows,
     pose_rows,
     run_rows,
@@ -40,6 +43,9 @@ CHANGING: Final[tuple[Label, ...]] = (
     "LOCATED_IN",
     "IN_PLACE",
     "ADJACENT_TO",
+    "Floor",
+    "Building",
+    "PART_OF",
 )
 
 
@@ -104,11 +110,18 @@ def changed_rows(changes: BatchChanges, view: MapView) -> GraphRows:
         ),
         "IN_PLACE": list(in_place_rows(view, changes.placed)),
         "ADJACENT_TO": list(adjacent_to_rows(view, changes.links)),
+        "Floor": list(floor_rows(view, changes.floors)),
+        "Building": list(building_rows(view)) if changes.formed or changes.floors else [],
+        "PART_OF": list(
+            part_of_rows(view, filter(view.places.__contains__, changes.formed), changes.floors)
+        ),
     }
+    gone = [p for p in changes.places if p not in view.places]
     absorbed = [o for o in changes.objects if o not in view.objects]
     nowhere = [o for o in changes.located if view.all_objects[o].place is None]
     deleted: dict[Label, list[int]] = {
-        "Place": [BASE["Place"] + p for p in changes.places if p not in view.places],
+        "Place": [BASE["Place"] + p for p in gone],
+        "PART_OF": [BASE["PART_OF"] + p for p in gone],
         "Object": [BASE["Object"] + o for o in absorbed],
         "LOCATED_IN": [BASE["LOCATED_IN"] + o for o in sorted({*absorbed, *nowhere})],
         "ADJACENT_TO": [

@@ -12,7 +12,7 @@ from typing import Final
 
 from psycopg import sql
 
-from projections.errors import DatabaseError
+from projections.errors import DatabaseError, ProjectionMismatch
 
 from . import swap
 from .connection import Connection, describe_connection
@@ -53,19 +53,33 @@ def create(connection: Connection, graph: str) -> None:
     run = statements("graph")
     connection.execute(run["create_graph"], {"graph": graph})
     connection.execute(run["mark"].format(graph=sql.Identifier(graph)))
-    for label in VERTEX_LABELS:
-        connection.execute(run["create_vlabel"], {"graph": graph, "label": label})
-    for edge in EDGE_LABELS:
-        connection.execute(run["create_elabel"], {"graph": graph, "label": edge})
+    for label in LABELS:
+        kind = "create_vlabel" if label in VERTEX_LABELS else "create_elabel"
+        connection.execute(run[kind], {"graph": graph, "label": label})
     for name in LABELS:
         table = sql.Identifier(graph, name)
         connection.execute(run["no_statistics"].format(table=table))
     add_policies(connection, graph)
-    found: dict[str, int] = dict(connection.execute(run["label_ids"], {"graph": graph}).fetchall())
+    found = _label_ids(connection, graph)
     if any(found.get(label) != number for label, number in LABEL_IDS.items()):
         raise DatabaseError(
             f"{describe_connection(connection)}: this version of Apache AGE numbers labels in"
             f" another way ({found}); use AGE 1.5 to 1.8"
+        )
+
+
+def _label_ids(connection: Connection, graph: str) -> dict[str, int]:
+    rows = connection.execute(statements("graph")["label_ids"], {"graph": graph}).fetchall()
+    return dict(rows)
+
+
+def refuse_older(connection: Connection, graph: str) -> None:
+    """Raise ProjectionMismatch for a graph that an older mapfold made, which lacks labels."""
+    missing = [label for label in LABELS if label not in _label_ids(connection, graph)]
+    if missing:
+        raise ProjectionMismatch(
+            f"{describe_connection(connection)}: an older mapfold made the graph there: it has no"
+            f" {', '.join(missing)}; run mapfold replay, which makes it anew"
         )
 
 
@@ -108,9 +122,11 @@ def counts(connection: Connection, graph: str) -> dict[str, int]:
 
 
 def lock(connection: Connection, graph: str) -> None:
-    """Lock all tables of a graph exclusively, if it is there."""
+    """Lock all tables of a graph exclusively, if it is there; an older version's has fewer."""
     if exists(connection, graph):
-        tables = sql.SQL(", ").join(sql.Identifier(graph, name) for name in (*PARENTS, *LABELS))
+        there = _label_ids(connection, graph)
+        names = [*PARENTS, *filter(there.__contains__, LABELS)]
+        tables = sql.SQL(", ").join(sql.Identifier(graph, name) for name in names)
         connection.execute(statements("graph")["lock"].format(tables=tables))
 
 

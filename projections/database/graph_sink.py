@@ -46,9 +46,11 @@ class GraphSink:
         self._loader: Loader = loader_of(loader)
 
     def ensure(self, connection: Connection) -> bool:
-        """Create an empty graph if there is none."""
+        """Create an empty graph if there is none. Raises ProjectionMismatch for that of an older
+        version."""
         ensure_extension(connection, "age")
         if graph_schema.exists(connection, GRAPH):
+            graph_schema.refuse_older(connection, GRAPH)
             return False
         graph_schema.create(connection, GRAPH)
         graph_schema.index(connection, GRAPH)

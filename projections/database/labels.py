@@ -10,6 +10,12 @@ the fold's ordinals, so every id follows from the log alone and no write has to 
     HAS_OBSERVATION, OBSERVES                     observation + 1
     LOCATED_IN                                    object + 1
     ADJACENT_TO                                   (a + 1) << 24 | (b + 1)
+    Floor                                         floor + 1
+    Building                                      1
+    PART_OF of a Place                            place + 1
+    PART_OF of a Floor                            1 << 40 | (floor + 1)
+
+The last three labels are younger than the others and so come after the edges.
 """
 
 from typing import Final, Literal, TypeAlias
@@ -21,7 +27,9 @@ OLD_GRAPH: Final = "semantic_map_old"
 """The graph that a shadow replaced, until its last reader has ended."""
 TABLE: Final = "detection_embeddings"
 
-VertexLabel: TypeAlias = Literal["Run", "Keyframe", "Pose", "Observation", "Object", "Place"]
+VertexLabel: TypeAlias = Literal[
+    "Run", "Keyframe", "Pose", "Observation", "Object", "Place", "Floor", "Building"
+]
 EdgeLabel: TypeAlias = Literal[
     "HAS_KEYFRAME",
     "HAS_POSE",
@@ -30,6 +38,7 @@ EdgeLabel: TypeAlias = Literal[
     "LOCATED_IN",
     "IN_PLACE",
     "ADJACENT_TO",
+    "PART_OF",
 ]
 Label: TypeAlias = VertexLabel | EdgeLabel
 
@@ -40,6 +49,8 @@ VERTEX_LABELS: Final[tuple[VertexLabel, ...]] = (
     "Observation",
     "Object",
     "Place",
+    "Floor",
+    "Building",
 )
 EDGE_LABELS: Final[tuple[EdgeLabel, ...]] = (
     "HAS_KEYFRAME",
@@ -49,11 +60,22 @@ EDGE_LABELS: Final[tuple[EdgeLabel, ...]] = (
     "LOCATED_IN",
     "IN_PLACE",
     "ADJACENT_TO",
+    "PART_OF",
 )
-LABELS: Final[tuple[Label, ...]] = (*VERTEX_LABELS, *EDGE_LABELS)
+_YOUNGEST: Final[tuple[Label, ...]] = ("Floor", "Building", "PART_OF")
+LABELS: Final[tuple[Label, ...]] = (
+    *(label for label in (*VERTEX_LABELS, *EDGE_LABELS) if label not in _YOUNGEST),
+    *_YOUNGEST,
+)
+"""In the order in which they are created."""
 LABEL_IDS: Final[dict[Label, int]] = {label: 3 + i for i, label in enumerate(LABELS)}
 
-CHANGING_EDGES: Final[tuple[EdgeLabel, ...]] = ("LOCATED_IN", "IN_PLACE", "ADJACENT_TO")
+CHANGING_EDGES: Final[tuple[EdgeLabel, ...]] = (
+    "LOCATED_IN",
+    "IN_PLACE",
+    "ADJACENT_TO",
+    "PART_OF",
+)
 """Edges that a later event may move or remove; the others are written once."""
 
 KEYS: Final[dict[VertexLabel, str]] = {
@@ -61,6 +83,7 @@ KEYS: Final[dict[VertexLabel, str]] = {
     "Observation": "det_id",
     "Object": "object_id",
     "Place": "place_id",
+    "Floor": "floor",
 }
 """The property by which readers find a vertex; each gets a btree index."""
 
@@ -74,6 +97,8 @@ COUNT_KEYS: Final[dict[Label, str]] = {
     "Observation": "observations",
     "Object": "objects",
     "Place": "places",
+    "Floor": "floors",
+    "Building": "buildings",
     **{label: label for label in EDGE_LABELS},
 }
 """The name under which `MapView.counts` counts a label's rows."""
@@ -82,6 +107,11 @@ COUNT_KEYS: Final[dict[Label, str]] = {
 def graphid_base(label: Label) -> int:
     """The graphid of number 0 of a label; add the number to get a row's id."""
     return LABEL_IDS[label] << 48
+
+
+def floor_part_number(floor: int) -> int:
+    """The number of the edge from a floor (ordinal) to the building."""
+    return 1 << 40 | (floor + 1)
 
 
 def adjacency_number(a: int, b: int) -> int:

@@ -19,9 +19,6 @@ from .inputs import MapInputs
 from .sink import Checkpoint, SinkName
 
 _WAS: Final[dict[SinkName, str]] = {"graph": "was", "vectors": "were"}
-_NOT_AN_OPTION: Final = "neighbourhood"
-"""The setting that ``--set`` does not take."""
-
 
 Fault: TypeAlias = Literal["log", "settings", "corrections"]
 """What of a projection's origin is another than it should be."""
@@ -59,21 +56,24 @@ def _settings_differences(before: str, settings: Settings) -> list[str]:
 
 def _options_to_match(before: str, settings: Settings) -> str | None:
     """The ``--set`` options that turn ``settings`` into a checkpoint's; None if none can."""
-    try:
-        old = Settings.model_validate_json(before)
-    except ValidationError:
+    old = _settings_of(before)
+    if old is None:
         return None
     changed = old.changed_from(settings)
-    if _NOT_AN_OPTION in changed:
-        return None
     return " ".join(_options(dict(sorted(changed.items())))) or None
+
+
+def _settings_of(document: str) -> Settings | None:
+    """A checkpoint's settings; None if this version cannot read them."""
+    try:
+        return Settings.model_validate_json(document)
+    except ValidationError:
+        return None
 
 
 def _options(values: Mapping[str, Any]) -> list[str]:
     return [
-        f"--set {shlex.quote(f'{name}={_option_value(value)}')}"
-        for name, value in values.items()
-        if name != _NOT_AN_OPTION
+        f"--set {shlex.quote(f'{name}={_option_value(value)}')}" for name, value in values.items()
     ]
 
 
@@ -87,7 +87,7 @@ def origin_fault(found: Checkpoint, log_id: str, inputs: MapInputs) -> Fault | N
         return "log"
     if found.fingerprint == inputs.fingerprint:
         return None
-    return "corrections" if found.settings == inputs.settings.model_dump_json() else "settings"
+    return "corrections" if _settings_of(found.settings) == inputs.settings else "settings"
 
 
 def refuse_other_origin(

@@ -84,7 +84,8 @@ def _record_all(
     view, rooms = folded.view, place_rooms(folded.view, run)
     if (merge := most_telling(folded.merges)) is not None:
         offset, part = merge.offset, merge.absorbed[0]
-        stamp = Stamp("demo-undo-merge", _ISSUED_BY, "these are two rooms")
+        why = "these are two rooms" if merge.across_rooms else f"two ends of the {part.room}"
+        stamp = Stamp("demo-undo-merge", _ISSUED_BY, why)
         yield _record(folder, settings, stamp, lambda c, s: undo_merge(c, s, offset))
         place, room = part.place_id, part.room
     elif view.places:

@@ -14,13 +14,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from eventsrc.log import LogWriter
 from eventsrc.sim import DEFAULT_SEED, simulate_run
+from eventsrc.sim.walls import occupancy_map
+from eventsrc.system_events import MAP_KEY
 from projections.database import rebuild
 from projections.database.connection import Targets, open_targets
 from projections.database.embedded import EmbeddedServer
 from projections.drawing import draw_map, floor_of
 from projections.drawing.picture import bridges_of
-from projections.settings import Settings
+from projections.settings import PRESETS, Settings
 
 from . import report
 from .asking import ask_lost, place_rooms
@@ -30,9 +33,8 @@ from .mapping import RoomMerge, fold_with_rooms, hash_tables, most_telling, plac
 from .recording import record_run
 from .report import DemoResult, result_document
 
-SETTINGS: Final = Settings(eps_m=0.75, min_samples=8)
-"""A look around leaves 22 keyframes in one spot, a drive through a door three or four within
-0.75 m: here the first is a place and the second not. The default chains the whole house."""
+SETTINGS: Final = Settings().with_assignments(PRESETS["rooms"])
+"""The default chains the whole house."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +67,8 @@ def _play(options: DemoOptions, folder: DemoFolder, tell: Tell) -> dict[str, Any
     with contextlib.ExitStack() as stack:
         with clock.stage("Run A explores the house and is recorded"):
             targets = stack.enter_context(_databases(folder, options))
+            with LogWriter(folder.log) as writer:
+                writer.append(MAP_KEY, occupancy_map(house).encode())
             recorded, followed = record_run(explorer, options.speed, folder, targets, SETTINGS)
             clock.tell(report.tell_recording(recorded, followed, detections, rooms, options.speed))
         with clock.stage("The databases are thrown away and the log is replayed"):
@@ -76,6 +80,7 @@ def _play(options: DemoOptions, folder: DemoFolder, tell: Tell) -> dict[str, Any
         with clock.stage("The map"):
             default_places = places_with(folder, Settings())
             clock.tell(report.tell_map(folded, Settings(), default_places))
+            clock.tell(report.tell_types(folded.view))
             clock.tell(report.tell_merges(folded.merges))
         with clock.stage("A person corrects the map"):
             corrected = correct(folder, targets, SETTINGS, explorer, folded)

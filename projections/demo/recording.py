@@ -66,8 +66,11 @@ def record_run(
     targets: Targets,
     settings: Settings,
 ) -> tuple[Recorded, Followed]:
-    """Have run A published, recorded into the folder's log, and tailed into the databases."""
+    """Have run A published, recorded into the folder's log behind what is in it, and tailed into
+    the databases."""
     started = time.monotonic()
+    with LogReader(folder.log) as reader:
+        before = reader.next_offset
     count = len(run.envelopes)
     drive_s = run.true_poses[-1].time_s
     with Router(_ANY_PORT) as router, Children() as children:
@@ -86,7 +89,7 @@ def record_run(
                 folder.stderr_of("simulate"),
             )
             children.wait(_TIMEOUT_S + drive_s / speed)
-            followed = background_tail.wait_for(Offset(count))
+            followed = background_tail.wait_for(Offset(before + count))
     seconds = time.monotonic() - started
     info = log_info(folder.log)
     with LogReader(folder.log) as reader:
@@ -145,13 +148,13 @@ class BackgroundTail:
         self._stop.set()
         report = self._running.result(_TAIL_TIMEOUT_S)
         delays = self._delays()
-        return Followed(report.events, report.batches, statistics.median(delays), max(delays))
+        return Followed(len(delays), report.batches, statistics.median(delays), max(delays))
 
     def _on_batch(self, report: TailReport) -> None:
         self._commits.append((report.next_offset, time.time_ns()))
 
     def _delays(self) -> list[float]:
-        """Seconds for every event, from the log's time stamp to the commit that covers it."""
+        """Seconds for every envelope, from the log's time stamp to the commit that covers it."""
         delays: list[float] = []
         commits = iter(self._commits)
         reached, committed_ns = 0, 0
@@ -159,5 +162,6 @@ class BackgroundTail:
             for event in reader.read(FIRST_OFFSET, self._commits[-1][0]):
                 while reached <= event.offset:
                     reached, committed_ns = next(commits)
-                delays.append((committed_ns - event.logged_ns) / 1e9)
+                if not is_system_key(event.key):
+                    delays.append((committed_ns - event.logged_ns) / 1e9)
         return delays

@@ -5,11 +5,13 @@ Lengths in metres, times in seconds.
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from textwrap import wrap
 from typing import Any
 
 from eventsrc.text import counted
 from projections.database import RebuildReport
 from projections.database.labels import EDGE_LABELS, TABLE, VERTEX_LABELS
+from projections.model.view import MapView
 from projections.relocalize import UNKNOWN_BELOW
 from projections.settings import Settings
 
@@ -38,6 +40,7 @@ def tell_recording(
         f"   {kept}; {recorded.rejected} rejected, {recorded.lost} lost, "
         f"{recorded.log_bytes / 1e6:.1f} MB"
     )
+    yield "   the walls of the house, an occupancy map, were put into the log before"
     yield (
         f"   a tail wrote them to Apache AGE and pgvector as they came, in "
         f"{counted(followed.batches, 'transaction')}:"
@@ -74,12 +77,26 @@ def tell_map(folded: Folded, other_settings: Settings, other_places: int) -> Ite
     pairs = counted(counts["adjacency"], "pair")
     yield (
         f"   {counted(transitions, 'transition')} between {pairs} of neighbouring places; "
-        f"settings ε {settings.eps_m:g} m, min_samples {settings.min_samples}"
+        f"{settings.places_text()}"
     )
     yield (
         f"   (the default, {other_settings.eps_m:g} m and {other_settings.min_samples}, chains "
         f"this drive into {counted(other_places, 'place')})"
     )
+
+
+def tell_types(view: MapView) -> Iterator[str]:
+    """What kinds of rooms the places seem to be."""
+    kinds = ((place, view.type_of(place.ordinal)) for place in view.places.values())
+    told = [
+        f"{_short(place.place_id)} {kind.type} {kind.probability:.0%}".replace("%", " %")
+        for place, kind in kinds
+        if kind is not None and kind.type is not None
+    ]
+    if told:
+        unsure = len(view.places) - len(told)
+        text = f"by what stands in them ({unsure} unsure): {', '.join(told)}"
+        yield from wrap(text, 96, initial_indent="   ", subsequent_indent="   ")
 
 
 def tell_merges(merges: tuple[RoomMerge, ...]) -> Iterator[str]:
@@ -160,7 +177,7 @@ def _pose(asked: AskedQuestion) -> str:
     off = "no pose" if asked.error_m is None else f"{asked.error_m:.2f} m off"
     sure = f"confidence {answer.confidence:.2f}"
     if answer.unknown:
-        sure += f", below {UNKNOWN_BELOW:g}: unknown"
+        sure += f", known {answer.known:.2f}, below {UNKNOWN_BELOW:g}: unknown"
     return f"pose {off}, {sure}, {1000 * asked.seconds:.0f} ms"
 
 

@@ -22,7 +22,7 @@ from .scene import (
     Spot,
     object_groups,
     object_spot,
-    place_names,
+    place_badges,
     two_sigma,
 )
 
@@ -35,11 +35,13 @@ _RINGS_M = tuple(0.07 * 1.28**step for step in range(15))
 
 
 def draw_adjacency(canvas: Canvas, view: MapView) -> None:
-    """A dashed line between neighbouring places and the number of transitions on it."""
+    """A dashed line between neighbouring places and the number of transitions on it; a dotted one
+    between two floors."""
     for a, b, count in view.edges():
         one, other = view.places[a], view.places[b]
         start, end = (one.centroid_x, one.centroid_y), (other.centroid_x, other.centroid_y)
-        line = {"arrowstyle": "-", "color": palette.INK, "lw": 1.2, "ls": (0, (4, 3))}
+        dashes = (1, 2) if view.is_between_floors(a, b) else (4, 3)
+        line = {"arrowstyle": "-", "color": palette.INK, "lw": 1.2, "ls": (0, dashes)}
         canvas.axes.annotate("", end, start, zorder=8, arrowprops=line)
         middle = (start[0] + end[0]) / 2, (start[1] + end[1]) / 2
         _draw_badge(
@@ -48,8 +50,8 @@ def draw_adjacency(canvas: Canvas, view: MapView) -> None:
 
 
 def draw_place_names(canvas: Canvas, view: MapView) -> None:
-    """Each place's name on its centroid, in its colour."""
-    names = place_names(view)
+    """Each place's name on its centroid, in its colour, and what kind of room it seems to be."""
+    names = place_badges(view)
     for ordinal, place in view.places.items():
         centroid = place.centroid_x, place.centroid_y
         colours = palette.place_colour(ordinal), "white", "white"
@@ -169,8 +171,10 @@ def _draw_badge(
         *spot, text, ha="center", va="center", size=size, weight="bold", color=ink, bbox=box,
         zorder=14,
     )  # fmt: skip
-    half_width = (0.36 * size * len(text) + 0.45 * size) * canvas.unit
-    canvas.occupied.append(Extent(*spot, half_width, 0.9 * size * canvas.unit))
+    lines = text.splitlines()
+    half_width = (0.36 * size * max(map(len, lines), default=0) + 0.45 * size) * canvas.unit
+    half_height = (0.25 + 0.65 * max(len(lines), 1)) * size * canvas.unit
+    canvas.occupied.append(Extent(*spot, half_width, half_height))
 
 
 def _label_request(canvas: Canvas, text: str, spot: tuple[float, float]) -> LabelRequest:

@@ -17,6 +17,7 @@ from . import canvas as palette
 from .base_layers import draw_drives, draw_floor, draw_regions, draw_walls
 from .canvas import Canvas, check_suffix, new_canvas
 from .labels import Extent
+from .map_walls import draw_map_walls, wall_spots
 from .overlays import (
     DOT_M,
     draw_adjacency,
@@ -78,8 +79,9 @@ def compose(
     by_evidence = view.settings.fusion == "evidence"
     shown = shown_objects(view, min_observations) if by_evidence else []
     standing = [object_spot(found) for found in shown]
-    canvas = new_canvas(view, floor, standing)
+    canvas = new_canvas(view, floor, [*standing, *wall_spots(view)])
     draw_floor(canvas, floor)
+    draw_map_walls(canvas, view)
     draw_regions(canvas, view)
     draw_drives(canvas, view)
     draw_walls(canvas, floor)
@@ -102,12 +104,12 @@ def compose(
 def _numbers(view: MapView, min_observations: int) -> str:
     counts, settings = view.counts(), view.settings
     shown = sum(found.obs_count >= min_observations for found in view.objects.values())
+    keyframes = counts["poses" if view.floors else "keyframes"]
     return (
-        f"{counted(counts['keyframes'], 'keyframe')} ({counts['noise']} in no place)  ·  "
+        f"{counted(keyframes, 'keyframe')} ({counts['noise']} in no place)  ·  "
         f"{counted(counts['places'], 'place')}  ·  "
         f"{counted(counts['objects'], 'object')}, {shown} of them shown: seen "
-        f"{counted(min_observations, 'time')} or more  ·  ε {settings.eps_m:g} m, "
-        f"min_samples {settings.min_samples}"
+        f"{counted(min_observations, 'time')} or more  ·  {settings.places_text()}"
     )
 
 

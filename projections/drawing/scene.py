@@ -152,6 +152,16 @@ def place_names(view: MapView) -> dict[int, str]:
     }
 
 
+def place_badges(view: MapView) -> dict[int, str]:
+    """`place_names`, and below an id what kind of room it is, where that is known."""
+    labels = place_names(view)
+    for place in view.places.values():
+        kind = view.type_of(place.ordinal) if place.name is None else None
+        if kind is not None and kind.type is not None:
+            labels[place.ordinal] += f"\n{kind.type}?"
+    return labels
+
+
 def _cut(name: str) -> str:
     return name if len(name) <= _MOST_LETTERS else f"{name[: _MOST_LETTERS - 1]}…"
 

@@ -113,8 +113,18 @@ def join(current: CurrentMap, stamp: Stamp, first: str, second: str) -> Join:
         raise EditRefused(
             f"{first} and {second} are one place already, {current.place_name(pair[0])}"
         )
+    _check_floor(f"{first} and {second}", *(current.keyframes[each].floor for each in pair))
     check_join(current, *pair)
     return build(Join, stamp, places=(_anchor(pair[0]), _anchor(pair[1])))
+
+
+def _check_floor(what: str, one: str | None, other: str | None) -> None:
+    """Raises EditRefused for things on two floors, which are never one."""
+    if one != other:
+        names = " and ".join(
+            "none" if name is None else repr(visible(name)) for name in (one, other)
+        )
+        raise EditRefused(f"{what} are on two floors, {names}; nothing on two floors is ever one")
 
 
 def _two_places(current: CurrentMap, first: str, second: str) -> tuple[Keyframe, Keyframe]:
@@ -136,6 +146,8 @@ def same_object(current: CurrentMap, stamp: Stamp, first: str, second: str) -> S
     one, other = current.find_observation(first), current.find_observation(second)
     if one.object == other.object:
         raise EditRefused(f"{first} and {second} are one object already")
+    floors = (current.view.keyframes[each.keyframe].floor for each in (one, other))
+    _check_floor(f"{first} and {second}", *floors)
     check_same(current, one.det_id, other.det_id)
     is_voted = current.settings.fusion == "evidence"  # then classes of one object may differ
     if one.class_name != other.class_name and not is_voted:
@@ -217,7 +229,7 @@ def use_settings(current: CurrentMap, stamp: Stamp, settings: Settings) -> UseSe
     """The map has these settings from here on."""
     if settings == (current.corrections.settings or Settings()):
         raise EditRefused("these are the settings of the log already")
-    plain = settings.model_dump(exclude={"neighbourhood"})
+    plain = settings.model_dump()
     return build(UseSettings, stamp, settings=plain)
 
 

@@ -2,37 +2,57 @@
 
 Which crops of a keyframe are asked with is drawn by hashing ``seed`` and each det_id; the one-crop
 question's crop is among the two-crop question's, and so on. The truth only scores the answer.
+
+A question of several views has the keyframe and those before it in its run, and how the robot moved
+between them by the poses that it reported.
 """
 
 import hashlib
+import math
 import sys
-from collections.abc import Iterable, Iterator
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from eventsrc.errors import MisuseError
 from eventsrc.ingest import Accepted, ingest
 from eventsrc.log import LogReader
 from eventsrc.system_events import is_system_key
+from projections import relocalize
 from projections.exact import quantise, to_float32
-from projections.relocalize import Crop
+from projections.relocalize import Crop, View
 
 from .truth import Key, Truth
 
 DEFAULT_SEED = 20260321
 
 
+T = TypeVar("T")
+VIEW_CROPS = 3
+"""Crops of a view at most."""
+_NEAR_BY = 4
+"""The views of a question are among the last so many keyframes for each view."""
+
+
 @dataclass(frozen=True, slots=True)
 class Question:
-    """Crops of one keyframe, and the true pose, room and instances behind them."""
+    """What is asked, and the true pose, room and instances behind it; pose and room are those of
+    the last view, and so is the key."""
 
     key: Key
-    crops: tuple[Crop, ...]
+    asked: relocalize.Question
     x: float
     y: float
     yaw: float
     room: str | None
     instances: tuple[str | None, ...]
+
+    @property
+    def crops(self) -> tuple[Crop, ...]:
+        """Those of all views."""
+        return self.asked.crops
 
 
 def read_keyframes(logs: Iterable[Path]) -> Iterator[Accepted]:
@@ -58,12 +78,39 @@ def make_questions(
     """One question of ``crops`` crops from each keyframe that has truth and as many embeddings."""
     found = []
     for keyframe in keyframes:
-        key = (keyframe.envelope.run_id, keyframe.envelope.keyframe_id)
-        usable = [i for i, vector in enumerate(keyframe.vectors) if vector is not None]
-        if key in truth.keyframes and len(usable) >= crops:
-            drawn = sorted(usable, key=lambda i: _draw_key(seed, keyframe.det_ids[i]))[:crops]
-            found.append(_question(keyframe, key, truth, drawn))
+        drawn = _draw(keyframe, crops, seed)
+        if _key(keyframe) in truth.keyframes and len(drawn) == crops:
+            found.append(_question([(keyframe, drawn)], truth))
     return found
+
+
+def make_view_questions(
+    keyframes: Iterable[Accepted], truth: Truth, views: int, seed: int = DEFAULT_SEED
+) -> list[Question]:
+    """One question from each keyframe that has truth and an embedding: it and the keyframes before
+    it that have embeddings, ``views`` in all, of up to `VIEW_CROPS` crops each.
+
+    None from one before which there are too few within 4 · ``views`` keyframes of its run.
+    """
+    found: list[Question] = []
+    recent: deque[tuple[int, Accepted, list[int]]] = deque(maxlen=views)
+    for number, keyframe in enumerate(keyframes):
+        if recent and recent[-1][1].envelope.run_id != keyframe.envelope.run_id:
+            recent.clear()
+        drawn = _draw(keyframe, VIEW_CROPS, seed)
+        if not drawn or _key(keyframe) not in truth.keyframes:
+            continue
+        recent.append((number, keyframe, drawn))
+        if len(recent) == views and number - recent[0][0] < _NEAR_BY * views:
+            found.append(_question([(each, crops) for _, each, crops in recent], truth))
+    return found
+
+
+def spread(items: Sequence[T], most: int) -> list[T]:
+    """``most`` of the items, evenly; all if there are no more."""
+    if len(items) <= most:
+        return list(items)
+    return [items[i * len(items) // most] for i in range(most)]
 
 
 def check_truth(keyframes: Iterable[Accepted], truth: Truth) -> None:
@@ -79,21 +126,51 @@ def check_truth(keyframes: Iterable[Accepted], truth: Truth) -> None:
     )
 
 
-def _draw_key(seed: int, det_id: str) -> bytes:
+def _key(keyframe: Accepted) -> Key:
+    return keyframe.envelope.run_id, keyframe.envelope.keyframe_id
+
+
+def _draw(keyframe: Accepted, most: int, seed: int) -> list[int]:
+    """Up to ``most`` of the detections that have an embedding."""
+    usable = [i for i, vector in enumerate(keyframe.vectors) if vector is not None]
+    return sorted(usable, key=lambda i: draw_key(seed, keyframe.det_ids[i]))[:most]
+
+
+def draw_key(seed: int, det_id: str) -> bytes:
+    """Orders the crops of a keyframe: the first are asked with."""
     return hashlib.sha256(f"{seed}:{det_id}".encode()).digest()
 
 
-def _question(keyframe: Accepted, key: Key, truth: Truth, drawn: list[int]) -> Question:
-    envelope = keyframe.envelope
+def _question(drawn: Sequence[tuple[Accepted, Sequence[int]]], truth: Truth) -> Question:
+    views = []
+    before = drawn[0][0]
+    for keyframe, indices in drawn:
+        crops = tuple(_crop(keyframe, index) for index in indices)
+        views.append(View(*_moved(_pose(before), _pose(keyframe)), crops))
+        before = keyframe
+    key = _key(before)
     return Question(
         key,
-        tuple(_crop(keyframe, index) for index in drawn),
-        envelope.map_x or 0.0,
-        envelope.map_y or 0.0,
-        envelope.map_yaw or 0.0,
+        relocalize.Question(tuple(views)),
+        *_pose(before),
         truth.room(key),
-        tuple(truth.instance(key, index) for index in drawn),
+        tuple(truth.instance(_key(k), index) for k, indices in drawn for index in indices),
     )
+
+
+def _pose(keyframe: Accepted) -> tuple[float, float, float]:
+    envelope = keyframe.envelope
+    return envelope.map_x or 0.0, envelope.map_y or 0.0, envelope.map_yaw or 0.0
+
+
+def _moved(
+    before: tuple[float, float, float], after: tuple[float, float, float]
+) -> tuple[float, float, float]:
+    """Metres ahead and to the left, and radians to the left, in the frame of the first pose."""
+    dx, dy, yaw = after[0] - before[0], after[1] - before[1], before[2]
+    turned = math.remainder(after[2] - yaw, math.tau)
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    return cos * dx + sin * dy, cos * dy - sin * dx, turned
 
 
 def _crop(keyframe: Accepted, index: int) -> Crop:

@@ -1,9 +1,9 @@
 """The evaluation: fold the map's log, ask questions from the query logs, score everything.
 
 Accuracy and errors are over *known* questions (some true instance of theirs is in the map), errors
-over those that have a pose. ``auroc`` is that of confidence between known and unknown questions.
+over those that have a pose. ``auroc`` is that of `known` between known and unknown questions.
 Calibration counts all questions: an answer is right when the question is known and the pose is
-within 1.5 m of the truth.
+within 1.5 m of the truth. ``plain`` and ``best_cosine`` are what a few lines do (`baselines`).
 """
 
 from collections.abc import Callable, Sequence
@@ -17,22 +17,35 @@ from projections.corrections import Corrections
 from projections.model.fold import fold_log
 from projections.model.log_commands import read_corrections
 from projections.model.view import MapView
-from projections.relocalize import DEFAULT_CAMERA, Camera, Method
+from projections.relocalize import Camera, Method
 from projections.settings import Settings
 
-from .questions import DEFAULT_SEED, check_truth, make_questions, read_keyframes
+from .own_questions import ask_own_questions
+from .own_scores import own_scores
+from .questions import (
+    DEFAULT_SEED,
+    check_truth,
+    make_questions,
+    make_view_questions,
+    read_keyframes,
+    spread,
+)
 from .scores import (
     auroc,
+    calibration_floor,
     expected_calibration_error,
     object_scores,
     percentile,
     place_scores,
     reliability,
 )
-from .trials import RoomIndex, Trial, TrialRunner
+from .trials import RIGHT_WITHIN_M, RoomIndex, Trial, TrialRunner
 from .truth import Truth
 
-CROPS = (1, 2, 3)
+CROPS, VIEWS = (1, 2, 3, 5), (1, 3, 5)
+MOST_VIEWS = 200
+"""Questions of each number of views at most, spread evenly: they take longer."""
+OWN_CROPS = (1, 3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,12 +65,14 @@ def evaluate(
     *,
     until: str = "end",
     method: Method = "joint",
-    camera: Camera = DEFAULT_CAMERA,
+    camera: Camera | None = None,
     seed: int = DEFAULT_SEED,
+    own: bool = False,
     note: Note | None = None,
 ) -> Evaluation:
     """Score the map of ``map_log`` (folded to ``until`` under its corrections) and questions from
-    ``query_logs``. ``settings`` may depend on the log's corrections.
+    ``query_logs``. ``settings`` may depend on the log's corrections. With ``own`` the map is asked
+    questions of its own too, which need no truth.
 
     ``note`` is called with what the user should know about ``until`` (`eventsrc.log.seek.resolve`).
     Deterministic but for ``latency_ms``, which is of exact search in memory plus the ranking.
@@ -74,14 +89,24 @@ def evaluate(
     rooms = RoomIndex(list(read_keyframes([map_log])), keyframes, truth)
     runner = TrialRunner(view, truth, camera=camera, method=method, room_index=rooms)
     trials = {n: runner.run(make_questions(keyframes, truth, n, seed)) for n in CROPS}
-    scores = {
+    views = {
+        n: runner.run(spread(make_view_questions(keyframes, truth, n, seed), MOST_VIEWS))
+        for n in VIEWS
+    }
+    scores: dict[str, Any] = {
         "places": place_scores(view, truth),
         "objects": object_scores(view, truth),
         "relocalization": {str(n): _summarise(found) for n, found in trials.items()},
+        "views": {str(n): _summarise(found) for n, found in views.items()},
         "method": method,
         "seed": seed,
         "offset": view.next_offset,
     }
+    if own:
+        scores["self"] = {
+            str(crops): own_scores(list(ask_own_questions(view, crops, seed=seed)))
+            for crops in OWN_CROPS
+        }
     return Evaluation(scores, trials, view)
 
 
@@ -91,6 +116,7 @@ def _summarise(trials: Sequence[Trial]) -> dict[str, Any]:
     unknown = [t for t in trials if not t.known]
     roomed = [t for t in known if t.question.room is not None]
     confidence = [t.answer.confidence for t in trials]
+    in_map = [t.answer.known for t in trials]
     correct = [t.correct for t in trials]
     return {
         "questions": len(trials),
@@ -111,13 +137,25 @@ def _summarise(trials: Sequence[Trial]) -> dict[str, Any]:
         "within_1_5_m": _share(known, lambda t: t.correct),
         "known_called_unknown": _share(known, lambda t: t.answer.unknown),
         "unknown_called_unknown": _share(unknown, lambda t: t.answer.unknown),
-        "auroc": auroc(
-            [t.answer.confidence for t in known], [t.answer.confidence for t in unknown]
-        ),
+        "auroc": auroc([t.answer.known for t in known], [t.answer.known for t in unknown]),
         "ece": expected_calibration_error(confidence, correct),
+        "ece_floor": calibration_floor(confidence),
+        "known_ece": expected_calibration_error(in_map, [t.known for t in trials]),
+        "known_ece_floor": calibration_floor(in_map),
         "reliability": reliability(confidence, correct),
+        "plain": {
+            "pose_error_m": _percentiles([t.plain_error_m for t in known]),
+            "within_1_5_m": _share(known, _plain_is_near),
+        },
+        "best_cosine": {
+            "auroc": auroc([t.best_cosine for t in known], [t.best_cosine for t in unknown])
+        },
         "latency_ms": _latency(trials),
     }
+
+
+def _plain_is_near(trial: Trial) -> bool:
+    return trial.plain_error_m is not None and trial.plain_error_m <= RIGHT_WITHIN_M
 
 
 def _share(trials: Sequence[Trial], holds: Callable[[Trial], bool]) -> float | None:

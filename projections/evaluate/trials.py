@@ -99,7 +99,7 @@ class TrialRunner:
         view: MapView,
         truth: Truth,
         *,
-        camera: Camera,
+        camera: Camera | None,
         method: Method,
         room_index: RoomIndex | None = None,
     ) -> None:
@@ -129,9 +129,9 @@ class TrialRunner:
     def _run(self, question: Question) -> Trial:
         began = time.perf_counter()
         candidates = self._index.search(question.crops)
-        answer = rank(question.crops, candidates, top=3, method=self._method, camera=self._camera)
+        answer = rank(question.asked, candidates, top=3, method=self._method, camera=self._camera)
         seconds = time.perf_counter() - began
-        plain = rank(question.crops, candidates, top=1, method="plain")
+        plain = rank(question.asked, candidates, top=1, method="plain")
         pose, places = answer.pose, answer.places
         known = any(i in self._instances for i in question.instances if i is not None)
         true_place = self._nearest(question.x, question.y)[3]

@@ -107,10 +107,12 @@ def _founding(history: History, record: PlaceHistory) -> Entry:
     named = ", ".join(keyframe_name(history, k) for k in first[:MOST_FOUNDERS])
     more = f" and {len(first) - MOST_FOUNDERS} more" if len(first) > MOST_FOUNDERS else ""
     where = position_text(history.keyframes[founder].pose)
+    by_rooms = history.settings.places == "rooms"
+    how = "was a long drive from every place" if by_rooms else "became the first core point"
     return Entry(
         record.cause,
         "founded",
-        f"founded: {keyframe_name(history, founder)} at {where} became the first core point"
+        f"founded: {keyframe_name(history, founder)} at {where} {how}"
         + (f"; members {named}{more}" if first else ""),
         {
             "founder": keyframe_name(history, founder),

@@ -22,6 +22,7 @@ from projections.deltas import (
     KeyframeAdded,
     KeyframeOrdinal,
     KeyframePlaced,
+    MapGiven,
     MergeRefused,
     ObjectClassified,
     ObjectEstimated,
@@ -55,6 +56,7 @@ from .records import (
     cause_of,
     last_before,
 )
+from .seen_from import SeenFrom
 
 NEVER = Offset(2**63 - 1)
 """The offset of an event that has not happened."""
@@ -91,11 +93,13 @@ class History:
         self.object_merges: list[ObjectMerge] = []
         self.runs: list[list[RunSeen]] = []
         self.skipped: list[EventSkipped] = []
+        self.maps: list[MapGiven] = []
         self.edges: dict[tuple[PlaceOrdinal, PlaceOrdinal], list[PlacesLinked]] = {}
         self.keyframe_ordinals: dict[tuple[RunId, KeyframeId], KeyframeOrdinal] = {}
         self.place_ordinals: dict[str, PlaceOrdinal] = {}
         self.object_ordinals: dict[str, ObjectOrdinal] = {}
         self._neighbours: tuple[int, Neighbours] | None = None
+        self._seen_from: tuple[Offset, SeenFrom] | None = None
 
     def apply(self, offset: Offset, deltas: Sequence[Delta]) -> None:
         """Add the deltas of the event at ``offset``."""
@@ -125,6 +129,13 @@ class History:
         if self._neighbours is None or self._neighbours[0] != count:
             self._neighbours = count, Neighbours(self.keyframes, self.settings)
         return self._neighbours[1]
+
+    @property
+    def seen_from(self) -> SeenFrom:
+        """What was seen from where so far; made anew when there is more."""
+        if self._seen_from is None or self._seen_from[0] != self.next_offset:
+            self._seen_from = self.next_offset, SeenFrom(self)
+        return self._seen_from[1]
 
     def place_at(self, keyframe: KeyframeOrdinal, end: Offset | None = None) -> PlaceOrdinal | None:
         """The place a keyframe is in after the events below ``end`` (default: all so far)."""
@@ -177,6 +188,9 @@ class History:
     def _event_skipped(self, delta: EventSkipped, _: Cause) -> None:
         self.skipped.append(delta)
 
+    def _map_given(self, delta: MapGiven, _: Cause) -> None:
+        self.maps.append(delta)
+
     def _place_formed(self, delta: PlaceFormed, cause: Cause) -> None:
         self.place_ordinals[delta.place_id] = delta.place
         self.places.append(PlaceHistory(delta, cause))
@@ -226,6 +240,7 @@ class History:
         RunSeen: _run_seen,
         KeyframeAdded: _keyframe_added,
         EventSkipped: _event_skipped,
+        MapGiven: _map_given,
         PlaceFormed: _place_formed,
         KeyframePlaced: _keyframe_placed,
         PlaceChanged: _place_changed,
@@ -268,6 +283,7 @@ class History:
             objects=tuple(move.object for move in moves if move.before in delta.absorbed),
             edges=tuple(link for link in links if link.a in places or link.b in places),
             joined=delta.joined,
+            drives=delta.drives,
         )
         self.merges.append(merge)
         self.places[delta.survivor].merges.append(merge)

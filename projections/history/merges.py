@@ -6,6 +6,9 @@ that a point of the path needed to become a core point. So the path leads from a
 one place, over points that this event made core, to an old core point of the other. The shortest
 such path is the chain.
 
+Places by rooms have no chains: they merge when their cells are a short drive apart on the mean.
+What both have seen is told beside it, for who reads it; the rule does not use it.
+
 When an event joins several places, the chains form a tree: each further place is joined to one that
 is joined already. A place that a ``join`` command brought has no chain: the two keyframes that the
 command names are the reason.
@@ -18,14 +21,18 @@ from itertools import pairwise
 from typing import Any
 
 from eventsrc.envelope import Offset
+from eventsrc.text import counted
 from projections.corrections import RecordedCommand
-from projections.deltas import KeyframeOrdinal, Link, PlaceOrdinal
+from projections.deltas import KeyframeOrdinal, Link, ObjectOrdinal, PlaceOrdinal
 from projections.model.command_text import command_document, command_on, command_title
 
 from .evidence import evidence_document
 from .history import History
 from .names import keyframe_name, log_name, place_name
 from .records import EdgeChange, Merge, ObjectMerge, Refusal
+
+_MOST_SEEN = 4
+"""Objects named in a text; of more, all but three are only counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,9 +57,10 @@ class Chain:
 def chains_of(history: History, merge: Merge) -> list[Chain]:
     """A chain for each absorbed place, in the order of joining, shortest first.
 
-    None for a place that a command joined, and none at all when another rule than distance merged
-    the places.
+    None for a place that a command joined, and none at all for places by rooms.
     """
+    if history.settings.places == "rooms":
+        return []
     made = history.neighbours.made_core(merge.bridge, merge.cause.offset)
     contacts = {keyframe: _contacts(history, merge, keyframe) for keyframe in made}
     joined, remaining, chains = {merge.survivor}, set(merge.absorbed), list[Chain]()
@@ -132,23 +140,49 @@ def _chain_of(
 
 
 def merge_reason(history: History, merge: Merge) -> str:
-    """The bridging keyframe, the core points it made, and the chain to each absorbed place."""
+    """The bridging keyframe, the core points it made, and the chain to each absorbed place; of
+    places by rooms how long the drive between them is."""
     if merge.cause.kind != "keyframe":
         return merge.cause.name
     commanded = "; ".join(_join_text(history, link) for link in join_links(merge))
     chains = chains_of(history, merge)
     bridge = keyframe_name(history, merge.bridge)
+    if merge.drives:
+        return f"{bridge} brought them near: {_drive_text(history, merge)}"
     if not chains:
-        if commanded:
-            return commanded
-        links = "; ".join(_link_text(history, link) for link in merge.links)
-        return f"{bridge} bridged them: {links}"
+        return commanded
     made = dict.fromkeys(point for chain in chains for point in chain.made_core)
     names = ["itself" if k == merge.bridge else keyframe_name(history, k) for k in made]
     what = "a core point" if len(made) == 1 else "core points"
     joins = "; ".join(chain_text(history, chain) for chain in chains)
     also = f"; {commanded}" if commanded else ""
     return f"{bridge} made {_enumerated(names)} {what}: {joins}{also}"
+
+
+def _drive_text(history: History, merge: Merge) -> str:
+    """``5 cells of a_p0 and 7 of a_p3 are a drive of 3.812 m apart on the mean, at most 4 m joins
+    them; nearest are those of run:2 and run:8, 0.900 m; both saw couch obj-7 and tv obj-2``."""
+    (drive,), (link,) = merge.drives, merge.links
+    survivor, absorbed = (place_name(history, place) for place in merge.places)
+    core, neighbour = keyframe_name(history, link.core), keyframe_name(history, link.neighbour)
+    cells = counted(drive.cells, "cell")
+    at = merge.cause.offset
+    both = [history.objects[each] for each in seen_from_both(history, merge)]
+    seen = [f"{each.class_name(at)} {each.object_id}" for each in both]
+    if len(seen) > _MOST_SEEN:
+        seen = [*seen[: _MOST_SEEN - 1], f"{len(seen) - _MOST_SEEN + 1} more"]
+    return (
+        f"{cells} of {survivor} and {drive.absorbed_cells} of {absorbed} are a drive of "
+        f"{drive.mean_um / 1e6:.3f} m apart on the mean, at most "
+        f"{history.settings.rooms.drive_m:g} m joins them; nearest are those of {core} and "
+        f"{neighbour}, {link.distance_um / 1e6:.3f} m"
+        + (f"; both saw {_enumerated(seen)}" if seen else "")
+    )
+
+
+def seen_from_both(history: History, merge: Merge) -> Sequence[ObjectOrdinal]:
+    """The objects that keyframes of all the places had seen when these merged."""
+    return history.seen_from.from_all(merge.places, merge.cause.offset)
 
 
 def join_links(merge: Merge) -> list[Link]:
@@ -222,6 +256,9 @@ def chain_text(history: History, chain: Chain) -> str:
 
 def _link_text(history: History, link: Link) -> str:
     core, neighbour = keyframe_name(history, link.core), keyframe_name(history, link.neighbour)
+    if history.settings.places == "rooms":
+        drive = f"{link.distance_um / 1e6:.3f} m"
+        return f"the cells of {core} and {neighbour} are a drive of {drive} apart"
     return f"{core} and {neighbour} are core points {link.distance_um / 1e6:.3f} m apart"
 
 
@@ -263,7 +300,23 @@ def merge_document(history: History, merge: Merge) -> dict[str, Any]:
         "objects": [history.objects[number].object_id for number in merge.objects],
         "edges": [_edge_document(history, edge) for edge in merge.edges],
         **(joined if merge.joined else {}),
+        **(_drives_document(history, merge) if merge.drives else {}),
     }
+
+
+def _drives_document(history: History, merge: Merge) -> dict[str, Any]:
+    """Why places by rooms merged, and what both had seen, which the rule does not use."""
+    drives = [
+        {
+            "mean_m": drive.mean_um / 1e6,
+            "limit_m": history.settings.rooms.drive_m,
+            "cells": drive.cells,
+            "absorbed_cells": drive.absorbed_cells,
+        }
+        for drive in merge.drives
+    ]
+    seen = [history.objects[each].object_id for each in seen_from_both(history, merge)]
+    return {"drives": drives, "seen_from_both": seen}
 
 
 def _joined_document(history: History, link: Link) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 Core points are counted by the rule of the fold, exactly and from the poses alone: a keyframe is a
 core point when at least ``min_samples`` posed keyframes, itself included, are within ε of it,
-inclusive.
+inclusive. Those on two floors never are.
 """
 
 from bisect import bisect_left
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from eventsrc.envelope import Offset
 from projections.deltas import KeyframeAdded, KeyframeOrdinal
 from projections.exact import distance_um, metres_to_um
+from projections.reducers.floors import shift_um
 from projections.settings import Settings
 
 
@@ -27,6 +28,10 @@ class Neighbours:
         self._numbers = [n for n, _, _ in posed]
         self._offsets = [offset for _, offset, _ in posed]
         self._positions = np.array([(p.x_um, p.y_um) for _, _, p in posed], np.int64).reshape(-1, 2)
+        names: dict[str | None, int] = {}
+        floors = [names.setdefault(k.floor, len(names)) for k in keyframes if k.pose is not None]
+        self._shifts = np.array([shift_um(floor) for floor in floors], np.int64).reshape(-1, 2)
+        self._positions += self._shifts
         self._row = {number: row for row, number in enumerate(self._numbers)}
         self._cells = _rows_by_cell(self._positions // self._radius)
 
@@ -66,7 +71,8 @@ class Neighbours:
 
     def positions(self, keyframes: Sequence[KeyframeOrdinal]) -> NDArray[np.float64]:
         """Positions of posed keyframes in metres, shape (n, 2)."""
-        metres: NDArray[np.float64] = self._positions[[self._row[k] for k in keyframes]] / 1e6
+        rows = [self._row[k] for k in keyframes]
+        metres: NDArray[np.float64] = (self._positions[rows] - self._shifts[rows]) / 1e6
         return metres
 
 

@@ -40,16 +40,22 @@ def view_at(history: History, latest: MapView, end: Offset) -> MapView:
     absorbed_by = view.survivors.absorbed_by
     view.places = {p.ordinal: p for p in view.all_places if p.ordinal not in absorbed_by}
     view.keyframes = _keyframes(history, latest, view.survivors, end)
+    for keyframe in view.keyframes:
+        if keyframe.floor is not None:
+            view.floors.setdefault(keyframe.floor, len(view.floors))
     view.observations = _observations(history, latest, end)
     view.all_objects = _objects(history, end)
     for merge in history.object_merges[: count_before(history.object_merges, end)]:
         view.object_survivors.merge(merge.survivor, (merge.absorbed,))
     absorbed = view.object_survivors.absorbed_by
     view.objects = {o.ordinal: o for o in view.all_objects if o.ordinal not in absorbed}
+    for found in view.objects.values():
+        view.contents.update(found)
     view.runs = _runs(history, view.keyframes, end)
     view.adjacency = _adjacency(history, end)
     for skipped in history.skipped[: count_before(history.skipped, end)]:
         view.skipped[skipped.kind] = view.skipped.get(skipped.kind, 0) + 1
+    view.map = last_before(history.maps, end)
     view.advance(end)
     return view
 
@@ -109,6 +115,7 @@ def _keyframes(
             survivors,
             k.observations,
             place if placed < end else None,
+            k.floor,
         )
         for k, placed, place in zip(
             latest.keyframes[:count], history.placed_offsets, history.placed_in, strict=False

@@ -6,6 +6,7 @@ Each map is a panel of one figure, drawn with `projections.drawing`.
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import fill
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -18,6 +19,7 @@ from projections.drawing.canvas import HALO, Bounds, Canvas, check_suffix
 from projections.drawing.overlays import draw_place_names
 from projections.model.view import MapView
 
+from .history import History
 from .known import KnownHistory
 from .merges import chains_of, merge_reason
 from .names import keyframe_name, place_title
@@ -31,6 +33,12 @@ _LEGEND = (
     "★ bridging keyframe    dashed: ε around it    ○ its neighbours    "
     "red: the core points that join them    ■ start of the run"
 )
+_ROOMS_LEGEND = (
+    "★ bridging keyframe    red: the two cells with the shortest drive between them    "
+    "■ start of the run"
+)
+_HEADER_WIDTH = 170
+"""Characters in a line of the header."""
 _AROUND_EPS = 4.0
 """The least margin around the core points of a merge, in ε."""
 
@@ -53,7 +61,8 @@ def draw_merge(known: KnownHistory, merge: Merge, out: Path) -> None:
         panel.axes.set_title(f"--at {view.next_offset}, {when}: {shown}", fontsize=10)
     history = known.history
     header = f"merge {merge.number}, {merge.cause.when}: {merge_reason(history, merge)}"
-    figure.suptitle(f"{header}\n{_LEGEND}", fontsize=9.5)
+    legend = _ROOMS_LEGEND if known.settings.places == "rooms" else _LEGEND
+    figure.suptitle(f"{fill(header, _HEADER_WIDTH)}\n{legend}", fontsize=9.5)
     _save(figure, out)
 
 
@@ -106,13 +115,10 @@ def _draw_chains(panel: Canvas, known: KnownHistory, merge: Merge) -> None:
     """The bridge with its ε circle and neighbours, and the chains of core points."""
     history, end = known.history, Offset(merge.cause.offset + 1)
     x, y = map(float, history.neighbours.positions([merge.bridge])[0])
-    circle = Circle((x, y), known.settings.eps_m, fill=False, lw=1.2, ls="--", zorder=12)
-    circle.set_edgecolor(palette.BRIDGE)
-    panel.axes.add_patch(circle)
-    near = history.neighbours.positions(history.neighbours.of(merge.bridge, end))
-    panel.axes.scatter(
-        near[:, 0], near[:, 1], s=26, facecolor="none", edgecolor=palette.BRIDGE, lw=0.9, zorder=12
-    )
+    if known.settings.places == "rooms":
+        _draw_links(panel, history, merge)
+    else:
+        _draw_neighbours(panel, history, merge, end)
     for chain in chains_of(history, merge):
         path = history.neighbours.positions(chain.points)
         panel.axes.plot(*path.T, color=palette.ESTIMATE, lw=2.2, marker="o", ms=5, zorder=14)
@@ -123,14 +129,37 @@ def _draw_chains(panel: Canvas, known: KnownHistory, merge: Merge) -> None:
     )  # fmt: skip
 
 
+def _draw_links(panel: Canvas, history: History, merge: Merge) -> None:
+    """The founders of the cells of places by rooms that are the shortest drive apart."""
+    for link in merge.links:
+        ends = history.neighbours.positions([link.core, link.neighbour])
+        panel.axes.plot(*ends.T, color=palette.ESTIMATE, lw=2.2, marker="o", ms=5, zorder=14)
+
+
+def _draw_neighbours(panel: Canvas, history: History, merge: Merge, end: Offset) -> None:
+    """The bridge's ε circle, and the keyframes in it."""
+    x, y = map(float, history.neighbours.positions([merge.bridge])[0])
+    circle = Circle((x, y), history.settings.eps_m, fill=False, lw=1.2, ls="--", zorder=12)
+    circle.set_edgecolor(palette.BRIDGE)
+    panel.axes.add_patch(circle)
+    near = history.neighbours.positions(history.neighbours.of(merge.bridge, end))
+    panel.axes.scatter(
+        near[:, 0], near[:, 1], s=26, facecolor="none", edgecolor=palette.BRIDGE, lw=0.9, zorder=12
+    )
+
+
 def _bounds_of_merge(known: KnownHistory, merge: Merge) -> Bounds:
     """A square around the bridge and the core points that join the places."""
     history = known.history
     points = [merge.bridge, *(k for chain in chains_of(history, merge) for k in chain.points)]
+    if known.settings.places == "rooms":
+        points += (k for link in merge.links for k in (link.core, link.neighbour))
     spots = history.neighbours.positions(points)
     (x0, y0), (x1, y1) = spots.min(axis=0), spots.max(axis=0)
     x, y = float(x0 + x1) / 2, float(y0 + y1) / 2
-    half = float(max(x1 - x0, y1 - y0)) / 2 + _AROUND_EPS * known.settings.eps_m
+    settings = known.settings
+    margin = settings.rooms.drive_m if settings.places == "rooms" else _AROUND_EPS * settings.eps_m
+    half = float(max(x1 - x0, y1 - y0)) / 2 + margin
     return x - half, y - half, x + half, y + half
 
 

@@ -22,6 +22,7 @@ from projections.deltas import (
     KeyframeOrdinal,
     KeyframePlaced,
     Link,
+    MeanDrive,
     ObjectClassified,
     ObjectEstimated,
     ObjectFound,
@@ -117,7 +118,8 @@ class Merge:
     """A merge of places, with the objects and edges it moved.
 
     ``number`` counts merges from 1. Sizes are members before the merge; ``absorbed`` and
-    ``absorbed_sizes`` are parallel. ``joined`` are the absorbed that came by a ``join`` command.
+    ``absorbed_sizes`` are parallel. ``joined`` are the absorbed that came by a ``join`` command,
+    ``drives`` why the others came where places are rooms.
     ``objects`` are those that the event moved out of an absorbed place. ``edges`` are all adjacency
     changes of the event that touch the places.
     """
@@ -133,6 +135,7 @@ class Merge:
     objects: tuple[ObjectOrdinal, ...]
     edges: tuple[EdgeChange, ...]
     joined: tuple[PlaceOrdinal, ...] = ()
+    drives: tuple[MeanDrive, ...] = ()
 
     @property
     def places(self) -> tuple[PlaceOrdinal, ...]:

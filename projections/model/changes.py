@@ -48,11 +48,12 @@ class BatchChanges:
     ``keyframes`` and ``observations`` are new. They never change later, except for the place of a
     keyframe and the object of an observation: ``placed`` are the keyframes that joined a place or
     whose place was absorbed, ``reassigned`` the observations whose object was absorbed. ``runs``,
-    ``objects`` and ``places`` are new or changed; one that is not in `MapView.objects` or
-    `MapView.places` any more was absorbed. ``located`` are objects that moved to another place or
-    out of one, absorbed ones among them. ``links`` are pairs of places whose shared transitions
-    changed; one that is not in `MapView.adjacency` any more is gone. ``embedded`` is in the order
-    of the observations.
+    ``objects`` and ``places`` are new or changed, places also by what is in them; one that is not
+    in `MapView.objects` or `MapView.places` any more was absorbed. ``located`` are objects that
+    moved to another place or out of one, absorbed ones among them. ``links`` are pairs of places
+    whose shared transitions changed; one that is not in `MapView.adjacency` any more is gone.
+    ``embedded`` is in the order of the observations. ``formed`` are the places that are new,
+    ``floors`` the numbers of new floors.
     """
 
     keyframes: range
@@ -65,6 +66,8 @@ class BatchChanges:
     placed: list[KeyframeOrdinal]
     links: list[tuple[PlaceOrdinal, PlaceOrdinal]]
     reassigned: list[ObservationOrdinal]
+    formed: list[PlaceOrdinal]
+    floors: range
 
 
 class ChangeTracker:
@@ -99,6 +102,7 @@ class ChangeTracker:
 
     def drain(self) -> BatchChanges:
         """All changes since the last drain."""
+        self._places.update(filter(self.view.places.__contains__, self.view.contents.touched))
         changes = BatchChanges(
             range(self._keyframes, len(self.view.keyframes)),
             range(self._observations, len(self.view.observations)),
@@ -110,6 +114,8 @@ class ChangeTracker:
             sorted(self._placed),
             sorted(self._links),
             sorted(self._reassigned),
+            sorted(self._formed),
+            range(self._floors, len(self.view.floors)),
         )
         self._start()
         return changes
@@ -125,13 +131,22 @@ class ChangeTracker:
         self._placed: set[KeyframeOrdinal] = set()
         self._links: set[tuple[PlaceOrdinal, PlaceOrdinal]] = set()
         self._reassigned: set[ObservationOrdinal] = set()
+        self._formed: set[PlaceOrdinal] = set()
+        self._floors = len(self.view.floors)
+        self.view.contents.touched.clear()
+
+    def _place_formed(self, delta: PlaceFormed) -> None:
+        self._places.add(delta.place)
+        self._formed.add(delta.place)
 
     def _places_merged(self, delta: PlacesMerged) -> None:
         self._places.add(delta.survivor)
         self._places.update(delta.absorbed)
         for place in delta.absorbed:
-            # Before the view applies it: afterwards they are members of the survivor.
-            self._placed.update(self.view.all_places[place].unordered_members)
+            # Before the view applies it: afterwards they are members of the survivor. A place that
+            # this event has formed is not there yet; a command may join it at once.
+            if place < len(self.view.all_places):
+                self._placed.update(self.view.all_places[place].unordered_members)
 
     def _objects_merged(self, delta: ObjectsMerged) -> None:
         self._objects.update((delta.survivor, delta.absorbed))
@@ -152,7 +167,7 @@ class ChangeTracker:
         ObjectMissing: lambda self, d: self._objects.add(d.object),
         ObjectRelocated: lambda self, d: self._objects.add(d.object),
         ObjectMoved: lambda self, d: self._located.add(d.object),
-        PlaceFormed: lambda self, d: self._places.add(d.place),
+        PlaceFormed: _place_formed,
         PlaceChanged: lambda self, d: self._places.add(d.place),
         PlaceNamed: lambda self, d: self._places.add(d.place),
         KeyframePlaced: lambda self, d: self._placed.add(d.keyframe),

@@ -5,7 +5,9 @@ ordinal, each line a JSON array. Integers are exact, a float is written as the s
 names it, an embedding enters by its checksum. Settings and the number of events are not part of it:
 the same map reached another way has the same digest. Under corrections there are two more sections:
 the places' names, and the corrections' fingerprint. Under fusion by evidence there is one more
-before them: of each Object its estimate, whether it is missing, and its relocations.
+before them: of each Object its estimate, whether it is missing, and its relocations. Where any
+keyframe's floor has a name there is one before that: of each of these keyframes the floor. With an
+occupancy map there is one more, of its cells and where they lie, before those of corrections.
 """
 
 import hashlib
@@ -29,10 +31,15 @@ def map_digest(view: MapView) -> str:
         remaining = lines(view)
         while chunk := "".join(islice(remaining, _LINES_AT_ONCE)):
             digest.update(chunk.encode("ascii"))
+    if view.floors:
+        floors = (_line((k.ordinal, k.floor)) for k in view.keyframes if k.floor is not None)
+        digest.update(f"floors\n{''.join(floors)}".encode())
     if view.settings.fusion == "evidence":
         digest.update(b"evidence\n")
         for line in _evidence(view):
             digest.update(line.encode())
+    if view.map is not None:
+        digest.update(f"map\n{_line(view.map.map.digest())}".encode())
     if own := view.corrections.fingerprint():
         names = [_line((p.ordinal, p.name)) for p in view.places.values() if p.name is not None]
         digest.update(f"names\n{''.join(names)}corrections\n{_line(own)}".encode())

@@ -4,9 +4,10 @@ from statistics import median
 from typing import Any
 
 from eventsrc.envelope import Offset
-from eventsrc.text import counted
+from eventsrc.text import counted, visible
 from projections.deltas import PlaceOrdinal
 from projections.exact import UM_PER_M
+from projections.place_types import PlaceType
 from projections.settings import Settings, assignment_texts
 
 from .command_text import command_document
@@ -29,9 +30,31 @@ def state_document(view: MapView, digest: str, known_at: Offset | None = None) -
         "objects": _objects(view),
         "adjacency": [
             {"a": view.place_id(a), "b": view.place_id(b), "shared_transitions": transitions}
+            | ({"between_floors": True} if view.is_between_floors(a, b) else {})
             for a, b, transitions in view.edges()
         ],
+        **({"floors": list(view.floors)} if view.floors else {}),
+        **_map(view),
         **_corrections(view, known_at),
+    }
+
+
+def _map(view: MapView) -> dict[str, Any]:
+    """The occupancy map in force; nothing where there is none."""
+    if view.map is None:
+        return {}
+    given = view.map.map
+    return {
+        "map": {
+            "offset": view.map.offset,
+            "map_id": given.map_id,
+            "source": given.source,
+            "resolution": given.resolution,
+            "origin": list(given.origin),
+            "width": given.width,
+            "height": given.height,
+            "digest": given.digest(),
+        }
     }
 
 
@@ -58,6 +81,7 @@ def _keyframes(view: MapView) -> list[dict[str, Any]]:
             "map_y": None if k.pose is None else k.pose.y_m,
             "map_yaw": None if k.pose is None else k.pose.yaw_rad,
             "place_id": view.place_id(k.place),
+            **_floor(k.floor),
         }
         for k in view.keyframes
     ]
@@ -71,9 +95,27 @@ def _places(view: MapView) -> list[dict[str, Any]]:
             "centroid_y": p.centroid_y,
             "keyframe_count": p.keyframe_count,
             **({} if p.name is None else {"name": p.name}),
+            **_floor(view.floor_of(p.ordinal)),
+            **_type(view.type_of(p.ordinal)),
         }
         for p in view.places.values()
     ]
+
+
+def _floor(name: str | None) -> dict[str, str]:
+    """The floor's name, where the log tells it."""
+    return {} if name is None else {"floor": name}
+
+
+def _type(found: PlaceType | None) -> dict[str, Any]:
+    """What kind of room it is; None where unsure. Nothing where nothing tells."""
+    if found is None:
+        return {}
+    return {
+        "type": found.type,
+        "type_probability": found.probability,
+        "type_candidates": [{"type": t, "probability": p} for t, p in found.candidates],
+    }
 
 
 def _objects(view: MapView) -> list[dict[str, Any]]:
@@ -127,6 +169,10 @@ def state_text(view: MapView, digest: str, known_at: Offset | None = None) -> st
     ]
     if view.settings.fusion == "evidence":
         lines.append(f"objects  {_standing(view)}")
+    if view.map is not None:
+        given = view.map.map
+        size = f"{given.width:,} × {given.height:,} cells of {given.resolution:g} m"
+        lines.append(f"walls    {size}, from {given.source} at offset {view.map.offset:,}")
     if in_force := view.corrections.in_force:
         known = view.next_offset if known_at is None else known_at
         lines.append(f"commands {len(in_force):,} in force, of those before {known:,}")
@@ -179,6 +225,17 @@ def _settings(settings: Settings) -> str:
     return text if changed else f"default: {text}"
 
 
+def _shown_type(found: PlaceType | None) -> str:
+    """``kitchen 87 %``; empty where unsure."""
+    if found is None or found.type is None:
+        return ""
+    return found.type if found.named else f"{found.type} {found.probability:.0%}".replace("%", " %")
+
+
+def _shown_floor(name: str | None) -> str:
+    return "-" if name is None else visible(name)
+
+
 def _place_lines(view: MapView) -> list[str]:
     if not view.places:
         return ["no places yet"]
@@ -194,10 +251,18 @@ def _place_lines(view: MapView) -> list[str]:
     width = max(len(place.place_id) for place in view.places.values())
     name_width = max((len(place.name) for _, place in shown if place.name is not None), default=0)
     named = f"  {'name':<{max(name_width, 4)}}" if name_width else ""
+    floors = {ordinal: _shown_floor(view.floor_of(ordinal)) for ordinal, _ in shown}
+    floor_width = max(5, *map(len, floors.values())) if view.floors else 0
+    named += f"  {'floor':<{floor_width}}" if floor_width else ""
+    types = {ordinal: _shown_type(view.type_of(ordinal)) for ordinal, _ in shown}
+    type_width = max(4, *map(len, types.values())) if any(types.values()) else 0
+    named += f"  {'type':<{type_width}}" if type_width else ""
     lines = [f"{'place':<{width}}{named}  keyframes  objects  centroid (m)        next to"]
     for ordinal, place in shown:
         centroid = f"({place.centroid_x:.2f}, {place.centroid_y:.2f})"
         name = f"  {place.name or '':<{max(name_width, 4)}}" if name_width else ""
+        name += f"  {floors[ordinal]:<{floor_width}}" if floor_width else ""
+        name += f"  {types[ordinal]:<{type_width}}" if type_width else ""
         lines.append(
             f"{place.place_id:<{width}}{name}  {place.keyframe_count:>9}  {objects[ordinal]:>7}  "
             f"{centroid:<18}  {', '.join(neighbours[ordinal])}".rstrip()

@@ -10,12 +10,13 @@ from typing import NamedTuple
 from eventsrc.envelope import Offset
 from eventsrc.ingest import Accepted, Rejected
 from eventsrc.log import Event, LogReader
-from eventsrc.system_events import is_system_key
+from eventsrc.occupancy_map import InvalidMap, OccupancyMap, decode_map
+from eventsrc.system_events import MAP_KEY, is_system_key
 from eventsrc.upcast import read_envelopes
 from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.deltas import Delta
 from projections.errors import FoldError
-from projections.exact import Neighbourhood, Units, unit_vectors
+from projections.exact import Units, unit_vectors
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 
@@ -29,20 +30,20 @@ SNAPSHOT_MIN_EVENTS = 5_000
 
 
 class FoldedEvent(NamedTuple):
-    """What the event at ``offset`` changed; mapfold's own events change nothing."""
+    """What the event at ``offset`` changed; of mapfold's own events only a map changes anything."""
 
     offset: Offset
     deltas: list[Delta]
 
 
 class ParsedEvent(NamedTuple):
-    """A validated event: ``parsed`` is None for mapfold's own events.
+    """A validated event: ``parsed`` is None for mapfold's own events other than maps.
 
     ``units`` are the unit vectors of the envelope's detections, in order; empty if it was rejected.
     """
 
     offset: Offset
-    parsed: Accepted | Rejected | None
+    parsed: Accepted | OccupancyMap | Rejected | None
     units: list[Units | None]
 
 
@@ -77,10 +78,20 @@ def parse_events(events: Sequence[Event]) -> list[ParsedEvent]:
     units = iter(unit_vectors([v for a in outcomes if isinstance(a, Accepted) for v in a.vectors]))
     coming, parsed_events = iter(outcomes), []
     for event in events:
-        parsed = None if is_system_key(event.key) else next(coming)
+        parsed = _parse_own(event) if is_system_key(event.key) else next(coming)
         count = len(parsed.vectors) if isinstance(parsed, Accepted) else 0
         parsed_events.append(ParsedEvent(event.offset, parsed, list(islice(units, count))))
     return parsed_events
+
+
+def _parse_own(event: Event) -> OccupancyMap | Rejected | None:
+    """One of mapfold's own events: a map, or None for one that a fold passes over."""
+    if event.key != MAP_KEY:
+        return None
+    try:
+        return decode_map(event.payload)
+    except InvalidMap as error:
+        return Rejected(f"it is on {MAP_KEY} and no map: {error}")
 
 
 def fold_parsed(event: ParsedEvent, semantic_map: SemanticMap) -> list[Delta]:
@@ -90,6 +101,8 @@ def fold_parsed(event: ParsedEvent, semantic_map: SemanticMap) -> list[Delta]:
         return []
     if isinstance(event.parsed, Rejected):
         raise FoldError(event.offset, event.parsed.reason)
+    if isinstance(event.parsed, OccupancyMap):
+        return semantic_map.use_map(event.offset, event.parsed)
     return semantic_map.fold(event.offset, event.parsed, event.units)
 
 
@@ -99,11 +112,10 @@ def fold_log(
     until: Offset | None = None,
     *,
     keep_embeddings: bool = True,
-    neighbourhood: Neighbourhood | None = None,
     corrections: Corrections = NO_CORRECTIONS,
 ) -> tuple[SemanticMap, MapView]:
     """Fold the first ``until`` events of a log, all of them for None."""
-    semantic_map = SemanticMap(settings, neighbourhood, corrections)
+    semantic_map = SemanticMap(settings, corrections)
     view = MapView(settings, keep_embeddings=keep_embeddings, corrections=corrections)
     _fold_into(reader, semantic_map, view, until)
     return semantic_map, view
@@ -115,7 +127,6 @@ def fold_log_cached(
     until: Offset | None = None,
     *,
     note: Callable[[str], None] = lambda _: None,
-    neighbourhood: Neighbourhood | None = None,
     corrections: Corrections = NO_CORRECTIONS,
 ) -> tuple[SemanticMap, MapView]:
     """`fold_log` without embeddings, from the nearest snapshot beside the log.
@@ -124,11 +135,9 @@ def fold_log_cached(
     called with a message for each snapshot that could not be used or kept; the result is the same.
     """
     end = reader.next_offset if until is None else min(until, reader.next_offset)
-    cache = SnapshotCache(
-        reader.path, reader.log_id, settings, note, neighbourhood, corrections=corrections
-    )
+    cache = SnapshotCache(reader.path, reader.log_id, settings, note, corrections=corrections)
     semantic_map, view = cache.latest(end) or (
-        SemanticMap(settings, neighbourhood, corrections),
+        SemanticMap(settings, corrections),
         MapView(settings, keep_embeddings=False, corrections=corrections),
     )
     start = semantic_map.next_offset

@@ -21,6 +21,8 @@ from projections.deltas import (
 from projections.exact import UM_PER_M, mean_m
 from projections.reducers.survivors import PlaceSurvivors
 
+_UM2_PER_M2 = UM_PER_M * UM_PER_M
+
 
 @dataclass(slots=True, eq=False)
 class RunRecord:
@@ -71,7 +73,8 @@ class PlaceRecord:
 class KeyframeRecord:
     """One keyframe. ``offset`` is its event's; ``pose`` is None when the robot had none.
 
-    ``joined`` is the place it joined, as of then; ``survivors`` are the view's.
+    ``joined`` is the place it joined, as of then; ``survivors`` are the view's. ``floor`` is the
+    name of the floor that the pose is on, where the log tells it.
     """
 
     ordinal: KeyframeOrdinal
@@ -84,6 +87,7 @@ class KeyframeRecord:
     survivors: PlaceSurvivors
     observations: list[ObservationOrdinal] | tuple[()] = ()
     joined: PlaceOrdinal | None = None
+    floor: str | None = None
 
     @property
     def place(self) -> PlaceOrdinal | None:
@@ -135,6 +139,15 @@ class Estimate:
         return self.y_um / UM_PER_M
 
     @property
+    def covariance_m2(self) -> tuple[float, float, float]:
+        """Its xx, xy and yy in m²."""
+        return (
+            self.var_xx_um2 / _UM2_PER_M2,
+            self.var_xy_um2 / _UM2_PER_M2,
+            self.var_yy_um2 / _UM2_PER_M2,
+        )
+
+    @property
     def est_sigma_m(self) -> float:
         """Metres; the standard error in the direction in which it is largest."""
         half = (self.var_xx_um2 + self.var_yy_um2) / 2
@@ -161,6 +174,7 @@ class ObjectRecord:
     `MapView.objects` lists those that were not absorbed. The fields after ``observations`` are
     those of fusion by evidence: ``misses`` is in how many keyframes of a run it should have been
     seen and was not, ``missing_in`` the run in which that was often enough to call it missing.
+    ``counted_as`` is how `PlaceContents` counts it.
     """
 
     ordinal: ObjectOrdinal
@@ -177,6 +191,7 @@ class ObjectRecord:
     misses: int = 0
     missing_in: RunOrdinal | None = None
     relocations: list[Relocation] = field(default_factory=list)
+    counted_as: tuple[PlaceOrdinal, str, bool] | None = None
 
     @property
     def mean_x(self) -> float:

@@ -27,7 +27,6 @@ from projections.deltas import (
     Pose,
     RunOrdinal,
 )
-from projections.exact import Neighbourhood
 from projections.reducers import State, part, prefixed
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
@@ -163,7 +162,10 @@ def _dump_keyframes(view: MapView) -> State:
     ]
     poses = [(k.ordinal, k.pose.x_um, k.pose.y_um) for k in view.keyframes if k.pose is not None]
     yaws = [k.pose.yaw_rad for k in view.keyframes if k.pose is not None]
+    floors = [_NONE if k.floor is None else view.floors[k.floor] for k in view.keyframes]
     return {
+        "floors": list(view.floors),
+        "keyframe_floors": np.array(floors if view.floors else (), np.int32),
         "keyframes": np.array(rows, np.int64).reshape(-1, 4),
         "timestamps": np.array([k.timestamp for k in view.keyframes], np.float64),
         "poses": np.array(poses, np.int64).reshape(-1, 3),
@@ -179,6 +181,9 @@ def _load_keyframes(view: MapView, state: State) -> None:
         )
     }
     rows = zip(state["keyframes"].tolist(), state["timestamps"].tolist(), strict=True)
+    names = state.get("floors", [])
+    view.floors = {name: number for number, name in enumerate(names)}
+    floors = state["keyframe_floors"].tolist() if names else ()
     for i, ((offset, run, keyframe_id, place), timestamp) in enumerate(rows):
         ordinal, run_id, pose = KeyframeOrdinal(i), view.runs[run].run_id, poses.get(i)
         record = KeyframeRecord(
@@ -187,6 +192,8 @@ def _load_keyframes(view: MapView, state: State) -> None:
         if place != _NONE:
             record.joined = place
             view.all_places[place].unordered_members.append(ordinal)
+        if names and floors[i] != _NONE:
+            record.floor = names[floors[i]]
         view.keyframes.append(record)
 
 
@@ -257,6 +264,8 @@ def _load_objects(view: MapView, state: State) -> None:
     view.objects = {o.ordinal: o for o in view.all_objects if o.ordinal not in absorbed_by}
     if view.settings.fusion == "evidence":
         _load_evidence(view, state)
+    for found in view.objects.values():
+        view.contents.update(found)
 
 
 def _dump_evidence(view: MapView) -> State:
@@ -332,7 +341,6 @@ def restore(
     data: bytes,
     settings: Settings,
     log_id: str,
-    neighbourhood: Neighbourhood | None = None,
     signatures_at: Callable[[int], Sequence[str]] = lambda _: (),
     *,
     corrections: Corrections = NO_CORRECTIONS,
@@ -342,7 +350,7 @@ def restore(
     ``signatures_at`` gives the log's `eventsrc.log.segment_signatures` up to an offset, as it is
     now. Raises SnapshotRefused, and what ``signatures_at`` raises.
     """
-    semantic_map = SemanticMap(settings, neighbourhood, corrections)
+    semantic_map = SemanticMap(settings, corrections)
     view = MapView(settings, keep_embeddings=False, corrections=corrections)
     try:
         state = unpack(data)
@@ -351,6 +359,7 @@ def restore(
         _check_signatures(about["segments"], signatures_at(about["offset"]))
         semantic_map.load(part("map", state))
         load_view(view, part("view", state))
+        view.map = semantic_map.current_map.given
         for delta in semantic_map.use_names(semantic_map.next_offset, corrections):
             view.apply(delta)
     except (MalformedSnapshot, zlib.error) as error:

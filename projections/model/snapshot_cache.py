@@ -15,7 +15,6 @@ from pathlib import Path
 from eventsrc.envelope import Offset
 from eventsrc.log import segment_signatures
 from projections.corrections import NO_CORRECTIONS, Corrections
-from projections.exact import Neighbourhood
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 
@@ -37,7 +36,6 @@ class SnapshotCache:
         log_id: str,
         settings: Settings,
         note: Note,
-        neighbourhood: Neighbourhood | None = None,
         *,
         corrections: Corrections = NO_CORRECTIONS,
     ) -> None:
@@ -48,7 +46,6 @@ class SnapshotCache:
         self._corrections = corrections
         self._fingerprint = snapshot_fingerprint(settings, corrections)
         self._note = note
-        self._neighbourhood = neighbourhood
         self._unusable: set[Path] = set()
 
     def offsets(self) -> list[Offset]:
@@ -70,7 +67,6 @@ class SnapshotCache:
                     data,
                     self._settings,
                     self._log_id,
-                    self._neighbourhood,
                     self._signatures,
                     corrections=self._corrections,
                 )

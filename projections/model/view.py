@@ -18,6 +18,7 @@ from projections.deltas import (
     EventSkipped,
     KeyframeAdded,
     KeyframePlaced,
+    MapGiven,
     MergeRefused,
     ObjectClassified,
     ObjectEstimated,
@@ -38,9 +39,11 @@ from projections.deltas import (
     RunSeen,
     SkipKind,
 )
+from projections.place_types import PlaceType, place_type
 from projections.reducers.survivors import ObjectSurvivors, PlaceSurvivors
 from projections.settings import Settings
 
+from .place_contents import PlaceContents
 from .records import (
     Estimate,
     KeyframeRecord,
@@ -61,6 +64,8 @@ class MapView:
     not absorbed, by ordinal, ascending; ``all_places`` also the absorbed, and ``survivors`` what
     these are part of now. So are ``objects``, ``all_objects`` and ``object_survivors``.
     ``adjacency`` maps (a, b), a founded before b, to shared transitions above 0; `edges` sorts it.
+    ``floors`` numbers the floors that have a name by their first keyframe. ``map`` is the occupancy
+    map in force and the offset of its event.
     ``next_offset`` is the number of events that went into the view; ``corrections`` are those they
     were folded under.
     """
@@ -86,6 +91,9 @@ class MapView:
         self.places: dict[PlaceOrdinal, PlaceRecord] = {}
         self.survivors = PlaceSurvivors()
         self.adjacency: dict[tuple[PlaceOrdinal, PlaceOrdinal], int] = {}
+        self.floors: dict[str, int] = {}
+        self.contents = PlaceContents()
+        self.map: MapGiven | None = None
         self.skipped: dict[SkipKind, int] = {"duplicate": 0, "conflict": 0, "det_id_reused": 0}
 
     def apply(self, delta: Delta) -> None:
@@ -106,6 +114,18 @@ class MapView:
     def place_id(self, place: PlaceOrdinal | None) -> str | None:
         """The id of a place, absorbed ones too; None for None."""
         return None if place is None else self.all_places[place].place_id
+
+    def floor_of(self, place: PlaceOrdinal) -> str | None:
+        """The name of the floor that a place is on; None if the log tells none."""
+        return self.keyframes[self.all_places[place].founder].floor
+
+    def is_between_floors(self, a: PlaceOrdinal, b: PlaceOrdinal) -> bool:
+        """Whether two places are on two floors, so that a way between them is stairs or a lift."""
+        return bool(self.floors) and self.floor_of(a) != self.floor_of(b)
+
+    def type_of(self, place: PlaceOrdinal) -> PlaceType | None:
+        """What kind of room a place is, by its Objects or its name; None if nothing tells."""
+        return place_type(self.contents.of(place), self.all_places[place].name)
 
     def class_counts(self, found: ObjectRecord) -> dict[str, int]:
         """How many observations of an Object are of each class, most first; ties by name."""
@@ -136,8 +156,11 @@ class MapView:
                 delta.timestamp,
                 delta.pose,
                 self.survivors,
+                floor=delta.floor,
             )
         )
+        if delta.floor is not None:
+            self.floors.setdefault(delta.floor, len(self.floors))
 
     def _observation_added(self, delta: ObservationAdded) -> None:
         if delta.observation < len(self.observations):
@@ -224,6 +247,7 @@ class MapView:
         found.sum_y_um = delta.sum_y_um
         found.first_seen = delta.first_seen
         found.last_seen = delta.last_seen
+        self.contents.update(found)
 
     def _objects_merged(self, delta: ObjectsMerged) -> None:
         survivor = self.all_objects[delta.survivor]
@@ -235,12 +259,14 @@ class MapView:
             relocations = survivor.relocations + absorbed.relocations
             survivor.relocations = sorted(relocations, key=lambda r: (r.offset, r.observation))
             absorbed.observations, absorbed.relocations, absorbed.place = [], [], None
+            self.contents.update(absorbed)
             self.object_survivors.merge(delta.survivor, (delta.absorbed,))
         survivor.obs_count = delta.obs_count
         survivor.sum_x_um = delta.sum_x_um
         survivor.sum_y_um = delta.sum_y_um
         survivor.first_seen = delta.first_seen
         survivor.last_seen = delta.last_seen
+        self.contents.update(survivor)
 
     def _object_estimated(self, delta: ObjectEstimated) -> None:
         self.all_objects[delta.object].estimate = Estimate(
@@ -253,7 +279,9 @@ class MapView:
         )
 
     def _object_classified(self, delta: ObjectClassified) -> None:
-        self.all_objects[delta.object].class_name = delta.class_name
+        found = self.all_objects[delta.object]
+        found.class_name = delta.class_name
+        self.contents.update(found)
 
     def _object_missing(self, delta: ObjectMissing) -> None:
         found = self.all_objects[delta.object]
@@ -275,13 +303,18 @@ class MapView:
             found.relocations.append(moved)
 
     def _object_moved(self, delta: ObjectMoved) -> None:
-        self.all_objects[delta.object].place = delta.place
+        found = self.all_objects[delta.object]
+        found.place = delta.place
+        self.contents.update(found)
 
     def _places_linked(self, delta: PlacesLinked) -> None:
         if delta.shared_transitions:
             self.adjacency[delta.a, delta.b] = delta.shared_transitions
         else:
             self.adjacency.pop((delta.a, delta.b), None)
+
+    def _map_given(self, delta: MapGiven) -> None:
+        self.map = delta
 
     # Functions of the class, not bound methods: a view that refers to itself would stay in memory,
     # once it is no longer used, until Python looks for cycles.
@@ -305,10 +338,11 @@ class MapView:
         ObjectRelocated: _object_relocated,
         ObjectMoved: _object_moved,
         PlacesLinked: _places_linked,
+        MapGiven: _map_given,
     }
 
     def counts(self) -> dict[str, int]:
-        """How many of everything; the seven in capitals are the graph's edges by label. What
+        """How many of everything; the eight in capitals are the graph's edges by label. What
         corrections leave out is counted at the end, where there is any."""
         posed = sum(k.pose is not None for k in self.keyframes)
         placed = sum(p.keyframe_count for p in self.places.values())
@@ -333,4 +367,7 @@ class MapView:
             "LOCATED_IN": sum(o.place is not None for o in self.objects.values()),
             "IN_PLACE": placed,
             "ADJACENT_TO": len(self.adjacency),
+            "floors": len(self.floors),
+            "buildings": int(bool(self.all_places or self.floors)),
+            "PART_OF": len(self.places) + len(self.floors),
         } | {kind: self.skipped[kind] for kind in _BY_CORRECTION if kind in self.skipped}

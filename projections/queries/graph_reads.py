@@ -32,6 +32,8 @@ def read_place_graph(connection: Connection) -> PlaceGraph:
                 place["centroid_y"],
                 place["keyframe_count"],
                 place.get("name"),
+                place.get("type"),
+                place.get("type_probability"),
             )
         )
     edges = [

@@ -11,6 +11,7 @@ from projections.deltas import PlaceOrdinal
 from projections.errors import QuestionError
 from projections.model.records import ObjectRecord
 from projections.model.view import MapView
+from projections.place_types import type_of_name
 from projections.relocalize import CandidatePlace, Candidates, Crop
 
 from .graph_reads import read_object, read_object_counts, read_objects_of_place, read_place_graph
@@ -148,12 +149,29 @@ def _named(place: PlaceNode | CandidatePlace | None, key: str = "name") -> dict[
     return {} if place is None or place.name is None else {key: place.name}
 
 
-def where_is(source: MapSource, object_id: str) -> dict[str, Any]:
-    """An Object and the Place it is located in. Raises QuestionError if there is none."""
-    thing = source.find_object(object_id)
-    if thing is None:
-        raise QuestionError(f"no object {object_id!r} in this map; mapfold state --json lists them")
-    return thing
+def where_is(source: MapSource, wanted: str) -> dict[str, Any] | list[dict[str, Any]]:
+    """An Object by its id and the Place it is located in; or the Places that are of this type or
+    have this name, likeliest first. Raises QuestionError if there is neither."""
+    thing = source.find_object(wanted)
+    if thing is not None:
+        return thing
+    places = source.place_graph().places.values()
+    kind = type_of_name(wanted)
+    found = [p for p in places if p.name == wanted or (kind is not None and p.type == kind)]
+    if not found:
+        types = sorted({place.type for place in places if place.type is not None})
+        known = f"; there are places of type {', '.join(types)}" if types else ""
+        raise QuestionError(
+            f"no object {wanted!r} in this map, and no place of that type or name{known}; "
+            "mapfold state --json lists objects and places"
+        )
+    found.sort(key=lambda p: (p.name != wanted, -(p.type_probability or 0.0), p.ordinal))
+    return [
+        {"place_id": p.place_id, "centroid_x": p.x, "centroid_y": p.y}
+        | ({} if p.type is None else {"type": p.type, "type_probability": p.type_probability})
+        | _named(p)
+        for p in found
+    ]
 
 
 def objects_of(source: MapSource, place_id: str) -> list[dict[str, Any]]:

@@ -6,7 +6,7 @@ a variable-length pattern in Cypher would load the whole graph per session inste
 
 from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from projections.errors import QuestionError
 from projections.model.view import MapView
@@ -15,7 +15,7 @@ from projections.model.view import MapView
 @dataclass(frozen=True, slots=True)
 class PlaceNode:
     """A Place; ``ordinal`` is its founding order, the centroid is in metres. ``name`` is None where
-    nobody named it."""
+    nobody named it, ``type`` where it is not sure what kind of room it is."""
 
     ordinal: int
     place_id: str
@@ -23,6 +23,8 @@ class PlaceNode:
     y: float
     keyframe_count: int
     name: str | None = None
+    type: str | None = None
+    type_probability: float | None = None
 
 
 class PlaceGraph:
@@ -38,10 +40,15 @@ class PlaceGraph:
     @classmethod
     def of_view(cls, view: MapView) -> "PlaceGraph":
         """The graph of a folded map."""
-        nodes = [
-            PlaceNode(p.ordinal, p.place_id, p.centroid_x, p.centroid_y, p.keyframe_count, p.name)
-            for p in view.places.values()
-        ]
+        nodes = []
+        for p in view.places.values():
+            node = PlaceNode(
+                p.ordinal, p.place_id, p.centroid_x, p.centroid_y, p.keyframe_count, p.name
+            )
+            kind = view.type_of(p.ordinal)
+            if kind is not None and kind.type is not None:
+                node = replace(node, type=kind.type, type_probability=kind.probability)
+            nodes.append(node)
         return cls(nodes, view.edges())
 
     def find(self, place_id: str) -> int:

@@ -5,10 +5,10 @@ The rules of `projections.reducers.places` hold, which these places take the cod
 7.  *Anchors* are the keyframes that the commands name. An anchor is in the place that it belongs to
     by the rules. Places with anchors that are kept apart *conflict*; they are never merged. Which
     points are core does not depend on it, nor who founds a place that nothing older touches.
-8.  Core points that share a cell of the grid (side ε/√2, `core_index`) are always of one place;
-    under another rule than plain distance each core point is a cell of its own. So cells with core
-    points are what is clustered. A cell keeps its place once it has one. Two anchors in one cell
-    cannot be kept apart, nor can one that arrives in a cell of the other's place.
+8.  Core points that share a cell of the grid (side ε/√2, `core_index`) are always of one place. So
+    cells with core points are what is clustered. A cell keeps its place once it has one. Two
+    anchors in one cell cannot be kept apart, nor can one that arrives in a cell of the other's
+    place.
 9.  Where fresh core points touch places that conflict, their cells are taken in like this. A fresh
     cell with points that are in a place already is of that place, of the one founded first if there
     are several. Then the links between cells that fresh core points make are followed: those of the
@@ -47,11 +47,10 @@ from projections.pair_groups import PairGroups
 from projections.reducers import State
 
 from .core_index import CoreIndex
-from .places import NOISE, Part, Places
-from .rule_index import RuleCoreIndex
+from .place_anchors import Apart, Inside, PlaceAnchors
+from .place_members import NOISE
+from .places import Part, Places
 
-Anchors: TypeAlias = dict[int, KeyframeOrdinal]
-"""The groups of anchors in a place, with the earliest anchor of each."""
 Rank: TypeAlias = tuple[int, int]
 """The order of what is clustered: (0, place), or (1, earliest fresh core point of a fresh cell)."""
 
@@ -70,18 +69,15 @@ class Refusal(NamedTuple):
     """A link that was not followed, and the anchors on its two sides that are kept apart."""
 
     link: CellLink
-    apart: tuple[KeyframeOrdinal, KeyframeOrdinal]
+    apart: Apart
 
 
 class ConstrainedPlaces(Places):
     """The reducer under pairs of anchors. Tell it of an anchor's keyframe before it is folded."""
 
-    def __init__(self, core_index: CoreIndex | RuleCoreIndex, groups: PairGroups[Keyframe]) -> None:
+    def __init__(self, core_index: CoreIndex, groups: PairGroups[Keyframe]) -> None:
         super().__init__(core_index)
-        self._groups = groups
-        self._anchors: dict[KeyframeOrdinal, int] = {}  # those that have come → group
-        self._inside: dict[PlaceOrdinal, Anchors] = {}
-        self._refused: set[tuple[PlaceOrdinal, PlaceOrdinal]] = set()
+        self._anchors = PlaceAnchors(groups)
         # Refused links by first core points of cells, both ways round: known to change nothing
         # while the places are the same.
         self._settled: set[tuple[int, int]] = set()
@@ -91,9 +87,7 @@ class ConstrainedPlaces(Places):
 
     def add_anchor(self, keyframe: KeyframeOrdinal, anchor: Keyframe) -> None:
         """A keyframe that may be an anchor."""
-        group = self._groups.group_of.get(anchor)
-        if group is not None:
-            self._anchors[keyframe] = group
+        self._anchors.add(keyframe, anchor)
 
     def fold(
         self,
@@ -103,34 +97,21 @@ class ConstrainedPlaces(Places):
         run_id: RunId,
         x_um: int,
         y_um: int,
-        yaw: float,
     ) -> list[Delta]:
         """As `Places.fold`."""
         if keyframe not in self._anchors:
-            return super().fold(offset, keyframe, run, run_id, x_um, y_um, yaw)
-        point = len(self.joined)
-        self.joined.append(NOISE)
-        self.keyframes.append(keyframe)
-        self.runs.append(run)
-        self.run_ids[run] = run_id
-        return self._fold_changes(offset, point, self.core_index.insert(x_um, y_um, yaw))
+            return super().fold(offset, keyframe, run, run_id, x_um, y_um)
+        point = self.add_point(keyframe, run, run_id)
+        return self._fold_changes(offset, point, self.core_index.insert(x_um, y_um))
 
     def dump(self) -> State:
         """Everything, for a snapshot."""
-        return super().dump() | {
-            "anchors": [[keyframe, group] for keyframe, group in self._anchors.items()],
-            "refused": sorted(map(list, self._refused)),
-        }
+        return super().dump() | self._anchors.dump()
 
     def load(self, state: State) -> None:
         """Take over what `dump` gave."""
         super().load(state)
-        for keyframe, group in state["anchors"]:
-            self._anchors[keyframe] = group
-            place = self.place_of(keyframe)
-            if place is not None:
-                self._enter(place, group, keyframe)
-        self._refused = {(a, b) for a, b in state["refused"]}
+        self._anchors.load(state, self.place_of)
 
     def _fold_changes(self, offset: Offset, newcomer: int, fresh: list[int]) -> list[Delta]:
         if self._settled and fresh == [newcomer] and not self._is_anchor(newcomer):
@@ -139,13 +120,13 @@ class ConstrainedPlaces(Places):
                 place = self.survivors.find(self.joined[older])
                 self._join(newcomer, place)
                 placed = KeyframePlaced(offset, self.keyframes[newcomer], place)
-                return [placed, self._place_changed(offset, place)]
+                return [placed, self.place_changed(offset, place)]
         return super()._fold_changes(offset, newcomer, fresh)
 
     def _joining(
         self, offset: Offset, newcomer: int, fresh: list[int], deltas: list[Delta]
     ) -> dict[int, PlaceOrdinal]:
-        if not self._anchors:
+        if not self._anchors.have_come:
             return super()._joining(offset, newcomer, fresh, deltas)
         self._refusals, self._undecided = [], []
         joining = super()._joining(offset, newcomer, fresh, deltas)
@@ -191,9 +172,7 @@ class ConstrainedPlaces(Places):
     ) -> PlacesMerged:
         delta = super()._merge(offset, newcomer, survivor, touched)
         self._settled.clear()
-        for place in delta.absorbed:
-            for group, keyframe in self._inside.pop(place, {}).items():
-                self._enter(survivor, group, keyframe)
+        self._anchors.merge(survivor, delta.absorbed)
         return delta
 
     def _parts(self, newcomer: int, fresh: list[int]) -> Iterator[Part]:
@@ -208,9 +187,9 @@ class ConstrainedPlaces(Places):
     def _has_conflict(self, fresh: list[int], parts: list[Part]) -> bool:
         """Whether any two things that the fresh core points touch may not come together."""
         touched = {place for part in parts for place in part.touched}
-        sides = [self._inside[place] for place in touched if place in self._inside]
-        sides += [{self._group(p): self.keyframes[p]} for p in fresh if self._is_new_anchor(p)]
-        return any(self._groups.conflicts(one, other) for one, other in combinations(sides, 2))
+        sides = [inside for place in touched if (inside := self._anchors.inside(place))]
+        sides += [self._own(p) for p in fresh if self._is_new_anchor(p)]
+        return any(self._anchors.apart(one, other) for one, other in combinations(sides, 2))
 
     def _split(self, fresh: list[int]) -> Iterator[Part]:
         """The parts that the cells of fresh core points make with what they touch (rule 9)."""
@@ -221,15 +200,16 @@ class ConstrainedPlaces(Places):
                 ranks[link.near] = 0, self.survivors.find(self.joined[link.near])
         forest = _Forest()
         for rank in ranks.values():
-            inside = self._inside.get(PlaceOrdinal(rank[1]), {}) if rank[0] == 0 else {}
+            inside = self._anchors.inside(PlaceOrdinal(rank[1])) if rank[0] == 0 else {}
             forest.inside[rank] = dict(inside)
         for point in filter(self._is_new_anchor, fresh):
             inside = forest.inside[ranks[self.core_index.first_core(point)]]
-            inside.setdefault(self._group(point), self.keyframes[point])
+            for group, keyframe in self._own(point).items():
+                inside.setdefault(group, keyframe)
         for link in sorted(links, key=lambda each: sorted((ranks[each.cell], ranks[each.near]))):
             one, other = forest.find(ranks[link.cell]), forest.find(ranks[link.near])
             if one != other:
-                apart = self._apart(forest.inside[one], forest.inside[other])
+                apart = self._anchors.apart(forest.inside[one], forest.inside[other])
                 if apart is None:
                     forest.unite(one, other)
                 else:
@@ -303,21 +283,20 @@ class ConstrainedPlaces(Places):
             for first, cell in index.cores_around(point)
             if cell is None or index.core_in_reach(cell, point) is not None
         }
-        own = {self._group(point): self.keyframes[point]}
-        free = (p for p in places if self._apart(own, self._inside.get(p, {})) is None)
+        own, anchors = self._own(point), self._anchors
+        free = (p for p in places if anchors.apart(own, anchors.inside(p)) is None)
         return min(free, default=None)
 
     def _obey_joins(
         self, offset: Offset, newcomer: int, point: int, entered: PlaceOrdinal, deltas: list[Delta]
     ) -> None:
         """Make the place that an anchor has entered one with those of its group (rule 11)."""
-        group = self._group(point)
-        for other in sorted(p for p, inside in self._inside.items() if group in inside):
+        for other, named in list(self._anchors.to_join(self.keyframes[point])):
             place = self.survivors.find(entered)
             if other == place or other in self.survivors.absorbed_by:
                 continue
-            pair = point, self._point_of(self._inside[other][group])
-            apart = self._apart(self._inside[place], self._inside[other])
+            pair = point, self.point_of(named)
+            apart = self._anchors.apart(*map(self._anchors.inside, (place, other)))
             if apart is None:
                 first, second = sorted((place, other))
                 merged = self._merge(offset, newcomer, first, {first: pair, second: pair})
@@ -331,24 +310,16 @@ class ConstrainedPlaces(Places):
         newcomer: int,
         places: tuple[PlaceOrdinal, PlaceOrdinal],
         pair: tuple[int, int],
-        apart: tuple[KeyframeOrdinal, KeyframeOrdinal],
+        apart: Apart,
         deltas: list[Delta],
     ) -> None:
         """Report a link that is refused, unless its two places were reported before. ``pair`` and
         ``apart`` are in the order of ``places``."""
         if places[0] > places[1]:
             places, apart = (places[1], places[0]), (apart[1], apart[0])
-        if places not in self._refused:
-            self._refused.add(places)
+        if self._anchors.refuses(*places):
             bridge, link = self.keyframes[newcomer], self._link(*pair)
             deltas.append(MergeRefused(offset, *places, bridge, link, apart))
-
-    def _apart(
-        self, inside: Anchors, other: Anchors
-    ) -> tuple[KeyframeOrdinal, KeyframeOrdinal] | None:
-        """The earliest anchors of two sides that are kept apart, None if there are none."""
-        pairs = self._groups.conflicts(inside, other)
-        return min(((inside[a], other[b]) for a, b in pairs), default=None)
 
     def _is_anchor(self, point: int) -> bool:
         return self.keyframes[point] in self._anchors
@@ -356,16 +327,12 @@ class ConstrainedPlaces(Places):
     def _is_new_anchor(self, point: int) -> bool:
         return self.keyframes[point] in self._anchors and self.joined[point] == NOISE
 
-    def _group(self, point: int) -> int:
-        return self._anchors[self.keyframes[point]]
+    def _own(self, point: int) -> Inside:
+        """What a place of this anchor alone has inside."""
+        return self._anchors.own(self.keyframes[point])
 
     def _enter_point(self, point: int, place: PlaceOrdinal) -> None:
-        self._enter(self.survivors.find(place), self._group(point), self.keyframes[point])
-
-    def _enter(self, place: PlaceOrdinal, group: int, keyframe: KeyframeOrdinal) -> None:
-        """An anchor is in a place from now on."""
-        inside = self._inside.setdefault(place, {})
-        inside[group] = min(keyframe, inside.get(group, keyframe))
+        self._anchors.enter(self.survivors.find(place), self._own(point))
 
 
 def _both_ways(link: CellLink) -> tuple[tuple[int, int], tuple[int, int]]:
@@ -377,7 +344,7 @@ class _Forest:
     anchors below each root."""
 
     def __init__(self) -> None:
-        self.inside: dict[Rank, Anchors] = {}
+        self.inside: dict[Rank, Inside] = {}
         self._parents: dict[Rank, Rank] = {}
 
     def find(self, rank: Rank) -> Rank:

@@ -94,7 +94,7 @@ class CoreIndex:
         self._counts: dict[int, int] = {}  # point that is not core → its neighbours so far
         self._newest: Cell | None = None  # where the last point went
 
-    def insert(self, x_um: int, y_um: int, yaw_rad: float) -> list[int]:  # noqa: ARG002
+    def insert(self, x_um: int, y_um: int) -> list[int]:
         """Add a point; the indices of the points that became core by it, ascending."""
         point = len(self.x)
         self.x.append(x_um)

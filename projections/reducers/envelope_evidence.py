@@ -1,4 +1,4 @@
-"""What an envelope says to fusion by evidence: its camera, its pose, and what was detected.
+"""What an envelope says to places and to fusion: its camera, its pose, and what was detected.
 
 A depth without a standard error has a twentieth of itself, at least 0.05 m; a position without one
 has 0.1 m.
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from eventsrc.envelope import Detection, DetId, Envelope
 from eventsrc.ingest import Accepted
 from projections.deltas import ObservationOrdinal, Pose
+from projections.exact import metres_to_um
 from projections.settings import Camera
 
 from .sights import Sighting
@@ -41,6 +42,14 @@ def camera_of(envelope: Envelope, otherwise: Camera) -> Camera:
         height_px=stated.height_px,
         yaw_rad=stated.yaw_rad,
     )
+
+
+def pose_of(envelope: Envelope) -> Pose | None:
+    """The pose in exact micrometres; None if the envelope has none."""
+    x, y, yaw = envelope.map_x, envelope.map_y, envelope.map_yaw
+    if x is None or y is None or yaw is None:
+        return None
+    return Pose(metres_to_um(x), metres_to_um(y), yaw)
 
 
 def small_angle(angle: float) -> float:

@@ -14,7 +14,7 @@ from zlib import crc32
 
 import numpy as np
 
-from eventsrc.envelope import Detection, DetId, KeyframeId, Offset, RunId, has_evidence
+from eventsrc.envelope import Detection, DetId, KeyframeId, Offset, RunId, has_evidence, has_floor
 from eventsrc.ingest import Accepted
 from projections.deltas import KeyframeOrdinal, RunOrdinal
 from projections.reducers import State, packed
@@ -50,6 +50,8 @@ def content_digest(accepted: Accepted) -> bytes:
             camera and (camera.hfov_deg, camera.width_px, camera.height_px, camera.yaw_rad),
             [*map(_evidence, envelope.detections)],
         )
+    if has_floor(envelope):
+        content += (envelope.floor, envelope.map_z)
     # Format version 2 has no references, so equal values give equal bytes.
     return hashlib.blake2b(marshal.dumps(content, 2), digest_size=_DIGEST_BYTES).digest()
 

@@ -23,11 +23,8 @@ Under ``keep-apart`` and ``join``, `projections.reducers.constrained_places` add
 """
 
 import math
-from bisect import bisect_left
-from collections.abc import Iterator, MutableSequence
+from collections.abc import Iterator
 from typing import NamedTuple
-
-import numpy as np
 
 from eventsrc.envelope import Offset, RunId
 from projections.deltas import (
@@ -35,20 +32,14 @@ from projections.deltas import (
     KeyframeOrdinal,
     KeyframePlaced,
     Link,
-    PlaceChanged,
-    PlaceFormed,
     PlaceOrdinal,
     PlacesMerged,
     RunOrdinal,
 )
-from projections.reducers import State, packed, part, prefixed
+from projections.reducers import State, part, prefixed
 
 from .core_index import CoreIndex
-from .rule_index import RuleCoreIndex
-from .survivors import PlaceSurvivors
-
-NOISE = PlaceOrdinal(-1)
-"""What the packed array of places holds for a point in none."""
+from .place_members import NOISE, PlaceMembers
 
 
 class Part(NamedTuple):
@@ -59,23 +50,12 @@ class Part(NamedTuple):
     touched: dict[PlaceOrdinal, tuple[int, int]]
 
 
-class Places:
-    """The reducer. Points are numbered by arrival among the keyframes that have a pose."""
+class Places(PlaceMembers):
+    """The reducer."""
 
-    def __init__(self, core_index: CoreIndex | RuleCoreIndex) -> None:
+    def __init__(self, core_index: CoreIndex) -> None:
+        super().__init__()
         self.core_index = core_index
-        # Per point: the place it joined, as of then; its keyframe; its run.
-        self.joined: MutableSequence[PlaceOrdinal] = packed("i")
-        self.keyframes: MutableSequence[KeyframeOrdinal] = packed("i")
-        self.runs: MutableSequence[RunOrdinal] = packed("i")
-        # Per run: its id, and how many places it has founded.
-        self.run_ids: dict[RunOrdinal, RunId] = {}
-        self.founded: dict[RunOrdinal, int] = {}
-        self.survivors = PlaceSurvivors()
-        # Per place, of its current members:
-        self.member_counts: list[int] = []
-        self.sums_x_um: list[int] = []
-        self.sums_y_um: list[int] = []
 
     def fold(
         self,
@@ -85,19 +65,14 @@ class Places:
         run_id: RunId,
         x_um: int,
         y_um: int,
-        yaw: float,
     ) -> list[Delta]:
         """Add a keyframe with a pose; what it changed, in the order of the delta contract."""
-        point = len(self.joined)
-        self.joined.append(NOISE)
-        self.keyframes.append(keyframe)
-        self.runs.append(run)
-        self.run_ids[run] = run_id
-        fresh = self.core_index.insert(x_um, y_um, yaw)
+        point = self.add_point(keyframe, run, run_id)
+        fresh = self.core_index.insert(x_um, y_um)
         if fresh == [point] and (older := self.core_index.enclosing_core(point)) is not None:
             place = self.survivors.find(self.joined[older])
             self._join(point, place)
-            return [KeyframePlaced(offset, keyframe, place), self._place_changed(offset, place)]
+            return [KeyframePlaced(offset, keyframe, place), self.place_changed(offset, place)]
         return self._fold_changes(offset, point, fresh)
 
     def _fold_changes(self, offset: Offset, newcomer: int, fresh: list[int]) -> list[Delta]:
@@ -111,53 +86,17 @@ class Places:
             self._join(joiner, place)
             changed.append(place)
             deltas.append(KeyframePlaced(offset, self.keyframes[joiner], place))
-        deltas += [self._place_changed(offset, place) for place in sorted({*map(find, changed)})]
+        deltas += [self.place_changed(offset, place) for place in sorted({*map(find, changed)})]
         return deltas
-
-    def label(self, point: int) -> PlaceOrdinal | None:
-        """The point's current place; None for noise."""
-        joined = self.joined[point]
-        return None if joined == NOISE else self.survivors.find(joined)
-
-    def place_of(self, keyframe: KeyframeOrdinal) -> PlaceOrdinal | None:
-        """A keyframe's current place; None for noise, or without a pose."""
-        point = self._point_of(keyframe)
-        is_there = point < len(self.keyframes) and self.keyframes[point] == keyframe
-        return self.label(point) if is_there else None
 
     def dump(self) -> State:
         """Everything, for a snapshot."""
-        absorbed_by, places = self.survivors.absorbed_by, range(len(self.member_counts))
-        own = {
-            "joined": np.array(self.joined, np.int32),
-            "keyframes": np.array(self.keyframes, np.int32),
-            "runs": np.array(self.runs, np.int32),
-            "run_ids": [[run, run_id] for run, run_id in self.run_ids.items()],
-            "founded": [[run, count] for run, count in self.founded.items()],
-            "survivors": [absorbed_by.get(PlaceOrdinal(p), p) for p in places],
-            "member_counts": self.member_counts,
-            "sums_x_um": self.sums_x_um,
-            "sums_y_um": self.sums_y_um,
-        }
-        return own | prefixed("crowd", self.core_index.dump())
+        return super().dump() | prefixed("crowd", self.core_index.dump())
 
     def load(self, state: State) -> None:
         """Take over what `dump` gave."""
-        self.joined = packed("i", state["joined"].tobytes())
-        self.keyframes = packed("i", state["keyframes"].tobytes())
-        self.runs = packed("i", state["runs"].tobytes())
-        self.run_ids = dict(state["run_ids"])
-        self.founded = dict(state["founded"])
-        parents = enumerate(state["survivors"])
-        self.survivors.absorbed_by = {PlaceOrdinal(p): s for p, s in parents if p != s}
-        self.member_counts = state["member_counts"]
-        self.sums_x_um = state["sums_x_um"]
-        self.sums_y_um = state["sums_y_um"]
+        super().load(state)
         self.core_index.load(part("crowd", state))
-
-    def _point_of(self, keyframe: KeyframeOrdinal) -> int:
-        """A keyframe's point; of one without a pose, that of the next."""
-        return bisect_left(self.keyframes, keyframe)
 
     def _joining(
         self, offset: Offset, newcomer: int, fresh: list[int], deltas: list[Delta]
@@ -180,7 +119,9 @@ class Places:
         joining: dict[int, PlaceOrdinal] = {}
         for group, touched in self._parts(newcomer, fresh):
             if not touched:
-                place = self._form_place(offset, group[0], deltas)
+                formed = self.form_place(offset, group[0])
+                deltas.append(formed)
+                place = formed.place
             else:
                 place = min(touched)
                 if len(touched) > 1:
@@ -256,17 +197,6 @@ class Places:
                 earliest = place
         return earliest
 
-    def _form_place(self, offset: Offset, founder: int, deltas: list[Delta]) -> PlaceOrdinal:
-        place, run = PlaceOrdinal(len(self.member_counts)), self.runs[founder]
-        counter = self.founded.get(run, 0)
-        self.founded[run] = counter + 1
-        self.member_counts.append(0)
-        self.sums_x_um.append(0)
-        self.sums_y_um.append(0)
-        place_id = f"{self.run_ids[run]}_p{counter}"
-        deltas.append(PlaceFormed(offset, place, place_id, self.keyframes[founder]))
-        return place
-
     def _merge(
         self,
         offset: Offset,
@@ -285,11 +215,7 @@ class Places:
             survivor_count=counts[survivor],
             absorbed_counts=tuple(counts[place] for place in absorbed),
         )
-        self.survivors.merge(survivor, absorbed)
-        for place in absorbed:
-            counts[survivor] += counts[place]
-            self.sums_x_um[survivor] += self.sums_x_um[place]
-            self.sums_y_um[survivor] += self.sums_y_um[place]
+        self.absorb(survivor, absorbed)
         return delta
 
     def _link(self, core: int, neighbour: int) -> Link:
@@ -297,16 +223,4 @@ class Places:
         return Link(self.keyframes[core], self.keyframes[neighbour], distance_um)
 
     def _join(self, point: int, place: PlaceOrdinal) -> None:
-        self.joined[point] = place
-        self.member_counts[place] += 1
-        self.sums_x_um[place] += self.core_index.x[point]
-        self.sums_y_um[place] += self.core_index.y[point]
-
-    def _place_changed(self, offset: Offset, place: PlaceOrdinal) -> PlaceChanged:
-        return PlaceChanged(
-            offset,
-            place,
-            self.member_counts[place],
-            self.sums_x_um[place],
-            self.sums_y_um[place],
-        )
+        self.join_place(point, place, self.core_index.x[point], self.core_index.y[point])

@@ -31,6 +31,8 @@ from .presence import Presence
 
 _LEAST_NEW, _LEAST_OLD = 4, 2
 _APART_M2 = 1.0
+_ONE_FLOOR_M2 = 5e7 * 5e7
+"""Farther apart are only Objects on two floors, which are laid out beside each other."""
 _LEAST_LOOK, _ODDS_WEIGHT = 1.5, 0.3
 _ENOUGH = 2.25
 _MOST = 128
@@ -168,7 +170,7 @@ class Relocations:
             old < newcomer
             and now.home not in (before.home, before.confirmed)
             and before.odds <= 1.0
-            and dx * dx + dy * dy >= _APART_M2
+            and _APART_M2 <= dx * dx + dy * dy <= _ONE_FLOOR_M2
             and self._landmarks.observations_of(old) >= _LEAST_OLD
         )
 

@@ -9,7 +9,7 @@ Per keyframe, in this order:
     keyframe has is left out and reported.
 3.  With a pose, the keyframe goes to places, and its observations in the map's embedding space go
     to landmarks: one by one under the page's rule, all together under fusion by evidence. A
-    keyframe without a pose is only kept.
+    keyframe without a pose is only kept. Floors are laid out beside each other (`floors`).
 4.  Names of places, located-in and adjacency are told what places and landmarks changed, in order,
     and give the deltas that follow from it.
 
@@ -24,6 +24,7 @@ from typing import TypeAlias
 
 from eventsrc.envelope import FIRST_OFFSET, DetId, Offset, RunId
 from eventsrc.ingest import Accepted
+from eventsrc.occupancy_map import OccupancyMap
 from projections.corrections import NO_CORRECTIONS, Corrections, Keyframe
 from projections.deltas import (
     Delta,
@@ -44,8 +45,7 @@ from projections.deltas import (
     RunSeen,
     SkipKind,
 )
-from projections.errors import SettingsError
-from projections.exact import Neighbourhood, Units, metres_to_um, unit_vectors
+from projections.exact import Units, unit_vectors
 from projections.pair_groups import PairGroups
 from projections.reducers import State, part, prefixed
 from projections.settings import Settings
@@ -53,38 +53,50 @@ from projections.settings import Settings
 from .adjacency import Adjacency
 from .constrained_landmarks import ConstrainedLandmarks
 from .constrained_places import ConstrainedPlaces
-from .core_index import CoreIndex
+from .current_map import CurrentMap
 from .edited_events import edit_event, edits_events
 from .embedding_space import Space
-from .envelope_evidence import FusibleObservation, camera_of, sightings_of, with_small_yaw
+from .envelope_evidence import (
+    FusibleObservation,
+    camera_of,
+    pose_of,
+    sightings_of,
+    with_small_yaw,
+)
 from .evidence_fusion import EvidenceFusion
+from .floors import Floors
 from .folded_ids import FoldedIds, content_digest
 from .landmarks import Landmarks
 from .located_in import LocatedIn
 from .place_names import PlaceNames
 from .places import Places
-from .rule_index import RuleCoreIndex
+from .rooms import Rooms
+from .rules import landmarks_by, places_by
 
-Reducer: TypeAlias = FoldedIds | Places | Landmarks | EvidenceFusion | LocatedIn | Adjacency
+Reducer: TypeAlias = (
+    FoldedIds
+    | Floors
+    | Places
+    | Rooms
+    | Landmarks
+    | EvidenceFusion
+    | LocatedIn
+    | Adjacency
+    | CurrentMap
+)
 
 
 class SemanticMap:
     """The fold's state. `fold` changes it in place and is otherwise pure.
 
-    ``next_offset`` is one past the last event folded or skipped. Another ``neighbourhood`` than
-    plain distance must be the one that the settings name, so that whatever is kept under their
-    fingerprint (a snapshot, a checkpoint) is of that rule and no other. Raises SettingsError.
+    ``next_offset`` is one past the last event folded or skipped.
     """
 
     def __init__(
         self,
         settings: Settings,
-        neighbourhood: Neighbourhood | None = None,
         corrections: Corrections = NO_CORRECTIONS,
     ) -> None:
-        _check_named(settings, neighbourhood)
-        if settings.places == "rooms":
-            raise SettingsError("places=rooms is not there yet; leave it out")
         self.settings = settings
         self.corrections = corrections
         self._edits_events = edits_events(corrections)
@@ -93,21 +105,28 @@ class SemanticMap:
         self._is_corrected = self._edits_events or bool(self._anchors)
         self.next_offset = FIRST_OFFSET
         self.folded_ids = FoldedIds()
+        self.floors = Floors(settings.floor_height_m)
         self.space = Space(settings)
-        core_index = (
-            CoreIndex(metres_to_um(settings.eps_m), settings.min_samples)
-            if neighbourhood is None
-            else RuleCoreIndex(neighbourhood, settings.min_samples)
-        )
-        self._anchored = None
-        if corrections.joined or corrections.apart:
-            groups = PairGroups(corrections.joined, corrections.apart)
-            self._anchored = ConstrainedPlaces(core_index, groups)
-        self.places = self._anchored or Places(core_index)
-        self.landmarks = _landmarks(settings, corrections)
+        self._grouped = PairGroups(corrections.joined, corrections.apart)
+        self.places = places_by(settings, self._grouped)
+        self._named = PairGroups(corrections.same, corrections.different)
+        self.landmarks = landmarks_by(settings, self._named)
         self.located_in = LocatedIn()
         self.adjacency = Adjacency()
+        self.current_map = CurrentMap(settings)
         self.observation_count = 0
+
+    def use_map(self, offset: Offset, given: OccupancyMap) -> list[Delta]:
+        """Take over an occupancy map, which holds for the events after it; what changed."""
+        self.next_offset = Offset(offset + 1)
+        given_map = self.current_map.fold(offset, given)
+        self._use_walls()
+        return [given_map]
+
+    def _use_walls(self) -> None:
+        grid = self.current_map.grid
+        if grid is not None and isinstance(self.places, Rooms):
+            self.places.use_walls(grid.straight_way_um)
 
     def skip(self, offset: Offset) -> None:
         """Pass over an event that does not change the map."""
@@ -144,9 +163,11 @@ class SemanticMap:
         if is_news:
             deltas.append(RunSeen(offset, run, envelope.run_id, envelope.timestamp))
         keyframe = folded_ids.add_keyframe(run, envelope.keyframe_id, offset, digest)
+        pose = pose_of(envelope)
+        floor, ground = (None, 0) if pose is None else self.floors.enter(envelope)
         if is_corrected and self._anchors:
-            self._add_anchor(keyframe, Keyframe(envelope.run_id, envelope.keyframe_id))
-        pose = _pose(accepted)
+            anchor = Keyframe(envelope.run_id, envelope.keyframe_id)
+            self._add_anchor(keyframe, anchor, None if pose is None else ground)
         deltas.append(
             KeyframeAdded(
                 offset,
@@ -156,6 +177,7 @@ class SemanticMap:
                 envelope.keyframe_id,
                 envelope.timestamp,
                 pose,
+                floor,
             )
         )
         if units is None:
@@ -165,20 +187,23 @@ class SemanticMap:
             deltas += [EventSkipped(offset, "dropped", run_id, keyframe_id, d) for d in dropped]
         fusible = self._observe(offset, keyframe, accepted, units, deltas)
         if pose is not None:
+            pose = self.floors.laid_out(pose, ground)
+            for seen in fusible if self._named.group_of else ():
+                self.floors.settle(self._named, seen[1], "object", ground)
             place = self._place(offset, keyframe, run, envelope.run_id, pose, deltas)
             landmarks, timestamp = self.landmarks, envelope.timestamp
             if isinstance(landmarks, EvidenceFusion):
                 camera = camera_of(envelope, self.settings.camera)
-                seen = sightings_of(accepted, fusible)
+                sights = self.floors.sightings(sightings_of(accepted, fusible), ground)
                 facing = with_small_yaw(pose)
-                fused = landmarks.fold(offset, run, timestamp, facing, camera, seen)
+                fused = landmarks.fold(offset, run, timestamp, facing, camera, sights)
                 self._locate(fused, keyframe, place)
                 deltas += fused
             else:
                 self._fuse(landmarks, offset, keyframe, place, pose, fusible, timestamp, deltas)
             deltas += self.located_in.collect_moves(offset)
             deltas += self.adjacency.collect_changes(offset)
-        return deltas
+        return self.floors.put_back(deltas)
 
     def use_names(self, offset: Offset, corrections: Corrections) -> list[PlaceNamed]:
         """Replace the names of places, as if they had been known from the start; what changes.
@@ -220,25 +245,30 @@ class SemanticMap:
             self.space.decide(*state["space"])
         for name, reducer in self._parts():
             reducer.load(part(name, state))
+        self._use_walls()
 
     def _parts(self) -> tuple[tuple[str, Reducer], ...]:
         return (
             ("seen", self.folded_ids),
+            ("floors", self.floors),
             ("places", self.places),
             ("landmarks", self.landmarks),
             ("located_in", self.located_in),
             ("adjacency", self.adjacency),
+            ("current_map", self.current_map),
         )
 
     def _all_anchors(self) -> frozenset[Keyframe]:
         pairs = (*self.corrections.apart, *self.corrections.joined)
         return frozenset(self.names.newest).union(*pairs)
 
-    def _add_anchor(self, keyframe: KeyframeOrdinal, anchor: Keyframe) -> None:
+    def _add_anchor(self, keyframe: KeyframeOrdinal, anchor: Keyframe, floor: int | None) -> None:
         if anchor in self._anchors:
             self.names.add_anchor(keyframe, anchor)
-            if self._anchored is not None:
-                self._anchored.add_anchor(keyframe, anchor)
+            if isinstance(self.places, ConstrainedPlaces | Rooms):
+                if floor is not None:
+                    self.floors.settle(self._grouped, anchor, "place", floor)
+                self.places.add_anchor(keyframe, anchor)
 
     def _observe(
         self,
@@ -308,9 +338,7 @@ class SemanticMap:
     ) -> PlaceOrdinal | None:
         """Run places and tell located-in and adjacency; the keyframe's own place."""
         folded_ids, place = self.folded_ids, None
-        changes = self.places.fold(
-            offset, keyframe, run, run_id, pose.x_um, pose.y_um, pose.yaw_rad
-        )
+        changes = self.places.fold(offset, keyframe, run, run_id, pose.x_um, pose.y_um)
         for delta in changes:
             deltas.append(delta)
             if type(delta) is KeyframePlaced:
@@ -366,31 +394,3 @@ class SemanticMap:
                 if type(following) is ObjectRelocated and following.object == delta.survivor:
                     self.located_in.object_left(delta.survivor)
                 self.located_in.objects_merged(delta.survivor, delta.absorbed)
-
-
-def _landmarks(settings: Settings, corrections: Corrections) -> Landmarks | EvidenceFusion:
-    named = None
-    if corrections.same or corrections.different:
-        named = PairGroups(corrections.same, corrections.different)
-    if settings.fusion == "evidence":
-        return EvidenceFusion(settings.evidence, named)
-    limits = settings.fusion_radius_m, settings.fusion_similarity
-    return Landmarks(*limits) if named is None else ConstrainedLandmarks(*limits, named)
-
-
-def _check_named(settings: Settings, neighbourhood: Neighbourhood | None) -> None:
-    given = None if neighbourhood is None else neighbourhood.name
-    if given != settings.neighbourhood:
-        raise SettingsError(
-            f"the settings name the neighbourhood {settings.neighbourhood!r}, the fold was given "
-            f"{given!r}; write SemanticMap(Settings(neighbourhood=rule.name), rule), "
-            "or neither for plain distance"
-        )
-
-
-def _pose(accepted: Accepted) -> Pose | None:
-    envelope = accepted.envelope
-    x, y, yaw = envelope.map_x, envelope.map_y, envelope.map_yaw
-    if x is None or y is None or yaw is None:
-        return None
-    return Pose(metres_to_um(x), metres_to_um(y), yaw)

@@ -1,7 +1,7 @@
 """Re-localisation: ranked Places and a pose from a few object crops, as a pure ranking.
 
 `rank` turns crops (`question`) and candidates into an `Answer`; candidates come from the databases
-(`projections.queries.relocalize`) or from a folded map (`ExactIndex`, `search_log`).
+(`projections.queries.relocalize`) or from a folded map (`ExactIndex`).
 """
 
 from .camera import Camera
@@ -12,13 +12,12 @@ from .candidates import (
     ExactIndex,
     Match,
     Stand,
-    search_log,
 )
+from .certainty import UNKNOWN_BELOW
 from .constants import MapConstants
-from .question import Crop, Question, View, describe_value, parse_json, parse_question, read_crops
+from .question import Crop, Question, View, describe_value
 from .ranking import (
     DEFAULT_CAMERA,
-    UNKNOWN_BELOW,
     Answer,
     Evidence,
     Method,
@@ -26,6 +25,15 @@ from .ranking import (
     RankedPlace,
     rank,
 )
+from .reading import (
+    parse_json,
+    parse_question,
+    question_schema,
+    read_crops,
+    read_moved,
+    read_question,
+)
+from .track import Track, Tracked, movement_of
 
 __all__ = [
     "DEFAULT_CAMERA",
@@ -45,11 +53,16 @@ __all__ = [
     "Question",
     "RankedPlace",
     "Stand",
+    "Track",
+    "Tracked",
     "View",
     "describe_value",
+    "movement_of",
     "parse_json",
     "parse_question",
+    "question_schema",
     "rank",
     "read_crops",
-    "search_log",
+    "read_moved",
+    "read_question",
 ]

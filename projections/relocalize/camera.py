@@ -1,8 +1,10 @@
-"""Camera model: a pinhole that looks straight ahead of the robot; bearings and sizes from boxes.
+"""Camera model: a level pinhole; bearings, sizes and edges of boxes.
 
 A box's centre gives a bearing, its height a relative depth: the height in pixels times the depth in
-metres is the same for one thing from wherever it is seen (its *size*, in pixel metres). A box that
-touches the picture's edge is cut off there, so its bearing and height count less.
+metres is the same for one thing from wherever it is seen (its *size*, in pixel metres). Its upper
+and its lower edge do so each for itself: the rise of the line of sight to an edge times the
+distance is how high above the camera that edge is. A box that touches the picture's border is cut
+off there: such an edge tells nothing, and the bearing counts less.
 """
 
 import math
@@ -19,6 +21,7 @@ Flags = NDArray[np.bool_]
 _MIN_HEIGHT_PX = 4.0
 _EDGE_PX = 1.0
 _UNKNOWN_HEIGHT_PX = 100.0
+_STEEPEST = 10.0
 _FARTHEST_PX = 1e6
 """Coordinates are limited to it, so that the geometry's squares stay finite."""
 
@@ -45,6 +48,11 @@ class Camera:
     def focal_px(self) -> float:
         """The focal length in pixels."""
         return self.width_px / 2.0 / math.tan(math.radians(self.hfov_deg) / 2.0)
+
+    @property
+    def half_field_rad(self) -> float:
+        """Half the horizontal field of view."""
+        return math.radians(self.hfov_deg) / 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,5 +84,55 @@ def views(camera: Camera, boxes: Sequence[tuple[float, float, float, float] | No
         height_px=np.where(known, np.maximum(y1 - y0, _MIN_HEIGHT_PX), _UNKNOWN_HEIGHT_PX),
         cut_x=(x0 <= _EDGE_PX) | (x1 >= camera.width_px - _EDGE_PX),
         cut_y=(y0 <= _EDGE_PX) | (y1 >= camera.height_px - _EDGE_PX),
+        known=known,
+    )
+
+
+UPPER, LOWER = 0, 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sights:
+    """Of n boxes the lines of sight. Distances are along the ground.
+
+    ``bearing`` is radians to the left of the robot's heading, 0 without a box; ``log_height`` the
+    logarithm of the box's height at a distance of 1 m; ``rise`` (2, n) how steeply the lines to the
+    upper and lower edge rise, and ``whole`` (2, n) which of these the picture's border does not
+    cut. ``cut`` says which boxes it cuts at a side, ``known`` is False where there is no box.
+    """
+
+    bearing: Floats
+    log_height: Floats
+    rise: Floats
+    whole: Flags
+    cut: Flags
+    known: Flags
+
+    @property
+    def tall(self) -> Flags:
+        """Which boxes have both edges, and so a height."""
+        both: Flags = self.whole[UPPER] & self.whole[LOWER]
+        return both
+
+
+def sights(camera: Camera, boxes: Sequence[tuple[float, float, float, float] | None]) -> Sights:
+    """Read boxes as `views` does; what is farther outside the picture than the picture is large is
+    left out."""
+    rows = np.array(
+        [(0.0, 0.0, 0.0, 0.0) if box is None else box for box in boxes], dtype=np.float64
+    ).reshape(-1, 4)
+    most = np.array((camera.width_px, camera.height_px) * 2)
+    x0, y0, x1, y1 = np.minimum(np.maximum(rows, -most), 2.0 * most).T
+    known = (x1 > x0) & (y1 > y0)
+    tangent = (camera.width_px / 2.0 - (x0 + x1) / 2.0) / camera.focal_px
+    per_px = 1.0 / (camera.focal_px * np.sqrt(1.0 + tangent * tangent))
+    rise = (camera.height_px / 2.0 - np.stack((y0, y1))) * per_px
+    inside = np.stack((y0 > _EDGE_PX, y1 < camera.height_px - _EDGE_PX))
+    return Sights(
+        bearing=np.where(known, np.arctan(tangent) + camera.yaw_rad, 0.0),
+        log_height=np.log(np.maximum(y1 - y0, _MIN_HEIGHT_PX) * per_px),
+        rise=rise,
+        whole=inside & known & (np.abs(rise) < _STEEPEST),
+        cut=(x0 <= _EDGE_PX) | (x1 >= camera.width_px - _EDGE_PX),
         known=known,
     )

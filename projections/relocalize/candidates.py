@@ -9,11 +9,14 @@ whatever BLAS does (see `projections.exact`). The same map and crops give the sa
 last bit.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from pathlib import Path
+from typing import Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from eventsrc.envelope import RunId
 from eventsrc.log import LogReader
@@ -22,21 +25,28 @@ from eventsrc.text import counted
 from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.deltas import ObservationOrdinal, PlaceOrdinal
 from projections.errors import QuestionError
-from projections.exact import Q40, UM_PER_M, quantise
+from projections.exact import Q40, quantise
 from projections.model.fold import fold_log
 from projections.model.records import Estimate
 from projections.model.view import MapView
 from projections.settings import Settings
 
 from .constants import FOLLOWERS, Cosines, MapConstants, Sample
-from .question import Box, Crop
+from .question import Box, Crop, Vector, describe_value
+from .walls import WallMap
 
 NEIGHBOURS = 64
 """Observations fetched per crop. From 48 on, the measures in docs/relocalization.md stay the same;
 fewer leave too few directions to triangulate an object from."""
 
+OBJECTS_OF_A_CLASS = 96
+"""For a crop of which only the class is known: so many Objects, those seen most often …"""
+MOST_OBJECTS = 512
+"""… with several classes at most so many in all …"""
+OBSERVATIONS_OF_EACH = 4
+"""… and of each so many observations, spread evenly over all."""
+
 Pose = tuple[float, float, float]
-UM2_PER_M2 = UM_PER_M * UM_PER_M
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,41 +87,28 @@ class Match:
 
 @dataclass(frozen=True, slots=True)
 class CandidatePlace:
-    """A Place that a match belongs to: id, centroid in metres, name if it has one."""
+    """A Place that a match belongs to: id, centroid in metres, name if it has one, and the floor it
+    is on if the log names that."""
 
     place_id: str
     x: float
     y: float
     name: str | None = None
+    floor: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
-    """``matches[i]`` are those of crop i, most similar first, ties by ordinal."""
+    """``matches[i]`` are those of crop i, most similar first, ties by ordinal.
+
+    Those of a crop without an embedding are observations of Objects of its class, with the
+    similarity 1. ``walls`` are those of the occupancy map in force, None without one.
+    """
 
     matches: tuple[tuple[Match, ...], ...]
     places: Mapping[PlaceOrdinal, CandidatePlace]
     constants: MapConstants = field(default_factory=MapConstants)
-
-
-def search_log(
-    log: Path,
-    point: str,
-    settings: Settings,
-    crops: Sequence[Crop],
-    *,
-    note: Note | None = None,
-    corrections: Corrections = NO_CORRECTIONS,
-) -> Candidates:
-    """Candidates from the map as of ``point`` of a log: offset, ISO time, run:keyframe or end.
-
-    ``note`` is called with what the user should know about ``point`` (`eventsrc.log.seek.resolve`).
-    """
-    with LogReader(log) as reader:
-        _, view = fold_log(
-            reader, settings, resolve(reader, point, note=note), corrections=corrections
-        )
-    return ExactIndex(view).search(crops)
+    walls: WallMap | None = None
 
 
 class ExactIndex:
@@ -125,7 +122,11 @@ class ExactIndex:
         self._matrix = np.array(vectors, dtype=np.float64)
         self.places = {
             place.ordinal: CandidatePlace(
-                place.place_id, place.centroid_x, place.centroid_y, place.name
+                place.place_id,
+                place.centroid_x,
+                place.centroid_y,
+                place.name,
+                view.floor_of(place.ordinal),
             )
             for place in view.places.values()
         }
@@ -133,6 +134,26 @@ class ExactIndex:
             (o.embedding_model for o in view.observations if o.embedding is not None), None
         )
         self.constants = MapConstants.of(view.settings, self._different())
+        self._walls = None if view.map is None else WallMap(view.map.map)
+
+    @classmethod
+    def of_log(
+        cls,
+        log: Path,
+        point: str,
+        settings: Settings,
+        *,
+        note: Note | None = None,
+        corrections: Corrections = NO_CORRECTIONS,
+    ) -> Self:
+        """That of the map as of ``point`` of a log: offset, ISO time, run:keyframe or end.
+
+        ``note`` is called with what the user should know about ``point``
+        (`eventsrc.log.seek.resolve`).
+        """
+        with LogReader(log) as reader:
+            end = resolve(reader, point, note=note)
+            return cls(fold_log(reader, settings, end, corrections=corrections)[1])
 
     def _different(self) -> Cosines:
         """The cosines of different things in one picture, of a sample of the observations."""
@@ -154,24 +175,57 @@ class ExactIndex:
             return Cosines()
         return Cosines(len(products), float(np.mean(products)), float(np.std(products)))
 
-    def search(self, crops: Sequence[Crop], neighbours: int = NEIGHBOURS) -> Candidates:
-        """The nearest observations of each crop. Raises QuestionError for another space."""
-        if not len(self._ordinals):
-            return Candidates(tuple(() for _ in crops), self.places, self.constants)
-        for crop in crops:
-            check_space(crop, self._matrix.shape[1], self.model)
-        matches = tuple(self._nearest(crop, neighbours) for crop in crops)
-        return Candidates(matches, self.places, self.constants)
+    def search(
+        self,
+        crops: Sequence[Crop],
+        neighbours: int = NEIGHBOURS,
+        without: Collection[ObservationOrdinal] = (),
+    ) -> Candidates:
+        """The nearest observations of each crop, as if the map had none of those ``without``.
+        Raises QuestionError for another space."""
+        if len(self._ordinals):
+            for crop in crops:
+                check_space(crop, self._matrix.shape[1], self.model)
+        dropped = np.isin(self._ordinals, list(without)) if without else None
+        objects = objects_of_a_class(crops)
+        matches = tuple(
+            self._of_class(crop.class_name, objects)
+            if crop.vector is None
+            else self._nearest(crop.vector, neighbours, dropped)
+            for crop in crops
+        )
+        refuse_unknown_classes(crops, matches, self._class_names)
+        return Candidates(matches, self.places, self.constants, self._walls)
 
-    def _nearest(self, crop: Crop, neighbours: int) -> tuple[Match, ...]:
-        if crop.vector is None:
+    def _nearest(
+        self, vector: Vector, neighbours: int, dropped: NDArray[np.bool_] | None
+    ) -> tuple[Match, ...]:
+        if not len(self._ordinals):
             return ()
-        products = self._matrix @ quantise(crop.vector).astype(np.float64)
+        products = self._matrix @ quantise(vector).astype(np.float64)
+        if dropped is not None:
+            products[dropped] = -np.inf
+            neighbours = min(neighbours, len(dropped) - int(dropped.sum()))
         order = np.argsort(-products, kind="stable")[:neighbours]
         return tuple(
             self._match(ObservationOrdinal(int(self._ordinals[i])), float(products[i]) / Q40)
             for i in order
         )
+
+    def _of_class(self, class_name: str | None, objects: int) -> tuple[Match, ...]:
+        things = [o for o in self._view.objects.values() if o.class_name == class_name]
+        most = sorted(things, key=lambda o: (-o.obs_count, o.ordinal))[:objects]
+        picked = [
+            seen[position]
+            for seen in (sorted(thing.observations) for thing in most)
+            for position in range(len(seen))
+            if (position + 1) * OBSERVATIONS_OF_EACH // len(seen)
+            > position * OBSERVATIONS_OF_EACH // len(seen)
+        ]
+        return tuple(self._match(ordinal, 1.0) for ordinal in sorted(picked))
+
+    def _class_names(self) -> set[str]:
+        return {found.class_name for found in self._view.objects.values()}
 
     def _match(self, ordinal: ObservationOrdinal, similarity: float) -> Match:
         observation = self._view.observations[ordinal]
@@ -199,11 +253,43 @@ def _stand(estimate: Estimate | None) -> Stand | None:
     return Stand(
         estimate.est_x,
         estimate.est_y,
-        estimate.var_xx_um2 / UM2_PER_M2,
-        estimate.var_xy_um2 / UM2_PER_M2,
-        estimate.var_yy_um2 / UM2_PER_M2,
+        *estimate.covariance_m2,
         estimate.spots,
     )
+
+
+def objects_of_a_class(crops: Sequence[Crop]) -> int:
+    """How many Objects are taken for each crop of which only the class is known."""
+    classes = {crop.class_name for crop in crops if crop.vector is None}
+    return min(OBJECTS_OF_A_CLASS, MOST_OBJECTS // max(len(classes), 1))
+
+
+def refuse_unknown_classes(
+    crops: Sequence[Crop],
+    matches: Sequence[Sequence[Match]],
+    class_names: Callable[[], Iterable[str]],
+) -> None:
+    """Raise QuestionError for a class that the map does not have, where nothing but classes is
+    asked with. ``class_names`` gives the classes of all Objects."""
+    if any(crop.vector is not None for crop in crops):
+        return
+    for crop, row in zip(crops, matches, strict=True):
+        if not row:
+            names = sorted(class_names())
+            near = get_close_matches(crop.class_name or "", names, 3, 0.5)
+            there = (
+                f"the nearest are {', '.join(near)}"
+                if near
+                else f"there are {', '.join(names[:_SHOWN])}{', …' if len(names) > _SHOWN else ''}"
+                if names
+                else "it has none"
+            )
+            raise QuestionError(
+                f"the map has no object of class {describe_value(crop.class_name)}; {there}"
+            )
+
+
+_SHOWN = 12
 
 
 def check_space(crop: Crop, dimension: int, model: str | None) -> None:

@@ -1,11 +1,8 @@
-"""Parameters of the ranking, with where each comes from.
+"""Parameters of the ranking that hold for all maps; what differs from map to map is read off it.
 
-The similarity model: a crop of an object and an observation of the same object in another session,
-seen from directions Δ apart, have a cosine near ``floor + side · exp(kappa · (cos Δ − 1))``. Floor,
-side and kappa were read off house-a against house-b of the trial data: 0.863 seen from the same
-direction, 0.831 at 50°, 0.78 from behind. The widths of the evidence (``sigma_*``), the price of an
-unknown crop and the geometry's tolerances were chosen on generated buildings that are not among
-those reported; docs/relocalization.md names them and `scripts/fit_confidence` fits the rest.
+How far away things are seen, how good bearings are, how alike one thing and two things look:
+`projections.evidence`, in `MapConstants`. What is here was chosen on the developing half of our
+trial data (docs/relocalization.md).
 """
 
 from dataclasses import dataclass
@@ -14,64 +11,74 @@ from typing import Final
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """Lengths in metres, angles in radians, similarities as cosines."""
+    """Lengths in metres, angles in radians; likeness is relative (`projections.evidence`)."""
 
-    floor: float = 0.776
-    side: float = 0.09
-    kappa: float = 1.2
-    sigma_observation: float = 0.016
-    sigma_instance: float = 0.009
+    # How a crop is explained: see `likelihood`.
+    in_map: float = 0.85
+    """Probability beforehand that a crop's thing is in the map."""
+    share: float = 0.5
+    """Of a landmark that fits as well as a thing anywhere would."""
+    tail: float = 0.03
+    """How much a landmark counts that is roughly in front, whatever its box says."""
+    twice: float = 2.0
+    """… up to so many times the usual distance."""
+    seen_from_m: float = 1.6
+    """Standard deviation of the distance to the nearest pose that saw the landmark: walls are not
+    in the map."""
+
+    through_walls: float = 0.3
+    """What is left of a landmark with a wall between: where it stands is an estimate."""
+    in_walls: float = 0.1
+    """… and of a pose inside a wall: poses are a little off."""
+
+    # Where robots are: see `pose`.
+    driven_m: float = 0.6
+    driven_far_m: float = 1.5
+    driven_share: float = 0.4
+    """Distances from poses that saw a landmark: a mixture of two normal distributions."""
+    reach_m: float = 1.6
+    """No pose farther than this from all of those is considered."""
+
+    # Looks: see `appearance`.
+    best_pairs: int = 4
+    """Observations of a landmark that count; missing ones cost ``missing`` each."""
+    missing: float = 0.5
+    most: float = 8.0
+    """Limit of a landmark's log-likelihood ratio by its looks."""
+    look_alike: float = 0.15
+    """Share of look-alikes among the different things that resemble a crop, which are as like as
+    the thing itself but for ``look_alike_below``; and of other things of the class."""
+    look_alike_below: float = 0.04
+    of_class: float = 0.35
+    least_spread: float = 0.06
+    """The spread of a thing's likenesses counts as at least this."""
+    own_spread: float = 0.4
+    """Part of their variance that is not common to all likenesses of a landmark with a crop."""
     independent: float = 6.0
-    """Errors of one object's observations are correlated: no more than this many count."""
-    too_similar: float = 3.0
-    """A crop *more* like an object than expected is penalised no further than this χ²."""
-    usual_best: float = 0.885
-    """No observation counts as more similar than this."""
-    same_crop: float = 0.04
-    """An observation more similar than ``usual_best`` by this much is the very crop asked with."""
-    same_crop_worth: float = 15.0
-    """Log-likelihood that it adds to its landmark; decides between look-alikes."""
-    usual_third: float = 0.875
-    """A run whose third best match is above this is of the question's own session: all cosines
-    against it are higher, and are shifted down (`sessions`)."""
-    session: float = 0.048
-    """By how much cosines within a session are higher than between two: 0.911 against 0.863 from
-    the same side, in house-a and house-b as in home-1 and home-2."""
-    session_price: float = 1.0
-    """Log-likelihood that a landmark loses for each run it takes for the question's own session."""
-    relevant: float = 0.72
-    """Less similar observations show another thing and are ignored."""
-    unknown_price: float = 7.0
-    """Log-likelihood of a perfect match above that of 'this crop is not in the map'."""
-    sigma_bearing: float = 0.04
-    sigma_bearing_cut: float = 0.08
-    sigma_log_depth: float = 0.15
-    sigma_log_depth_cut: float = 0.3
-    sigma_landmark: float = 0.1
-    vague: float = 0.5
-    """How much of the log of the error ellipse's area counts: a landmark of uncertain position fits
-    everything a little, which must not score as high as a close fit of a certain one."""
-    map_bearing: float = 0.02
-    map_bearing_cut: float = 0.08
-    map_log_depth: float = 0.08
-    map_log_depth_cut: float = 0.3
-    map_least: float = 0.06
-    """Errors of the boxes a landmark is made of, radians and log; and metres on top."""
-    sigma_size_least: float = 0.05
-    gate: float = 5.0
-    """χ² below which a point belongs to a landmark."""
-    half_view: float = 0.55
-    """Without boxes: the half of the field of view in which objects are expected."""
-    usual_depth: float = 2.6
-    usual_depth_spread: float = 0.45
-    driven: float = 0.7
-    """Standard deviation of the robot's distance from poses where robots have been."""
-    driven_most: float = 2.5
-    """Greatest penalty for it: a part of the building may not be explored yet."""
-    seen_from: float = 4.0
-    seen_from_no_box: float = 0.8
-    """Standard deviation of the distance from poses that saw the landmark; without boxes the
-    position depends on it alone."""
+    """Likenesses of a landmark are related: no more than this many count."""
+    side_weight: float = 0.85
+    """How much of the log-likelihood by the side of view counts."""
+    same_picture: float = 0.98
+    """A likeness above this is to the very crop asked with; the robot then looks from there, as
+    exp(kappa (cos Δ − 1))."""
+    same_picture_kappa: float = 50.0
+    text_weight: float = 0.5
+    """Part of the logarithm of the ratio that counts when the crop is a text."""
+    class_ratio: float = 1.5
+    """Log-likelihood ratio of a landmark that has the class of a crop without a look."""
+
+    # Boxes: see `landmarks` and `likelihood`.
+    pose_m: float = 0.1
+    size_spread: float = 0.2
+    """Of the logarithm of a landmark's height in a box, beside what is common to all boxes."""
+    other_sizes: float = 0.7
+    """… of any other thing."""
+    edge_m: float = 0.08
+    edge_part: float = 0.1
+    """Standard error of an edge's elevation, and what a part of the elevation adds."""
+    edge_rise: float = 0.02
+    other_rises: float = 0.25
+    """Standard error of the rise of a line of sight, and that of any other thing."""
 
 
 MODEL: Final = Model()

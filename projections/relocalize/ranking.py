@@ -21,15 +21,17 @@ from projections.deltas import PlaceOrdinal
 
 from .camera import Camera
 from .candidates import Candidates, Match
+from .certainty import UNKNOWN_BELOW, known_probability
+from .floors import Hypotheses, Layout
+from .likelihood import Scene
 from .model import MODEL, Model
 from .pose import Posterior, locate
-from .question import Crop, Question
+from .question import Crop, Question, View
+from .thin import thinness
 
 Method = Literal["joint", "plain"]
 DEFAULT_CAMERA: Final = Camera()
 PLAIN_NEIGHBOURS: Final = 10
-UNKNOWN_BELOW: Final = 0.3
-"""Below this confidence the answer is 'unknown'."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +49,7 @@ class RankedPlace:
     """A Place and its score: the share of the poses' weight that lies in it.
 
     With the plain method the score is the sum of similarities. The centroid is in metres.
-    ``name`` is None where nobody named the Place.
+    ``name`` is None where nobody named the Place, ``floor`` where the log names no floor.
     """
 
     place_id: str
@@ -56,12 +58,14 @@ class RankedPlace:
     centroid_y: float
     evidence: tuple[Evidence, ...]
     name: str | None = None
+    floor: str | None = None
 
     def document(self) -> dict[str, Any]:
-        """As JSON; only a Place that has a name has that key."""
+        """As JSON; only a Place that has a name or a floor has that key."""
         document = asdict(self) | {"evidence": [asdict(evidence) for evidence in self.evidence]}
-        if self.name is None:
-            del document["name"]
+        for key in ("name", "floor"):
+            if document[key] is None:
+                del document[key]
         return document
 
 
@@ -69,41 +73,55 @@ class RankedPlace:
 class PoseHypothesis:
     """Metres and radians in the map frame; ``yaw`` is None when the evidence leaves it open.
 
-    ``spread_m`` is the root mean square distance of all weighed poses from this one.
+    ``spread_m`` is the root mean square distance of all weighed poses from this one, of those on
+    its floor. ``floor`` is the floor it is on, None where the log names none.
     """
 
     x: float
     y: float
     yaw: float | None
     spread_m: float
+    floor: str | None = None
+
+    def document(self) -> dict[str, Any]:
+        """As JSON; only a pose on a floor with a name has that key."""
+        document = asdict(self)
+        if self.floor is None:
+            del document["floor"]
+        return document
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """``confidence`` is the calibrated probability that the pose is right within 1.5 m.
+    """Two calibrated probabilities: ``known`` that the map has one of the things shown,
+    ``confidence`` that the pose is right within 1.5 m.
 
-    ``poses`` are all poses that were weighed, likeliest first: x, y, yaw and weight.
+    ``hypotheses`` are what the pose was chosen from; None where there is no pose, and with the
+    plain method. ``thin`` says what there is too little of in the map (`thin.thinness`), None where
+    there is enough.
     """
 
     places: tuple[RankedPlace, ...]
     pose: PoseHypothesis | None
     confidence: float
-    poses: tuple[tuple[float, float, float, float], ...] = field(
-        default=(), compare=False, repr=False
-    )
+    known: float = 0.0
+    hypotheses: Hypotheses | None = field(default=None, compare=False, repr=False)
+    thin: str | None = None
 
     @property
     def unknown(self) -> bool:
-        """Whether the confidence is too low to name a Place."""
-        return self.confidence < UNKNOWN_BELOW
+        """Whether the things shown are more likely not in the map."""
+        return self.known < UNKNOWN_BELOW
 
     def document(self) -> dict[str, Any]:
         """The answer as JSON, in the shape of ``relocalize --json``."""
         return {
             "places": [place.document() for place in self.places],
-            "pose": None if self.pose is None else asdict(self.pose),
+            "pose": None if self.pose is None else self.pose.document(),
             "confidence": self.confidence,
+            "known": self.known,
             "unknown": self.unknown,
+            "thin": self.thin,
         }
 
 
@@ -113,22 +131,42 @@ def rank(
     *,
     top: int = 3,
     method: Method = "joint",
-    camera: Camera = DEFAULT_CAMERA,
+    camera: Camera | None = None,
     model: Model = MODEL,
 ) -> Answer:
     """The answer to a question, or to the crops of one picture; ``candidates.matches`` run parallel
-    to the crops."""
-    crops = question.crops if isinstance(question, Question) else question
-    order = sorted(range(len(crops)), key=lambda index: crops[index].sort_key)
-    crops = [crops[index] for index in order]
-    candidates = replace(candidates, matches=tuple(candidates.matches[i] for i in order))
+    to the crops. The camera is that of the question, else ``camera``, else that of the map."""
+    asked = question if isinstance(question, Question) else Question.of(question)
+    views, candidates = _in_order(asked, candidates)
+    crops = [crop for view in views for crop in view.crops]
+    known = known_probability(crops, candidates.matches, candidates.constants)
+    thin = thinness(crops, candidates.matches)
     if method == "plain":
-        return _rank_plain(candidates, top)
-    posterior = locate(crops, candidates.matches, camera, model)
-    return _answer(candidates, posterior, top)
+        return replace(_rank_plain(candidates, top), known=known, thin=thin)
+    floors = Layout.of(candidates.places)
+    candidates = floors.laid_out(candidates)
+    camera = asked.camera or camera or candidates.constants.camera
+    walls = None if floors.has_several else candidates.walls
+    scene = Scene(candidates.constants, camera, model, walls)
+    posterior = locate(views, candidates.matches, scene)
+    return replace(_answer(candidates, posterior, top, floors), known=known, thin=thin)
 
 
-def _answer(candidates: Candidates, posterior: Posterior | None, top: int) -> Answer:
+def _in_order(question: Question, candidates: Candidates) -> tuple[list[View], Candidates]:
+    """Views whose crops are in one order, whatever order they came in, and their candidates."""
+    views, rows, start = [], [], 0
+    for view in question.views:
+        crops = view.crops
+        order = sorted(range(len(crops)), key=lambda index: crops[index].sort_key)
+        views.append(replace(view, crops=tuple(crops[index] for index in order)))
+        rows += [candidates.matches[start + index] for index in order]
+        start += len(crops)
+    return views, replace(candidates, matches=tuple(rows))
+
+
+def _answer(
+    candidates: Candidates, posterior: Posterior | None, top: int, floors: Layout
+) -> Answer:
     sums = _similarity_sums(candidates.matches)
     shares = {} if posterior is None else _place_shares(candidates, posterior)
     known = sorted(shares.keys() | sums.keys())
@@ -137,10 +175,10 @@ def _answer(candidates: Candidates, posterior: Posterior | None, top: int) -> An
     places = _ranked_places(candidates, order[:top], scores)
     if posterior is None:
         return Answer(places, None, 0.0)
-    pose = PoseHypothesis(posterior.x, posterior.y, posterior.yaw, posterior.spread_m)
-    rows = zip(posterior.poses.tolist(), posterior.weights.tolist(), strict=True)
-    poses = tuple((x, y, yaw, weight) for (x, y, yaw), weight in rows)
-    return Answer(places, pose, posterior.confidence, poses=poses)
+    x, floor = floors.put_back(posterior.x), floors.floor_at(posterior.x)
+    spread = floors.spread_m(posterior)
+    pose = PoseHypothesis(x, posterior.y, posterior.yaw, spread, floor)
+    return Answer(places, pose, posterior.confidence, hypotheses=floors.hypotheses(posterior))
 
 
 def _place_shares(candidates: Candidates, posterior: Posterior) -> dict[PlaceOrdinal, float]:
@@ -176,7 +214,15 @@ def _ranked_places(
         place = candidates.places[ordinal]
         evidence = _evidence(candidates.matches, ordinal)
         ranked.append(
-            RankedPlace(place.place_id, scores[ordinal], place.x, place.y, evidence, place.name)
+            RankedPlace(
+                place.place_id,
+                scores[ordinal],
+                place.x,
+                place.y,
+                evidence,
+                place.name,
+                place.floor,
+            )
         )
     return tuple(ranked)
 
@@ -201,9 +247,8 @@ def _rank_plain(candidates: Candidates, top: int) -> Answer:
     share = sums[order[0]] / math.fsum(sums.values())
     places = _ranked_places(candidates, order[:top], sums)
     spread = _spread(candidates, order[0], winner.x, winner.y)
-    return Answer(
-        places, PoseHypothesis(winner.x, winner.y, None, spread), max(0.0, min(1.0, share))
-    )
+    pose = PoseHypothesis(winner.x, winner.y, None, spread, winner.floor)
+    return Answer(places, pose, max(0.0, min(1.0, share)))
 
 
 def _similarity_sums(matches: Sequence[Sequence[Match]]) -> dict[PlaceOrdinal, float]:

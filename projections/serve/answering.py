@@ -1,7 +1,8 @@
 """Answers to questions over any transport: JSON in, JSON out, rate limited, errors as replies.
 
-A question is what ``mapfold relocalize`` takes; an object with crops may also have ``top`` and
-``method``. Every refusal is ``{"error": {"kind", "message"}}`` with one of the kinds in ``_KINDS``.
+A question is what ``mapfold relocalize`` takes; an object may also have ``top``, ``method`` and
+``session``. Every refusal is ``{"error": {"kind", "message"}}`` with one of the kinds in
+``_KINDS``.
 """
 
 import contextlib
@@ -10,7 +11,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Final, cast, get_args
+from typing import Any, Final, NamedTuple, cast, get_args
 
 from eventsrc.errors import MapfoldError
 from projections.errors import (
@@ -22,17 +23,20 @@ from projections.errors import (
 )
 from projections.queries.graph_reads import objects_near, places_near
 from projections.relocalize import (
-    DEFAULT_CAMERA,
     Camera,
-    Crop,
     Method,
+    Question,
     describe_value,
+    movement_of,
     parse_json,
     rank,
-    read_crops,
+    read_moved,
+    read_question,
 )
+from projections.relocalize.question import STILL, Movement
 
 from .pools import Pools
+from .sessions import Sessions, session_name
 
 
 class TooMuchError(MapfoldError):
@@ -125,7 +129,7 @@ class Answerer:
         *,
         per_second: float,
         max_bytes: int = DEFAULT_MAX_BYTES,
-        camera: Camera = DEFAULT_CAMERA,
+        camera: Camera | None = None,
         tell: Callable[[str], None] = lambda _: None,
     ) -> None:
         self._pools, self._bucket, self._camera = pools, TokenBucket(per_second), camera
@@ -133,6 +137,7 @@ class Answerer:
         # One at a time: the JSON parser holds the GIL for up to 30 ms, and the thread that reads
         # from the network must run in between.
         self._parsing = threading.Lock()
+        self._sessions = Sessions()
         self.max_bytes = max_bytes
 
     def relocalize(self, payload: bytes, options: Mapping[str, str]) -> dict[str, Any]:
@@ -142,11 +147,17 @@ class Answerer:
                 f"the question has {len(payload)} bytes, more than {self.max_bytes}"
             )
         with self._parsing:
-            crops, top, method = _read(payload, options)
+            asked = _read(payload, options)
+        question = asked.question
         with self._reporting_errors():
             self._bucket.take_token()
-            candidates = self._pools.candidates(crops)
-        return rank(crops, candidates, top=top, method=method, camera=self._camera).document()
+            candidates = self._pools.candidates(question.crops)
+        answer = rank(question, candidates, top=asked.top, method=asked.method, camera=self._camera)
+        if asked.session is None:
+            return answer.document()
+        moved = movement_of(asked.moved, question)
+        tracked = self._sessions.tracked(asked.session, moved, answer)
+        return answer.document() | {"track": tracked}
 
     def state(self, what: str, options: Mapping[str, str]) -> dict[str, Any]:
         """``places`` or ``objects`` near a pose: x, y and radius in metres."""
@@ -189,12 +200,24 @@ def encode(document: Mapping[str, Any]) -> bytes:
     return json.dumps(document, ensure_ascii=False, allow_nan=False).encode()
 
 
-def _read(payload: bytes, options: Mapping[str, str]) -> tuple[tuple[Crop, ...], int, Method]:
+class _Asked(NamedTuple):
+    question: Question
+    top: int
+    method: Method
+    session: str | None
+    moved: Movement
+
+
+def _read(payload: bytes, options: Mapping[str, str]) -> _Asked:
     document = parse_json(payload)
     fields = document if isinstance(document, dict) else {}
     top = _top(options.get("top", fields.get("top", 3)))
     method = _method(options.get("method", fields.get("method", "joint")))
-    return read_crops(document), top, method
+    session = session_name(options.get("session", fields.get("session")))
+    if session is not None and method != "joint":
+        raise QuestionError("a session follows the poses of the method joint; ask without plain")
+    moved = STILL if session is None else read_moved(document)
+    return _Asked(read_question(document), top, method, session, moved)
 
 
 def _top(value: Any) -> int:

@@ -16,18 +16,27 @@ from starlette.requests import ClientDisconnect
 
 from eventsrc.errors import MapfoldError
 from projections.errors import QuestionError
-from projections.relocalize import describe_value
+from projections.relocalize import describe_value, question_schema
 
 from .answering import DEFAULT_RADIUS_M, MAX_TOP, Answerer, TooMuchError, encode, refusal
 from .connections import peer_of
 from .fair_queue import FairQueue
 
-_EXAMPLE = {"crops": [{"class": "cup", "bbox": [120, 80, 250, 310], "embedding": "<base64>"}]}
+_CROP = {"class": "cup", "bbox": [120, 80, 250, 310], "embedding": "<base64>"}
+_EXAMPLES = {
+    "one picture": {"value": {"crops": [_CROP]}},
+    "a robot that turned a quarter to the left between two pictures": {
+        "value": {
+            "views": [{"crops": [_CROP]}, {"dx": 0.0, "dy": 0.0, "dyaw": 1.57, "crops": [_CROP]}]
+        }
+    },
+    "near a toilet and a mirror": {"value": {"crops": [{"class": "toilet"}, {"class": "mirror"}]}},
+}
 _QUESTION = {
     "requestBody": {
         "required": True,
-        "description": "An envelope, a list of detections, or an object with crops.",
-        "content": {"application/json": {"schema": {}, "example": _EXAMPLE}},
+        "description": "An envelope, a list of detections, or an object with crops or views.",
+        "content": {"application/json": {"schema": question_schema(), "examples": _EXAMPLES}},
     }
 }
 
@@ -70,9 +79,10 @@ def create_app(answerer: Answerer, queue: FairQueue) -> FastAPI:
         request: Request,
         top: int | None = Query(None, ge=1, le=MAX_TOP),
         method: str | None = None,
+        session: str | None = Query(None, description="Track the questions of this name."),
     ) -> Response:
         payload = await _read_body(request, answerer.max_bytes)
-        given = {"top": top, "method": method}
+        given = {"top": top, "method": method, "session": session}
         options = {name: str(value) for name, value in given.items() if value is not None}
         return await answered(request, lambda: answerer.relocalize(payload, options))
 

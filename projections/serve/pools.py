@@ -23,7 +23,9 @@ from projections.database.connection import (
 )
 from projections.database.sink import SinkName
 from projections.errors import DatabaseUnavailable, ProjectionMissing
-from projections.queries.relocalize import fetch, prepare_graph, prepare_vectors
+from projections.queries.candidates import CandidateSearch
+from projections.queries.known_constants import ConstantsMemory
+from projections.queries.relocalize import prepare_graph, prepare_vectors
 from projections.relocalize import Candidates, Crop
 
 OUTAGE_TIMEOUT_S: Final = 10.0
@@ -88,6 +90,7 @@ class Pools:
         self, targets: Targets, size: int, tell: Callable[[str], None] = lambda _: None
     ) -> None:
         self._targets, self._size, self._outage = targets, size, Outage(tell)
+        self._memory = ConstantsMemory()
         self.check()  # a clear error at once; a pool would retry without one
         self._vectors = _pool(targets.vector_url, size, self._prepare_vectors)
         self._graph = self._vectors
@@ -108,7 +111,7 @@ class Pools:
         _require_map("vectors", self._targets.vector_url)
 
     def candidates(self, crops: Sequence[Crop]) -> Candidates:
-        """`projections.queries.relocalize.fetch` over pooled connections."""
+        """`CandidateSearch.candidates` over pooled connections."""
         return self._ask(lambda wait_s: self._candidates(crops, wait_s))
 
     def on_graph(self, ask: Callable[[Connection], Result]) -> Result:
@@ -123,9 +126,12 @@ class Pools:
     def _candidates(self, crops: Sequence[Crop], wait_s: float) -> Candidates:
         with self._borrow(self._vectors, self._targets.vector_url, wait_s) as vectors:
             if self._graph is self._vectors:
-                return fetch(vectors, vectors, crops)
+                return self._search(vectors, vectors).candidates(crops)
             with self._borrow(self._graph, self._targets.graph_url, wait_s) as graph:
-                return fetch(vectors, graph, crops)
+                return self._search(vectors, graph).candidates(crops)
+
+    def _search(self, vectors: Connection, graph: Connection) -> CandidateSearch:
+        return CandidateSearch(self._targets, vectors, graph, self._memory)
 
     def _ask(self, ask: Callable[[float], Result]) -> Result:
         if self._outage.is_on:

@@ -10,6 +10,7 @@ import sys
 from time import perf_counter
 from typing import Any, Final
 
+import numpy as np
 import pybase64
 from starlette.datastructures import QueryParams
 
@@ -23,6 +24,8 @@ from projections.errors import QuestionError
 from projections.model.fold import fold_log
 from projections.model.log_commands import read_corrections
 from projections.relocalize import Candidates, Crop, ExactIndex, Match, parse_question, rank
+
+from projections.relocalize.floors import Hypotheses
 
 from .log_map import LogMap
 from .log_prefix import PrefixReader
@@ -49,13 +52,14 @@ class Localizer:
         """Ranked places, a pose, all poses weighed (x, y, yaw, weight), and for each crop what in
         the map looks like it."""
         started = perf_counter()
-        crops = parse_question(payload)
+        question = parse_question(payload)
+        crops = question.crops
         top = text_of(query, "top", "3")
         if not (top.isascii() and top.isdecimal() and 1 <= int(top[:9]) <= _MOST_TOP):
             raise QuestionError(f"top is {top[:40]!r}; give a number from 1 to {_MOST_TOP}")
         end, index = self._index(through, query)
         candidates = index.search(crops)
-        found = rank(crops, candidates, top=int(top))
+        found = rank(question, candidates, top=int(top))
         words = ["question.json", "--log", str(self._opened.log), "--as-of", str(end)]
         settings = self._opened.words(*assignments_of(query))
         return {
@@ -63,7 +67,7 @@ class Localizer:
             "at": end,
             "known_at": end,
             **found.document(),
-            "poses": [list(pose) for pose in found.poses],
+            "poses": _poses(found.hypotheses),
             "crops": [
                 _crop(crop, matches, candidates)
                 for crop, matches in zip(crops, candidates.matches, strict=True)
@@ -88,6 +92,14 @@ class Localizer:
         if len(view.observations) <= _KEPT_OBSERVATIONS:
             self._kept = key, index
         return end, index
+
+
+def _poses(found: Hypotheses | None) -> list[list[float]]:
+    """x, y, yaw and weight of each, likeliest first."""
+    if found is None:
+        return []
+    rows: list[list[float]] = np.column_stack((found.poses, found.weights)).tolist()
+    return rows
 
 
 def _crop(crop: Crop, matches: tuple[Match, ...], candidates: Candidates) -> dict[str, Any]:

@@ -97,7 +97,7 @@ def _bridge(history: History, merge: Merge) -> dict[str, Any]:
     chains = chains_of(history, merge)
     points = [point for chain in chains for point in chain.points]
     points += [end for link in merge.links for end in (link.core, link.neighbour)]
-    by_core_points = history.settings.places == "page" and history.settings.neighbourhood is None
+    by_core_points = history.settings.places == "page"
     core = _core_points(history, points, Offset(offset + 1)) if by_core_points else []
     sizes = [merge.survivor_size, *merge.absorbed_sizes]
     return {

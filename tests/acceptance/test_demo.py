@@ -17,7 +17,7 @@ import pytest
 
 from eventsrc.log import LogReader
 from eventsrc.sim import simulate_run
-from eventsrc.system_events import COMMAND_KEY
+from eventsrc.system_events import COMMAND_KEY, MAP_KEY
 from projections.cli.options import settings_from
 from projections.model.digest import map_digest
 from projections.model.fold import fold_log
@@ -71,7 +71,8 @@ def test_the_readme_shows_what_it_prints(played: Played) -> None:
 def test_every_keyframe_went_through_the_router_into_the_log(played: Played) -> None:
     run = simulate_run()
     with LogReader(played.out / "log") as reader:
-        events = [event for event in reader.read() if event.key != COMMAND_KEY]
+        walls, *events = [event for event in reader.read() if event.key != COMMAND_KEY]
+    assert walls.key == MAP_KEY
     assert [event.payload for event in events] == list(run.payloads)
     assert {event.key for event in events} == {"tb/detections"}
     record = played.numbers["record"]

@@ -28,7 +28,7 @@ def test_envelopes_are_calibrated_as_their_log_is(tmp_path: Path) -> None:
     documents = drive(4, "run-a", 60)
     events = [each for each in ingest_all([*map(payload, documents)]) if isinstance(each, Accepted)]
     settings = Settings(fusion="evidence", eps_m=0.9)
-    found, seconds = calibrated_settings(events, settings)
+    found, seconds = calibrated_settings(events, settings, ask=True)
     with LogReader(write_log(tmp_path / "log", documents)) as reader:
         assert found == calibrate(reader, settings).calibrated
     assert found != settings

@@ -4,7 +4,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from projections.evaluate.questions import Question
+from projections import relocalize
+from projections.evaluate.questions import Question, spread
 from projections.evaluate.trials import Trial
 from projections.relocalize import Answer, PoseHypothesis
 from tests.bench.truth.localising import (
@@ -12,7 +13,6 @@ from tests.bench.truth.localising import (
     Scores,
     localise,
     score,
-    spread,
     stranger_of,
 )
 from tests.bench.truth.localising_table import against_plain, localise_table
@@ -21,12 +21,22 @@ from tests.bench.truth.worlds import WORLDS, load_generator, make_case
 HALVES = SimpleNamespace(DEVELOP=["w1", "w2", "w3"], VALIDATE=["v1", "v2"])
 
 
+def _question(keyframe: int) -> Question:
+    return Question(("q", keyframe), relocalize.Question(()), 0.0, 0.0, 0.0, None, ())
+
+
 def _trial(
-    confidence: float, cosine: float, *, known: bool, error: float | None, plain: float
+    confidence: float,
+    in_map: float,
+    cosine: float,
+    *,
+    known: bool,
+    error: float | None,
+    plain: float,
 ) -> Trial:
     pose = None if error is None else PoseHypothesis(error, 0.0, None, 0.0)
-    question = Question(("q", 1), (), 0.0, 0.0, 0.0, None, ())
-    answer = Answer((), pose, confidence)
+    question = _question(1)
+    answer = Answer((), pose, confidence, in_map)
     return Trial(
         question,
         answer,
@@ -50,20 +60,20 @@ def _trial(
 def test_scores_are_those_computed_by_hand() -> None:
     found = score(
         [
-            _trial(0.95, 0.9, known=True, error=0.5, plain=1.0),
-            _trial(0.15, 0.6, known=True, error=2.5, plain=2.0),
-            _trial(0.85, 0.7, known=False, error=0.1, plain=9.0),
-            _trial(0.05, 0.5, known=False, error=None, plain=9.0),
+            _trial(0.95, 0.65, 0.9, known=True, error=0.5, plain=1.0),
+            _trial(0.15, 0.45, 0.6, known=True, error=2.5, plain=2.0),
+            _trial(0.85, 0.55, 0.7, known=False, error=0.1, plain=9.0),
+            _trial(0.05, 0.05, 0.5, known=False, error=None, plain=9.0),
         ]
     )
     assert (found.questions, found.known) == (4, 2)
     assert (found.p50_m, found.plain_p50_m, found.place_p50_m) == (1.5, 1.5, 9.0)
     assert (found.within, found.plain_within) == (0.5, 0.5)
-    assert found.auroc == 0.75  # of the four pairs only 0.15 against 0.85 is in the wrong order
+    assert found.auroc == 0.75  # of the four pairs only 0.45 against 0.55 is in the wrong order
     assert found.cosine_auroc == 0.75
     assert (found.known_called_unknown, found.unknown_called_known) == (0.5, 0.5)
     assert found.confidence_ece == pytest.approx((0.05 + 0.15 + 0.85 + 0.05) / 4)
-    assert found.known_ece == pytest.approx((0.05 + 0.85 + 0.85 + 0.05) / 4)
+    assert found.known_ece == pytest.approx((0.35 + 0.55 + 0.55 + 0.05) / 4)
     # One answer a bin: |y - p| is 1 - p with probability p, and p with 1 - p.
     expected = sum(2 * p * (1 - p) for p in (0.95, 0.15, 0.85, 0.05)) / 4
     assert found.confidence_floor == pytest.approx(expected)
@@ -102,7 +112,9 @@ def test_the_worst_beside_the_plain_recipe_stands_last_below_the_means() -> None
 
 
 def test_as_many_questions_of_another_building_are_spread_evenly() -> None:
-    of_ten = [Question(("q", n), (), 0.0, 0.0, 0.0, None, ()) for n in range(10)]
+    of_ten = [
+        Question(("q", n), relocalize.Question(()), 0.0, 0.0, 0.0, None, ()) for n in range(10)
+    ]
     assert [q.key[1] for q in spread(of_ten, 4)] == [0, 2, 5, 7]
     assert spread(of_ten, 20) == of_ten
     assert spread(of_ten, 0) == []
@@ -130,7 +142,7 @@ def test_a_building_is_mapped_by_both_rules_and_asked_with_known_and_unknown_thi
         ("rover tb3_house", "evidence"),
     ]
     for row in rows:
-        assert list(row.scores) == ["1 crop", "3 crops"]
+        assert list(row.scores) == ["1 crop", "3 crops", "1 view", "3 views", "5 views"]
         for scores in row.scores.values():
             assert 0 < scores.known < scores.questions
             assert scores.p50_m is not None

@@ -60,7 +60,7 @@ def drawn() -> str:
 
 def _fold(places: Places, x: float, y: float) -> list[object]:
     n = len(places.joined)
-    return list(places.fold(n, n, 0, "run", round(x * 1e6), round(y * 1e6), 0.0))
+    return list(places.fold(n, n, 0, "run", round(x * 1e6), round(y * 1e6)))
 
 
 def _legend(places: Places) -> str:

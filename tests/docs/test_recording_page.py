@@ -13,8 +13,10 @@ from eventsrc.envelope import (
     Envelope,
     EnvelopeCamera,
 )
+from eventsrc.grid_messages import is_grid_message, read_grid_message
 from eventsrc.ingest import Accepted, ingest
 from eventsrc.metrics import serving_metrics
+from eventsrc.occupancy_map import decode_map
 from eventsrc.recorder import DEFAULT_QUEUE_SIZE, RecorderReport
 from eventsrc.recorder.queue import DEFAULT_QUEUE_BYTES
 from eventsrc.robot.sender import WINDOW
@@ -27,9 +29,22 @@ PAGE = (Path(__file__).parents[2] / "docs" / "recording.md").read_text()
 Start = Callable[..., Program]
 
 
+def _blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
+
+
 def _block(language: str) -> str:
-    (block,) = re.findall(rf"^```{language}\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
-    return str(block)
+    (block,) = _blocks(language)
+    return block
+
+
+def test_the_grid_on_the_page_is_accepted() -> None:
+    grid = _blocks("json")[1].encode()
+    assert is_grid_message(grid)
+    assert decode_map(read_grid_message(grid, "tb/map").encode()).cells.tolist() == [
+        [100, 100, 100],
+        [255, 0, 100],
+    ]
 
 
 def test_the_three_terminals_say_what_the_page_says(
@@ -69,8 +84,9 @@ def test_the_numbers_on_the_page_are_those_in_the_code() -> None:
 
 
 def test_the_envelope_on_the_page_has_every_field_and_is_accepted() -> None:
-    document = json.loads(_block("json"))
-    assert isinstance(ingest(_block("json").encode()), Accepted)
+    of_envelope = _blocks("json")[0]
+    document = json.loads(of_envelope)
+    assert isinstance(ingest(of_envelope.encode()), Accepted)
     shown = (document, document["camera"], {**document["detections"][0], "det_id": "by default"})
     for fields, model in zip(shown, (Envelope, EnvelopeCamera, Detection), strict=True):
         assert set(fields) == {f.alias or name for name, f in model.model_fields.items()}

@@ -99,6 +99,32 @@ def test_written_constants_are_in_every_fold_and_can_be_undone(mapfold: Commands
     assert _settings(log).evidence == EvidenceConstants()
 
 
+def test_the_map_says_how_it_would_do_and_a_second_write_records_nothing(
+    mapfold: Commands,
+) -> None:
+    first = mapfold("calibrate", "log", "--write", "--json", *BY_EVIDENCE).json
+    own = first["localiser"]
+    for crops in ("1", "3"):
+        scores = own["questions"][crops]
+        assert scores["known"] <= scores["questions"] / 2 <= 100
+        assert scores["known_called_unknown"] <= 0.1
+        assert scores["pose_error_m"]["p50"] < scores["plain"]["pose_error_m"]["p50"]
+    recorded = _settings(mapfold.folder / "log").localizer.model_dump()
+    named = {f"localizer.{name}": value for name, value in recorded.items()}
+    assert {name: named[name] for name in own["constants"]} == own["constants"]
+    assert named["localizer.known_count"] > 200
+    assert named["localizer.known_scale"] != 1.0
+    second = mapfold("calibrate", "log", "--write").out
+    assert second.endswith("the log has these constants already; nothing is recorded\n")
+    lines = second.splitlines()
+    start = next(n for n, line in enumerate(lines) if line.startswith("re-localisation  asked"))
+    assert [line.split()[0] for line in lines[start + 1 : start + 6]] == [
+        "1", "3", "right,", "known", "confidence",
+    ]  # fmt: skip
+    reset = mapfold("calibrate", "log", "--json", "--set", "localizer.known_shift=5.0").json
+    assert reset["localiser"]["constants"] == own["constants"]  # the one in force plays no part
+
+
 def test_write_with_set_switches_the_rule_in_one_command(mapfold: Commands) -> None:
     said = mapfold("calibrate", "log", "--write", *BY_EVIDENCE, "--reason", "try it").out
     assert "folded by the page's rule" not in said
@@ -110,7 +136,10 @@ def test_write_with_set_switches_the_rule_in_one_command(mapfold: Commands) -> N
     )
     assert mapfold("edits", "log", "--json").json[0]["reason"] == "try it"
     listed = mapfold("edits", "log").out
-    assert re.search(r"use-settings fusion=evidence, \d+ constants of evidence  ", listed)
+    assert re.search(
+        r"use-settings fusion=evidence, \d+ constants of evidence, 6 constants of localizer  ",
+        listed,
+    )
 
 
 def test_what_is_in_the_log_already_is_not_recorded_again(tmp_path: Path) -> None:
@@ -187,13 +216,13 @@ def test_a_correction_counts(mapfold: Commands) -> None:
     assert (found["keyframes"], found["runs"]) == (80, 1)
 
 
-def test_progress_counts_the_events_of_both_rounds(mapfold: Commands) -> None:
+def test_progress_counts_the_events_of_all_folds(mapfold: Commands) -> None:
     told: list[tuple[int, int]] = []
     with LogReader(mapfold.folder / "log") as reader:
         calibrate(reader, Settings(), progress=lambda done, total: told.append((done, total)))
-    assert {total for _, total in told} == {320}
+    assert {total for _, total in told} == {480}
     assert [done for done, _ in told] == sorted(done for done, _ in told)
-    assert told[-1] == (320, 320)
+    assert told[-1] == (480, 480)
 
 
 Start = Callable[..., Program]

@@ -36,7 +36,7 @@ from projections.settings import Settings
 from projections.model.view import MapView
 from tests.thorough import stride
 
-settings = Settings(eps_m=0.75, min_samples=8, fusion=sys.argv[2])
+settings = Settings(eps_m=0.75, min_samples=8, fusion=sys.argv[2], places=sys.argv[3])
 fold, view, vectors = SemanticMap(settings), MapView(settings), []
 lines = Path(sys.argv[1]).read_bytes().splitlines()
 for offset, line in enumerate(lines):
@@ -69,14 +69,14 @@ def _synthetic_run() -> list[bytes]:
     return payloads
 
 
-def _fold_in(kernel: str, threads: str, seed: str, lines: Path, fusion: str) -> tuple[str, str]:
+def _fold_in(kernel: str, threads: str, seed: str, lines: Path, *rules: str) -> tuple[str, str]:
     env = os.environ | {
         "OPENBLAS_CORETYPE": kernel,
         "OPENBLAS_NUM_THREADS": threads,
         "PYTHONHASHSEED": seed,
     }
     done = subprocess.run(
-        [sys.executable, "-c", FOLD, str(lines), fusion],
+        [sys.executable, "-c", FOLD, str(lines), *rules],
         env=env,
         capture_output=True,
         text=True,
@@ -87,15 +87,15 @@ def _fold_in(kernel: str, threads: str, seed: str, lines: Path, fusion: str) -> 
     return digest, product
 
 
-@pytest.mark.parametrize("fusion", ["page", "evidence"])
+@pytest.mark.parametrize("rules", [("page", "page"), ("evidence", "page"), ("page", "rooms")])
 @pytest.mark.parametrize("run", ["synthetic", "house-a", "home-1"])
 def test_one_digest_on_every_kernel_thread_count_and_hash_seed(
-    run: str, fusion: str, tmp_path: Path
+    run: str, rules: tuple[str, str], tmp_path: Path
 ) -> None:
     payloads = _synthetic_run() if run == "synthetic" else shared_run(run)
     lines = tmp_path / "run.jsonl"
     lines.write_bytes(b"\n".join(payloads))
     chosen = PLACES[:: stride(3)]
-    results = {place: _fold_in(*place, lines, fusion) for place in chosen}
+    results = {place: _fold_in(*place, lines, *rules) for place in chosen}
     assert len({digest for digest, _ in results.values()}) == 1, results
     assert len({product for _, product in results.values()}) > 1, "all kernels are one here"

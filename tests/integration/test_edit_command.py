@@ -147,7 +147,7 @@ def test_what_is_wrong_is_one_line_and_writes_nothing(mapfold: Commands) -> None
         (("correct-poses", "run-b", "cut.tum", "--dx", "1", *WHY), "give either FILE or some of"),
         (("correct-poses", "run-b", "cut.tum", *WHY), "cut.tum, line 1: 5 numbers instead of 8"),
         (("correct-poses", "run-b", "none.tum", *WHY), "none.tum: No such file or directory"),
-        (("use-settings", *WHY), "give FILE or --set NAME=VALUE"),
+        (("use-settings", *WHY), "give FILE, --preset NAME or --set NAME=VALUE"),
         (("use-settings", "--set", "eps=1", *WHY), "--set eps=1: no setting 'eps'"),
         (("use-settings", "cut.tum", *WHY), "not JSON"),
         (("undo", "c9", *WHY), "no command 'c9' in this log; there is no command at all"),

@@ -51,6 +51,7 @@ def test_import_prints_its_counts(run: Commands) -> None:
         "rejected": 1,
         "system": 0,
         "skipped": 0,
+        "maps": 0,
         "first_offset": 0,
         "next_offset": 6,
         "recovered_segments": 0,

@@ -14,11 +14,12 @@ from projections.errors import ProjectionMismatch, ProjectionMissing, QuestionEr
 from projections.model.fold import fold_log
 from projections.model.view import MapView
 from projections.queries.relocalize import CandidateReader, relocalize
-from projections.relocalize import Candidates, Crop, ExactIndex, rank, read_crops
+from projections.relocalize import Crop, ExactIndex, Track, rank, read_crops
 from projections.settings import Settings
+from tests.candidates import assert_equal, found
 from tests.commands import Commands
 from tests.envelopes import detection
-from tests.logs import walk, write_log
+from tests.logs import WEIRD, walk, write_log
 
 SETTINGS = Settings()
 
@@ -58,39 +59,14 @@ def questions() -> Iterator[tuple[Crop, ...]]:
             yield read_crops(document)
 
 
-def found(candidates: Candidates) -> list[list[tuple[object, ...]]]:
-    return [
-        [
-            (
-                m.det_id,
-                m.run_id,
-                m.pose,
-                m.bbox,
-                m.class_name,
-                m.object_id,
-                m.object_place,
-                m.keyframe_place,
-            )
-            for m in sorted(row, key=lambda m: m.observation)
-        ]
-        for row in candidates.matches
-    ]
-
-
 def test_candidates_are_those_of_exact_search(targets: Targets, view: MapView) -> None:
     index = ExactIndex(view)
     with CandidateReader(targets) as reader:
         asked = 0
         for crops in questions():
             live, exact = reader.candidates(crops, 200), index.search(crops, 200)
-            assert found(live) == found(exact)
+            assert_equal(live, exact)
             assert {m.run_id for row in live.matches for m in row} == {"run-a", "run-c"}
-            places = {m.object_place for row in live.matches for m in row} - {None}
-            assert all(live.places[p] == exact.places[p] for p in places if p is not None)
-            for ours, theirs in zip(live.matches, exact.matches, strict=True):
-                assert [m.similarity for m in ours] == pytest.approx(
-                    [m.similarity for m in theirs], abs=1e-5
-                )
             asked += 1
         assert asked > 5
 
@@ -195,7 +171,12 @@ class TestCommand:
         evidence = answer["places"][0]["evidence"][0]
         assert set(evidence) == {"det_id", "object_id", "class_name", "similarity"}
         assert set(answer["pose"]) == {"x", "y", "yaw", "spread_m"}
-        nothing = mapfold("relocalize", question, "--log", log, "--as-of", "0", "--json").json
+        assert 0.0 <= answer["known"] <= 1.0
+        empty = mapfold("relocalize", question, "--log", log, "--as-of", "0", "--json")
+        nothing = empty.json
+        assert nothing["thin"] == "0 observations from 0 spots"
+        assert "the map is thin, 0 observations from 0 spots: do not trust" in empty.err
+        assert nothing["unknown"] is True
         assert nothing["places"] == []
         assert nothing["pose"] is None
         assert nothing["confidence"] == 0.0
@@ -209,6 +190,61 @@ class TestCommand:
         assert "default settings" in plain.err
         assert "default settings" not in given.err
 
+    def test_classes_take_the_place_of_a_question(
+        self, mapfold: Commands, log: Path, tmp_path: Path
+    ) -> None:
+        first, second = WEIRD[:2]
+        asked = ("relocalize", "--log", log, "--json")
+        said = mapfold(*asked, "--class", first, "--class", second).json
+        assert {e["class_name"] for place in said["places"] for e in place["evidence"]} == {
+            first,
+            second,
+        }
+        file = tmp_path / "classes.json"
+        file.write_text(json.dumps([{"class": first}, {"class": second}]))
+        assert mapfold(*asked, file).json == said
+        refused = mapfold("relocalize", "--log", log, "--class", "bakers rack", code=2)
+        assert "the nearest are baker's rack" in refused.err
+
+    def test_a_question_of_several_views(
+        self, mapfold: Commands, log: Path, tmp_path: Path
+    ) -> None:
+        seen = [d["detections"] for d in walk(60, seed=3) if d["detections"]][:2]
+        moved = {"dx": 0.25, "dy": 0.0, "dyaw": 0.5, "crops": seen[1]}
+        file = tmp_path / "views.json"
+        file.write_text(json.dumps({"views": [{"crops": seen[0]}, moved]}))
+        assert mapfold("relocalize", file, "--log", log, "--json").json["pose"]
+        file.write_text(json.dumps({"views": [{"crops": seen[0]}, {"crops": seen[1]}]}))
+        refused = mapfold("relocalize", file, "--log", log, code=2)
+        assert "views.1.dx: is missing" in refused.err
+
+    def test_a_stream_of_questions_is_tracked(
+        self, mapfold: Commands, log: Path, tmp_path: Path
+    ) -> None:
+        index, track = ExactIndex(view_of(log, SETTINGS)), Track("relocalize --track")
+        lines, expected = [], []
+        for number, document in enumerate(walk(14, seed=3)):
+            if not document["detections"]:
+                continue
+            moved = {"dx": 0.25 * number, "dy": 0.0, "dyaw": 0.5}
+            asked = {"crops": document["detections"], **moved}
+            answer = rank(crops := read_crops(asked), index.search(crops))
+            found = track.step((0.25 * number, 0.0, 0.5), answer.hypotheses, answer.confidence)
+            lines.append(json.dumps(asked))
+            expected.append(answer.document() | {"track": found.document()})
+        file = tmp_path / "questions.jsonl"
+        file.write_text("\n\n".join(lines) + "\n")
+        asked_log = ("relocalize", "--track", "--log", log)
+        assert len(expected) > 5
+        assert expected[-1]["track"]["questions"] == len(expected)
+        assert [json.loads(line) for line in mapfold(*asked_log, file).out.splitlines()] == expected
+        file.write_text("\n".join([lines[0], "nonsense", lines[1]]))
+        said = mapfold(*asked_log, file, code=2)
+        first, error, second = map(json.loads, said.out.splitlines())
+        assert [first, second] == expected[:2]
+        assert error["error"]["kind"] == "bad_question"
+        assert "1 of 3 questions could not be answered" in said.err
+
     def test_plain_and_text(self, mapfold: Commands, log: Path, question: Path) -> None:
         said = mapfold("relocalize", question, "--log", log, "--as-of", "end", "--method", "plain")
         assert "run-a_p" in said.out
@@ -217,6 +253,9 @@ class TestCommand:
         ("arguments", "said"),
         [
             (["--as-of", "end"], "--log"),
+            (["--class", "cup"], "give either QUERY"),
+            (["--track", "--class", "cup"], "--track reads questions"),
+            (["--track", "--method", "plain"], "--track follows the poses"),
             (["--set", "eps_m=1.0"], "--log LOG"),
             (["--method", "magic"], "joint and plain"),
             (["--image", "big"], "--image"),

@@ -22,7 +22,7 @@ from projections.database.connection import Connection, Targets, connect
 from projections.database.embedded import EmbeddedServer
 from projections.errors import DatabaseUnavailable, ProjectionMissing
 from projections.queries.relocalize import relocalize
-from projections.relocalize import parse_question
+from projections.relocalize import Track, parse_question, question_schema
 from projections.serve import Answerer, FairQueue, Pools, ZenohService
 from projections.serve.answering import TokenBucket, TooMuchError
 from projections.serve.guard import Guard
@@ -30,7 +30,7 @@ from projections.serve.http import create_app
 from projections.serve.listening import bind, serving
 from projections.settings import Settings
 from tests.envelopes import detection
-from tests.logs import walk, write_log
+from tests.logs import WEIRD, walk, write_log
 from tests.servers import kill_postgres, server_to_kill
 
 DEADLINE_S = 30.0
@@ -72,6 +72,30 @@ def question(number: int = 0) -> bytes:
     return json.dumps(documents[number % len(documents)]).encode()
 
 
+def tracked_question(number: int, moved: tuple[float, float, float], name: str) -> bytes:
+    crops = json.loads(question(number))["detections"]
+    dx, dy, dyaw = moved
+    asked = {"dx": dx, "dy": dy, "dyaw": dyaw, "crops": crops, "session": name}
+    return json.dumps(asked).encode()
+
+
+def _forms() -> dict[str, bytes]:
+    first, second = (json.loads(question(n))["detections"] for n in (0, 1))
+    moved = {"dx": 0.5, "dy": 0.0, "dyaw": 0.25, "crops": second}
+    text = {"embedding": first[0]["embedding"], "text": True}
+    forms: dict[str, Any] = {
+        "views": {"views": [{"crops": first}, moved], "camera": CAMERA},
+        "classes": {"crops": [{"class": WEIRD[0]}, {"class": WEIRD[1]}]},
+        "both": [*first, {"class": WEIRD[2]}],
+        "text": [text],
+    }
+    return {name: json.dumps(form).encode() for name, form in forms.items()}
+
+
+CAMERA = {"hfov_deg": 90.0, "width_px": 640.0, "height_px": 480.0}
+FORMS = _forms()
+
+
 def ask(session: Session, selector: str, payload: bytes | None = None) -> tuple[bool, Any]:
     ((good, answer),) = session.get_replies(selector, payload, timeout_s=DEADLINE_S)
     return good, json.loads(answer)
@@ -96,12 +120,52 @@ class TestZenoh:
         assert answer == relocalize(targets, parse_question(question())).document()
 
     @pytest.mark.usefixtures("service")
+    @pytest.mark.parametrize("form", FORMS)
+    def test_views_classes_and_texts_are_answered(
+        self, connected: Callable[[], Session], targets: Targets, form: str
+    ) -> None:
+        good, answer = ask(connected(), "mapfold/relocalize", FORMS[form])
+        assert good
+        assert answer == relocalize(targets, parse_question(FORMS[form])).document()
+        assert answer["places"]
+
+    @pytest.mark.usefixtures("service")
+    def test_a_session_is_tracked(self, connected: Callable[[], Session], targets: Targets) -> None:
+        track, session = Track("robot-7"), connected()
+        for number in range(4):
+            moved = (0.25 * number, 0.0, 0.125)
+            asked = tracked_question(number, moved, "robot-7")
+            answer = relocalize(targets, parse_question(asked))
+            tracked = track.step(moved, answer.hypotheses, answer.confidence)
+            expected = answer.document() | {"track": tracked.document()}
+            assert ask(session, "mapfold/relocalize", asked) == (True, expected)
+        assert expected["track"]["questions"] == 4
+        good, other = ask(session, "mapfold/relocalize?session=robot-8", question())
+        assert good
+        assert other["track"]["questions"] == 1
+
+    @pytest.mark.usefixtures("service")
+    def test_an_unknown_class_is_named_with_the_nearest(
+        self, connected: Callable[[], Session]
+    ) -> None:
+        good, answer = ask(connected(), "mapfold/relocalize", b'[{"class": "baker rack"}]')
+        assert not good
+        assert "no object of class 'baker rack'; the nearest are baker's rack" in str(answer)
+
+    @pytest.mark.usefixtures("service")
     @pytest.mark.parametrize(
         ("selector", "payload", "kind"),
         [
             ("mapfold/relocalize", b"nonsense", "bad_question"),
             ("mapfold/relocalize", None, "bad_question"),
             ("mapfold/relocalize?top=0", question(), "bad_question"),
+            ("mapfold/relocalize?session=a;method=plain", question(), "bad_question"),
+            ("mapfold/relocalize", b'{"session": 7, "crops": [{"class": "a"}]}', "bad_question"),
+            (
+                "mapfold/relocalize?session=a",
+                b'{"dx": 1, "dy": NaN, "dyaw": 0, "crops": [{"class": "a"}]}',
+                "bad_question",
+            ),
             ("mapfold/relocalize", b"[" * 2_000_000, "bad_question"),
             (
                 "mapfold/relocalize",
@@ -234,8 +298,27 @@ class TestHttp:
         expected = relocalize(targets, parse_question(question()), top=1).document()
         assert fetch(f"{http}/relocalize?top=1", question()) == (200, expected)
 
+    @pytest.mark.parametrize("form", FORMS)
+    def test_views_classes_and_texts_are_answered(
+        self, http: str, targets: Targets, form: str
+    ) -> None:
+        expected = relocalize(targets, parse_question(FORMS[form])).document()
+        assert fetch(f"{http}/relocalize", FORMS[form]) == (200, expected)
+
+    def test_a_session_is_tracked(self, http: str) -> None:
+        for number in range(3):
+            asked = tracked_question(number, (0.5, 0.0, 0.0), "robot-7")
+            status, answer = fetch(f"{http}/relocalize", asked)
+            assert (status, answer["track"]["questions"]) == (200, number + 1)
+        _, answer = fetch(f"{http}/relocalize?session=robot-7", question())
+        assert answer["track"]["questions"] == 4
+
     def test_it_describes_itself(self, http: str) -> None:
         _, document = fetch(f"{http}/openapi.json")
+        asked = document["paths"]["/relocalize"]["post"]["requestBody"]["content"]
+        forms = [form.get("properties", {}) for form in question_schema()["anyOf"]]
+        described = asked["application/json"]["schema"]["anyOf"]
+        assert [set(form.get("properties", {})) for form in described] == [set(f) for f in forms]
         assert {"/relocalize", "/state/{what}", "/health"} <= set(document["paths"])
         assert fetch(f"{http}/health") == (200, {"status": "ok"})
 

@@ -7,6 +7,7 @@ import pytest
 
 from eventsrc.log import LogWriter
 from eventsrc.system_events import LOSS_KEY, Loss
+from projections.place_types import place_type
 from projections.settings import Settings
 from tests.commands import Commands
 from tests.envelopes import detection, envelope, payload
@@ -60,9 +61,27 @@ def test_the_document_says_what_was_seen(mapfold: Commands, log: Path) -> None:
         "place_id": None,
     }
     assert document["keyframes"][7]["map_x"] is None
+    kind = place_type({"cup": 1.0})
+    assert kind is not None
     assert document["places"] == [
-        {"place_id": "run-a_p0", "centroid_x": 0.1, "centroid_y": 0.0, "keyframe_count": 3},
-        {"place_id": "run-a_p1", "centroid_x": 9.1, "centroid_y": 0.0, "keyframe_count": 3},
+        {
+            "place_id": "run-a_p0",
+            "centroid_x": 0.1,
+            "centroid_y": 0.0,
+            "keyframe_count": 3,
+            "type": None,
+            "type_probability": kind.probability,
+            "type_candidates": [{"type": t, "probability": p} for t, p in kind.candidates],
+        },
+        {
+            "place_id": "run-a_p1",
+            "centroid_x": 9.1,
+            "centroid_y": 0.0,
+            "keyframe_count": 3,
+            "type": None,
+            "type_probability": kind.probability,
+            "type_candidates": [{"type": t, "probability": p} for t, p in kind.candidates],
+        },
     ]
     first = document["objects"][0]
     assert (first["class_name"], first["place_id"], first["obs_count"]) == ("cup", "run-a_p0", 3)

@@ -9,16 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from projections.corrections import Keyframe
-from projections.deltas import MergeRefused, PlaceFormed, PlacesMerged, Pose
-from projections.exact import Neighbourhood
+from projections.deltas import MergeRefused, PlaceFormed, PlacesMerged
 from projections.pair_groups import PairGroups, without_contradictions
 from projections.reducers.constrained_places import ConstrainedPlaces
 from projections.reducers.core_index import CoreIndex, cell_side_um
 from projections.reducers.places import Places
-from projections.reducers.rule_index import RuleCoreIndex
 from tests.folds import near_matrix
 from tests.naive_constrained import NaiveConstrainedPlaces
-from tests.property.test_places_are_dbscan import EPS_UM, Point, _alike
+from tests.property.test_places_are_dbscan import EPS_UM, Point
 
 Statements = list[tuple[tuple[int, int], bool]]
 
@@ -69,7 +67,7 @@ def anchor(point: int) -> Keyframe:
     return Keyframe("r", point)
 
 
-def constrained(index: CoreIndex | RuleCoreIndex, statements: Statements) -> ConstrainedPlaces:
+def constrained(index: CoreIndex, statements: Statements) -> ConstrainedPlaces:
     joined = [(anchor(a), anchor(b)) for (a, b), is_same in statements if is_same]
     apart = [(anchor(a), anchor(b)) for (a, b), is_same in statements if not is_same]
     return ConstrainedPlaces(index, PairGroups(joined, apart))
@@ -88,12 +86,12 @@ def cell(point: Point) -> tuple[int, int]:
     return point[0] // side, point[1] // side
 
 
-def _within_eps(a: Pose, b: Pose) -> bool:
-    return (a.x_um - b.x_um) ** 2 + (a.y_um - b.y_um) ** 2 <= EPS_UM**2
+def _within_eps(a: Point, b: Point) -> bool:
+    return (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 <= EPS_UM**2
 
 
 def check_every_prefix(
-    new_index: Callable[[], CoreIndex | RuleCoreIndex],
+    new_index: Callable[[], CoreIndex],
     points: list[Point],
     statements: Statements,
     matrix: np.ndarray,
@@ -104,9 +102,9 @@ def check_every_prefix(
     places = constrained(new_index(), statements)
     refused: set[tuple[int, int]] = set()
     founders: list[int] = []
-    for n, (x, y, yaw) in enumerate(points):
+    for n, (x, y, _) in enumerate(points):
         places.add_anchor(n, anchor(n))
-        deltas = places.fold(n, n, 0, "r", x, y, yaw)
+        deltas = places.fold(n, n, 0, "r", x, y)
         naive.add(matrix[: n + 1, : n + 1])
         ours = [places.label(i) for i in range(n + 1)]
         assert ours == naive.labels
@@ -135,51 +133,28 @@ def test_plain_distance_equals_the_naive_rules(
 
 
 def check_plain_distance(points: list[Point], statements: Statements, least: int) -> None:
-    poses = [Pose(*point) for point in points]
     check_every_prefix(
         lambda: CoreIndex(EPS_UM, least),
         points,
         statements,
-        near_matrix(len(points), lambda i, j: _within_eps(poses[i], poses[j])),
+        near_matrix(len(points), lambda i, j: _within_eps(points[i], points[j])),
         least,
         lambda i: cell(points[i]),
     )
 
 
 @given(world=worlds(), least=st.integers(1, 6))
-def test_another_neighbourhood_equals_the_naive_rules(
+def test_pairs_that_refuse_and_join_nothing_change_no_delta(
     world: tuple[list[Point], Statements], least: int
 ) -> None:
     points, statements = world
-    poses = [Pose(*point) for point in points]
-    rule = Neighbourhood("test", EPS_UM, _alike)
-    check_every_prefix(
-        lambda: RuleCoreIndex(rule, least),
-        points,
-        statements,
-        near_matrix(len(points), lambda i, j: _alike(poses[i], poses[j])),
-        least,
-        lambda i: i,
-    )
-
-
-@given(world=worlds(), least=st.integers(1, 6), is_ruled=st.booleans())
-def test_pairs_that_refuse_and_join_nothing_change_no_delta(
-    world: tuple[list[Point], Statements], least: int, is_ruled: bool
-) -> None:
-    points, statements = world
-    poses = [Pose(*point) for point in points]
-    rule = Neighbourhood("test", EPS_UM, _alike if is_ruled else _within_eps)
-
-    def index() -> CoreIndex | RuleCoreIndex:
-        return RuleCoreIndex(rule, least) if is_ruled else CoreIndex(EPS_UM, least)
-
-    plain, ours = Places(index()), constrained(index(), statements)
-    matrix = near_matrix(len(points), lambda i, j: rule.holds(poses[i], poses[j]))
-    naive = naive_of(statements, least, lambda i: i if is_ruled else cell(points[i]))
+    plain = Places(CoreIndex(EPS_UM, least))
+    ours = constrained(CoreIndex(EPS_UM, least), statements)
+    matrix = near_matrix(len(points), lambda i, j: _within_eps(points[i], points[j]))
+    naive = naive_of(statements, least, lambda i: cell(points[i]))
     for n, point in enumerate(points):
         ours.add_anchor(n, anchor(n))
-        expected, deltas = plain.fold(n, n, 0, "r", *point), ours.fold(n, n, 0, "r", *point)
+        expected, deltas = plain.fold(n, n, 0, "r", *point[:2]), ours.fold(n, n, 0, "r", *point[:2])
         naive.add(matrix[: n + 1, : n + 1])
         if naive.had_effect or any(naive.conflict(inside, inside) for inside in naive.inside):
             return
@@ -195,7 +170,7 @@ def test_a_link_is_of_core_points_of_the_two_sides(
     for n, point in enumerate(points):
         places.add_anchor(n, anchor(n))
         labels = [places.label(i) for i in range(n)]
-        deltas = places.fold(n, n, 0, "r", *point)
+        deltas = places.fold(n, n, 0, "r", *point[:2])
         for merge in deltas:
             if type(merge) is PlacesMerged and not merge.joined:
                 for absorbed, link in zip(merge.absorbed, merge.links, strict=True):

@@ -6,11 +6,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.deltas import PlacesMerged, Pose
-from projections.exact import Neighbourhood
+from projections.deltas import PlacesMerged
 from projections.reducers.core_index import CoreIndex
 from projections.reducers.places import Places
-from projections.reducers.rule_index import RuleCoreIndex
 from tests.folds import NaivePlaces, batch_dbscan, near_matrix
 
 Point = tuple[int, int, float]
@@ -53,8 +51,8 @@ POINTS = st.one_of(LISTS, walks())
 
 def check_every_prefix(places: Places, points: list[Point], matrix: np.ndarray, least: int) -> None:
     naive = NaivePlaces(least)
-    for n, (x, y, yaw) in enumerate(points, start=1):
-        places.fold(n - 1, n - 1, 0, "r", x, y, yaw)
+    for n, (x, y, _) in enumerate(points, start=1):
+        places.fold(n - 1, n - 1, 0, "r", x, y)
         are_near = matrix[:n, :n]
         labels, cores = batch_dbscan(are_near, least)
         ours = [places.label(i) for i in range(n)]
@@ -89,77 +87,15 @@ def test_smallest_epsilons_equal_batch_dbscan(points: list[Point], least: int, e
     check_every_prefix(places, small, near_matrix(len(small), is_near), least)
 
 
-def _alike(a: Pose, b: Pose) -> bool:
-    """Near, and looking the same way within a right angle."""
-    near = (a.x_um - b.x_um) ** 2 + (a.y_um - b.y_um) ** 2 <= EPS_UM**2
-    return near and math.cos(a.yaw_rad - b.yaw_rad) > 0.01
-
-
-def _wall(a: Pose, b: Pose) -> bool:
-    """Near, and on the same side of a wall along x = 0."""
-    near = max(abs(a.x_um - b.x_um), abs(a.y_um - b.y_um)) <= EPS_UM
-    return near and (a.x_um < 0) == (b.x_um < 0)
-
-
-@given(points=POINTS, least=st.integers(1, 6), rule=st.sampled_from([_alike, _wall]))
-def test_any_symmetric_predicate_equals_batch_dbscan(points, least, rule) -> None:
-    poses = [Pose(*point) for point in points]
-    matrix = near_matrix(len(points), lambda i, j: rule(poses[i], poses[j]))
-    places = Places(RuleCoreIndex(Neighbourhood("test", EPS_UM, rule), least))
-    check_every_prefix(places, points, matrix, least)
-
-
-@given(data=st.data(), count=st.integers(0, 14), least=st.integers(1, 5))
-def test_any_relation_at_all_equals_batch_dbscan(data: st.DataObject, count: int, least) -> None:
-    """Who is near whom is drawn, pair by pair; only the reach is geometry. The yaw is a name."""
-    pairs = [(i, j) for j in range(count) for i in range(j)]
-    related = data.draw(st.sets(st.sampled_from(pairs))) if pairs else set()
-    spots = data.draw(st.lists(_lattice(EPS_UM, 1), min_size=count, max_size=count))
-    points = [(x, y, float(i)) for i, (x, y, _) in enumerate(spots)]
-
-    def holds(a: Pose, b: Pose) -> bool:
-        i, j = sorted((int(a.yaw_rad), int(b.yaw_rad)))
-        return (i, j) in related
-
-    def is_near(i: int, j: int) -> bool:
-        (ax, ay, _), (bx, by, _) = points[i], points[j]
-        is_in_reach = max(abs(ax - bx), abs(ay - by)) <= EPS_UM
-        return is_in_reach and tuple(sorted((i, j))) in related
-
-    places = Places(RuleCoreIndex(Neighbourhood("drawn", EPS_UM, holds), least))
-    check_every_prefix(places, points, near_matrix(count, is_near), least)
-
-
 @given(points=POINTS, least=st.integers(1, 6))
-def test_both_core_indexes_give_the_same_deltas(points: list[Point], least: int) -> None:
-    """Plain distance as a predicate gives the same deltas, but for which pair a merge names."""
-
-    def holds(a: Pose, b: Pose) -> bool:
-        return (a.x_um - b.x_um) ** 2 + (a.y_um - b.y_um) ** 2 <= EPS_UM**2
-
-    plain = Places(CoreIndex(EPS_UM, least))
-    ruled = Places(RuleCoreIndex(Neighbourhood("test", EPS_UM, holds), least))
-    for n, (x, y, yaw) in enumerate(points):
-        one = plain.fold(n, n, 0, "r", x, y, yaw)
-        other = ruled.fold(n, n, 0, "r", x, y, yaw)
-        assert [_without_links(d) for d in one] == [_without_links(d) for d in other]
-        for delta in one:
-            for link in getattr(delta, "links", ()):
-                assert plain.core_index.is_core(link.core)
-                assert plain.core_index.is_core(link.neighbour)
-                assert link.distance_um <= EPS_UM
-
-
-@given(points=POINTS, least=st.integers(1, 6), is_ruled=st.booleans())
 def test_a_link_is_of_a_fresh_core_point_and_an_older_one_of_the_absorbed_place(
-    points: list[Point], least: int, is_ruled: bool
+    points: list[Point], least: int
 ) -> None:
-    rule = Neighbourhood("test", EPS_UM, _alike)
-    places = Places(RuleCoreIndex(rule, least) if is_ruled else CoreIndex(EPS_UM, least))
-    for n, (x, y, yaw) in enumerate(points):
+    places = Places(CoreIndex(EPS_UM, least))
+    for n, (x, y, _) in enumerate(points):
         cores = {i for i in range(n) if places.core_index.is_core(i)}
         labels = [places.label(i) for i in range(n)]
-        for merge in places.fold(n, n, 0, "r", x, y, yaw):
+        for merge in places.fold(n, n, 0, "r", x, y):
             if type(merge) is not PlacesMerged:
                 continue
             for absorbed, link in zip(merge.absorbed, merge.links, strict=True):
@@ -168,9 +104,3 @@ def test_a_link_is_of_a_fresh_core_point_and_an_older_one_of_the_absorbed_place(
                 assert link.neighbour in cores
                 assert labels[link.neighbour] == absorbed
                 assert places.core_index.are_neighbours(link.core, link.neighbour)
-
-
-def _without_links(delta):
-    if not hasattr(delta, "links"):
-        return delta
-    return delta.offset, delta.survivor, delta.absorbed, delta.bridge, delta.absorbed_counts

@@ -33,6 +33,21 @@ def place_rank(answer: Answer, room: str) -> float:
     return ids.index(room) if room in ids else math.inf
 
 
+def error_of(answer: Answer, keyframe: Keyframe) -> float:
+    """Distance of the answer's pose from the keyframe's, in metres."""
+    assert answer.pose is not None
+    at = keyframe.accepted.envelope
+    return math.hypot(answer.pose.x - (at.map_x or 0.0), answer.pose.y - (at.map_y or 0.0))
+
+
+def is_at_a_door(mapped: RoomMap, keyframe: Keyframe) -> bool:
+    """Whether the map has a keyframe of another room within 0.7 m."""
+    at = keyframe.accepted.envelope
+    x, y = at.map_x or 0.0, at.map_y or 0.0
+    others = [k.accepted.envelope for k in mapped.run if k.room != keyframe.room]
+    return any(math.hypot((e.map_x or 0.0) - x, (e.map_y or 0.0) - y) < 0.7 for e in others)
+
+
 @given(st.sampled_from(SEEDS), st.data())
 @settings(max_examples=examples(25), deadline=None)
 def test_the_order_of_crops_does_not_matter(seed: int, data: st.DataObject) -> None:
@@ -62,10 +77,14 @@ def test_one_more_consistent_crop_never_lowers_the_true_place(seed: int) -> None
     assert len(seen) > 5
     for keyframe in seen:
         crops = crops_of(keyframe)[:3]
-        ranks = [
-            place_rank(rank(part, mapped.search(part), top=len(mapped.rooms)), keyframe.room)
+        answers = [
+            rank(part, mapped.search(part), top=len(mapped.rooms))
             for part in (crops[:1], crops[:2], crops)
         ]
+        ranks = [place_rank(answer, keyframe.room) for answer in answers]
+        assert error_of(answers[-1], keyframe) <= 0.6
+        if is_at_a_door(mapped, keyframe):
+            continue  # half of the pose's weight may lie in the next room
         for fewer, more in itertools.pairwise(ranks):
             assert more <= fewer
         assert ranks[-1] == 0

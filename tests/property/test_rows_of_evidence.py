@@ -24,9 +24,11 @@ EVIDENCE = Settings(fusion="evidence")
 Events = Sequence[Sequence[d.Delta]]
 
 
-def followed(events: Events, size: int, tables: MemoryTables) -> MapView:
+def followed(
+    events: Events, size: int, tables: MemoryTables, rules: Settings = EVIDENCE
+) -> MapView:
     """A live sink's tables after batches of ``size``, each sent twice, as after a failed commit."""
-    tracker, sink = ChangeTracker(MapView(EVIDENCE, keep_embeddings=False)), MemorySink()
+    tracker, sink = ChangeTracker(MapView(rules, keep_embeddings=False)), MemorySink()
     for start in range(0, len(events), size):
         for offset in range(start, min(start + size, len(events))):
             tracker.apply_event(d.Offset(offset), events[offset], offset)
@@ -36,8 +38,10 @@ def followed(events: Events, size: int, tables: MemoryTables) -> MapView:
     return tracker.view
 
 
-def rebuilt(events: Events, size: int) -> tuple[MapView, MemoryTables, dict[str, int]]:
-    tracker, tables = ChangeTracker(MapView(EVIDENCE, keep_embeddings=False)), MemoryTables()
+def rebuilt(
+    events: Events, size: int, rules: Settings = EVIDENCE
+) -> tuple[MapView, MemoryTables, dict[str, int]]:
+    tracker, tables = ChangeTracker(MapView(rules, keep_embeddings=False)), MemoryTables()
     shadow = MemorySink().shadow()
     shadow.create(tables)
     for offset, deltas in enumerate(events):

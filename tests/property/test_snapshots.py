@@ -6,8 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.deltas import Delta, Pose
-from projections.exact import Neighbourhood
+from projections.deltas import Delta
 from projections.model.digest import map_digest
 from projections.model.snapshot import restore, snapshot, unpack
 from projections.reducers.adjacency import Adjacency
@@ -25,24 +24,20 @@ def _lists(state: dict[str, Any]) -> dict[str, Any]:
     return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in state.items()}
 
 
-def _same_side(a: Pose, b: Pose) -> bool:
-    return (a.x_um < 2_500_000) == (b.x_um < 2_500_000)
-
-
 @given(
     documents=runs(),
     cut=st.integers(0, 45),
     least=st.sampled_from([1, 2, 3, 5]),
-    rule=st.sampled_from([None, Neighbourhood("same side", 800_000, _same_side)]),
+    places=st.sampled_from(["page", "rooms"]),
 )
 def test_restore_then_fold_is_fold_from_the_start(
-    documents: list[dict[str, Any]], cut: int, least: int, rule: Neighbourhood | None
+    documents: list[dict[str, Any]], cut: int, least: int, places: str
 ) -> None:
-    settings = Settings(**{**SETTINGS, "min_samples": least})
-    whole = Folded.start(settings, rule).extend(documents)
-    begun = Folded.start(settings, rule).extend(documents[:cut])
+    settings = Settings(**{**SETTINGS, "min_samples": least, "places": places})
+    whole = Folded.start(settings).extend(documents)
+    begun = Folded.start(settings).extend(documents[:cut])
     data = snapshot(begun.map, begun.view, "log")
-    again = Folded(*restore(data, begun.view.settings, "log", rule), [])
+    again = Folded(*restore(data, begun.view.settings, "log"), [])
     again.extend(documents[cut:])
     assert [list(map(_plain, d)) for d in again.deltas] == [
         list(map(_plain, d)) for d in whole.deltas[cut:]

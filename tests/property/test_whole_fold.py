@@ -6,14 +6,12 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.deltas import Pose
-from projections.exact import Neighbourhood
 from projections.model.digest import map_digest
 from projections.model.snapshot import restore, snapshot
 from projections.settings import Settings
 from tests.envelopes import detection, envelope
 from tests.folds import Folded
-from tests.naive_map import NaiveMap, Posed
+from tests.naive_map import NaiveMap
 
 LOOKS = [[1, 0, 0], [1, 1, 0], [3, 4, 0], [0, 1, 2], [-1, 0.3, 1e-3], [1e-30, 2e-30, 0]]
 LOOKS += [[-1, 0, 0], [1, 2]]
@@ -59,15 +57,6 @@ def _document(rng: random.Random) -> dict[str, Any]:
     return envelope(number, x, y, detections=detections, **fields)
 
 
-def _facing(a: Pose, b: Pose) -> bool:
-    """On one side of a wall, or looking the same way."""
-    return (a.x_um < 2_000_000) == (b.x_um < 2_000_000) or a.yaw_rad == b.yaw_rad
-
-
-def _naive_facing(a: Posed, b: Posed) -> bool:
-    return max(abs(a[0] - b[0]), abs(a[1] - b[1])) <= 600_000 and _facing(Pose(*a), Pose(*b))
-
-
 @given(world=worlds())
 def test_after_every_event_the_digest_is_that_of_the_naive_map(
     world: tuple[dict[str, Any], list[dict[str, Any]]],
@@ -76,13 +65,17 @@ def test_after_every_event_the_digest_is_that_of_the_naive_map(
     check_every_prefix(Folded.start(Settings(**settings)), NaiveMap(settings), documents)
 
 
-@given(world=worlds())
-def test_the_digest_is_that_of_the_naive_map_under_another_neighbourhood(
-    world: tuple[dict[str, Any], list[dict[str, Any]]],
+@given(
+    world=worlds(),
+    cell_m=st.sampled_from([0.2, 0.25, 0.6]),
+    drive_m=st.sampled_from([0.5, 1.0, 2.0]),
+)
+def test_the_digest_is_that_of_the_naive_map_of_places_by_rooms(
+    world: tuple[dict[str, Any], list[dict[str, Any]]], cell_m: float, drive_m: float
 ) -> None:
     settings, documents = world
-    folded = Folded.start(Settings(**settings), Neighbourhood("facing", 600_000, _facing))
-    check_every_prefix(folded, NaiveMap(settings, _naive_facing), documents)
+    settings |= {"places": "rooms", "rooms": {"cell_m": cell_m, "drive_m": drive_m}}
+    check_every_prefix(Folded.start(Settings(**settings)), NaiveMap(settings), documents)
 
 
 @given(world=worlds())

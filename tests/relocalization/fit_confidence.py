@@ -1,123 +1,212 @@
-"""Fit the weights of `projections.relocalize.pose` on generated buildings; print them.
+"""Fit the weights of re-localisation's two probabilities on generated buildings; print them.
 
-Buildings 0 … 9 are fitted on; 10 … 13 are held out and reported beside them. Each is asked with one
-to three crops, mapped whole and by its first third only, by its own second session and by another
-building's. Plain gradient descent (Newton's), so that nothing but numpy is needed.
+    scripts/fit_confidence [--every 4] [--jobs 2] [--cache DIR]
 
-    scripts/fit_confidence [--step 2]
+Robots and buildings of the developing half of ``worlds`` (`tests.bench.truth.worlds`): four of its
+buildings are fitted on, the others are held out and reported beside them. Run a makes the map, by
+evidence and with its own constants; the later runs ask it with one to three crops and with one to
+five views, and so do as many questions from another building. Then the maps are asked their own
+questions with the weights found: how far the probabilities are off there is what `mapfold
+calibrate` compares a map with.
 """
 
 import argparse
+import functools
 import math
 import sys
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import astuple
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from projections.evaluate.scores import auroc, expected_calibration_error
-from projections.relocalize import Camera, ExactIndex
+from projections.calibrate.localiser import Line, fit_line, logit
+from projections.evaluate.own_questions import ask_own_questions
+from projections.evaluate.questions import make_questions, make_view_questions, spread
+from projections.evaluate.scores import (
+    auroc,
+    calibration_floor,
+    expected_calibration_error,
+    instances_of,
+)
+from projections.evaluate.trials import RIGHT_WITHIN_M
+from projections.model.view import MapView
+from projections.relocalize import ExactIndex, certainty, features
+from projections.relocalize.likelihood import Scene
 from projections.relocalize.model import MODEL
-from projections.relocalize.pose import WEIGHTS, locate
-from tests.relocalization.buildings import Building, Keyframe
-from tests.relocalization.drives import drive
-from tests.relocalization.rooms import crops_of, fold
+from projections.relocalize.pose import locate
+from tests.bench.truth.localising import later_runs, make_map, stranger_of
+from tests.bench.truth.worlds import CACHE, WORLDS, Case, load_generator, make_case, pairs
 
-FITTED, HELD_OUT = range(10), range(10, 14)
-WITHIN_M = 1.5
-RIDGE = 0.1
-Row = tuple[tuple[float, ...], bool, bool, int]
-"""Features, whether the answer was right, whether the question was known, number of crops."""
+HELD_OUT = ("rmf_hotel", "aws_hospital")
+RIDGE = 0.3
+CROPS, VIEWS = (1, 2, 3), (1, 3, 5)
+Floats = NDArray[np.float64]
 
 
-def runs_of(seed: int) -> tuple[list[Keyframe], list[Keyframe]]:
-    """A building's exploring run, 700 keyframes, and a second session of 400."""
-    building = Building(
-        seed,
-        columns=2 + seed % 3,
-        rows=2 + seed // 2 % 2,
-        things=50 + 10 * (seed % 5),
-        look_alikes=0.3 + 0.225 * (seed % 3),
-    )
-    return (
-        drive(building, f"b{seed}-a", 1000 + seed, 700),
-        drive(building, f"b{seed}-b", 2000 + seed, 400),
-    )
+class Row(NamedTuple):
+    """One question: features of both models, whether it was known, whether the pose was right."""
+
+    pair: tuple[str, str]
+    kind: str
+    known_features: tuple[float, ...]
+    features: tuple[float, ...]
+    known: bool
+    right: bool
 
 
-def ask(mapped: Sequence[Keyframe], asked: Sequence[Keyframe], step: int) -> list[Row]:
-    """Features and outcome of every ``step``-th question with one, two and three crops."""
-    index = ExactIndex(fold(mapped))
-    instances = {i for k in mapped for i in k.instances if i is not None}
-    rows: list[Row] = []
-    for crops in (1, 2, 3):
-        rng = np.random.default_rng(crops)
-        usable = [k for k in asked if len(k.instances) >= crops]
-        for keyframe in usable[::step]:
-            drawn = sorted(rng.choice(len(keyframe.instances), crops, replace=False))
-            rows.append(_row(index, instances, keyframe, drawn))
+class Weights(NamedTuple):
+    """Of `known` and `confidence`, intercepts first."""
+
+    known: tuple[float, ...]
+    confidence: tuple[float, ...]
+
+
+def cases(pair: tuple[str, str], cache: Path) -> tuple[Case, Case]:
+    """A robot in a building, and in another one."""
+    profile, world = pair
+    generator = load_generator(WORLDS)
+    other = stranger_of(generator, "develop", world)
+    own, stranger = (make_case(generator, profile, each, cache=cache) for each in (world, other))
+    return own, stranger
+
+
+def ask(every: int, cache: Path, pair: tuple[str, str]) -> list[Row]:
+    """The questions of every kind that have candidates and a pose."""
+    case, stranger = cases(pair, cache)
+    view = make_map(case, "evidence", ask=False)
+    index = ExactIndex(view)
+    scene = Scene(index.constants, index.constants.camera, MODEL)
+    instances = {i for _, i in instances_of(view, case.truth) if i is not None}
+    rows = []
+    for word, make, counts in (
+        ("crop", make_questions, CROPS),
+        ("view", make_view_questions, VIEWS),
+    ):
+        for count in counts:
+            own = make(later_runs(case), case.truth, count)[::every]
+            others = make(later_runs(stranger), stranger.truth, count)
+            for question in [*own, *spread(others, len(own))]:
+                matches = index.search(question.crops).matches
+                alike = certainty.known_features(question.crops, matches, index.constants)
+                posterior = locate(question.asked.views, matches, scene)
+                if alike is None or posterior is None:
+                    continue
+                known = any(i in instances for i in question.instances if i is not None)
+                off = math.hypot(posterior.x - question.x, posterior.y - question.y)
+                found = astuple(posterior.features)
+                right = known and off <= RIGHT_WITHIN_M
+                rows.append(Row(pair, f"{count} {word}", alike, found, known, right))
     return rows
 
 
-def _row(index: ExactIndex, instances: set[str], keyframe: Keyframe, drawn: list[int]) -> Row:
-    seen = crops_of(keyframe)
-    crops = sorted((seen[i] for i in drawn), key=lambda crop: crop.sort_key)
-    known = any(keyframe.instances[i] in instances for i in drawn)
-    posterior = locate(crops, index.search(crops).matches, Camera(), MODEL)
-    if posterior is None:
-        return (0.0,) * (len(WEIGHTS) - 1), False, known, len(crops)
-    envelope = keyframe.accepted.envelope
-    error = math.hypot(posterior.x - (envelope.map_x or 0), posterior.y - (envelope.map_y or 0))
-    return posterior.features, known and error <= WITHIN_M, known, len(crops)
+def ask_itself(
+    weights: Weights, cache: Path, pair: tuple[str, str]
+) -> list[tuple[float, bool, float, bool]]:
+    """Of a map's own questions the logit of `known` and whether it was, and of `confidence`."""
+    certainty.KNOWN_WEIGHTS, features.WEIGHTS = weights  # type: ignore[misc, assignment]
+    view: MapView = make_map(cases(pair, cache)[0], "evidence", ask=False)
+    answers = [each for crops in (1, 3) for each in ask_own_questions(view, crops)]
+    return [
+        (logit(a.answer.known), a.known, logit(a.answer.confidence), a.correct) for a in answers
+    ]
 
 
-def fit(x: NDArray[np.float64], y: NDArray[np.bool_]) -> NDArray[np.float64]:
+def fit(x: Floats, y: NDArray[np.bool_], weight: Floats) -> tuple[float, ...]:
     """Logistic regression with a little ridge, by Newton's method; intercept first."""
-    x = np.column_stack((np.ones(len(x)), x))
+    spread_of = x.std(axis=0) + 1e-9
+    x = np.column_stack((np.ones(len(x)), x / spread_of))
     weights = np.zeros(x.shape[1])
     penalty = RIDGE * np.eye(x.shape[1])
     penalty[0, 0] = 0.0
     for _ in range(50):
         p = 1 / (1 + np.exp(-np.clip(x @ weights, -40, 40)))
-        gradient = x.T @ (p - y) + penalty @ weights
-        hessian = (x * (p * (1 - p))[:, None]).T @ x + penalty
+        gradient = x.T @ (weight * (p - y)) + penalty @ weights
+        hessian = (x * (weight * p * (1 - p))[:, None]).T @ x + penalty
         weights = weights - np.linalg.solve(hessian, gradient)
-    return weights
+    weights[1:] /= spread_of
+    return tuple(round(float(each), 3) for each in weights)
 
 
-def report(name: str, rows: Sequence[Row], weights: NDArray[np.float64]) -> None:
-    """One line: how many, calibration error, AUROC of known against unknown."""
-    x = np.array([(1.0, *row[0]) for row in rows])
-    p = (1 / (1 + np.exp(-np.clip(x @ weights, -40, 40)))).tolist()
-    ece = expected_calibration_error(p, [row[1] for row in rows])
-    apart = auroc(
-        [c for c, row in zip(p, rows, strict=True) if row[2]],
-        [c for c, row in zip(p, rows, strict=True) if not row[2]],
+def fit_both(rows: Sequence[Row]) -> Weights:
+    """Every map counts the same, however many questions it was asked."""
+    asked = {pair: sum(row.pair == pair for row in rows) for pair in {row.pair for row in rows}}
+    weight = np.array([len(rows) / len(asked) / asked[row.pair] for row in rows])
+    known = np.array([row.known for row in rows])
+    right = np.array([row.right for row in rows])
+    return Weights(
+        fit(np.array([row.known_features for row in rows]), known, weight),
+        fit(np.array([row.features for row in rows]), right, weight),
     )
-    right = sum(row[1] for row in rows) / len(rows)
-    print(f"{name}: {len(rows)} questions, {right:.3f} right, ECE {ece:.3f}, AUROC {apart:.3f}")
+
+
+def report(name: str, rows: Sequence[Row], weights: Weights) -> None:
+    """Means over maps, by kind of question: AUROC, shares wrongly called, calibration errors."""
+    for kind in dict.fromkeys(row.kind for row in rows):
+        of_maps = []
+        for pair in dict.fromkeys(row.pair for row in rows):
+            own = [row for row in rows if row.pair == pair and row.kind == kind]
+            if not (0 < sum(row.known for row in own) < len(own)):
+                continue
+            said = [_say(weights.known, row.known_features) for row in own]
+            sure = [_say(weights.confidence, row.features) for row in own]
+            yes = [p for p, row in zip(said, own, strict=True) if row.known]
+            no = [p for p, row in zip(said, own, strict=True) if not row.known]
+            best = [[r.known_features[0] for r in own if r.known == k] for k in (True, False)]
+            of_maps.append(
+                (
+                    auroc(yes, no) or 0.0,
+                    auroc(*best) or 0.0,
+                    sum(p < certainty.UNKNOWN_BELOW for p in yes) / len(yes),
+                    sum(p >= certainty.UNKNOWN_BELOW for p in no) / len(no),
+                    expected_calibration_error(said, [row.known for row in own]),
+                    calibration_floor(said),
+                    expected_calibration_error(sure, [row.right for row in own]),
+                    calibration_floor(sure),
+                )
+            )
+        if of_maps:
+            means = "  ".join(f"{each:.3f}" for each in np.mean(of_maps, axis=0))
+            print(f"{name:10} {kind:7} {len(of_maps):3}  {means}")
+
+
+def _say(weights: Sequence[float], values: Sequence[float]) -> float:
+    return certainty.probability(certainty.logit_of(weights, values))
 
 
 def main() -> None:
-    """Generate, ask, fit, print."""
+    """Ask, fit, print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--step", type=int, default=2, help="use every STEP-th question")
-    step = parser.parse_args().step
-    runs = {seed: runs_of(seed) for seed in (*FITTED, *HELD_OUT)}
-    rows: dict[int, list[Row]] = {}
-    for seed, (mapped, asked) in runs.items():
-        stranger = runs[(seed + 1) % len(runs)][1]
-        rows[seed] = []
-        for part in (mapped, mapped[: len(mapped) // 3]):
-            rows[seed] += ask(part, asked, step) + ask(part, stranger, 2 * step)
-        print(f"building {seed}: {len(rows[seed])} questions", file=sys.stderr)
-    fitted = [row for seed in FITTED for row in rows[seed]]
-    weights = fit(np.array([row[0] for row in fitted]), np.array([row[1] for row in fitted]))
-    report("fitted", fitted, weights)
-    held_out = [row for seed in HELD_OUT for row in rows[seed]]
-    for crops in (1, 2, 3):
-        report(f"held out, {crops} crops", [row for row in held_out if row[3] == crops], weights)
-    print(f"WEIGHTS = ({', '.join(f'{w:.3f}' for w in weights)})")
+    parser.add_argument("--every", type=int, default=4, help="use every N-th question")
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    parser.add_argument("--cache", type=Path, default=CACHE, help="where generated runs are kept")
+    options = parser.parse_args()
+    chosen = pairs(load_generator(WORLDS), "develop")
+    with ProcessPoolExecutor(options.jobs) as pool:
+        asking = functools.partial(ask, options.every, options.cache)
+        rows = [row for found in pool.map(asking, chosen) for row in found]
+        fitted = [row for row in rows if row.pair[1] not in HELD_OUT]
+        held_out = [row for row in rows if row.pair[1] in HELD_OUT]
+        weights = fit_both(fitted)
+        print("           kind   maps AUROC  cosine k>unk  unk>k  ECE kn floor  ECE co floor")
+        report("fitted", fitted, weights)
+        report("held out", held_out, weights)
+        for robot in dict.fromkeys(pair[0] for pair in chosen):
+            others = [row for row in rows if row.pair[0] != robot]
+            report(robot, [row for row in rows if row.pair[0] == robot], fit_both(others))
+        itself = functools.partial(ask_itself, weights, options.cache)
+        of_fitted = [pair for pair in chosen if pair[1] not in HELD_OUT]
+        own = [each for found in pool.map(itself, of_fitted) for each in found]
+    print(f"KNOWN_WEIGHTS = {weights.known}", file=sys.stdout)
+    print(f"WEIGHTS = {weights.confidence}")
+    flat = Line(1.0, 0.0)
+    known = fit_line([each[0] for each in own], [each[1] for each in own], flat, 1.0)
+    sure = fit_line([each[2] for each in own], [each[3] for each in own], flat, 1.0)
+    print(f"KNOWN_USUAL = Line({known.scale:.2f}, {known.shift:.2f})")
+    print(f"CONFIDENCE_USUAL = Line({sure.scale:.2f}, {sure.shift:.2f})")
 
 
 if __name__ == "__main__":

@@ -14,9 +14,11 @@ from projections.demo import report
 from projections.demo.correcting import Corrected
 from projections.demo.mapping import Folded, Part, RoomMerge, most_telling
 from projections.demo.recording import Followed, Recorded
-from projections.demo.report import DemoResult
+from projections.demo.report import DemoResult, tell_types
 from projections.model.view import MapView
 from projections.settings import Settings
+from tests.envelopes import detection, envelope
+from tests.folds import fold
 
 RECORDED = Recorded(
     run_id="sim-1-a",
@@ -147,3 +149,18 @@ def test_singular_forms() -> None:
     assert "through 1 room, " in lines
     assert "with 1 detection are in the log" in lines
     assert "in 1 transaction:" in lines
+
+
+def test_types_of_places_are_told_in_lines_that_fit() -> None:
+    seen = [detection("toilet", [1, 0]), detection("sink", [0, 1])]
+    documents = [
+        envelope(10 * room + k, 20.0 * room, 0.0, detections=seen if room else [])
+        for room in range(7)
+        for k in range(4)
+    ]
+    lines = list(tell_types(fold(documents).view))
+    assert lines[0].startswith("   by what stands in them (1 unsure): p1 bathroom ")
+    assert sum(line.count("bathroom") for line in lines) == 6
+    assert len(lines) > 1
+    assert all(len(line) <= 96 for line in lines)
+    assert list(tell_types(fold(documents[:4]).view)) == []

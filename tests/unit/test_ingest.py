@@ -317,3 +317,25 @@ def test_a_camera_needs_its_size_and_field_of_view() -> None:
     for text in ("NaN", "Infinity"):
         raw = payload(envelope(camera={**CAMERA, "yaw_rad": "?"})).replace(b'"?"', text.encode())
         assert refusal(raw).startswith("camera.yaw_rad: ")
+
+
+@pytest.mark.parametrize(
+    ("value", "name"), [(2, "2"), ("2", "2"), (-1, "-1"), ("attic", "attic"), (None, None)]
+)
+def test_a_floor_is_a_name_or_a_number(value: Any, name: str | None) -> None:
+    result = ingest(payload(envelope(floor=value, map_z=-2)))
+    assert isinstance(result, Accepted)
+    assert result.envelope.floor == name
+    assert result.envelope.map_z == -2.0
+
+
+@pytest.mark.parametrize("value", ["", "a" * 257, "a\nb", 1.5, True, [1], {"name": 1}, 2**63])
+def test_a_wrong_floor_is_refused_with_the_field_and_the_value(value: Any) -> None:
+    said = refusal(payload(envelope(floor=value)))
+    assert said.startswith("floor: ")
+    assert "(got " in said
+
+
+@pytest.mark.parametrize("value", [1.1e7, "up", True, [0.0]])
+def test_a_wrong_height_is_refused(value: Any) -> None:
+    assert refusal(payload(envelope(map_z=value))).startswith("map_z: ")

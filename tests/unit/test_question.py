@@ -8,8 +8,15 @@ import numpy as np
 import pytest
 
 from projections.errors import QuestionError
-from projections.relocalize import parse_question, read_crops
-from projections.relocalize.question import MAX_CROPS
+from projections.relocalize import (
+    Camera,
+    parse_question,
+    question_schema,
+    read_crops,
+    read_question,
+)
+from projections.relocalize.question import MAX_CROPS, MAX_VIEWS
+from projections.serve import http
 from tests.envelopes import MODEL, detection, embedding, envelope
 
 VECTOR = [3.0, 4.0, 0.0]
@@ -27,16 +34,80 @@ def test_an_envelope_its_detections_and_crops_are_the_same_question() -> None:
 
 
 def test_a_crop_may_be_nothing_but_numbers() -> None:
-    (crop,) = parse_question(b'{"crops": [{"embedding": [0, 2.5]}]}')
+    (crop,) = parse_question(b'{"crops": [{"embedding": [0, 2.5]}]}').crops
+    assert crop.vector is not None
     assert crop.vector.tolist() == [0.0, 1.0]
     assert (crop.bbox, crop.class_name, crop.det_id, crop.model) == (None, None, None, None)
 
 
-def test_crops_without_an_embedding_are_left_out() -> None:
-    crops = read_crops([detection("cup"), detection("chair", VECTOR)])
-    assert [c.class_name for c in crops] == ["chair"]
+def test_a_crop_without_an_embedding_is_one_of_its_class() -> None:
+    crops = read_crops([detection("cup"), detection("chair", VECTOR), {"bbox": [1, 2, 3, 4]}])
+    assert [c.class_name for c in crops] == ["cup", "chair"]
+    assert [c.vector is None for c in crops] == [True, False]
 
 
+def test_a_text_says_that_it_is_one() -> None:
+    asked = [
+        {"embedding": VECTOR, "text": True},
+        {"embedding": VECTOR},
+        {"class": "a", "text": True},
+    ]
+    assert [c.is_text for c in read_crops(asked)] == [True, False, False]
+
+
+def test_views_have_movements_between_them() -> None:
+    seen = detection("cup", VECTOR)
+    views = [
+        {"dx": "not read", "crops": [seen]},
+        {"dx": 1, "dy": -0.5, "dyaw": 3.0, "detections": [seen, seen]},
+        {"dx": 0, "dy": 0, "dyaw": 0, "crops": []},
+    ]
+    question = read_question({"views": views, "crops": "not read"})
+    assert [len(view.crops) for view in question.views] == [1, 2, 0]
+    moved = [(view.dx, view.dy, view.dyaw) for view in question.views]
+    assert moved == [(0.0, 0.0, 0.0), (1.0, -0.5, 3.0), (0.0, 0.0, 0.0)]
+    assert len(question.crops) == 3
+    assert [crop for view in question.views for crop in view.crops] == list(question.crops)
+
+
+def test_one_picture_is_one_view() -> None:
+    (view,) = read_question([detection("cup", VECTOR)]).views
+    assert (view.dx, view.dy, view.dyaw, len(view.crops)) == (0.0, 0.0, 0.0, 1)
+
+
+def test_a_question_may_state_its_camera() -> None:
+    camera = {"hfov_deg": 90, "width_px": 1280, "height_px": 720, "yaw_rad": 0.5}
+    asked = envelope(1, detections=[detection("cup", VECTOR)], camera=camera)
+    assert read_question(asked).camera == Camera(1280.0, 720.0, 90.0, 0.5)
+    assert read_question([detection("cup", VECTOR)]).camera is None
+
+
+def test_the_schema_holds_what_is_read() -> None:
+    """Its examples in HTTP's description are questions."""
+    schema = question_schema()
+    assert {"crops", "detections", "views"} == {
+        key for form in schema["anyOf"] for key in form.get("properties", {})
+    }
+    view = schema["anyOf"][2]["properties"]["views"]["items"]
+    assert set(view["properties"]) == {"dx", "dy", "dyaw", "crops"}
+    crop = view["properties"]["crops"]["items"]
+    assert set(crop["properties"]) == {
+        "embedding",
+        "embedding_dim",
+        "embedding_model",
+        "text",
+        "class",
+        "bbox",
+        "det_id",
+    }
+    for form in http._EXAMPLES.values():
+        document = json.loads(json.dumps(form["value"]).replace("<base64>", BASE64))
+        assert read_question(document).crops
+
+
+ONE = {"crops": [{"embedding": VECTOR}]}
+MOVED = {"dx": 0.0, "dy": 0.0, "dyaw": 0.5, **ONE}
+BASE64 = embedding(VECTOR)["embedding"]
 NAN = embedding([float("nan"), 1.0])
 
 
@@ -48,8 +119,29 @@ NAN = embedding([float("nan"), 1.0])
         (b"{}\n{}\n", "more comes behind the question, in line 2; send one JSON document"),
         ({}, "neither an envelope"),
         ("text", "neither an envelope"),
-        ([], "the question has no crops; send at least one"),
-        ([detection("cup")], "the question has 1 crop and no embedding"),
+        ([], "the question has no crops with an embedding or a class; send at least one"),
+        ([{"bbox": [1, 2, 3, 4]}], "no crops with an embedding or a class; send at least one"),
+        ({"views": []}, "send a list of views"),
+        ({"views": {}}, "send a list of views"),
+        ({"views": [7]}, "views.0: should be a JSON object"),
+        ({"views": [{"crops": [], "dx": 1.0}]}, "no crops with an embedding or a class"),
+        ({"views": [ONE, ONE]}, "views.1.dx: is missing; give the metres and radians moved"),
+        ({"views": [ONE, {**MOVED, "dyaw": None}]}, "views.1.dyaw: input should be a valid number"),
+        ({"views": [ONE, {**MOVED, "dx": True}]}, "views.1.dx: input should be a valid number"),
+        ({"views": [ONE, {**MOVED, "dx": 1e4}]}, "views.1.dx: input should be less than"),
+        (b'{"views": [{"crops": [{"class": "a"}]}, {"dx": NaN, "dy": 0, "dyaw": 0}]}', "finite"),
+        (b'{"views": [{"crops": [{"class": "a"}]}, {"dx": 0, "dy": 1e999, "dyaw": 0}]}', "finite"),
+        ({"views": [ONE, {**MOVED, "crops": 7}]}, "views.1: the question is neither"),
+        (
+            {"views": [ONE, {**MOVED, "crops": [{"embedding": []}]}]},
+            "views.1.crops.0.embedding: is",
+        ),
+        ({"views": [ONE] + [MOVED] * MAX_VIEWS}, f"9 views, more than {MAX_VIEWS}"),
+        ({"views": [ONE, {**MOVED, "crops": [{"class": "a"}] * MAX_CROPS}]}, "32 crops in all its"),
+        ({"views": [ONE, {**MOVED, "crops": [{"embedding": [1.0]}]}]}, "mixes embedding spaces"),
+        ({**ONE, "camera": 7}, "camera: "),
+        ({**ONE, "camera": {"hfov_deg": 0, "width_px": 1, "height_px": 1}}, "camera.hfov_deg: "),
+        ([{"class": "a", "text": 1}], "crops.0.text: input should be a valid boolean"),
         ([{"embedding": "###"}], "crops.0.embedding: not base64"),
         ([{"embedding": "AAA="}], "2 bytes, so no row"),
         ([{"embedding": []}], "is empty"),

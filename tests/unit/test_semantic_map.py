@@ -15,8 +15,6 @@ import numpy as np
 import pytest
 
 from projections.deltas import EventSkipped, KeyframeAdded, ObjectFound, ObservationAdded, RunSeen
-from projections.errors import SettingsError
-from projections.exact import Neighbourhood
 from projections.model.digest import map_digest
 from projections.reducers import landmarks
 from projections.reducers.folded_ids import content_digest
@@ -216,18 +214,6 @@ def test_the_deltas_of_a_keyframe_come_in_the_order_of_the_contract() -> None:
         "ObjectSeen",
         "ObjectMoved",
     ]
-
-
-def test_a_neighbourhood_other_than_the_settings_name_is_refused() -> None:
-    rule = Neighbourhood("walls", 1_000_000, lambda _a, _b: True)
-    for settings, given in (
-        (Settings(), rule),
-        (Settings(neighbourhood="walls"), None),
-        (Settings(neighbourhood="doors"), rule),
-    ):
-        with pytest.raises(SettingsError, match=r"name the neighbourhood .*rule\.name"):
-            SemanticMap(settings, given)
-    assert SemanticMap(Settings(neighbourhood="walls"), rule).next_offset == 0
 
 
 def test_skip_passes_over_an_offset_and_changes_nothing() -> None:

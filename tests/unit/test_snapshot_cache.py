@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from eventsrc.log import ALWAYS, LogReader, LogWriter, recover_log
-from projections.exact import Neighbourhood
 from projections.model import fold as folding
 from projections.model import snapshot as codec
 from projections.model.digest import map_digest
@@ -145,25 +144,6 @@ def test_settings_do_not_share_snapshots(log: Path) -> None:
 
 
 @pytest.mark.usefixtures("eager")
-def test_a_snapshot_is_never_taken_for_one_of_another_neighbourhood(log: Path) -> None:
-    """Three folds of one log, by three rules, one after the other through one cache; then again."""
-    near = Neighbourhood("near", 1_000_000, lambda a, b: (a.x_um - b.x_um) ** 2 < 10**10)
-    wall = Neighbourhood("wall", 2_000_000, lambda a, b: (a.x_um < 2e6) == (b.x_um < 2e6))
-    found, notes = [], []
-    for rule in (None, near, wall, None, near, wall):
-        settings = Settings(neighbourhood=rule and rule.name)
-        with LogReader(log) as reader:
-            _, view = fold_log_cached(reader, settings, note=notes.append, neighbourhood=rule)
-            _, plain = fold_log(reader, settings, neighbourhood=rule)
-        assert map_digest(view) == map_digest(plain)
-        found.append(map_digest(view))
-    assert found[:3] == found[3:]
-    assert len(set(found)) == 3
-    assert len(_files(log)) == 3
-    assert notes == []
-
-
-@pytest.mark.usefixtures("eager")
 def test_a_cache_that_cannot_be_written_is_a_note(log: Path) -> None:
     log.with_name("log.snapshots").write_text("in the way")
     notes: list[str] = []
@@ -227,23 +207,25 @@ def test_restore_refuses_other_settings() -> None:
     data = snapshot(folded.map, folded.view, "log")
     with pytest.raises(SnapshotRefused, match="other settings"):
         restore(data, Settings(eps_m=0.1), "log")
-    rule = Neighbourhood("everywhere", 1_000_000, lambda _a, _b: True)
     with pytest.raises(SnapshotRefused, match="other settings"):
-        restore(data, Settings(neighbourhood=rule.name), "log", rule)
+        restore(data, Settings(places="rooms"), "log")
 
 
 @pytest.mark.parametrize("instead", [None, 7, "x", [], [[1]], {}, 1 << 70, np.zeros((2, 2))])
-def test_restore_refuses_content_that_does_not_fit_together(instead: Any) -> None:
+@pytest.mark.parametrize("settings", [Settings(), Settings(places="rooms")])
+def test_restore_refuses_content_that_does_not_fit_together(
+    settings: Settings, instead: Any
+) -> None:
     """Whatever stands in place of any value, by another hand: a refusal, or a map, but no crash."""
-    folded = Folded.start().extend(_documents(5))
+    folded = Folded.start(settings).extend(_documents(5))
     state = unpack(snapshot(folded.map, folded.view, "log"))
     for name in state:
         if not name.startswith("about."):
             with contextlib.suppress(SnapshotRefused):
-                restore(pack(state | {name: instead}), Settings(), "log")
+                restore(pack(state | {name: instead}), settings, "log")
     for name in ("map.places.joined", "map.seen.offsets", "view.keyframes"):
         with pytest.raises(SnapshotRefused, match="does not fit together"):
-            restore(pack({k: v for k, v in state.items() if k != name}), Settings(), "log")
+            restore(pack({k: v for k, v in state.items() if k != name}), settings, "log")
 
 
 def test_bytes_with_another_head_or_checksum_are_refused() -> None:

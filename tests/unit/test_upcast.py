@@ -60,7 +60,7 @@ def test_there_is_an_upcaster_for_every_older_version() -> None:
 
 @pytest.mark.parametrize(
     ("payload", "version"),
-    [(BARE, 1), (b' \n[ {"class"', 1), (b"[1]", 3), (b"[]", 3), (b"{}", 3), (b"", 3)],
+    [(BARE, 1), (b' \n[ {"class"', 1), (b"[1]", 4), (b"[]", 4), (b"{}", 4), (b"", 4)],
 )
 def test_the_version_is_detected_from_the_payload(payload: bytes, version: int) -> None:
     assert detect_version(payload) == version
@@ -116,6 +116,16 @@ def test_unknown_fields_of_version_2_with_names_of_version_3_are_dropped() -> No
     younger = read_envelope(event(fits, 3))
     assert isinstance(younger, Accepted)
     assert younger.envelope.camera is not None
+
+
+def test_fields_of_version_3_with_names_of_version_4_are_dropped() -> None:
+    for more in ({"floor": 2, "map_z": 1.0}, {"floor": {"of": "ours"}, "map_z": "high"}):
+        old = read_envelope(event(envelope(1, **more), 3))
+        assert isinstance(old, Accepted)
+        assert (old.envelope.floor, old.envelope.map_z) == (None, None)
+    new = read_envelope(event(envelope(1, floor=2, map_z=1.0), 4))
+    assert isinstance(new, Accepted)
+    assert (new.envelope.floor, new.envelope.map_z) == ("2", 1.0)
 
 
 def test_a_faulty_envelope_of_version_2_is_refused_with_its_own_fault() -> None:

@@ -1,59 +1,133 @@
--- From crops to candidates: the nearest observations; of each its Object, the Object's Place, and the
--- Place of its keyframe. Graph ids follow from the observation's number (det_pk), so every step but the
--- search is a look-up of an indexed id. `{questions}` is a VALUES list of (crop, vector) bind parameters.
--- The last column of each half is its origin: log id, and fingerprint of settings and of what the
--- observations depend on (through JSON, as a table of an older version has no column for it).
+-- From crops to candidates: the nearest observations, or those of a class; of each its Object, the
+-- Object's Place, and the Place of its keyframe. Graph ids follow from the observation's number (det_pk),
+-- so every step but the search is a look-up of an indexed id. `{questions}` is a VALUES list of (crop,
+-- vector) bind parameters. `origin` is log id, and fingerprint of settings and of what the observations
+-- depend on (through JSON, as a table of an older version has no column for it).
+-- Other words in braces are the parts of these names below.
 
--- name: near
--- The nearest `%(neighbours)s` observations of each crop, from the vectors' database.
-WITH question (crop, wanted) AS ({questions})
-SELECT question.crop, near.det_pk, near.det_id, near.run_id, 1 - near.distance, near.class_name,
-       near.bbox, near.map_x, near.map_y, near.map_yaw, near.embedding_model,
-       (SELECT log_id || ' ' || coalesce(to_jsonb(c) ->> 'observed', fingerprint)
-        FROM mapfold.checkpoint c WHERE sink = 'vectors')
-FROM question CROSS JOIN LATERAL (
-    SELECT det_pk, det_id, run_id, class_name, bbox, map_x, map_y, map_yaw, embedding_model,
-           embedding <=> question.wanted AS distance
-    FROM public.detection_embeddings ORDER BY embedding <=> question.wanted LIMIT %(neighbours)s
-) AS near
+-- name: cosines
+-- Key, number, mean and deviation of the cosines of different things in one picture, of the sample of
+-- projections/relocalize/constants.py; null when the key is the one that the reader already knows. The
+-- sample changes when the number of observations has doubled, or with each of the first ones.
+(SELECT CASE WHEN sampled.key IS DISTINCT FROM %(known_cosines)s::text THEN (
+    SELECT json_build_array(sampled.key, count(*), coalesce(avg(1 - (one.embedding <=> other.embedding)), 0),
+                            coalesce(stddev_pop(1 - (one.embedding <=> other.embedding)), 0))
+    FROM generate_series(sampled.stride, sampled.edge, sampled.stride) AS picked (det_pk)
+    JOIN public.detection_embeddings AS one USING (det_pk)
+    JOIN public.detection_embeddings AS other
+        ON other.det_pk BETWEEN one.det_pk + 1 AND one.det_pk + %(followers)s
+        AND other.run_id = one.run_id AND other.keyframe_id = one.keyframe_id
+        AND other.class_name <> one.class_name
+ ) END
+ FROM (
+    SELECT edge, greatest(1, CASE WHEN number > %(sampled)s THEN edge / %(sampled)s ELSE 1 END) AS stride,
+           (SELECT log_id || ' ' || coalesce(to_jsonb(c) ->> 'observed', fingerprint)
+            FROM mapfold.checkpoint c WHERE sink = 'vectors') || ' ' || edge AS key
+    FROM (
+        SELECT number, CASE WHEN number > %(sampled)s
+            THEN 1::bigint << (length(ltrim(number::bit(64)::text, '0')) - 1) ELSE number END AS edge
+        FROM (SELECT coalesce(max(det_pk), 0) AS number FROM public.detection_embeddings) AS last
+    ) AS limited
+ ) AS sampled)
 
--- name: graph
--- Object, its Place and the keyframe's Place of each observation, from the graph's database.
-SELECT seen.det_pk, thing.properties, its.id, its.properties, there.id, there.properties,
-       (SELECT log_id || ' ' || coalesce(to_jsonb(c) ->> 'observed', fingerprint)
-        FROM mapfold.checkpoint c WHERE sink = 'graph')
-FROM unnest(%(det_pks)s::bigint[]) AS seen (det_pk)
+-- name: settings
+-- Fingerprint and settings of the graph; null when the fingerprint is the one already known.
+(SELECT CASE WHEN fingerprint IS DISTINCT FROM %(known_settings)s::text
+    THEN json_build_array(fingerprint, settings) END
+ FROM mapfold.checkpoint WHERE sink = 'graph')
+
+-- name: of_vectors
+-- What is to know of the vectors as a whole, in one of the rows.
+CASE WHEN row_number() OVER () = 1 THEN json_build_array({cosines}, (
+    SELECT log_id || ' ' || coalesce(to_jsonb(c) ->> 'observed', fingerprint)
+    FROM mapfold.checkpoint c WHERE sink = 'vectors')) END
+
+-- name: of_graph
+-- The same of the graph.
+CASE WHEN row_number() OVER () = 1 THEN json_build_array({settings}, (
+    SELECT log_id || ' ' || coalesce(to_jsonb(c) ->> 'observed', fingerprint)
+    FROM mapfold.checkpoint c WHERE sink = 'graph')) END
+
+-- name: observed
+near.det_pk, near.det_id, near.run_id, near.class_name, near.bbox, near.map_x, near.map_y, near.map_yaw,
+near.embedding_model
+
+-- name: along
+-- Ids of Object, its Place and the keyframe's Place; the properties of each only once, as they are long.
+near.det_pk, thing.id, CASE WHEN row_number() OVER (PARTITION BY thing.id) = 1 THEN thing.properties END,
+its.id, CASE WHEN row_number() OVER (PARTITION BY its.id) = 1 THEN its.properties END,
+there.id, CASE WHEN row_number() OVER (PARTITION BY there.id) = 1 THEN there.properties END
+
+-- name: followed
+-- Joins from `near.det_pk` along the graph.
 LEFT JOIN {observes} AS observes
-    ON observes.start_id = ag_catalog._graphid(%(observation)s, seen.det_pk)
+    ON observes.start_id = ag_catalog._graphid(%(observation)s, coalesce(near.det_pk, 0))
 LEFT JOIN {object} AS thing ON thing.id = observes.end_id
 LEFT JOIN {located_in} AS located ON located.start_id = thing.id
 LEFT JOIN {place} AS its ON its.id = located.end_id
 LEFT JOIN {has_observation} AS has
-    ON has.end_id = ag_catalog._graphid(%(observation)s, seen.det_pk)
+    ON has.end_id = ag_catalog._graphid(%(observation)s, coalesce(near.det_pk, 0))
 LEFT JOIN {in_place} AS in_place ON in_place.start_id = has.start_id
 LEFT JOIN {place} AS there ON there.id = in_place.end_id
+
+-- name: near
+-- The nearest `%(neighbours)s` observations of each crop, from the vectors' database; at least one row,
+-- of nulls if there is no observation.
+WITH question (crop, wanted) AS ({questions})
+SELECT {of_vectors}, question.crop, 1 - near.distance, {observed}
+FROM question LEFT JOIN LATERAL (
+    SELECT det_pk, det_id, run_id, class_name, bbox, map_x, map_y, map_yaw, embedding_model,
+           embedding <=> question.wanted AS distance
+    FROM public.detection_embeddings ORDER BY embedding <=> question.wanted LIMIT %(neighbours)s
+) AS near ON true
+
+-- name: described
+-- These observations, from the vectors' database; at least one row.
+SELECT {of_vectors}, 0, 1.0, {observed}
+FROM (SELECT 1) AS one
+LEFT JOIN public.detection_embeddings AS near ON near.det_pk = ANY(%(det_pks)s::bigint[])
+
+-- name: graph
+-- Object, its Place and the keyframe's Place of each observation, from the graph's database; at least
+-- one row.
+SELECT {of_graph}, {along}
+FROM (SELECT 1) AS one
+LEFT JOIN unnest(%(det_pks)s::bigint[]) AS near (det_pk) ON true
+{followed}
 
 -- name: near_and_graph
 -- Both in one round trip and one snapshot, when they share a database.
 WITH question (crop, wanted) AS ({questions})
-SELECT question.crop, near.det_pk, near.det_id, near.run_id, 1 - near.distance, near.class_name,
-       near.bbox, near.map_x, near.map_y, near.map_yaw, near.embedding_model,
-       (SELECT log_id || ' ' || coalesce(to_jsonb(c) ->> 'observed', fingerprint)
-        FROM mapfold.checkpoint c WHERE sink = 'vectors'),
-       thing.properties, its.id, its.properties, there.id, there.properties,
-       (SELECT log_id || ' ' || coalesce(to_jsonb(c) ->> 'observed', fingerprint)
-        FROM mapfold.checkpoint c WHERE sink = 'graph')
-FROM question CROSS JOIN LATERAL (
+SELECT {of_vectors}, question.crop, 1 - near.distance, {observed}, {of_graph}, {along}
+FROM question LEFT JOIN LATERAL (
     SELECT det_pk, det_id, run_id, class_name, bbox, map_x, map_y, map_yaw, embedding_model,
            embedding <=> question.wanted AS distance
     FROM public.detection_embeddings ORDER BY embedding <=> question.wanted LIMIT %(neighbours)s
-) AS near
-LEFT JOIN {observes} AS observes
-    ON observes.start_id = ag_catalog._graphid(%(observation)s, near.det_pk)
-LEFT JOIN {object} AS thing ON thing.id = observes.end_id
-LEFT JOIN {located_in} AS located ON located.start_id = thing.id
-LEFT JOIN {place} AS its ON its.id = located.end_id
-LEFT JOIN {has_observation} AS has
-    ON has.end_id = ag_catalog._graphid(%(observation)s, near.det_pk)
-LEFT JOIN {in_place} AS in_place ON in_place.start_id = has.start_id
-LEFT JOIN {place} AS there ON there.id = in_place.end_id
+) AS near ON true
+{followed}
+
+-- name: of_classes
+-- Observations of the Objects of each class, from the graph's database: the Objects that were seen most
+-- often, and of each some observations spread evenly over all. `%(patterns)s` are properties to match.
+SELECT wanted.number, seen.det_pk
+FROM unnest(%(patterns)s::text[]) WITH ORDINALITY AS wanted (pattern, number)
+CROSS JOIN LATERAL (
+    SELECT id FROM {object}
+    WHERE properties OPERATOR(ag_catalog.@>) wanted.pattern::ag_catalog.agtype
+    ORDER BY ag_catalog.agtype_access_operator(
+        VARIADIC ARRAY[properties, '"obs_count"'::ag_catalog.agtype])::int8 DESC, id
+    LIMIT %(objects)s
+) AS thing
+CROSS JOIN LATERAL (
+    SELECT start_id::text::bigint & 281474976710655 AS det_pk,
+           row_number() OVER (ORDER BY start_id) AS position, count(*) OVER () AS total
+    FROM {observes} WHERE end_id = thing.id
+) AS seen
+WHERE seen.position * %(of_each)s / seen.total > (seen.position - 1) * %(of_each)s / seen.total
+ORDER BY 1, 2
+
+-- name: class_names
+-- Classes of Objects.
+SELECT DISTINCT ag_catalog.agtype_access_operator(
+    VARIADIC ARRAY[properties, '"class_name"'::ag_catalog.agtype])
+FROM {object}

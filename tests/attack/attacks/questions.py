@@ -35,6 +35,13 @@ def cases() -> Iterator[bytes]:
     for value in (b"1e400", b"-1e400", b"NaN", b'"x"', b"[]", b"{}", b"null", b"1.5", b"9" * 5000):
         yield _question_with(b'"top":' + value)
         yield _question_with(b'"method":' + value)
+        yield _question_with(b'"session":' + value)
+        yield _question_with(b'"session":"robot","dy":0,"dyaw":0,"dx":' + value)
+        yield _question_with(b'"views":' + value)
+        yield (
+            b'{"views":[{"crops":[{"class":"cup"}]},{"dx":0,"dy":0,"dyaw":%b,"crops":[]}]}' % value
+        )
+        yield b'{"crops":[{"class":"cup","text":%b}],"camera":%b}' % (value, value)
     yield b"[" * 900_000
     yield b'{"a":' * 150_000
     yield b"\xff" * 1000
@@ -42,6 +49,9 @@ def cases() -> Iterator[bytes]:
     yield b'{"crops":[{"embedding":"' + b"A" * 900_000 + b'"}]}'
     yield b'{"crops":[{"class":"' + b"\\u0000" * 100_000 + b'","embedding":[1]}]}'
     yield b'{"crops":[{"embedding":[1e308,1e308]}]}'
+    yield b'{"crops":[' + b",".join(b'{"class":"%d"}' % n for n in range(32)) + b"]}"
+    yield b'{"crops":[{"class":"' + b"x" * 900_000 + b'"}]}'
+    yield b'{"views":[' + b",".join([b'{"dx":1e3,"dy":-1e3,"dyaw":9}'] * 100_000) + b"]}"
     yield b""
 
 

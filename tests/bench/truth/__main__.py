@@ -1,7 +1,8 @@
 """One table: Objects by the page's rule and by evidence, side by side, against the truth.
 
 python -m tests.bench.truth [--half develop|validate] [--quick] [--world W…] [--profile P…]
-    [--moved FRACTION] [--calibrated] [--places] [--limit N] [--set NAME=VALUE…]
+    [--moved FRACTION] [--calibrated] [--places [--walls] | --types]
+    [--limit N] [--set NAME=VALUE…]
     [--worlds DIR] [--cache DIR] [--json FILE]
 python -m tests.bench.truth --localise [--every N] [--map page|evidence] [--brief] [--jobs N] …
 
@@ -29,8 +30,10 @@ from .folding import fold_timed
 from .localising import MAPS, LocaliseRow, localise, stranger_of
 from .localising_table import localise_table
 from .moving import score_moved
+from .place_types import TypesRow, types_row, types_table
 from .places import RULES, PlacesRow, places_row, places_table
 from .scoring import score_objects
+from .walls import Walls, world_names, world_walls
 from .worlds import (
     CACHE,
     LIMIT,
@@ -58,7 +61,14 @@ def main() -> None:
         cases = _cases(generator, chosen, options, limit)
         if options.places:
             rules = {**RULES, "rooms": RULES["rooms"].with_assignments(options.set)}
-            places = [places_row(case, rules) for case in cases]
+            places = [
+                places_row(case, rules, _walls(generator, case) if options.walls else None)
+                for case in cases
+            ]
+        elif options.types:
+            ruled = [RULES["rooms"].model_copy(update={"fusion": f}) for f in ("page", "evidence")]
+            by_rule = [settings.with_assignments(options.set) for settings in ruled]
+            types = [types_row(case, settings) for case in cases for settings in by_rule]
         else:
             rows = [_row(case, options) for case in cases]
     except (NoWorldsError, SettingsError) as error:
@@ -71,13 +81,23 @@ def main() -> None:
         print(places_table(places))
         _write(options.json, places)
         return
+    if options.types:
+        print(types_table(types))
+        _write(options.json, types)
+        return
     if options.calibrated:
         print(calibration_table(rows))
     print(tables.moved_table(rows) if options.moved else tables.objects_table(rows))
     _write(options.json, rows)
 
 
-def _write(path: Path | None, rows: Sequence[tables.Row | PlacesRow]) -> None:
+def _walls(generator: ModuleType, case: Case) -> Walls | None:
+    """The walls of a generated building; None for house-a, which has none."""
+    world = case.name.rpartition(" ")[2]
+    return world_walls(generator, world) if world in world_names(generator) else None
+
+
+def _write(path: Path | None, rows: Sequence[tables.Row | PlacesRow | TypesRow]) -> None:
     if path is not None:
         document = [dataclasses.asdict(row) for row in rows]
         path.write_text(json.dumps(document, indent=1) + "\n")
@@ -131,6 +151,10 @@ def _options() -> argparse.Namespace:
         "--calibrated", action="store_true", help="the map's own constants beside the priors"
     )
     parser.add_argument("--places", action="store_true", help="places against rooms, no Objects")
+    parser.add_argument(
+        "--walls", action="store_true", help="with --places: rooms with an occupancy map, too"
+    )
+    parser.add_argument("--types", action="store_true", help="types of places against room names")
     parser.add_argument("--localise", action="store_true", help="where the robot is, instead")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="ask every N-th question")
     parser.add_argument("--map", nargs="+", choices=MAPS, default=MAPS, help="rules of the maps")

@@ -17,8 +17,11 @@ WORSE_V = 0.01
 """So much worse in V no calibrated map may be."""
 
 
-def calibrated_settings(events: Sequence[Accepted], settings: Settings) -> tuple[Settings, float]:
-    """The settings with the constants that the map itself shows, and the processor time of it."""
+def calibrated_settings(
+    events: Sequence[Accepted], settings: Settings, *, ask: bool = False
+) -> tuple[Settings, float]:
+    """The settings with the constants that the map itself shows, those of re-localisation too if it
+    is asked, and the processor time of it."""
 
     def fold(used: Settings) -> tuple[MapView, Cameras]:
         view, cameras = MapView(used), Cameras()
@@ -27,7 +30,7 @@ def calibrated_settings(events: Sequence[Accepted], settings: Settings) -> tuple
         return view, cameras
 
     start = time.process_time()
-    return calibrate_by(fold, settings).calibrated, time.process_time() - start
+    return calibrate_by(fold, settings, ask=ask).calibrated, time.process_time() - start
 
 
 _WIDTHS = (26, 7, 7, 7, 7, 7, 7, 7, 7, 7, 8)

@@ -4,6 +4,7 @@ import time
 from collections.abc import Iterator, Sequence
 
 from eventsrc.ingest import Accepted
+from eventsrc.occupancy_map import OccupancyMap
 from projections.deltas import Delta
 from projections.exact import unit_vectors
 from projections.model.fold import READ_AHEAD, gc_paused
@@ -12,21 +13,26 @@ from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 
 
-def fold_timed(events: Sequence[Accepted], settings: Settings) -> tuple[MapView, float]:
-    """The view of validated envelopes folded in order, and the seconds of processor time that unit
-    vectors, fold and view took."""
+def fold_timed(
+    events: Sequence[Accepted], settings: Settings, walls: OccupancyMap | None = None
+) -> tuple[MapView, float]:
+    """The view of validated envelopes folded in order, after a map if one is given, and the seconds
+    of processor time that unit vectors, fold and view took."""
     start = time.process_time()
     view = MapView(settings, keep_embeddings=False)
-    for _ in fold_into(view, events):
+    for _ in fold_into(view, events, walls):
         pass
     return view, time.process_time() - start
 
 
 def fold_into(
-    view: MapView, events: Sequence[Accepted]
+    view: MapView, events: Sequence[Accepted], walls: OccupancyMap | None = None
 ) -> Iterator[tuple[Accepted, Sequence[Delta]]]:
-    """Fold envelopes into an empty view; each with its deltas."""
+    """Fold envelopes into an empty view, after a map if one is given; each with its deltas."""
     semantic_map = SemanticMap(view.settings)
+    if walls is not None:
+        offset = semantic_map.next_offset
+        view.apply_event(offset, semantic_map.use_map(offset, walls))
     with gc_paused():
         for first in range(0, len(events), READ_AHEAD):
             chunk = events[first : first + READ_AHEAD]

@@ -12,7 +12,8 @@ from types import ModuleType
 from typing import Any
 
 from eventsrc.ingest import Accepted
-from projections.evaluate.questions import Question, make_questions
+from eventsrc.text import counted
+from projections.evaluate.questions import Question, make_questions, make_view_questions, spread
 from projections.evaluate.scores import (
     auroc,
     calibration_floor,
@@ -31,7 +32,7 @@ from .worlds import Case
 PLACES = {"eps_m": 0.75, "min_samples": 8}
 """Settings of the places: with the defaults most buildings are one place."""
 MAPS = ("page", "evidence")
-CROPS = (1, 3)
+CROPS, VIEWS = (1, 3), (1, 3, 5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,13 +97,14 @@ def later_runs(case: Case) -> list[Accepted]:
     return [each for each in case.events if each.envelope.run_id != case.first_run]
 
 
-def make_map(case: Case, rule: str) -> MapView:
-    """Run a by the page's rule, uncalibrated, or by evidence with the map's own constants."""
+def make_map(case: Case, rule: str, *, ask: bool = True) -> MapView:
+    """Run a by the page's rule, uncalibrated, or by evidence with the map's own constants; those of
+    re-localisation too, unless the map is not to be asked."""
     events = first_run(case)
     settings = Settings(camera=case.camera, **PLACES)
     if rule == "evidence":
         settings = settings.model_copy(update={"fusion": "evidence"})
-        settings, _ = calibrated_settings(events, settings)
+        settings, _ = calibrated_settings(events, settings, ask=ask)
     view = MapView(settings)
     for _ in fold_into(view, events):
         pass
@@ -112,18 +114,15 @@ def make_map(case: Case, rule: str) -> MapView:
 def asked(case: Case, stranger: Case, every: int) -> dict[str, tuple[list[Question], ...]]:
     """By kind: every n-th question of the case's later runs, and as many of the stranger's."""
     found = {}
-    for crops in CROPS:
-        own = make_questions(later_runs(case), case.truth, crops)[::every]
-        others = make_questions(later_runs(stranger), stranger.truth, crops)
-        found[f"{crops} crop{'s' if crops > 1 else ''}"] = own, spread(others, len(own))
+    for word, make, counts in (
+        ("crop", make_questions, CROPS),
+        ("view", make_view_questions, VIEWS),
+    ):
+        for count in counts:
+            own = make(later_runs(case), case.truth, count)[::every]
+            others = make(later_runs(stranger), stranger.truth, count)
+            found[counted(count, word)] = own, spread(others, len(own))
     return found
-
-
-def spread(questions: Sequence[Question], count: int) -> list[Question]:
-    """``count`` of the questions, or all if there are fewer, evenly."""
-    if len(questions) <= count:
-        return list(questions)
-    return [questions[i * len(questions) // count] for i in range(count)]
 
 
 def localise(case: Case, stranger: Case, rules: Sequence[str], every: int) -> list[LocaliseRow]:
@@ -148,7 +147,7 @@ def score(trials: Sequence[Trial], cpu_ms: float = 0.0) -> Scores:
     known = [trial for trial in trials if trial.known]
     unknown = [trial for trial in trials if not trial.known]
     sure = [trial.answer.confidence for trial in trials]
-    in_map = [_known(trial) for trial in trials]
+    in_map = [trial.answer.known for trial in trials]
     return Scores(
         len(trials),
         len(known),
@@ -159,7 +158,7 @@ def score(trials: Sequence[Trial], cpu_ms: float = 0.0) -> Scores:
         percentile(_present(t.plain_place_error_m for t in known), 0.5),
         _share(t.correct for t in known),
         _share(t.plain_error_m is not None and t.plain_error_m <= RIGHT_WITHIN_M for t in known),
-        auroc([_known(t) for t in known], [_known(t) for t in unknown]),
+        auroc([t.answer.known for t in known], [t.answer.known for t in unknown]),
         auroc([t.best_cosine for t in known], [t.best_cosine for t in unknown]),
         _share(t.answer.unknown for t in known),
         _share(not t.answer.unknown for t in unknown),
@@ -169,11 +168,6 @@ def score(trials: Sequence[Trial], cpu_ms: float = 0.0) -> Scores:
         calibration_floor(sure),
         cpu_ms,
     )
-
-
-def _known(trial: Trial) -> float:
-    """The probability that the map knows the things shown."""
-    return trial.answer.confidence
 
 
 def _present(values: Iterable[float | None]) -> list[float]:

@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+from eventsrc.occupancy_map import OccupancyMap
 from projections.deltas import KeyframeOrdinal, KeyframePlaced, PlaceOrdinal
 from projections.evaluate.scores import agreement
 from projections.evaluate.truth import Truth
@@ -16,6 +17,7 @@ from projections.settings import Settings
 
 from .folding import fold_into, fold_timed
 from .tables import HOUSE, number
+from .walls import Walls
 from .worlds import Case
 
 RULES = {
@@ -24,6 +26,8 @@ RULES = {
     "rooms": Settings(places="rooms"),
 }
 """The rules of the table by their names; shares and ratios are told of the last."""
+LEAST_WALLED = 0.5
+"""Rooms have walls where so much of the borders between them are walls; else they are zones."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,19 +58,27 @@ class PlacesRow:
     keyframes: int
     rooms: int
     rules: dict[str, PlaceScores]
+    walled: float | None = None
+    """What share of the borders of the rooms are walls; None where no walls were asked for."""
 
 
-def places_row(case: Case, rules: Mapping[str, Settings] = RULES) -> PlacesRow:
-    """Fold a case under each rule and score its places."""
+def places_row(
+    case: Case, rules: Mapping[str, Settings] = RULES, walls: Walls | None = None
+) -> PlacesRow:
+    """Fold a case under each rule and score its places; with ``walls``, the last once more with
+    the building's occupancy map before the drive, as rule ``walls``."""
     rooms = {case.truth.room((a.envelope.run_id, a.envelope.keyframe_id)) for a in case.events}
     scores = {name: _score(case, settings) for name, settings in rules.items()}
-    return PlacesRow(case.name, len(case.events), len(rooms - {None}), scores)
+    if walls is not None:
+        scores["walls"] = _score(case, list(rules.values())[-1], walls.map)
+    walled = None if walls is None else walls.walled
+    return PlacesRow(case.name, len(case.events), len(rooms - {None}), scores, walled)
 
 
-def _score(case: Case, settings: Settings) -> PlaceScores:
-    _, seconds = fold_timed(case.events, settings)
+def _score(case: Case, settings: Settings, walls: OccupancyMap | None = None) -> PlaceScores:
+    _, seconds = fold_timed(case.events, settings, walls)
     view, first, late = MapView(settings, keep_embeddings=False), {}, set()
-    for _, deltas in fold_into(view, case.events):
+    for _, deltas in fold_into(view, case.events, walls):
         for delta in deltas:
             if isinstance(delta, KeyframePlaced):
                 first[delta.keyframe] = delta.place
@@ -121,6 +133,9 @@ def places_table(rows: Sequence[PlacesRow]) -> str:
                 own = [row for row in buildings if row.name.split()[part] == key]
                 if len(own) not in (1, len(buildings)):
                     lines.append(_line(f"  {key}", _cells(own)))
+        own = [row for row in buildings if row.walled is not None and row.walled >= LEAST_WALLED]
+        if own:
+            lines.append(_line("  rooms have walls", _cells(own)))
         for name in names:
             worst = min(buildings, key=lambda row: row.rules[name].v_measure)
             value = number(worst.rules[name].v_measure, 3)

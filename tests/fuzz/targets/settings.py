@@ -19,7 +19,7 @@ class SettingsTarget(Target):
     def seeds(self) -> Sequence[bytes]:
         """Defaults, some, and assignments."""
         documents = (
-            Settings().model_dump(exclude={"neighbourhood"}),
+            Settings().model_dump(),
             {"eps_m": 0.75, "min_samples": 8},
             ["eps_m=1.0", "embedding_model=none", "min_samples = 4"],
         )

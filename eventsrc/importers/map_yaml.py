@@ -1,0 +1,123 @@
+"""The map.yaml of a map server (Nav2, ROS 1) and its image: from files to an occupancy map.
+
+``mode`` says how a pixel becomes a cell, as in Nav2's map_io. With p the mean of red, green and
+blue from 0 (black) to 1, a pixel is occupied by 1 - p, by p if ``negate`` is set:
+
+``trinary``  occupied above ``occupied_thresh``, free below ``free_thresh``, else unknown
+``scale``    the same, but between the two thresholds 1 to 99 in proportion
+``raw``      the pixel's own value where it is 0 to 100, else unknown
+
+A pixel that is not opaque is unknown, but for ``raw``; Nav2 averages its alpha in for ``trinary``.
+"""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from eventsrc.envelope import Position, describe_error
+from eventsrc.errors import MisuseError
+from eventsrc.grey_images import BadImage, decode_rgba
+from eventsrc.occupancy_map import MAX_MAP_CELLS, OCCUPIED, UNKNOWN, InvalidMap, OccupancyMap
+from eventsrc.system_events import MAX_MAP_SIDE, MapYaw, Resolution
+from eventsrc.text import visible
+
+MAX_YAML_BYTES = 64 * 1024
+MAX_IMAGE_BYTES = 128 * 1024 * 1024
+_OPAQUE = 255
+_WHITE = 3 * 255
+_Share = Annotated[float, Field(ge=0.0, le=1.0)]
+
+
+class _MapFile(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
+
+    image: Annotated[str, Field(min_length=1)]
+    resolution: Resolution
+    origin: tuple[Position, Position, MapYaw]
+    negate: Annotated[int, Field(ge=0, le=1)]
+    occupied_thresh: _Share
+    free_thresh: _Share
+    mode: Literal["trinary", "scale", "raw"] = "trinary"
+
+
+def read_map_yaml(path: Path) -> OccupancyMap:
+    """The map of a map.yaml; its image's path is relative to it. Raises MisuseError."""
+    described = _described(path)
+    image = path.parent / described.image
+    try:
+        pixels = decode_rgba(_content(image, MAX_IMAGE_BYTES), MAX_MAP_SIDE, MAX_MAP_CELLS)
+        cells = _cells(pixels, described)[::-1]
+        map_ = OccupancyMap(path.stem, described.resolution, described.origin, path.name, cells)
+        map_.encode()
+    except BadImage as error:
+        raise MisuseError(f"{image}: {error}; give a PGM or PNG image") from None
+    except InvalidMap as error:
+        raise MisuseError(f"{path}: {error}") from None
+    return map_
+
+
+def _described(path: Path) -> _MapFile:
+    text = _content(path, MAX_YAML_BYTES)
+    try:
+        document = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        reason = visible(" ".join(str(error).split()))
+        raise MisuseError(f"{path}: no YAML: {reason}") from None
+    if not isinstance(document, dict):
+        raise MisuseError(f"{path}: no map.yaml: it has no fields such as image and resolution")
+    try:
+        described = _MapFile.model_validate(document)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        field = visible(".".join(map(str, first["loc"])))
+        raise MisuseError(f"{path}: {field}: {describe_error(first)}") from None
+    if described.free_thresh > described.occupied_thresh:
+        raise MisuseError(
+            f"{path}: free_thresh {described.free_thresh:g} is above occupied_thresh "
+            f"{described.occupied_thresh:g}"
+        )
+    return described
+
+
+def _content(path: Path, limit: int) -> bytes:
+    try:
+        with path.open("rb") as file:
+            content = file.read(limit + 1)
+    except (OSError, ValueError) as error:  # ValueError: a name with a null character
+        reason = getattr(error, "strerror", None) or error
+        raise MisuseError(f"{visible(str(path))}: {reason}; check the path") from None
+    if len(content) > limit:
+        raise MisuseError(f"{path}: larger than {limit:,} bytes; is this the right file?")
+    return content
+
+
+def _cells(pixels: NDArray[np.uint8], described: _MapFile) -> NDArray[np.uint8]:
+    """Cells of the rows of red, green, blue and alpha, shape (height, width)."""
+    total = pixels[..., :3].sum(axis=-1, dtype=np.uint16)
+    table = _raw_values() if described.mode == "raw" else _threshold_values(described)
+    cells: NDArray[np.uint8] = table[total]
+    if described.mode != "raw":
+        cells[pixels[..., 3] != _OPAQUE] = UNKNOWN
+    return cells
+
+
+def _raw_values() -> NDArray[np.uint8]:
+    """The cell of each sum of red, green and blue, 0 to 765."""
+    level = np.rint(np.arange(_WHITE + 1) / 3)
+    return np.where(level <= OCCUPIED, level, UNKNOWN).astype(np.uint8)
+
+
+def _threshold_values(described: _MapFile) -> NDArray[np.uint8]:
+    """The cell of each sum of red, green and blue, 0 to 765."""
+    shade = np.arange(_WHITE + 1) / _WHITE
+    occupied = shade if described.negate else 1.0 - shade
+    low, high = described.free_thresh, described.occupied_thresh
+    between = np.full(_WHITE + 1, float(UNKNOWN))
+    if described.mode == "scale" and high > low:
+        between = np.rint((occupied - low) / (high - low) * 98.0 + 1.0).clip(1.0, 99.0)
+    values = np.where(occupied > high, float(OCCUPIED), np.where(occupied < low, 0.0, between))
+    return values.astype(np.uint8)

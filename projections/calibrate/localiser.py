@@ -1,0 +1,127 @@
+"""How re-localisation would do on a map, and how far its two probabilities are off there.
+
+The map is asked its own questions (`projections.evaluate.own_questions`). A logit z of `known` or
+of `confidence` is compared with whether it was right: the scale and shift that fit best, drawn
+towards those that fit on the maps that the weights were fitted on, because the map's own questions
+are not quite those of another day: what is left out is not the same as what was never there. What
+the map differs by from those maps is its correction.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from projections.evaluate.own_questions import OwnAnswer, ask_own_questions
+from projections.localizer import LocalizerConstants
+from projections.model.view import MapView
+from projections.relocalize.certainty import corrected, probability
+
+from .shrinking import rounded
+
+CROPS = (1, 3)
+
+
+class Line(NamedTuple):
+    """A logit z is right with the probability of scale · z + shift."""
+
+    scale: float
+    shift: float
+
+
+KNOWN_USUAL = Line(0.81, 0.62)
+CONFIDENCE_USUAL = Line(0.93, -0.24)
+"""Of the own questions of the maps that the weights were fitted on (`scripts/fit_confidence`)."""
+KNOWN_FIRMNESS, CONFIDENCE_FIRMNESS = 12.0, 64.0
+"""How firmly a map's line is drawn towards the usual one: the precision of its shift, of its scale
+four times as much. A question whose logit is near 0 has a precision of a quarter. How near poses
+are on own questions hangs on the tour as much as on the map, so that line hardly moves."""
+_FIRM = 1e-9
+_ROUNDS = 60
+_BOUNDS = (Line(0.25, -4.0), Line(4.0, 4.0))
+
+
+@dataclass(frozen=True, slots=True)
+class OwnScores:
+    """What the map's own questions show. ``answers`` are those of the map without a correction,
+    ``constants`` its correction."""
+
+    answers: tuple[OwnAnswer, ...]
+    constants: LocalizerConstants
+
+    def known(self, answer: OwnAnswer) -> float:
+        """The probability that an answer's things are in the map, with the correction."""
+        c = self.constants
+        return _corrected(answer.answer.known, c.known_scale, c.known_shift)
+
+    def confidence(self, answer: OwnAnswer) -> float:
+        """The probability that its pose is right, with the correction."""
+        c = self.constants
+        return _corrected(answer.answer.confidence, c.confidence_scale, c.confidence_shift)
+
+
+NOT_ASKED = OwnScores((), LocalizerConstants())
+
+
+def read_localiser(view: MapView) -> OwnScores:
+    """Ask a map whose settings have no correction."""
+    answers = tuple(each for crops in CROPS for each in ask_own_questions(view, crops))
+    return OwnScores(answers, correction(answers))
+
+
+def correction(answers: Sequence[OwnAnswer]) -> LocalizerConstants:
+    """The constants with which the map's probabilities are right; the defaults without answers."""
+    said, is_known = [logit(a.answer.known) for a in answers], [a.known for a in answers]
+    sure, is_right = [logit(a.answer.confidence) for a in answers], [a.correct for a in answers]
+    known = _beyond(fit_line(said, is_known, KNOWN_USUAL, KNOWN_FIRMNESS), KNOWN_USUAL)
+    confidence = _beyond(
+        fit_line(sure, is_right, CONFIDENCE_USUAL, CONFIDENCE_FIRMNESS), CONFIDENCE_USUAL
+    )
+    return LocalizerConstants(
+        known_scale=known.scale,
+        known_shift=known.shift,
+        known_count=len(answers),
+        confidence_scale=confidence.scale,
+        confidence_shift=confidence.shift,
+        confidence_count=len(answers),
+    )
+
+
+def fit_line(logits: Sequence[float], right: Sequence[bool], usual: Line, firmness: float) -> Line:
+    """The line that fits best, drawn towards the usual one."""
+    z = np.array(logits, dtype=np.float64)
+    y = np.array(right, dtype=np.float64)
+    x = np.stack([np.ones(len(z)), z], axis=1)
+    start = np.array([usual.shift, usual.scale])
+    weight = np.diag([firmness, 4.0 * firmness])
+    line = start.copy()
+    for _ in range(_ROUNDS):
+        p = 1.0 / (1.0 + np.exp(-np.clip(x @ line, -30.0, 30.0)))
+        uphill = x.T @ (y - p) - weight @ (line - start)
+        curvature = (x * (p * (1.0 - p))[:, None]).T @ x + weight
+        step: NDArray[np.float64] = np.linalg.solve(curvature, uphill)
+        line = line + np.clip(step, -1.0, 1.0)
+    return Line(float(line[1]), float(line[0]))
+
+
+def _beyond(line: Line, usual: Line) -> Line:
+    """What turns a logit of this map into one for which the usual line is right, bounded."""
+    least, most = _BOUNDS
+    scale, shift = line.scale / usual.scale, (line.shift - usual.shift) / usual.scale
+    return Line(
+        rounded(min(max(scale, least.scale), most.scale)),
+        rounded(min(max(shift, least.shift), most.shift)),
+    )
+
+
+def logit(p: float) -> float:
+    """The logit of a probability, not beyond that of one in 10⁹."""
+    p = min(max(p, _FIRM), 1.0 - _FIRM)
+    return math.log(p / (1.0 - p))
+
+
+def _corrected(p: float, scale: float, shift: float) -> float:
+    return probability(corrected(logit(p), scale, shift))

@@ -1,0 +1,172 @@
+"""The map's own questions: what it would answer if it had not been where it was asked from.
+
+Each is a keyframe of the map, asked with crops that it has. Its *visit* is taken out of the map:
+what was observed in its run within `VISIT` keyframes of it. A robot that comes another day sees
+things less alike than within one run, so the cosines to the rest of its own run are lowered by the
+map's session shift. Asked so, a thing that was seen at another time too is *known*.
+
+Asked again with the things shown taken out, as the fold knows them, the same question is one that
+the map cannot know. What stands beside them and is of the same class is taken out too: the fold may
+have split it off.
+"""
+
+import math
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+from eventsrc.envelope import RunId
+from projections.deltas import ObservationOrdinal
+from projections.exact import to_float32
+from projections.model.records import KeyframeRecord, ObjectRecord, ObservationRecord
+from projections.model.view import MapView
+from projections.relocalize import Answer, Crop, ExactIndex, Match, rank
+
+from .baselines import best_cosine, plain_position
+from .questions import DEFAULT_SEED, draw_key, spread
+from .trials import RIGHT_WITHIN_M
+
+VISIT = 20
+"""Keyframes of a run before and after one that are of the same visit."""
+STAND_APART_M, SEEN_APART_M = 2.0, 3.0
+"""Objects of one class are taken out together if they stand nearer to each other, or within twice
+that where one was seen from a single spot; on maps of the page's rule, if the positions they were
+seen from are."""
+MOST = 100
+"""Keyframes asked from at most, spread evenly over the map."""
+
+
+@dataclass(frozen=True, slots=True)
+class OwnAnswer:
+    """The answer to one of the map's own questions, of so many ``crops``.
+
+    ``known`` says that something shown was observed outside the visit too, ``taken_out`` that the
+    things shown were taken out of the map. Errors are in metres, None without a pose.
+    """
+
+    crops: int
+    taken_out: bool
+    known: bool
+    answer: Answer
+    error_m: float | None
+    plain_error_m: float | None
+    best_cosine: float
+
+    @property
+    def correct(self) -> bool:
+        """Whether the things are known and the pose is within 1.5 m."""
+        return self.known and self.error_m is not None and self.error_m <= RIGHT_WITHIN_M
+
+
+def ask_own_questions(
+    view: MapView, crops: int, *, most: int = MOST, seed: int = DEFAULT_SEED
+) -> Iterator[OwnAnswer]:
+    """Ask from up to ``most`` of the keyframes that have ``crops`` crops: first with the visit
+    taken out, then with the things shown taken out too."""
+    index = ExactIndex(view)
+    constants = index.constants
+    lowered = constants.evidence.session_shift * (1.0 - constants.different)
+    runs, by_class = _by_run(view), _by_class(view)
+    askable = [
+        (keyframe, seen)
+        for keyframe in view.keyframes
+        if keyframe.pose is not None and len(seen := _drawn(view, keyframe, crops, seed)) == crops
+    ]
+    for keyframe, seen in spread(askable, most):
+        asked = [_crop(view.observations[ordinal]) for ordinal in seen]
+        visit = _visit(runs, keyframe)
+        shown = _observations_of_things(view, by_class, seen)
+        for taken_out, without in ((False, visit), (True, visit | shown)):
+            found = index.search(asked, without=without)
+            rows = tuple(_another_day(row, keyframe.run_id, lowered) for row in found.matches)
+            answer = rank(asked, replace(found, matches=rows), top=1, camera=constants.camera)
+            pose = None if answer.pose is None else (answer.pose.x, answer.pose.y)
+            yield OwnAnswer(
+                crops,
+                taken_out,
+                not taken_out and bool(shown - visit),
+                answer,
+                _error(keyframe, pose),
+                _error(keyframe, plain_position(rows)),
+                best_cosine(rows),
+            )
+
+
+def _by_run(view: MapView) -> dict[RunId, list[KeyframeRecord]]:
+    runs: dict[RunId, list[KeyframeRecord]] = {}
+    for keyframe in view.keyframes:
+        runs.setdefault(keyframe.run_id, []).append(keyframe)
+    for keyframes in runs.values():
+        keyframes.sort(key=lambda keyframe: keyframe.keyframe_id)
+    return runs
+
+
+def _by_class(view: MapView) -> dict[str, list[ObjectRecord]]:
+    classes: dict[str, list[ObjectRecord]] = {}
+    for thing in view.objects.values():
+        classes.setdefault(thing.class_name, []).append(thing)
+    return classes
+
+
+def _visit(
+    runs: dict[RunId, list[KeyframeRecord]], keyframe: KeyframeRecord
+) -> set[ObservationOrdinal]:
+    """What was observed within `VISIT` keyframes of one, by their numbers in the run."""
+    own, number = runs[keyframe.run_id], keyframe.keyframe_id
+    first = bisect_left(own, number - VISIT, key=lambda each: each.keyframe_id)
+    last = bisect_right(own, number + VISIT, key=lambda each: each.keyframe_id)
+    return {ordinal for each in own[first:last] for ordinal in each.observations}
+
+
+def _drawn(
+    view: MapView, keyframe: KeyframeRecord, crops: int, seed: int
+) -> list[ObservationOrdinal]:
+    """Up to ``crops`` of a keyframe's observations that have an embedding."""
+    usable = [o for o in keyframe.observations if view.observations[o].embedding is not None]
+    return sorted(usable, key=lambda o: draw_key(seed, view.observations[o].det_id))[:crops]
+
+
+def _observations_of_things(
+    view: MapView, by_class: dict[str, list[ObjectRecord]], seen: Sequence[ObservationOrdinal]
+) -> set[ObservationOrdinal]:
+    """These, the others of their Objects, and those of Objects that may be the same thing."""
+    found = set(seen)
+    for ordinal in seen:
+        number = view.observations[ordinal].object
+        if number is not None:
+            thing = view.objects[number]
+            for other in by_class[thing.class_name]:
+                if other is thing or _may_be_one(thing, other):
+                    found.update(other.observations)
+    return found
+
+
+def _may_be_one(one: ObjectRecord, other: ObjectRecord) -> bool:
+    """Whether two Objects of one class are so near each other that they may be one thing."""
+    if one.estimate is not None and other.estimate is not None:
+        dx = one.estimate.est_x - other.estimate.est_x
+        dy = one.estimate.est_y - other.estimate.est_y
+        unsure = min(one.estimate.spots, other.estimate.spots) < 2
+        return math.hypot(dx, dy) < STAND_APART_M * (1 + unsure)
+    return math.hypot(one.mean_x - other.mean_x, one.mean_y - other.mean_y) < SEEN_APART_M
+
+
+def _crop(observation: ObservationRecord) -> Crop:
+    assert observation.embedding is not None  # noqa: S101 - drawn among those that have one
+    look = to_float32(observation.embedding)
+    return Crop(look, observation.bbox, observation.class_name, observation.det_id)
+
+
+def _another_day(row: Sequence[Match], run_id: RunId, lowered: float) -> tuple[Match, ...]:
+    """The matches as if those of one run were of another day, most similar first."""
+    moved = [
+        replace(match, similarity=match.similarity - lowered) if match.run_id == run_id else match
+        for match in row
+    ]
+    return tuple(sorted(moved, key=lambda match: (-match.similarity, match.observation)))
+
+
+def _error(keyframe: KeyframeRecord, at: tuple[float, float] | None) -> float | None:
+    if at is None or keyframe.pose is None:
+        return None
+    return math.hypot(at[0] - keyframe.pose.x_m, at[1] - keyframe.pose.y_m)

@@ -1,0 +1,34 @@
+"""What a map's numbers say about its settings: all in one place, or hardly anything in any."""
+
+from collections.abc import Mapping
+from typing import Final
+
+from eventsrc.text import counted
+from projections.settings import Settings
+
+LEAST_POSES: Final = 20
+"""With fewer there is nothing to say yet."""
+_MOSTLY: Final = 0.8
+
+
+def places_advice(counts: Mapping[str, int], settings: Settings) -> str | None:
+    """One line that names the setting that helps; None where nothing stands out. ``counts`` are
+    those of `MapView.counts`."""
+    posed, noise, places = counts["poses"], counts["noise"], counts["places"]
+    if posed < LEAST_POSES:
+        return None
+    if noise >= _MOSTLY * posed:
+        return (
+            f"{noise:,} of {counted(posed, 'keyframe')} with a pose are in no place; --preset rooms"
+            " puts each into one"
+        )
+    if places != 1:
+        return None
+    but = f" but {noise:,}" if noise else ""
+    found = f"all {counted(posed, 'keyframe')} with a pose{but} are in one place"
+    if settings.places == "rooms":
+        return (
+            f"{found}; if that is more than one room, a smaller rooms.drive_m than"
+            f" {settings.rooms.drive_m:g} tells them apart"
+        )
+    return f"{found}; if that is more than one room, --preset rooms tells them apart"

@@ -1,0 +1,295 @@
+"""Candidates from the live databases: one round trip to each of them for crops with embeddings.
+
+Crops without one are answered with observations of Objects of their class, which takes three more.
+
+Graph and vectors are one map only if the same log and settings made both. Each has a checkpoint of
+its own, and ``replay --only`` or ``tail --only`` may have made one of them from something else. The
+numbers of observations then differ, and an answer made of both would be wrong; it is refused.
+"""
+
+import contextlib
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from functools import lru_cache
+from typing import Any, Final, NamedTuple
+
+import psycopg
+from psycopg import sql
+
+from projections.database.connection import (
+    Connection,
+    Targets,
+    database_errors,
+    describe_target,
+)
+from projections.database.graph_render import text
+from projections.database.labels import LABEL_IDS
+from projections.database.statements import statements, tables
+from projections.deltas import ObservationOrdinal, PlaceOrdinal
+from projections.errors import ProjectionMismatch, ProjectionMissing, QuestionError
+from projections.relocalize import NEIGHBOURS, CandidatePlace, Candidates, Crop, Match, Stand
+from projections.relocalize.candidates import (
+    OBSERVATIONS_OF_EACH,
+    check_space,
+    objects_of_a_class,
+    refuse_unknown_classes,
+)
+
+from .known_constants import ConstantsMemory, KnownConstants
+
+_NUMBER_MASK: Final = (1 << 48) - 1
+_NEAR: Final = 12
+"""Number of columns of the statement ``near``."""
+_Rows = list[tuple[Any, ...]]
+
+
+def refuse_mixed(
+    vectors: str | None, graph: str | None, vectors_place: str, graph_place: str
+) -> None:
+    """Raise ProjectionMismatch unless both origins, each ``log id, space, fingerprint``, agree."""
+    if vectors is None or graph is None or vectors == graph:
+        return
+    log, _, _ = vectors.rpartition(" ")
+    graph_log, _, _ = graph.rpartition(" ")
+    reason = (
+        f"made with other settings than the graph, both from log {log}"
+        if log == graph_log
+        else f"made from log {log}, the graph from log {graph_log}"
+    )
+    where = "" if vectors_place == graph_place else f" (the graph is in {graph_place})"
+    raise ProjectionMismatch(
+        f"{vectors_place}: the vectors there were {reason}{where}; run mapfold replay LOG without"
+        " --only, so that one log and one set of settings make both"
+    )
+
+
+class CandidateSearch:
+    """One question's search over open connections to ``targets``; the same one twice for one
+    database."""
+
+    def __init__(
+        self,
+        targets: Targets,
+        vectors: Connection,
+        graph: Connection,
+        memory: ConstantsMemory,
+    ) -> None:
+        self._targets, self._memory = targets, memory
+        self._vectors, self._graph = vectors, graph
+        self._known: KnownConstants = memory.known
+
+    def candidates(self, crops: Sequence[Crop], neighbours: int = NEIGHBOURS) -> Candidates:
+        """The ``neighbours`` observations most similar to each crop, with their Places; of a crop
+        without embedding observations of its class."""
+        looked = [number for number, crop in enumerate(crops) if crop.vector is not None]
+        named = [number for number, crop in enumerate(crops) if crop.vector is None]
+        near: _Rows = []
+        along = _Along.of(())
+        if looked or not named:
+            near, along = self._nearest([crops[number] for number in looked], neighbours)
+            if named:
+                near = [(looked[crop], *row) for crop, *row in near]
+        if named:
+            of_classes, more = self._of_classes(crops, named)
+            near, along = near + of_classes, along.and_more(more)
+        self._memory.known = self._known
+        found = _assemble(len(crops), near, along, self._known)
+        refuse_unknown_classes(crops, found.matches, self._class_names)
+        return found
+
+    def _nearest(self, crops: Sequence[Crop], neighbours: int) -> "tuple[_Rows, _Along]":
+        """Rows of crop, similarity, det_pk and what follows in ``near``; and what is along them."""
+        one = self._vectors is self._graph
+        values: dict[str, Any] = {"neighbours": neighbours, "observation": LABEL_IDS["Observation"]}
+        values |= {f"crop_{i}": crop.vector for i, crop in enumerate(crops)}
+        with _query_errors(self._targets.vector_url):
+            statement = _statement("near_and_graph" if one else "near", len(crops))
+            rows = self._vectors.execute(statement, values | self._known.parameters).fetchall()
+        near, origin = self._near(rows)
+        model = next((row[-1] for row in near), None)
+        for crop in crops:
+            check_space(crop, 0 if crop.vector is None else len(crop.vector), model)
+        if not one:
+            return near, self._follow([row[2] for row in near], origin)
+        return near, self._along([row[_NEAR:] for row in rows], origin)
+
+    def _of_classes(self, crops: Sequence[Crop], named: Sequence[int]) -> "tuple[_Rows, _Along]":
+        """The same for crops of which only the class is known; ``named`` are their numbers."""
+        names = sorted({crops[number].class_name or "" for number in named})
+        values: dict[str, Any] = {
+            "patterns": [f'{{"class_name": {text(name)}}}' for name in names],
+            "objects": objects_of_a_class(crops),
+            "of_each": OBSERVATIONS_OF_EACH,
+        }
+        with _query_errors(self._targets.graph_url):
+            picked = self._graph.execute(_statement("of_classes"), values).fetchall()
+        det_pks = sorted({det_pk for _, det_pk in picked})
+        values = {"det_pks": det_pks, **self._known.parameters}
+        with _query_errors(self._targets.vector_url):
+            rows = self._vectors.execute(_statement("described"), values).fetchall()
+        found, origin = self._near(rows)
+        described = {row[2]: row[1:] for row in found}
+        along = self._follow(det_pks, origin)
+        by_class: dict[str, list[int]] = {}
+        for place, det_pk in picked:
+            by_class.setdefault(names[place - 1], []).append(det_pk)
+        near = [
+            (number, *described[det_pk])
+            for number in named
+            for det_pk in by_class.get(crops[number].class_name or "", ())
+            if det_pk in described
+        ]
+        return near, along
+
+    def _near(self, rows: _Rows) -> tuple[_Rows, str | None]:
+        """Learn the cosines; the rows from ``crop`` on that have an observation, and the origin."""
+        cosines, origin = next((row[0] for row in rows if row[0] is not None), (None, None))
+        self._known = self._known.with_cosines(cosines)
+        return [row[1:_NEAR] for row in rows if row[3] is not None], origin
+
+    def _follow(self, det_pks: Iterable[int], origin: str | None) -> "_Along":
+        """Object and Places of observations; ``origin`` is that of the vectors."""
+        values = {"det_pks": sorted(set(det_pks)), "observation": LABEL_IDS["Observation"]}
+        with _query_errors(self._targets.graph_url):
+            rows = self._graph.execute(_statement("graph"), values | self._known.parameters)
+            return self._along(rows.fetchall(), origin)
+
+    def _along(self, rows: _Rows, origin: str | None) -> "_Along":
+        """Learn the settings and check the origin."""
+        settings, graph = next((row[0] for row in rows if row[0] is not None), (None, None))
+        if graph != origin or settings is not None:
+            place = describe_target(self._targets.graph_url)
+            refuse_mixed(origin, graph, describe_target(self._targets.vector_url), place)
+            self._known = self._known.with_settings(settings, place)
+        return _Along.of(rows)
+
+    def _class_names(self) -> list[str]:
+        with _query_errors(self._targets.graph_url):
+            rows = self._graph.execute(_statement("class_names")).fetchall()
+        return [json.loads(row[0]) for row in rows if row[0] is not None]
+
+
+@lru_cache(maxsize=128)
+def _statement(name: str, crops: int = 0) -> sql.Composed:
+    """``crops`` is the number of those that are searched for, in the statements that search."""
+    rows = [
+        sql.SQL("({}::int, {}::vector)").format(sql.Literal(i), sql.Placeholder(f"crop_{i}"))
+        for i in range(crops)
+    ]
+    none = sql.SQL("SELECT 0, NULL::vector WHERE false")
+    questions = sql.SQL("VALUES {}").format(sql.SQL(", ").join(rows)) if rows else none
+    run = statements("relocalize")
+    return run[name].format(
+        questions=questions,
+        of_vectors=run["of_vectors"].format(cosines=run["cosines"]),
+        of_graph=run["of_graph"].format(settings=run["settings"]),
+        observed=run["observed"],
+        along=run["along"],
+        followed=run["followed"].format(**tables()),
+        **tables(),
+    )
+
+
+class _Thing(NamedTuple):
+    object_id: str
+    class_name: str
+    stand: Stand | None
+
+
+_NO_THING: Final = (None, None, None)
+
+
+class _Along(NamedTuple):
+    """Ids of Object, its Place and the keyframe's Place by det_pk; and what is at these ids."""
+
+    ids: dict[int, tuple[str | None, str | None, str | None]]
+    things: dict[str | None, _Thing]
+    places: dict[str | None, tuple[PlaceOrdinal, CandidatePlace]]
+
+    @classmethod
+    def of(cls, rows: Sequence[tuple[Any, ...]]) -> "_Along":
+        """Of rows of the statement ``graph``."""
+        found = cls({}, {}, {})
+        for _, det_pk, thing, thing_is, its, its_is, there, there_is in rows:
+            if det_pk is not None:
+                found.ids[det_pk] = thing, its, there
+            if thing_is is not None:
+                found.things[thing] = _thing(thing_is)
+            for place, place_is in ((its, its_is), (there, there_is)):
+                if place_is is not None:
+                    found.places[place] = _ordinal(place), _place(place_is)
+        return found
+
+    def and_more(self, more: "_Along") -> "_Along":
+        """With those of ``more``."""
+        return _Along(self.ids | more.ids, self.things | more.things, self.places | more.places)
+
+
+def _assemble(crops: int, near: _Rows, along: _Along, known: KnownConstants) -> Candidates:
+    matches: list[list[Match]] = [[] for _ in range(crops)]
+    ordinals: dict[str | None, PlaceOrdinal | None] = {
+        place: ordinal for place, (ordinal, _) in along.places.items()
+    }
+    ordinals[None] = None
+    for crop, similarity, det_pk, det_id, run_id, class_name, bbox, x, y, yaw, _ in near:
+        thing_id, its, there = along.ids.get(det_pk, _NO_THING)
+        thing = along.things.get(thing_id)
+        matches[crop].append(
+            Match(
+                ObservationOrdinal(det_pk - 1),
+                det_id,
+                run_id,
+                float(similarity),
+                None if x is None else (x, y, yaw),
+                tuple(bbox),
+                class_name if thing is None else thing.class_name,
+                None if thing is None else thing.object_id,
+                ordinals[its],
+                ordinals[there],
+                None if thing is None else thing.stand,
+            )
+        )
+    ordered = (tuple(sorted(row, key=lambda m: (-m.similarity, m.observation))) for row in matches)
+    return Candidates(tuple(ordered), dict(along.places.values()), known.constants)
+
+
+def _thing(properties: str) -> _Thing:
+    """Without a stand under the page's rule, and for a map of an older version, which has no
+    covariance."""
+    found = json.loads(properties)
+    stand = None
+    if "est_xx" in found:
+        stand = Stand(*(found[f"est_{name}"] for name in ("x", "y", "xx", "xy", "yy", "spots")))
+    return _Thing(found["object_id"], found["class_name"], stand)
+
+
+def _place(properties: str) -> CandidatePlace:
+    found = json.loads(properties)
+    return CandidatePlace(
+        found["place_id"],
+        found["centroid_x"],
+        found["centroid_y"],
+        found.get("name"),
+        found.get("floor"),
+    )
+
+
+def _ordinal(graphid: str) -> PlaceOrdinal:
+    return PlaceOrdinal((int(graphid) & _NUMBER_MASK) - 1)
+
+
+@contextlib.contextmanager
+def _query_errors(url: str) -> Iterator[None]:
+    """Errors of a question that does not fit the map, or of a database without a map."""
+    with database_errors(url):
+        try:
+            yield
+        except (psycopg.errors.UndefinedTable, psycopg.errors.InvalidSchemaName):
+            raise ProjectionMissing(
+                f"{describe_target(url)}: nothing has been projected there yet; run mapfold replay"
+            ) from None
+        except psycopg.errors.DataException as error:
+            raise QuestionError(
+                f"the question does not fit the map: {error.diag.message_primary}; ask with the"
+                " model that made the map"
+            ) from None

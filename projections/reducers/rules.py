@@ -1,0 +1,33 @@
+"""The reducers that a map's settings and commands ask for."""
+
+from eventsrc.envelope import DetId
+from projections.corrections import Keyframe
+from projections.exact import metres_to_um
+from projections.pair_groups import PairGroups
+from projections.settings import Settings
+
+from .constrained_landmarks import ConstrainedLandmarks
+from .constrained_places import ConstrainedPlaces
+from .core_index import CoreIndex
+from .evidence_fusion import EvidenceFusion
+from .landmarks import Landmarks
+from .places import Places
+from .rooms import Rooms
+
+
+def places_by(settings: Settings, groups: PairGroups[Keyframe]) -> Places | Rooms:
+    """The reducer of places; ``groups`` are the keyframes that commands name."""
+    if settings.places == "rooms":
+        rooms = settings.rooms
+        return Rooms(metres_to_um(rooms.cell_m), metres_to_um(rooms.drive_m), groups)
+    core_index = CoreIndex(metres_to_um(settings.eps_m), settings.min_samples)
+    return ConstrainedPlaces(core_index, groups) if groups.group_of else Places(core_index)
+
+
+def landmarks_by(settings: Settings, named: PairGroups[DetId]) -> Landmarks | EvidenceFusion:
+    """The reducer of landmarks; ``named`` are the detections that commands name."""
+    groups = named if named.group_of else None
+    if settings.fusion == "evidence":
+        return EvidenceFusion(settings.evidence, groups)
+    limits = settings.fusion_radius_m, settings.fusion_similarity
+    return Landmarks(*limits) if groups is None else ConstrainedLandmarks(*limits, groups)

@@ -1,0 +1,89 @@
+"""How sure an answer is: `known`, whether the map has the things shown, and `confidence`, whether
+the pose is within 1.5 m.
+
+Both are logistic models. What they are computed from depends neither on the embedding model nor on
+the size of the map: likenesses are relative, (cosine - different) / (1 - different), 0 for what
+different things of this map look like to each other and 1 for the same picture. A thing seen again
+on another day has some 0.75, the most similar of a building that was never mapped 0.2 to 0.4, or
+0.7 where it has furniture of the same model.
+
+The weights are for all maps; `scripts/fit_confidence` fits them. How far a map is off is in its
+`LocalizerConstants`: a shift and a scale of the logit, which `mapfold calibrate` reads off the
+map's own questions.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+from .candidates import Match
+from .constants import MapConstants
+from .question import Crop
+
+UNKNOWN_BELOW: Final = 0.5
+"""Below this probability of `known` the answer is 'unknown'."""
+KNOWN_WEIGHTS: Final[tuple[float, ...]] = (-15.095, 19.053, 4.775, 10.356, -1.612)
+"""Intercept, then one for each of `known_features`."""
+_NEAREST: Final = 4
+_LEAST: Final = 0.4
+"""Less alike is as good as not alike at all, in the means over the crops."""
+_NO_LOOK: Final = 0.5
+"""`known` of a question whose crops have no embedding: their classes are in the map."""
+
+
+def known_probability(
+    crops: Sequence[Crop], matches: Sequence[Sequence[Match]], constants: MapConstants
+) -> float:
+    """The probability that the map has one of the things shown; ``matches`` run parallel to
+    ``crops``, each row most similar first. 0 where nothing is similar to any crop."""
+    features = known_features(crops, matches, constants)
+    if features is None:
+        return _NO_LOOK if any(matches) else 0.0
+    localizer = constants.localizer
+    logit = logit_of(KNOWN_WEIGHTS, features)
+    return probability(corrected(logit, localizer.known_scale, localizer.known_shift))
+
+
+def known_features(
+    crops: Sequence[Crop], matches: Sequence[Sequence[Match]], constants: MapConstants
+) -> tuple[float, ...] | None:
+    """The greatest relative likeness of any crop to an observation, and the mean over the crops of
+    each one's greatest. Then of each crop's mean likeness to the four most similar: by how much the
+    mean over the crops is below the greatest, and the second greatest; both are 0 for one crop. In
+    all but the first a likeness counts as at least 0.4. None if no crop has an embedding and
+    matches."""
+    zero, localizer = constants.different, constants.localizer
+    best, mean = [], []
+    for crop, row in zip(crops, matches, strict=True):
+        if crop.vector is None or not row:
+            continue
+        shift = localizer.text_shift if crop.is_text else 0.0
+        likeness = [(m.similarity + shift - zero) / (1.0 - zero) for m in row[:_NEAREST]]
+        best.append(min(likeness[0], 1.0))
+        mean.append(min(math.fsum(likeness) / len(likeness), 1.0))
+    if not best:
+        return None
+    alike = sorted((max(each, _LEAST) for each in mean), reverse=True)
+    return (
+        max(best),
+        math.fsum(max(each, _LEAST) for each in best) / len(best),
+        math.fsum(alike) / len(alike) - alike[0],
+        alike[min(1, len(alike) - 1)] - alike[0],
+    )
+
+
+def logit_of(weights: Sequence[float], features: Sequence[float]) -> float:
+    """The intercept and the weighted features."""
+    return weights[0] + math.fsum(
+        weight * value for weight, value in zip(weights[1:], features, strict=True)
+    )
+
+
+def corrected(logit: float, scale: float, shift: float) -> float:
+    """A logit with a map's own correction."""
+    return scale * logit + shift
+
+
+def probability(logit: float) -> float:
+    """Between 0 and 1."""
+    return 1.0 / (1.0 + math.exp(-max(-40.0, min(40.0, logit))))

@@ -1,0 +1,101 @@
+"""Floors in re-localisation: poses one above the other are not near each other.
+
+Where candidates are of several floors, positions on each are laid out beside those on the others,
+`STEP_M` apart in x, before the ranking sees them; the pose of the answer is moved back and says
+which floor it is on. A match that is of no Place is on a floor of its own. With one floor nothing
+is moved.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from projections.deltas import PlaceOrdinal
+
+from .camera import Floats
+from .candidates import CandidatePlace, Candidates, Match, Stand
+from .pose import Posterior
+
+STEP_M = 1e8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hypotheses:
+    """Poses (n, 3) in the map frame with weights (n,) that add up to 1, likeliest first, and the
+    name of each one's floor."""
+
+    poses: Floats
+    weights: Floats
+    floors: tuple[str | None, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """``numbers`` are those of the floors with Places, by name; None has none."""
+
+    numbers: Mapping[str | None, int]
+
+    @classmethod
+    def of(cls, places: Mapping[PlaceOrdinal, CandidatePlace]) -> "Layout":
+        """The floors of these Places: those with a name by name, then that without."""
+        names = {place.floor for place in places.values()}
+        ordered: list[str | None] = [*sorted(name for name in names if name is not None)]
+        return cls({name: i for i, name in enumerate(ordered + [None] * (None in names))})
+
+    @property
+    def has_several(self) -> bool:
+        """Whether anything is moved."""
+        return len(self.numbers) > 1
+
+    def laid_out(self, candidates: Candidates) -> Candidates:
+        """The candidates with their positions laid out."""
+        if not self.has_several:
+            return candidates
+        rows = candidates.matches
+        moved = tuple(tuple(self._moved(m, candidates.places) for m in row) for row in rows)
+        return replace(candidates, matches=moved)
+
+    def floor_at(self, x: float) -> str | None:
+        """The floor of a laid out position; None where it has no name."""
+        number = round(x / STEP_M) if self.has_several else 0
+        return next((name for name, each in self.numbers.items() if each == number), None)
+
+    def put_back(self, x: float) -> float:
+        """A laid out x as it is on its floor."""
+        return x - round(x / STEP_M) * STEP_M if self.has_several else x
+
+    def spread_m(self, posterior: Posterior) -> float:
+        """The root mean square distance of the poses on the answer's floor from it."""
+        if not self.has_several:
+            return posterior.spread_m
+        dx, dy = posterior.poses[:, 0] - posterior.x, posterior.poses[:, 1] - posterior.y
+        weights = posterior.weights * (np.abs(dx) < STEP_M / 2)
+        return math.sqrt(float(weights @ (dx * dx + dy * dy)) / float(weights.sum()))
+
+    def hypotheses(self, posterior: Posterior) -> Hypotheses:
+        """The poses of a posterior, as they are on their floors."""
+        if not self.has_several:
+            floor = next(iter(self.numbers), None)
+            return Hypotheses(posterior.poses, posterior.weights, (floor,) * len(posterior.poses))
+        poses = posterior.poses.copy()
+        floors = tuple(self.floor_at(x) for x in poses[:, 0].tolist())
+        poses[:, 0] -= np.round(poses[:, 0] / STEP_M) * STEP_M
+        return Hypotheses(poses, posterior.weights, floors)
+
+    def _moved(self, match: Match, places: Mapping[PlaceOrdinal, CandidatePlace]) -> Match:
+        place = match.object_place if match.keyframe_place is None else match.keyframe_place
+        number = len(self.numbers) if place is None else self.numbers[places[place].floor]
+        if not number:
+            return match
+        dx, pose, stand = number * STEP_M, match.pose, match.object_stand
+        return replace(
+            match,
+            pose=None if pose is None else (pose[0] + dx, pose[1], pose[2]),
+            object_stand=None if stand is None else _stand(stand, dx),
+        )
+
+
+def _stand(stand: Stand, dx: float) -> Stand:
+    return replace(stand, x=stand.x + dx)

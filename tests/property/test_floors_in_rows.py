@@ -1,0 +1,78 @@
+"""Rows of the graph of a building with floors: what the view says, in batches and rebuilt."""
+
+import json
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from eventsrc.log import LogReader
+from projections.database.memory_sink import MemoryTables
+from projections.model.fold import fold_log
+from projections.model.view import MapView
+from projections.settings import Settings
+from tests.live_rows import followed_and_rebuilt
+from tests.logs import write_log
+from tests.property.test_floors import buildings, drive
+from tests.rows import ORDER, expected_graph
+
+
+def parsed(tables: MemoryTables) -> dict[str, list[tuple[Any, ...]]]:
+    """The rows as `expected_graph` writes them."""
+    return {
+        label: [
+            (*map(str, row[:-1]), json.loads(row[-1]))
+            for _, row in sorted(tables.graph[label].items())  # type: ignore[index]
+        ]
+        for label in ORDER
+    }
+
+
+@given(building=buildings(), size=st.integers(1, 9))
+def test_batches_and_a_rebuild_have_the_rows_of_the_view(
+    building: tuple[dict[str, Any], list[dict[str, Any]]], size: int
+) -> None:
+    raw, documents = building
+    settings = Settings(**raw)
+    with TemporaryDirectory() as folder:
+        log = write_log(Path(folder) / "log", documents)
+        live, anew = followed_and_rebuilt(log, settings, size)
+        with LogReader(log) as reader:
+            view = fold_log(reader, settings)[1]
+    assert live.graph == anew.graph
+    assert parsed(live) == expected_graph(view)
+
+
+def graph_of(tmp_path: Path, *floors: dict[str, Any]) -> tuple[MapView, Any]:
+    log = write_log(tmp_path / "log", drive(*floors))
+    with LogReader(log) as reader:
+        view = fold_log(reader, Settings())[1]
+    return view, parsed(followed_and_rebuilt(log, Settings(), 4)[0])
+
+
+def test_places_are_part_of_their_floor_and_floors_of_the_building(tmp_path: Path) -> None:
+    _, rows = graph_of(tmp_path, {"floor": "ground"}, {"map_z": 3.1})
+    (building,) = rows["Building"]
+    names = {row[0]: row[1]["floor"] for row in rows["Floor"]}
+    places = {row[0]: row[1]["floor"] for row in rows["Place"]}
+    assert sorted(names.values()) == ["1", "ground"]
+    assert {(places.get(a, "a floor"), names.get(b, b)) for _, a, b, _ in rows["PART_OF"]} == {
+        ("ground", "ground"),
+        ("1", "1"),
+        ("a floor", building[0]),
+    }
+    ((*_, edge),) = rows["ADJACENT_TO"]
+    assert edge == {"shared_transitions": 1, "between_floors": True}
+    assert {row[1]["floor"] for row in rows["Pose"]} == {"1", "ground"}
+
+
+def test_without_floors_places_are_part_of_the_building_and_say_no_floor(tmp_path: Path) -> None:
+    _, rows = graph_of(tmp_path, {})
+    assert rows["Floor"] == []
+    assert [row[1:] for row in rows["PART_OF"]] == [
+        (rows["Place"][0][0], rows["Building"][0][0], {})
+    ]
+    assert "floor" not in rows["Place"][0][1]
+    assert all("floor" not in row[1] for row in rows["Pose"])

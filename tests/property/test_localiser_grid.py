@@ -1,0 +1,85 @@
+"""Grids of positions against distances taken one by one."""
+
+import math
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from projections.relocalize.appearance import DIRECTIONS
+from projections.relocalize.grid import cells_near, distinct, likely_spots
+from projections.relocalize.landmarks import Cue, Landmarks
+
+_METRES = st.floats(-8.0, 8.0)
+_POINTS = st.lists(st.tuples(_METRES, _METRES), min_size=1, max_size=8)
+_NOTHING = Cue(np.zeros(1), np.zeros(1), np.zeros(1), np.zeros(1))
+
+
+def landmarks(looks: list[float], spots: list[list[tuple[float, float]]]) -> Landmarks:
+    """Landmarks with these ratios by looks, seen from these positions."""
+    count = len(looks)
+    starts = np.cumsum([0, *(len(each) for each in spots[:-1])])
+    return Landmarks(
+        np.zeros((count, 2)),
+        np.zeros((count, 3)),
+        np.repeat(np.array(looks)[:, None], DIRECTIONS, axis=1),
+        _NOTHING,
+        (_NOTHING, _NOTHING),
+        np.array([spot for each in spots for spot in each]),
+        starts,
+        np.zeros(count),
+    )
+
+
+@given(_POINTS, st.floats(0.2, 2.0))
+def test_every_position_within_reach_is_in_a_cell_and_no_cell_is_far(
+    points: list[tuple[float, float]], reach: float
+) -> None:
+    cells = cells_near(np.array(points), 0.7, reach)
+    keys = {(round(x / 0.7), round(y / 0.7)) for x, y in cells.tolist()}
+    assert len(keys) == len(cells)
+    for x, y in points:
+        for turn in range(8):
+            there = x + 0.7 * reach * math.cos(turn), y + 0.7 * reach * math.sin(turn)
+            nearest = min(math.dist(there, cell) for cell in cells.tolist())
+            assert nearest <= 0.7  # half a cell's diagonal, and what the points are rounded by
+    for cell in cells.tolist():
+        assert min(math.dist(cell, point) for point in points) <= reach + 0.85
+
+
+@given(_POINTS)
+def test_points_in_one_square_count_once(points: list[tuple[float, float]]) -> None:
+    found = distinct(np.array(points), 0.175)
+    expected = {(round(x / 0.175), round(y / 0.175)) for x, y in points}
+    assert {(round(x / 0.175), round(y / 0.175)) for x, y in found.tolist()} == expected
+    assert len(found) == len(expected)
+
+
+def test_few_crops_are_looked_for_at_all_their_landmarks() -> None:
+    spots = [[(float(10 * k), 0.0)] for k in range(10)]
+    marks = landmarks([1.0 + k for k in range(10)], spots)
+    assert len(likely_spots([marks] * 3, 0.175)) == 10
+
+
+def test_of_many_crops_each_is_looked_for_at_its_best_landmarks() -> None:
+    many = []
+    for crop in range(20):
+        spots = [[(10.0 * k, 100.0 * crop)] for k in range(10)]
+        many.append(landmarks([float(k != crop % 10) + 0.1 * k for k in range(10)], spots))
+    found = {(round(x), round(y)) for x, y in likely_spots(many, 0.175).tolist()}
+    assert len(found) == 3 * 20
+    for crop in range(20):
+        best = 8 if crop % 10 == 9 else 9
+        assert any(abs(x - 10 * best) <= 1 and abs(y - 100 * crop) <= 1 for x, y in found)
+
+
+def test_landmarks_that_look_all_the_same_are_all_looked_for() -> None:
+    """A class has no best Object."""
+    many = [landmarks([4.0] * 30, [[(7.0 * k, 9.0 * c)] for k in range(30)]) for c in range(3)]
+    assert len(likely_spots(many, 0.175)) == 90
+
+
+def test_no_question_has_more_spots_than_six_hundred() -> None:
+    spots = [[(3.0 * k, 5.0 * each) for k in range(64)] for each in range(20)]
+    marks = landmarks([4.0] * 20, spots)
+    assert 300 <= len(likely_spots([marks], 0.175)) <= 600

@@ -1,0 +1,238 @@
+"""The likelihood of a crop at a pose against the same written out for one landmark and one pose."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from projections.evidence import EvidenceConstants
+from projections.relocalize import Camera, MapConstants
+from projections.relocalize.appearance import DIRECTIONS, appearance_tables
+from projections.relocalize.camera import Sights, sights
+from projections.relocalize.landmarks import CropEvidence, Cue, Landmarks
+from projections.relocalize.likelihood import Scene, log_likelihood, terms_at
+from projections.relocalize.model import MODEL, Model
+from tests.thorough import examples
+
+TURN = 2.0 * math.pi
+seeds = st.integers(0, 2**32 - 1)
+
+
+def random_crop(rng: np.random.Generator, count: int, camera: Camera) -> CropEvidence:
+    """A crop with ``count`` landmarks; some cues are missing, some boxes cut or absent."""
+
+    def cue(scale: float) -> Cue:
+        variance = np.where(rng.random(count) < 0.25, math.inf, rng.uniform(0.01, 0.2, count))
+        gradients = rng.normal(0, 0.3, (2, count))
+        return Cue(rng.normal(0, scale, count), gradients[0], gradients[1], variance)
+
+    root = rng.normal(0, 0.4, (count, 2, 2))
+    spread = root @ root.transpose(0, 2, 1) + 0.01 * np.eye(2)
+    counts = rng.integers(1, 4, count)
+    marks = Landmarks(
+        rng.uniform(-4, 4, (count, 2)),
+        np.stack((spread[:, 0, 0], spread[:, 0, 1], spread[:, 1, 1]), axis=1),
+        np.exp(rng.normal(0, 2, (count, DIRECTIONS))),
+        cue(0.5),
+        (cue(0.5), cue(0.5)),
+        rng.uniform(-4, 4, (int(counts.sum()), 2)),
+        np.cumsum([0, *counts[:-1].tolist()]),
+        rng.uniform(0, 1, count),
+    )
+    left, top = rng.uniform(0, 300), rng.uniform(0, 200)
+    box = (left, top, left + rng.uniform(5, 340), top + rng.uniform(5, 200))
+    if rng.random() < 0.3:
+        box = (0.0, *box[1:])
+    if rng.random() < 0.3:
+        box = (*box[:3], camera.height_px)
+    own = sights(camera, [None if rng.random() < 0.2 else box])
+    return CropEvidence(marks, float(own.bearing[0]) if own.known[0] else None, own)
+
+
+def slow(crop: CropEvidence, pose: np.ndarray, error: float, turn: float, scene: Scene) -> float:  # type: ignore[type-arg]
+    """The mixture at one pose."""
+    x, y, yaw = (float(v) for v in pose)
+    total = 0.0
+    marks, model = crop.landmarks, scene.model
+    ends = [*marks.starts[1:].tolist(), len(marks.seen_from)]
+    for i in range(len(marks.xy)):
+        points = marks.seen_from[int(marks.starts[i]) : ends[i]]
+        nearest = min((px - x) ** 2 + (py - y) ** 2 for px, py in points)
+        seen = math.exp(-0.5 * nearest / (model.seen_from_m**2 + error))
+        total += seen * fit_of(crop, i, (x, y, yaw), error, turn, scene)
+    return math.log(1 - model.in_map + model.in_map * model.share * total)
+
+
+def fit_of(
+    crop: CropEvidence,
+    i: int,
+    pose: tuple[float, float, float],
+    error: float,
+    turn: float,
+    scene: Scene,
+) -> float:
+    marks, model, evidence = crop.landmarks, scene.model, scene.constants.evidence
+    x, y, yaw = pose
+    dx, dy = float(marks.xy[i, 0]) - x, float(marks.xy[i, 1]) - y
+    reach = max(math.hypot(dx, dy), 0.3)
+    u = np.array([dx, dy]) / reach
+    xx, xy, yy = marks.spread[i]
+    covariance = np.array([[xx, xy], [xy, yy]])
+    pose2 = model.pose_m**2 + error
+    towards = math.atan2(dy, dx)
+    looked = towards
+    if evidence.side_by == "heading" and crop.bearing is not None:
+        looked -= crop.bearing
+    looks = float(
+        np.interp(
+            looked % TURN,
+            np.arange(DIRECTIONS + 1) * TURN / DIRECTIONS,
+            [*marks.ratios[i], marks.ratios[i][0]],
+        )
+    )
+    half = scene.camera.half_field_rad
+    near = reach < model.twice * evidence.range_m
+    if crop.bearing is None:
+        off = math.remainder(towards - yaw - scene.camera.yaw_rad, TURN)
+        usual = (math.log(reach) - math.log(evidence.range_m)) / evidence.range_spread
+        at_distance = math.exp(max(-0.5 * usual * usual, -6.0))
+        return looks * (abs(off) < half) * (at_distance + model.tail * near)
+    across = np.array([-u[1], u[0]])
+    sigma = evidence.bearing_cut_rad if crop.sight.cut[0] else evidence.bearing_rad
+    variance = (float(across @ covariance @ across) + pose2) / reach**2 + sigma**2 + turn
+    off = math.remainder(towards - yaw - crop.bearing, TURN)
+    bell = math.exp(-0.5 * min(off * off / variance, 40.0)) / math.sqrt(TURN * variance)
+    boxed = size_fit(crop, i, u, reach, covariance, pose2, model)
+    for edge in (0, 1):
+        if crop.sight.whole[edge, 0]:
+            boxed += edge_fit(crop, edge, i, u, reach, covariance, pose2, model)
+    in_front = near and abs(off) < half
+    return looks * (bell * 2.0 * half * math.exp(boxed) + model.tail * in_front)
+
+
+def log_normal(off: float, variance: float) -> float:
+    return -0.5 * off * off / variance - 0.5 * math.log(TURN * variance)
+
+
+def size_fit(crop, i, u, reach, covariance, pose2, model: Model) -> float:  # type: ignore[no-untyped-def]
+    cue, sight = crop.landmarks.size, crop.sight
+    if not math.isfinite(cue.variance[i]):
+        return 0.0
+    g = np.array([cue.by_x[i], cue.by_y[i]]) - u / reach
+    variance = float(g @ covariance @ g) + float(cue.variance[i]) + pose2 / reach**2
+    taller = float(cue.mean[i]) - float(sight.log_height[0]) - math.log(reach)
+    if not bool(sight.tall[0]):
+        return max(-0.5 * min(taller, 0.0) ** 2 / variance, -4.0)
+    ratio = log_normal(taller, variance) - log_normal(taller, variance + model.other_sizes**2)
+    return min(max(ratio, -6.0), 6.0)
+
+
+def edge_fit(crop, edge, i, u, reach, covariance, pose2, model: Model) -> float:  # type: ignore[no-untyped-def]
+    cue = crop.landmarks.edges[edge]
+    if not math.isfinite(cue.variance[i]):
+        return 0.0
+    expected = float(cue.mean[i]) / reach
+    g = (np.array([cue.by_x[i], cue.by_y[i]]) - expected * u) / reach
+    variance = float(g @ covariance @ g) + model.edge_rise**2
+    variance += (float(cue.variance[i]) + expected**2 * pose2) / reach**2
+    off = float(crop.sight.rise[edge, 0]) - expected
+    ratio = log_normal(off, variance) - log_normal(off, variance + model.other_rises**2)
+    return min(max(ratio, -4.0), 4.0)
+
+
+@given(seeds, st.integers(1, 5), st.sampled_from(["sight", "heading"]))
+@settings(max_examples=examples(60), deadline=None)
+def test_the_likelihood_is_that_written_out_for_each_landmark(
+    seed: int, count: int, side_by: str
+) -> None:
+    rng = np.random.default_rng(seed)
+    camera = Camera(yaw_rad=float(rng.choice([0.0, 0.4])))
+    evidence = EvidenceConstants.model_validate({"side_by": side_by})
+    scene = Scene(MapConstants(evidence=evidence), camera, MODEL)
+    crop = random_crop(rng, count, camera)
+    poses = np.column_stack((rng.uniform(-4, 4, (6, 2)), rng.uniform(-10, 10, 6)))
+    error, turn = float(rng.uniform(0, 0.1)), float(rng.uniform(0, 0.05))
+    terms = terms_at(crop, poses[:, :2], error, scene)
+    found = log_likelihood(crop, terms, poses[:, 2], turn, scene)
+    expected = [slow(crop, pose, error, turn, scene) for pose in poses]
+    assert found.tolist() == pytest.approx(expected, abs=1e-9)
+    assert min(found) >= math.log(1 - MODEL.in_map) - 1e-12
+
+
+def slow_table(
+    likeness: list[float], side: list[float], look: float, constants: MapConstants
+) -> tuple[float, float]:
+    """For one landmark and direction: which thing, which side before it is made a density."""
+    e, m = constants.evidence, MODEL
+    ratios, errors = [], []
+    for u, seen in zip(likeness, side, strict=True):
+        mean = e.same_back - e.session_shift
+        mean += e.same_side * math.exp(e.same_kappa * (math.cos(look - seen) - 1.0))
+        errors.append(u - mean)
+        same = max(-0.5 * (min(u - mean, 0.0) / e.same_spread) ** 2, -8.0)
+        spread = constants.different_spread / (1.0 - constants.different)
+
+        def density(z: float, width: float, e: EvidenceConstants = e) -> float:
+            return math.exp(-0.5 * min(z * z, 200.0)) * e.same_spread / width
+
+        different = m.look_alike * density(
+            min(u - mean + m.look_alike_below, 0.0) / e.same_spread, e.same_spread
+        )
+        different += m.of_class * density(
+            (u - e.same_class) / e.same_class_spread, e.same_class_spread
+        )
+        different += (1 - m.look_alike - m.of_class) * density(u / spread, spread)
+        ratios.append(same - math.log(different))
+    best = sorted(ratios, reverse=True)[: m.best_pairs]
+    which = (sum(best) - m.missing * (m.best_pairs - len(best))) / m.best_pairs
+    common = sum(errors) / len(errors)
+    scatter = sum((error - common) ** 2 for error in errors) / len(errors)
+    variance = max(e.same_spread, m.least_spread) ** 2
+    own, number = m.own_spread * variance, min(len(errors), m.independent)
+    return which, -0.5 * (scatter * number / own + common**2 / (variance - own + own / number))
+
+
+@given(seeds, st.lists(st.integers(1, 9), min_size=1, max_size=4))
+@settings(max_examples=examples(40), deadline=None)
+def test_looks_are_those_written_out_for_each_observation(seed: int, counts: list[int]) -> None:
+    rng = np.random.default_rng(seed)
+    constants = MapConstants(different=0.4)
+    total = sum(counts)
+    likeness = np.round(rng.uniform(-0.2, 0.95, total) * 128) / 128  # steps of the table
+    side = rng.uniform(-math.pi, math.pi, total)
+    starts = np.cumsum([0, *counts[:-1]])
+    tables = appearance_tables(likeness, side, starts, constants, MODEL)
+    for row, (start, count) in enumerate(zip(starts.tolist(), counts, strict=True)):
+        part = slice(start, start + count)
+        both = [
+            slow_table(
+                likeness[part].tolist(), side[part].tolist(), k * TURN / DIRECTIONS, constants
+            )
+            for k in range(DIRECTIONS)
+        ]
+        fits = [max(fit - max(f for _, f in both), -8.0) for _, fit in both]
+        mean = math.log(sum(math.exp(f) for f in fits) / DIRECTIONS)
+        expected = [
+            min(which + MODEL.side_weight * (fit - mean), MODEL.most)
+            for (which, _), fit in zip(both, fits, strict=True)
+        ]
+        # The table's cosines of the change of side are rounded to 1/16.
+        assert tables[row].tolist() == pytest.approx(expected, abs=0.4)
+        assert float(np.mean(np.abs(tables[row] - expected))) < 0.1
+
+
+@given(
+    st.lists(
+        st.none() | st.tuples(*[st.floats(allow_nan=False, allow_infinity=False)] * 4),
+        min_size=1,
+        max_size=4,
+    )
+)
+def test_whatever_a_box_holds_its_sights_are_finite(boxes: list[tuple[float, ...] | None]) -> None:
+    found: Sights = sights(Camera(), boxes)  # type: ignore[arg-type]
+    for values in (found.bearing, found.log_height, found.rise):
+        assert np.isfinite(values).all()
+    assert (np.abs(found.bearing) < math.pi / 2).all()
+    assert not (found.whole & ~found.known).any()

@@ -1,0 +1,149 @@
+"""Small scenes for the localiser: things on a plane, mapped views of them, a question, candidates.
+
+No embeddings: a match's cosine is made from whether it shows the same thing and from the change of
+side, as `projections.evidence` describes it.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from projections.evidence import EvidenceConstants
+from projections.relocalize import (
+    Camera,
+    Candidates,
+    Crop,
+    MapConstants,
+    Match,
+    Question,
+    Stand,
+    View,
+)
+from projections.relocalize.question import Box
+
+Pose = tuple[float, float, float]
+EVIDENCE = EvidenceConstants(range_m=2.5)
+CONSTANTS = MapConstants(evidence=EVIDENCE, different=0.5, different_spread=0.06)
+UP_M = 0.4
+"""The camera's height."""
+FARTHEST_M = 5.0
+"""Farther things are not detected."""
+
+
+@dataclass(frozen=True)
+class Thing:
+    """Where it stands, how tall it is from the ground, and what it is called."""
+
+    x: float
+    y: float
+    tall_m: float = 1.0
+    name: str = "chair"
+
+
+def box_of(thing: Thing, pose: Pose, camera: Camera) -> Box | None:
+    """What an upright line of the thing's height gives; None if it is not in the picture."""
+    dx, dy = thing.x - pose[0], thing.y - pose[1]
+    ahead = math.cos(pose[2]) * dx + math.sin(pose[2]) * dy
+    left = math.cos(pose[2]) * dy - math.sin(pose[2]) * dx
+    if not 0.3 < ahead < FARTHEST_M:
+        return None
+    middle = camera.width_px / 2 - camera.focal_px * left / ahead
+    if not 0.0 < middle < camera.width_px:
+        return None
+    half = 0.2 * camera.focal_px / ahead
+    rise = camera.focal_px / ahead
+    return (
+        max(0.0, middle - half),
+        max(0.0, camera.height_px / 2 - (thing.tall_m - UP_M) * rise),
+        min(camera.width_px, middle + half),
+        min(camera.height_px, camera.height_px / 2 + UP_M * rise),
+    )
+
+
+def cosine(constants: MapConstants, likeness: float) -> float:
+    """The cosine of a relative likeness."""
+    return constants.different + likeness * (1.0 - constants.different)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Things, the poses that the map was made from, and the constants of the map."""
+
+    things: Sequence[Thing]
+    poses: Sequence[Pose]
+    constants: MapConstants = CONSTANTS
+    camera: Camera = field(default_factory=Camera)
+    has_estimates: bool = True
+
+    def match(self, number: int, index: int, pose: Pose, likeness: float) -> Match | None:
+        """Thing ``index`` as mapped from a pose; None if it was not in view."""
+        thing = self.things[index]
+        box = box_of(thing, pose, self.camera)
+        if box is None:
+            return None
+        stand = Stand(thing.x, thing.y, 0.02, 0.0, 0.02, 3) if self.has_estimates else None
+        similarity = cosine(self.constants, likeness)
+        return Match(
+            number, f"d{number}", "mapped", similarity, pose, box, thing.name, f"o{index}",
+            object_stand=stand,
+        )  # fmt: skip
+
+    def row(
+        self, shown: int | None, at: Pose, noise: float = 0.0, seed: int = 0
+    ) -> tuple[Match, ...]:
+        """The matches of a crop that shows thing ``shown`` from ``at``, most similar first."""
+        rng = np.random.default_rng(seed)
+        evidence, found = self.constants.evidence, []
+        for index in range(len(self.things)):
+            for place, pose in enumerate(self.poses):
+                thing = self.things[index]
+                mapped = math.atan2(thing.y - pose[1], thing.x - pose[0])
+                asked = math.atan2(thing.y - at[1], thing.x - at[0])
+                side = math.exp(evidence.same_kappa * (math.cos(mapped - asked) - 1.0))
+                likeness = evidence.same_back + evidence.same_side * side - evidence.session_shift
+                if index != shown:
+                    likeness = 0.3 if shown is not None else 0.1
+                number = index * len(self.poses) + place
+                match = self.match(number, index, pose, likeness + noise * rng.standard_normal())
+                if match is not None:
+                    found.append(match)
+        return tuple(sorted(found, key=lambda m: (-m.similarity, m.observation)))
+
+    def crop(self, shown: int, at: Pose, *, boxed: bool = True) -> Crop:
+        """Thing ``shown`` as seen from ``at``. The vector only tells crops apart."""
+        box = box_of(self.things[shown], at, self.camera) if boxed else None
+        vector = np.full(4, shown, dtype=np.float32)
+        return Crop(vector, box, self.things[shown].name, f"crop-{shown}")
+
+    def in_view(self, at: Pose) -> list[int]:
+        """Things that a picture from a pose shows."""
+        return [i for i, thing in enumerate(self.things) if box_of(thing, at, self.camera)]
+
+    def ask(
+        self, ats: Sequence[tuple[Pose, Sequence[int]]], noise: float = 0.0, *, boxed: bool = True
+    ) -> tuple[Question, Candidates]:
+        """A question whose views show things from poses, with the movement between them."""
+        views, rows = [], []
+        for number, (at, shown) in enumerate(ats):
+            moved = (0.0, 0.0, 0.0) if number == 0 else movement(ats[number - 1][0], at)
+            views.append(View(*moved, tuple(self.crop(i, at, boxed=boxed) for i in shown)))
+            rows += [self.row(i, at, noise, seed=i + 100 * number) for i in shown]
+        return Question(tuple(views)), Candidates(tuple(rows), {}, self.constants)
+
+
+def movement(before: Pose, after: Pose) -> Pose:
+    """Metres ahead and left in the first pose's frame, and the turn."""
+    dx, dy = after[0] - before[0], after[1] - before[1]
+    cos, sin = math.cos(before[2]), math.sin(before[2])
+    turn = math.remainder(after[2] - before[2], 2.0 * math.pi)
+    return cos * dx + sin * dy, cos * dy - sin * dx, turn
+
+
+def around(thing: Thing, count: int, far_m: float = 2.0, start: float = 0.0) -> list[Pose]:
+    """Poses on a circle about a thing that look at it."""
+    angles = [start + 2.0 * math.pi * k / count for k in range(count)]
+    return [
+        (thing.x + far_m * math.cos(a), thing.y + far_m * math.sin(a), a + math.pi) for a in angles
+    ]
