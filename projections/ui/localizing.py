@@ -24,7 +24,6 @@ from projections.errors import QuestionError
 from projections.model.fold import fold_log
 from projections.model.log_commands import read_corrections
 from projections.relocalize import Candidates, Crop, ExactIndex, Match, parse_question, rank
-
 from projections.relocalize.floors import Hypotheses
 
 from .log_map import LogMap

@@ -9,6 +9,7 @@ from projections.settings import Settings
 
 from .log_map import MOST_ALTERNATIVES, MOST_HISTORIES, LogMap
 from .opened import Opened
+from .walls import wall_segments
 
 _KIB: Final = 1 if sys.platform == "darwin" else 1024
 """What ``ru_maxrss`` counts in."""
@@ -37,6 +38,7 @@ def log_document(opened: Opened, shown: LogMap, *, folded: bool = True) -> dict[
         "token_needed": opened.token_needed,
         "losses": sum(each.get("count") or 0 for each in own if each["kind"] == "loss"),
         "rejected": sum(each["kind"] == "rejected" for each in own),
+        "walls": _walls(shown) if folded else [],
         "problems": shown.problems if folded else [],
     }
 
@@ -50,6 +52,12 @@ def memory_document() -> dict[str, Any]:
         "most_maps": most,
         "text": f"{peak / 2**20:,.0f} MiB at most so far; at most {most} maps are kept",
     }
+
+
+def _walls(shown: LogMap) -> list[list[float]]:
+    """Those of the occupancy map in force at the end of the log."""
+    maps = shown.timeline.history.maps
+    return wall_segments(maps[-1].map) if maps else []
 
 
 def _runs(shown: LogMap) -> list[dict[str, Any]]:
