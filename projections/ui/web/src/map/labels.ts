@@ -123,10 +123,8 @@ const NUDGES: readonly (readonly [number, number])[] = [
 
 function draw(on: Surface, scene: Scene, wanted: Wanted, taken: Box[]) {
   if (!(wanted.x > -20 && wanted.y > -20 && wanted.x < scene.width + 20 && wanted.y < scene.height + 20)) return;
-  on.font = wanted.font;
-  const main = on.measureText(wanted.text).width;
-  on.font = SMALL_FONT;
-  const second = wanted.second === undefined ? 0 : on.measureText(wanted.second).width + 6;
+  const main = widthOf(on, wanted.font, wanted.text);
+  const second = wanted.second === undefined ? 0 : widthOf(on, SMALL_FONT, wanted.second) + 6;
   const width = main + second + (wanted.chip === undefined ? 4 : 24);
   const height = wanted.chip === undefined ? 15 : 21;
   const spots = candidates(wanted, width, height, scene.width);
@@ -139,6 +137,22 @@ function draw(on: Surface, scene: Scene, wanted: Wanted, taken: Box[]) {
   if (box === undefined) return;
   taken.push(box);
   write(on, scene, wanted, box, main);
+}
+
+const widths = new Map<string, number>();
+const MOST_WIDTHS = 5000;
+
+/** Measured once: while dragging the same texts are asked for again and again. */
+function widthOf(on: Surface, font: string, text: string): number {
+  const key = `${font} ${text}`;
+  let width = widths.get(key);
+  if (width === undefined) {
+    if (widths.size >= MOST_WIDTHS) widths.clear();
+    on.font = font;
+    width = on.measureText(text).width;
+    widths.set(key, width);
+  }
+  return width;
 }
 
 function candidates({ x, y, away }: Wanted, width: number, height: number, most: number): Box[] {
