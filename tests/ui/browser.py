@@ -46,3 +46,27 @@ def opened(page: Page, url: str) -> Page:
     page.goto(url)
     page.wait_for_selector("html[data-painted]", timeout=WAIT_MS)
     return page
+
+
+def pixels(page: Page, side: str = "main") -> str:
+    """What a map's canvas shows, without what lies over it, when drawing has rested."""
+    drawn = "side => document.querySelector(`canvas[data-side=${side}]`).toDataURL()"
+    before = ""
+    while (now := str(page.evaluate(drawn, side))) != before:
+        before = now
+        page.wait_for_timeout(150)
+    return now
+
+
+def point_over(page: Page, name: str) -> tuple[float, float]:
+    """A point of the window where the pointer is over the thing of this name."""
+    box = page.locator("canvas.map").bounding_box()
+    assert box is not None
+    for share in (0.44, 0.5, 0.38, 0.6):
+        for x in range(40, int(box["width"]) - 40, 12):
+            at = box["x"] + x, box["y"] + box["height"] * share
+            page.mouse.move(*at)
+            tip = page.locator(".tip .first")
+            if tip.count() and tip.inner_text().strip("\u2068\u2069") == name:
+                return at
+    raise AssertionError(f"{name} is nowhere under the pointer")

@@ -13,6 +13,7 @@ from playwright.sync_api import Page, expect
 from eventsrc.log import LogReader
 from tests.commands import Commands
 from tests.logs import append_raw
+from tests.ui.browser import point_over
 from tests.ui.conftest import SAMPLE, WIDE, Visit
 from tests.ui.test_moments import moment
 from tests.ui_server import UiServer, showing
@@ -39,9 +40,7 @@ def test_a_place_is_renamed_from_the_context_menu_and_the_name_undone(
 ) -> None:
     log, server = edited
     page = visit(server, "#panel=why")
-    box = page.locator("canvas.map").bounding_box()
-    assert box is not None
-    page.mouse.click(box["x"] + box["width"] * 0.72, box["y"] + box["height"] * 0.4, button="right")
+    page.mouse.click(*point_over(page, "sim-7-a_p6"), button="right")
     page.get_by_role("menuitem", name="Rename this place").click()
     page.get_by_role("textbox", name="Name").fill("<b>guests</b>")
     record(page, "a bed for guests")
@@ -110,8 +109,8 @@ def test_a_growing_log_is_followed_and_a_moment_kept(
         append_raw(log, payload)
     with showing(mapfold, log, *WIDE) as server:
         page = visit(server)
-        page.get_by_role("button", name="Live").click()
         expect(page.locator(".facts")).to_contain_text("100 keyframes")
+        expect(page.get_by_role("button", name="Live")).to_have_attribute("aria-pressed", "true")
         for payload in payloads[100:180]:
             append_raw(log, payload)
         expect(page.locator(".facts")).to_contain_text("180 keyframes")

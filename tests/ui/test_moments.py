@@ -8,6 +8,7 @@ from playwright.sync_api import Page, expect
 
 from tests.commands import Commands
 from tests.thorough import rounds
+from tests.ui.browser import pixels, point_over
 from tests.ui.conftest import SAMPLE, WIDE, Visit
 from tests.ui_server import UiServer
 
@@ -62,40 +63,35 @@ def test_hovering_tells_what_is_there_and_a_click_selects_it(
     sample: UiServer, visit: Visit
 ) -> None:
     page = visit(sample)
-    canvas = page.locator("canvas.map")
-    box = canvas.bounding_box()
-    assert box is not None
-    found: dict[str, int] = {}
-    for x in range(40, int(box["width"]) - 40, 12):
-        canvas.hover(position={"x": x, "y": int(box["height"] * 0.44)})
-        if page.locator(".tip").count():
-            first = page.locator(".tip").inner_text().split("\n")[0]
-            found[first.strip("\u2068\u2069")] = x
-    assert {"sim-7-a_p0", "sim-7-a_p6"} <= set(found)
-    canvas.click(position={"x": found["sim-7-a_p6"], "y": int(box["height"] * 0.44)})
+    plain = pixels(page)
+    at = point_over(page, "sim-7-a_p6")
+    assert pixels(page) != plain
+    page.mouse.click(*at)
     expect(page.locator(".thing h2")).to_have_text("sim-7-a_p6")
+    expect(page.locator(".facts-list")).to_contain_text("79")
 
 
 def test_zooming_and_panning_move_the_map_and_the_whole_map_comes_back(
     sample: UiServer, visit: Visit
 ) -> None:
     page = visit(sample)
-    whole = page.locator("canvas.map").screenshot()
+    whole = pixels(page)
     page.locator("canvas.map").hover(position={"x": 300, "y": 200})
     page.mouse.wheel(0, -600)
-    page.wait_for_timeout(100)
-    near = page.locator("canvas.map").screenshot()
+    page.mouse.move(2, 2)
+    near = pixels(page)
     assert near != whole
+    page.locator("canvas.map").hover(position={"x": 300, "y": 200})
     page.mouse.down()
     page.mouse.move(500, 300, steps=4)
     page.mouse.up()
-    page.wait_for_timeout(100)
-    assert page.locator("canvas.map").screenshot() not in (whole, near)
-    page.keyboard.press("Alt+ArrowLeft")
-    page.keyboard.press("f")
     page.mouse.move(2, 2)
-    page.wait_for_timeout(100)
-    assert page.locator("canvas.map").screenshot() == whole
+    panned = pixels(page)
+    assert panned not in (whole, near)
+    page.keyboard.press("Alt+ArrowLeft")
+    assert pixels(page) not in (whole, near, panned)
+    page.keyboard.press("f")
+    assert pixels(page) == whole
 
 
 def test_dragging_the_timeline_shows_each_moment_as_state_does(

@@ -10,6 +10,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from tests.commands import Commands
+from tests.ui.browser import pixels
 from tests.ui.conftest import SAMPLE, WIDE, Visit
 from tests.ui.test_moments import moment
 from tests.ui_server import UiServer, showing
@@ -49,16 +50,16 @@ def test_why_draws_the_bridge_of_a_merge_before_and_after(
     sample: UiServer, visit: Visit, mapfold: Commands
 ) -> None:
     page = visit(sample, "#at=349&panel=why")
-    plain = page.locator("canvas.map").screenshot()
+    plain = pixels(page)
     page.get_by_role("button", name="p0 ← p7").click()
     expect(page.locator(".summary")).to_have_text("sim-7-a_p0 absorbed sim-7-a_p7")
     minis = page.locator(".mini canvas")
     expect(minis).to_have_count(2)
-    assert minis.nth(0).screenshot() != minis.nth(1).screenshot()
+    drawn = [mini.evaluate("canvas => canvas.toDataURL()") for mini in minis.all()]
+    assert drawn[0] != drawn[1]
     expect(page.locator(".bridge figcaption")).to_contain_text("ε = 1 m")
     page.mouse.move(2, 2)
-    page.wait_for_timeout(150)
-    assert page.locator("canvas.map").screenshot() != plain
+    assert pixels(page) != plain
     said = mapfold("merges", SAMPLE, *WIDE, "--show", "2").out
     assert words(page.locator(".lines").inner_text()) == words(said)
 
@@ -66,11 +67,9 @@ def test_why_draws_the_bridge_of_a_merge_before_and_after(
 def test_comparing_two_moments_says_and_draws_what_changed(
     sample: UiServer, visit: Visit, mapfold: Commands
 ) -> None:
+    plain = pixels(visit(sample, "#at=349&panel=compare"))
     page = visit(sample, "#at=348&panel=compare")
     page.get_by_role("button", name="Take 348").click()
-    page.keyboard.press("Escape")
-    page.locator("canvas.map").focus()
-    plain = page.locator("canvas.map").screenshot()
     page.get_by_role("button", name="Next event").click()
     expect(page.locator(".changes")).to_contain_text("1 place gone")
     expect(page.locator(".changes")).to_contain_text("19 objects moved")
@@ -79,7 +78,7 @@ def test_comparing_two_moments_says_and_draws_what_changed(
     )
     expect(page.locator(".lines")).to_contain_text("digest 1a57d958a6bbab51 → 081f0c5b26250711")
     assert words(page.locator(".lines").inner_text()) == words(run_shown(page, mapfold, "--all"))
-    assert page.locator("canvas.map").screenshot() != plain
+    assert pixels(page) != plain
     page.get_by_role("button", name="Swap").click()
     assert moment(page) == 348
     expect(page.locator(".changes")).to_contain_text("1 new place")
@@ -97,13 +96,12 @@ def test_comparing_two_settings_shows_two_maps_with_one_view(
     expect(page.locator(".pane-title").nth(1)).to_contain_text("ε 0.75 m, 8 neighbours: 10 places")
     expect(page.locator(".panel")).to_contain_text("The places part ways at event 31")
     assert "places differ from offset 31 on" in run_shown(page, mapfold)
-    page.wait_for_timeout(200)
-    main, other = page.locator("canvas[data-side=main]"), page.locator("canvas[data-side=other]")
-    before = main.screenshot(), other.screenshot()
-    main.hover(position={"x": 100, "y": 200})
+    before = pixels(page), pixels(page, "other")
+    assert before[0] != before[1]
+    page.locator("canvas[data-side=main]").hover(position={"x": 100, "y": 200})
     page.mouse.wheel(0, -400)
-    page.wait_for_timeout(150)
-    after = main.screenshot(), other.screenshot()
+    page.mouse.move(2, 2)
+    after = pixels(page), pixels(page, "other")
     assert before[0] != after[0]
     assert before[1] != after[1]
     expect(page.locator("table")).to_contain_text("agreement of places (ARI)")
@@ -154,7 +152,7 @@ def two_runs(mapfold: Commands, tmp_path_factory: pytest.TempPathFactory) -> Ite
 
 def test_a_lost_robot_is_found_by_the_map_before_its_run(two_runs: UiServer, visit: Visit) -> None:
     page = visit(two_runs, "#panel=lost")
-    plain = page.locator("canvas.map").screenshot()
+    plain = pixels(visit(two_runs, "#at=445&panel=lost"))
     keyframe, question = _question(two_runs)
     page.get_by_label("A keyframe whose crops").fill(keyframe)
     page.get_by_role("button", name="Where is it?").click()
@@ -165,8 +163,7 @@ def test_a_lost_robot_is_found_by_the_map_before_its_run(two_runs: UiServer, vis
     expect(page.locator(".ranked > li").first).to_contain_text(f"{found['places'][0]['score']:.3f}")
     expect(page.locator(".summary")).to_contain_text("The true pose is")
     page.mouse.move(2, 2)
-    page.wait_for_timeout(150)
-    assert page.locator("canvas.map").screenshot() != plain
+    assert pixels(page) != plain
 
 
 def _question(server: UiServer) -> tuple[str, Any]:

@@ -45,12 +45,21 @@ export function drawLabels(on: Surface, scene: Scene) {
 }
 
 /** Where an answer is drawn that labels must not cover. */
-function reserved({ bridge, lost, view }: Scene): Box[] {
+function reserved({ bridge, lost, difference, view }: Scene): Box[] {
   const spots = [
     ...(bridge?.chains.flatMap((chain) => chain.points) ?? []),
     ...(lost === null ? [] : [lost.pose, lost.truth, ...lost.evidence]),
   ];
-  return spots.flatMap((spot) => (spot === null ? [] : [{ x: screenX(view, spot.x) - 12, y: screenY(view, spot.y) - 24, width: 24, height: 48 }]));
+  const gone = difference === null ? [] : goneAt(difference).map(([x, y]) => ({ x: screenX(view, x) - 55, y: screenY(view, y) + 13, width: 110, height: 18 }));
+  const marked = spots.flatMap((spot) => (spot === null ? [] : [{ x: screenX(view, spot.x) - 12, y: screenY(view, spot.y) - 24, width: 24, height: 48 }]));
+  return [...marked, ...gone];
+}
+
+/** The middles, in metres, of places that a difference says are gone. */
+export function goneAt({ before, difference }: NonNullable<Scene["difference"]>): [number, number, number][] {
+  return [...difference.places]
+    .filter(([place, change]) => change === "gone" && before.standsAs[place] === place)
+    .map(([place]) => [before.x[place], before.y[place], place]);
 }
 
 function placeLabels(scene: Scene): Wanted[] {
@@ -114,13 +123,11 @@ const NUDGES: readonly (readonly [number, number])[] = [
 
 function draw(on: Surface, scene: Scene, wanted: Wanted, taken: Box[]) {
   if (!(wanted.x > -20 && wanted.y > -20 && wanted.x < scene.width + 20 && wanted.y < scene.height + 20)) return;
-  on.font = wanted.font;
-  const main = on.measureText(wanted.text).width;
-  on.font = SMALL_FONT;
-  const second = wanted.second === undefined ? 0 : on.measureText(wanted.second).width + 6;
+  const main = widthOf(on, wanted.font, wanted.text);
+  const second = wanted.second === undefined ? 0 : widthOf(on, SMALL_FONT, wanted.second) + 6;
   const width = main + second + (wanted.chip === undefined ? 4 : 24);
   const height = wanted.chip === undefined ? 15 : 21;
-  const spots = candidates(wanted, width, height);
+  const spots = candidates(wanted, width, height, scene.width);
   const free = spots.find(
     (box) =>
       box.x >= 2 && box.y >= 2 && box.x + width <= scene.width - 2 && box.y + height <= scene.height - 2 &&
@@ -132,9 +139,27 @@ function draw(on: Surface, scene: Scene, wanted: Wanted, taken: Box[]) {
   write(on, scene, wanted, box, main);
 }
 
-function candidates({ x, y, away }: Wanted, width: number, height: number): Box[] {
+const widths = new Map<string, number>();
+const MOST_WIDTHS = 5000;
+
+/** Measured once: while dragging the same texts are asked for again and again. */
+function widthOf(on: Surface, font: string, text: string): number {
+  const key = `${font} ${text}`;
+  let width = widths.get(key);
+  if (width === undefined) {
+    if (widths.size >= MOST_WIDTHS) widths.clear();
+    on.font = font;
+    width = on.measureText(text).width;
+    widths.set(key, width);
+  }
+  return width;
+}
+
+function candidates({ x, y, away }: Wanted, width: number, height: number, most: number): Box[] {
   if (away === 0) {
-    return NUDGES.map(([dx, dy]) => ({ x: x - width / 2 + dx, y: y - height / 2 + dy, width, height }));
+    // Near an edge of the picture the label stands inside it.
+    const inside = (left: number) => Math.max(3, Math.min(most - width - 3, left));
+    return NUDGES.map(([dx, dy]) => ({ x: inside(x - width / 2 + dx), y: y - height / 2 + dy, width, height }));
   }
   return DIRECTIONS.map(([dx, dy]) => ({
     x: x + dx * (away + width / 2) - width / 2,

@@ -1,8 +1,8 @@
 /** What an answer adds to the map: a difference, the bridge of a merge, where a lost robot may be. */
 
-import { isolated, label } from "../model/names";
+import { isolated, label, shortPlace } from "../model/names";
 import { drawArrow, dotRadius } from "./keyframes";
-import { type Box, FONT, overlap } from "./labels";
+import { type Box, FONT, goneAt, overlap } from "./labels";
 import { withAlpha } from "./palette";
 import type { Bridge, Scene } from "./scene";
 import type { Surface } from "./surface";
@@ -39,10 +39,14 @@ export function drawDifference(on: Surface, scene: Scene) {
     const colour = { new: palette.added, gone: palette.removed, moved: palette.moved }[change];
     badge(on, screenX(view, history.changes.x[shown]), screenY(view, history.changes.y[shown]), colour, change);
   }
-  for (const [place, change] of difference.places) {
-    if (change !== "gone") continue;
-    const map = before.standsAs[place] === place ? before : scene.map;
-    text(on, scene, screenX(view, map.x[place]), screenY(view, map.y[place]) + 22, `${isolated(label(history.placeIds[place]))} gone`, palette.removed);
+}
+
+/** Above the labels: the names of places that are gone. */
+export function drawGone(on: Surface, scene: Scene) {
+  if (scene.difference === null) return;
+  const { view, history, palette } = scene;
+  for (const [x, y, place] of goneAt(scene.difference)) {
+    text(on, scene, screenX(view, x), screenY(view, y) + 22, `${isolated(label(shortPlace(history, place)))} gone`, palette.removed);
   }
 }
 

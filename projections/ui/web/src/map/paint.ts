@@ -3,7 +3,7 @@
 import { drawGrid, drawRegions, drawWalls } from "./ground";
 import { drawKeyframes, drawRobot } from "./keyframes";
 import { drawLabels } from "./labels";
-import { drawBridge, drawDifference, drawLikely, drawLost } from "./overlays";
+import { drawBridge, drawDifference, drawGone, drawLikely, drawLost } from "./overlays";
 import type { Scene } from "./scene";
 import type { Surface } from "./surface";
 import { drawEdges, drawObjects } from "./things";
@@ -19,6 +19,7 @@ export function paint(on: Surface, scene: Scene) {
   drawDifference(on, scene);
   drawRobot(on, scene);
   if (scene.layers.labels) drawLabels(on, scene);
+  drawGone(on, scene);
   if (scene.bridge !== null) drawBridge(on, scene, scene.bridge);
   drawLost(on, scene);
 }

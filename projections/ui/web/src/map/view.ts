@@ -14,15 +14,15 @@ export const screenY = (view: View, y: number) => view.y - y * view.k;
 export const mapX = (view: View, x: number) => (x - view.x) / view.k;
 export const mapY = (view: View, y: number) => (view.y - y) / view.k;
 
-/** The view in which the bounds fill a canvas, leaving a margin in pixels. */
-export function fitted(bounds: Bounds, width: number, height: number, margin = 56): View {
+/** The view in which the bounds fill a canvas, leaving margins in pixels. */
+export function fitted(bounds: Bounds, width: number, height: number, margin = 40, top = 26): View {
   const w = Math.max(bounds.x1 - bounds.x0, 0.5) + 1.2;
   const h = Math.max(bounds.y1 - bounds.y0, 0.5) + 1.2;
-  const k = Math.max(1e-3, Math.min((width - 2 * margin) / w, (height - 2 * margin) / h));
+  const k = Math.max(1e-3, Math.min((width - 2 * margin) / w, (height - top - 2 * margin) / h));
   return {
     k,
     x: width / 2 - (k * (bounds.x0 + bounds.x1)) / 2,
-    y: height / 2 + (k * (bounds.y0 + bounds.y1)) / 2,
+    y: (height + top) / 2 + (k * (bounds.y0 + bounds.y1)) / 2,
   };
 }
 

@@ -61,7 +61,8 @@ export function objectClass(history: History, map: MapState, object: number): st
   return row < 0 ? "" : (history.classes[history.changes.class[row]] ?? "");
 }
 
-const PLAIN = /[\u0000-\u001f\u007f-\u009f\u2028\u2029]/g;
+/** Control characters, and those that turn the direction of what follows. */
+const PLAIN = /[\u0000-\u001f\u007f-\u009f\u2028\u2029\u200e\u200f\u202a-\u202e\u2066-\u2069]/g;
 
 /** A text of the log on one line, short enough for a label; control characters become visible. */
 export function label(text: string, most = 28): string {

@@ -113,7 +113,7 @@ function miniScene(history: History, map: MapState, merge: MergeStory, width: nu
     history,
     map,
     regions: bounds === null ? null : regionsOf(history, map, gridOf(bounds)),
-    view: fitted(points.length > 0 ? near : (bounds ?? near), width, height, 0),
+    view: fitted(points.length > 0 ? near : (bounds ?? near), width, height, 0, 0),
     palette: dark ? DARK : LIGHT,
     width,
     height,

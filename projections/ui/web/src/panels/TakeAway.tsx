@@ -7,6 +7,7 @@ import { paint } from "../map/paint";
 import { SvgSurface } from "../map/surface";
 import { stateDocument } from "../model/document";
 import { tell } from "../state/pointer";
+import { writtenAddress } from "../state/url";
 import * as store from "../state/store";
 import { Icon } from "../ui/icons";
 import { copy } from "./Told";
@@ -46,7 +47,7 @@ export function TakeAway() {
           {item("Picture as SVG", saveSvg)}
           {item("State as JSON", saveJson)}
           {item("Copy as command", copyCommand)}
-          {item("Copy the link to this view", () => copy(location.href, "the link"))}
+          {item("Copy the link to this view", () => copy(location.href.replace(/#.*$/, "") + writtenAddress(true), "the link"))}
         </div>
       )}
     </div>

@@ -39,13 +39,14 @@ export function applyAddress(hash: string) {
     const through = store.history.value?.through ?? 0;
     const at = found.at === null ? through : Math.max(0, Math.min(through, Math.round(found.at)));
     store.at.value = at;
-    if (at < through) store.live.value = false;
+    store.live.value = found.at === null;
   });
 }
 
-export function writtenAddress(): string {
+/** Without a moment while the page follows the log, unless the link is for somebody else. */
+export function writtenAddress(still = false): string {
   const found = new URLSearchParams();
-  found.set("at", String(store.at.value));
+  if (still || !store.live.value) found.set("at", String(store.at.value));
   const thing = store.selection.value;
   if (thing !== null) found.set("select", `${thing.kind}:${thing.id}`);
   found.set("panel", store.panel.value ?? "none");

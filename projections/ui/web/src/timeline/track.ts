@@ -8,7 +8,7 @@ import { when } from "../ui/summary";
 import { densityOf } from "./density";
 import { ROWS_HEIGHT, ROW_HEIGHT, drawMark, rowOf } from "./marks";
 
-const SIDE = 14;
+const SIDE = 28;
 const BIN_PIXELS = 4;
 const HIT_PIXELS = 7;
 
