@@ -226,10 +226,10 @@ def _settings(settings: Settings) -> str:
 
 
 def _shown_type(found: PlaceType | None) -> str:
-    """``kitchen 87 %``; empty where unsure."""
-    if found is None or found.type is None:
+    """``kitchen 87 %``; empty where unsure, or where the name says it."""
+    if found is None or found.type is None or found.named:
         return ""
-    return found.type if found.named else f"{found.type} {found.probability:.0%}".replace("%", " %")
+    return f"{found.type} {found.probability:.0%}".replace("%", " %")
 
 
 def _shown_floor(name: str | None) -> str:

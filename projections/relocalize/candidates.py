@@ -41,9 +41,9 @@ fewer leave too few directions to triangulate an object from."""
 
 OBJECTS_OF_A_CLASS = 96
 """For a crop of which only the class is known: so many Objects, those seen most often …"""
-MOST_OBJECTS = 512
-"""… with several classes at most so many in all …"""
-OBSERVATIONS_OF_EACH = 4
+MOST_OBJECTS = 128
+"""… with several classes at most so many in all, since each takes a third of a millisecond …"""
+OBSERVATIONS_OF_EACH = 3
 """… and of each so many observations, spread evenly over all."""
 
 Pose = tuple[float, float, float]

@@ -276,8 +276,11 @@ def _with_class_sizes(
 
 def _spots(poses: Floats, owner: Indices) -> tuple[Floats, Indices]:
     """Where each landmark was seen from, to 0.18 m, and where each landmark's begin."""
-    cells = np.rint(poses[:, :2] / _SPOT_M).astype(np.int64)
-    rows = np.unique(np.column_stack((owner, cells)), axis=0)
-    starts = np.searchsorted(rows[:, 0], np.arange(int(owner[-1]) + 1))
-    spots: Floats = rows[:, 1:].astype(np.float64) * _SPOT_M
+    x, y = np.rint(poses[:, :2].T / _SPOT_M)
+    order = np.lexsort((y, x, owner))
+    x, y, owner = x[order], y[order], owner[order]
+    is_new = np.ones(len(owner), dtype=np.bool_)
+    is_new[1:] = (np.diff(owner) != 0) | (np.diff(x) != 0) | (np.diff(y) != 0)
+    starts = np.searchsorted(owner[is_new], np.arange(int(owner[-1]) + 1))
+    spots: Floats = np.column_stack((x, y))[is_new] * _SPOT_M
     return spots, starts.astype(np.intp)

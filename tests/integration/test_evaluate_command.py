@@ -156,7 +156,7 @@ def test_the_trial_house_is_found_again(mapfold: Commands) -> None:
     for flag, run in (("--map", "house-a"), ("--query", "house-c"), ("--query", "home-2")):
         folder = SHARED / run.split("-")[0]
         lines = gzip.decompress((folder / f"{run}.jsonl.gz").read_bytes()).splitlines(True)
-        asked = len(lines) if flag == "--map" else rounds(len(lines), len(lines) // 3)
+        asked = len(lines) if flag == "--map" else rounds(len(lines), len(lines) // 6)
         mapfold("import", mapfold.folder / run, "-", stdin=b"".join(lines[:asked]))
         truth = (folder / f"{run}.truth.jsonl.gz").resolve()
         arguments += [flag, str(mapfold.folder / run), "--truth", str(truth)]

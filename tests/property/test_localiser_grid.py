@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from projections.relocalize.appearance import DIRECTIONS
 from projections.relocalize.grid import cells_near, distinct, likely_spots
-from projections.relocalize.landmarks import Cue, Landmarks
+from projections.relocalize.landmarks import Cue, Landmarks, _spots
 
 _METRES = st.floats(-8.0, 8.0)
 _POINTS = st.lists(st.tuples(_METRES, _METRES), min_size=1, max_size=8)
@@ -83,3 +83,19 @@ def test_no_question_has_more_spots_than_six_hundred() -> None:
     spots = [[(3.0 * k, 5.0 * each) for k in range(64)] for each in range(20)]
     marks = landmarks([4.0] * 20, spots)
     assert 300 <= len(likely_spots([marks], 0.175)) <= 600
+
+
+@given(st.lists(st.tuples(st.integers(0, 3), _METRES, _METRES), min_size=1, max_size=20))
+def test_each_landmark_has_the_squares_that_it_was_seen_from(
+    seen: list[tuple[int, float, float]],
+) -> None:
+    names = sorted({owner for owner, _, _ in seen})
+    ordered = sorted((names.index(owner), x, y) for owner, x, y in seen)
+    owners = np.array([owner for owner, _, _ in ordered])
+    poses = np.array([(x, y, 0.0) for _, x, y in ordered])
+    spots, starts = _spots(poses, owners)
+    ends = [*starts[1:].tolist(), len(spots)]
+    for owner, (start, end) in enumerate(zip(starts.tolist(), ends, strict=True)):
+        found = [(round(x / 0.175), round(y / 0.175)) for x, y in spots[start:end].tolist()]
+        expected = {(round(x / 0.175), round(y / 0.175)) for o, x, y in ordered if o == owner}
+        assert sorted(found) == sorted(expected)

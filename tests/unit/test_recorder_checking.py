@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eventsrc.append import append_payload
+from eventsrc.envelope import ENVELOPE_VERSION
 from eventsrc.errors import LogError
 from eventsrc.log import ALWAYS, LogWriter, active_segment
 from eventsrc.recorder.queue import MessageQueue
@@ -86,7 +87,7 @@ def test_the_log_is_that_of_appending_one_by_one(messages: list[tuple[str, bytes
         report = recorded.thread.report()
         assert report.recorded + report.rejected == len(events) == len(messages)
         assert report.rejected == sum(event.key == "mapfold/rejected" for event in events)
-        valid = [e for e in events if e.key != "mapfold/rejected" and e.version == 3]
+        valid = [e for e in events if e.key != "mapfold/rejected" and e.version == ENVELOPE_VERSION]
         assert sorted(recorded.acknowledged) == sorted(payload_sha256(e.payload) for e in valid)
 
 

@@ -33,7 +33,7 @@ from .moving import score_moved
 from .place_types import TypesRow, types_row, types_table
 from .places import RULES, PlacesRow, places_row, places_table
 from .scoring import score_objects
-from .walls import Walls, world_names, world_walls
+from .walls import world_names, world_walls
 from .worlds import (
     CACHE,
     LIMIT,
@@ -62,8 +62,9 @@ def main() -> None:
         if options.places:
             rules = {**RULES, "rooms": RULES["rooms"].with_assignments(options.set)}
             places = [
-                places_row(case, rules, _walls(generator, case) if options.walls else None)
+                places_row(case, rules, world_walls(generator, _world(case)) if walled else None)
                 for case in cases
+                if not (walled := options.walls) or _world(case) in world_names(generator)
             ]
         elif options.types:
             ruled = [RULES["rooms"].model_copy(update={"fusion": f}) for f in ("page", "evidence")]
@@ -91,10 +92,9 @@ def main() -> None:
     _write(options.json, rows)
 
 
-def _walls(generator: ModuleType, case: Case) -> Walls | None:
-    """The walls of a generated building; None for house-a, which has none."""
-    world = case.name.rpartition(" ")[2]
-    return world_walls(generator, world) if world in world_names(generator) else None
+def _world(case: Case) -> str:
+    """The building of a case; house-a, whose walls are not known, is in no generator."""
+    return case.name.rpartition(" ")[2]
 
 
 def _write(path: Path | None, rows: Sequence[tables.Row | PlacesRow | TypesRow]) -> None:
