@@ -65,7 +65,7 @@ export function BridgeView({ merge, history }: { merge: MergeStory; history: His
         ))}{" "}
         keyframes; <ThingLink thing={{ kind: "keyframe", id: keyframeId(history, merge.bridge) }} /> linked them.
         {merge.eps_m !== null && ` A circle is ε = ${merge.eps_m} m; a point with ${merge.min_samples} neighbours in it, itself among them, is a core point (ringed).`} Blue points
-        became core points by this event; the black line is the chain that links the places.
+        became core points by this event; the thick line is the chain that links the places.
       </figcaption>
     </figure>
   );
