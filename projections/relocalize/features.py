@@ -1,7 +1,9 @@
 """Features of a posterior, and its confidence: a logistic model of them.
 
 `confidence` is the probability that the pose is within 1.5 m of the truth. A robot that sees only
-what the map does not have counts as never right.
+what the map does not have counts as never right. Where only classes are known, no likeness tells
+whether the things are those of the map; `confidence` is then the posterior's own weight near the
+answer, which supposes that they are.
 """
 
 import math
@@ -27,15 +29,16 @@ WEIGHTS: Final = (-10.01, 18.17, 1.607, -0.882, -2.168, -0.407, 0.406)
 @dataclass(frozen=True, slots=True)
 class Features:
     """``likeness`` is the greatest relative likeness of any crop's match, ``margin`` what it is
-    above that of a landmark more than 2.5 m away, the greatest of any crop and at most 0.5.
+    above that of a landmark more than 2.5 m away, the greatest of any crop and at most 0.5. Crops
+    of which only the class is known do not count; without any other both are None.
 
     ``mass`` is the weight within 1.5 m of the answer, ``loss`` the expected error in metres, 2.5 m
     at most. ``best_crop`` and ``mean_crop`` are log-likelihood ratios of the crops at the likeliest
     pose; a crop without evidence counts as explained by nothing.
     """
 
-    likeness: float
-    margin: float
+    likeness: float | None
+    margin: float | None
     mass: float
     loss: float
     best_crop: float
@@ -50,11 +53,12 @@ def features_of(
     loss: float,
     model: Model,
 ) -> Features:
-    """Of crops with evidence, their landmarks and log-likelihoods; ``asked`` counts all crops."""
+    """``crops`` are the log-likelihoods of those with evidence, ``landmarks`` those of crops that
+    have a look too; ``asked`` counts all crops."""
     missing = (asked - len(crops)) * unexplained(model)
     return Features(
-        max(float(each.likeness.max()) for each in landmarks),
-        max(_margin(each) for each in landmarks),
+        max((float(each.likeness.max()) for each in landmarks), default=None),
+        max((_margin(each) for each in landmarks), default=None),
         mass,
         loss,
         float(crops.max()),
@@ -73,6 +77,8 @@ def _margin(landmarks: Landmarks) -> float:
 
 def confidence_of(features: Features, constants: LocalizerConstants) -> float:
     """The probability that the pose is within 1.5 m."""
+    if features.likeness is None:
+        return min(features.mass, 1.0)
     return _logistic(WEIGHTS, features, constants.confidence_scale, constants.confidence_shift)
 
 

@@ -77,11 +77,13 @@ class Landmarks:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CropEvidence:
-    """A crop with its landmarks. ``bearing`` (radians, left positive) is None without a box."""
+    """A crop with its landmarks. ``bearing`` (radians, left positive) is None without a box;
+    ``has_look`` is False where only the class is known."""
 
     landmarks: Landmarks
     bearing: float | None
     sight: Sights
+    has_look: bool = True
 
 
 def likeness_of(crop: Crop, row: Sequence[Match], constants: MapConstants) -> Floats:
@@ -110,7 +112,8 @@ def crop_evidence(
     less = subtract_shifts(matches, raw, shifts)
     found = _landmarks(crop, matches, raw, less, constants, model)
     own = sights(camera, [crop.bbox])
-    return CropEvidence(found, float(own.bearing[0]) if own.known[0] else None, own)
+    bearing = float(own.bearing[0]) if own.known[0] else None
+    return CropEvidence(found, bearing, own, crop.vector is not None)
 
 
 @dataclass(frozen=True, slots=True)

@@ -266,7 +266,7 @@ def _choose(
     squared = (cells[:, 0] - x) ** 2 + (cells[:, 1] - y) ** 2
     crops = [crop for view in sighted for crop in view.crops]
     found = features_of(
-        [crop.landmarks for crop in crops],
+        [crop.landmarks for crop in crops if crop.has_look],
         each[:, likeliest],
         asked,
         float(of_cell[squared < 1.5**2].sum()),

@@ -208,6 +208,34 @@ def test_crops_without_boxes_or_looks_are_answered_near_their_things(kind: str) 
     assert math.hypot(found.x - 0.75, found.y - 0.25) < 3.0
 
 
+@given(st.integers(0, 10_000), st.booleans())
+@settings(max_examples=examples(15), deadline=None)
+def test_a_class_is_no_likeness(seed: int, all_classes: bool) -> None:
+    """Its matches have the similarity 1, which says nothing of how sure the pose is."""
+    scene, at, shown = random_scene(seed)
+    question, candidates = scene.ask([(at, [shown[0], shown[-1]])], noise=0.05)
+    (view,) = question.views
+    named = (True, all_classes)
+    crops = tuple(
+        replace(crop, vector=None) if is_named else crop
+        for crop, is_named in zip(view.crops, named, strict=True)
+    )
+    rows = tuple(
+        tuple(replace(m, similarity=1.0) for m in row) if is_named else row
+        for row, is_named in zip(candidates.matches, named, strict=True)
+    )
+    asked = Question((replace(view, crops=crops),))
+    found = posterior_of(asked, replace(candidates, matches=rows))
+    if all_classes:
+        assert found.features.likeness is found.features.margin is None
+        assert found.confidence == pytest.approx(found.features.mass)
+    else:
+        alone = Question((replace(view, crops=view.crops[1:]),))
+        expected = posterior_of(alone, replace(candidates, matches=rows[1:]))
+        assert found.features.likeness == pytest.approx(expected.features.likeness)
+        assert found.features.margin == expected.features.margin
+
+
 @pytest.mark.parametrize(
     "box",
     [
