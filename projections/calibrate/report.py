@@ -140,8 +140,9 @@ def hints(calibration: Calibration) -> Iterator[str]:
         yield _camera_hint(fault, camera.hfov_deg)
     if calibration.settings.fusion != "evidence":
         yield (
-            "the map is folded by the page's rule, which uses none of these; --set fusion=evidence"
-            " --write switches the log to fusion by evidence"
+            "the map is folded by the page's rule, so its objects do not depend on these, only"
+            " re-localisation does; --set fusion=evidence --write switches the log to fusion by"
+            " evidence"
         )
 
 

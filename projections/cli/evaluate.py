@@ -169,10 +169,19 @@ def _document(found: _Scored) -> Mapping[str, Any]:
 
 
 def worst_of(found: _Scored) -> tuple[Path, Mapping[str, Any], Mapping[str, Any]] | None:
-    """The map whose median error is greatest beside the plain recipe's, with both errors."""
+    """The map whose median error is greatest beside the plain recipe's, with both errors; by the
+    maps' own questions where no others were asked of things that a map has."""
+    return _worst_by("relocalization", found) or _worst_by("self", found)
+
+
+def _worst_by(
+    group: str, found: _Scored
+) -> tuple[Path, Mapping[str, Any], Mapping[str, Any]] | None:
     compared = []
     for log, scores in found:
-        column = scores["relocalization"][_JUDGED_BY]
+        if group not in scores:
+            continue
+        column = scores[group][_JUDGED_BY]
         ours, plain = column["pose_error_m"], column["plain"]["pose_error_m"]
         if ours["p50"] is not None and plain["p50"]:
             compared.append((ours["p50"] / plain["p50"], log, ours, plain))

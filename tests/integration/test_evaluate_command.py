@@ -138,6 +138,22 @@ def test_of_several_maps_the_worst_is_named(mapfold: Commands, runs: list[str]) 
     assert "--picture draws one map; give one --map" in refused.err
 
 
+def test_of_several_maps_that_are_asked_about_themselves_the_worst_is_named(
+    mapfold: Commands, runs: list[str]
+) -> None:
+    maps_alone = ["--map", str(mapfold.folder / "x"), *runs[:2], "--self"]
+    own = mapfold("evaluate", *maps_alone, "--json").json
+    ratios = {
+        each["map"]: each["self"]["3"]["pose_error_m"]["p50"]
+        / each["self"]["3"]["plain"]["pose_error_m"]["p50"]
+        for each in own["maps"]
+        if each["self"]["3"]["known"]
+    }
+    assert own["worst"] == max(ratios, key=ratios.__getitem__)
+    said = mapfold("evaluate", *maps_alone).out
+    assert said.splitlines()[-1].startswith(f"worst map: {own['worst']}, 3 crops: pose error p50")
+
+
 def test_truth_that_fits_nothing_is_misuse(mapfold: Commands, runs: list[str]) -> None:
     broken = mapfold.folder / "broken.jsonl"
     broken.write_text('{"run_id": "a"}\n')
