@@ -132,7 +132,7 @@ def _read_views(items: Any) -> Question:
         name = f"views.{index}"
         if not isinstance(item, dict):
             raise QuestionError(f"{name}: should be a JSON object")
-        moved = _movement(item, name) if index else STILL
+        moved = _movement(item, name, "view") if index else STILL
         view = View(*moved, _read_crops(item, f"{name}.crops"))
         crops += len(view.crops)
         if crops > MAX_CROPS:
@@ -152,17 +152,18 @@ def read_moved(document: Any) -> Movement:
     name, found = "", document
     if isinstance(views, list) and views and isinstance(views[0], dict):
         name, found = "views.0", views[0]
-    return _movement(found, name) if found.keys() & {"dx", "dy", "dyaw"} else STILL
+    return _movement(found, name, "question") if found.keys() & {"dx", "dy", "dyaw"} else STILL
 
 
-def _movement(document: dict[str, Any], name: str) -> Movement:
+def _movement(document: dict[str, Any], name: str, since: str) -> Movement:
+    """``since`` is what it is since the one before, a view or a question."""
     try:
         moved = _Movement.model_validate(document)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         key = ".".join(str(part) for part in (name, *first["loc"]) if part)
         what = (
-            "is missing; give the metres and radians moved since the view before"
+            f"is missing; give the metres and radians moved since the {since} before"
             if first["type"] == "missing"
             else describe_error(first).lower()
         )

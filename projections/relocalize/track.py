@@ -108,7 +108,7 @@ class Track:
         if len(self.particles):
             self._move(moved, random)
         power = min(max(self._moved, _LEAST_COUNT), 1.0)
-        self._moved, self.lost = 0.0, self.lost + (1.0 - self.lost) * _CARRIED
+        self.lost += (1.0 - self.lost) * _CARRIED
         if hypotheses is not None:
             sure = min(max(confidence, _LEAST_SURE), _MOST_SURE)
             self._weigh(hypotheses, sure, power, random)
@@ -117,6 +117,7 @@ class Track:
             self.lost /= self.lost + among
         if not len(self.particles):
             return Tracked(None, 0.0, self._questions)
+        self._moved = 0.0
         return self._estimate()
 
     def _move(self, moved: Movement, random: np.random.Generator) -> None:

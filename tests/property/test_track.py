@@ -133,6 +133,16 @@ def test_two_look_alikes_are_told_apart_by_the_way_between_two_questions() -> No
     assert second.confidence > 0.9
 
 
+def test_questions_without_a_pose_do_not_weaken_the_first_that_has_one() -> None:
+    """A robot that stands still has told nothing before."""
+    late, prompt = Track("robot"), Track("robot")
+    assert late.step(STILL, None, 0.0).pose is None
+    found = hypotheses((1.0, 2.0, 0.0, 1.0))
+    expected = prompt.step(STILL, found, 0.9).confidence
+    assert expected > 0.8
+    assert late.step(STILL, found, 0.9).confidence == pytest.approx(expected, abs=0.02)
+
+
 def test_one_wrong_answer_moves_little() -> None:
     track = Track("robot")
     for step in range(4):

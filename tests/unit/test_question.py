@@ -13,6 +13,7 @@ from projections.relocalize import (
     parse_question,
     question_schema,
     read_crops,
+    read_moved,
     read_question,
 )
 from projections.relocalize.question import MAX_CROPS, MAX_VIEWS
@@ -109,6 +110,21 @@ ONE = {"crops": [{"embedding": VECTOR}]}
 MOVED = {"dx": 0.0, "dy": 0.0, "dyaw": 0.5, **ONE}
 BASE64 = embedding(VECTOR)["embedding"]
 NAN = embedding([float("nan"), 1.0])
+
+
+@pytest.mark.parametrize(
+    ("question", "said"),
+    [
+        ({**ONE, "dx": 1.0}, "dy: is missing; give the metres and"),
+        ({"views": [{**ONE, "dyaw": 1.0}]}, "views.0.dx: is missing"),
+        ({**MOVED, "dx": "far"}, "dx: input should be a valid number"),
+    ],
+)
+def test_a_movement_since_the_last_question_is_whole(question: Any, said: str) -> None:
+    with pytest.raises(QuestionError, match=r".") as refused:
+        read_moved(question)
+    assert str(refused.value).startswith(said)
+    assert "missing" not in said or str(refused.value).endswith("since the question before")
 
 
 @pytest.mark.parametrize(
