@@ -80,5 +80,7 @@ def _tracked(
     document = parse_json(line)
     question, moved = read_question(document), read_moved(document)
     answer = rank(question, search(question.crops), top=top, camera=camera)
-    tracked = track.step(movement_of(moved, question), answer.hypotheses, answer.confidence)
+    tracked = track.step(
+        movement_of(moved, question), answer.hypotheses, answer.confidence, answer.known
+    )
     return answer.document() | {"track": tracked.document()}

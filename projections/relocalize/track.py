@@ -10,6 +10,9 @@ the second says how many particles are drawn anew from the posterior: few while 
 explain what is seen, nearly all once they do not and another place does. So a kidnapped robot is
 found again after a few questions, and a single wrong answer moves little.
 
+Things that the map does not have (``known`` below 0.5) make it less likely that the robot is where
+the particles are, by known / (1 - known), at least an eighth.
+
 Questions from places near each other share their errors, and a look-alike deceives several in a
 row: a likelihood is taken to a power that is the smaller, the less the robot has moved since the
 last question, and 1 after 3 m or most of a turn.
@@ -41,9 +44,11 @@ _CARRIED: Final = 0.01
 """Probability that the robot was carried elsewhere between two questions."""
 _LEAST_LOST: Final = 0.005
 """Look-alikes deceive several questions in a row, which their likelihoods do not know."""
-_UNANSWERED: Final = 0.8
-"""How much likelier nothing in the map looks like what is seen where the robot is elsewhere, as a
-ratio."""
+_NEUTRAL: Final = 0.5
+"""`known` of a question that tells nothing about it, as one of classes alone."""
+_LEAST_DOUBT: Final = 0.125
+"""One question whose things are not in the map makes the robot's being where it was taken to be at
+most so much less likely, as a ratio."""
 _ANYWHERE: Final = 1.0 / (1_000.0 * 2.0 * math.pi)
 """Density of a robot that may be anywhere: 1,000 m², any heading."""
 _SIGMA_M: Final = 0.4
@@ -59,6 +64,8 @@ _MOST_SLIP_M, _MOST_SLIP_RAD = 5.0, math.pi
 _INDEPENDENT_M: Final = 3.0
 _INDEPENDENT_RAD: Final = 5.0
 _LEAST_COUNT: Final = 0.1
+_LEAST_COUNT_OF_KNOWN: Final = 0.25
+"""The same of `known`: whether a thing is in the map hardly depends on where it is seen from."""
 _WITHIN_M: Final = 1.5
 _AROUND_M: Final = 1.0
 _TRIED: Final = 80
@@ -101,19 +108,28 @@ class Track:
         self.particles: Floats = np.zeros((0, 3))
         self.lost = 1.0
 
-    def step(self, moved: Movement, hypotheses: Hypotheses | None, confidence: float) -> Tracked:
-        """One question: how the robot moved since the last one, and what it was answered with."""
+    def step(
+        self,
+        moved: Movement,
+        hypotheses: Hypotheses | None,
+        confidence: float,
+        known: float = _NEUTRAL,
+    ) -> Tracked:
+        """One question: how the robot moved since the last one, and what it was answered with.
+
+        ``known`` is the probability that the map has the things shown; 0.5 tells nothing.
+        """
         self._questions += 1
         random = np.random.Generator(np.random.PCG64([self._seed, self._questions]))
         if len(self.particles):
             self._move(moved, random)
         power = min(max(self._moved, _LEAST_COUNT), 1.0)
         self.lost += (1.0 - self.lost) * _CARRIED
+        among = (1.0 - self.lost) * _known_ratio(known) ** max(power, _LEAST_COUNT_OF_KNOWN)
         if hypotheses is not None:
             sure = min(max(confidence, _LEAST_SURE), _MOST_SURE)
-            self._weigh(hypotheses, sure, power, random)
+            self._weigh(hypotheses, sure, among, power, random)
         else:
-            among = (1.0 - self.lost) * _UNANSWERED**power
             self.lost /= self.lost + among
         if not len(self.particles):
             return Tracked(None, 0.0, self._questions)
@@ -142,9 +158,15 @@ class Track:
         )
 
     def _weigh(
-        self, hypotheses: Hypotheses, sure: float, power: float, random: np.random.Generator
+        self,
+        hypotheses: Hypotheses,
+        sure: float,
+        among: float,
+        power: float,
+        random: np.random.Generator,
     ) -> None:
-        """Weigh the particles and some fresh ones, and draw ``PARTICLES`` of them again."""
+        """Weigh the particles, which weigh ``among`` together, and some fresh ones, and draw
+        ``PARTICLES`` of them again."""
         poses, shares = hypotheses.poses[:_MOST_POSES].copy(), hypotheses.weights[:_MOST_POSES]
         poses[:, 0] += [STEP_M * self._number(name) for name in hypotheses.floors[:_MOST_POSES]]
         shares = shares / shares.sum()
@@ -154,7 +176,7 @@ class Track:
         fresh[:, 2] = _wrapped(fresh[:, 2])
         lost = self.lost
         ratios = _likelihood(self.particles, poses, shares, sure) / _ANYWHERE
-        stayed = np.power(ratios, power) * ((1.0 - lost) / max(len(self.particles), 1))
+        stayed = np.power(ratios, power) * (among / max(len(self.particles), 1))
         # The likelihood's integral over all poses: near those of the posterior, and elsewhere; of a
         # share that is new.
         found = lost * sure * power
@@ -192,6 +214,14 @@ class Track:
         )
         confidence = (1.0 - self.lost) * float((away < _WITHIN_M).mean())
         return Tracked(pose, confidence, self._questions)
+
+
+def _known_ratio(known: float) -> float:
+    """How much likelier it is to see such things where the particles are than elsewhere.
+
+    Things that the map has are seen all over the map, so they do not speak for one spot in it.
+    """
+    return 1.0 if known >= _NEUTRAL else max(known / (1.0 - known), _LEAST_DOUBT)
 
 
 def movement_of(first: Movement, question: Question) -> Movement:

@@ -42,7 +42,7 @@ class Sessions:
             self._kept[name] = (self._now(), track)
             if len(self._kept) > self._most:
                 del self._kept[next(iter(self._kept))]
-            return track.step(moved, answer.hypotheses, answer.confidence).document()
+            return track.step(moved, answer.hypotheses, answer.confidence, answer.known).document()
 
     def _forget(self) -> None:
         ended = self._now() - SILENT_S

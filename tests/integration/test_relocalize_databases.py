@@ -229,7 +229,9 @@ class TestCommand:
             moved = {"dx": 0.25 * number, "dy": 0.0, "dyaw": 0.5}
             asked = {"crops": document["detections"], **moved}
             answer = rank(crops := read_crops(asked), index.search(crops))
-            found = track.step((0.25 * number, 0.0, 0.5), answer.hypotheses, answer.confidence)
+            found = track.step(
+                (0.25 * number, 0.0, 0.5), answer.hypotheses, answer.confidence, answer.known
+            )
             lines.append(json.dumps(asked))
             expected.append(answer.document() | {"track": found.document()})
         file = tmp_path / "questions.jsonl"

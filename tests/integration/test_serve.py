@@ -136,7 +136,7 @@ class TestZenoh:
             moved = (0.25 * number, 0.0, 0.125)
             asked = tracked_question(number, moved, "robot-7")
             answer = relocalize(targets, parse_question(asked))
-            tracked = track.step(moved, answer.hypotheses, answer.confidence)
+            tracked = track.step(moved, answer.hypotheses, answer.confidence, answer.known)
             expected = answer.document() | {"track": tracked.document()}
             assert ask(session, "mapfold/relocalize", asked) == (True, expected)
         assert expected["track"]["questions"] == 4

@@ -40,17 +40,18 @@ moves = st.tuples(
     st.floats(-MAX_MOVED_M, MAX_MOVED_M),
     st.floats(-MAX_TURNED_RAD, MAX_TURNED_RAD),
 )
-steps = st.lists(st.tuples(moves, st.none() | seen, st.floats(0.0, 1.0)), min_size=1, max_size=8)
+shares = st.floats(0.0, 1.0)
+steps = st.lists(st.tuples(moves, st.none() | seen, shares, shares), min_size=1, max_size=8)
 
 
 @given(steps)
 @settings(max_examples=examples(60), deadline=None)
 def test_hostile_odometry_and_answers_leave_a_sound_filter(
-    given_steps: list[tuple[Movement, Hypotheses | None, float]],
+    given_steps: list[tuple[Movement, Hypotheses | None, float, float]],
 ) -> None:
     track, answered = Track("robot"), False
-    for moved, found, confidence in given_steps:
-        tracked = track.step(moved, found, confidence)
+    for moved, found, confidence, known in given_steps:
+        tracked = track.step(moved, found, confidence, known)
         answered, pose = answered or found is not None, tracked.pose
         assert (pose is not None) == answered
         assert 0.0 <= tracked.confidence <= 1.0
@@ -67,11 +68,13 @@ def test_hostile_odometry_and_answers_leave_a_sound_filter(
 @given(steps, st.text(max_size=20))
 @settings(max_examples=examples(20), deadline=None)
 def test_the_same_session_is_the_same_to_the_last_bit(
-    given_steps: list[tuple[Movement, Hypotheses | None, float]], name: str
+    given_steps: list[tuple[Movement, Hypotheses | None, float, float]], name: str
 ) -> None:
     one, other = Track(name), Track(name)
-    for moved, found, confidence in given_steps:
-        assert one.step(moved, found, confidence) == other.step(moved, found, confidence)
+    for moved, found, confidence, known in given_steps:
+        assert one.step(moved, found, confidence, known) == other.step(
+            moved, found, confidence, known
+        )
     assert one.particles.tobytes() == other.particles.tobytes()
 
 
@@ -141,6 +144,59 @@ def test_questions_without_a_pose_do_not_weaken_the_first_that_has_one() -> None
     expected = prompt.step(STILL, found, 0.9).confidence
     assert expected > 0.8
     assert late.step(STILL, found, 0.9).confidence == pytest.approx(expected, abs=0.02)
+
+
+def converged(known: float) -> tuple[Track, float]:
+    """After a metre between each two of ten questions that agree."""
+    track, confidence = Track("robot"), 0.0
+    for step in range(10):
+        moved = (float(step > 0), 0.0, 0.0)
+        confidence = track.step(moved, hypotheses((step, 0.0, 0.0, 1.0)), 0.8, known).confidence
+    return track, confidence
+
+
+wrong_poses = st.tuples(st.floats(30.0, 90.0), st.floats(-9.0, 9.0), angles).map(
+    lambda pose: hypotheses((*pose, 1.0))
+)
+
+
+@given(
+    st.floats(0.5, 1.5),
+    st.lists(
+        st.tuples(st.none() | wrong_poses, st.floats(0.0, 0.1), st.floats(0.0, 0.05)),
+        min_size=10,
+        max_size=10,
+    ),
+)
+@settings(max_examples=examples(20), deadline=None)
+def test_things_that_the_map_does_not_have_say_soon_that_the_robot_is_elsewhere(
+    way: float, asked: list[tuple[Hypotheses | None, float, float]]
+) -> None:
+    (track, confidence), (half, _) = converged(0.95), converged(0.95)
+    assert confidence > 0.95
+    for found, sure, known in asked:
+        confidence = track.step((way, 0.0, 0.0), found, sure, known).confidence
+        kept = half.step((way, 0.0, 0.0), found, sure, 0.5).confidence
+        assert confidence < kept, "half-known things say nothing"
+    assert confidence < 0.5 < track.lost
+    assert half.lost < 0.4
+
+
+@given(st.floats(0.5, 1.0))
+@settings(max_examples=examples(10), deadline=None)
+def test_things_that_the_map_has_change_nothing(known: float) -> None:
+    """Seen all over the map, they do not say where in it the robot is: as with 0.5."""
+    (one, first), (other, second) = converged(known), converged(0.5)
+    assert first == second > 0.95
+    assert one.particles.tobytes() == other.particles.tobytes()
+
+
+def test_one_unknown_picture_is_soon_forgiven() -> None:
+    track, before = converged(0.95)
+    after = track.step((1.0, 0.0, 0.0), hypotheses((50.0, 9.0, 1.0, 1.0)), 0.05, 0.0)
+    assert 0.9 < after.confidence < before
+    again = track.step((1.0, 0.0, 0.0), hypotheses((11.0, 0.0, 0.0, 1.0)), 0.8, 0.95)
+    assert again.confidence > 0.97
 
 
 def test_one_wrong_answer_moves_little() -> None:
@@ -213,7 +269,7 @@ def follow(seed: int, runs: list[list[Keyframe]]) -> tuple[list[float], list[flo
             last = pose
             crops = crops_of(keyframe)[: min(2, MAX_CROPS)]
             answer = rank(crops, mapped.search(crops)) if crops else Answer((), None, 0.0)
-            found = track.step(noisy, answer.hypotheses, answer.confidence)
+            found = track.step(noisy, answer.hypotheses, answer.confidence, answer.known)
             single.append(error(answer.pose, pose))
             tracked.append(error(found.pose, pose))
     return single, tracked

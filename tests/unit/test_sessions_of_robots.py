@@ -36,7 +36,7 @@ def test_a_session_is_the_track_of_its_name() -> None:
     sessions, track = Sessions(), Track("robot-7")
     for x in (1.0, 1.5, 2.0):
         moved = (0.5, 0.0, 0.0)
-        expected = track.step(moved, answer(x).hypotheses, 0.9)
+        expected = track.step(moved, answer(x).hypotheses, 0.9, 0.0)
         sessions.tracked("another", moved, answer(9.0))
         assert sessions.tracked("robot-7", moved, answer(x)) == expected.document()
 
