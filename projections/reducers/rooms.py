@@ -105,6 +105,8 @@ class Rooms(PlaceMembers):
         is_anchor = keyframe in self._anchors
         if cell is not None and (not is_anchor or self._may_enter(keyframe, cell)):
             deltas = list[Delta]()
+            if is_anchor:  # what its place merges with now must suit it
+                self._anchors.enter(self._place_of_cell(cell), self._anchors.own(keyframe))
             if last is not None and not self._cells.is_linked(last, cell):
                 deltas = self._merge_all(offset, keyframe, self._link(last, cell))
             elif not is_anchor:  # nearly always

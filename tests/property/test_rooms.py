@@ -147,6 +147,11 @@ def test_drives_with_commands_equal_the_naive_rules(points: list[At], seed: int)
     check_every_prefix(points, told(seed, len(points)))
 
 
+def test_a_keyframe_kept_apart_enters_a_cell_before_its_way_there_merges_places() -> None:
+    points = [(0, 0, 0), (1, 0, -751), (0, 0, 0), (0, 0, -751)]
+    check_every_prefix(points, [((0, 2), False), ((0, 3), False), ((2, 3), False)])
+
+
 @pytest.mark.parametrize("seed", range(12))
 def test_buildings_equal_the_naive_rules(seed: int) -> None:
     points = building(seed)
