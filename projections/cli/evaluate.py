@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
 
@@ -12,6 +12,7 @@ from projections.evaluate import evaluate as score
 from projections.evaluate import read_truth
 from projections.evaluate.picture import draw_failures
 from projections.evaluate.questions import DEFAULT_SEED
+from projections.relocalize import Method
 
 from .options import (
     HfovOption,
@@ -121,8 +122,10 @@ def evaluate(
     check_picture(picture)
     if picture is not None and len(map_logs) > 1:
         raise MisuseError("--picture draws one map; give one --map")
-    truth, settings = read_truth(truth_files or []), settings_of(settings_file, set_)
     asked = bool(query_logs or truth_files) or not self_
+    if not asked:
+        _refuse_alone(method_from(method), hfov, image)
+    truth, settings = read_truth(truth_files or []), settings_of(settings_file, set_)
     found = []
     for map_log in map_logs:
         result = score(
@@ -152,9 +155,40 @@ def evaluate(
         display(worst_text(found))
 
 
+def _refuse_alone(method: Method, hfov: float | None, image: str | None) -> None:
+    """Raise MisuseError for options that questions of the map's own do not read."""
+    given = {
+        "--method plain": method == "plain",
+        "--hfov": hfov is not None,
+        "--image": image is not None,
+    }
+    unread = [option for option, is_given in given.items() if is_given]
+    if unread:
+        raise MisuseError(
+            f"{' and '.join(unread)}: --self alone asks by the method joint, which it compares with"
+            " the plain one, and with the camera of the map's settings; leave it out, or ask from"
+            " --query too"
+        )
+
+
 _Scored = Sequence[tuple[Path, Mapping[str, Any]]]
 _JUDGED_BY = "3"
-"""Crops of the questions by which the worst map is found."""
+"""Crops of the questions by which the worst map is found; of a map without such questions the
+fewest of which it has some."""
+
+
+class Judged(NamedTuple):
+    """A map and its errors, and the plain recipe's, with ``crops`` crops a question."""
+
+    log: Path
+    crops: str
+    ours: Mapping[str, Any]
+    plain: Mapping[str, Any]
+
+    @property
+    def ratio(self) -> float:
+        """The median error as a part of the plain recipe's."""
+        return float(self.ours["p50"] / self.plain["p50"])
 
 
 def _document(found: _Scored) -> Mapping[str, Any]:
@@ -164,31 +198,28 @@ def _document(found: _Scored) -> Mapping[str, Any]:
     worst = worst_of(found)
     return {
         "maps": [{"map": str(log), **scores} for log, scores in found],
-        "worst": None if worst is None else str(worst[0]),
+        "worst": None if worst is None else str(worst.log),
     }
 
 
-def worst_of(found: _Scored) -> tuple[Path, Mapping[str, Any], Mapping[str, Any]] | None:
-    """The map whose median error is greatest beside the plain recipe's, with both errors; by the
-    maps' own questions where no others were asked of things that a map has."""
+def worst_of(found: _Scored) -> Judged | None:
+    """The map whose median error is greatest beside the plain recipe's; by the maps' own questions
+    where no others were asked of things that a map has."""
     return _worst_by("relocalization", found) or _worst_by("self", found)
 
 
-def _worst_by(
-    group: str, found: _Scored
-) -> tuple[Path, Mapping[str, Any], Mapping[str, Any]] | None:
-    compared = []
-    for log, scores in found:
-        if group not in scores:
-            continue
-        column = scores[group][_JUDGED_BY]
-        ours, plain = column["pose_error_m"], column["plain"]["pose_error_m"]
+def _worst_by(group: str, found: _Scored) -> Judged | None:
+    judged = [_judged(log, scores[group]) for log, scores in found if group in scores]
+    return max((each for each in judged if each), key=lambda each: each.ratio, default=None)
+
+
+def _judged(log: Path, columns: Mapping[str, Any]) -> Judged | None:
+    """None where no question has errors to compare."""
+    for crops in sorted(columns, key=lambda crops: (crops != _JUDGED_BY, int(crops))):
+        ours, plain = columns[crops]["pose_error_m"], columns[crops]["plain"]["pose_error_m"]
         if ours["p50"] is not None and plain["p50"]:
-            compared.append((ours["p50"] / plain["p50"], log, ours, plain))
-    if not compared:
-        return None
-    _, log, ours, plain = max(compared, key=lambda each: each[0])
-    return log, ours, plain
+            return Judged(log, crops, ours, plain)
+    return None
 
 
 def worst_text(found: _Scored) -> str:
@@ -196,10 +227,9 @@ def worst_text(found: _Scored) -> str:
     worst = worst_of(found)
     if worst is None:
         return "no map was asked about things that it has\n"
-    log, ours, plain = worst
     return (
-        f"worst map: {log}, {_JUDGED_BY} crops: pose error p50 {ours['p50']:.2f} m,"
-        f" the plain recipe's {plain['p50']:.2f} m\n"
+        f"worst map: {worst.log}, {counted(int(worst.crops), 'crop')}: pose error p50"
+        f" {worst.ours['p50']:.2f} m, the plain recipe's {worst.plain['p50']:.2f} m\n"
     )
 
 

@@ -154,6 +154,22 @@ def test_of_several_maps_that_are_asked_about_themselves_the_worst_is_named(
     assert said.splitlines()[-1].startswith(f"worst map: {own['worst']}, 3 crops: pose error p50")
 
 
+@pytest.mark.parametrize(
+    ("options", "unread"),
+    [
+        (["--method", "plain"], "--method plain"),
+        (["--hfov", "90"], "--hfov"),
+        (["--image", "640x480", "--hfov", "90"], "--hfov and --image"),
+    ],
+)
+def test_options_that_the_maps_own_questions_do_not_read_are_misuse(
+    mapfold: Commands, runs: list[str], options: list[str], unread: str
+) -> None:
+    said = mapfold("evaluate", *runs[:2], "--self", *options, code=2)
+    assert f"{unread}: --self alone asks by the method joint" in said.err
+    assert said.out == ""
+
+
 def test_truth_that_fits_nothing_is_misuse(mapfold: Commands, runs: list[str]) -> None:
     broken = mapfold.folder / "broken.jsonl"
     broken.write_text('{"run_id": "a"}\n')
