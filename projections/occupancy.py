@@ -5,7 +5,8 @@ turned and shifted into the grid's own frame (cosine and sine as multiples of 2â
 there a cell is a half-open square, and a line's cells are the cells of its points.
 
 `passable` is the rule of ``places = "rooms"``: the straight line between two poses meets no wall,
-and both ends are in one region (`projections.clearance`), so that no narrow place lies between.
+and both ends are in one region (`projections.clearance`), so that no narrow place lies between. Of
+a pose outside the grid only walls on the line are known.
 A pose may lie in a wall, because the robot's idea of where it is was off by a little: walls that
 a line begins or ends in do not count, and a wall cell is of the region around it.
 
@@ -69,25 +70,28 @@ class OccupancyGrid:
         """Whether a point lies in a wall."""
         return self._has_wall(self._to_grid(point))
 
-    def region(self, point: Point) -> int:
-        """The region that a point is in; outside the grid, that of the nearest cell in its row or
-        column. `NOWHERE` for one deep in a wall."""
+    def region(self, point: Point) -> int | None:
+        """The region that a point is in, `NOWHERE` for one deep in a wall; None outside the
+        grid."""
         column, row = self.cell(point)
         rows, columns = self.walls.shape
-        row, column = min(max(row, 0), rows - 1), min(max(column, 0), columns - 1)
+        if not (0 <= row < rows and 0 <= column < columns):
+            return None
         return int(self.regions[row // self.block, column // self.block])
 
     def passable(self, a: Point, b: Point) -> bool:
         """Whether two poses may be neighbours; symmetric."""
-        return self.region(a) == self.region(b) and self.is_free_line(a, b)
+        return self.straight_way_um(a, b) is not None
 
     def straight_way_um(self, a: Point, b: Point) -> int | None:
         """How far the straight way between two poses counts as for ``places = "rooms"``; None where
         they are not `passable`. A way in a region that is as small as a room counts less."""
-        if not self.passable(a, b):
+        start, end = self.region(a), self.region(b)
+        is_within = start is not None and end is not None
+        if (is_within and start != end) or not self.is_free_line(a, b):
             return None
         length = distance_um(*a, *b)
-        return length // SMALL_SHARE if self.region(a) in self._small else length
+        return length // SMALL_SHARE if is_within and start in self._small else length
 
     def is_free_line(self, a: Point, b: Point) -> bool:
         """Whether the line from a to b meets no wall but those that it begins and ends in."""

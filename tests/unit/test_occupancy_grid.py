@@ -93,16 +93,19 @@ def test_poses_deep_in_walls_are_in_no_region() -> None:
     assert grid.region((M // 10, M // 10)) == 0
 
 
-def test_around_the_grid_is_no_wall_and_of_the_region_at_its_edge() -> None:
+def test_outside_the_grid_only_walls_on_the_way_count() -> None:
     cells = np.zeros((40, 40))
     cells[:, 20] = 100
     grid = OccupancyGrid(_map(cells, origin=(10.0, -5.0, 0.0)))
-    left, right = (9 * M, -3 * M), (15 * M, -3 * M)
-    assert grid.region(left) == grid.region((11 * M, -3 * M))
-    assert grid.region(right) == grid.region((13 * M, -3 * M))
-    assert grid.passable(left, (11 * M, -3 * M))
-    assert not grid.passable(left, right)
+    left, right, beyond = (9 * M, -3 * M), (15 * M, -3 * M), (9 * M, 3 * M)
+    inside = (11 * M, -3 * M)
+    assert grid.region(left) is None
+    assert grid.region(inside) is not None
     assert not grid.is_wall(left)
+    assert grid.straight_way_um(left, inside) == 2 * M  # whole, though the room is small
+    assert grid.straight_way_um(left, beyond) == 6 * M
+    assert grid.straight_way_um(inside, (12 * M - M // 10, -3 * M)) == (M - M // 10) // 4
+    assert not grid.passable(left, right)
 
 
 def test_a_pose_outside_does_not_take_the_wall_away_that_it_meets_first() -> None:
