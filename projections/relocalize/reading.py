@@ -13,7 +13,7 @@ in an envelope is *not* read: it is what is being asked.
 
 import binascii
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated, Any, Final
 
@@ -101,7 +101,12 @@ def read_crops(document: Any) -> tuple[Crop, ...]:
 def read_question(document: Any) -> Question:
     """A parsed question: at least one crop, and all embeddings of one space."""
     if isinstance(document, dict) and "views" in document:
-        question = _read_views(document["views"])
+        beside = [key for key in ("crops", "detections") if document.get(key) is not None]
+        if beside:
+            raise QuestionError(
+                f"the question has views and {beside[0]}; send each crop in the view that shows it"
+            )
+        question = _read_views(document["views"], document.get("camera"))
     else:
         question = Question.of(_read_crops(document, "crops"))
     _check_crops(question.crops)
@@ -120,7 +125,8 @@ def _camera(document: Any) -> Camera:
     return Camera(given.width_px, given.height_px, given.hfov_deg, given.yaw_rad)
 
 
-def _read_views(items: Any) -> Question:
+def _read_views(items: Any, camera: Any) -> Question:
+    """``camera`` is the question's, None where it has none."""
     if not isinstance(items, list) or not items:
         raise QuestionError('views: send a list of views, such as {"crops": [...]}')
     if len(items) > MAX_VIEWS:
@@ -132,6 +138,10 @@ def _read_views(items: Any) -> Question:
         name = f"views.{index}"
         if not isinstance(item, dict):
             raise QuestionError(f"{name}: should be a JSON object")
+        if item.get("camera") not in (None, camera):
+            raise QuestionError(
+                f"{name}.camera: the views of a question have one camera; give it beside views"
+            )
         moved = _movement(item, name, "view") if index else STILL
         view = View(*moved, _read_crops(item, f"{name}.crops"))
         crops += len(view.crops)
@@ -280,8 +290,9 @@ def _floats(name: str, given: str | list[float] | None) -> Vector:
         return np.asarray(given, dtype=np.float64).astype(np.float32)
 
 
-def question_schema() -> dict[str, Any]:
-    """A JSON schema of questions, for people and generators of clients."""
+def question_schema(options: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """A JSON schema of questions, for people and generators of clients; ``options`` are properties
+    that whoever answers reads beside those of the question."""
     crop = _CropModel.model_json_schema(by_alias=True)
     crop |= {"title": "Crop", "description": "It needs an embedding or a class."}
     crops = {"type": "array", "items": crop, "maxItems": MAX_CROPS}
@@ -289,17 +300,29 @@ def question_schema() -> dict[str, Any]:
     view = {
         "title": "View",
         "type": "object",
-        "description": movement["description"] + " The first view needs no movement.",
+        "description": movement["description"] + " The first view's is that since the question"
+        " before, and is read only where questions are tracked.",
         "properties": {**movement["properties"], "crops": crops},
         "required": ["crops"],
     }
     views = {"type": "array", "items": view, "minItems": 1, "maxItems": MAX_VIEWS}
+    common = {"camera": EnvelopeCamera.model_json_schema(), **(options or {})}
+    moved = {
+        key: {**value, "description": "Since the question before; read where they are tracked."}
+        for key, value in movement["properties"].items()
+    }
+    forms: tuple[tuple[str, Any, dict[str, Any]], ...] = (
+        ("crops", crops, moved),
+        ("detections", crops, moved),
+        ("views", views, {}),
+    )
     return {
         "title": "Question",
         "anyOf": [
-            {"type": "object", "properties": {"crops": crops}, "required": ["crops"]},
-            {"type": "object", "properties": {"detections": crops}, "required": ["detections"]},
-            {"type": "object", "properties": {"views": views}, "required": ["views"]},
+            *(
+                {"type": "object", "properties": {key: of, **more, **common}, "required": [key]}
+                for key, of, more in forms
+            ),
             crops,
         ],
     }

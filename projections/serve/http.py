@@ -6,7 +6,7 @@ threads of the `FairQueue` answer them, because database access is synchronous.
 
 import asyncio
 from collections.abc import Callable
-from typing import Any
+from typing import Any, get_args
 
 from fastapi import FastAPI, Query, Request
 from fastapi.exceptions import RequestValidationError
@@ -16,11 +16,12 @@ from starlette.requests import ClientDisconnect
 
 from eventsrc.errors import MapfoldError
 from projections.errors import QuestionError
-from projections.relocalize import describe_value, question_schema
+from projections.relocalize import Method, describe_value, question_schema
 
 from .answering import DEFAULT_RADIUS_M, MAX_TOP, Answerer, TooMuchError, encode, refusal
 from .connections import peer_of
 from .fair_queue import FairQueue
+from .sessions import MAX_NAME
 
 _CROP = {"class": "cup", "bbox": [120, 80, 250, 310], "embedding": "<base64>"}
 _EXAMPLES = {
@@ -32,11 +33,24 @@ _EXAMPLES = {
     },
     "near a toilet and a mirror": {"value": {"crops": [{"class": "toilet"}, {"class": "mirror"}]}},
 }
+_OPTIONS = {
+    "top": {"type": "integer", "minimum": 1, "maximum": MAX_TOP, "default": 3},
+    "method": {"type": "string", "enum": list(get_args(Method)), "default": "joint"},
+    "session": {
+        "type": "string",
+        "minLength": 1,
+        "maxLength": MAX_NAME,
+        "description": "Track the questions of this name.",
+    },
+}
+"""What the service reads of a question beside what every question has."""
 _QUESTION = {
     "requestBody": {
         "required": True,
         "description": "An envelope, a list of detections, or an object with crops or views.",
-        "content": {"application/json": {"schema": question_schema(), "examples": _EXAMPLES}},
+        "content": {
+            "application/json": {"schema": question_schema(_OPTIONS), "examples": _EXAMPLES}
+        },
     }
 }
 

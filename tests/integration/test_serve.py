@@ -318,7 +318,10 @@ class TestHttp:
         asked = document["paths"]["/relocalize"]["post"]["requestBody"]["content"]
         forms = [form.get("properties", {}) for form in question_schema()["anyOf"]]
         described = asked["application/json"]["schema"]["anyOf"]
-        assert [set(form.get("properties", {})) for form in described] == [set(f) for f in forms]
+        options = {"top", "method", "session"}
+        assert [set(form.get("properties", {})) for form in described] == [
+            set(form) | options if form else set() for form in forms
+        ]
         assert {"/relocalize", "/state/{what}", "/health"} <= set(document["paths"])
         assert fetch(f"{http}/health") == (200, {"status": "ok"})
 

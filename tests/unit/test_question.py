@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from eventsrc.envelope import EnvelopeCamera
 from projections.errors import QuestionError
 from projections.relocalize import (
     Camera,
@@ -17,7 +18,7 @@ from projections.relocalize import (
     read_question,
 )
 from projections.relocalize.question import MAX_CROPS, MAX_VIEWS
-from projections.serve import http
+from projections.serve import answering, http
 from tests.envelopes import MODEL, detection, embedding, envelope
 
 VECTOR = [3.0, 4.0, 0.0]
@@ -63,7 +64,7 @@ def test_views_have_movements_between_them() -> None:
         {"dx": 1, "dy": -0.5, "dyaw": 3.0, "detections": [seen, seen]},
         {"dx": 0, "dy": 0, "dyaw": 0, "crops": []},
     ]
-    question = read_question({"views": views, "crops": "not read"})
+    question = read_question({"views": views, "crops": None})
     assert [len(view.crops) for view in question.views] == [1, 2, 0]
     moved = [(view.dx, view.dy, view.dyaw) for view in question.views]
     assert moved == [(0.0, 0.0, 0.0), (1.0, -0.5, 3.0), (0.0, 0.0, 0.0)]
@@ -86,11 +87,17 @@ def test_a_question_may_state_its_camera() -> None:
 def test_the_schema_holds_what_is_read() -> None:
     """Its examples in HTTP's description are questions."""
     schema = question_schema()
-    assert {"crops", "detections", "views"} == {
-        key for form in schema["anyOf"] for key in form.get("properties", {})
-    }
+    moved = {"dx", "dy", "dyaw"}
+    assert [set(form.get("properties", {})) for form in schema["anyOf"]] == [
+        {"crops", "camera"} | moved,
+        {"detections", "camera"} | moved,
+        {"views", "camera"},
+        set(),
+    ]
     view = schema["anyOf"][2]["properties"]["views"]["items"]
     assert set(view["properties"]) == {"dx", "dy", "dyaw", "crops"}
+    camera = schema["anyOf"][0]["properties"]["camera"]
+    assert set(camera["properties"]) == set(EnvelopeCamera.model_fields)
     crop = view["properties"]["crops"]["items"]
     assert set(crop["properties"]) == {
         "embedding",
@@ -104,6 +111,31 @@ def test_the_schema_holds_what_is_read() -> None:
     for form in http._EXAMPLES.values():
         document = json.loads(json.dumps(form["value"]).replace("<base64>", BASE64))
         assert read_question(document).crops
+
+
+def test_the_service_says_what_else_it_reads() -> None:
+    """Its options, at their limits, are read; beyond them they are refused."""
+    body: Any = http._QUESTION["requestBody"]
+    *forms, _ = body["content"]["application/json"]["schema"]["anyOf"]
+    for form in forms:
+        given = form["properties"]
+        assert given["method"]["enum"] == ["joint", "plain"]
+        asked = {
+            **ONE,
+            "top": given["top"]["maximum"],
+            "session": "x" * given["session"]["maxLength"],
+        }
+        read = answering._read(json.dumps(asked).encode(), {})
+        assert (read.top, read.session) == (asked["top"], asked["session"])
+        for key, wrong in (("top", asked["top"] + 1), ("session", asked["session"] + "x")):
+            with pytest.raises(QuestionError, match=f"^{key} is "):
+                answering._read(json.dumps({**asked, key: wrong}).encode(), {})
+
+
+def test_a_view_may_repeat_the_camera_of_its_question() -> None:
+    camera = {"hfov_deg": 90, "width_px": 1280, "height_px": 720}
+    question = read_question({"views": [{**ONE, "camera": camera}], "camera": camera})
+    assert question.camera == Camera(1280.0, 720.0, 90.0)
 
 
 ONE = {"crops": [{"embedding": VECTOR}]}
@@ -139,6 +171,10 @@ def test_a_movement_since_the_last_question_is_whole(question: Any, said: str) -
         ([{"bbox": [1, 2, 3, 4]}], "no crops with an embedding or a class; send at least one"),
         ({"views": []}, "send a list of views"),
         ({"views": {}}, "send a list of views"),
+        ({"views": [ONE], **ONE}, "has views and crops; send each crop in the view that shows it"),
+        ({"views": [ONE], "detections": []}, "the question has views and detections"),
+        ({"views": [ONE, {**MOVED, "camera": {}}]}, "views.1.camera: the views of a question have"),
+        ({"views": [{**ONE, "camera": {}}], "camera": {"yaw_rad": 1}}, "views.0.camera: the views"),
         ({"views": [7]}, "views.0: should be a JSON object"),
         ({"views": [{"crops": [], "dx": 1.0}]}, "no crops with an embedding or a class"),
         ({"views": [ONE, ONE]}, "views.1.dx: is missing; give the metres and radians moved"),
