@@ -86,6 +86,17 @@ def test_places_by_rooms_do_not_reach_through_a_wall(tmp_path: Path) -> None:
     assert None not in apart
 
 
+def test_a_map_is_of_the_first_floor_of_a_log_only(tmp_path: Path) -> None:
+    east = [envelope(k, 4.0 - 0.25 * (k % 4), 0.0, floor="0") for k in range(8)]
+    west = [envelope(k, 1.7 - 0.25 * (k % 4), 0.0, floor="0") for k in range(8, 16)]
+    above = [
+        envelope(k, e["map_x"], e["map_y"], floor="1")
+        for k, e in enumerate((*east, *west), start=16)
+    ]
+    places = _places(_write(tmp_path / "rooms", ROOMS, *east, *west, *above))
+    assert places == [0] * 8 + [1] * 8 + [2] * 16
+
+
 def test_a_map_holds_for_what_comes_after_it_only(tmp_path: Path) -> None:
     """What was one place before the map stays one; new ground is judged by it."""
     both = [envelope(k, 0.2 + 0.4 * k, 0.0) for k in range(12)]
