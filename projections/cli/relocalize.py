@@ -192,10 +192,10 @@ def _pose_line(answer: Answer) -> str:
 def _place_lines(number: int, place: RankedPlace) -> list[str]:
     centroid = f"({place.centroid_x:.2f}, {place.centroid_y:.2f}) m"
     lines = [f"{number}. {_place_text(place)}  score {place.score:.3f}  centroid {centroid}"]
-    lines += [
-        f"   {e.similarity:.3f}  {e.class_name}  {e.object_id or 'no object'}  {e.det_id}"
-        for e in place.evidence
-    ]
+    for seen in place.evidence:
+        likeness = f"{seen.similarity:.3f}" if seen.compared else "class"
+        object_id = seen.object_id or "no object"
+        lines.append(f"   {likeness}  {seen.class_name}  {object_id}  {seen.det_id}")
     return lines
 
 

@@ -36,12 +36,22 @@ PLAIN_NEIGHBOURS: Final = 10
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """An observation in the map that supports a Place. ``object_id`` is None if unfused."""
+    """An observation in the map that supports a Place. ``object_id`` is None if unfused.
+
+    ``compared`` is False where the crop is a class alone: ``similarity`` is then 1.
+    """
 
     det_id: str
     object_id: str | None
     class_name: str
     similarity: float
+    compared: bool = True
+
+    def document(self) -> dict[str, Any]:
+        """As JSON."""
+        document = asdict(self)
+        del document["compared"]
+        return document
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +72,7 @@ class RankedPlace:
 
     def document(self) -> dict[str, Any]:
         """As JSON; only a Place that has a name or a floor has that key."""
-        document = asdict(self) | {"evidence": [asdict(evidence) for evidence in self.evidence]}
+        document = asdict(self) | {"evidence": [each.document() for each in self.evidence]}
         for key in ("name", "floor"):
             if document[key] is None:
                 del document[key]
@@ -142,14 +152,14 @@ def rank(
     known = known_probability(crops, candidates.matches, candidates.constants)
     thin = thinness(crops, candidates.matches)
     if method == "plain":
-        return replace(_rank_plain(candidates, top), known=known, thin=thin)
+        return replace(_rank_plain(candidates, crops, top), known=known, thin=thin)
     floors = Layout.of(candidates.places)
     candidates = floors.laid_out(candidates)
     camera = asked.camera or camera or candidates.constants.camera
     walls = None if floors.has_several else candidates.walls
     scene = Scene(candidates.constants, camera, model, walls)
     posterior = locate(views, candidates.matches, scene)
-    return replace(_answer(candidates, posterior, top, floors), known=known, thin=thin)
+    return replace(_answer(candidates, crops, posterior, top, floors), known=known, thin=thin)
 
 
 def _in_order(question: Question, candidates: Candidates) -> tuple[list[View], Candidates]:
@@ -165,14 +175,18 @@ def _in_order(question: Question, candidates: Candidates) -> tuple[list[View], C
 
 
 def _answer(
-    candidates: Candidates, posterior: Posterior | None, top: int, floors: Layout
+    candidates: Candidates,
+    crops: Sequence[Crop],
+    posterior: Posterior | None,
+    top: int,
+    floors: Layout,
 ) -> Answer:
     sums = _similarity_sums(candidates.matches)
     shares = {} if posterior is None else _place_shares(candidates, posterior)
     known = sorted(shares.keys() | sums.keys())
     order = sorted(known, key=lambda p: (-shares.get(p, 0.0), -sums.get(p, 0.0), p))
     scores = {place: shares.get(place, 0.0) for place in known}
-    places = _ranked_places(candidates, order[:top], scores)
+    places = _ranked_places(candidates, crops, order[:top], scores)
     if posterior is None:
         return Answer(places, None, 0.0)
     x, floor = floors.put_back(posterior.x), floors.floor_at(posterior.x)
@@ -182,7 +196,8 @@ def _answer(
 
 
 def _place_shares(candidates: Candidates, posterior: Posterior) -> dict[PlaceOrdinal, float]:
-    """The weight of the poses by the Place of the nearest placed candidate keyframe."""
+    """The weight of the poses by the Place of the nearest placed candidate keyframe; at most 1,
+    which a rounded sum may exceed."""
     placed = sorted({spot for row in candidates.matches for m in row if (spot := _placed(m))})
     if not placed:
         return {}
@@ -192,7 +207,7 @@ def _place_shares(candidates: Candidates, posterior: Posterior) -> dict[PlaceOrd
     nearest = np.argmin(dx * dx + dy * dy, axis=1)
     owners = np.array([spot[2] for spot in placed])[nearest]
     return {
-        PlaceOrdinal(int(place)): float(posterior.weights[owners == place].sum())
+        PlaceOrdinal(int(place)): min(float(posterior.weights[owners == place].sum()), 1.0)
         for place in np.unique(owners)
     }
 
@@ -206,13 +221,16 @@ def _placed(match: Match) -> tuple[float, float, PlaceOrdinal] | None:
 
 
 def _ranked_places(
-    candidates: Candidates, order: Sequence[PlaceOrdinal], scores: Mapping[PlaceOrdinal, float]
+    candidates: Candidates,
+    crops: Sequence[Crop],
+    order: Sequence[PlaceOrdinal],
+    scores: Mapping[PlaceOrdinal, float],
 ) -> tuple[RankedPlace, ...]:
     """The places of ``order`` (ordinals) with their scores and evidence."""
     ranked = []
     for ordinal in order:
         place = candidates.places[ordinal]
-        evidence = _evidence(candidates.matches, ordinal)
+        evidence = _evidence(candidates.matches, crops, ordinal)
         ranked.append(
             RankedPlace(
                 place.place_id,
@@ -227,17 +245,25 @@ def _ranked_places(
     return tuple(ranked)
 
 
-def _evidence(matches: Sequence[Sequence[Match]], place: PlaceOrdinal) -> tuple[Evidence, ...]:
+def _evidence(
+    matches: Sequence[Sequence[Match]], crops: Sequence[Crop], place: PlaceOrdinal
+) -> tuple[Evidence, ...]:
     """The best match of each crop whose Object is located in the place, or was seen from it."""
     best = [
-        next((m for m in row if place in (m.object_place, m.keyframe_place)), None)
-        for row in matches
+        next(((m, crop) for m in row if place in (m.object_place, m.keyframe_place)), None)
+        for row, crop in zip(matches, crops, strict=True)
     ]
-    found = sorted((m for m in best if m is not None), key=lambda m: (-m.similarity, m.observation))
-    return tuple(Evidence(m.det_id, m.object_id, m.class_name, m.similarity) for m in found)
+    found = sorted(
+        (each for each in best if each is not None),
+        key=lambda each: (-each[0].similarity, each[0].observation),
+    )
+    return tuple(
+        Evidence(m.det_id, m.object_id, m.class_name, m.similarity, crop.vector is not None)
+        for m, crop in found
+    )
 
 
-def _rank_plain(candidates: Candidates, top: int) -> Answer:
+def _rank_plain(candidates: Candidates, crops: Sequence[Crop], top: int) -> Answer:
     """The plain method's answer. Its confidence is the winner's share of all similarity."""
     sums = _similarity_sums(candidates.matches)
     if not sums:
@@ -245,7 +271,7 @@ def _rank_plain(candidates: Candidates, top: int) -> Answer:
     order = sorted(sums, key=lambda place: (-sums[place], place))
     winner = candidates.places[order[0]]
     share = sums[order[0]] / math.fsum(sums.values())
-    places = _ranked_places(candidates, order[:top], sums)
+    places = _ranked_places(candidates, crops, order[:top], sums)
     spread = _spread(candidates, order[0], winner.x, winner.y)
     pose = PoseHypothesis(winner.x, winner.y, None, spread, winner.floor)
     return Answer(places, pose, max(0.0, min(1.0, share)))
