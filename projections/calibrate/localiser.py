@@ -5,6 +5,13 @@ of `confidence` is compared with whether it was right: the scale and shift that 
 towards those that fit on the maps that the weights were fitted on, because the map's own questions
 are not quite those of another day: what is left out is not the same as what was never there. What
 the map differs by from those maps is its correction.
+
+Machines agree on the correction. What `known` is computed from is exact, and the line is fitted
+with exactly rounded sums and `projections.exact_functions`. `confidence` and the error of the pose
+come from numpy and libm, which differ in the last bits; that is why logits are rounded to multiples
+of 2⁻¹⁰ before the fit and constants to three decimals after it. What can still differ: a last bit
+that moves an error across 1.5 m, or that decides between two poses of equal weight, changes whether
+an answer is right. One such answer of a hundred moves the constants of `confidence` by about 0.01.
 """
 
 import math
@@ -12,15 +19,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from projections.evaluate.own_questions import OwnAnswer, ask_own_questions
+from projections.exact_functions import exp, log
 from projections.localizer import LocalizerConstants
 from projections.model.view import MapView
 from projections.relocalize.certainty import corrected, probability
-
-from .shrinking import rounded
 
 CROPS = (1, 3)
 
@@ -41,6 +44,9 @@ four times as much. A question whose logit is near 0 has a precision of a quarte
 are on own questions hangs on the tour as much as on the map, so that line hardly moves."""
 _FIRM = 1e-9
 _ROUNDS = 60
+_ENOUGH = 1e-12
+_STEPS_OF_A_LOGIT = 1024
+_DECIMALS = 3
 _BOUNDS = (Line(0.25, -4.0), Line(4.0, 4.0))
 
 
@@ -74,8 +80,8 @@ def read_localiser(view: MapView) -> OwnScores:
 
 def correction(answers: Sequence[OwnAnswer]) -> LocalizerConstants:
     """The constants with which the map's probabilities are right; the defaults without answers."""
-    said, is_known = [logit(a.answer.known) for a in answers], [a.known for a in answers]
-    sure, is_right = [logit(a.answer.confidence) for a in answers], [a.correct for a in answers]
+    said, is_known = [_stepped(a.answer.known) for a in answers], [a.known for a in answers]
+    sure, is_right = [_stepped(a.answer.confidence) for a in answers], [a.correct for a in answers]
     known = _beyond(fit_line(said, is_known, KNOWN_USUAL, KNOWN_FIRMNESS), KNOWN_USUAL)
     confidence = _beyond(
         fit_line(sure, is_right, CONFIDENCE_USUAL, CONFIDENCE_FIRMNESS), CONFIDENCE_USUAL
@@ -92,19 +98,29 @@ def correction(answers: Sequence[OwnAnswer]) -> LocalizerConstants:
 
 def fit_line(logits: Sequence[float], right: Sequence[bool], usual: Line, firmness: float) -> Line:
     """The line that fits best, drawn towards the usual one."""
-    z = np.array(logits, dtype=np.float64)
-    y = np.array(right, dtype=np.float64)
-    x = np.stack([np.ones(len(z)), z], axis=1)
-    start = np.array([usual.shift, usual.scale])
-    weight = np.diag([firmness, 4.0 * firmness])
-    line = start.copy()
+    pairs = [(z, 1.0 if is_right else 0.0) for z, is_right in zip(logits, right, strict=True)]
+    scale, shift = usual
     for _ in range(_ROUNDS):
-        p = 1.0 / (1.0 + np.exp(-np.clip(x @ line, -30.0, 30.0)))
-        uphill = x.T @ (y - p) - weight @ (line - start)
-        curvature = (x * (p * (1.0 - p))[:, None]).T @ x + weight
-        step: NDArray[np.float64] = np.linalg.solve(curvature, uphill)
-        line = line + np.clip(step, -1.0, 1.0)
-    return Line(float(line[1]), float(line[0]))
+        up, up_z = [-firmness * (shift - usual.shift)], [-4.0 * firmness * (scale - usual.scale)]
+        bend, bend_z, bend_zz = [firmness], [0.0], [4.0 * firmness]
+        for z, y in pairs:
+            p = 1.0 / (1.0 + exp(-min(max(scale * z + shift, -30.0), 30.0)))
+            unsure = p * (1.0 - p)
+            up.append(y - p)
+            up_z.append((y - p) * z)
+            bend.append(unsure)
+            bend_z.append(unsure * z)
+            bend_zz.append(unsure * z * z)
+        by_shift, by_scale = math.fsum(up), math.fsum(up_z)
+        a, b, c = math.fsum(bend), math.fsum(bend_z), math.fsum(bend_zz)
+        size = a * c - b * b  # above 0, as a and c hold the firmness
+        to_shift = (c * by_shift - b * by_scale) / size
+        to_scale = (a * by_scale - b * by_shift) / size
+        shift += min(max(to_shift, -1.0), 1.0)
+        scale += min(max(to_scale, -1.0), 1.0)
+        if max(abs(to_shift), abs(to_scale)) < _ENOUGH:
+            break
+    return Line(scale, shift)
 
 
 def _beyond(line: Line, usual: Line) -> Line:
@@ -112,15 +128,20 @@ def _beyond(line: Line, usual: Line) -> Line:
     least, most = _BOUNDS
     scale, shift = line.scale / usual.scale, (line.shift - usual.shift) / usual.scale
     return Line(
-        rounded(min(max(scale, least.scale), most.scale)),
-        rounded(min(max(shift, least.shift), most.shift)),
+        round(min(max(scale, least.scale), most.scale), _DECIMALS),
+        round(min(max(shift, least.shift), most.shift), _DECIMALS) + 0.0,
     )
 
 
 def logit(p: float) -> float:
     """The logit of a probability, not beyond that of one in 10⁹."""
     p = min(max(p, _FIRM), 1.0 - _FIRM)
-    return math.log(p / (1.0 - p))
+    return log(p / (1.0 - p))
+
+
+def _stepped(p: float) -> float:
+    """The logit as the nearest multiple of 2⁻¹⁰, in which a last bit of p is seldom seen."""
+    return round(logit(p) * _STEPS_OF_A_LOGIT) / _STEPS_OF_A_LOGIT
 
 
 def _corrected(p: float, scale: float, shift: float) -> float:

@@ -12,15 +12,18 @@ from projections.relocalize import UNKNOWN_BELOW
 from .localiser import CROPS, OwnScores
 
 _EDGES = (0.0, 0.25, 0.5, 0.75, 1.0)
+_DECIMALS = 6
 FEW = 20
 """Known questions below which the figures say little."""
 
 
 def localiser_document(own: OwnScores) -> dict[str, Any]:
-    """JSON: scores with the correction, by number of crops, and the correction as it is set."""
+    """JSON: scores with the correction, by number of crops, and the correction as it is set.
+
+    Scores have six decimals; beyond, machines may differ in the errors and in `confidence`."""
     constants = own.constants.model_dump(exclude={"text_shift"})
     return {
-        "questions": {str(crops): _scores(own, crops) for crops in CROPS},
+        "questions": {str(crops): _rounded(_scores(own, crops)) for crops in CROPS},
         "constants": {f"localizer.{name}": value for name, value in constants.items()},
     }
 
@@ -66,6 +69,15 @@ def localiser_text(own: OwnScores) -> str:
 def _scores(own: OwnScores, crops: int) -> dict[str, Any]:
     answers = [each for each in own.answers if each.crops == crops]
     return own_scores(answers, own.known, own.confidence, UNKNOWN_BELOW)
+
+
+def _rounded(document: Any) -> Any:
+    """A JSON document with the decimals that are told."""
+    if isinstance(document, dict):
+        return {key: _rounded(value) for key, value in document.items()}
+    if isinstance(document, list):
+        return [_rounded(value) for value in document]
+    return round(document, _DECIMALS) if isinstance(document, float) else document
 
 
 def _right(said: Sequence[tuple[float, bool]]) -> list[str]:

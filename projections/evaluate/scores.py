@@ -151,7 +151,8 @@ def calibration_floor(confidence: Sequence[float]) -> float:
             p = confidence[i]
             chances = np.append(chances * (1.0 - p), 0.0) + np.append(0.0, chances * p)
         expected = math.fsum(confidence[i] for i in members)
-        gaps.append(float(chances @ np.abs(np.arange(len(chances)) - expected)))
+        off = np.abs(np.arange(len(chances)) - expected)
+        gaps.append(math.fsum((chances * off).tolist()))  # not @, whose order BLAS chooses
     return math.fsum(gaps) / len(confidence) if confidence else 0.0
 
 

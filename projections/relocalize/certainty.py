@@ -16,6 +16,8 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
+from projections.exact_functions import exp
+
 from .candidates import Match
 from .constants import MapConstants
 from .question import Crop
@@ -85,5 +87,5 @@ def corrected(logit: float, scale: float, shift: float) -> float:
 
 
 def probability(logit: float) -> float:
-    """Between 0 and 1."""
-    return 1.0 / (1.0 + math.exp(-max(-40.0, min(40.0, logit))))
+    """Between 0 and 1; the same bits on every machine."""
+    return 1.0 / (1.0 + exp(-max(-40.0, min(40.0, logit))))

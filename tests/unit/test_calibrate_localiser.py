@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -103,6 +104,36 @@ def test_the_line_is_the_most_probable_one(pairs: list[tuple[float, bool]]) -> N
         assert cost(found.scale + off[0], found.shift + off[1]) > best
 
 
+def test_last_bits_of_probabilities_are_not_in_the_constants() -> None:
+    """Neither those of each probability, nor the order of the answers."""
+    said = _own(_spread_logits(400), Line(1.3, -0.4))
+    expected = correction(said)
+    assert expected != LocalizerConstants(known_count=400, confidence_count=400)
+    for towards in (0.0, 1.0):
+        moved = [
+            replace(
+                each,
+                answer=replace(
+                    each.answer,
+                    known=math.nextafter(each.answer.known, towards),
+                    confidence=math.nextafter(each.answer.confidence, towards),
+                ),
+            )
+            for each in said
+        ]
+        assert correction(moved) == expected
+        assert correction(moved[::-1]) == expected
+
+
+@given(st.lists(st.tuples(st.floats(-6, 6), st.booleans()), max_size=40))
+def test_the_line_does_not_depend_on_the_order(pairs: list[tuple[float, bool]]) -> None:
+    first, second = (
+        fit_line([z for z, _ in order], [y for _, y in order], Line(0.8, 0.3), 3.0)
+        for order in (pairs, pairs[::-1])
+    )
+    assert first == second
+
+
 @given(st.floats(-20.0, 20.0))
 def test_the_logit_is_that_of_the_probability(z: float) -> None:
     assert logit(probability(z)) == pytest.approx(z, abs=1e-6)
@@ -131,6 +162,9 @@ def test_the_scores_are_of_the_corrected_probabilities() -> None:
     assert document["questions"]["3"]["questions"] == 0
     assert document["constants"]["localizer.known_shift"] == 1.0
     assert "localizer.text_shift" not in document["constants"]
+    assert document["questions"]["1"]["ece"] == round(
+        own_scores(answers, own.known, own.confidence)["ece"], 6
+    )
 
 
 def test_the_text_says_how_often_what_was_said_was_right() -> None:
