@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from projections import deltas as d
+from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.database.graph_render import object_rows
 from projections.database.labels import COUNT_KEYS, LABELS, TABLE
 from projections.database.memory_sink import MemorySink, MemoryTables
@@ -25,10 +26,15 @@ Events = Sequence[Sequence[d.Delta]]
 
 
 def followed(
-    events: Events, size: int, tables: MemoryTables, rules: Settings = EVIDENCE
+    events: Events,
+    size: int,
+    tables: MemoryTables,
+    rules: Settings = EVIDENCE,
+    corrections: Corrections = NO_CORRECTIONS,
 ) -> MapView:
     """A live sink's tables after batches of ``size``, each sent twice, as after a failed commit."""
-    tracker, sink = ChangeTracker(MapView(rules, keep_embeddings=False)), MemorySink()
+    view = MapView(rules, keep_embeddings=False, corrections=corrections)
+    tracker, sink = ChangeTracker(view), MemorySink()
     for start in range(0, len(events), size):
         for offset in range(start, min(start + size, len(events))):
             tracker.apply_event(d.Offset(offset), events[offset], offset)
@@ -39,9 +45,13 @@ def followed(
 
 
 def rebuilt(
-    events: Events, size: int, rules: Settings = EVIDENCE
+    events: Events,
+    size: int,
+    rules: Settings = EVIDENCE,
+    corrections: Corrections = NO_CORRECTIONS,
 ) -> tuple[MapView, MemoryTables, dict[str, int]]:
-    tracker, tables = ChangeTracker(MapView(rules, keep_embeddings=False)), MemoryTables()
+    view = MapView(rules, keep_embeddings=False, corrections=corrections)
+    tracker, tables = ChangeTracker(view), MemoryTables()
     shadow = MemorySink().shadow()
     shadow.create(tables)
     for offset, deltas in enumerate(events):

@@ -30,10 +30,11 @@ def test_batches_of_any_size_give_the_rows_of_a_rebuild(
 ) -> None:
     raw, documents, commands = world
     rules = Settings(**raw, **rule)
-    folded = Folded.start(rules, corrections=compiled(commands)).extend(documents)
+    corrections = compiled(commands)
+    folded = Folded.start(rules, corrections=corrections).extend(documents)
     live = MemoryTables()
-    followed(folded.deltas, size, live, rules)
-    _, anew, counted = rebuilt(folded.deltas, rebuild_size, rules)
+    followed(folded.deltas, size, live, rules, corrections)
+    _, anew, counted = rebuilt(folded.deltas, rebuild_size, rules, corrections)
     assert live.graph == anew.graph
     assert counted["Place"] == len(folded.view.places)
 
