@@ -1,6 +1,5 @@
 """``mapfold db``: the embedded server, check and repair of the databases, roles, retry."""
 
-import sys
 from dataclasses import asdict
 from typing import Annotated, Any
 
@@ -61,7 +60,6 @@ def start(as_json: JsonOption = False) -> None:
         emit({"url": address, "data": str(server.data), "running": True, "kept": True})
         return
     display(address)
-    sys.stdout.flush()  # before the line on stderr, also where both are one pipe
     say(f"running, with its data in {server.data}; stop it with: mapfold db stop")
 
 

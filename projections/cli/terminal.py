@@ -22,7 +22,9 @@ people = Console(stderr=True, highlight=False, soft_wrap=True, markup=False)
 
 
 def say(message: str) -> None:
-    """Print a message of one or several lines to stderr."""
+    """Print a message of one or several lines to stderr, and before it what stdout still buffers,
+    so that both are in order where they go to one pipe."""
+    sys.stdout.flush()
     people.print(visible_lines(message))
 
 
