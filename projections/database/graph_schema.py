@@ -14,7 +14,7 @@ from psycopg import sql
 
 from projections.errors import DatabaseError, ProjectionMismatch
 
-from . import swap
+from . import replaced_tables
 from .connection import Connection, describe_connection
 from .cypher import PARENTS, add_policies
 from .labels import (
@@ -152,7 +152,7 @@ def drop_in_background(connection: Connection, graph: str) -> None:
     """Have the server drop a graph of ours, if it is there; closes the connection then."""
     if exists(connection, graph):
         connection.execute("SET search_path = ag_catalog, public")
-        swap.send_and_close(
+        replaced_tables.send_and_close(
             connection, statements("graph")["drop_named"].format(graph=sql.Literal(graph))
         )
 

@@ -10,7 +10,7 @@ from projections.errors import DatabaseError
 from projections.model.changes import BatchChanges
 from projections.model.view import MapView
 
-from . import graph_schema, swap
+from . import graph_schema, replaced_tables
 from .connection import Connection, describe_connection, ensure_extension
 from .cypher import policies_apply
 from .grants import copy_privileges
@@ -84,7 +84,7 @@ class GraphSink:
         """
         ensure_extension(connection, "age")
         graph_schema.exists(connection, GRAPH)
-        if swap.try_drop_lock(connection, self.name):
+        if replaced_tables.try_drop_lock(connection, self.name):
             for graph in (OLD_GRAPH, NEXT_GRAPH):
                 with connection.transaction():
                     graph_schema.drop(connection, graph)
@@ -95,9 +95,9 @@ class GraphSink:
 
     def drop_replaced(self, connection: Connection) -> None:
         """Have the replaced graph dropped once its last reader is gone."""
-        if swap.wait_for_earlier_transactions(connection) and swap.try_drop_lock(
-            connection, self.name
-        ):
+        if replaced_tables.wait_for_earlier_transactions(
+            connection
+        ) and replaced_tables.try_drop_lock(connection, self.name):
             graph_schema.drop_in_background(connection, OLD_GRAPH)
 
 
@@ -132,7 +132,7 @@ class GraphShadow:
 
     def lock_readers(self, connection: Connection) -> None:
         """Keep readers away from the graph."""
-        swap.wait_for_drop(connection, GraphSink.name)
+        replaced_tables.wait_for_drop(connection, GraphSink.name)
         graph_schema.lock(connection, GRAPH)
 
     def swap_in(self, connection: Connection) -> None:

@@ -10,7 +10,7 @@ from projections.errors import DatabaseError
 from projections.model.changes import BatchChanges
 from projections.model.view import MapView
 
-from . import swap, vector_table
+from . import replaced_tables, vector_table
 from .connection import Connection, describe_connection, ensure_extension
 from .grants import copy_privileges
 from .labels import TABLE
@@ -70,7 +70,9 @@ class VectorSink:
         """Drop a replaced table that was left; refuse early if the name in use is not ours."""
         ensure_extension(connection, "vector")
         vector_table.dimension(connection)
-        if vector_table.has_old(connection) and swap.try_drop_lock(connection, self.name):
+        if vector_table.has_old(connection) and replaced_tables.try_drop_lock(
+            connection, self.name
+        ):
             vector_table.drop_old(connection)
 
     def shadow(self) -> "VectorShadow":
@@ -79,7 +81,9 @@ class VectorSink:
 
     def drop_replaced(self, connection: Connection) -> None:
         """Have the replaced table dropped."""
-        if vector_table.has_old(connection) and swap.try_drop_lock(connection, self.name):
+        if vector_table.has_old(connection) and replaced_tables.try_drop_lock(
+            connection, self.name
+        ):
             vector_table.drop_old_in_background(connection)
 
     def _refuse_if_not_owner(self, connection: Connection, dimension: int) -> None:
@@ -140,7 +144,7 @@ class VectorShadow:
 
     def lock_readers(self, connection: Connection) -> None:
         """Keep readers away from the table."""
-        swap.wait_for_drop(connection, VectorSink.name)
+        replaced_tables.wait_for_drop(connection, VectorSink.name)
         if vector_table.dimension(connection) is not None:
             vector_table.lock(connection)
 

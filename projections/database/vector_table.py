@@ -23,7 +23,7 @@ from psycopg.rows import TupleRow
 from eventsrc.text import counted
 from projections.errors import DatabaseError
 
-from . import swap
+from . import replaced_tables
 from .connection import Connection, describe_connection, extension_version
 from .labels import TABLE
 from .statements import statements
@@ -144,7 +144,7 @@ def drop_old(connection: Connection) -> None:
 
 def drop_old_in_background(connection: Connection) -> None:
     """Have the server drop the replaced table in the background; closes the connection."""
-    swap.send_and_close(connection, statements("vectors")["drop_old"].format())
+    replaced_tables.send_and_close(connection, statements("vectors")["drop_old"].format())
 
 
 def _set_storage(connection: Connection, schema: str, dimension: int) -> None:

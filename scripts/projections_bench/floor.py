@@ -29,8 +29,8 @@ from projections.database import rebuild
 from projections.database.connection import Targets, connect
 from projections.database.embedded import EmbeddedServer
 from projections.database.labels import GRAPH, LABELS
+from projections.database.replaced_tables import wait_for_drop
 from projections.database.statements import statements
-from projections.database.swap import wait_for_drop
 from projections.model.fold import fold_log
 from projections.settings import Settings
 

@@ -11,7 +11,7 @@ from psycopg import sql
 from projections.database import RebuildProgress, rebuild
 from projections.database.check import check
 from projections.database.connection import Connection, Targets, connect
-from projections.database.swap import try_drop_lock
+from projections.database.replaced_tables import try_drop_lock
 from projections.database.vector_table import build_hnsw
 from projections.errors import DatabaseError
 from projections.settings import Settings
@@ -55,7 +55,7 @@ def test_the_next_rebuild_drops_what_the_server_did_not(
 ) -> None:
     rebuild(log, one_database, SETTINGS, until=30)
     with monkeypatch.context() as patched:
-        patched.setattr("projections.database.swap.send_and_close", nobody_drops)
+        patched.setattr("projections.database.replaced_tables.send_and_close", nobody_drops)
         rebuild(log, one_database, SETTINGS)
     rows = all_rows(one_database)
     assert left_over(pg) == {"semantic_map_old", "mapfold_old"}

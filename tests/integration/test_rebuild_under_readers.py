@@ -111,7 +111,7 @@ def test_a_long_transaction_keeps_its_graph_and_the_next_rebuild_drops_it(
     tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It has read only the table so far; the graph it reads later must still be whole."""
-    monkeypatch.setattr("projections.database.swap.WAIT_SECONDS", 0.2)
+    monkeypatch.setattr("projections.database.replaced_tables.WAIT_SECONDS", 0.2)
     log = write_log(tmp_path / "log", walk(60))
     rebuild(log, one_database, SETTINGS)
     with connect_for_cypher(one_database.graph_url) as reader:

@@ -1,4 +1,4 @@
-"""After a swap: wait for the last readers of the replaced tables, then have the server drop them.
+"""Drop the tables that a swap has replaced, once their last readers have ended.
 
 The swap itself is `graph_schema.swap_in`, and for vectors `vector_table.set_aside` and `move_in`.
 
