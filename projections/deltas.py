@@ -140,7 +140,7 @@ class PlaceFormed(msgspec.Struct, frozen=True, gc=False):
     founder: KeyframeOrdinal
 
 
-class Link(msgspec.Struct, frozen=True, gc=False):
+class PlaceLink(msgspec.Struct, frozen=True, gc=False):
     """Two core points within ε of each other that joined two places; keyframe ordinals, µm.
 
     Of places by rooms: the founders of the two places' cells that are the shortest drive apart,
@@ -176,7 +176,7 @@ class PlacesMerged(msgspec.Struct, frozen=True, gc=False):
     survivor: PlaceOrdinal
     absorbed: tuple[PlaceOrdinal, ...]
     bridge: KeyframeOrdinal
-    links: tuple[Link, ...]
+    links: tuple[PlaceLink, ...]
     survivor_count: int
     absorbed_counts: tuple[int, ...]
     joined: tuple[PlaceOrdinal, ...] = ()
@@ -196,7 +196,7 @@ class MergeRefused(msgspec.Struct, frozen=True, gc=False):
     a: PlaceOrdinal
     b: PlaceOrdinal
     bridge: KeyframeOrdinal
-    link: Link
+    link: PlaceLink
     apart: tuple[KeyframeOrdinal, KeyframeOrdinal]
 
 

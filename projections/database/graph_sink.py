@@ -10,7 +10,7 @@ from projections.errors import DatabaseError
 from projections.model.changes import BatchChanges
 from projections.model.view import MapView
 
-from . import graph_schema, replaced_tables
+from . import graph_schema
 from .connection import Connection, describe_connection, ensure_extension
 from .cypher import policies_apply
 from .grants import copy_privileges
@@ -26,6 +26,7 @@ from .labels import (
     Label,
 )
 from .loader import InsertLoader, Load, Loader, LoaderName, loader_of, unnest_columns
+from .replaced_tables import try_drop_lock, wait_for_drop, wait_for_earlier_transactions
 from .sink import PreparedWrite, SinkName
 from .statements import statements
 
@@ -84,7 +85,7 @@ class GraphSink:
         """
         ensure_extension(connection, "age")
         graph_schema.exists(connection, GRAPH)
-        if replaced_tables.try_drop_lock(connection, self.name):
+        if try_drop_lock(connection, self.name):
             for graph in (OLD_GRAPH, NEXT_GRAPH):
                 with connection.transaction():
                     graph_schema.drop(connection, graph)
@@ -95,9 +96,7 @@ class GraphSink:
 
     def drop_replaced(self, connection: Connection) -> None:
         """Have the replaced graph dropped once its last reader is gone."""
-        if replaced_tables.wait_for_earlier_transactions(
-            connection
-        ) and replaced_tables.try_drop_lock(connection, self.name):
+        if wait_for_earlier_transactions(connection) and try_drop_lock(connection, self.name):
             graph_schema.drop_in_background(connection, OLD_GRAPH)
 
 
@@ -132,7 +131,7 @@ class GraphShadow:
 
     def lock_readers(self, connection: Connection) -> None:
         """Keep readers away from the graph."""
-        replaced_tables.wait_for_drop(connection, GraphSink.name)
+        wait_for_drop(connection, GraphSink.name)
         graph_schema.lock(connection, GRAPH)
 
     def swap_in(self, connection: Connection) -> None:

@@ -10,11 +10,12 @@ from projections.errors import DatabaseError
 from projections.model.changes import BatchChanges
 from projections.model.view import MapView
 
-from . import replaced_tables, vector_table
+from . import vector_table
 from .connection import Connection, describe_connection, ensure_extension
 from .grants import copy_privileges
 from .labels import TABLE
 from .loader import InsertLoader, Load, Loader, LoaderName, loader_of
+from .replaced_tables import try_drop_lock, wait_for_drop
 from .sink import PreparedWrite, SinkName
 from .vector_rows import VectorRow, new_rows
 from .vector_table import READERS, SHADOW
@@ -70,9 +71,7 @@ class VectorSink:
         """Drop a replaced table that was left; refuse early if the name in use is not ours."""
         ensure_extension(connection, "vector")
         vector_table.dimension(connection)
-        if vector_table.has_old(connection) and replaced_tables.try_drop_lock(
-            connection, self.name
-        ):
+        if vector_table.has_old(connection) and try_drop_lock(connection, self.name):
             vector_table.drop_old(connection)
 
     def shadow(self) -> "VectorShadow":
@@ -81,9 +80,7 @@ class VectorSink:
 
     def drop_replaced(self, connection: Connection) -> None:
         """Have the replaced table dropped."""
-        if vector_table.has_old(connection) and replaced_tables.try_drop_lock(
-            connection, self.name
-        ):
+        if vector_table.has_old(connection) and try_drop_lock(connection, self.name):
             vector_table.drop_old_in_background(connection)
 
     def _refuse_if_not_owner(self, connection: Connection, dimension: int) -> None:
@@ -144,7 +141,7 @@ class VectorShadow:
 
     def lock_readers(self, connection: Connection) -> None:
         """Keep readers away from the table."""
-        replaced_tables.wait_for_drop(connection, VectorSink.name)
+        wait_for_drop(connection, VectorSink.name)
         if vector_table.dimension(connection) is not None:
             vector_table.lock(connection)
 

@@ -23,7 +23,7 @@ from typing import Any
 from eventsrc.envelope import Offset
 from eventsrc.text import counted
 from projections.corrections import RecordedCommand
-from projections.deltas import KeyframeOrdinal, Link, ObjectOrdinal, PlaceOrdinal
+from projections.deltas import KeyframeOrdinal, ObjectOrdinal, PlaceLink, PlaceOrdinal
 from projections.model.command_text import command_document, command_on, command_title
 
 from .evidence import evidence_document
@@ -185,7 +185,7 @@ def seen_from_both(history: History, merge: Merge) -> Sequence[ObjectOrdinal]:
     return history.seen_from.from_all(merge.places, merge.cause.offset)
 
 
-def join_links(merge: Merge) -> list[Link]:
+def join_links(merge: Merge) -> list[PlaceLink]:
     """The links of the places that a command joined, one for each: the keyframes that it names."""
     return [
         link
@@ -194,7 +194,7 @@ def join_links(merge: Merge) -> list[Link]:
     ]
 
 
-def _join_text(history: History, link: Link) -> str:
+def _join_text(history: History, link: PlaceLink) -> str:
     core, neighbour = keyframe_name(history, link.core), keyframe_name(history, link.neighbour)
     distance = f"{link.distance_um / 1e6:.3f} m apart"
     found = _command(history, (link.core, link.neighbour), joins=True)
@@ -254,7 +254,7 @@ def chain_text(history: History, chain: Chain) -> str:
     return " ".join([*steps, names[-1]])
 
 
-def _link_text(history: History, link: Link) -> str:
+def _link_text(history: History, link: PlaceLink) -> str:
     core, neighbour = keyframe_name(history, link.core), keyframe_name(history, link.neighbour)
     if history.settings.places == "rooms":
         drive = f"{link.distance_um / 1e6:.3f} m"
@@ -262,7 +262,7 @@ def _link_text(history: History, link: Link) -> str:
     return f"{core} and {neighbour} are core points {link.distance_um / 1e6:.3f} m apart"
 
 
-def link_document(history: History, link: Link) -> dict[str, Any]:
+def link_document(history: History, link: PlaceLink) -> dict[str, Any]:
     """A link of the merge as JSON."""
     return {
         "core": keyframe_name(history, link.core),
@@ -319,7 +319,7 @@ def _drives_document(history: History, merge: Merge) -> dict[str, Any]:
     return {"drives": drives, "seen_from_both": seen}
 
 
-def _joined_document(history: History, link: Link) -> dict[str, Any]:
+def _joined_document(history: History, link: PlaceLink) -> dict[str, Any]:
     command = _document(_command(history, (link.core, link.neighbour), joins=True))
     return {**link_document(history, link), "command": command}
 

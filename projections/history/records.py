@@ -21,7 +21,6 @@ from projections.deltas import (
     KeyframeAdded,
     KeyframeOrdinal,
     KeyframePlaced,
-    Link,
     MeanDrive,
     ObjectClassified,
     ObjectEstimated,
@@ -34,6 +33,7 @@ from projections.deltas import (
     ObjectsMerged,
     PlaceChanged,
     PlaceFormed,
+    PlaceLink,
     PlaceNamed,
     PlaceOrdinal,
 )
@@ -131,7 +131,7 @@ class Merge:
     survivor_size: int
     absorbed: tuple[PlaceOrdinal, ...]
     absorbed_sizes: tuple[int, ...]
-    links: tuple[Link, ...]
+    links: tuple[PlaceLink, ...]
     objects: tuple[ObjectOrdinal, ...]
     edges: tuple[EdgeChange, ...]
     joined: tuple[PlaceOrdinal, ...] = ()
@@ -155,7 +155,7 @@ class Refusal:
     a: PlaceOrdinal
     b: PlaceOrdinal
     bridge: KeyframeOrdinal
-    link: Link
+    link: PlaceLink
     apart: tuple[KeyframeOrdinal, KeyframeOrdinal]
 
 

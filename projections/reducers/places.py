@@ -31,7 +31,7 @@ from projections.deltas import (
     Delta,
     KeyframeOrdinal,
     KeyframePlaced,
-    Link,
+    PlaceLink,
     PlaceOrdinal,
     PlacesMerged,
     RunOrdinal,
@@ -218,9 +218,9 @@ class Places(PlaceMembers):
         self.absorb(survivor, absorbed)
         return delta
 
-    def _link(self, core: int, neighbour: int) -> Link:
+    def _link(self, core: int, neighbour: int) -> PlaceLink:
         distance_um = math.isqrt(self.core_index.squared_distance(core, neighbour))
-        return Link(self.keyframes[core], self.keyframes[neighbour], distance_um)
+        return PlaceLink(self.keyframes[core], self.keyframes[neighbour], distance_um)
 
     def _join(self, point: int, place: PlaceOrdinal) -> None:
         self.join_place(point, place, self.core_index.x[point], self.core_index.y[point])

@@ -33,9 +33,9 @@ from projections.deltas import (
     Delta,
     KeyframeOrdinal,
     KeyframePlaced,
-    Link,
     MeanDrive,
     MergeRefused,
+    PlaceLink,
     PlaceOrdinal,
     PlacesMerged,
     RunOrdinal,
@@ -281,7 +281,7 @@ class Rooms(PlaceMembers):
         offset: Offset,
         bridge: KeyframeOrdinal,
         pair: Pair,
-        link: Link,
+        link: PlaceLink,
         drive: MeanDrive | None,
     ) -> PlacesMerged:
         """Make the two one; without a mean drive, because a command joins them."""
@@ -310,7 +310,7 @@ class Rooms(PlaceMembers):
         self._closeness[absorbed] = {}
         return delta
 
-    def _link_of(self, pair: Pair) -> Link:
+    def _link_of(self, pair: Pair) -> PlaceLink:
         """The founders of the two places' cells that are the shortest drive apart, and how far
         that is; of several the earliest. There are such: places without are not close."""
         distance, cell, other = min(
@@ -320,7 +320,7 @@ class Rooms(PlaceMembers):
             if self._place_of_cell(other) == pair.b
         )
         core, neighbour = (self.keyframes[self._founders[each]] for each in (cell, other))
-        return Link(core, neighbour, distance)
+        return PlaceLink(core, neighbour, distance)
 
     def _enter(
         self,
@@ -340,7 +340,7 @@ class Rooms(PlaceMembers):
             pair = Pair(min(place, other), max(place, other))
             ends = (anchor, named) if place < other else (named, anchor)
             (ax, ay), (bx, by) = map(self._positions.__getitem__, ends)
-            link = Link(*ends, distance_um(ax, ay, bx, by))
+            link = PlaceLink(*ends, distance_um(ax, ay, bx, by))
             apart = self._anchors.apart(*map(self._anchors.inside, pair))
             if apart is None:
                 deltas.append(self._merge(offset, anchor, pair, link, None))

@@ -7,8 +7,8 @@ import pytest
 from projections.deltas import (
     KeyframeOrdinal,
     KeyframePlaced,
-    Link,
     PlaceFormed,
+    PlaceLink,
     PlaceOrdinal,
     PlacesMerged,
 )
@@ -44,7 +44,7 @@ def test_noise_is_a_cluster_of_its_own():
 
 def test_keyframes_are_renamed_that_end_in_another_place_than_their_first():
     view, truth = _case(["A"] * 4, [0, 0, 1, 1])
-    link = Link(KeyframeOrdinal(0), KeyframeOrdinal(2), 0)
+    link = PlaceLink(KeyframeOrdinal(0), KeyframeOrdinal(2), 0)
     merged = PlacesMerged(9, PlaceOrdinal(0), (PlaceOrdinal(1),), link.core, (link,), 2, (2,))
     view.apply_event(9, [merged])
     first = {KeyframeOrdinal(k): PlaceOrdinal(p) for k, p in enumerate([0, 0, 1, 0])}

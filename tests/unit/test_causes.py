@@ -6,9 +6,9 @@ from projections.deltas import (
     Delta,
     KeyframeAdded,
     KeyframePlaced,
-    Link,
     PlaceChanged,
     PlaceFormed,
+    PlaceLink,
     PlacesMerged,
     Pose,
 )
@@ -37,7 +37,7 @@ def commanded() -> History:
     history = History(Settings())
     history.apply(0, keyframe(0))
     history.apply(1, keyframe(1))
-    merged = PlacesMerged(2, 0, (1,), 1, (Link(0, 1, 10**7),), 1, (1,))
+    merged = PlacesMerged(2, 0, (1,), 1, (PlaceLink(0, 1, 10**7),), 1, (1,))
     history.apply(2, [merged, PlaceChanged(2, 0, 2, 10**7, 0)])
     return history
 

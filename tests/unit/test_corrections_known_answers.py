@@ -19,7 +19,7 @@ from eventsrc.commands import (
 )
 from eventsrc.envelope import Offset
 from projections.corrections import Corrections, RecordedCommand, compile_corrections
-from projections.deltas import Link, MergeRefused, ObjectsMerged, PlacesMerged
+from projections.deltas import MergeRefused, ObjectsMerged, PlaceLink, PlacesMerged
 from projections.errors import ImpossibleCommand
 from projections.model.changes import ChangeTracker
 from projections.reducers.landmarks import object_id
@@ -72,7 +72,7 @@ def labels(folded: Folded) -> list[int | None]:
 def test_a_bridge_between_places_kept_apart_joins_the_first_and_is_reported_once() -> None:
     folded = under(apart(3, 0)).extend([*ROOMS, *line(1.3, 1.35, 1.4, first=6)])
     assert labels(folded) == [0, 0, 0, 1, 1, 1, 0, 0, 0]
-    link = Link(core=6, neighbour=3, distance_um=1_300_000)
+    link = PlaceLink(core=6, neighbour=3, distance_um=1_300_000)
     assert folded.all(MergeRefused) == [MergeRefused(6, 0, 1, 6, link, apart=(0, 3))]
     assert folded.all(PlacesMerged) == []
 
@@ -104,7 +104,7 @@ def test_joined_places_are_one_as_soon_as_both_are_there() -> None:
     folded = under(join(4, 1)).extend([*line(0.0, 0.1, 0.2), *line(9.0, 9.1, 9.2, 9.3, first=3)])
     (merge,) = folded.all(PlacesMerged)
     assert (merge.offset, merge.survivor, merge.absorbed, merge.joined) == (5, 0, (1,), (1,))
-    assert merge.links == (Link(core=4, neighbour=1, distance_um=9_000_000),)
+    assert merge.links == (PlaceLink(core=4, neighbour=1, distance_um=9_000_000),)
     assert labels(folded) == [0] * 7
     assert folded.view.places[0].keyframe_count == 7
 
@@ -121,7 +121,7 @@ def test_a_join_of_places_that_grew_into_conflict_is_refused() -> None:
     folded = under(join(0, 20), apart(0, 3)).extend([*ROOMS, late])
     assert labels(folded) == [0, 0, 0, 1, 1, 1, 1]
     assert [(d.a, d.b, d.link) for d in folded.all(MergeRefused)] == [
-        (0, 1, Link(core=6, neighbour=0, distance_um=2_750_000))
+        (0, 1, PlaceLink(core=6, neighbour=0, distance_um=2_750_000))
     ]
 
 

@@ -11,13 +11,13 @@ from projections.deltas import (
     Delta,
     EventSkipped,
     KeyframePlaced,
-    Link,
     ObjectMoved,
     ObservationAdded,
+    PlaceLink,
     Pose,
 )
 
-KINDS = (*get_args(Delta), Link, Pose)
+KINDS = (*get_args(Delta), PlaceLink, Pose)
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)

@@ -6,9 +6,9 @@ import pytest
 
 from projections.deltas import (
     KeyframePlaced,
-    Link,
     PlaceChanged,
     PlaceFormed,
+    PlaceLink,
     PlacesLinked,
     PlacesMerged,
 )
@@ -51,7 +51,7 @@ def test_a_merge_names_the_bridge_and_the_pair_that_reached_over() -> None:
         survivor=0,
         absorbed=(1,),
         bridge=6,
-        links=(Link(core=6, neighbour=3, distance_um=1_300_000),),
+        links=(PlaceLink(core=6, neighbour=3, distance_um=1_300_000),),
         survivor_count=3,
         absorbed_counts=(3,),
     )
@@ -66,7 +66,7 @@ def test_a_link_reaches_a_core_point_that_the_absorbed_place_had_before() -> Non
     folded = fold(envelope(i, x, y) for i, (x, y) in enumerate(spots))
     (merge,) = folded.all(PlacesMerged)
     assert (merge.survivor, merge.absorbed, merge.bridge) == (0, (1,), 6)
-    assert merge.links == (Link(core=6, neighbour=1, distance_um=670_820),)
+    assert merge.links == (PlaceLink(core=6, neighbour=1, distance_um=670_820),)
 
 
 def test_a_newcomer_that_is_not_core_can_still_merge_two_places() -> None:
@@ -79,7 +79,7 @@ def test_a_newcomer_that_is_not_core_can_still_merge_two_places() -> None:
     assert len(folded.all(PlaceFormed)) == 2
     (merge,) = folded.all(PlacesMerged)
     assert (merge.survivor, merge.absorbed, merge.bridge) == (0, (1,), 12)
-    assert merge.links == (Link(core=10, neighbour=5, distance_um=1_300_000),)
+    assert merge.links == (PlaceLink(core=10, neighbour=5, distance_um=1_300_000),)
     assert not folded.map.places.core_index.is_core(12)
     assert folded.view.places[0].keyframe_count == 13
 
