@@ -14,7 +14,7 @@ exact; `projections.exact` says why and where the bounds are. Timestamps are the
 seconds.
 
 The deltas of one event come in this order: RunSeen, KeyframeAdded, ObservationAdded …, then places
-(PlaceFormed, PlacesMerged, MergeRefused, KeyframePlaced, PlaceChanged, PlaceNamed), landmarks
+(PlaceFormed, PlacesMerged, MergeRefused, KeyframePlaced, PlaceChanged, PlaceNamed), Objects
 (ObjectFound / ObjectSeen, ObjectsMerged / ObjectRelocated, ObjectClassified, ObjectEstimated,
 ObjectMissing), located-in (ObjectMoved), adjacency (PlacesLinked). An ObjectRelocated stands right
 after the ObjectsMerged that makes the Object found elsewhere part of the one that moved. A delta

@@ -10,7 +10,7 @@ from projections.deltas import ObservationOrdinal, Pose, RunOrdinal
 from projections.evidence import EvidenceConstants
 from projections.exact import metres_to_um, unit_vectors
 from projections.pair_groups import PairGroups
-from projections.reducers.evidence_landmarks import EvidenceLandmarks, LandmarkDelta
+from projections.reducers.evidence_objects import EvidenceObjects, ObjectDelta
 from projections.reducers.sights import Sighting
 from projections.settings import Camera
 
@@ -21,7 +21,7 @@ CLASSES = ("chair", "table", "plant")
 
 
 class Picture(NamedTuple):
-    """One call of `EvidenceLandmarks.fold`, and the true thing of each sighting."""
+    """One call of `EvidenceObjects.fold`, and the true thing of each sighting."""
 
     offset: Offset
     run: RunOrdinal
@@ -108,15 +108,13 @@ def a_sighting(
     return Sighting(ObservationOrdinal(observation), det_id, label, unit[0], unit[2], bbox)
 
 
-def fold_all(
-    pictures: list[Picture], groups: PairGroups[DetId] | None = None
-) -> list[LandmarkDelta]:
+def fold_all(pictures: list[Picture], groups: PairGroups[DetId] | None = None) -> list[ObjectDelta]:
     """The deltas of all pictures."""
-    landmarks = EvidenceLandmarks(EvidenceConstants(), groups)
-    return [delta for picture in pictures for delta in fold_one(landmarks, picture)]
+    objects = EvidenceObjects(EvidenceConstants(), groups)
+    return [delta for picture in pictures for delta in fold_one(objects, picture)]
 
 
-def fold_one(landmarks: EvidenceLandmarks, picture: Picture) -> list[LandmarkDelta]:
+def fold_one(objects: EvidenceObjects, picture: Picture) -> list[ObjectDelta]:
     """The deltas of one picture."""
     offset, run, timestamp, pose, sightings, _ = picture
-    return landmarks.fold(offset, run, timestamp, pose, CAMERA, sightings)
+    return objects.fold(offset, run, timestamp, pose, CAMERA, sightings)

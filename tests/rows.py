@@ -80,7 +80,7 @@ def expected_graph(view: MapView) -> dict[str, list[tuple[Any, ...]]]:
         if k.place is not None:
             place_end = gid("Place", k.place + 1)
             rows["IN_PLACE"].append((gid("IN_PLACE", n), gid("Keyframe", n), place_end, {}))
-    _expect_landmarks(view, rows)
+    _expect_objects(view, rows)
     for p in view.places.values():
         properties = {
             "place_id": p.place_id,
@@ -128,7 +128,7 @@ def recounted_contents(view: MapView, place: int) -> dict[str, float]:
     return counted
 
 
-def _expect_landmarks(view: MapView, rows: dict[str, list[tuple[Any, ...]]]) -> None:
+def _expect_objects(view: MapView, rows: dict[str, list[tuple[Any, ...]]]) -> None:
     for o in view.observations:
         n, k = o.ordinal + 1, view.keyframes[o.keyframe]
         properties: dict[str, Any] = {

@@ -20,7 +20,7 @@ from projections.model.fold import READ_AHEAD, fold_events, fold_log_cached, gc_
 from projections.model.log_commands import read_commands
 from projections.model.records import KeyframeRecord, ObjectRecord, ObservationRecord
 from projections.model.view import MapView
-from projections.reducers.landmarks import object_id
+from projections.reducers.objects import object_id
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 

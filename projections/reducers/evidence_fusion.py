@@ -1,4 +1,4 @@
-"""Fusion by evidence, whole: landmarks, which of them are missing, which stand elsewhere now."""
+"""Fusion by evidence: Objects, which of them are missing, and which stand elsewhere now."""
 
 from collections.abc import Container, Sequence
 from typing import TypeAlias
@@ -17,12 +17,12 @@ from projections.pair_groups import PairGroups
 from projections.reducers import State, part, prefixed
 from projections.settings import Camera
 
-from .evidence_landmarks import EvidenceLandmarks, LandmarkDelta
+from .evidence_objects import EvidenceObjects, ObjectDelta
 from .presence import Presence
 from .relocations import Relocations
 from .sights import Sighting
 
-FusionDelta: TypeAlias = LandmarkDelta | ObjectMissing
+FusionDelta: TypeAlias = ObjectDelta | ObjectMissing
 
 
 class EvidenceFusion:
@@ -31,9 +31,9 @@ class EvidenceFusion:
     def __init__(
         self, constants: EvidenceConstants, groups: PairGroups[DetId] | None = None
     ) -> None:
-        self._landmarks = EvidenceLandmarks(constants, groups)
+        self._objects = EvidenceObjects(constants, groups)
         self._presence = Presence()
-        self._relocations = Relocations(self._presence, self._landmarks)
+        self._relocations = Relocations(self._presence, self._objects)
 
     def fold(
         self,
@@ -45,13 +45,13 @@ class EvidenceFusion:
         sightings: Sequence[Sighting],
     ) -> list[FusionDelta]:
         """Fuse the observations of one picture; look for what it does not show."""
-        fused = self._landmarks.fold(offset, run, timestamp, pose, camera, sightings)
+        fused = self._objects.fold(offset, run, timestamp, pose, camera, sightings)
         missing = self._presence.fold(offset, run, pose, camera, fused)
         moved = self._relocations.fold(fused)
         if not moved:
             return [*fused, *missing]
         for pair in moved:
-            fused += self._landmarks.relocate(offset, pair)
+            fused += self._objects.relocate(offset, pair)
             self._presence.relocate(pair.old, pair.new)
         elsewhere = {ordinal for pair in moved for ordinal in (pair.old, pair.new)}
         left = [delta for delta in missing if delta.object not in elsewhere]
@@ -60,25 +60,25 @@ class EvidenceFusion:
     def dump(self) -> State:
         """Everything, for a snapshot."""
         return (
-            prefixed("landmarks", self._landmarks.dump())
+            prefixed("landmarks", self._objects.dump())
             | prefixed("presence", self._presence.dump())
             | prefixed("relocations", self._relocations.dump())
         )
 
     def load(self, state: State) -> None:
         """Take over what `dump` gave."""
-        self._landmarks.load(part("landmarks", state))
+        self._objects.load(part("landmarks", state))
         self._presence.load(part("presence", state))
         self._relocations.load(part("relocations", state))
 
 
 def _in_order(
-    fused: Sequence[LandmarkDelta], absorbed: Container[ObjectOrdinal]
-) -> list[LandmarkDelta]:
+    fused: Sequence[ObjectDelta], absorbed: Container[ObjectOrdinal]
+) -> list[ObjectDelta]:
     """Classes and estimates last, ascending, the latest of each Object that is left."""
-    others: list[LandmarkDelta] = []
-    classes: dict[ObjectOrdinal, LandmarkDelta] = {}
-    estimates: dict[ObjectOrdinal, LandmarkDelta] = {}
+    others: list[ObjectDelta] = []
+    classes: dict[ObjectOrdinal, ObjectDelta] = {}
+    estimates: dict[ObjectOrdinal, ObjectDelta] = {}
     for delta in fused:
         if type(delta) is ObjectClassified:
             classes[delta.object] = delta

@@ -1,4 +1,4 @@
-"""Which Object each observation of a picture is of: rules 1 to 3 of `evidence_landmarks`."""
+"""Which Object each observation of a picture is of: rules 1 to 3 of `evidence_objects`."""
 
 from collections.abc import Mapping, Sequence
 

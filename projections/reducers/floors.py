@@ -5,7 +5,7 @@ n × ``floor_height_m``, a height half-way belongs to the upper one. So 2.8 m is
 floor, and the same floor as that of an envelope with ``"floor": 1``. Poses without either are on a
 floor of their own, which has no name.
 
-The reducers of places and landmarks are given *laid out* positions: those of each floor are moved
+The reducers of places and Objects are given *laid out* positions: those of each floor are moved
 by a multiple of `STEP_UM`, which is ten times what a map spans. So nothing on two floors is ever
 within reach of each other, whatever the rule, and the deltas are moved back. The floor that the
 first pose of a log is on is not moved: a map of one floor is as it would be without floors.

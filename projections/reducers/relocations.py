@@ -39,7 +39,7 @@ _MOST = 128
 
 
 class Comparing(Protocol):
-    """What is asked of landmarks."""
+    """What is asked of the reducer of Objects."""
 
     def class_of(self, ordinal: ObjectOrdinal) -> str:
         """The class of most of an Object's observations."""
@@ -75,9 +75,9 @@ class _Newcomer(NamedTuple):
 class Relocations:
     """The reducer."""
 
-    def __init__(self, presence: Presence, landmarks: Comparing) -> None:
+    def __init__(self, presence: Presence, objects: Comparing) -> None:
         self._presence = presence
-        self._landmarks = landmarks
+        self._objects = objects
         self._newcomers: dict[ObjectOrdinal, _Newcomer] = {}
         self._class_of: dict[ObjectOrdinal, str] = {}
         self._by_class: dict[str, dict[ObjectOrdinal, None]] = {}
@@ -140,21 +140,21 @@ class Relocations:
 
     def _newcomers_like(self, old: ObjectOrdinal) -> list[ObjectOrdinal]:
         """The newcomers for which an Object is a candidate."""
-        own = self._by_class.get(self._landmarks.class_of(old), {})
+        own = self._by_class.get(self._objects.class_of(old), {})
         return [
             ordinal
             for ordinal in own
             if ordinal in self._newcomers
-            and self._landmarks.observations_of(ordinal) >= _LEAST_NEW
+            and self._objects.observations_of(ordinal) >= _LEAST_NEW
             and self._could_be(old, ordinal)
         ]
 
     def _best(self, newcomer: ObjectOrdinal) -> _Candidate | None:
         """The Object that the newcomer is, if it is one."""
         candidates: list[_Candidate] = []
-        for old in self._by_class.get(self._landmarks.class_of(newcomer), {}):
+        for old in self._by_class.get(self._objects.class_of(newcomer), {}):
             if self._could_be(old, newcomer):
-                look = self._landmarks.compare(old, newcomer)
+                look = self._objects.compare(old, newcomer)
                 if look is not None:
                     odds = min(self._presence.attendance[old].odds, 1.0)
                     candidates.append(_Candidate(look - _ODDS_WEIGHT * log(odds), look, old))
@@ -171,7 +171,7 @@ class Relocations:
             and now.home not in (before.home, before.confirmed)
             and before.odds <= 1.0
             and _APART_M2 <= dx * dx + dy * dy <= _ONE_FLOOR_M2
-            and self._landmarks.observations_of(old) >= _LEAST_OLD
+            and self._objects.observations_of(old) >= _LEAST_OLD
         )
 
     def _classify(self, ordinal: ObjectOrdinal, class_name: str) -> None:

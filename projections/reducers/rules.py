@@ -6,11 +6,11 @@ from projections.exact import metres_to_um
 from projections.pair_groups import PairGroups
 from projections.settings import Settings
 
-from .constrained_landmarks import ConstrainedLandmarks
+from .constrained_objects import ConstrainedObjects
 from .constrained_places import ConstrainedPlaces
 from .core_index import CoreIndex
 from .evidence_fusion import EvidenceFusion
-from .landmarks import Landmarks
+from .objects import Objects
 from .places import Places
 from .rooms import Rooms
 
@@ -24,10 +24,10 @@ def places_by(settings: Settings, groups: PairGroups[Keyframe]) -> Places | Room
     return ConstrainedPlaces(core_index, groups) if groups.group_of else Places(core_index)
 
 
-def landmarks_by(settings: Settings, named: PairGroups[DetId]) -> Landmarks | EvidenceFusion:
-    """The reducer of landmarks; ``named`` are the detections that commands name."""
+def objects_by(settings: Settings, named: PairGroups[DetId]) -> Objects | EvidenceFusion:
+    """The reducer of Objects; ``named`` are the detections that commands name."""
     groups = named if named.group_of else None
     if settings.fusion == "evidence":
         return EvidenceFusion(settings.evidence, groups)
     limits = settings.fusion_radius_m, settings.fusion_similarity
-    return Landmarks(*limits) if groups is None else ConstrainedLandmarks(*limits, groups)
+    return Objects(*limits) if groups is None else ConstrainedObjects(*limits, groups)

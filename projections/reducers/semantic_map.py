@@ -8,10 +8,10 @@ Per keyframe, in this order:
 2.  The run, the keyframe and its observations are added. An observation whose det_id an earlier
     keyframe has is left out and reported.
 3.  With a pose, the keyframe goes to places, and its observations in the map's embedding space go
-    to landmarks: one by one under the page's rule, all together under fusion by evidence. A
-    keyframe without a pose is only kept. Floors are laid out beside each other (`floors`).
-4.  Names of places, located-in and adjacency are told what places and landmarks changed, in order,
-    and give the deltas that follow from it.
+    to Objects: one by one under the page's rule, all together under fusion by evidence. A keyframe
+    without a pose is only kept. Floors are laid out beside each other (`floors`).
+4.  Names of places, located-in and adjacency are given the changes of places and Objects, in order,
+    and give the deltas that follow from them.
 
 The fold has no clock, chance, disk, network or database. The same events give the same deltas.
 """
@@ -51,7 +51,7 @@ from projections.reducers import State, part, prefixed
 from projections.settings import Settings
 
 from .adjacency import Adjacency
-from .constrained_landmarks import ConstrainedLandmarks
+from .constrained_objects import ConstrainedObjects
 from .constrained_places import ConstrainedPlaces
 from .current_map import CurrentMap
 from .edited_events import edit_event, edits_events
@@ -66,19 +66,19 @@ from .envelope_evidence import (
 from .evidence_fusion import EvidenceFusion
 from .floors import Floors
 from .folded_ids import FoldedIds, content_digest
-from .landmarks import Landmarks
 from .located_in import LocatedIn
+from .objects import Objects
 from .place_names import PlaceNames
 from .places import Places
 from .rooms import Rooms
-from .rules import landmarks_by, places_by
+from .rules import objects_by, places_by
 
 Reducer: TypeAlias = (
     FoldedIds
     | Floors
     | Places
     | Rooms
-    | Landmarks
+    | Objects
     | EvidenceFusion
     | LocatedIn
     | Adjacency
@@ -110,7 +110,7 @@ class SemanticMap:
         self._grouped = PairGroups(corrections.joined, corrections.apart)
         self.places = places_by(settings, self._grouped)
         self._named = PairGroups(corrections.same, corrections.different)
-        self.landmarks = landmarks_by(settings, self._named)
+        self.objects = objects_by(settings, self._named)
         self.located_in = LocatedIn()
         self.adjacency = Adjacency()
         self.current_map = CurrentMap(settings)
@@ -191,16 +191,16 @@ class SemanticMap:
             for seen in fusible if self._named.group_of else ():
                 self.floors.settle(self._named, seen[1], "object", ground)
             place = self._place(offset, keyframe, run, envelope.run_id, pose, deltas)
-            landmarks, timestamp = self.landmarks, envelope.timestamp
-            if isinstance(landmarks, EvidenceFusion):
+            objects, timestamp = self.objects, envelope.timestamp
+            if isinstance(objects, EvidenceFusion):
                 camera = camera_of(envelope, self.settings.camera)
                 sights = self.floors.sightings(sightings_of(accepted, fusible), ground)
                 facing = with_small_yaw(pose)
-                fused = landmarks.fold(offset, run, timestamp, facing, camera, sights)
+                fused = objects.fold(offset, run, timestamp, facing, camera, sights)
                 self._locate(fused, keyframe, place)
                 deltas += fused
             else:
-                self._fuse(landmarks, offset, keyframe, place, pose, fusible, timestamp, deltas)
+                self._fuse(objects, offset, keyframe, place, pose, fusible, timestamp, deltas)
             deltas += self.located_in.collect_moves(offset)
             deltas += self.adjacency.collect_changes(offset)
         return self.floors.put_back(deltas)
@@ -252,7 +252,7 @@ class SemanticMap:
             ("seen", self.folded_ids),
             ("floors", self.floors),
             ("places", self.places),
-            ("landmarks", self.landmarks),
+            ("landmarks", self.objects),
             ("located_in", self.located_in),
             ("adjacency", self.adjacency),
             ("current_map", self.current_map),
@@ -359,7 +359,7 @@ class SemanticMap:
 
     def _fuse(
         self,
-        landmarks: Landmarks,
+        objects: Objects,
         offset: Offset,
         keyframe: KeyframeOrdinal,
         place: PlaceOrdinal | None,
@@ -368,16 +368,16 @@ class SemanticMap:
         timestamp: float,
         deltas: list[Delta],
     ) -> None:
-        """Run landmarks of the page's rule and tell located-in."""
+        """Run the fusion of the page's rule and tell located-in."""
         x_um, y_um = pose.x_um, pose.y_um
-        if isinstance(landmarks, ConstrainedLandmarks):
+        if isinstance(objects, ConstrainedObjects):
             for seen in fusible:
-                more = landmarks.fold_named(offset, *seen, timestamp, x_um, y_um)
+                more = objects.fold_named(offset, *seen, timestamp, x_um, y_um)
                 deltas += more
                 self._locate(more, keyframe, place)
             return
         for observation, det_id, class_name, vector, norm2 in fusible:
-            fused = landmarks.fold(
+            fused = objects.fold(
                 offset, observation, det_id, class_name, vector, norm2, timestamp, x_um, y_um
             )
             deltas += fused

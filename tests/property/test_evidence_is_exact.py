@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from projections.evidence import EvidenceConstants
-from projections.reducers.evidence_landmarks import EvidenceLandmarks
+from projections.reducers.evidence_objects import EvidenceObjects
 from tests.evidence_pictures import a_room, fold_all, fold_one, pictures_of
 
 _OF_MATH = (
@@ -41,8 +41,8 @@ def test_it_calls_nothing_of_libm(monkeypatch: pytest.MonkeyPatch) -> None:
             patch.setattr(math, name, _raising(f"math.{name}"), raising=False)
         for name in _OF_NUMPY:
             patch.setattr(np, name, _raising(f"np.{name}"), raising=False)
-        landmarks = EvidenceLandmarks(EvidenceConstants(sizes_m={"chair": 0.5}))
-        with_sizes = [delta for picture in pictures for delta in fold_one(landmarks, picture)]
+        objects = EvidenceObjects(EvidenceConstants(sizes_m={"chair": 0.5}))
+        with_sizes = [delta for picture in pictures for delta in fold_one(objects, picture)]
         after = fold_all(pictures)
     assert before == after
     assert len(with_sizes) >= len(before) // 2
@@ -57,9 +57,9 @@ def test_no_float_is_raised_to_a_power() -> None:
     from projections.reducers import (
         agreement,
         class_heights,
-        evidence_landmarks,
         evidence_matching,
         evidence_merging,
+        evidence_objects,
         label_counts,
         looks,
         presence,
@@ -71,7 +71,7 @@ def test_no_float_is_raised_to_a_power() -> None:
     )
 
     modules = (
-        *(agreement, class_heights, evidence_landmarks, evidence_merging, exact_functions),
+        *(agreement, class_heights, evidence_objects, evidence_merging, exact_functions),
         *(
             evidence_matching,
             presence,

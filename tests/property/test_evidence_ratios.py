@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from projections.evidence import EvidenceConstants
 from projections.reducers.agreement import log_of, logs
-from projections.reducers.evidence_landmarks import EvidenceLandmarks
+from projections.reducers.evidence_objects import EvidenceObjects
 from projections.reducers.label_counts import LabelCounts
 from projections.reducers.spots import Spots
 from projections.reducers.things import Thing
@@ -56,10 +56,10 @@ def test_the_ratio_of_one_label_is_that_of_a_pair_among_many(
 @settings(max_examples=10, deadline=None)
 @given(st.integers(0, 10_000))
 def test_the_looks_of_one_thing_compare_as_among_several(seed: int) -> None:
-    landmarks = EvidenceLandmarks(EvidenceConstants())
+    objects = EvidenceObjects(EvidenceConstants())
     for picture in pictures_of(a_room(seed, 10), seed, 40):
-        fold_one(landmarks, picture)
-    things = [thing for thing in landmarks._index._things if thing is not None]
-    merging = landmarks._merging
+        fold_one(objects, picture)
+    things = [thing for thing in objects._index._things if thing is not None]
+    merging = objects._merging
     for one in things:
         assert merging._looks(one, things) == [merging.look(one, other) for other in things]

@@ -80,7 +80,7 @@ def test_the_view_from_deltas_is_the_reducers_own_state(documents: list[dict[str
         assert places.label(point) == view.keyframes[keyframe].place
     own = [
         (o.count, o.sum_x_um, o.sum_y_um, o.first_seen, o.last_seen)
-        for o in folded.map.landmarks.objects
+        for o in folded.map.objects.sums
     ]
     assert own == [
         (o.obs_count, o.sum_x_um, o.sum_y_um, o.first_seen, o.last_seen)

@@ -22,7 +22,7 @@ from projections.corrections import Corrections, RecordedCommand, compile_correc
 from projections.deltas import MergeRefused, ObjectsMerged, PlaceLink, PlacesMerged
 from projections.errors import ImpossibleCommand
 from projections.model.changes import ChangeTracker
-from projections.reducers.landmarks import object_id
+from projections.reducers.objects import object_id
 from projections.settings import Settings
 from tests.envelopes import detection, envelope
 from tests.folds import Folded, accepted

@@ -16,9 +16,9 @@ import pytest
 
 from projections.deltas import EventSkipped, KeyframeAdded, ObjectFound, ObservationAdded, RunSeen
 from projections.model.digest import map_digest
-from projections.reducers import landmarks
+from projections.reducers import objects
 from projections.reducers.folded_ids import content_digest
-from projections.reducers.landmarks import object_id
+from projections.reducers.objects import object_id
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 from tests.envelopes import detection, envelope
@@ -153,8 +153,8 @@ def test_more_than_4096_observations_of_an_object_stay_exact() -> None:
     folded.extend(envelope(i, 0.0, 0.0, detections=[detection(vector=[3, 4])]) for i in range(4100))
     assert folded.view.objects[0].obs_count == 4100
     assert {o.similarity_q40 for o in folded.view.observations} == {2**40}
-    landmark = folded.map.landmarks.objects[0]
-    assert landmark.norm2 == sum(int(v) ** 2 for v in landmark.vector_sum)
+    thing = folded.map.objects.sums[0]
+    assert thing.norm2 == sum(int(v) ** 2 for v in thing.vector_sum)
 
 
 def test_opposite_vectors_leave_an_object_without_a_direction() -> None:
@@ -175,7 +175,7 @@ def test_an_object_is_fused_up_to_the_bound_of_its_sums(
 ) -> None:
     """Five million observations of one chair; at the bound the error names the object."""
     folded = fold([envelope(0, 0.0, 0.0, detections=[detection(vector=[3, 4])])])
-    chair = folded.map.landmarks.objects[0]
+    chair = folded.map.objects.sums[0]
     times = 5_000_000
     chair.vector_sum *= times
     chair.norm2, chair.count = chair.norm2 * times**2, times
@@ -183,7 +183,7 @@ def test_an_object_is_fused_up_to_the_bound_of_its_sums(
     assert folded.view.objects[0].obs_count == times + 1
     assert folded.view.observations[1].similarity_q40 == 2**40
     assert chair.norm2 == sum(int(v) ** 2 for v in chair.vector_sum)
-    monkeypatch.setattr(landmarks, "MAX_IN_A_SUM", times + 1)
+    monkeypatch.setattr(objects, "MAX_IN_A_SUM", times + 1)
     before = chair.vector_sum.copy()
     with pytest.raises(OverflowError, match=r"object 0 of class 'cup' has 5000001 observations"):
         folded.extend([envelope(2, 0.0, 0.0, detections=[detection(vector=[3, 4])])])

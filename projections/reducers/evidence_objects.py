@@ -1,4 +1,4 @@
-"""Landmarks by evidence: observations fused into Objects where they stand.
+"""Observations fused into Objects where they stand: the rule of `fusion = "evidence"`.
 
 The rules, for the observations of one picture:
 
@@ -16,7 +16,7 @@ The rules, for the observations of one picture:
     observations.
 5.  Two Objects are merged when better views show that they are one (`evidence_merging`).
 
-Under ``same-object`` and ``different-objects`` the rules of `constrained_landmarks` hold besides:
+Under ``same-object`` and ``different-objects`` the rules of `constrained_objects` hold besides:
 Objects that are kept apart are no candidates for each other's observations, those that are one are
 merged at once, also within one picture.
 
@@ -51,21 +51,21 @@ from .agreement import Agreement, Slopes
 from .evidence_matching import Matching
 from .evidence_merging import Merging
 from .label_counts import LabelCounts
-from .landmarks import object_id
 from .looks import LookRatios, LookScale, looks_of
+from .objects import object_id
 from .relocations import Moved
 from .sights import Sighting, Sights
 from .spots import Spots
 from .thing_index import ThingIndex
 from .things import Thing
 
-LandmarkDelta: TypeAlias = (
+ObjectDelta: TypeAlias = (
     ObjectFound | ObjectSeen | ObjectsMerged | ObjectRelocated | ObjectClassified | ObjectEstimated
 )
 _SURE = 0.85
 
 
-class EvidenceLandmarks:
+class EvidenceObjects:
     """The reducer."""
 
     def __init__(
@@ -98,7 +98,7 @@ class EvidenceLandmarks:
         pose: Pose,
         camera: Camera,
         sightings: Sequence[Sighting],
-    ) -> list[LandmarkDelta]:
+    ) -> list[ObjectDelta]:
         """Fuse the observations of one picture."""
         if not sightings:
             return []
@@ -112,7 +112,7 @@ class EvidenceLandmarks:
             run, pose, labels, looks, inverses, sights, sightings, self._object_of
         )
         inverse_of = inverses.tolist()  # 1 / length of each look
-        deltas: list[LandmarkDelta] = []
+        deltas: list[ObjectDelta] = []
         seen: list[ObjectOrdinal] = []
         named: dict[ObjectOrdinal, str] = {}  # the classes before
         to_unite: list[tuple[ObjectOrdinal, ObjectOrdinal]] = []
@@ -183,7 +183,7 @@ class EvidenceLandmarks:
             return None
         return self._merging.look(thing, second)
 
-    def relocate(self, offset: Offset, moved: Moved) -> list[LandmarkDelta]:
+    def relocate(self, offset: Offset, moved: Moved) -> list[ObjectDelta]:
         """Make an Object found elsewhere one with the one that stood here before, and estimate it
         from the later observations only."""
         thing, later = self._index.thing(moved.old), self._index.thing(moved.new)
@@ -200,7 +200,7 @@ class EvidenceLandmarks:
         class_name = thing.class_name
         merged = self._unite(offset, moved.old, moved.new, set(), {}, evidence)
         places = [round(number * 1e6) for number in (*before, *after)]
-        deltas: list[LandmarkDelta] = [
+        deltas: list[ObjectDelta] = [
             merged,
             ObjectRelocated(offset, moved.old, moved.observation, *places),
         ]

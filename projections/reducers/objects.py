@@ -1,4 +1,4 @@
-"""Landmarks: repeated observations fused into Objects.
+"""Repeated observations fused into Objects: the rule of `fusion = "page"`.
 
 The rules, for an observation of class C made from the pose (x, y):
 
@@ -20,7 +20,7 @@ opposite looks, has no direction; its cosine with anything is 0.
 Every Object is listed in the nine grid cells of side ``fusion_radius_m`` around its mean, so one
 look-up finds all candidates however large the map is.
 
-Under ``same-object`` and ``different-objects``, `projections.reducers.constrained_landmarks` adds
+Under ``same-object`` and ``different-objects``, `projections.reducers.constrained_objects` adds
 rules.
 """
 
@@ -65,13 +65,13 @@ def object_id(det_id: DetId) -> str:
     return "obj-" + hashlib.sha256(det_id.encode()).hexdigest()[:16]
 
 
-class Landmarks:
+class Objects:
     """The reducer."""
 
     def __init__(self, fusion_radius_m: float, fusion_similarity: float) -> None:
         self._radius_um = max(metres_to_um(fusion_radius_m), 1)
         self._least_q40 = fusion_similarity * Q40
-        self.objects: list[ObjectSums] = []  # by ordinal
+        self.sums: list[ObjectSums] = []  # by ordinal
         self._near: dict[Bucket, list[ObjectOrdinal]] = {}
 
     def fold(
@@ -93,7 +93,7 @@ class Landmarks:
         ``candidates`` are some of `candidates_at`, all by default; ``otherwise`` is the Object that
         is taken if none of them will do, a new one by default.
         """
-        radius_um, objects = self._radius_um, self.objects
+        radius_um, objects = self._radius_um, self.sums
         column, row = x_um // radius_um, y_um // radius_um
         winner: ObjectOrdinal | None = None
         best_q40, best_dot = -math.inf, 0
@@ -142,7 +142,7 @@ class Landmarks:
 
     def dump(self) -> State:
         """Everything, for a snapshot. The vectors' sums are one matrix, a row for each Object."""
-        objects = self.objects
+        objects = self.sums
         return {
             "classes": [o.class_name for o in objects],
             "vectors": np.array([o.vector_sum for o in objects]),
@@ -168,14 +168,14 @@ class Landmarks:
                 last,
                 *state["cells"][index],
             )
-            self.objects.append(sums)
+            self.sums.append(sums)
             self._list(ObjectOrdinal(index), sums)
 
     def _add_object(
         self, offset: Offset, observation: ObservationOrdinal, det_id: DetId, sums: ObjectSums
     ) -> list[ObjectFound | ObjectSeen]:
-        ordinal = ObjectOrdinal(len(self.objects))
-        self.objects.append(sums)
+        ordinal = ObjectOrdinal(len(self.sums))
+        self.sums.append(sums)
         self._list(ordinal, sums)
         found = ObjectFound(offset, ordinal, object_id(det_id), sums.class_name, observation)
         return [found, _object_seen(offset, ordinal, observation, Q40, sums)]

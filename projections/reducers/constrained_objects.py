@@ -1,6 +1,6 @@
-"""Landmarks under ``same-object`` and ``different-objects``.
+"""Objects under ``same-object`` and ``different-objects``.
 
-The rules of `projections.reducers.landmarks` hold, and besides:
+The rules of `projections.reducers.objects` hold, and besides:
 
 4.  The commands name detections, by det_id. Those that are the same by command make a *group*. As
     soon as two of a group belong to Objects, these are one: the one founded first survives, with
@@ -29,10 +29,10 @@ from projections.exact import MAX_IN_A_SUM
 from projections.pair_groups import PairGroups
 from projections.reducers import State
 
-from .landmarks import Landmarks
+from .objects import Objects
 
 
-class ConstrainedLandmarks(Landmarks):
+class ConstrainedObjects(Objects):
     """The reducer under pairs of det_ids."""
 
     def __init__(
@@ -56,7 +56,7 @@ class ConstrainedLandmarks(Landmarks):
         x_um: int,
         y_um: int,
     ) -> list[ObjectFound | ObjectSeen | ObjectsMerged]:
-        """Fuse one observation, as `Landmarks.fold`; an ObjectsMerged comes last."""
+        """Fuse one observation, as `Objects.fold`; an ObjectsMerged comes last."""
         group = self._groups.group_of.get(det_id)
         seen = offset, observation, det_id, class_name, vector, norm2, timestamp, x_um, y_um
         if group is None:
@@ -82,7 +82,7 @@ class ConstrainedLandmarks(Landmarks):
     def dump(self) -> State:
         """Everything, for a snapshot."""
         return super().dump() | {
-            "other_classes": [[*o.other_classes] for o in self.objects],
+            "other_classes": [[*o.other_classes] for o in self.sums],
             "object_of": sorted(map(list, self._object_of.items())),
             "absorbed": sorted(self._absorbed),
         }
@@ -95,7 +95,7 @@ class ConstrainedLandmarks(Landmarks):
                 self._add_class(ObjectOrdinal(index), class_name)
         for ordinal in state["absorbed"]:
             self._absorbed.add(ordinal)
-            self._unlist(ordinal, self.objects[ordinal])
+            self._unlist(ordinal, self.sums[ordinal])
         for group, ordinal in state["object_of"]:
             self._object_of[group] = ordinal
             self._inside.setdefault(ordinal, set()).add(group)
@@ -103,7 +103,7 @@ class ConstrainedLandmarks(Landmarks):
     def _merge(
         self, offset: Offset, survivor: ObjectOrdinal, absorbed: ObjectOrdinal
     ) -> ObjectsMerged:
-        sums, other = self.objects[survivor], self.objects[absorbed]
+        sums, other = self.sums[survivor], self.sums[absorbed]
         if sums.count + other.count > MAX_IN_A_SUM:
             raise OverflowError(
                 f"objects {survivor} and {absorbed} have more than {MAX_IN_A_SUM} observations "
@@ -140,7 +140,7 @@ class ConstrainedLandmarks(Landmarks):
 
     def _add_class(self, ordinal: ObjectOrdinal, class_name: str) -> None:
         """The Object has a member of this class."""
-        sums = self.objects[ordinal]
+        sums = self.sums[ordinal]
         if class_name not in (sums.class_name, *sums.other_classes):
             self._unlist(ordinal, sums)
             sums.other_classes += (class_name,)

@@ -23,7 +23,7 @@ from projections.deltas import (
 from projections.evidence import EvidenceConstants
 from projections.pair_groups import PairGroups
 from projections.reducers import State
-from projections.reducers.evidence_landmarks import EvidenceLandmarks, LandmarkDelta
+from projections.reducers.evidence_objects import EvidenceObjects, ObjectDelta
 from projections.reducers.thing_index import ThingIndex
 from tests.evidence_pictures import (
     DIM,
@@ -38,7 +38,7 @@ from tests.evidence_pictures import (
 _SEEDS = st.integers(0, 10_000)
 
 
-def _assignment(deltas: list[LandmarkDelta]) -> dict[ObservationOrdinal, ObjectOrdinal]:
+def _assignment(deltas: list[ObjectDelta]) -> dict[ObservationOrdinal, ObjectOrdinal]:
     """The Object of each observation after all deltas."""
     of: dict[ObservationOrdinal, ObjectOrdinal] = {}
     for delta in deltas:
@@ -63,10 +63,10 @@ def _through_json(state: State) -> State:
 @given(_SEEDS, st.integers(0, 40))
 def test_a_dump_taken_anywhere_goes_on_as_if_nothing_had_happened(seed: int, cut: int) -> None:
     pictures = pictures_of(a_room(seed), seed, 40)
-    landmarks = EvidenceLandmarks(EvidenceConstants())
-    before = [delta for picture in pictures[:cut] for delta in fold_one(landmarks, picture)]
-    other = EvidenceLandmarks(EvidenceConstants())
-    other.load(_through_json(landmarks.dump()))
+    objects = EvidenceObjects(EvidenceConstants())
+    before = [delta for picture in pictures[:cut] for delta in fold_one(objects, picture)]
+    other = EvidenceObjects(EvidenceConstants())
+    other.load(_through_json(objects.dump()))
     after = [delta for picture in pictures[cut:] for delta in fold_one(other, picture)]
     assert before + after == fold_all(pictures)
 
@@ -75,9 +75,9 @@ def test_a_dump_taken_anywhere_goes_on_as_if_nothing_had_happened(seed: int, cut
 @given(_SEEDS)
 def test_two_things_in_one_picture_are_never_one(seed: int) -> None:
     pictures = pictures_of(a_room(seed, 12), seed, 40)
-    landmarks = EvidenceLandmarks(EvidenceConstants())
+    objects = EvidenceObjects(EvidenceConstants())
     for picture in pictures:
-        seen = [d.object for d in fold_one(landmarks, picture) if isinstance(d, ObjectSeen)]
+        seen = [d.object for d in fold_one(objects, picture) if isinstance(d, ObjectSeen)]
         assert len(set(seen)) == len(seen) == len(picture.sightings)
 
 
@@ -85,13 +85,13 @@ def test_two_things_in_one_picture_are_never_one(seed: int) -> None:
 @given(_SEEDS)
 def test_deltas_are_complete_and_in_order(seed: int) -> None:
     pictures = pictures_of(a_room(seed, 12), seed, 60)
-    landmarks = EvidenceLandmarks(EvidenceConstants())
+    objects = EvidenceObjects(EvidenceConstants())
     alive: set[ObjectOrdinal] = set()
     members: Counter[ObjectOrdinal] = Counter()
     labels: dict[ObjectOrdinal, list[str]] = {}
     classes: dict[ObjectOrdinal, str] = {}
     for picture in pictures:
-        deltas = fold_one(landmarks, picture)
+        deltas = fold_one(objects, picture)
         kinds = [type(delta).__name__ for delta in deltas]
         order = ["ObjectsMerged", "ObjectClassified", "ObjectEstimated"]
         later = [order.index(kind) for kind in kinds if kind in order]
@@ -204,11 +204,11 @@ def test_the_grid_changes_nothing(seed: int) -> None:
 
     pictures = pictures_of(a_room(seed, 30, 30.0), seed, 60, side=30.0)
     constants = EvidenceConstants(range_m=2.0)
-    landmarks, naive = EvidenceLandmarks(constants), EvidenceLandmarks(constants)
+    objects, naive = EvidenceObjects(constants), EvidenceObjects(constants)
     index = Naive(constants)
     naive._index = naive._merging._index = naive._matching._index = index
     for picture in pictures:
-        assert fold_one(landmarks, picture) == fold_one(naive, picture)
+        assert fold_one(objects, picture) == fold_one(naive, picture)
 
 
 _PIXEL = st.one_of(
@@ -222,7 +222,7 @@ def test_boxes_of_any_size_give_finite_estimates(
     boxes: list[tuple[float, float, float, float]], seed: int
 ) -> None:
     chance = np.random.default_rng(seed)
-    landmarks = EvidenceLandmarks(EvidenceConstants())
+    objects = EvidenceObjects(EvidenceConstants())
     for number, box in enumerate(boxes):
         sighting = a_sighting(number, "chair", chance.normal(size=DIM), box)
         if number % 3 == 1:
@@ -232,9 +232,9 @@ def test_boxes_of_any_size_give_finite_estimates(
         x_um = int(chance.choice([0, 10**13, -(10**13)]))
         pose = Pose(x_um, 0, float(chance.uniform(-4, 4)))
         picture = Picture(Offset(number + 1), RunOrdinal(0), 0.0, pose, [sighting], [0])
-        for delta in fold_one(landmarks, picture):
+        for delta in fold_one(objects, picture):
             if isinstance(delta, ObjectEstimated):
                 assert abs(delta.x_um) < 10**14
                 assert delta.var_xx_um2 > 0
                 assert delta.var_yy_um2 > 0
-    assert np.isfinite(landmarks.dump()["things.estimates"]).all()
+    assert np.isfinite(objects.dump()["things.estimates"]).all()
