@@ -30,6 +30,7 @@ COMMANDS: "Mapping[str, str]" = {
     "serve": "projections.cli.serve",
     "ui": "projections.cli.ui",
     "draw": "projections.cli.draw",
+    "export": "projections.cli.export",
     "merges": "projections.cli.time_travel",
     "why": "projections.cli.time_travel",
     "diff": "projections.cli.time_travel",

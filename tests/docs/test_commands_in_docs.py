@@ -11,6 +11,7 @@ from tests.thorough import THOROUGH
 DOCUMENTS = (
     "README.md",
     "docs/corrections.md",
+    "docs/export.md",
     "docs/fusion.md",
     "docs/simulator.md",
     "docs/time-travel.md",
