@@ -15,6 +15,8 @@ from pydantic import (
     Field,
     SerializerFunctionWrapHandler,
     ValidationError,
+    ValidationInfo,
+    field_validator,
     model_serializer,
     model_validator,
 )
@@ -24,8 +26,6 @@ from eventsrc.envelope import ANGLE_RAD, HFOV_DEG, PIXELS, Text, describe_error
 
 from .errors import SettingsError
 from .evidence import EvidenceConstants
-from .localizer import LocalizerConstants
-from .rooms import RoomsConstants
 
 _MAX_SHOWN = 80
 _MOST_CONSTANTS = 4
@@ -41,6 +41,63 @@ class Camera(BaseModel):
     width_px: Annotated[float, PIXELS] = 640.0
     height_px: Annotated[float, PIXELS] = 400.0
     yaw_rad: Annotated[float, ANGLE_RAD] = 0.0
+
+
+_MOST_CELLS = 20
+"""Most cells' radii in ``drive_m``; what a new link costs grows with the square of it."""
+_Length = Annotated[float, Field(ge=0.01, le=100.0)]
+
+
+class RoomsConstants(BaseModel):
+    """Constants of places by rooms (``places = "rooms"``), lengths in metres.
+
+    They were chosen on the developing half of the trial data; docs/places.md has the rule and what
+    was tried.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    cell_m: _Length = 0.75
+    """A pose farther than this from all anchors becomes the anchor of a new cell."""
+    drive_m: Annotated[_Length, Field(validate_default=True)] = 4.0
+    """Places join up to this mean driven distance between their cells."""
+
+    @field_validator("drive_m")
+    @classmethod
+    def _is_few_cells(cls, drive_m: float, info: ValidationInfo) -> float:
+        cell_m = info.data.get("cell_m")
+        if cell_m is not None and drive_m > _MOST_CELLS * cell_m:
+            raise ValueError(f"is more than {_MOST_CELLS} times cell_m, which is {cell_m:g}")
+        return drive_m
+
+
+_Shift = Annotated[float, Field(ge=-10.0, le=10.0)]
+_Scale = Annotated[float, Field(ge=0.1, le=10.0)]
+_Count = Annotated[int, Field(ge=0)]
+
+
+class LocalizerConstants(BaseModel):
+    """Constants of re-localisation that a map's own questions can tell.
+
+    `projections.relocalize` has two numbers beside a pose: `known`, whether the things shown are in
+    the map, and `confidence`, whether the pose is within 1.5 m. Both are logistic models with
+    weights for all maps. A logit z becomes scale · z + shift, by how far they are off on one map;
+    the defaults change nothing. `mapfold calibrate` asks the map about its own keyframes and
+    records the correction with the number of questions that it rests on.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    known_shift: _Shift = 0.0
+    known_scale: _Scale = 1.0
+    known_count: _Count = 0
+    """How many of the map's own questions the correction of `known` rests on; 0 for none."""
+    confidence_shift: _Shift = 0.0
+    confidence_scale: _Scale = 1.0
+    confidence_count: _Count = 0
+    text_shift: Annotated[float, Field(ge=-2.0, le=2.0)] = 0.45
+    """What a text's cosine with a picture is below that of two pictures of different things of
+    one class: added to it before it is compared with cosines of pictures."""
 
 
 _YOUNGER = {

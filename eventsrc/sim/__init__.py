@@ -5,7 +5,7 @@ numbers are integers from named PCG64 streams (`random_streams`), and coordinate
 tenth of a millimetre, so that the same seed gives the same payloads on every machine.
 """
 
-from .house import House, build_house
+from .house import House, build_house, occupancy_map
 from .run import DEFAULT_SEED, SimulatedRun, simulate_run
 
-__all__ = ["DEFAULT_SEED", "House", "SimulatedRun", "build_house", "simulate_run"]
+__all__ = ["DEFAULT_SEED", "House", "SimulatedRun", "build_house", "occupancy_map", "simulate_run"]

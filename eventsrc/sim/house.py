@@ -12,6 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from eventsrc.errors import MapfoldError
+from eventsrc.occupancy_map import OCCUPIED, OccupancyMap
 
 from .catalogue import DINING_SET, FURNITURE, MODELS, Model
 from .floorplan import Door, FloorPlan, Room, build_floor_plan
@@ -23,6 +24,9 @@ _ATTEMPTS = 40
 _TRIES = 250
 _DOOR_CLEAR_M = 0.85
 _CHAIR_OFFSETS = ((-0.35, -0.7), (0.35, -0.7), (-0.35, 0.7), (0.35, 0.7))
+_MAP_RESOLUTION_M = 0.05
+_MAP_MARGIN = 10
+"""Cells around the outermost walls."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,3 +173,27 @@ def _door_areas(plan: FloorPlan, room: Room) -> Iterator[Rect]:
 def _door_area(door: Door) -> Rect:
     deep, wide = 2 * _DOOR_CLEAR_M, door.width_m
     return Rect.around(*door.centre, *((wide, deep) if door.flat else (deep, wide)))
+
+
+def occupancy_map(house: House) -> OccupancyMap:
+    """The walls as an occupancy map, as a map server would publish them.
+
+    No furniture, nothing unknown. A wall takes the cells that its line is in.
+    """
+    lines = [(w.x0, w.y0, w.x1, w.y1) for w in house.plan.walls]
+    left = _cell(min(min(x0, x1) for x0, _, x1, _ in lines)) - _MAP_MARGIN
+    below = _cell(min(min(y0, y1) for _, y0, _, y1 in lines)) - _MAP_MARGIN
+    columns = _cell(max(max(x0, x1) for x0, _, x1, _ in lines)) - left + _MAP_MARGIN + 1
+    rows = _cell(max(max(y0, y1) for _, y0, _, y1 in lines)) - below + _MAP_MARGIN + 1
+    cells = np.zeros((rows, columns), np.uint8)
+    for line in lines:
+        x0, y0, x1, y1 = map(_cell, line)
+        spans = sorted((y0 - below, y1 - below)), sorted((x0 - left, x1 - left))
+        cells[spans[0][0] : spans[0][1] + 1, spans[1][0] : spans[1][1] + 1] = OCCUPIED
+    origin = round(left * _MAP_RESOLUTION_M, 6), round(below * _MAP_RESOLUTION_M, 6), 0.0
+    return OccupancyMap(f"house-{house.seed}", _MAP_RESOLUTION_M, origin, "simulated house", cells)
+
+
+def _cell(metres: float) -> int:
+    """The number of a cell; walls lie on tenths of a millimetre, so the division is safe."""
+    return round(metres * 10_000) // round(_MAP_RESOLUTION_M * 10_000)

@@ -21,9 +21,9 @@ from typing import NamedTuple
 
 from projections.evaluate.own_questions import OwnAnswer, ask_own_questions
 from projections.exact_functions import exp, log
-from projections.localizer import LocalizerConstants
 from projections.model.view import MapView
 from projections.relocalize.certainty import corrected, probability
+from projections.settings import LocalizerConstants
 
 CROPS = (1, 3)
 

@@ -16,12 +16,11 @@ from eventsrc.log import LogReader
 from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.deltas import Delta, KeyframeAdded, KeyframeOrdinal
 from projections.evidence import EvidenceConstants
-from projections.localizer import LocalizerConstants
 from projections.model.fold import READ_AHEAD, fold_parsed, gc_paused, parse_events
 from projections.model.view import MapView
 from projections.reducers.envelope_evidence import camera_of
 from projections.reducers.semantic_map import SemanticMap
-from projections.settings import Camera, Settings
+from projections.settings import Camera, LocalizerConstants, Settings
 
 from .localiser import NOT_ASKED, OwnScores, read_localiser
 from .reading import Round, read

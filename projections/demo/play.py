@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from eventsrc.log import LogWriter
-from eventsrc.sim import DEFAULT_SEED, simulate_run
-from eventsrc.sim.walls import occupancy_map
+from eventsrc.sim import DEFAULT_SEED, occupancy_map, simulate_run
 from eventsrc.system_events import MAP_KEY
 from projections.database import rebuild
 from projections.database.connection import Targets, open_targets

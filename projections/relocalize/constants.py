@@ -12,8 +12,7 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple, Self
 
 from projections.evidence import EvidenceConstants
-from projections.localizer import LocalizerConstants
-from projections.settings import Settings
+from projections.settings import LocalizerConstants, Settings
 
 from .camera import Camera
 

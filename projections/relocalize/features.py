@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from projections.localizer import LocalizerConstants
+from projections.settings import LocalizerConstants
 
 from .camera import Floats
 from .landmarks import Landmarks

@@ -21,9 +21,9 @@ from projections.calibrate.localiser import (
 from projections.calibrate.localiser_text import localiser_document, localiser_text
 from projections.evaluate.own_questions import OwnAnswer
 from projections.evaluate.own_scores import own_scores
-from projections.localizer import LocalizerConstants
 from projections.relocalize import Answer
 from projections.relocalize.certainty import probability
+from projections.settings import LocalizerConstants
 
 
 def _answer(

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from eventsrc.envelope import RunId
 from projections.deltas import ObservationOrdinal
-from projections.localizer import LocalizerConstants
 from projections.relocalize import Crop, MapConstants, Match, rank
 from projections.relocalize.candidates import Candidates
 from projections.relocalize.certainty import known_features, known_probability
+from projections.settings import LocalizerConstants
 
 CROP = Crop(np.ones(1, dtype=np.float32))
 NAMED = Crop(None, class_name="chair")

@@ -6,9 +6,14 @@ from hypothesis import strategies as st
 
 from projections.errors import SettingsError
 from projections.evidence import EvidenceConstants
-from projections.localizer import LocalizerConstants
-from projections.rooms import RoomsConstants
-from projections.settings import Camera, Settings, assignment_texts, settings_by_name
+from projections.settings import (
+    Camera,
+    LocalizerConstants,
+    RoomsConstants,
+    Settings,
+    assignment_texts,
+    settings_by_name,
+)
 
 
 def test_assignments_change_what_they_name() -> None:

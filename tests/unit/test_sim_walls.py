@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from eventsrc.occupancy_map import OCCUPIED, decode_map
-from eventsrc.sim import build_house, simulate_run
-from eventsrc.sim.walls import occupancy_map
+from eventsrc.sim import build_house, occupancy_map, simulate_run
 from projections.occupancy import OccupancyGrid
 
 
