@@ -1,12 +1,16 @@
-"""A calibration as text and as JSON."""
+"""A calibration as text and as JSON: the constants, and re-localisation's scores on the map's own
+questions."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import Any
 
 from eventsrc.text import counted, visible
+from projections.evaluate.own_scores import own_scores
 from projections.history.rendering import table
+from projections.relocalize import UNKNOWN_BELOW
 
-from .localiser_text import localiser_document, localiser_text
+from .localiser import CROPS, OwnScores
 from .looks import FEWEST_DIFFERENT
 from .rounds import Calibration
 from .shrinking import Reading
@@ -23,6 +27,10 @@ _RESTS_ON = {
     "session_shift": "observation",
 }
 _SIZE = "sizes_m."
+_EDGES = (0.0, 0.25, 0.5, 0.75, 1.0)
+_DECIMALS = 6
+FEW = 20
+"""Known questions below which the figures say little."""
 
 
 def readings(calibration: Calibration) -> list[Reading]:
@@ -158,3 +166,81 @@ def _camera_hint(fault: Reading, hfov_deg: float) -> str:
         f"bearings are off by {abs(value):.0%} of the angle from the picture's middle: "
         f"camera.hfov_deg={hfov_deg:g} seems {which}"
     )
+
+
+def localiser_document(own: OwnScores) -> dict[str, Any]:
+    """JSON: scores on the map's own questions with the correction, by number of crops, and the
+    correction as it is set.
+
+    Scores have six decimals; beyond, machines may differ in the errors and in `confidence`.
+    """
+    constants = own.constants.model_dump(exclude={"text_shift"})
+    return {
+        "questions": {str(crops): _rounded(_scores(own, crops)) for crops in CROPS},
+        "constants": {f"localizer.{name}": value for name, value in constants.items()},
+    }
+
+
+def localiser_text(own: OwnScores) -> str:
+    """Two tables: errors and shares, and how often what was said was right."""
+    if not own.answers:
+        return "re-localisation: no keyframe to ask from\n"
+    rows = [
+        (
+            counted(crops, "crop"),
+            str(scores["questions"] // 2),
+            str(scores["known"]),
+            _two_decimals(scores["pose_error_m"]["p50"]),
+            _two_decimals(scores["pose_error_m"]["p90"]),
+            _two_decimals(scores["plain"]["pose_error_m"]["p50"]),
+            _two_decimals(scores["within_1_5_m"]),
+            _two_decimals(scores["known_called_unknown"]),
+            _two_decimals(scores["taken_out_called_known"]),
+        )
+        for crops in CROPS
+        if (scores := _scores(own, crops))["questions"]
+    ]
+    header = (
+        "re-localisation", "asked", "known", "p50 m", "p90 m", "plain p50", "within 1.5 m",
+        "called unknown", "taken out, called known",
+    )  # fmt: skip
+    bins = [f"said {low:g} to {high:g}" for low, high in pairwise(_EDGES)]
+    known = ("known", *_right([(own.known(a), a.known) for a in own.answers]))
+    sure = ("confidence", *_right([(own.confidence(a), a.correct) for a in own.answers]))
+    tables = table(header, rows, right=header[1:])
+    tables += table(("right, of how many", *bins), [known, sure], right=bins)
+    count = sum(answer.known for answer in own.answers)
+    if count < FEW:
+        seen = "question" if count == 1 else "questions"
+        tables += (
+            f"{count} {seen} about what was seen at another time: the figures say little, and"
+            " re-localisation's numbers stay near those of other maps\n"
+        )
+    return tables
+
+
+def _scores(own: OwnScores, crops: int) -> dict[str, Any]:
+    answers = [each for each in own.answers if each.crops == crops]
+    return own_scores(answers, own.known, own.confidence, UNKNOWN_BELOW)
+
+
+def _rounded(value: Any) -> Any:
+    """A JSON value, its numbers rounded to `_DECIMALS`."""
+    if isinstance(value, dict):
+        return {key: _rounded(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [_rounded(each) for each in value]
+    return round(value, _DECIMALS) if isinstance(value, float) else value
+
+
+def _right(said: Sequence[tuple[float, bool]]) -> list[str]:
+    """For each bin the share that was right, and how many there are."""
+    cells = []
+    for low, high in pairwise(_EDGES):
+        right = [each for p, each in said if low <= p < high or p == high == 1.0]
+        cells.append(f"{sum(right) / len(right):.2f} of {len(right)}" if right else "-")
+    return cells
+
+
+def _two_decimals(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"

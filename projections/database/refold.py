@@ -5,7 +5,8 @@ goes on until it has all events that came meanwhile. An event that cannot be fol
 tail does; but one that only a command keeps from being folded ends the refold, and the old map
 stays. And it looks for commands that are recorded while it is at work: those that only name places
 join it; another one restarts it once. After that it goes through, so that commands that keep coming
-cannot keep the map from changing, and the next refold begins.
+cannot keep the map from changing, and the next refold begins. Rows of vectors that no correction
+changes are kept (`KeptVectors`).
 
 The checkpoint says which commands the new map knows, in the transaction of the swap. Whatever ends
 a refold, a command that no map knows yet makes the next tail refold.
@@ -13,26 +14,29 @@ a refold, a command that no map knows yet makes the next tail refold.
 
 import threading
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.log import Event, LogReader
 from projections.errors import DatabaseError, ImpossibleCommand
+from projections.model.changes import BatchChanges
 from projections.model.fold import gc_paused
+from projections.model.view import MapView
 
+from . import vector_table
 from .checkpoints import DeadLetter, dead_letter
-from .connection import Connection, database_errors
+from .connection import Connection, database_errors, describe_connection
 from .inputs import LogInputs, MapInputs, commands_between
-from .kept_rows import KeptVectors
+from .labels import TABLE
 from .live_fold import LiveFold, batches
 from .refold_progress import RefoldProgress
 from .shadows import FoldedLog, ShadowOf, ShadowWriter, drop_replaced, stream, swap_in_new_map
 from .sink import Checkpoint, Shadow, SinkName
 from .statements import statements
 from .stores import DatabaseSink, Store
-from .vector_table import has_hnsw
+from .vector_table import READERS, has_hnsw
 
 TICK_EVENTS: Final = 256
 LOOK_S: Final = 0.5
@@ -172,3 +176,46 @@ def refuse_if_not_allowed(stores: Sequence[Store], advice: str) -> None:
                 " this role may not make the tables of a new one; have their owner make it, then"
                 f" start again; {advice}"
             )
+
+
+class KeptVectors:
+    """Implements `Shadow` for vectors that have the events before ``start``, without a shadow.
+
+    Rows of later events are added to the readers' table, in the transaction of the swap.
+    """
+
+    def __init__(self, sink: DatabaseSink, start: Offset) -> None:
+        self._sink: Final = sink
+        self._start: Final = start
+
+    def create(self, connection: Connection) -> None:
+        """Nothing to do."""
+
+    def load(self, changes: BatchChanges, view: MapView) -> Callable[[Connection], None]:
+        """Returns a function that adds the rows of events that came since."""
+        missing = [row for row in changes.embedded if row[0].offset >= self._start]
+        if not missing:
+            return lambda _: None
+        return self._sink.prepare(replace(changes, embedded=missing), view).send
+
+    def finish(self, view: MapView) -> Callable[[Connection], Mapping[str, int]]:
+        """Returns a function that compares numbers."""
+        expected = sum(o.embedding_crc is not None for o in view.observations)
+
+        def finish(connection: Connection) -> Mapping[str, int]:
+            found = vector_table.count(connection, READERS)
+            if found != expected:
+                raise DatabaseError(
+                    f"{describe_connection(connection)}: {TABLE} has {found:,} rows, the map"
+                    f" {expected:,} searchable detections; run mapfold replay, which makes both"
+                    " again"
+                )
+            return {TABLE: found}
+
+        return finish
+
+    def lock_readers(self, connection: Connection) -> None:
+        """Nothing to do: readers see the added rows when the transaction is committed."""
+
+    def swap_in(self, connection: Connection) -> None:
+        """Nothing to do."""

@@ -10,9 +10,11 @@ An ``end`` is a number of events: the answer is about the map after the events 0
 
 from array import array
 from bisect import bisect_left
-from collections.abc import Callable, MutableSequence, Sequence
+from collections.abc import Callable, Iterable, MutableSequence, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
+
+import numpy as np
 
 from eventsrc.envelope import FIRST_OFFSET, KeyframeId, Offset, RunId
 from projections.corrections import NO_CORRECTIONS, Corrections
@@ -56,7 +58,6 @@ from .records import (
     cause_of,
     last_before,
 )
-from .seen_from import SeenFrom
 
 NEVER = Offset(2**63 - 1)
 """The offset of an event that has not happened."""
@@ -68,6 +69,39 @@ NO_PLACE = PlaceOrdinal(-1)
 class _Move:
     object: ObjectOrdinal
     before: PlaceOrdinal | None
+
+
+class SeenFrom:
+    """The sightings of a history so far, each with its keyframe, in order of offset."""
+
+    def __init__(self, history: "History") -> None:
+        self._history = history
+        seen = [(s.offset, s.object) for found in history.objects for s in found.sightings]
+        seen.sort()
+        self._offsets = [offset for offset, _ in seen]
+        self._objects = np.array([thing for _, thing in seen], np.int64)
+        self._keyframes = np.searchsorted(np.array(history.keyframe_offsets), self._offsets)
+        self._placed_at = np.array(history.placed_offsets)
+        self._placed_in = np.array(history.placed_in)
+
+    def from_all(self, places: Iterable[PlaceOrdinal], end: Offset) -> Sequence[ObjectOrdinal]:
+        """The objects that keyframes of each of these places saw by the events below ``end``, by
+        their ordinals."""
+        count, history = bisect_left(self._offsets, end), self._history
+        survivors: list[int] = [NO_PLACE] * len(history.places)
+        for place, record in enumerate(history.places):
+            if record.formed.offset < end:
+                survivors[place] = history.survivor_of(PlaceOrdinal(place), end)
+        keyframes = self._keyframes[:count]
+        is_placed = self._placed_at[keyframes] < end
+        joined = np.where(is_placed, self._placed_in[keyframes], 0)
+        found = np.where(is_placed, np.array([*survivors, NO_PLACE])[joined], NO_PLACE)
+        seen = [set(np.unique(self._objects[:count][found == place]).tolist()) for place in places]
+        things = (
+            {history.object_survivor(ObjectOrdinal(each), end) for each in from_one}
+            for from_one in seen
+        )
+        return sorted(set.intersection(*things))
 
 
 class History:

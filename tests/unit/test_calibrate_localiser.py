@@ -18,7 +18,7 @@ from projections.calibrate.localiser import (
     fit_line,
     logit,
 )
-from projections.calibrate.localiser_text import localiser_document, localiser_text
+from projections.calibrate.report import localiser_document, localiser_text
 from projections.evaluate.own_questions import OwnAnswer
 from projections.evaluate.own_scores import own_scores
 from projections.relocalize import Answer
