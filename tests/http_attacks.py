@@ -2,15 +2,14 @@
 
 import os
 import re
-import signal
 import socket
 import ssl
-import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 from tests import prefork
+from tests.ready_program import ReadyProgram
 
 DEADLINE_S = 30.0
 
@@ -62,13 +61,13 @@ main()
 """
 
 
-class Served:
+class Served(ReadyProgram):
     """``mapfold serve --http`` in a process of its own."""
 
     def __init__(self, *args: str, open_files: int | None = None, **env: str) -> None:
         clean = {k: v for k, v in os.environ.items() if not k.startswith("MAPFOLD_")}
         said, stderr = os.pipe()
-        self.program = prefork.start(
+        program = prefork.start(
             _LIMITED,
             ["-c", str(open_files or ""), *args],
             env={**clean, **env},
@@ -76,20 +75,10 @@ class Served:
             stderr=stderr,
         )
         os.close(stderr)
-        self._stderr = os.fdopen(said)
-        self.said: list[str] = []
-        self._ready = threading.Event()
-        self._reader = threading.Thread(target=self._read)
-        self._reader.start()
-        assert self._ready.wait(120.0), self.text
+        super().__init__(program, said, ready_s=120.0, end_s=DEADLINE_S)
         found = re.search(r"answering https?://\S+:(\d+)", self.text)
         assert found, self.text
         self.port = int(found[1])
-
-    @property
-    def text(self) -> str:
-        """What it has said to people."""
-        return "\n".join(self.said)
 
     @property
     def peak_bytes(self) -> int:
@@ -98,24 +87,6 @@ class Served:
         found = re.search(r"VmHWM:\s+(\d+) kB", text)
         assert found
         return int(found[1]) * 1024
-
-    def _read(self) -> None:
-        with self._stderr:
-            for line in self._stderr:
-                self.said.append(line.rstrip("\n"))
-                if "Ctrl-C" in line:
-                    self._ready.set()
-        self._ready.set()
-
-    def end(self) -> int:
-        """SIGTERM; its exit code."""
-        self.program.send_signal(signal.SIGTERM)
-        try:
-            return self.program.wait(DEADLINE_S)
-        finally:
-            self.program.kill()
-            self.program.wait()
-            self._reader.join()
 
 
 @contextmanager

@@ -4,8 +4,6 @@ import http.client
 import json
 import os
 import re
-import signal
-import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,6 +12,7 @@ from typing import Any
 from urllib.parse import urlencode
 
 from tests.commands import Commands
+from tests.ready_program import ReadyProgram
 
 WAIT_S = 60.0
 
@@ -38,35 +37,17 @@ class Answered:
         return self.status, error["kind"], error["message"]
 
 
-class UiServer:
-    """A running server; what it says to people is in ``said``."""
+class UiServer(ReadyProgram):
+    """A running server."""
 
     def __init__(self, mapfold: Commands, *args: str | Path) -> None:
         read, write = os.pipe()
-        self.program = mapfold.start("ui", *args, stderr=write)
+        program = mapfold.start("ui", *args, stderr=write)
         os.close(write)
-        self._stderr = os.fdopen(read)
-        self.said: list[str] = []
-        self._ready = threading.Event()
-        self._reader = threading.Thread(target=self._read)
-        self._reader.start()
-        assert self._ready.wait(WAIT_S), self.text
+        super().__init__(program, read, ready_s=WAIT_S, end_s=WAIT_S)
         found = re.search(r"showing .* at http://(\S+?):(\d+)/(?:\?token=(\S+))?", self.text)
         assert found, self.text
         self.host, self.port, self.token = found[1], int(found[2]), found[3]
-
-    @property
-    def text(self) -> str:
-        """What it has said to people."""
-        return "\n".join(self.said)
-
-    def _read(self) -> None:
-        with self._stderr:
-            for line in self._stderr:
-                self.said.append(line.rstrip("\n"))
-                if "Ctrl-C" in line:
-                    self._ready.set()
-        self._ready.set()
 
     def ask(
         self,
@@ -116,15 +97,6 @@ class UiServer:
             )
         finally:
             connection.close()
-
-    def end(self) -> int:
-        """SIGTERM; its exit code."""
-        self.program.send_signal(signal.SIGTERM)
-        try:
-            return self.program.wait(WAIT_S)
-        finally:
-            self.program.kill()
-            self._reader.join()
 
 
 @contextmanager

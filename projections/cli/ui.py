@@ -117,7 +117,9 @@ def ui(
         gate = TokenGate(app, token, everything=not local)
         guarded = SafeHeaders(Guard(gate, hosts=(host, *(allow_host or ()))))
         bound = stack.enter_context(serving(guarded, listener, tell=say))
-        stack.callback(watch.close)  # before the server, which waits for its streams to end
+        # Before the server, which waits for its streams and answers to end.
+        stack.callback(watch.close)
+        stack.callback(service.end)
         shown = f"[{host}]" if ":" in host else host
         url = f"http://{shown}:{bound}/" + ("" if token is None else f"?token={token}")
         if not local:

@@ -60,7 +60,8 @@ _OBJECT_DELTAS = frozenset({ObjectFound, ObjectSeen, ObjectsMerged})
 """Needed too where two objects may become one."""
 
 _done: "Synchronized[int] | None" = None
-"""In a worker process: the number of events that all workers have folded."""
+"""In a worker process: the number of events that all workers have folded, or `_STOP`."""
+_STOP = -1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -190,7 +191,7 @@ def fold_all(
     """The results of the first ``end`` events under each of ``rules``, in their order.
 
     With ``keep_views`` each has its map too, without embeddings. Raises FoldError at an event that
-    cannot be folded.
+    cannot be folded, and what ``progress`` raises, which ends the folds.
     """
     workers = min(processes or _processors(), len(rules))
     if workers <= 1 or (processes is None and end * len(rules) < MIN_PARALLEL_EVENTS):
@@ -273,7 +274,12 @@ def _in_processes(
             futures = [
                 pool.submit(_fold_share, log, each, end, truth, keep_views) for each in shares
             ]
-        _report_progress(futures, done, end * len(shares), progress)
+        try:
+            _report_progress(futures, done, end * len(shares), progress)
+        except BaseException:
+            with done.get_lock():
+                done.value = _STOP
+            raise  # when the workers have stopped
         try:
             return [future.result() for future in futures]
         except BrokenProcessPool:
@@ -310,6 +316,8 @@ def _fold_share(
         nonlocal reported
         if _done is not None:
             with _done.get_lock():
+                if _done.value == _STOP:
+                    raise MapfoldError("given up")  # nobody reads it: the caller raised
                 _done.value += folded - reported
         reported = folded
 

@@ -95,7 +95,7 @@ def create_app(answerer: Answerer, queue: FairQueue) -> FastAPI:
         method: str | None = None,
         session: str | None = Query(None, description="Track the questions of this name."),
     ) -> Response:
-        payload = await _read_body(request, answerer.max_bytes)
+        payload = await read_body(request, answerer.max_bytes)
         given = {"top": top, "method": method, "session": session}
         options = {name: str(value) for name, value in given.items() if value is not None}
         return await answered(request, lambda: answerer.relocalize(payload, options))
@@ -148,7 +148,7 @@ def _add_error_handlers(app: FastAPI) -> None:
         return JSONResponse(document, status)
 
 
-async def _read_body(request: Request, most: int) -> bytes:
+async def read_body(request: Request, most: int) -> bytes:
     """The body, at most ``most`` bytes. Raises QuestionError for a longer one.
 
     Some of a longer one is still read: a client that is cut off while sending sees a broken
@@ -161,5 +161,5 @@ async def _read_body(request: Request, most: int) -> bytes:
         if length > _DRAIN_FACTOR * most:
             break
     if length > most:
-        raise QuestionError(f"the question has more than {most} bytes; send fewer crops")
+        raise QuestionError(f"the question has more than {most} bytes; send less")
     return bytes(body)

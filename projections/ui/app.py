@@ -5,9 +5,10 @@ of `UiService` answer them.
 """
 
 import asyncio
-import json
+import functools
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from html import escape
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -15,21 +16,23 @@ from fastapi.responses import JSONResponse, Response, StreamingResponse
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
+from eventsrc.envelope import Offset
 from eventsrc.errors import MapfoldError
 from eventsrc.text import visible
+from projections.serve.answering import TooMuchError
+from projections.serve.http import read_body
 
 from .answers import digest_answer, history_answer
+from .binary import encoded
 from .comparisons import bisect_answer, conditions_answer, diff_answer, merges_answer
-from .corrections import corrections_answer
-from .docs_page import docs_page
 from .edits import MOST_BYTES as MOST_EDIT_BYTES
-from .edits import Editor
-from .live import LiveWatch
+from .edits import Editor, corrections_answer, read_edit
+from .live import MOST_STREAMS, LiveWatch
 from .localizing import MOST_BYTES, question_answer
 from .log_map import LogMap
-from .requests import assignments_of, read_body, refusal
+from .requests import assignments_of, refusal
 from .search import keyframe_answer, search_answer
-from .service import UiService
+from .service import GoOn, UiService
 from .static_files import static_files
 from .stories import why_answer
 from .token_gate import EDIT_PATH
@@ -85,47 +88,66 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
     answers("search", "Things that are called so", search_answer)
     answers("keyframe", "A keyframe and its detections", keyframe_answer)
 
+    async def apart(request: Request, work: Callable[[Offset, GoOn], bytes]) -> Response:
+        content = await _awaited(request, functools.partial(service.ask_apart, work))
+        return Response(content, media_type="application/json")
+
     @app.get("/api/whatif", summary="The map under other settings, or without a command")
     async def whatif(request: Request) -> Response:
         query = request.query_params
-        future = service.ask_apart(lambda end: encoded(whatif_answer(service.opened, end, query)))
-        return Response(await _awaited(request, future), media_type="application/json")
+
+        def work(end: Offset, go_on: GoOn) -> bytes:
+            return encoded(whatif_answer(service.opened, end, query, go_on))
+
+        return await apart(request, work)
 
     answers("question", "A mapped keyframe's crops as a question", question_answer)
 
     @app.post("/api/relocalize", summary="Where a robot is that sees some crops, by the map at W")
     async def relocalize(request: Request) -> Response:
         query, payload = request.query_params, await read_body(request, MOST_BYTES)
-        ask = service.localizer.answer
-        future = service.ask_apart(lambda end: encoded(ask(end, query, payload)))
-        return Response(await _awaited(request, future), media_type="application/json")
+
+        def work(end: Offset, go_on: GoOn) -> bytes:
+            return encoded(service.localizer.answer(end, query, payload, go_on))
+
+        return await apart(request, work)
 
     if editor is not None:
 
         @app.post(EDIT_PATH, summary="Give a command, or see what it would change")
         async def edit(request: Request) -> Response:
-            payload = await read_body(request, MOST_EDIT_BYTES)
-            future = service.ask_apart(lambda end: editor.answer(end, payload))
+            asked = read_edit(await read_body(request, MOST_EDIT_BYTES))
+
+            def work(end: Offset, go_on: GoOn) -> dict[str, Any]:
+                return editor.answer(end, asked, go_on)
+
+            if asked.dry_run:
+                return await apart(request, lambda end, go_on: encoded(work(end, go_on)))
+            future = service.ask_apart(work)  # recorded also when the page leaves meanwhile
             document = await asyncio.wrap_future(future)
-            if document["recorded"]:
-                await asyncio.wrap_future(service.refresh())
-                document["through"] = service.log_document()["through"]
-            return _json(document)
+            await asyncio.wrap_future(service.refresh())
+            return _json(document | {"through": service.log_document()["through"]})
 
     @app.get("/api/live", summary="Server-sent events: what is new in the log")
     async def live() -> Response:
+        if watch.is_full:
+            raise TooMuchError(
+                f"{MOST_STREAMS} pages follow this log already; close one and load this page again"
+            )
         return StreamingResponse(watch.stream(), media_type="text/event-stream")
 
     @app.get("/docs", include_in_schema=False)
     async def docs() -> Response:
-        return Response(docs_page(app.openapi()), media_type="text/html")
+        return Response(_docs_page(app.openapi()), media_type="text/html")
 
     @app.get("/{path:path}", include_in_schema=False)
     async def static(request: Request) -> Response:
         found = files.get(request.scope["path"])
         if found is None:
             raise HTTPException(404)
-        headers = {"ETag": found.etag, "Cache-Control": "no-cache"}
+        # A link with the token is in no cache.
+        kept = "no-store" if request.url.query else "no-cache"
+        headers = {"ETag": found.etag, "Cache-Control": kept}
         if request.headers.get("if-none-match") == found.etag:
             return Response(status_code=304, headers=headers)
         return Response(found.content, media_type=found.media_type, headers=headers)
@@ -136,26 +158,27 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
 async def _answer(
     service: UiService, request: Request, work: Callable[[LogMap, float], bytes]
 ) -> bytes:
-    """The answer of ``work`` under the settings of the request. A fold under other settings is
-    given up when the page leaves."""
+    """The answer of ``work`` under the settings of the request."""
+    sets = assignments_of(request.query_params)
+    return await _awaited(request, functools.partial(service.ask, sets, work))
+
+
+async def _awaited(
+    request: Request, submit: Callable[[Callable[[], bool]], Future[bytes]]
+) -> bytes:
+    """The result. When the page leaves, the work is not wanted any more, and not begun."""
     here = True
+    answered = asyncio.ensure_future(asyncio.wrap_future(submit(lambda: here)))
+    leaving = asyncio.ensure_future(_disconnect(request))
     try:
-        sets = assignments_of(request.query_params)
-        return await _awaited(request, service.ask(sets, work, lambda: here))
+        await asyncio.wait((answered, leaving), return_when=asyncio.FIRST_COMPLETED)
+        if not answered.done():
+            answered.cancel()
+            raise ClientDisconnect
+        return answered.result()
     finally:
         here = False
-
-
-async def _awaited(request: Request, future: Future[bytes]) -> bytes:
-    """The result. When the page leaves, work that has not begun is dropped."""
-    answered = asyncio.ensure_future(asyncio.wrap_future(future))
-    leaving = asyncio.ensure_future(_disconnect(request))
-    await asyncio.wait((answered, leaving), return_when=asyncio.FIRST_COMPLETED)
-    leaving.cancel()
-    if not answered.done():
-        answered.cancel()
-        raise ClientDisconnect
-    return answered.result()
+        leaving.cancel()
 
 
 async def _disconnect(request: Request) -> None:
@@ -164,9 +187,19 @@ async def _disconnect(request: Request) -> None:
         pass
 
 
-def encoded(document: Mapping[str, Any]) -> bytes:
-    """Compact UTF-8 JSON; text from logs stays text, whatever it is."""
-    return json.dumps(document, ensure_ascii=False, allow_nan=False).encode("utf-8", "replace")
+def _docs_page(schema: Mapping[str, Any]) -> bytes:
+    """A table of the questions of an OpenAPI ``schema``; FastAPI's own page loads its code from
+    another host."""
+    rows = [
+        f"<tr><td><code>{escape(method.upper())} {escape(path)}</code><td>{escape(each['summary'])}"
+        for path, methods in schema["paths"].items()
+        for method, each in methods.items()
+    ]
+    return (
+        '<!doctype html><html lang="en"><meta charset="utf-8"><title>mapfold ui</title>'
+        "<h1>What this server answers</h1><p>In full in docs/ui.md of mapfold; for programs:"
+        ' <a href="/openapi.json">openapi.json</a>.</p><table>' + "".join(rows) + "</table></html>"
+    ).encode()
 
 
 def _json(document: Mapping[str, Any], status: int = 200) -> Response:

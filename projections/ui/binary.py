@@ -1,4 +1,4 @@
-"""Arrays as one binary answer: a JSON header, then the arrays back to back.
+"""JSON, and arrays as one binary answer: a JSON header, then the arrays back to back.
 
 The answer is the length of the header in bytes (uint32, little-endian), the header as UTF-8 JSON,
 zeros up to the first array, and the arrays in the order of ``arrays`` in the header. Each array
@@ -22,12 +22,18 @@ _LENGTH_BYTES: Final = 4
 _OFFSET_DIGITS: Final = 12
 
 
+def encoded(document: Mapping[str, Any]) -> bytes:
+    """Compact UTF-8 JSON; half a surrogate pair, which UTF-8 cannot hold, becomes a question
+    mark."""
+    return json.dumps(document, ensure_ascii=False, allow_nan=False).encode("utf-8", "replace")
+
+
 def packed_arrays(header: Mapping[str, Any], columns: Mapping[str, Column]) -> bytes:
     """The binary answer; ``arrays`` is added to the header."""
     # The header names offsets, which depend on its length: room is kept for the longest ones.
-    longest = _encoded(header, columns, 10**_OFFSET_DIGITS)
+    longest = _header(header, columns, 10**_OFFSET_DIGITS)
     start = _aligned(_LENGTH_BYTES + len(longest))
-    head = _encoded(header, columns, start)
+    head = _header(header, columns, start)
     parts = [len(head).to_bytes(_LENGTH_BYTES, "little"), head]
     parts.append(bytes(start - _LENGTH_BYTES - len(head)))
     for column in columns.values():
@@ -35,14 +41,14 @@ def packed_arrays(header: Mapping[str, Any], columns: Mapping[str, Column]) -> b
     return b"".join(parts)
 
 
-def _encoded(header: Mapping[str, Any], columns: Mapping[str, Column], start: int) -> bytes:
+def _header(header: Mapping[str, Any], columns: Mapping[str, Column], start: int) -> bytes:
     """The header of arrays that begin at ``start``."""
     placed = []
     for name, column in columns.items():
         dtype = _NAMES[column.dtype]
         placed.append({"name": name, "dtype": dtype, "length": len(column), "offset": start})
         start += _aligned(column.nbytes)
-    return json.dumps({**header, "arrays": placed}, ensure_ascii=False, allow_nan=False).encode()
+    return encoded({**header, "arrays": placed})
 
 
 def _aligned(length: int) -> int:

@@ -15,7 +15,7 @@ from .requests import assignments_of, text_of
 
 MOST_LINES: Final = 200
 _FLAGS: Final = ("1", "true", "yes")
-_WORDS: Final = ("and", "or", "not", "true", "false", "none")
+_WORDS: Final = ("and", "or", "not", "none")
 
 
 def diff_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:

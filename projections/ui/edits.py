@@ -1,4 +1,4 @@
-"""Corrections from the page: a dry run first, then the command recorded with a reason.
+"""Corrections: the list of them, and new ones: a dry run first, then recorded with a reason.
 
 The body of ``POST /api/edit`` is ``{"kind", "arguments", "reason", "dry_run", "command_id"}``. The
 arguments of a kind are those of ``mapfold edit LOG KIND``, in that order. A command goes into the
@@ -11,15 +11,17 @@ from collections.abc import Callable
 from typing import Annotated, Any, Final
 
 from pydantic import BaseModel, ConfigDict, Field, StrictStr, ValidationError
+from starlette.datastructures import QueryParams
 
 from eventsrc.commands import Command
 from eventsrc.envelope import describe_error
 from eventsrc.errors import LogError, MisuseError
-from eventsrc.text import counted
+from eventsrc.text import counted, visible
 from projections.edit import make
 from projections.edit.correct_poses import Span, by_transform
 from projections.edit.current import CurrentMap
-from projections.edit.effect import EffectCache
+from projections.edit.effect import EffectCache, effects_of
+from projections.edit.listing import edits_document, edits_text
 from projections.edit.make import Stamp
 from projections.edit.outcome import void_text
 from projections.edit.record import Made, MakeCommand, OpenSession, make_command, record_command
@@ -28,6 +30,7 @@ from projections.history.rendering import difference_text
 from projections.settings import Settings
 
 from .comparisons import MOST_LINES
+from .log_map import LogMap
 from .log_prefix import PrefixReader
 from .moment import command_line
 from .opened import Opened
@@ -117,9 +120,21 @@ KINDS: Final = {
 """The kinds of `mapfold edit` that the page can give; of ``correct-poses`` those by a transform."""
 
 
-def edit_kinds() -> list[dict[str, Any]]:
-    """The kinds and the names of their arguments."""
-    return [{"kind": kind, "arguments": each.names} for kind, each in KINDS.items()]
+def corrections_answer(shown: LogMap, _: QueryParams) -> dict[str, Any]:
+    """The commands of the log: who gave which, why, what it changed, what is undone. Effects only
+    where they are known already."""
+    current = CurrentMap(shown.reader, shown.opened.settings)
+    found = effects_of(current, known_only=True)
+    times = {event.offset: event.logged_ns for event in current.command_events()}
+    return {
+        "corrections": [
+            {**each, "text": visible(f"{each['kind']} {each['what']}")}
+            for each in edits_document(found, times)
+        ],
+        "kinds": [{"kind": kind, "arguments": each.names} for kind, each in KINDS.items()],
+        "lines": edits_text(found, times).splitlines(),
+        "command": command_line(shown.opened, "edits", *shown.opened.words()),
+    }
 
 
 class Editor:
@@ -131,9 +146,8 @@ class Editor:
         self._opened, self._log_id = opened, log_id
         self._open_session, self._issued_by = open_session, issued_by
 
-    def answer(self, through: int, payload: bytes) -> dict[str, Any]:
-        """What the command would change, or did."""
-        asked = _read(payload)
+    def answer(self, through: int, asked: Edit, go_on: Callable[[], None]) -> dict[str, Any]:
+        """What the command would change, or did. ``go_on`` ends a dry run by raising."""
         if asked.kind not in KINDS:
             raise QuestionError(f"no edit {asked.kind[:40]!r}; there are {', '.join(KINDS)}")
         make_ = self._checked(KINDS[asked.kind].command(asked.kind, asked.arguments))
@@ -142,7 +156,7 @@ class Editor:
         stamp = Stamp(asked.command_id or uuid.uuid4().hex, self._issued_by, asked.reason)
         notes: list[str] = []
         if asked.dry_run:
-            with PrefixReader(self._opened.log) as reader:
+            with PrefixReader(self._opened.log, go_on=go_on) as reader:
                 made = make_command(reader, make_, stamp, self._opened.settings, notes.append)
                 return self._document(through, asked, made, notes)
         made = record_command(
@@ -201,7 +215,8 @@ class Editor:
         return command_line(self._opened, "edit", asked.kind, *words, *arguments)
 
 
-def _read(payload: bytes) -> Edit:
+def read_edit(payload: bytes) -> Edit:
+    """The body of a request. Raises QuestionError."""
     try:
         return Edit.model_validate(json.loads(payload))
     except ValidationError as error:

@@ -16,6 +16,8 @@ from .service import UiService
 
 LOOK_S: Final = 0.3
 TAILS_S: Final = 5.0
+MOST_STREAMS: Final = 32
+"""Each holds a connection; the server has 128."""
 _SEND_S: Final = 0.1
 _BEAT_S: Final = 15.0
 
@@ -31,6 +33,7 @@ class LiveWatch:
         self._sinks: list[dict[str, Any]] | None = None
         self._fault: str | None = None
         self._closing = threading.Event()
+        self._streams = 0
         self._threads = [threading.Thread(target=self._look, name="look")]
         if tails is not None:
             self._threads.append(threading.Thread(target=self._ask_tails, name="tails"))
@@ -49,6 +52,11 @@ class LiveWatch:
         for thread in self._threads:
             thread.join()
 
+    @property
+    def is_full(self) -> bool:
+        """Whether `MOST_STREAMS` pages listen."""
+        return self._streams >= MOST_STREAMS
+
     def document(self) -> dict[str, Any]:
         """What a page hears now."""
         log = self._service.log_document()
@@ -62,17 +70,21 @@ class LiveWatch:
     async def stream(self) -> AsyncIterator[bytes]:
         """Server-sent events: one at once, then one for each change."""
         last, silent = "", 0.0
-        yield b"retry: 1000\n\n"
-        while not self._closing.is_set():
-            now = json.dumps(self.document(), allow_nan=False)
-            if now != last:
-                last, silent = now, 0.0
-                yield f"event: log\ndata: {now}\n\n".encode()
-            elif silent >= _BEAT_S:
-                silent = 0.0
-                yield b": still here\n\n"
-            await asyncio.sleep(_SEND_S)
-            silent += _SEND_S
+        self._streams += 1
+        try:
+            yield b"retry: 1000\n\n"
+            while not self._closing.is_set():
+                now = json.dumps(self.document(), allow_nan=False)
+                if now != last:
+                    last, silent = now, 0.0
+                    yield f"event: log\ndata: {now}\n\n".encode()
+                elif silent >= _BEAT_S:
+                    silent = 0.0
+                    yield b": still here\n\n"
+                await asyncio.sleep(_SEND_S)
+                silent += _SEND_S
+        finally:
+            self._streams -= 1
 
     def _look(self) -> None:
         while not self._closing.wait(LOOK_S):

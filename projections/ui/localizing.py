@@ -7,6 +7,7 @@ W folds the log once more. The last such map is kept where it is small.
 
 import shlex
 import sys
+from collections.abc import Callable
 from time import perf_counter
 from typing import Any, Final
 
@@ -47,7 +48,9 @@ class Localizer:
         self._opened = opened
         self._kept: tuple[object, ExactIndex] | None = None
 
-    def answer(self, through: Offset, query: QueryParams, payload: bytes) -> dict[str, Any]:
+    def answer(
+        self, through: Offset, query: QueryParams, payload: bytes, go_on: Callable[[], None]
+    ) -> dict[str, Any]:
         """Ranked places, a pose, all poses weighed (x, y, yaw, weight), and for each crop what in
         the map looks like it."""
         started = perf_counter()
@@ -56,7 +59,7 @@ class Localizer:
         top = text_of(query, "top", "3")
         if not (top.isascii() and top.isdecimal() and 1 <= int(top[:9]) <= _MOST_TOP):
             raise QuestionError(f"top is {top[:40]!r}; give a number from 1 to {_MOST_TOP}")
-        end, index = self._index(through, query)
+        end, index = self._index(through, query, go_on)
         candidates = index.search(crops)
         found = rank(question, candidates, top=int(top))
         words = ["question.json", "--log", str(self._opened.log), "--as-of", str(end)]
@@ -75,9 +78,11 @@ class Localizer:
             "command": shlex.join(["mapfold", "relocalize", *words, *settings]),
         }
 
-    def _index(self, through: Offset, query: QueryParams) -> tuple[Offset, ExactIndex]:
+    def _index(
+        self, through: Offset, query: QueryParams, go_on: Callable[[], None]
+    ) -> tuple[Offset, ExactIndex]:
         """The map at W under the commands before it, to be searched."""
-        with PrefixReader(self._opened.log, through) as reader:
+        with PrefixReader(self._opened.log, through, go_on) as reader:
             end = resolve(reader, text_of(query, "at", "end"))
             corrections = read_corrections(reader, end)
             settings = self._opened.settings(corrections)

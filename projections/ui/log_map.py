@@ -102,7 +102,8 @@ class LogMap:
         """Equal while the map only grows: another one means that the past is another too."""
         known = self.timeline.corrections()
         offsets = ",".join(str(command.offset) for command in known.in_force)
-        made = f"{map_fingerprint(self.timeline.settings, known)} {offsets} {self._stopped}"
+        map_ = map_fingerprint(self.timeline.settings, known)
+        made = f"{self.log_id} {map_} {offsets} {self._stopped}"
         return hashlib.sha256(made.encode()).hexdigest()[:16]
 
     def refresh(self, end: Offset | None = None) -> bool:

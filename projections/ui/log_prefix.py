@@ -1,7 +1,7 @@
 """A reader of the first events of a log, up to where it can be read and folded."""
 
 import sys
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 
 from eventsrc.envelope import FIRST_OFFSET, Offset
@@ -9,16 +9,20 @@ from eventsrc.log import Event, LogReader, Unreadable
 from eventsrc.log.reader import OnGap
 
 _NO_LIMIT = Offset(sys.maxsize)
+_ASK_EVERY = 500
 
 
 class PrefixReader(LogReader):
     """A `LogReader` that takes a log to end at ``limit``, if it has as many events.
 
-    Nothing behind the limit is read, so damage there is no error.
+    Nothing behind the limit is read, so damage there is no error. ``go_on`` is called from time to
+    time while events are read; what it raises ends the reading.
     """
 
-    def __init__(self, path: Path, limit: Offset = _NO_LIMIT) -> None:
-        self.limit = limit
+    def __init__(
+        self, path: Path, limit: Offset = _NO_LIMIT, go_on: Callable[[], None] = lambda: None
+    ) -> None:
+        self.limit, self._go_on = limit, go_on
         super().__init__(path)
 
     @property
@@ -48,7 +52,10 @@ class PrefixReader(LogReader):
         """Events from ``start`` to before ``end``, at most to the limit."""
         if self.is_limited:
             end = self.next_offset if end is None else min(end, self.next_offset)
-        return super().read(start, end, keys=keys, on_gap=on_gap)
+        for number, event in enumerate(super().read(start, end, keys=keys, on_gap=on_gap)):
+            if number % _ASK_EVERY == 0:
+                self._go_on()
+            yield event
 
     def first_unreadable(self) -> Offset | None:
         """The first offset whose event cannot be read; None if all can. Reads the whole log."""

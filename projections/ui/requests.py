@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from starlette.datastructures import QueryParams
-from starlette.requests import Request
 
 from eventsrc.errors import LogError, MapfoldError, MisuseError
 from projections.errors import DatabaseError, LogPointError, QuestionError, SettingsError
@@ -12,9 +11,6 @@ from projections.history import ExpressionError, NoSuchThing
 from projections.serve.answering import TooMuchError
 
 MOST_SETS: Final = 50
-_DRAIN_FACTOR: Final = 8
-"""So much of a body that is too long is read: a client that is cut off while it sends sees a broken
-connection instead of the reason."""
 _KINDS: Final[tuple[tuple[type[MapfoldError], str, int], ...]] = (
     (TooMuchError, "too_much", 503),
     (NoSuchThing, "not_found", 404),
@@ -63,16 +59,3 @@ def number_of(query: Mapping[str, str], name: str, default: int) -> int:
     if not (text.isascii() and text.isdecimal() and len(text) <= 18):
         raise QuestionError(f"{name} is {text[:40]!r}; give a whole number from 0 on")
     return int(text)
-
-
-async def read_body(request: Request, most: int) -> bytes:
-    """The body. Raises QuestionError for one of more than ``most`` bytes."""
-    body, length = bytearray(), 0
-    async for part in request.stream():
-        length += len(part)
-        body += part if length <= most else b""
-        if length > _DRAIN_FACTOR * most:
-            break
-    if length > most:
-        raise QuestionError(f"the question has more than {most} bytes; send less")
-    return bytes(body)

@@ -1,5 +1,6 @@
 """The map under other settings or without a command, compared with the log's own map."""
 
+from collections.abc import Callable
 from time import perf_counter
 from typing import Any
 
@@ -23,13 +24,15 @@ from .requests import assignments_of, text_of
 _OPTIONS = ("try", "grid", "without")
 
 
-def whatif_answer(opened: Opened, through: Offset, query: QueryParams) -> dict[str, Any]:
+def whatif_answer(
+    opened: Opened, through: Offset, query: QueryParams, go_on: Callable[[], None]
+) -> dict[str, Any]:
     """``set`` together make one alternative; each ``try``, ``grid`` and ``without`` as the options
     of ``mapfold whatif``. Says how long the folds took: ``seconds``, and each its own."""
     started = perf_counter()
     sets = assignments_of(query)
     tries, grids, without = (query.getlist(name) for name in _OPTIONS)
-    with PrefixReader(opened.log, through) as reader:
+    with PrefixReader(opened.log, through, go_on) as reader:
         end = resolve(reader, text_of(query, "at", "end"))
         known_at = resolve(reader, text_of(query, "known_at", str(end)))
         commands = read_commands(reader, known_at)
@@ -39,7 +42,7 @@ def whatif_answer(opened: Opened, through: Offset, query: QueryParams) -> dict[s
     trials += command_trials(commands, without, opened.settings)
     if not trials:
         raise MisuseError("nothing to try; give set, try, grid or without")
-    found = what_if(opened.log, base, trials, end, truth=opened.truth)
+    found = what_if(opened.log, base, trials, end, truth=opened.truth, progress=lambda *_: go_on())
     words = [w for name in _OPTIONS for text in query.getlist(name) for w in (f"--{name}", text)]
     words += [word for text in sets for word in ("--set", text)]
     words += [*opened.base_words(), "--at", str(end)]

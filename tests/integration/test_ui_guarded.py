@@ -1,17 +1,21 @@
 """Who may ask `mapfold ui`, and what comes back for what no honest page sends."""
 
+import contextlib
 import json
 import re
 import socket
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
+from eventsrc.system_events import LOSS_KEY, REJECTED_KEY
+from projections.ui.live import MOST_STREAMS
 from tests.commands import Commands
 from tests.envelopes import detection, envelope
 from tests.http_attacks import answer, request, status
-from tests.logs import walk, write_log
+from tests.logs import append_raw, walk, write_log
 from tests.ui_client import read_arrays
 from tests.ui_server import UiServer, showing
 
@@ -212,6 +216,30 @@ def test_there_is_no_page_that_loads_from_other_hosts(server: UiServer) -> None:
         assert not re.search(rb"<script>|<style|style=| on\w+=", page.body)
 
 
+def test_a_link_with_the_token_is_in_no_cache(exposed: UiServer, editing: UiServer) -> None:
+    for server in (exposed, editing):
+        assert server.ask("/", token=server.token).headers["cache-control"] == "no-store"
+    assert editing.ask("/").headers["cache-control"] == "no-cache"
+
+
+def test_many_pages_follow_and_one_more_is_told(mapfold: Commands, log: Path) -> None:
+    with showing(mapfold, log) as server, ExitStack() as stack:
+        for _ in range(MOST_STREAMS):
+            assert next(stack.enter_context(server.live()))["through"] == 40
+        got = server.ask("/api/live")
+        assert got.error[:2] == (503, "too_much")
+        assert f"{MOST_STREAMS} pages" in got.error[2]
+        assert server.api("digest")["at"] == 40
+        stack.pop_all().close()
+        for _ in range(100):  # the server hears it a moment later
+            got = server.ask("/api/digest")
+            with contextlib.suppress(AssertionError), server.live() as heard:
+                assert next(heard)["through"] == 40
+                break
+        else:
+            raise AssertionError("closed streams are still counted")
+
+
 class TestHugeQuestions:
     def test_a_huge_body(self, editing: UiServer) -> None:
         bearer = {"Authorization": f"Bearer {editing.token}"}
@@ -295,6 +323,17 @@ class TestHostileNames:
         found = hostile.api("search", q=name)["found"]
         assert {"run", "object"} <= {each["kind"] for each in found}
         assert hostile.ask("/api/why", what=f"object:{name}").json["error"]["kind"] == "not_found"
+
+    def test_what_mapfold_itself_never_writes(self, mapfold: Commands, tmp_path: Path) -> None:
+        """Half a surrogate pair in events of mapfold's own keys, as an imported log may have."""
+        log = write_log(tmp_path / "log", walk(5))
+        append_raw(log, rb'{"key": "\ud800", "reason": "\udfff"}', key=REJECTED_KEY)
+        loss = {"publisher": "\ud800", "first": 1, "last": 2, "count": 2, "cause": "queue_full"}
+        append_raw(log, json.dumps(loss).encode(), key=LOSS_KEY)
+        with showing(mapfold, log) as server:
+            header, arrays = read_arrays(server.ask("/api/history").body)
+            assert len(header["system"]) == 2
+            assert len(arrays["kf_x"]) == 5
 
     def test_a_name_and_a_reason(self, hostile: UiServer) -> None:
         place = f"{HOSTILE[0]}_p0"

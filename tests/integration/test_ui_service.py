@@ -1,17 +1,28 @@
 """The service behind the page without HTTP: folds given up, and how many maps are kept."""
 
+import contextlib
+import json
+import multiprocessing
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from starlette.datastructures import QueryParams
 
+from eventsrc.envelope import Offset
+from eventsrc.errors import LogError, MapfoldError
 from eventsrc.log import LogReader
+from projections.history import parallel
+from projections.history.parallel import Rules, fold_all
 from projections.model.digest import map_digest
 from projections.model.fold import fold_log
 from projections.settings import Settings
+from projections.ui.edits import Edit, Editor
 from projections.ui.log_map import MOST_ALTERNATIVES, LogMap
 from projections.ui.opened import Opened
 from projections.ui.service import GivenUp, UiService
+from projections.ui.whatif_answer import whatif_answer
 from tests.logs import walk, write_log
 
 WAIT_S = 60.0
@@ -50,6 +61,88 @@ def test_a_fold_that_nobody_waits_for_is_given_up_and_continued_later(
     whole: list[bool] = []
     service.ask(["eps_m=0.9"], digest, lambda: not whole.append(True)).result(WAIT_S)
     assert len(progress) < len(whole)
+
+
+def test_the_end_gives_up_the_fold_under_way_and_all_questions(
+    log: Path, service: UiService
+) -> None:
+    service.ask([], digest).result(WAIT_S)
+
+    def ending() -> bool:
+        service.end()
+        return True
+
+    for sets, wanted in (
+        (["eps_m=0.8"], ending),
+        (["eps_m=0.9"], lambda: True),
+        ([], lambda: True),
+    ):
+        with pytest.raises(GivenUp, match="ends"):
+            service.ask(sets, digest, wanted).result(WAIT_S)
+
+
+@pytest.mark.parametrize("answer", ["whatif", "relocalize", "edit"])
+def test_long_answers_are_given_up_while_they_fold(
+    log: Path, service: UiService, answer: str
+) -> None:
+    """Each takes a fold at least; ``wanted`` is asked at its beginning and while it folds."""
+    query = QueryParams("eps_m=0.8")
+    question = json.dumps({"crops": [{"class": "baker's rack"}]}).encode()
+    editor = Editor(service.opened, service.log_id, contextlib.nullcontext, "somebody")  # type: ignore[arg-type]
+    edit = Edit(kind="forget-run", arguments=["run-a"])
+    work = {
+        "whatif": lambda end, go_on: whatif_answer(service.opened, end, query, go_on),
+        "relocalize": lambda end, go_on: service.localizer.answer(end, query, question, go_on),
+        "edit": lambda end, go_on: editor.answer(end, edit, go_on),
+    }[answer]
+    asked: list[bool] = []
+
+    def wanted() -> bool:
+        asked.append(True)
+        return len(asked) < 3
+
+    with pytest.raises(GivenUp, match="nobody"):
+        service.ask_apart(work, wanted).result(WAIT_S)
+    assert len(asked) == 3
+    assert service.ask_apart(work).result(WAIT_S)["through"] == 1300
+
+
+def test_processes_of_a_what_if_stop_when_it_is_given_up(log: Path) -> None:
+    def progress(_folded: int, _events: int) -> None:
+        raise GivenUp
+
+    rules = [Rules(Settings(eps_m=eps)) for eps in (0.5, 1.0)]
+    with pytest.raises(GivenUp):
+        fold_all(log, rules, Offset(1300), processes=2, progress=progress)
+    assert multiprocessing.active_children() == []
+
+
+def test_a_worker_stops_at_its_next_report(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shared = multiprocessing.get_context("spawn").Value("q", parallel._STOP)
+    monkeypatch.setattr(parallel, "_done", shared)
+    with pytest.raises(MapfoldError):
+        parallel._fold_share(log, [Rules(Settings())], Offset(1300), None, keep_views=False)
+    assert shared.value == parallel._STOP
+
+
+def test_another_log_in_the_same_place_is_not_folded(tmp_path: Path) -> None:
+    here = write_log(tmp_path / "log", walk(20, seed=6))
+    with UiService(Opened(here, lambda _: Settings())) as service:
+        assert service.ask(["eps_m=0.8"], lambda shown, _: shown.through).result(WAIT_S) == 20
+        shutil.rmtree(here)
+        write_log(here, walk(20, seed=7))
+        with pytest.raises(LogError, match="another log"):
+            service.ask(["eps_m=0.9"], digest).result(WAIT_S)
+
+
+def test_the_state_names_the_log(log: Path, tmp_path: Path) -> None:
+    """Else a page whose server now shows another log would add that one's rows to its own."""
+    other = write_log(tmp_path / "log", walk(20, seed=6))
+    keys = set()
+    for each in (log, other):
+        with UiService(Opened(each, lambda _: Settings())) as service:
+            keys.add(service.ask([], lambda shown, _: shown.key).result(WAIT_S))
+    assert len(keys) == 2
 
 
 def test_work_that_has_not_begun_is_dropped(service: UiService) -> None:
