@@ -2,7 +2,8 @@
 
 The JSON has the fields of the ROS message: ``info`` with ``resolution``, ``width``, ``height`` and
 ``origin`` (``position`` and the quaternion ``orientation``), and ``data``, row by row from the
-origin: -1 for unknown, else 0 to 100. ``header`` may be there or not.
+origin: -1 for unknown, else 0 to 100. ``header`` may be there or not, and so may ``floor``, which
+ROS does not have: the floor that the map is of, as in envelopes.
 """
 
 import math
@@ -50,6 +51,7 @@ class _Head(msgspec.Struct):
 
     info: _Info
     data: msgspec.Raw
+    floor: int | str | None = None
 
 
 _HEAD = msgspec.json.Decoder(_Head)
@@ -83,7 +85,8 @@ def read_grid_message(payload: bytes, source: str) -> OccupancyMap:
     at = info.origin.position
     origin = (at.x, at.y, _yaw(info.origin.orientation))
     grid = cells.astype(np.uint8).reshape(info.height, info.width)
-    return OccupancyMap(None, info.resolution, origin, source, grid)
+    floor = None if head.floor is None else str(head.floor)
+    return OccupancyMap(None, info.resolution, origin, source, grid, floor)
 
 
 def _size(info: _Info) -> str:

@@ -8,6 +8,7 @@ holds for what comes after it. `eventsrc.grid_messages` makes one from a nav_msg
 import hashlib
 import json
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import pybase64
@@ -35,16 +36,18 @@ class InvalidMap(ValueError):
     """This is no occupancy map; the message names the field, its value and the rule."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class OccupancyMap:
     """An occupancy grid. ``cells`` is of shape (height, width) with values as in the event; its
-    first row is the one of the origin, where the image's is the last."""
+    first row is the one of the origin, where the image's is the last. ``floor`` is the one that it
+    names, None for the floor that the log is of first. Nothing of it is ever changed."""
 
     map_id: str | None
     resolution: float
     origin: tuple[float, float, float]
     source: str
     cells: Cells
+    floor: str | None = None
 
     @property
     def width(self) -> int:
@@ -57,7 +60,12 @@ class OccupancyMap:
         return int(self.cells.shape[0])
 
     def digest(self) -> str:
-        """SHA-256 of what it says of the building, as 64 hex digits: id and source do not count."""
+        """SHA-256 of the grid and where it lies, as 64 hex digits: id, source and floor do not
+        count."""
+        return self._digest
+
+    @cached_property
+    def _digest(self) -> str:
         head = (self.resolution, *self.origin, self.width, self.height)
         text = ",".join(map(repr, head)).encode()
         return hashlib.sha256(text + b"\n" + self.cells.tobytes()).hexdigest()
@@ -70,6 +78,7 @@ class OccupancyMap:
             raise InvalidMap(f"a cell has the value {int(self.cells[~allowed][0])}: {_VALUES}")
         document = {
             **({} if self.map_id is None else {"map_id": self.map_id}),
+            **({} if self.floor is None else {"floor": self.floor}),
             "resolution": self.resolution,
             "origin": list(self.origin),
             "width": self.width,
@@ -102,7 +111,8 @@ def decode_map(payload: bytes) -> OccupancyMap:
     cells = rows[::-1]
     if ((cells > OCCUPIED) & (cells != UNKNOWN)).any():
         raise InvalidMap(f"png: it has other values than allowed: {_VALUES}")
-    return OccupancyMap(event.map_id, event.resolution, event.origin, event.source, cells)
+    about = event.map_id, event.resolution, event.origin, event.source
+    return OccupancyMap(*about, cells, event.floor)
 
 
 def read_map_head(payload: bytes) -> OccupancyMapEvent:

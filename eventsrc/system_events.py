@@ -14,7 +14,7 @@ from typing import Annotated, Literal
 import pybase64
 from pydantic import BaseModel, ConfigDict, Field
 
-from .envelope import Position, Text
+from .envelope import Floor, Position, Text
 
 RESERVED_PREFIX = "mapfold/"
 REJECTED_KEY = "mapfold/rejected"
@@ -95,3 +95,5 @@ class OccupancyMapEvent(BaseModel):
     height: Annotated[int, Field(ge=1, le=MAX_MAP_SIDE)]
     png: str
     source: Text
+    floor: Floor = None
+    """The floor that it is of; without it the one that the log is of first."""

@@ -44,14 +44,16 @@ class _MapFile(BaseModel):
     mode: Literal["trinary", "scale", "raw"] = "trinary"
 
 
-def read_map_yaml(path: Path) -> OccupancyMap:
-    """The map of a map.yaml; its image's path is relative to it. Raises MisuseError."""
+def read_map_yaml(path: Path, floor: str | None = None) -> OccupancyMap:
+    """The map of a map.yaml, of this floor; its image's path is relative to it. Raises
+    MisuseError."""
     described = _described(path)
     image = path.parent / described.image
     try:
         pixels = decode_rgba(_content(image, MAX_IMAGE_BYTES), MAX_MAP_SIDE, MAX_MAP_CELLS)
         cells = _cells(pixels, described)[::-1]
-        map_ = OccupancyMap(path.stem, described.resolution, described.origin, path.name, cells)
+        about = path.stem, described.resolution, described.origin, path.name
+        map_ = OccupancyMap(*about, cells, floor)
         map_.encode()
     except BadImage as error:
         raise MisuseError(f"{image}: {error}; give a PGM or PNG image") from None

@@ -59,6 +59,12 @@ def import_(
             help="The map.yaml of a map server; its walls hold from here on, for the files too.",
         ),
     ] = None,
+    floor: Annotated[
+        str | None,
+        typer.Option(
+            metavar="F", help="The floor that the map is of, as `floor` in envelopes names it."
+        ),
+    ] = None,
     json_: JsonOption = False,
 ) -> None:
     """Append recorded envelopes to a log, in the order of the files, after an occupancy map.
@@ -72,7 +78,9 @@ def import_(
         raise MisuseError("nothing to import; give a FILE, or a map by --map")
     check_sources(names)
     check_key(key, "--key")
-    given_map = None if map_ is None else read_map_yaml(map_)
+    if floor is not None and map_ is None:
+        raise MisuseError(f"--floor {visible(floor)} is for a map; give one by --map, too")
+    given_map = None if map_ is None else read_map_yaml(map_, floor)
     rejects = _RejectPrinter()
     try:
         with LogWriter(log, fsync=IMPORT_FSYNC) as writer, _progress() as show:

@@ -100,9 +100,10 @@ def _map_text(head: OccupancyMapEvent) -> str:
     name = "" if head.map_id is None else f" {head.map_id}"
     x, y, yaw = head.origin
     turned = f", turned by {yaw:g} rad" if yaw else ""
+    floor = "" if head.floor is None else f", of floor {head.floor}"
     return (
         f"map{name} of {head.width:,} × {head.height:,} cells of {head.resolution:g} m from "
-        f"({x:g}, {y:g}){turned}, from {head.source}"
+        f"({x:g}, {y:g}){turned}{floor}, from {head.source}"
     )
 
 

@@ -36,5 +36,7 @@ def view_of_floor(view: MapView, floor: str) -> MapView:
         for (a, b), count in view.adjacency.items()
         if a in found.places and b in found.places
     }
+    if (given := view.maps_in_force().get(name)) is not None:
+        found.maps[None] = given  # the only floor is the first
     found.floors, found.contents = view.floors, view.contents
     return found

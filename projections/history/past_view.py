@@ -55,7 +55,8 @@ def view_at(history: History, latest: MapView, end: Offset) -> MapView:
     view.adjacency = _adjacency(history, end)
     for skipped in history.skipped[: count_before(history.skipped, end)]:
         view.skipped[skipped.kind] = view.skipped.get(skipped.kind, 0) + 1
-    view.map = last_before(history.maps, end)
+    for given in history.maps[: count_before(history.maps, end)]:
+        view.maps[given.map.floor] = given
     view.advance(end)
     return view
 

@@ -7,7 +7,8 @@ the same map reached another way has the same digest. Under corrections there ar
 the places' names, and the corrections' fingerprint. Under fusion by evidence there is one more
 before them: of each Object its estimate, whether it is missing, and its relocations. Where any
 keyframe's floor has a name there is one before that: of each of these keyframes the floor. With an
-occupancy map there is one more, of its cells and where they lie, before those of corrections.
+occupancy map there is one more, of its cells and where they lie, before those of corrections; maps
+that name a floor follow it, by name.
 """
 
 import hashlib
@@ -38,8 +39,11 @@ def map_digest(view: MapView) -> str:
         digest.update(b"evidence\n")
         for line in _evidence(view):
             digest.update(line.encode())
-    if view.map is not None:
-        digest.update(f"map\n{_line(view.map.map.digest())}".encode())
+    if (given := view.maps.get(None)) is not None:
+        digest.update(f"map\n{_line(given.map.digest())}".encode())
+    if named := sorted((floor, g.map) for floor, g in view.maps.items() if floor is not None):
+        lines_of_maps = (_line((floor, each.digest())) for floor, each in named)
+        digest.update(f"maps of floors\n{''.join(lines_of_maps)}".encode())
     if own := view.corrections.fingerprint():
         names = [_line((p.ordinal, p.name)) for p in view.places.values() if p.name is not None]
         digest.update(f"names\n{''.join(names)}corrections\n{_line(own)}".encode())

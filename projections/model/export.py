@@ -5,7 +5,7 @@ from typing import Any
 
 from eventsrc.envelope import Offset
 from eventsrc.text import counted, visible
-from projections.deltas import PlaceOrdinal
+from projections.deltas import MapGiven, PlaceOrdinal
 from projections.exact import UM_PER_M
 from projections.place_types import PlaceType
 from projections.settings import Settings, assignment_texts
@@ -40,21 +40,28 @@ def state_document(view: MapView, digest: str, known_at: Offset | None = None) -
 
 
 def _map(view: MapView) -> dict[str, Any]:
-    """The occupancy map in force; nothing where there is none."""
-    if view.map is None:
-        return {}
-    given = view.map.map
+    """The occupancy map in force on the first floor, and where maps name floors all of them;
+    nothing where there is none."""
+    first = view.map
+    named = any(floor is not None for floor in view.maps)
     return {
-        "map": {
-            "offset": view.map.offset,
-            "map_id": given.map_id,
-            "source": given.source,
-            "resolution": given.resolution,
-            "origin": list(given.origin),
-            "width": given.width,
-            "height": given.height,
-            "digest": given.digest(),
-        }
+        **({} if first is None else {"map": _given(first)}),
+        **({"maps": [_given(each) for each in view.maps_in_force().values()]} if named else {}),
+    }
+
+
+def _given(delta: MapGiven) -> dict[str, Any]:
+    given = delta.map
+    return {
+        "offset": delta.offset,
+        "map_id": given.map_id,
+        "source": given.source,
+        "resolution": given.resolution,
+        "origin": list(given.origin),
+        "width": given.width,
+        "height": given.height,
+        "digest": given.digest(),
+        **_floor(given.floor),
     }
 
 
@@ -169,15 +176,22 @@ def state_text(view: MapView, digest: str, known_at: Offset | None = None) -> st
     ]
     if view.settings.fusion == "evidence":
         lines.append(f"objects  {_standing(view)}")
-    if view.map is not None:
-        given = view.map.map
-        size = f"{given.width:,} × {given.height:,} cells of {given.resolution:g} m"
-        lines.append(f"walls    {size}, from {given.source} at offset {view.map.offset:,}")
+    lines += [_walls(floor, given, view) for floor, given in view.maps_in_force().items()]
     if in_force := view.corrections.in_force:
         known = view.next_offset if known_at is None else known_at
         lines.append(f"commands {len(in_force):,} in force, of those before {known:,}")
     lines += _place_lines(view)
     return "\n".join(lines) + "\n"
+
+
+def _walls(floor: str | None, delta: MapGiven, view: MapView) -> str:
+    given = delta.map
+    size = f"{given.width:,} × {given.height:,} cells of {given.resolution:g} m"
+    where = "" if floor is None else f" of floor {visible(floor)}"
+    line = f"walls    {size}{where}, from {given.source} at offset {delta.offset:,}"
+    if view.settings.places == "rooms":
+        return line
+    return f"{line}; places=page does not use them for places, --preset rooms does"
 
 
 def _standing(view: MapView) -> str:

@@ -4,6 +4,7 @@ import gc
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import lru_cache
 from itertools import islice
 from typing import NamedTuple
 
@@ -89,9 +90,13 @@ def _parse_own(event: Event) -> OccupancyMap | Rejected | None:
     if event.key != MAP_KEY:
         return None
     try:
-        return decode_map(event.payload)
+        return _decoded(event.payload)
     except InvalidMap as error:
         return Rejected(f"it is on {MAP_KEY} and no map: {error}")
+
+
+_decoded = lru_cache(maxsize=1)(decode_map)
+"""Map servers publish the same map again and again: its image is then decoded once."""
 
 
 def fold_parsed(event: ParsedEvent, semantic_map: SemanticMap) -> list[Delta]:

@@ -301,7 +301,7 @@ def _load_places(view: MapView, rows: list[list[Any]]) -> None:
             view.survivors.merge(survivor, (place.ordinal,))
 
 
-FOLD_VERSION = 2
+FOLD_VERSION = 3
 """Raise it with every change of the reducers after which the same log gives another map."""
 
 
@@ -359,7 +359,7 @@ def restore(
         _check_signatures(about["segments"], signatures_at(about["offset"]))
         semantic_map.load(part("map", state))
         load_view(view, part("view", state))
-        view.map = semantic_map.current_map.given
+        view.maps = dict(semantic_map.current_map.given)
         for delta in semantic_map.use_names(semantic_map.next_offset, corrections):
             view.apply(delta)
     except (MalformedSnapshot, zlib.error) as error:

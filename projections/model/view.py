@@ -39,6 +39,7 @@ from projections.deltas import (
     RunSeen,
     SkipKind,
 )
+from projections.floor_maps import map_in_force
 from projections.place_types import PlaceType, place_type
 from projections.reducers.survivors import ObjectSurvivors, PlaceSurvivors
 from projections.settings import Settings
@@ -64,8 +65,8 @@ class MapView:
     not absorbed, by ordinal, ascending; ``all_places`` also the absorbed, and ``survivors`` what
     these are part of now. So are ``objects``, ``all_objects`` and ``object_survivors``.
     ``adjacency`` maps (a, b), a founded before b, to shared transitions above 0; `edges` sorts it.
-    ``floors`` numbers the floors that have a name by their first keyframe. ``map`` is the occupancy
-    map in force and the offset of its event.
+    ``floors`` numbers the floors that have a name by their first keyframe. ``maps`` are the
+    last occupancy maps by the floor that they name, each with the offset of its event.
     ``next_offset`` is the number of events that went into the view; ``corrections`` are those they
     were folded under.
     """
@@ -93,7 +94,7 @@ class MapView:
         self.adjacency: dict[tuple[PlaceOrdinal, PlaceOrdinal], int] = {}
         self.floors: dict[str, int] = {}
         self.contents = PlaceContents()
-        self.map: MapGiven | None = None
+        self.maps: dict[str | None, MapGiven] = {}
         self.skipped: dict[SkipKind, int] = {"duplicate": 0, "conflict": 0, "det_id_reused": 0}
 
     def apply(self, delta: Delta) -> None:
@@ -118,6 +119,23 @@ class MapView:
     def floor_of(self, place: PlaceOrdinal) -> str | None:
         """The name of the floor that a place is on; None if the log tells none."""
         return self.keyframes[self.all_places[place].founder].floor
+
+    @property
+    def first_floor(self) -> str | None:
+        """The floor of the first pose; None also where there is none."""
+        return next((k.floor for k in self.keyframes if k.pose is not None), None)
+
+    @property
+    def map(self) -> MapGiven | None:
+        """The occupancy map in force on the first floor."""
+        return map_in_force(self.maps, self.first_floor, is_first=True) if self.maps else None
+
+    def maps_in_force(self) -> dict[str | None, MapGiven]:
+        """The occupancy map of each floor that has one, ordered by offset."""
+        found = dict(self.maps)
+        if None in self.maps:
+            found = {self.first_floor: found.pop(None)} | found
+        return dict(sorted(found.items(), key=lambda item: item[1].offset))
 
     def is_between_floors(self, a: PlaceOrdinal, b: PlaceOrdinal) -> bool:
         """Whether two places are on two floors, so that a way between them is stairs or a lift."""
@@ -314,7 +332,7 @@ class MapView:
             self.adjacency.pop((delta.a, delta.b), None)
 
     def _map_given(self, delta: MapGiven) -> None:
-        self.map = delta
+        self.maps[delta.map.floor] = delta
 
     # Functions of the class, not bound methods: a view that refers to itself would stay in memory,
     # once it is no longer used, until Python looks for cycles.

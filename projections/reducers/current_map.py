@@ -1,61 +1,98 @@
-"""The occupancy map in force: the last one given, from its offset on.
+"""The occupancy maps in force: of each floor the last one given, from its offset on.
 
-A second map replaces the first. What was folded before a map keeps its place: a fold never looks
-back. Two poses are judged by the map in force when the later of them is folded.
+A second map of a floor replaces the first; one with the same grid changes nothing. What was folded
+before a map keeps its place: a fold never looks back. Two poses are judged by the map in force when
+the later of them is folded.
+
+A map that names no floor is of the floor that the log is of first, unless another names that one.
 """
+
+from functools import partial
 
 import numpy as np
 
 from eventsrc.envelope import Offset
 from eventsrc.occupancy_map import OccupancyMap
 from projections.deltas import MapGiven
-from projections.occupancy import OccupancyGrid
-from projections.reducers import State
+from projections.floor_maps import map_in_force
+from projections.occupancy import OccupancyGrid, Point
+from projections.reducers import State, part, prefixed
 from projections.settings import Settings
+
+from .driven_cells import StraightWay
+from .floors import Floors, shift_um
 
 
 class CurrentMap:
-    """The reducer. ``grid`` has the walls of ``given``; both are None before the first map.
+    """The reducer. ``given`` are the maps by the floor that they name.
 
-    Walls are worked out only for places by rooms, which use them: for a large map that takes
-    seconds.
+    Walls are worked out when the first pose on their floor is folded after the map, as that takes a
+    second or two for a large one: maps that are replaced before cost nothing.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, floors: Floors) -> None:
         self._uses_walls = settings.places == "rooms"
-        self.given: MapGiven | None = None
-        self.grid: OccupancyGrid | None = None
+        self._floors = floors
+        self.given: dict[str | None, MapGiven] = {}
+        # By number of the floor; what is not there has not been asked for.
+        self._ways: dict[int, StraightWay | None] = {}
 
-    def fold(self, offset: Offset, given: OccupancyMap) -> MapGiven:
-        """Take over a map."""
-        delta = MapGiven(offset, given)
-        self._use(delta)
+    def fold(self, offset: Offset, given: OccupancyMap) -> MapGiven | None:
+        """Take over a map; None if it changes nothing."""
+        before = self.given.get(given.floor)
+        if before is not None and before.map.digest() == given.digest():
+            return None
+        delta = self.given[given.floor] = MapGiven(offset, given)
+        self._ways.clear()
         return delta
+
+    @property
+    def has_walls(self) -> bool:
+        """Whether places go by the walls of any map."""
+        return self._uses_walls and bool(self.given)
+
+    def way_at(self, at: Point) -> StraightWay | None:
+        """How to tell the straight ways on the floor of a position, laid out beside the others
+        (`projections.reducers.floors`); None where the floor has no map."""
+        number = self._floors.number_at(*at)
+        if number not in self._ways:
+            self._ways[number] = self._way_on(number)
+        return self._ways[number]
+
+    def _way_on(self, number: int) -> StraightWay | None:
+        given = map_in_force(self.given, self._floors.names[number], is_first=number == 0)
+        if given is None:
+            return None
+        way = OccupancyGrid(given.map).straight_way_um
+        return partial(_moved_back, way, *shift_um(number)) if number else way
 
     def dump(self) -> State:
         """Everything, for a snapshot; nothing without a map."""
-        if self.given is None:
-            return {}
-        given = self.given.map
-        return {
-            "offset": self.given.offset,
-            "map_id": given.map_id,
-            "resolution": given.resolution,
-            "origin": list(given.origin),
-            "source": given.source,
-            "cells": given.cells,
-        }
+        parts: State = {}
+        for number, (offset, given) in enumerate(
+            (delta.offset, delta.map) for delta in self.given.values()
+        ):
+            fields = {
+                "offset": offset,
+                "floor": given.floor,
+                "map_id": given.map_id,
+                "resolution": given.resolution,
+                "origin": list(given.origin),
+                "source": given.source,
+                "cells": given.cells,
+            }
+            parts |= prefixed(str(number), fields)
+        return {"maps": len(self.given), **parts} if parts else {}
 
     def load(self, state: State) -> None:
         """Take over what `dump` gave."""
-        if state:
-            x, y, yaw = state["origin"]
-            cells = np.ascontiguousarray(state["cells"])
-            fields = state["map_id"], state["resolution"], (x, y, yaw), state["source"]
-            self._use(MapGiven(state["offset"], OccupancyMap(*fields, cells)))
+        for number in range(state.get("maps", 0)):
+            fields = part(str(number), state)
+            x, y, yaw = fields["origin"]
+            about = fields["map_id"], fields["resolution"], (x, y, yaw), fields["source"]
+            cells = np.ascontiguousarray(fields["cells"])
+            self.fold(fields["offset"], OccupancyMap(*about, cells, fields["floor"]))
 
-    def _use(self, given: MapGiven) -> None:
-        before = self.given
-        self.given = given
-        if self._uses_walls and (before is None or before.map.digest() != given.map.digest()):
-            self.grid = OccupancyGrid(given.map)
+
+def _moved_back(way: StraightWay, dx: int, dy: int, a: Point, b: Point) -> int | None:
+    return way((a[0] - dx, a[1] - dy), (b[0] - dx, b[1] - dy))

@@ -30,6 +30,8 @@ from projections.reducers import State
 
 StraightWay: TypeAlias = Callable[[tuple[int, int], tuple[int, int]], int | None]
 """How far the straight way between two positions counts as, all in µm; None where walls bar it."""
+WayAt: TypeAlias = Callable[[tuple[int, int]], StraightWay | None]
+"""The straight ways on the floor of a position; None where no walls are known on that floor."""
 
 
 class Nearer(NamedTuple):
@@ -45,13 +47,11 @@ class Nearer(NamedTuple):
 class DrivenCells:
     """Cells are numbered as they are made."""
 
-    def __init__(
-        self, cell_um: int, reach_um: int, straight_way: StraightWay | None = None
-    ) -> None:
+    def __init__(self, cell_um: int, reach_um: int, way_at: WayAt | None = None) -> None:
         self._cell_um = cell_um
         self._cell2 = cell_um * cell_um
         self.reach_um = reach_um
-        self.straight_way = straight_way
+        self.way_at = way_at
         self.anchors: list[tuple[int, int]] = []
         # By square of the grid of side ``cell_um``: the cells with their anchors in it, and the
         # cells that a position in it may belong to, with their anchors.
@@ -63,8 +63,8 @@ class DrivenCells:
 
     def find(self, x_um: int, y_um: int) -> int | None:
         """The cell of a position; None if no anchor is near enough."""
-        if self.straight_way is not None:
-            return self._find_between_walls((x_um, y_um), self.straight_way)
+        if self.way_at is not None and (way := self.way_at((x_um, y_um))) is not None:
+            return self._find_between_walls((x_um, y_um), way)
         best, least = None, self._cell2 + 1
         key = x_um // self._cell_um, y_um // self._cell_um
         for cell, x, y in self._around.get(key, ()):  # ascending
@@ -108,10 +108,9 @@ class DrivenCells:
         """
         self._linked[a].add(b)
         self._linked[b].add(a)
-        if self.straight_way is None:
-            length: int | None = distance_um(*self.anchors[a], *self.anchors[b])
-        else:
-            length = self.straight_way(self.anchors[a], self.anchors[b])
+        start, end = self.anchors[a], self.anchors[b]
+        way = None if self.way_at is None else self.way_at(start)
+        length = distance_um(*start, *end) if way is None else way(start, end)
         if length is None or length >= self.near[a].get(b, self.reach_um):
             return
         # The ends' own sides: nearer to the far end through the link than they were to it.
@@ -135,7 +134,8 @@ class DrivenCells:
 
     def with_a_way_to(self, cell: int) -> list[int]:
         """Where walls are known, the cells that are linked to a new one without being driven."""
-        way, at = self.straight_way, self.anchors[cell]
+        at = self.anchors[cell]
+        way = None if self.way_at is None else self.way_at(at)
         if way is None:
             return []
         column, row = at[0] // self._cell_um, at[1] // self._cell_um

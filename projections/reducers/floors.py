@@ -65,18 +65,27 @@ def shift_of_sum(sum_x_um: int, sum_y_um: int, count: int) -> tuple[int, int]:
 
 class Floors:
     """The reducer. ``ordinals`` numbers the floors by their first pose, None for the one without a
-    name."""
+    name; ``names`` are in that order."""
 
     def __init__(self, floor_height_m: float) -> None:
         self._height_um = metres_to_um(floor_height_m)
         self.ordinals: dict[str | None, int] = {}
+        self.names: list[str | None] = []
         # By what is one by command and the group's number, the floor it is on.
         self._homes: dict[tuple[str, int], int] = {}
 
     def enter(self, envelope: Envelope) -> tuple[str | None, int]:
         """The floor of an envelope with a pose, and its number."""
         name = floor_name(envelope, self._height_um)
-        return name, self.ordinals.setdefault(name, len(self.ordinals))
+        if name not in self.ordinals:
+            self.ordinals[name] = len(self.names)
+            self.names.append(name)
+        return name, self.ordinals[name]
+
+    def number_at(self, x_um: int, y_um: int) -> int:
+        """The number of the floor of a laid out position."""
+        column, row = (x_um + STEP_UM // 2) // STEP_UM, (y_um + STEP_UM // 2) // STEP_UM
+        return row * _FLOORS_A_ROW + column
 
     def settle(self, groups: PairGroups[Any], thing: Any, kind: str, floor: int) -> None:
         """``thing``, on this floor, belongs to its group only if that is on this floor."""
@@ -110,12 +119,12 @@ class Floors:
     def dump(self) -> State:
         """Everything, for a snapshot."""
         homes = [[kind, group, floor] for (kind, group), floor in sorted(self._homes.items())]
-        return {"names": list(self.ordinals), "homes": homes}
+        return {"names": self.names, "homes": homes}
 
     def load(self, state: State) -> None:
         """Take over what `dump` gave; older snapshots have nothing, their maps one floor."""
-        names = state.get("names", [None])
-        self.ordinals = {name: ordinal for ordinal, name in enumerate(names)}
+        self.names = list(state.get("names", [None]))
+        self.ordinals = {name: ordinal for ordinal, name in enumerate(self.names)}
         self._homes = {(kind, group): floor for kind, group, floor in state.get("homes", ())}
 
 

@@ -44,7 +44,7 @@ from projections.exact import distance_um
 from projections.pair_groups import PairGroups
 from projections.reducers import State, part, prefixed
 
-from .driven_cells import DrivenCells, StraightWay
+from .driven_cells import DrivenCells, WayAt
 from .place_anchors import Apart, PlaceAnchors
 from .place_members import PlaceMembers
 
@@ -66,11 +66,11 @@ class Rooms(PlaceMembers):
         cell_um: int,
         drive_um: int,
         groups: PairGroups[Keyframe] = _NO_GROUPS,
-        straight_way: StraightWay | None = None,
+        way_at: WayAt | None = None,
     ) -> None:
         super().__init__()
         self._drive_um = drive_um
-        self._cells = DrivenCells(cell_um, 2 * drive_um, straight_way)
+        self._cells = DrivenCells(cell_um, 2 * drive_um, way_at)
         self._anchors = PlaceAnchors(groups)
         # Per cell: the place it joined, as of then, and the point that founded it.
         self._cell_places: list[PlaceOrdinal] = []
@@ -86,9 +86,9 @@ class Rooms(PlaceMembers):
         """A keyframe that may be an anchor."""
         self._anchors.add(keyframe, anchor)
 
-    def use_walls(self, straight_way: StraightWay | None) -> None:
+    def use_walls(self, way_at: WayAt | None) -> None:
         """From now on cells and links are made by these walls; what was made stays as it is."""
-        self._cells.straight_way = straight_way
+        self._cells.way_at = way_at
 
     def fold(
         self,

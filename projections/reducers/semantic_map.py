@@ -113,7 +113,7 @@ class SemanticMap:
         self.objects = objects_by(settings, self._named)
         self.located_in = LocatedIn()
         self.adjacency = Adjacency()
-        self.current_map = CurrentMap(settings)
+        self.current_map = CurrentMap(settings, self.floors)
         self.observation_count = 0
 
     def use_map(self, offset: Offset, given: OccupancyMap) -> list[Delta]:
@@ -121,12 +121,11 @@ class SemanticMap:
         self.next_offset = Offset(offset + 1)
         given_map = self.current_map.fold(offset, given)
         self._use_walls()
-        return [given_map]
+        return [] if given_map is None else [given_map]
 
     def _use_walls(self) -> None:
-        grid = self.current_map.grid
-        if grid is not None and isinstance(self.places, Rooms):
-            self.places.use_walls(grid.straight_way_um)
+        if self.current_map.has_walls and isinstance(self.places, Rooms):
+            self.places.use_walls(self.current_map.way_at)
 
     def skip(self, offset: Offset) -> None:
         """Pass over an event that does not change the map."""

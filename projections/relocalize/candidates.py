@@ -102,13 +102,13 @@ class Candidates:
     """``matches[i]`` are those of crop i, most similar first, ties by ordinal.
 
     Those of a crop without an embedding are observations of Objects of its class, with the
-    similarity 1. ``walls`` are those of the occupancy map in force, None without one.
+    similarity 1. ``walls`` are those of the occupancy maps in force, by floor.
     """
 
     matches: tuple[tuple[Match, ...], ...]
     places: Mapping[PlaceOrdinal, CandidatePlace]
     constants: MapConstants = field(default_factory=MapConstants)
-    walls: WallMap | None = None
+    walls: Mapping[str | None, WallMap] = field(default_factory=dict)
 
 
 class ExactIndex:
@@ -134,7 +134,8 @@ class ExactIndex:
             (o.embedding_model for o in view.observations if o.embedding is not None), None
         )
         self.constants = MapConstants.of(view.settings, self._different())
-        self._walls = None if view.map is None else WallMap(view.map.map)
+        maps = view.maps_in_force()
+        self._walls = {floor: WallMap(given.map) for floor, given in maps.items()}
 
     @classmethod
     def of_log(

@@ -3,7 +3,7 @@
 Where candidates are of several floors, positions on each are laid out beside those on the others,
 `STEP_M` apart in x, before the ranking sees them; the pose of the answer is moved back and says
 which floor it is on. A match that is of no Place is on a floor of its own. With one floor nothing
-is moved.
+is moved. Only floors of the matches count, not all of the map: the databases know no others.
 """
 
 import math
@@ -17,6 +17,7 @@ from projections.deltas import PlaceOrdinal
 from .camera import Floats
 from .candidates import CandidatePlace, Candidates, Match, Stand
 from .pose import Posterior
+from .walls import Flags, WallMap, Walls
 
 STEP_M = 1e8
 
@@ -32,15 +33,48 @@ class Hypotheses:
 
 
 @dataclass(frozen=True, slots=True)
+class _LaidOutWalls:
+    """The walls of several floors, by their numbers."""
+
+    floors: Mapping[int, WallMap]
+
+    def contains(self, xy: Floats) -> Flags:
+        """Which positions (h, 2) are inside walls."""
+        found = np.zeros(len(xy), bool)
+        number = np.round(xy[:, 0] / STEP_M)
+        for each, walls in self.floors.items():
+            here = number == each
+            found[here] = walls.contains(xy[here] - (each * STEP_M, 0.0))
+        return found
+
+    def hides(self, things: Floats, xy: Floats, asked: Flags) -> Flags:
+        """Whether a wall is between a thing (n, 2) and a position (h, 2): shape (n, h)."""
+        hidden = np.zeros(asked.shape, bool)
+        of_things, of_xy = (np.round(each[:, 0] / STEP_M) for each in (things, xy))
+        for each, walls in self.floors.items():
+            here = asked & (of_things == each)[:, None] & (of_xy == each)[None]
+            moved = np.array((each * STEP_M, 0.0))
+            hidden |= walls.hides(things - moved, xy - moved, here)
+        return hidden
+
+
+@dataclass(frozen=True, slots=True)
 class Layout:
     """``numbers`` are those of the floors with Places, by name; None has none."""
 
     numbers: Mapping[str | None, int]
 
     @classmethod
-    def of(cls, places: Mapping[PlaceOrdinal, CandidatePlace]) -> "Layout":
-        """The floors of these Places: those with a name by name, then that without."""
-        names = {place.floor for place in places.values()}
+    def of(cls, candidates: Candidates) -> "Layout":
+        """The floors of these matches: those with a name by name, then that without."""
+        ordinals = {
+            place
+            for row in candidates.matches
+            for match in row
+            for place in (match.object_place, match.keyframe_place)
+            if place is not None
+        }
+        names = {candidates.places[place].floor for place in ordinals}
         ordered: list[str | None] = [*sorted(name for name in names if name is not None)]
         return cls({name: i for i, name in enumerate(ordered + [None] * (None in names))})
 
@@ -56,6 +90,15 @@ class Layout:
         rows = candidates.matches
         moved = tuple(tuple(self._moved(m, candidates.places) for m in row) for row in rows)
         return replace(candidates, matches=moved)
+
+    def walls(self, walls: Mapping[str | None, WallMap]) -> Walls | None:
+        """The walls of each floor, laid out; None where there are none."""
+        if not self.numbers:  # no match is in a Place, so all may be on any floor
+            return next(iter(walls.values())) if len(walls) == 1 else None
+        found = {number: walls[name] for name, number in self.numbers.items() if name in walls}
+        if self.has_several:
+            return _LaidOutWalls(found) if found else None
+        return found.get(0)
 
     def floor_at(self, x: float) -> str | None:
         """The floor of a laid out position; None where it has no name."""

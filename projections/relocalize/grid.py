@@ -9,7 +9,7 @@ import numpy as np
 from .camera import Floats
 from .landmarks import Landmarks
 from .model import Model
-from .walls import WallMap
+from .walls import Walls
 
 _LEAST_PRIOR: Final = 1e-9
 _LANDMARKS, _LEAST_LANDMARKS = 48, 3
@@ -60,7 +60,7 @@ def cells_near(points: Floats, cell_m: float, reach_m: float) -> Floats:
     return _unique((cells[:, None] + steps[None]).reshape(-1, 2)) * cell_m
 
 
-def log_prior(xy: Floats, been: Floats, model: Model, walls: WallMap | None = None) -> Floats:
+def log_prior(xy: Floats, been: Floats, model: Model, walls: Walls | None = None) -> Floats:
     """How likely a robot is there: by the distance from where robots have been; inside a wall less
     so."""
     dx = xy[:, 0, None] - been[None, :, 0]

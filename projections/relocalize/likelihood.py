@@ -32,7 +32,7 @@ from .camera import LOWER, UPPER, Camera, Floats
 from .constants import MapConstants
 from .landmarks import CropEvidence, Cue
 from .model import Model
-from .walls import WallMap
+from .walls import Walls
 
 Indices = NDArray[np.intp]
 
@@ -77,7 +77,7 @@ class Scene:
     constants: MapConstants
     camera: Camera
     model: Model
-    walls: WallMap | None = None
+    walls: Walls | None = None
 
 
 def terms_at(crop: CropEvidence, xy: Floats, error_m2: float, scene: Scene) -> Terms:

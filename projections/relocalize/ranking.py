@@ -153,11 +153,10 @@ def rank(
     thin = thinness(crops, candidates.matches)
     if method == "plain":
         return replace(_rank_plain(candidates, crops, top), known=known, thin=thin)
-    floors = Layout.of(candidates.places)
+    floors = Layout.of(candidates)
     candidates = floors.laid_out(candidates)
     camera = asked.camera or camera or candidates.constants.camera
-    walls = None if floors.has_several else candidates.walls
-    scene = Scene(candidates.constants, camera, model, walls)
+    scene = Scene(candidates.constants, camera, model, floors.walls(candidates.walls))
     posterior = locate(views, candidates.matches, scene)
     return replace(_answer(candidates, crops, posterior, top, floors), known=known, thin=thin)
 

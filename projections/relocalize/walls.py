@@ -5,7 +5,7 @@ are a block apart. Both ends are left out: poses are a little off, and things st
 """
 
 import math
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +23,19 @@ _MOST_POINTS: Final = 200
 Flags = NDArray[np.bool_]
 
 
+class Walls(Protocol):
+    """Walls, for many positions at once."""
+
+    def contains(self, xy: Floats) -> Flags:
+        """Which positions (h, 2), in metres, are inside walls."""
+
+    def hides(self, things: Floats, xy: Floats, asked: Flags) -> Flags:
+        """Whether a wall is between a thing (n, 2) and a position (h, 2): shape (n, h), false where
+        it is not ``asked``."""
+
+
 class WallMap:
-    """The walls of a map, for many positions at once."""
+    """The walls of a map."""
 
     def __init__(self, source: OccupancyMap) -> None:
         cells, blocks = wall_blocks(source)

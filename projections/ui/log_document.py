@@ -55,9 +55,9 @@ def memory_document() -> dict[str, Any]:
 
 
 def _walls(shown: LogMap) -> list[list[float]]:
-    """Those of the occupancy map in force at the end of the log."""
-    maps = shown.timeline.history.maps
-    return wall_segments(maps[-1].map) if maps else []
+    """Those of the occupancy maps in force at the end of the log, of all floors."""
+    last = {given.map.floor: given.map for given in shown.timeline.history.maps}
+    return [segment for each in last.values() for segment in wall_segments(each)]
 
 
 def _runs(shown: LogMap) -> list[dict[str, Any]]:

@@ -17,7 +17,7 @@ MOST_SEGMENTS: Final = 20_000
 _Mask = NDArray[np.bool_]
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=8)
 def wall_segments(given: OccupancyMap) -> list[list[float]]:
     """x and y of both ends, metres in the map frame, to the millimetre."""
     step = 1

@@ -53,6 +53,18 @@ def test_a_map_alone_can_be_imported_and_nothing_can_not(run: Commands) -> None:
     assert not (run.folder / "N").exists()
 
 
+def test_a_map_is_of_the_floor_that_is_given(run: Commands) -> None:
+    run("import", "L", "--map", "map.yaml", "--floor", "1")
+    (event,) = read_log(run.folder / "L")
+    assert decode_map(event.payload).floor == "1"
+    assert ", of floor 1, from map.yaml" in run("log", "cat", "L").out
+    said = run("import", "N", "drive.jsonl", "--floor", "1", code=2)
+    assert "--floor 1 is for a map; give one by --map, too" in said.err
+    said = run("import", "N", "--map", "map.yaml", "--floor", "", code=2)
+    assert "map.yaml: floor: is no floor; give an integer or a text" in said.err
+    assert not (run.folder / "N").exists()
+
+
 def test_a_bad_map_leaves_the_log_as_it_was(run: Commands) -> None:
     (run.folder / "map.png").unlink()
     said = run("import", "L", "drive.jsonl", "--map", "map.yaml", code=2)

@@ -1,6 +1,7 @@
 """Occupancy maps in the fold: the view, the digest, snapshots, time travel, state and pictures."""
 
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.occupancy_map import OccupancyMap
 from eventsrc.system_events import MAP_KEY
+from projections.drawing.one_floor import view_of_floor
 from projections.errors import FoldError
 from projections.history import Timeline
 from projections.model.digest import map_digest
@@ -64,7 +66,7 @@ def test_only_the_digest_tells_a_map_under_the_pages_rule(tmp_path: Path) -> Non
     ]
     assert map_digest(mapped) == map_digest(again)
     assert len({map_digest(view) for view in (plain, mapped, other)}) == 3
-    mapped.map = None
+    mapped.maps.clear()
     assert map_digest(mapped) == map_digest(plain)
 
 
@@ -95,6 +97,34 @@ def test_a_map_is_of_the_first_floor_of_a_log_only(tmp_path: Path) -> None:
     ]
     places = _places(_write(tmp_path / "rooms", ROOMS, *east, *west, *above))
     assert places == [0] * 8 + [1] * 8 + [2] * 16
+
+
+def test_state_and_pictures_have_the_maps_of_floors(tmp_path: Path) -> None:
+    run = Commands.in_folder(tmp_path)
+    east = [envelope(k, 4.0 - 0.25 * (k % 4), 0.0, floor="0") for k in range(8)]
+    above = [envelope(k, 1.7 - 0.25 * (k % 4), 0.0, floor="1") for k in range(8, 16)]
+    upstairs = replace(ROOMS, floor="1")
+    _write(tmp_path / "L", HALL, upstairs, *east, *above)
+    shown = run("state", "L", "--preset", "rooms", "--json").json
+    assert shown["map"]["offset"] == 0
+    assert [(m["offset"], m.get("floor")) for m in shown["maps"]] == [(0, None), (1, "1")]
+    text = run("state", "L", "--preset", "rooms").out
+    assert "walls    10 × 5 cells of 1 m of floor 0, from drawing at offset 0\n" in text
+    assert "walls    10 × 5 cells of 1 m of floor 1, from drawing at offset 1\n" in text
+    with LogReader(tmp_path / "L") as reader:
+        _, view = fold_log(reader, Settings())
+    one, other = (view_of_floor(view, floor).map for floor in "01")
+    assert one is not None
+    assert other is not None
+    assert (one.map.cells.tolist(), other.map.cells.tolist()) == (
+        HALL.cells.tolist(),
+        upstairs.cells.tolist(),
+    )
+    with Timeline(tmp_path / "L", Settings()) as timeline:
+        for until in range(19):
+            past, folded = timeline.at(until), _view(tmp_path / "L", until)
+            assert past.maps_in_force().keys() == folded.maps_in_force().keys()
+            assert map_digest(past) == map_digest(folded)
 
 
 def test_a_map_holds_for_what_comes_after_it_only(tmp_path: Path) -> None:
@@ -129,10 +159,10 @@ def test_a_snapshot_has_the_map(tmp_path: Path) -> None:
             snapshot(semantic_map, view, reader.log_id), Settings(), reader.log_id
         )
     assert map_digest(seen) == map_digest(view)
-    assert seen.map is restored.current_map.given
+    assert seen.map is restored.current_map.given[None]
     assert seen.map is not None
     assert (seen.map.offset, seen.map.map.origin) == (8, HALL.origin)
-    assert restored.use_map(9, ROOMS)[0] is restored.current_map.given
+    assert restored.use_map(9, ROOMS)[0] is restored.current_map.given[None]
 
 
 def test_time_travel_has_the_map_of_its_time(tmp_path: Path) -> None:
@@ -167,7 +197,10 @@ def test_state_names_the_map_only_where_there_is_one(tmp_path: Path) -> None:
         "height": 5,
         "digest": HALL.digest(),
     }
-    assert "walls    10 × 5 cells of 1 m, from drawing at offset 8\n" in run("state", "mapped").out
+    named = "walls    10 × 5 cells of 1 m, from drawing at offset 8"
+    unused = "; places=page does not use them for places, --preset rooms does"
+    assert f"{named}{unused}\n" in run("state", "mapped").out
+    assert f"{named}\n" in run("state", "mapped", "--preset", "rooms").out
 
 
 @pytest.mark.parametrize("suffix", ["svg", "png", "pdf"])

@@ -72,7 +72,7 @@ def rooms_of(statements: Statements, way=None) -> Rooms:
         [(Keyframe("r", a), Keyframe("r", b)) for (a, b), is_same in statements if is_same is want]
         for want in (True, False)
     )
-    return Rooms(CELL_UM, DRIVE_UM, PairGroups(joined, apart), way)
+    return Rooms(CELL_UM, DRIVE_UM, PairGroups(joined, apart), way and (lambda _: way))
 
 
 def fold_one(rooms: Rooms, n: int, at: At) -> list:
@@ -92,7 +92,7 @@ def check_every_prefix(
     refused: set[tuple[int, int]] = set()
     for n, at in enumerate(points):
         if n == known_from:
-            rooms.use_walls(way)
+            rooms.use_walls(way and (lambda _: way))
             naive.way = way
         deltas = fold_one(rooms, n, at)
         naive.add(*at)

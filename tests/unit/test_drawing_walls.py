@@ -17,7 +17,7 @@ from tests.maps import drawn_map
 
 def _view(given: OccupancyMap, *spots: tuple[float, float]) -> MapView:
     view = fold([envelope(k, x, y) for k, (x, y) in enumerate(spots)]).view
-    view.map = MapGiven(0, given)
+    view.maps[None] = MapGiven(0, given)
     return view
 
 
@@ -73,8 +73,8 @@ def test_a_map_away_from_the_drive_or_without_one_is_no_trouble() -> None:
     assert wall_spots(_view(given, (0.0, 0.0))) == []
     assert compose(_view(given, (0.0, 0.0)), "t", Floor()).axes.get_images() == []
     alone = MapView(Settings())
-    alone.map = MapGiven(0, given)
+    alone.maps[None] = MapGiven(0, given)
     found, _ = _drawn_walls(alone)
     assert len(found) == 3
-    alone.map = MapGiven(0, drawn_map("..", 0.5))
+    alone.maps[None] = MapGiven(0, drawn_map("..", 0.5))
     compose(alone, "t", Floor())

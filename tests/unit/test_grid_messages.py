@@ -52,6 +52,13 @@ def test_an_orientation_that_nobody_set_is_no_turn() -> None:
     assert read_grid_message(payload(document), "k").origin == (0.0, 0.0, 0.0)
 
 
+def test_a_message_may_name_its_floor() -> None:
+    assert read_grid_message(payload(grid_message(MAP)), "k").floor is None
+    assert read_grid_message(payload({**grid_message(MAP), "floor": 2}), "k").floor == "2"
+    assert read_grid_message(payload({**grid_message(MAP), "floor": "attic"}), "k").floor == "attic"
+    assert "Expected `int | str | null`" in _read({**grid_message(MAP), "floor": [2]})
+
+
 def test_what_means_to_be_a_grid_is_told_from_an_envelope() -> None:
     assert is_grid_message(payload(grid_message(MAP)))
     assert is_grid_message(b"\n " + payload(grid_message(MAP)))

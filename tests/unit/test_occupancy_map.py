@@ -42,6 +42,14 @@ def test_a_map_comes_back_from_its_event() -> None:
     assert "map_id" not in json.loads(anonymous.encode())
 
 
+def test_a_map_may_name_its_floor() -> None:
+    upstairs = OccupancyMap("house", 0.1, (0.0, 0.0, 0.0), "drawing", HOUSE.cells, "1st")
+    assert json.loads(upstairs.encode())["floor"] == decode_map(upstairs.encode()).floor == "1st"
+    assert decode_map(_document(floor=2)).floor == "2"
+    assert decode_map(_document(floor=None)).floor is decode_map(HOUSE.encode()).floor is None
+    assert "floor" not in json.loads(HOUSE.encode())
+
+
 def test_the_image_shows_the_building_upright() -> None:
     """The last row of the PNG is the row of the origin, as in the image of a map server."""
     from PIL import Image
@@ -88,6 +96,8 @@ def test_the_digest_is_of_the_building_and_not_of_names() -> None:
         (_document(width=9_000, height=9_000), "it has 9,000 × 9,000 cells, more than 16,000,000"),
         (_document(source=""), "source: is empty"),
         (_document(map_id="a\x00b"), "map_id: has the control character U+0000 at index 1"),
+        (_document(floor=""), "floor: is no floor; give an integer or a text of 1 to 256"),
+        (_document(floor=1.5), "floor: is no floor"),
         (_document(png="#"), "png: is not base64"),
         (_document(png=""), "png: it is no PNG image"),
         (_document(width=6), "png: it has 5 × 3 pixels, not 6 × 3"),

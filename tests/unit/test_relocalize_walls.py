@@ -96,21 +96,21 @@ def test_an_answer_keeps_out_of_walls_and_does_not_look_through_them() -> None:
     crop = Crop(np.array([1.0, 0.2, 0.0], np.float32), (280.0, 150.0, 360.0, 250.0), "chair")
     open_ = rank([crop], ExactIndex(view).search([crop]))
     room = OccupancyMap(None, 0.1, (-3.0, -3.0, 0.0), "s", np.zeros((60, 110), np.uint8))
-    view.map = MapGiven(0, room)
+    view.maps[None] = MapGiven(0, room)
     same = rank([crop], ExactIndex(view).search([crop]))
     assert same == open_, "a map without walls changes nothing"
     assert open_.pose is not None
     cells = np.zeros((60, 110), np.uint8)
     column = int((open_.pose.x + 3.0) / 0.1)
     cells[:, column - 3 : column + 4] = 100
-    view.map = MapGiven(0, OccupancyMap(None, 0.1, (-3.0, -3.0, 0.0), "s", cells))
+    view.maps[None] = MapGiven(0, OccupancyMap(None, 0.1, (-3.0, -3.0, 0.0), "s", cells))
     index = ExactIndex(view)
     walled = rank([crop], index.search([crop]))
     assert walled.pose is not None
     assert walled.hypotheses is not None
     assert open_.hypotheses is not None
     inside = [
-        float(found.weights[WallMap(view.map.map).contains(found.poses[:, :2])].sum())
+        float(found.weights[WallMap(view.maps[None].map).contains(found.poses[:, :2])].sum())
         for found in (open_.hypotheses, walled.hypotheses)
     ]
     assert inside[1] < 0.5 * inside[0]
