@@ -21,7 +21,6 @@ from .scene import (
     LostRobot,
     Spot,
     object_groups,
-    object_spot,
     place_badges,
     two_sigma,
 )
@@ -77,7 +76,7 @@ def draw_objects(canvas: Canvas, view: MapView, min_observations: int) -> int:
     groups = object_groups(view, min_observations)
     for group in groups:
         colour = palette.INK if group.place is None else palette.place_colour(group.place)
-        xs, ys = zip(*map(object_spot, group.members), strict=True)
+        xs, ys = zip(*(member.spot for member in group.members), strict=True)
         face, edge = ("white", colour) if group.missing else (colour, "white")
         width = 1.1 if group.missing else 0.6
         canvas.axes.scatter(
@@ -100,7 +99,7 @@ def _draw_evidence(canvas: Canvas, found: ObjectRecord, colour: str) -> None:
     if found.estimate is not None:
         width, height, angle = two_sigma(found.estimate)
         ellipse = Ellipse(
-            object_spot(found), width, height, angle=angle, fill=False, edgecolor=colour,
+            found.spot, width, height, angle=angle, fill=False, edgecolor=colour,
             lw=0.7, alpha=0.75 if width < _WIDE_M else 0.35, zorder=8,
             linestyle="-" if found.missing_in is None else (0, (3, 2)),
         )  # fmt: skip
@@ -109,7 +108,7 @@ def _draw_evidence(canvas: Canvas, found: ObjectRecord, colour: str) -> None:
         last = found.relocations[-1]
         arrow = {"arrowstyle": "-|>", "color": colour, "lw": 0.9, "ls": ":"}
         start = last.from_x_um / 1e6, last.from_y_um / 1e6
-        canvas.axes.annotate("", object_spot(found), start, zorder=9, arrowprops=arrow)
+        canvas.axes.annotate("", found.spot, start, zorder=9, arrowprops=arrow)
 
 
 def draw_bridges(canvas: Canvas, bridges: Sequence[Bridge]) -> None:

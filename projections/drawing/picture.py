@@ -31,7 +31,6 @@ from .scene import (
     Bridge,
     Floor,
     LostRobot,
-    object_spot,
     place_names,
     shown_objects,
     spot_of,
@@ -78,7 +77,7 @@ def compose(
     """The finished canvas, not yet written to a file."""
     by_evidence = view.settings.fusion == "evidence"
     shown = shown_objects(view, min_observations) if by_evidence else []
-    standing = [object_spot(found) for found in shown]
+    standing = [found.spot for found in shown]
     canvas = new_canvas(view, floor, [*standing, *wall_spots(view)])
     draw_floor(canvas, floor)
     draw_map_walls(canvas, view)

@@ -85,7 +85,7 @@ class ObjectGroup:
     @property
     def spot(self) -> tuple[float, float]:
         """The middle of its members."""
-        xs, ys = zip(*map(object_spot, self.members), strict=True)
+        xs, ys = zip(*(member.spot for member in self.members), strict=True)
         return sum(xs) / len(xs), sum(ys) / len(ys)
 
 
@@ -107,12 +107,6 @@ def shown_objects(view: MapView, min_observations: int) -> list[ObjectRecord]:
     return [found for found in view.objects.values() if found.obs_count >= min_observations]
 
 
-def object_spot(found: ObjectRecord) -> tuple[float, float]:
-    """Where an object is drawn: where it stands by estimate, else where the robot saw it from."""
-    at = found.estimate
-    return (found.mean_x, found.mean_y) if at is None else (at.est_x, at.est_y)
-
-
 def two_sigma(at: Estimate) -> tuple[float, float, float]:
     """The ellipse of two standard errors around an estimate: full width and height in metres, and
     the angle from the x axis to the width, in degrees."""
@@ -126,7 +120,7 @@ def two_sigma(at: Estimate) -> tuple[float, float, float]:
 def _add_to_group(clumps: list[list[ObjectRecord]], found: ObjectRecord) -> None:
     """Add an object to the first clump whose first member is near, else begin another."""
     for clump in clumps:
-        if math.dist(object_spot(clump[0]), object_spot(found)) <= _NEAR_M:
+        if math.dist(clump[0].spot, found.spot) <= _NEAR_M:
             clump.append(found)
             return
     clumps.append([found])

@@ -13,8 +13,6 @@ from typing import Any, Final
 
 from projections.model.view import MapView
 
-from .graphs import position
-
 _WGS84_A_M: Final = 6_378_137.0
 _WGS84_E2: Final = 6.694_379_990_141_316e-3
 _DECIMALS: Final = 9
@@ -116,16 +114,15 @@ def _hull(points: Sequence[_Point]) -> list[_Point]:
 
 def _objects(view: MapView, at: _Placing) -> Iterable[dict[str, Any]]:
     for found in view.objects.values():
-        estimate = found.estimate if view.settings.fusion == "evidence" else None
         yield _feature(
             "object",
             "Point",
-            at(*position(view, found)),
+            at(*found.spot),
             object_id=found.object_id,
             class_name=found.class_name,
             place_id=view.place_id(found.place),
             obs_count=found.obs_count,
-            sigma_m=None if estimate is None else estimate.est_sigma_m,
+            sigma_m=None if found.estimate is None else found.estimate.est_sigma_m,
             missing=True if found.missing_in is not None else None,
         )
 

@@ -11,18 +11,9 @@ from typing import Any, Final
 import networkx
 
 from eventsrc.text import visible
-from projections.model.records import ObjectRecord
 from projections.model.view import MapView
 
 _NOT_IN_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-
-
-def position(view: MapView, found: ObjectRecord) -> tuple[float, float]:
-    """Where an Object stands, metres: its estimate under fusion by evidence where it has one, else
-    the mean of the poses that it was seen from, which is all that the page's rule knows."""
-    if view.settings.fusion == "evidence" and found.estimate is not None:
-        return found.estimate.est_x, found.estimate.est_y
-    return found.mean_x, found.mean_y
 
 
 def _graph(view: MapView) -> networkx.Graph:
@@ -44,8 +35,7 @@ def _graph(view: MapView) -> networkx.Graph:
             ),
         )
     for found in view.objects.values():
-        x, y = position(view, found)
-        estimate = found.estimate if view.settings.fusion == "evidence" else None
+        x, y = found.spot
         graph.add_node(
             found.object_id,
             **_known(
@@ -53,7 +43,7 @@ def _graph(view: MapView) -> networkx.Graph:
                 class_name=found.class_name,
                 x=x,
                 y=y,
-                sigma_m=None if estimate is None else estimate.est_sigma_m,
+                sigma_m=None if found.estimate is None else found.estimate.est_sigma_m,
                 obs_count=found.obs_count,
                 missing=True if found.missing_in is not None else None,
             ),

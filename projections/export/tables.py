@@ -51,7 +51,7 @@ def _places(view: MapView) -> str:
 def _objects(view: MapView) -> str:
     rows = []
     for found in view.objects.values():
-        at = found.estimate if view.settings.fusion == "evidence" else None
+        at = found.estimate
         rows.append(
             (
                 found.object_id,

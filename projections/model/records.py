@@ -194,6 +194,12 @@ class ObjectRecord:
     counted_as: tuple[PlaceOrdinal, str, bool] | None = None
 
     @property
+    def spot(self) -> tuple[float, float]:
+        """Where it stands by estimate, metres; without one `mean_x` and `mean_y`."""
+        at = self.estimate
+        return (self.mean_x, self.mean_y) if at is None else (at.est_x, at.est_y)
+
+    @property
     def mean_x(self) -> float:
         """Metres; the mean of the positions the robot observed it from."""
         return mean_m(self.sum_x_um, self.obs_count)
