@@ -14,6 +14,7 @@ def test_sim() -> None:
         "House",
         "SimulatedRun",
         "build_house",
+        "occupancy_map",
         "simulate_run",
     ]
 
