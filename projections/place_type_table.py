@@ -8,8 +8,7 @@ may stand, not in what share of rooms it does: the shares, the other types and t
 ProcTHOR does not have are estimates of our own. So this is a small table made by hand, guided by a
 published one. docs/decisions/place-types.md tells how well it does.
 
-A digit is the share of rooms that have at least one: 0 is 0.7 %, 1 is 5 %, 2 is 20 %, 3 is 50 %,
-4 is 90 %.
+There are five grades of the share of rooms that have at least one: 90, 50, 20, 5 and 0.7 %.
 """
 
 from collections.abc import Mapping
@@ -17,6 +16,7 @@ from types import MappingProxyType
 from typing import Final
 
 SHARES: Final = (0.007, 0.05, 0.2, 0.5, 0.9)
+"""The grades; the first one is that of classes not named for a type."""
 
 TYPES: Final = (
     "kitchen",
@@ -33,7 +33,7 @@ TYPES: Final = (
     "patient room",
     "library",
 )
-"""The columns of the table, in its order."""
+"""The types; every row of `TABLE` has their order."""
 
 NAMES: Final[Mapping[str, str]] = MappingProxyType(
     {
@@ -114,127 +114,158 @@ SYNONYMS: Final[Mapping[str, str]] = MappingProxyType(
 )
 """Other names of classes."""
 
-_NAME_WIDTH: Final = 19
-# kitchen, dining, living, bedroom, bath, office, meeting, hall, reception, laundry, storage,
-# patient, library
-_ROWS: Final = """
-refrigerator       4 1 0 0 0 1 0 0 0 1 1 0 0
-oven               4 0 0 0 0 0 0 0 0 0 0 0 0
-stove              4 0 0 0 0 0 0 0 0 0 0 0 0
-range hood         4 0 0 0 0 0 0 0 0 0 0 0 0
-microwave          4 0 0 0 0 1 0 0 0 0 0 0 0
-dishwasher         3 0 0 0 0 0 0 0 0 1 0 0 0
-toaster            3 0 0 0 0 0 0 0 0 0 0 0 0
-kettle             3 1 0 0 0 1 0 0 0 0 0 0 0
-coffee machine     3 1 0 0 0 2 1 0 1 0 0 0 0
-kitchen cabinet    4 1 0 0 0 0 0 0 0 1 0 0 0
-sink               4 0 0 0 4 0 0 0 0 3 0 1 0
-faucet             3 0 0 0 3 0 0 0 0 2 0 1 0
-pan                3 0 0 0 0 0 0 0 0 0 0 0 0
-pot                3 0 0 0 0 0 0 0 0 0 0 0 0
-plate              3 3 1 0 0 0 0 0 0 0 0 0 0
-knife              3 2 0 0 0 0 0 0 0 0 0 0 0
-fork               3 2 0 0 0 0 0 0 0 0 0 0 0
-spoon              3 2 0 0 0 0 0 0 0 0 0 0 0
-bowl               3 2 1 1 0 0 0 0 0 0 0 0 0
-cup                3 3 1 1 0 2 1 0 0 0 0 1 0
-bottle             3 2 1 1 2 1 1 0 0 1 0 1 0
-wine glass         2 3 1 0 0 0 0 0 0 0 0 0 0
-apple              3 1 0 0 0 0 0 0 0 0 0 0 0
-banana             3 1 0 0 0 0 0 0 0 0 0 0 0
-orange             3 1 0 0 0 0 0 0 0 0 0 0 0
-bread              3 1 0 0 0 0 0 0 0 0 0 0 0
-dining table       2 4 1 0 0 0 0 0 0 0 0 0 0
-chair              2 4 2 2 0 3 4 1 2 0 0 3 3
-stool              2 1 1 1 0 0 0 0 1 0 0 1 1
-couch              0 0 4 1 0 1 1 0 3 0 0 0 2
-armchair           0 0 3 1 0 1 0 1 3 0 0 2 2
-ottoman            0 0 2 1 0 0 0 0 1 0 0 0 0
-coffee table       0 0 4 0 0 0 0 0 2 0 0 0 1
-side table         0 0 3 1 0 0 0 1 3 0 0 1 0
-tv                 1 0 4 2 0 1 3 0 2 0 0 2 0
-tv stand           0 0 3 1 0 0 0 0 0 0 0 0 0
-remote             0 0 3 1 0 0 0 0 0 0 0 1 0
-fireplace          0 1 2 0 0 0 0 0 0 0 0 0 0
-bed                0 0 0 4 0 0 0 0 0 0 0 4 0
-nightstand         0 0 0 3 0 0 0 0 0 0 0 2 0
-wardrobe           0 0 0 3 0 0 0 1 0 0 0 1 0
-dresser            0 0 1 3 1 0 0 1 0 0 0 0 0
-pillow             0 0 2 3 0 0 0 0 0 0 0 3 0
-teddy bear         0 0 1 2 0 0 0 0 0 0 0 0 0
-alarm clock        0 0 0 2 0 0 0 0 0 0 0 0 0
-suitcase           0 0 0 2 0 0 0 1 0 0 1 0 0
-curtain            1 2 2 3 1 1 1 0 0 0 0 3 0
-lamp               1 2 3 3 1 2 1 2 2 0 0 1 2
-picture            1 2 3 3 1 2 2 3 2 0 0 1 1
-clock              2 1 2 2 0 2 2 1 2 0 0 2 1
-vase               1 2 2 1 0 0 0 1 1 0 0 0 0
-potted plant       1 2 3 2 1 3 2 2 3 0 0 0 1
-toilet             0 0 0 0 4 0 0 0 0 0 0 0 0
-bathtub            0 0 0 0 3 0 0 0 0 0 0 0 0
-shower             0 0 0 0 3 0 0 0 0 0 0 0 0
-shower curtain     0 0 0 0 3 0 0 0 0 0 0 0 0
-towel              1 0 0 0 4 0 0 0 0 2 0 1 0
-toilet paper       0 0 0 0 4 0 0 0 0 0 1 0 0
-soap               2 0 0 0 3 0 0 0 0 1 0 1 0
-mirror             0 0 1 2 4 0 0 2 1 0 0 1 0
-toothbrush         0 0 0 0 3 0 0 0 0 0 0 0 0
-hair drier         0 0 0 1 2 0 0 0 0 0 0 0 0
-desk               0 0 1 2 0 4 0 0 2 0 0 0 2
-office chair       0 0 0 1 0 4 2 0 1 0 0 0 0
-monitor            0 0 0 1 0 4 1 0 1 0 0 2 1
-keyboard           0 0 0 1 0 3 0 0 1 0 0 0 1
-mouse              0 0 0 1 0 3 0 0 1 0 0 0 1
-laptop             0 1 2 2 0 3 2 0 0 0 0 0 1
-printer            0 0 0 0 0 3 0 0 1 0 0 0 1
-telephone          0 0 0 0 0 2 1 0 2 0 0 1 0
-drawer unit        0 0 0 1 0 3 0 0 0 0 1 0 0
-whiteboard         0 0 0 0 0 2 3 0 0 0 0 0 0
-conference table   0 0 0 0 0 0 4 0 0 0 0 0 0
-projector          0 0 0 0 0 0 3 0 0 0 0 0 0
-projector screen   0 0 0 0 0 0 3 0 0 0 0 0 0
-reception desk     0 0 0 0 0 0 0 0 4 0 0 0 0
-sign               0 0 0 0 0 0 0 2 3 0 1 0 0
-vending machine    0 1 0 0 0 0 0 1 2 0 0 0 0
-bench              0 1 0 0 0 0 0 3 2 0 0 0 1
-umbrella stand     0 0 0 0 0 0 0 2 1 0 0 0 0
-coat rack          0 0 0 1 0 1 0 3 1 0 0 0 0
-shoe rack          0 0 0 1 0 0 0 3 0 0 0 0 0
-stairs             0 0 1 0 0 0 0 3 1 0 0 0 0
-fire extinguisher  1 0 0 0 0 0 0 3 1 0 2 0 0
-trash can          3 0 1 1 3 3 2 1 2 1 1 3 1
-book               1 0 2 2 0 2 0 0 1 0 0 0 4
-bookshelf          0 1 2 1 0 2 0 0 0 0 0 0 4
-shelf              1 0 2 1 1 2 0 0 0 1 4 0 2
-cabinet            3 2 2 1 2 2 1 0 0 2 2 2 0
-table              1 2 2 0 0 1 2 0 1 0 0 1 2
-washing machine    2 0 0 0 2 0 0 0 0 4 0 0 0
-clothes dryer      0 0 0 0 1 0 0 0 0 4 0 0 0
-laundry basket     0 0 0 2 2 0 0 0 0 3 0 0 0
-ironing board      0 0 0 1 0 0 0 0 0 3 1 0 0
-backpack           0 0 1 2 0 1 0 1 0 0 0 0 1
-box                0 0 1 1 0 1 0 0 0 1 4 0 0
-pallet             0 0 0 0 0 0 0 0 0 0 4 0 0
-pallet jack        0 0 0 0 0 0 0 0 0 0 3 0 0
-forklift           0 0 0 0 0 0 0 0 0 0 3 0 0
-ladder             0 0 0 0 0 0 0 0 0 1 3 0 0
-bucket             1 0 0 0 1 0 0 0 0 2 3 0 0
-cart               0 0 0 0 0 0 0 1 0 1 3 2 0
-vacuum cleaner     0 0 0 1 0 0 0 1 0 2 3 0 0
-hospital bed       0 0 0 0 0 0 0 0 0 0 0 4 0
-wheelchair         0 0 0 0 0 0 0 2 1 0 0 2 0
-overbed table      0 0 0 0 0 0 0 0 0 0 0 3 0
-iv stand           0 0 0 0 0 0 0 0 0 0 0 3 0
-medical trolley    0 0 0 0 0 0 0 1 0 0 0 3 0
-"""
+_USUAL: Final[Mapping[str, Mapping[float, str]]] = MappingProxyType(
+    {
+        "kitchen": {
+            0.9: "refrigerator, oven, stove, range hood, microwave, kitchen cabinet, sink",
+            0.5: (
+                "dishwasher, toaster, kettle, coffee machine, faucet, pan, pot, plate, "
+                "knife, fork, spoon, bowl, cup, bottle, apple, banana, orange, bread, "
+                "trash can, cabinet"
+            ),
+            0.2: "wine glass, dining table, chair, stool, clock, soap, washing machine",
+            0.05: (
+                "tv, curtain, lamp, picture, vase, potted plant, towel, fire "
+                "extinguisher, book, shelf, table, bucket"
+            ),
+        },
+        "dining room": {
+            0.9: "dining table, chair",
+            0.5: "plate, cup, wine glass",
+            0.2: (
+                "knife, fork, spoon, bowl, bottle, curtain, lamp, picture, vase, potted "
+                "plant, cabinet, table"
+            ),
+            0.05: (
+                "refrigerator, kettle, coffee machine, kitchen cabinet, apple, banana, "
+                "orange, bread, stool, fireplace, clock, laptop, vending machine, bench, "
+                "bookshelf"
+            ),
+        },
+        "living room": {
+            0.9: "couch, coffee table, tv",
+            0.5: "armchair, side table, tv stand, remote, lamp, picture, potted plant",
+            0.2: (
+                "chair, ottoman, fireplace, pillow, curtain, clock, vase, laptop, book, "
+                "bookshelf, shelf, cabinet, table"
+            ),
+            0.05: (
+                "plate, bowl, cup, bottle, wine glass, dining table, stool, dresser, "
+                "teddy bear, mirror, desk, stairs, trash can, backpack, box"
+            ),
+        },
+        "bedroom": {
+            0.9: "bed",
+            0.5: "nightstand, wardrobe, dresser, pillow, curtain, lamp, picture",
+            0.2: (
+                "chair, tv, teddy bear, alarm clock, suitcase, clock, potted plant, "
+                "mirror, desk, laptop, book, laundry basket, backpack"
+            ),
+            0.05: (
+                "bowl, cup, bottle, stool, couch, armchair, ottoman, side table, tv "
+                "stand, remote, vase, hair drier, office chair, monitor, keyboard, "
+                "mouse, drawer unit, coat rack, shoe rack, trash can, bookshelf, shelf, "
+                "cabinet, ironing board, box, vacuum cleaner"
+            ),
+        },
+        "bathroom": {
+            0.9: "sink, toilet, towel, toilet paper, mirror",
+            0.5: "faucet, bathtub, shower, shower curtain, soap, toothbrush, trash can",
+            0.2: "bottle, hair drier, cabinet, washing machine, laundry basket",
+            0.05: ("dresser, curtain, lamp, picture, potted plant, shelf, clothes dryer, bucket"),
+        },
+        "office": {
+            0.9: "desk, office chair, monitor",
+            0.5: ("chair, potted plant, keyboard, mouse, laptop, printer, drawer unit, trash can"),
+            0.2: (
+                "coffee machine, cup, lamp, picture, clock, telephone, whiteboard, book, "
+                "bookshelf, shelf, cabinet"
+            ),
+            0.05: (
+                "refrigerator, microwave, kettle, bottle, couch, armchair, tv, curtain, "
+                "coat rack, table, backpack, box"
+            ),
+        },
+        "meeting room": {
+            0.9: "chair, conference table",
+            0.5: "tv, whiteboard, projector, projector screen",
+            0.2: "picture, clock, potted plant, office chair, laptop, trash can, table",
+            0.05: (
+                "coffee machine, cup, bottle, couch, curtain, lamp, monitor, telephone, cabinet"
+            ),
+        },
+        "hall": {
+            0.5: "picture, bench, coat rack, shoe rack, stairs, fire extinguisher",
+            0.2: "lamp, potted plant, mirror, sign, umbrella stand, wheelchair",
+            0.05: (
+                "chair, armchair, side table, wardrobe, dresser, suitcase, clock, vase, "
+                "vending machine, trash can, backpack, cart, vacuum cleaner, medical "
+                "trolley"
+            ),
+        },
+        "reception": {
+            0.9: "reception desk",
+            0.5: "couch, armchair, side table, potted plant, sign",
+            0.2: (
+                "chair, coffee table, tv, lamp, picture, clock, desk, telephone, vending "
+                "machine, bench, trash can"
+            ),
+            0.05: (
+                "coffee machine, stool, ottoman, vase, mirror, office chair, monitor, "
+                "keyboard, mouse, printer, umbrella stand, coat rack, stairs, fire "
+                "extinguisher, book, table, wheelchair"
+            ),
+        },
+        "laundry room": {
+            0.9: "washing machine, clothes dryer",
+            0.5: "sink, laundry basket, ironing board",
+            0.2: "faucet, towel, cabinet, bucket, vacuum cleaner",
+            0.05: (
+                "refrigerator, dishwasher, kitchen cabinet, bottle, soap, trash can, "
+                "shelf, box, ladder, cart"
+            ),
+        },
+        "storage room": {
+            0.9: "shelf, box, pallet",
+            0.5: "pallet jack, forklift, ladder, bucket, cart, vacuum cleaner",
+            0.2: "fire extinguisher, cabinet",
+            0.05: (
+                "refrigerator, suitcase, toilet paper, drawer unit, sign, trash can, ironing board"
+            ),
+        },
+        "patient room": {
+            0.9: "bed, hospital bed",
+            0.5: ("chair, pillow, curtain, trash can, overbed table, iv stand, medical trolley"),
+            0.2: "armchair, tv, nightstand, clock, monitor, cabinet, cart, wheelchair",
+            0.05: (
+                "sink, faucet, cup, bottle, stool, side table, remote, wardrobe, lamp, "
+                "picture, towel, soap, mirror, telephone, table"
+            ),
+        },
+        "library": {
+            0.9: "book, bookshelf",
+            0.5: "chair",
+            0.2: "couch, armchair, lamp, desk, shelf, table",
+            0.05: (
+                "stool, coffee table, picture, clock, potted plant, monitor, keyboard, "
+                "mouse, laptop, printer, bench, trash can, backpack"
+            ),
+        },
+    }
+)
+"""By type, the classes that a share of its rooms have at least one of."""
 
 
 def _shares() -> dict[str, tuple[float, ...]]:
-    rows = {}
-    for line in _ROWS.strip().splitlines():
-        name, grades = line[:_NAME_WIDTH].strip(), line[_NAME_WIDTH:].split()
-        rows[name] = tuple(SHARES[int(grade)] for grade in grades)
-    return rows
+    share_of: dict[str, dict[str, float]] = {}
+    for room, usual in _USUAL.items():
+        for share, classes in usual.items():
+            for name in classes.split(", "):
+                share_of.setdefault(name, {})[room] = share
+    return {
+        name: tuple(share_by_room.get(room, SHARES[0]) for room in TYPES)
+        for name, share_by_room in share_of.items()
+    }
 
 
 TABLE: Final[Mapping[str, tuple[float, ...]]] = MappingProxyType(_shares())

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eventsrc.sim.catalogue import FURNITURE, MODELS
+from projections import place_type_table
 from projections.place_type_table import NAMES, SHARES, SYNONYMS, TABLE, TYPES
 from projections.place_types import UNSURE, known_class, place_type, type_of_name
 
@@ -103,6 +104,9 @@ def test_a_name_that_says_a_type_decides(name: str, kind: str | None) -> None:
 def test_the_table_is_whole() -> None:
     assert len(TABLE) > 100
     assert all(len(shares) == len(TYPES) and {*shares} <= {*SHARES} for shares in TABLE.values())
+    for usual in place_type_table._USUAL.values():
+        named = [name for classes in usual.values() for name in classes.split(", ")]
+        assert len(named) == len(set(named)), "a class has one grade"
     assert all(len({*shares}) > 1 for shares in TABLE.values()), "a row that tells nothing"
     assert {*SYNONYMS.values()} <= TABLE.keys()
     assert not SYNONYMS.keys() & TABLE.keys()
