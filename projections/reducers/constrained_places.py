@@ -32,7 +32,7 @@ from typing import NamedTuple, TypeAlias
 
 import msgspec
 
-from eventsrc.envelope import Offset, RunId
+from eventsrc.envelope import Offset
 from projections.corrections import Keyframe
 from projections.deltas import (
     Delta,
@@ -41,14 +41,13 @@ from projections.deltas import (
     MergeRefused,
     PlaceOrdinal,
     PlacesMerged,
-    RunOrdinal,
 )
 from projections.pair_groups import PairGroups
 from projections.reducers import State
 
 from .core_index import CoreIndex
 from .place_anchors import Apart, Inside, PlaceAnchors
-from .place_members import NOISE
+from .place_members import NOISE, PosedKeyframe
 from .places import Part, Places
 
 Rank: TypeAlias = tuple[int, int]
@@ -89,18 +88,11 @@ class ConstrainedPlaces(Places):
         """A keyframe that may be an anchor."""
         self._anchors.add(keyframe, anchor)
 
-    def fold(
-        self,
-        offset: Offset,
-        keyframe: KeyframeOrdinal,
-        run: RunOrdinal,
-        run_id: RunId,
-        x_um: int,
-        y_um: int,
-    ) -> list[Delta]:
+    def fold(self, posed: PosedKeyframe) -> list[Delta]:
         """As `Places.fold`."""
+        offset, keyframe, run, run_id, x_um, y_um = posed
         if keyframe not in self._anchors:
-            return super().fold(offset, keyframe, run, run_id, x_um, y_um)
+            return super().fold(posed)
         point = self.add_point(keyframe, run, run_id)
         return self._fold_changes(offset, point, self.core_index.insert(x_um, y_um))
 

@@ -7,6 +7,7 @@ of places that merge the one founded first survives, whatever the text of its id
 
 from bisect import bisect_left
 from collections.abc import MutableSequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,6 +25,17 @@ from .survivors import PlaceSurvivors
 
 NOISE = PlaceOrdinal(-1)
 """What the packed array of places holds for a point in none."""
+
+
+class PosedKeyframe(NamedTuple):
+    """A keyframe with a pose, as the reducers of places are given it; ``offset`` is its event."""
+
+    offset: Offset
+    keyframe: KeyframeOrdinal
+    run: RunOrdinal
+    run_id: RunId
+    x_um: int
+    y_um: int
 
 
 class PlaceMembers:

@@ -26,20 +26,18 @@ import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from eventsrc.envelope import Offset, RunId
+from eventsrc.envelope import Offset
 from projections.deltas import (
     Delta,
-    KeyframeOrdinal,
     KeyframePlaced,
     PlaceLink,
     PlaceOrdinal,
     PlacesMerged,
-    RunOrdinal,
 )
 from projections.reducers import State, part, prefixed
 
 from .core_index import CoreIndex
-from .place_members import NOISE, PlaceMembers
+from .place_members import NOISE, PlaceMembers, PosedKeyframe
 
 
 class Part(NamedTuple):
@@ -57,16 +55,9 @@ class Places(PlaceMembers):
         super().__init__()
         self.core_index = core_index
 
-    def fold(
-        self,
-        offset: Offset,
-        keyframe: KeyframeOrdinal,
-        run: RunOrdinal,
-        run_id: RunId,
-        x_um: int,
-        y_um: int,
-    ) -> list[Delta]:
+    def fold(self, posed: PosedKeyframe) -> list[Delta]:
         """Add a keyframe with a pose; what it changed, in the order of the delta contract."""
+        offset, keyframe, run, run_id, x_um, y_um = posed
         point = self.add_point(keyframe, run, run_id)
         fresh = self.core_index.insert(x_um, y_um)
         if fresh == [point] and (older := self.core_index.enclosing_core(point)) is not None:

@@ -27,7 +27,7 @@ takes in. So what a keyframe costs is bounded by what is near.
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from eventsrc.envelope import Offset, RunId
+from eventsrc.envelope import Offset
 from projections.corrections import Keyframe
 from projections.deltas import (
     Delta,
@@ -46,7 +46,7 @@ from projections.reducers import State, part, prefixed
 
 from .driven_cells import DrivenCells, WayAt
 from .place_anchors import Apart, PlaceAnchors
-from .place_members import PlaceMembers
+from .place_members import PlaceMembers, PosedKeyframe
 
 _NO_GROUPS: PairGroups[Keyframe] = PairGroups((), ())
 
@@ -90,16 +90,9 @@ class Rooms(PlaceMembers):
         """From now on cells and links are made by these walls; what was made stays as it is."""
         self._cells.way_at = way_at
 
-    def fold(
-        self,
-        offset: Offset,
-        keyframe: KeyframeOrdinal,
-        run: RunOrdinal,
-        run_id: RunId,
-        x_um: int,
-        y_um: int,
-    ) -> list[Delta]:
+    def fold(self, posed: PosedKeyframe) -> list[Delta]:
         """Add a keyframe with a pose; what it changed, in the order of the delta contract."""
+        offset, keyframe, run, run_id, x_um, y_um = posed
         point = self.add_point(keyframe, run, run_id)
         cell, last = self._cells.find(x_um, y_um), self._last_cells.get(run)
         is_anchor = keyframe in self._anchors

@@ -68,6 +68,7 @@ from .floors import Floors
 from .folded_ids import FoldedIds, content_digest
 from .located_in import LocatedIn
 from .objects import Objects
+from .place_members import PosedKeyframe
 from .place_names import PlaceNames
 from .places import Places
 from .rooms import Rooms
@@ -337,7 +338,9 @@ class SemanticMap:
     ) -> PlaceOrdinal | None:
         """Run places and tell located-in and adjacency; the keyframe's own place."""
         folded_ids, place = self.folded_ids, None
-        changes = self.places.fold(offset, keyframe, run, run_id, pose.x_um, pose.y_um)
+        changes = self.places.fold(
+            PosedKeyframe(offset, keyframe, run, run_id, pose.x_um, pose.y_um)
+        )
         for delta in changes:
             deltas.append(delta)
             if type(delta) is KeyframePlaced:

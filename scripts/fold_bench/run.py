@@ -21,6 +21,7 @@ from projections.exact import unit_vectors
 from projections.model.fold import READ_AHEAD, fold_events, fold_log, gc_paused
 from projections.model.view import MapView
 from projections.reducers.core_index import CoreIndex
+from projections.reducers.place_members import PosedKeyframe
 from projections.reducers.places import Places
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
@@ -39,7 +40,7 @@ def fold_places(points: list[tuple[int, int]]) -> tuple[float, list[int | None]]
     places = Places(CoreIndex(EPS_UM, LEAST))
     start = clock()
     for n, (x, y) in enumerate(points):
-        places.fold(n, n, 0, "r", x, y)
+        places.fold(PosedKeyframe(n, n, 0, "r", x, y))
     return clock() - start, [places.label(n) for n in range(len(points))]
 
 
@@ -84,7 +85,7 @@ def lifelong() -> None:
 
     def fold_one(at: tuple[float, float]) -> None:
         nonlocal number
-        places.fold(number, number, 0, "r", round(at[0] * 1e6), round(at[1] * 1e6))
+        places.fold(PosedKeyframe(number, number, 0, "r", round(at[0] * 1e6), round(at[1] * 1e6)))
         number += 1
 
     _tenths("places alone", house_walk(count), count, fold_one)

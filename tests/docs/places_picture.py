@@ -7,6 +7,7 @@ from pathlib import Path
 
 from projections.deltas import PlacesMerged
 from projections.reducers.core_index import CoreIndex, cell_side_um
+from projections.reducers.place_members import PosedKeyframe
 from projections.reducers.places import Places
 
 PICTURE = Path(__file__).parents[2] / "docs" / "images" / "place-merge.svg"
@@ -60,7 +61,7 @@ def drawn() -> str:
 
 def _fold(places: Places, x: float, y: float) -> list[object]:
     n = len(places.joined)
-    return list(places.fold(n, n, 0, "run", round(x * 1e6), round(y * 1e6)))
+    return list(places.fold(PosedKeyframe(n, n, 0, "run", round(x * 1e6), round(y * 1e6))))
 
 
 def _legend(places: Places) -> str:

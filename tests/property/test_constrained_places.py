@@ -13,6 +13,7 @@ from projections.deltas import MergeRefused, PlaceFormed, PlacesMerged
 from projections.pair_groups import PairGroups, without_contradictions
 from projections.reducers.constrained_places import ConstrainedPlaces
 from projections.reducers.core_index import CoreIndex, cell_side_um
+from projections.reducers.place_members import PosedKeyframe
 from projections.reducers.places import Places
 from tests.folds import near_matrix
 from tests.naive_constrained import NaiveConstrainedPlaces
@@ -104,7 +105,7 @@ def check_every_prefix(
     founders: list[int] = []
     for n, (x, y, _) in enumerate(points):
         places.add_anchor(n, anchor(n))
-        deltas = places.fold(n, n, 0, "r", x, y)
+        deltas = places.fold(PosedKeyframe(n, n, 0, "r", x, y))
         naive.add(matrix[: n + 1, : n + 1])
         ours = [places.label(i) for i in range(n + 1)]
         assert ours == naive.labels
@@ -154,7 +155,8 @@ def test_pairs_that_refuse_and_join_nothing_change_no_delta(
     naive = naive_of(statements, least, lambda i: cell(points[i]))
     for n, point in enumerate(points):
         ours.add_anchor(n, anchor(n))
-        expected, deltas = plain.fold(n, n, 0, "r", *point[:2]), ours.fold(n, n, 0, "r", *point[:2])
+        posed = PosedKeyframe(n, n, 0, "r", *point[:2])
+        expected, deltas = plain.fold(posed), ours.fold(posed)
         naive.add(matrix[: n + 1, : n + 1])
         if naive.had_effect or any(naive.conflict(inside, inside) for inside in naive.inside):
             return
@@ -170,7 +172,7 @@ def test_a_link_is_of_core_points_of_the_two_sides(
     for n, point in enumerate(points):
         places.add_anchor(n, anchor(n))
         labels = [places.label(i) for i in range(n)]
-        deltas = places.fold(n, n, 0, "r", *point[:2])
+        deltas = places.fold(PosedKeyframe(n, n, 0, "r", *point[:2]))
         for merge in deltas:
             if type(merge) is PlacesMerged and not merge.joined:
                 for absorbed, link in zip(merge.absorbed, merge.links, strict=True):

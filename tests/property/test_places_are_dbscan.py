@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from projections.deltas import PlacesMerged
 from projections.reducers.core_index import CoreIndex
+from projections.reducers.place_members import PosedKeyframe
 from projections.reducers.places import Places
 from tests.folds import NaivePlaces, batch_dbscan, near_matrix
 
@@ -52,7 +53,7 @@ POINTS = st.one_of(LISTS, walks())
 def check_every_prefix(places: Places, points: list[Point], matrix: np.ndarray, least: int) -> None:
     naive = NaivePlaces(least)
     for n, (x, y, _) in enumerate(points, start=1):
-        places.fold(n - 1, n - 1, 0, "r", x, y)
+        places.fold(PosedKeyframe(n - 1, n - 1, 0, "r", x, y))
         are_near = matrix[:n, :n]
         labels, cores = batch_dbscan(are_near, least)
         ours = [places.label(i) for i in range(n)]
@@ -95,7 +96,7 @@ def test_a_link_is_of_a_fresh_core_point_and_an_older_one_of_the_absorbed_place(
     for n, (x, y, _) in enumerate(points):
         cores = {i for i in range(n) if places.core_index.is_core(i)}
         labels = [places.label(i) for i in range(n)]
-        for merge in places.fold(n, n, 0, "r", x, y):
+        for merge in places.fold(PosedKeyframe(n, n, 0, "r", x, y)):
             if type(merge) is not PlacesMerged:
                 continue
             for absorbed, link in zip(merge.absorbed, merge.links, strict=True):

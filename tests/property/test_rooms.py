@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from projections.corrections import Keyframe
 from projections.deltas import KeyframePlaced, MergeRefused, PlaceChanged, PlaceFormed, PlacesMerged
 from projections.pair_groups import PairGroups, without_contradictions
+from projections.reducers.place_members import PosedKeyframe
 from projections.reducers.rooms import Rooms
 from tests.naive_rooms import NaiveRooms
 
@@ -78,7 +79,7 @@ def rooms_of(statements: Statements, way=None) -> Rooms:
 def fold_one(rooms: Rooms, n: int, at: At) -> list:
     run, x, y = at
     rooms.add_anchor(n, Keyframe("r", n))
-    return rooms.fold(n, n, run, f"r{run}", x, y)
+    return rooms.fold(PosedKeyframe(n, n, run, f"r{run}", x, y))
 
 
 def check_every_prefix(

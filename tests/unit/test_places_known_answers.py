@@ -13,6 +13,7 @@ from projections.deltas import (
     PlacesMerged,
 )
 from projections.reducers.core_index import CoreIndex
+from projections.reducers.place_members import PosedKeyframe
 from projections.reducers.places import Places
 from tests.envelopes import envelope
 from tests.folds import fold
@@ -177,7 +178,7 @@ def test_a_year_in_one_room_leaves_nothing_to_count() -> None:
     """No counts, no points that are not core, no unlinked cells."""
     places, rng = Places(CoreIndex(1_500_000, 3)), random.Random(1)
     for n in range(20_000):
-        places.fold(n, n, 0, "r", rng.randrange(4_000_000), rng.randrange(3_000_000))
+        places.fold(PosedKeyframe(n, n, 0, "r", rng.randrange(4_000_000), rng.randrange(3_000_000)))
     state = places.dump()
     assert state["crowd.loose"].tolist() == []
     assert state["crowd.sparse_cores"].tolist() == []
@@ -190,7 +191,7 @@ def test_the_envelopes_of_two_rooms_with_a_wall_between_stay_short() -> None:
     places = Places(core_index)
     for n in range(20_000):
         x = rng.randrange(500_000) + (n % 2) * 2_100_000
-        places.fold(n, n, 0, "r", x, rng.randrange(3_000_000))
+        places.fold(PosedKeyframe(n, n, 0, "r", x, rng.randrange(3_000_000)))
     assert {places.label(n) for n in range(20_000)} == {0, 1}
     sides = [s for cell in core_index._cells.values() for s in cell.sides or () if s is not None]
     assert sides
@@ -199,5 +200,5 @@ def test_the_envelopes_of_two_rooms_with_a_wall_between_stay_short() -> None:
 
 def test_noise_is_labelled_none() -> None:
     places = Places(CoreIndex(1_500_000, 3))
-    assert places.fold(0, 0, 0, "r", 0, 0) == []
+    assert places.fold(PosedKeyframe(0, 0, 0, "r", 0, 0)) == []
     assert places.label(0) is None
