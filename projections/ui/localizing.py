@@ -5,7 +5,6 @@ The search needs the map with its embeddings, which histories do not keep: a que
 W folds the log once more. The last such map is kept where it is small.
 """
 
-import shlex
 import sys
 from collections.abc import Callable
 from time import perf_counter
@@ -29,7 +28,7 @@ from projections.relocalize.floors import Hypotheses
 
 from .log_map import LogMap
 from .log_prefix import PrefixReader
-from .moment import Moment, command_line
+from .moment import Moment, command_line, shell_line
 from .opened import Opened
 from .requests import assignments_of, text_of
 from .search import keyframe_of
@@ -75,7 +74,7 @@ class Localizer:
                 for crop, matches in zip(crops, candidates.matches, strict=True)
             ],
             "seconds": round(perf_counter() - started, 3),
-            "command": shlex.join(["mapfold", "relocalize", *words, *settings]),
+            "command": shell_line("mapfold", "relocalize", *words, *settings),
         }
 
     def _index(

@@ -50,4 +50,29 @@ class Moment:
 
 def command_line(opened: Opened, name: str, *words: str) -> str:
     """``mapfold NAME LOG …``, quoted for a shell."""
-    return shlex.join(["mapfold", name, str(opened.log), *words])
+    return shell_line("mapfold", name, str(opened.log), *words)
+
+
+def shell_line(*words: str) -> str:
+    """A command line of printable characters only, for bash and zsh.
+
+    A terminal obeys a control character of a name also between quotes when the line is pasted:
+    Ctrl-C ends the line, and what follows is a command of its own. Those that turn the direction of
+    text would show another command. Such a word is written as ``$'…'``.
+    """
+    return " ".join(map(_quoted, words))
+
+
+def _quoted(word: str) -> str:
+    if word.isprintable():
+        return shlex.quote(word)
+    return "$'" + "".join(map(_escaped, word)) + "'"
+
+
+def _escaped(char: str) -> str:
+    if char in "'\\":
+        return f"\\{char}"
+    if char.isprintable():
+        return char
+    errors = "surrogateescape" if "\udc80" <= char <= "\udcff" else "replace"  # bytes of a path
+    return "".join(f"\\{byte:03o}" for byte in char.encode("utf-8", errors))
