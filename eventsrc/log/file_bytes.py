@@ -8,7 +8,6 @@ the process.
 import errno
 import os
 from pathlib import Path
-from types import TracebackType
 
 BLOCK_BYTES = 1024 * 1024
 _SECTOR = 64 * 1024
@@ -127,10 +126,5 @@ class FileBytes:
     def __enter__(self) -> "FileBytes":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        at: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

@@ -37,7 +37,7 @@ from .connection import (
 )
 from .cypher import PARENTS
 from .graph_render import Row, expected_rows
-from .inputs import LogInputs, MapInputs, SettingsOf
+from .inputs import LogInputs, SettingsOf
 from .labels import GRAPH, LABELS, TABLE, VERTEX_LABELS
 from .live_fold import LiveFold, batches
 from .origin import command_for, refuse_mismatch, rows_dropped
@@ -197,8 +197,10 @@ def _check_sink(
                 raise rows_dropped(checkpoint, sink, describe_target(url), log, known.latest)
             inputs = known.at(checkpoint.known_to)
             refuse_mismatch(checkpoint, sink, describe_target(url), log, reader, inputs)
+            fold = LiveFold(inputs.settings, corrections=inputs.corrections)
+            folding = _folded(fold, _events(connection, reader, checkpoint, sink))
             compare = _compare_graph if sink == "graph" else _compare_vectors
-            compare(connection, reader, checkpoint, inputs, comparison)
+            compare(connection, fold, folding, comparison)
             foreign = foreign_tables(connection) if sink == "graph" else ()
     return CheckReport(
         sink,
@@ -269,14 +271,9 @@ def _events(
 
 
 def _compare_graph(
-    connection: Connection,
-    reader: LogReader,
-    checkpoint: Checkpoint,
-    inputs: MapInputs,
-    comparison: _Comparison,
+    connection: Connection, fold: LiveFold, folding: Iterator[None], comparison: _Comparison
 ) -> None:
-    fold = LiveFold(inputs.settings, corrections=inputs.corrections)
-    for _ in _folded(fold, _events(connection, reader, checkpoint, "graph")):
+    for _ in folding:
         fold.tracker.drain()
     for label in LABELS:
         columns = ["id"] if label in VERTEX_LABELS else ["id", "start_id", "end_id"]
@@ -291,18 +288,10 @@ def _compare_graph(
 
 
 def _compare_vectors(
-    connection: Connection,
-    reader: LogReader,
-    checkpoint: Checkpoint,
-    inputs: MapInputs,
-    comparison: _Comparison,
+    connection: Connection, fold: LiveFold, folding: Iterator[None], comparison: _Comparison
 ) -> None:
-    fold = LiveFold(inputs.settings, corrections=inputs.corrections)
-    events = _events(connection, reader, checkpoint, "vectors")
     expected = (
-        _vector_row(row)
-        for _ in _folded(fold, events)
-        for row in new_rows(fold.tracker.drain(), fold.view)
+        _vector_row(row) for _ in folding for row in new_rows(fold.tracker.drain(), fold.view)
     )
     # Binary, so that a float32 arrives as the float32 it is.
     with connection.cursor(name="check", binary=True) as cursor:
@@ -312,6 +301,7 @@ def _compare_vectors(
 
 
 def _folded(fold: LiveFold, events: Iterable[tuple[Event, bool]]) -> Iterator[None]:
+    """Fold the events; yields after each batch."""
     for parked, group in groupby(events, key=itemgetter(1)):
         for batch in batches((event for event, _ in group), BATCH_EVENTS):
             if parked:

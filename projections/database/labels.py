@@ -18,7 +18,7 @@ the fold's ordinals, so every id follows from the log alone and no write has to 
 The last three labels are younger than the others and so come after the edges.
 """
 
-from typing import Final, Literal, TypeAlias
+from typing import Final, Literal, TypeAlias, get_args
 
 GRAPH: Final = "semantic_map"
 NEXT_GRAPH: Final = "semantic_map_next"
@@ -42,26 +42,8 @@ EdgeLabel: TypeAlias = Literal[
 ]
 Label: TypeAlias = VertexLabel | EdgeLabel
 
-VERTEX_LABELS: Final[tuple[VertexLabel, ...]] = (
-    "Run",
-    "Keyframe",
-    "Pose",
-    "Observation",
-    "Object",
-    "Place",
-    "Floor",
-    "Building",
-)
-EDGE_LABELS: Final[tuple[EdgeLabel, ...]] = (
-    "HAS_KEYFRAME",
-    "HAS_POSE",
-    "HAS_OBSERVATION",
-    "OBSERVES",
-    "LOCATED_IN",
-    "IN_PLACE",
-    "ADJACENT_TO",
-    "PART_OF",
-)
+VERTEX_LABELS: Final[tuple[VertexLabel, ...]] = get_args(VertexLabel)
+EDGE_LABELS: Final[tuple[EdgeLabel, ...]] = get_args(EdgeLabel)
 _YOUNGEST: Final[tuple[Label, ...]] = ("Floor", "Building", "PART_OF")
 LABELS: Final[tuple[Label, ...]] = (
     *(label for label in (*VERTEX_LABELS, *EDGE_LABELS) if label not in _YOUNGEST),

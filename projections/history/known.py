@@ -41,6 +41,18 @@ _PROGRESS_EVERY = 500
 _Caused = TypeVar("_Caused", Merge, Refusal, ObjectMerge)
 
 
+def checked_end(reader: LogReader, end: Offset | None) -> Offset:
+    """``end``, the end of the log for None. Raises LogPointError for one beyond the log."""
+    if end is None:
+        return reader.next_offset
+    if not 0 <= end <= reader.next_offset:
+        raise LogPointError(
+            f"{end} is no point in {reader.path}, which holds "
+            f"{counted(reader.next_offset, 'event')}; give 0 to {reader.next_offset}"
+        )
+    return end
+
+
 class KnownHistory:
     """What happened to the map, under ``corrections``; an ``end`` is a number of events.
 
@@ -96,7 +108,7 @@ class KnownHistory:
         nearest snapshot beside the log, if there is one; a later call folds the history, from then
         on it is a look-up.
         """
-        wanted = self.checked(end)
+        wanted = self._checked(end)
         if self._history.next_offset < wanted and not self._snapshot_tried:
             self._snapshot_tried = True
             if (view := self._from_snapshot(wanted)) is not None:
@@ -110,31 +122,31 @@ class KnownHistory:
     ) -> Iterator[FoldedEvent]:
         """The deltas of each event from ``start`` to before ``end``, by a separate fold from the
         nearest snapshot."""
-        found = self._snapshots().latest(self.checked(start))
+        found = self._snapshots().latest(self._checked(start))
         fresh = SemanticMap(self.settings, corrections=self.corrections)
         semantic_map = fresh if found is None else found[0]
-        events = self.reader.read(semantic_map.next_offset, self.checked(end))
+        events = self.reader.read(semantic_map.next_offset, self._checked(end))
         folded = fold_events(events, semantic_map, ahead=READ_AHEAD)
         return (event for event in folded if event.offset >= start)
 
     def merges(self, end: Offset | None = None) -> list[Merge]:
         """Every merge of places by the first ``end`` events, in order."""
-        return _before(self.history.merges, self.checked(end))
+        return _before(self.history.merges, self._checked(end))
 
     def refusals(self, end: Offset | None = None) -> list[Refusal]:
         """Every merge that a command refused in the first ``end`` events, in order."""
-        return _before(self.history.refusals, self.checked(end))
+        return _before(self.history.refusals, self._checked(end))
 
     def object_merges(self, end: Offset | None = None) -> list[ObjectMerge]:
         """Every merge of objects by the first ``end`` events, in order."""
-        return _before(self.history.object_merges, self.checked(end))
+        return _before(self.history.object_merges, self._checked(end))
 
     def why(self, thing: str, end: Offset | None = None) -> Explanation:
         """What happened to a place or an object, and which commands are about it.
 
         ``thing`` is an id, or the name of a place. Raises NoSuchThing with the nearest names.
         """
-        history, last = self.history, self.checked(end)
+        history, last = self.history, self._checked(end)
         if thing in history.object_ordinals:
             seen = self._latest.observations.__getitem__
             explained = explain_object(history, seen, find_object(history, thing), last)
@@ -149,7 +161,7 @@ class KnownHistory:
     def why_same(self, first: str, second: str, end: Offset | None = None) -> Explanation:
         """Since when, and by which merges, two keyframes (``run:keyframe``) are in one place; which
         commands join them or keep them apart."""
-        history, last = self.history, self.checked(end)
+        history, last = self.history, self._checked(end)
         a, b = (find_keyframe(history, text) for text in (first, second))
         told = same_place_commands(self._teller, history, (a, b), last)
         return with_entries(explain_same_place(history, a, b, last), told)
@@ -159,7 +171,7 @@ class KnownHistory:
         history = self.history
         if self._index is None:
             self._index = CountIndex(history)
-        return HistoryFacts(history, self._index, self.checked(end))
+        return HistoryFacts(history, self._index, self._checked(end))
 
     def bisect(
         self,
@@ -175,21 +187,13 @@ class KnownHistory:
         """
         asked = Expression(expression) if isinstance(expression, str) else expression
         facts = self.facts(end)
-        if self.checked(start) > facts.end:
+        if self._checked(start) > facts.end:
             raise LogPointError(f"the start ({start}) is after the end ({facts.end}); swap them")
         _check_names(asked, facts)
         return Searcher(asked, facts, self.history.cause_at).search(start, facts.end, scan=scan)
 
-    def checked(self, end: Offset | None) -> Offset:
-        """``end``, the end of the log for None. Raises LogPointError for one beyond the log."""
-        if end is None:
-            return self.end
-        if not 0 <= end <= self.end:
-            raise LogPointError(
-                f"{end} is no point in {self.reader.path}, which holds "
-                f"{counted(self.end, 'event')}; give 0 to {self.end}"
-            )
-        return end
+    def _checked(self, end: Offset | None) -> Offset:
+        return checked_end(self.reader, end)
 
     def _fold_to(self, end: Offset) -> None:
         events = self.reader.read(self._history.next_offset, end)

@@ -12,9 +12,7 @@ from typing import TypeAlias
 
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
-from eventsrc.text import counted
 from projections.corrections import Corrections, RecordedCommand, compile_corrections
-from projections.errors import LogPointError
 from projections.model.fold import FoldedEvent
 from projections.model.log_commands import read_commands
 from projections.model.view import MapView
@@ -25,7 +23,7 @@ from .conditions import Expression
 from .diff import Difference, difference_of
 from .explanation import Explanation
 from .history import History
-from .known import KnownHistory, Progress
+from .known import KnownHistory, Progress, checked_end
 from .names import place_name
 from .records import Cause, Merge
 
@@ -93,7 +91,7 @@ class Timeline:
 
     def corrections(self, known_at: Offset | None = None) -> Corrections:
         """What the commands before ``known_at`` compile to; all of them for None."""
-        commands = self.commands(end=self._checked(known_at))
+        commands = self.commands(end=checked_end(self.reader, known_at))
         if len(commands) not in self._compiled:
             self._compiled[len(commands)] = compile_corrections(commands)
         return self._compiled[len(commands)]
@@ -165,8 +163,8 @@ class Timeline:
     ) -> Difference:
         """The difference between the maps after ``start`` and after ``end`` events, each under the
         commands before it, or both under those before ``known_at``."""
-        last = self._checked(end)
-        known = [at if known_at is None else known_at for at in (self._checked(start), last)]
+        last, first = checked_end(self.reader, end), checked_end(self.reader, start)
+        known = [at if known_at is None else known_at for at in (first, last)]
         before, after = self.knowing(known[0]).at(start), self.knowing(known[1]).at(last)
         absorbed = self._absorbed(before, last, known[1]) if start <= last else {}
         return difference_of(before, after, absorbed, self.commands(min(known), max(known)))
@@ -191,7 +189,7 @@ class Timeline:
         return self._known(end, known_at).bisect(expression, start, end, scan=scan)
 
     def _known(self, end: Offset | None, known_at: Offset | None) -> KnownHistory:
-        return self.knowing(self._checked(end) if known_at is None else known_at)
+        return self.knowing(checked_end(self.reader, end) if known_at is None else known_at)
 
     def _settings_under(self, corrections: Corrections) -> Settings:
         if self._settings is None:
@@ -199,17 +197,6 @@ class Timeline:
         return (
             self._settings if isinstance(self._settings, Settings) else self._settings(corrections)
         )
-
-    def _checked(self, end: Offset | None) -> Offset:
-        """``end``, the end of the log for None. Raises LogPointError for one beyond the log."""
-        if end is None:
-            return self.end
-        if not 0 <= end <= self.end:
-            raise LogPointError(
-                f"{end} is no point in {self.reader.path}, which holds "
-                f"{counted(self.end, 'event')}; give 0 to {self.end}"
-            )
-        return end
 
     def _absorbed(
         self, before: MapView, end: Offset, known_at: Offset

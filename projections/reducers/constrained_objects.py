@@ -14,22 +14,18 @@ So both are obeyed exactly. An observation that has no embedding of the map's sp
 no Object, whatever a command says of it.
 """
 
-import numpy as np
-from numpy.typing import NDArray
-
 from eventsrc.envelope import DetId, Offset
 from projections.deltas import (
     ObjectFound,
     ObjectOrdinal,
     ObjectSeen,
     ObjectsMerged,
-    ObservationOrdinal,
 )
 from projections.exact import MAX_IN_A_SUM
 from projections.pair_groups import PairGroups
 from projections.reducers import State
 
-from .objects import Objects
+from .objects import FusibleObservation, Objects
 
 
 class ConstrainedObjects(Objects):
@@ -47,20 +43,16 @@ class ConstrainedObjects(Objects):
     def fold_named(
         self,
         offset: Offset,
-        observation: ObservationOrdinal,
-        det_id: DetId,
-        class_name: str,
-        vector: NDArray[np.float64],
-        norm2: int,
+        seen: FusibleObservation,
         timestamp: float,
         x_um: int,
         y_um: int,
     ) -> list[ObjectFound | ObjectSeen | ObjectsMerged]:
         """Fuse one observation, as `Objects.fold`; an ObjectsMerged comes last."""
+        _, det_id, class_name, *_ = seen
         group = self._groups.group_of.get(det_id)
-        seen = offset, observation, det_id, class_name, vector, norm2, timestamp, x_um, y_um
         if group is None:
-            return [*self.fold(*seen)]
+            return [*self.fold(offset, seen, timestamp, x_um, y_um)]
         own = self._object_of.get(group)
         inside = {group} if own is None else self._inside[own]
         free = [
@@ -69,7 +61,7 @@ class ConstrainedObjects(Objects):
             if candidate == own
             or not self._groups.conflicts(inside, self._inside.get(candidate, ()))
         ]
-        fused = self.fold(*seen, free, own)
+        fused = self.fold(offset, seen, timestamp, x_um, y_um, free, own)
         deltas: list[ObjectFound | ObjectSeen | ObjectsMerged] = [*fused]
         ordinal = fused[-1].object
         self._add_class(ordinal, class_name)

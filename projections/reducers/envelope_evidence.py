@@ -6,21 +6,15 @@ has 0.1 m.
 
 import math
 from collections.abc import Sequence
-from typing import TypeAlias
 
-import numpy as np
-from numpy.typing import NDArray
-
-from eventsrc.envelope import Detection, DetId, Envelope
+from eventsrc.envelope import Detection, Envelope
 from eventsrc.ingest import Accepted
-from projections.deltas import ObservationOrdinal, Pose
+from projections.deltas import Pose
 from projections.exact import metres_to_um
 from projections.settings import Camera
 
+from .objects import FusibleObservation
 from .sights import Sighting
-
-FusibleObservation: TypeAlias = tuple[ObservationOrdinal, DetId, str, NDArray[np.float64], int]
-"""Ordinal, det_id, class name, unit vector of the map's space, its squared norm."""
 
 _DEPTH_SIGMA_SHARE = 0.05
 _LEAST_DEPTH_SIGMA_M = 0.05

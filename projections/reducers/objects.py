@@ -28,6 +28,7 @@ import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,8 @@ from projections.deltas import ObjectFound, ObjectOrdinal, ObjectSeen, Observati
 from projections.exact import MAX_IN_A_SUM, MAX_IN_ONE_DOT, Q40, long_dot, metres_to_um
 from projections.reducers import State
 
+FusibleObservation: TypeAlias = tuple[ObservationOrdinal, DetId, str, NDArray[np.float64], int]
+"""Ordinal, det_id, class name, unit vector as of `exact.Units`, its squared norm."""
 Bucket = tuple[str, int, int]
 """Class name, column and row of a grid cell."""
 
@@ -77,22 +80,19 @@ class Objects:
     def fold(
         self,
         offset: Offset,
-        observation: ObservationOrdinal,
-        det_id: DetId,
-        class_name: str,
-        vector: NDArray[np.float64],
-        norm2: int,
+        seen: FusibleObservation,
         timestamp: float,
         x_um: int,
         y_um: int,
         candidates: Sequence[ObjectOrdinal] | None = None,
         otherwise: ObjectOrdinal | None = None,
     ) -> list[ObjectFound | ObjectSeen]:
-        """Fuse one observation. ``vector`` and ``norm2`` are of its unit vector, `exact.Units`.
+        """Fuse one observation, seen from (x, y).
 
         ``candidates`` are some of `candidates_at`, all by default; ``otherwise`` is the Object that
         is taken if none of them will do, a new one by default.
         """
+        observation, det_id, class_name, vector, norm2 = seen
         radius_um, objects = self._radius_um, self.sums
         column, row = x_um // radius_um, y_um // radius_um
         winner: ObjectOrdinal | None = None

@@ -57,7 +57,6 @@ from .current_map import CurrentMap
 from .edited_events import edit_event, edits_events
 from .embedding_space import Space
 from .envelope_evidence import (
-    FusibleObservation,
     camera_of,
     pose_of,
     sightings_of,
@@ -67,7 +66,7 @@ from .evidence_fusion import EvidenceFusion
 from .floors import Floors
 from .folded_ids import FoldedIds, content_digest
 from .located_in import LocatedIn
-from .objects import Objects
+from .objects import FusibleObservation, Objects
 from .place_members import PosedKeyframe
 from .place_names import PlaceNames
 from .places import Places
@@ -374,14 +373,12 @@ class SemanticMap:
         x_um, y_um = pose.x_um, pose.y_um
         if isinstance(objects, ConstrainedObjects):
             for seen in fusible:
-                more = objects.fold_named(offset, *seen, timestamp, x_um, y_um)
+                more = objects.fold_named(offset, seen, timestamp, x_um, y_um)
                 deltas += more
                 self._locate(more, keyframe, place)
             return
-        for observation, det_id, class_name, vector, norm2 in fusible:
-            fused = objects.fold(
-                offset, observation, det_id, class_name, vector, norm2, timestamp, x_um, y_um
-            )
+        for seen in fusible:
+            fused = objects.fold(offset, seen, timestamp, x_um, y_um)
             deltas += fused
             self.located_in.object_seen(fused[-1].object, keyframe, place)
 
