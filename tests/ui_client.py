@@ -6,7 +6,7 @@ import struct
 from dataclasses import dataclass, field
 from typing import Any
 
-_CODES = {"f8": "d", "f4": "f", "i4": "i", "u4": "I", "u1": "B"}
+_CODES = {"i8": "q", "f8": "d", "f4": "f", "i4": "i", "u4": "I", "u1": "B"}
 
 
 def read_arrays(answer: bytes) -> tuple[dict[str, Any], dict[str, list[Any]]]:

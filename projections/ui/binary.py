@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Column: TypeAlias = NDArray[Any]
-DTYPES: Final = {"f8": "<f8", "f4": "<f4", "i4": "<i4", "u4": "<u4", "u1": "|u1"}
+DTYPES: Final = {"i8": "<i8", "f8": "<f8", "f4": "<f4", "i4": "<i4", "u4": "<u4", "u1": "|u1"}
 """The types of arrays by the names in the header."""
 _NAMES: Final = {np.dtype(code): name for name, code in DTYPES.items()}
 _ALIGNED: Final = 8

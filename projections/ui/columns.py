@@ -110,6 +110,7 @@ def _keyframe_columns(
         "kf_yaw": where[:, 2].astype("<f4"),
         "kf_stamp": np.array([k.timestamp for k in keyframes], "<f8"),
         "kf_number": _ints(numbers),
+        "kf_id": np.array([k.keyframe_id for k in keyframes], "<i8"),
     }
 
 

@@ -1,6 +1,8 @@
-"""The browser and the pages of these tests; without chromium or playwright they are left out."""
+"""The browser and the pages of these tests. Without chromium or playwright they are left out, but
+not under scripts/test_ui, which sets ``MAPFOLD_TEST_UI``."""
 
 import importlib.util
+import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -15,13 +17,16 @@ from tests.ui_server import UiServer, showing
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
-if importlib.util.find_spec("playwright") is None:
-    collect_ignore_glob = ["test_*.py"]
-else:
+ALL = "MAPFOLD_TEST_UI" in os.environ
+"""Whether nothing may be left out."""
+
+if importlib.util.find_spec("playwright") is not None or ALL:
     from tests.ui.browser import browser, opened, program
 
-    if program() is None:
+    if program() is None and not ALL:
         collect_ignore_glob = ["test_*.py"]
+else:
+    collect_ignore_glob = ["test_*.py"]
 
 WIDE = ("--set", "eps_m=1.0", "--set", "min_samples=8")
 SAMPLE = ROOT / "logs" / "sample"

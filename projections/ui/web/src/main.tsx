@@ -10,8 +10,10 @@ import { keepPlaying, keepRested } from "./state/playing";
 import { keepTheme } from "./state/theme";
 import { keepAddress } from "./state/url";
 import { App } from "./ui/App";
+import { keepFaults } from "./ui/faults";
 import { keepKeys } from "./ui/keyboard";
 
+keepFaults();
 keepTheme();
 render(<App />, document.getElementById("app") as HTMLElement);
 keepKeys();

@@ -34,7 +34,7 @@ export function randomTables(seed: number, events = 120): Tables {
     const keyframe = rows.kf.length;
     const posed = next() > 0.1;
     const place = Number.NaN;
-    rows.kf.push({ offset, run: below(2), x: posed ? Math.fround(next() * 20) : place, y: posed ? Math.fround(next() * 10) : place, yaw: next(), stamp: 1000 + offset / 2, number: keyframe + 1 });
+    rows.kf.push({ offset, run: below(2), x: posed ? Math.fround(next() * 20) : place, y: posed ? Math.fround(next() * 10) : place, yaw: next(), stamp: 1000 + offset / 2, number: keyframe + 1, id: keyframe + 1 });
     rows.ev.push({ offset, stamp: 1000 + offset / 2, kind: 0, ref: keyframe });
     if (posed) noise.push(keyframe);
     if (posed && (standing.length === 0 || next() < 0.1)) {
@@ -74,12 +74,12 @@ export function randomTables(seed: number, events = 120): Tables {
 }
 
 const TYPES: Record<string, string> = {
-  kf_x: "f4", kf_y: "f4", kf_yaw: "f4", kf_stamp: "f8",
+  kf_id: "i8", kf_x: "f4", kf_y: "f4", kf_yaw: "f4", kf_stamp: "f8",
   oc_x: "f4", oc_y: "f4", oc_xx: "f4", oc_xy: "f4", oc_yy: "f4", oc_missing: "u1",
   ev_stamp: "f8", ev_kind: "u1",
 };
 const FIELDS: Record<string, string[]> = {
-  kf: ["offset", "run", "x", "y", "yaw", "stamp", "number"],
+  kf: ["offset", "run", "x", "y", "yaw", "stamp", "number", "id"],
   pl: ["offset", "keyframe", "place"],
   pf: ["offset", "place", "founder"],
   mg: ["offset", "survivor", "absorbed", "keyframe"],
@@ -89,7 +89,7 @@ const FIELDS: Record<string, string[]> = {
   ad: ["offset", "a", "b", "count"],
   ev: ["offset", "stamp", "kind", "ref"],
 };
-const ARRAYS = { f8: Float64Array, f4: Float32Array, i4: Int32Array, u1: Uint8Array };
+const ARRAYS = { i8: BigInt64Array, f8: Float64Array, f4: Float32Array, i4: Int32Array, u1: Uint8Array };
 
 /** As the server sends the rows of the events from `from` to before `to`. */
 export function encoded(tables: Tables, from = 0, to = tables.through): ArrayBuffer {
@@ -129,7 +129,10 @@ export function encoded(tables: Tables, from = 0, to = tables.through): ArrayBuf
   const head = header(offsets);
   new DataView(answer).setUint32(0, head.length, true);
   new Uint8Array(answer).set(head, 4);
-  arrays.forEach(({ dtype, values }, index) => new ARRAYS[dtype](answer, offsets[index], values.length).set(values));
+  arrays.forEach(({ dtype, values }, index) => {
+    if (dtype === "i8") new BigInt64Array(answer, offsets[index], values.length).set(values.map(BigInt));
+    else new ARRAYS[dtype](answer, offsets[index], values.length).set(values);
+  });
   return answer;
 }
 

@@ -7,7 +7,7 @@ import { mapAt } from "../src/model/map_at";
 import { Stamps, momentsOf, neighbour, playedTo } from "../src/model/moments";
 import { findKeyframe, keyframeId, label } from "../src/model/names";
 import { searchLocally } from "../src/model/search";
-import { completions } from "../src/panels/completion";
+import { completions, quoted } from "../src/panels/completion";
 import { encoded, randomTables } from "./histories";
 
 const history = decodeHistory(encoded(randomTables(5)));
@@ -67,6 +67,8 @@ describe("names", () => {
       expect(findKeyframe(history, id.replace("/", ":"))).toBe(each);
     }
     expect(findKeyframe(history, "a/99999")).toBe(-1);
+    expect(findKeyframe(history, "a/-1")).toBe(-1);
+    expect(findKeyframe(history, `a/${"9".repeat(40)}`)).toBe(-1);
     expect(findKeyframe(history, "<script>")).toBe(-1);
   });
   it("shortens by characters, not by halves of them, and shows control characters", () => {
@@ -108,10 +110,21 @@ describe("completions", () => {
   it("offers functions, then names of the kind that the argument takes", () => {
     expect(titles("s")).toEqual(["size(place)", "same_place(keyframe, keyframe)"]);
     expect(titles("not pl")).toEqual(["place_count()"]);
+    expect(titles("place_count() > 3 an")).toEqual(["and"]);
     expect(completed("size('r_p")).toBe("size('r_p0')");
     expect(completed("same_place('a:")).toMatch(/^same_place\('a:\d+', '$/);
     expect(completed(`${completed("same_place('a:")}b`)).toMatch(/^same_place\('a:\d+', 'b:\d+'\)$/);
     expect(titles("size('r_p0') >")).toEqual([]);
+  });
+  it("escapes quotes and backslashes in names, and finds them as they were escaped", () => {
+    const name = `'"\\ O'Brien`;
+    const hostile = { ...history, placeIds: [name] };
+    const [first] = completions("size('O", 7, functions, hostile);
+    const text = `size('${first.insert}`;
+    expect(text).toBe(`size('\\'"\\\\ O\\'Brien')`);
+    expect(quoted(name)).toBe(text.slice(5, -1));
+    expect(completions(text, text.length - 3, functions, hostile).map(({ title }) => title)).toEqual([name]);
+    expect(completions(`${text} `, text.length + 1, functions, hostile).map(({ title }) => title)).not.toContain(name);
   });
 });
 

@@ -1,5 +1,7 @@
 /** Asks the server that the page came from. Every failure becomes an `ApiError` with a sentence. */
 
+import { storage } from "../state/kept";
+
 export class ApiError extends Error {
   constructor(
     readonly kind: string,
@@ -27,8 +29,8 @@ function takeToken(): string | null {
   const shown = new URL(location.href);
   const hash = new URLSearchParams(shown.hash.replace(/^#/, ""));
   const found = hash.get("token") ?? shown.searchParams.get("token");
-  if (found === null) return sessionStorage.getItem("mapfold token");
-  sessionStorage.setItem("mapfold token", found);
+  if (found === null) return storage("sessionStorage")?.getItem("mapfold token") ?? null;
+  storage("sessionStorage")?.setItem("mapfold token", found);
   hash.delete("token");
   shown.searchParams.delete("token");
   shown.hash = hash.toString();
@@ -87,14 +89,20 @@ export async function postJson<T>(path: string, body: unknown, signal?: AbortSig
   return (await (await ask(path, init)).json()) as T;
 }
 
-/** Server-sent events, one after the other until the server ends; with the token in a header. */
+/** Server-sent events, one after the other until the server ends or is silent for long, which it
+ * never is; with the token in a header. */
 export async function* liveEvents(path: string, signal: AbortSignal): AsyncGenerator<unknown> {
   const response = await ask(path, { signal, headers: { Accept: "text/event-stream" } });
   if (response.body === null) return;
   const reader = response.body.pipeThrough(new TextDecoderStream()).getReader();
   let rest = "";
   for (;;) {
-    const { done, value } = await reader.read();
+    const next = await Promise.race([reader.read(), silence()]);
+    if (next === null) {
+      await reader.cancel();
+      return;
+    }
+    const { done, value } = next;
     if (done) return;
     const parts = (rest + value).replace(/\r\n/g, "\n").split("\n\n");
     rest = parts.pop() ?? "";
@@ -103,6 +111,12 @@ export async function* liveEvents(path: string, signal: AbortSignal): AsyncGener
       if (data.length > 0) yield JSON.parse(data.map((line) => line.slice(5).trimStart()).join("\n"));
     }
   }
+}
+
+const LONGEST_SILENCE_MS = 40_000;
+
+function silence(): Promise<null> {
+  return new Promise((resolve) => setTimeout(() => resolve(null), LONGEST_SILENCE_MS));
 }
 
 /** `/api/why?what=place%3Ap1&at=3`, without parameters that are null or undefined. */

@@ -22,11 +22,11 @@ interface Header {
   kinds: string[];
   system?: SystemEvent[];
   refusals?: { offset: number; a: number; b: number }[];
-  kf_number_is_id?: boolean;
   settings: Record<string, unknown>;
 }
 
 const TYPES = {
+  i8: BigInt64Array,
   f8: Float64Array,
   f4: Float32Array,
   i4: Int32Array,
@@ -58,7 +58,6 @@ export function decodeHistory(answer: ArrayBuffer, before: History | null = null
     objectIds: [...(before?.objectIds ?? []), ...strings.object_id],
     classes: strings.class,
     runIds: strings.run_id,
-    numberIsId: header.kf_number_is_id ?? true,
     system: [...(before?.system ?? []), ...(header.system ?? [])],
     refusals: [...(before?.refusals ?? []), ...(header.refusals ?? [])],
     settings: header.settings,
@@ -68,10 +67,10 @@ export function decodeHistory(answer: ArrayBuffer, before: History | null = null
 
 function joined(first: Column | undefined, second: Column): Column {
   if (first === undefined || first.length === 0) return second;
-  const Type = second.constructor as new (length: number) => Column;
+  const Type = second.constructor as new (length: number) => Float64Array;
   const both = new Type(first.length + second.length);
-  both.set(first);
-  both.set(second, first.length);
+  both.set(first as Float64Array); // both are of one type, whichever it is
+  both.set(second as Float64Array, first.length);
   return both;
 }
 
@@ -101,7 +100,7 @@ function assembled(raw: Map<string, Column>, rest: Omit<History, Arrays>): Histo
       y: f4("kf_y"),
       yaw: f4("kf_yaw"),
       stamp: read("kf_stamp", Float64Array),
-      number: i4("kf_number"),
+      id: read("kf_id", BigInt64Array),
     },
     placed: { offset: i4("pl_offset"), keyframe: i4("pl_keyframe"), place: i4("pl_place") },
     founded: { offset: i4("pf_offset"), place: i4("pf_place"), founder: i4("pf_founder") },

@@ -8,7 +8,7 @@ export interface Keyframes {
   y: Float32Array;
   yaw: Float32Array;
   stamp: Float64Array;
-  number: Int32Array;
+  id: BigInt64Array;
 }
 
 export interface ObjectChanges {
@@ -59,8 +59,6 @@ export interface History {
   objectIds: string[];
   classes: string[];
   runIds: string[];
-  /** Whether `keyframes.number` is the keyframe's id; otherwise ids are too large for it. */
-  numberIsId: boolean;
   /** Commands, rejected payloads and losses; `events.ref` is an index of them. */
   system: SystemEvent[];
   refusals: { offset: number; a: number; b: number }[];
@@ -75,7 +73,7 @@ export interface History {
   raw: ReadonlyMap<string, Column>;
 }
 
-export type Column = Float64Array | Float32Array | Int32Array | Uint32Array | Uint8Array;
+export type Column = BigInt64Array | Float64Array | Float32Array | Int32Array | Uint32Array | Uint8Array;
 
 export interface SystemEvent {
   offset: number;

@@ -5,19 +5,19 @@ import type { MapState } from "./map_at";
 
 /** RUN/ID of a keyframe. */
 export function keyframeId(history: History, keyframe: number): string {
-  const { run, number } = history.keyframes;
-  return `${history.runIds[run[keyframe]]}/${number[keyframe]}`;
+  const { run, id } = history.keyframes;
+  return `${history.runIds[run[keyframe]]}/${id[keyframe]}`;
 }
 
 /** The ordinal of a keyframe given as RUN/ID, RUN:ID, or ID alone where there is one run; or -1. */
 export function findKeyframe(history: History, text: string): number {
-  const parts = /^(?:(.*)[/:])?(\d+)$/s.exec(text);
+  const parts = /^(?:(.*)[/:])?(-?\d{1,19})$/s.exec(text);
   if (parts === null) return -1;
   const run = parts[1] === undefined ? (history.runIds.length === 1 ? 0 : -1) : history.runIds.indexOf(parts[1]);
-  const wanted = Number(parts[2]);
-  const { run: runs, number } = history.keyframes;
+  const wanted = BigInt(parts[2]);
+  const { run: runs, id } = history.keyframes;
   for (let each = 0; each < runs.length; each++) {
-    if (number[each] === wanted && runs[each] === run) return each;
+    if (id[each] === wanted && runs[each] === run) return each;
   }
   return -1;
 }
@@ -61,8 +61,8 @@ export function objectClass(history: History, map: MapState, object: number): st
   return row < 0 ? "" : (history.classes[history.changes.class[row]] ?? "");
 }
 
-/** Control characters, and those that turn the direction of what follows. */
-const PLAIN = /[\u0000-\u001f\u007f-\u009f\u2028\u2029\u200e\u200f\u202a-\u202e\u2066-\u2069]/g;
+/** Control characters, those that turn the direction of what follows, and those without a width. */
+const PLAIN = /[\u0000-\u001f\u007f-\u009f\u00ad\u061c\u180e\u200b\u200e\u200f\u2028-\u202e\u2060-\u206f\ufeff]/g;
 
 /** A text of the log on one line, short enough for a label; control characters become visible. */
 export function label(text: string, most = 28): string {

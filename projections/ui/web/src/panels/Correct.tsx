@@ -26,6 +26,7 @@ interface Correction {
 interface Outcome {
   lines?: string[];
   offset?: number | null;
+  command_id?: string;
   effect_text?: string | null;
   notes?: string[];
   command?: string;
@@ -97,7 +98,13 @@ function Form() {
     setBusy(true);
     setFailed(null);
     try {
-      const outcome = await postJson<Outcome>("/api/edit", { kind: wanted.kind, arguments: given, reason, dry_run: dry });
+      const outcome = await postJson<Outcome>("/api/edit", {
+        kind: wanted.kind,
+        arguments: given,
+        reason,
+        dry_run: dry,
+        command_id: preview?.command_id, // recorded once, also when its answer is lost and it is sent again
+      });
       if (dry) setPreview(outcome);
       else {
         tell(`Recorded at offset ${outcome.offset}. It changes ${outcome.effect_text ?? "the map"}.`);

@@ -6,7 +6,7 @@ import { ApiError, address, getJson } from "../api/client";
 import { showEvent } from "../state/actions";
 import { sentence } from "../state/loading";
 import * as store from "../state/store";
-import { type Completion, type ConditionFunction, completions } from "./completion";
+import { type Completion, type ConditionFunction, completions, quoted } from "./completion";
 import { CommandLine, Moment } from "./Told";
 
 interface Turn {
@@ -35,28 +35,32 @@ const every = signal(false);
 export function Find() {
   const [functions, setFunctions] = useState<ConditionFunction[]>([]);
   const [busy, setBusy] = useState(false);
+  const [leaving] = useState(() => new AbortController());
   useEffect(() => {
-    getJson<{ functions: ConditionFunction[] }>("/api/conditions").then(
+    getJson<{ functions: ConditionFunction[] }>("/api/conditions", leaving.signal).then(
       (found) => setFunctions(found.functions),
       () => setFunctions([]),
     );
+    return () => leaving.abort();
+  }, []);
+  useEffect(() => {
+    store.foundAt.value = answer.value === null ? [] : turnsOf(answer.value);
     return () => {
       store.foundAt.value = [];
     };
-  }, []);
+  }, [answer.value]);
   const ask = async () => {
     const history = store.history.value;
     if (history === null || text.value.trim() === "") return;
     setBusy(true);
     try {
-      const found = await getJson<Search>(address("/api/bisect", { condition: text.value, scan: every.value ? "1" : null, to: history.through, known_at: history.knownAt }));
+      const found = await getJson<Search>(address("/api/bisect", { condition: text.value, scan: every.value ? "1" : null, to: history.through, known_at: history.knownAt }), leaving.signal);
       answer.value = found;
       problem.value = null;
-      store.foundAt.value = found.turns.map(({ offset, becomes }) => ({ offset, becomes }));
       if (found.found !== null) showEvent(found.found.offset);
     } catch (error) {
+      if (leaving.signal.aborted) return;
       answer.value = null;
-      store.foundAt.value = [];
       problem.value = { message: sentence(error), column: error instanceof ApiError ? error.column : null };
     } finally {
       setBusy(false);
@@ -182,8 +186,12 @@ function Problem() {
   );
 }
 
+function turnsOf({ found, turns }: Search): Turn[] {
+  return turns.length > 0 || found === null ? turns : [found];
+}
+
 function Found({ found }: { found: Search }) {
-  const turns = found.turns.length > 0 ? found.turns : found.found !== null ? [found.found] : [];
+  const turns = turnsOf(found);
   return (
     <div class="told">
       <p class="summary">
@@ -231,8 +239,8 @@ function Examples({ functions }: { functions: readonly ConditionFunction[] }) {
   const place = history.placeIds[0];
   const examples = [
     `place_count() == ${Math.max(1, store.map.value?.places.length ?? 1)}`,
-    ...(place === undefined ? [] : [`size('${place}') > 50`]),
-    ...(history.placeIds.length > 1 ? [`merged('${history.placeIds[history.merges.absorbed[0] ?? 1]}')`] : []),
+    ...(place === undefined ? [] : [`size(${quoted(place)}) > 50`]),
+    ...(history.placeIds.length > 1 ? [`merged(${quoted(history.placeIds[history.merges.absorbed[0] ?? 1])})`] : []),
     "object_count() >= 10",
   ];
   return (

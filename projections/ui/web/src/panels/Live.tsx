@@ -1,7 +1,8 @@
-/** Follows a log that grows: server-sent events tell when there is more. */
+/** Follows a log that grows: server-sent events tell when there is more. A page that is hidden does
+ * not listen: browsers open at most six connections to a server, and each page would hold one. */
 
 import { signal } from "@preact/signals";
-import { liveEvents } from "../api/client";
+import { ApiError, LOST, liveEvents } from "../api/client";
 import { counted } from "../model/names";
 import { goLive } from "../state/actions";
 import { grow } from "../state/loading";
@@ -30,20 +31,42 @@ const news = signal<LiveNews | null>(null);
 const AGAIN_MS = 1500;
 
 export function keepLive() {
+  let stop = new AbortController();
   const listen = async () => {
     for (;;) {
+      await shown();
+      stop = new AbortController();
       try {
-        for await (const heard of liveEvents("/api/live", new AbortController().signal)) hear(heard as LiveNews);
-      } catch {
-        // The banner tells that the server does not answer; it is asked again.
+        for await (const heard of liveEvents("/api/live", stop.signal)) hear(heard as LiveNews);
+      } catch (error) {
+        // That the server does not answer is told by the banner.
+        const refused = error instanceof ApiError && error.kind !== LOST;
+        if (refused) store.refused.value = `The page does not follow the log: ${error.message}`;
       }
       await new Promise((resolve) => setTimeout(resolve, AGAIN_MS));
     }
   };
+  document.addEventListener("visibilitychange", () => {
+    if (document.hidden) stop.abort();
+  });
   void listen();
 }
 
+/** Waits until the page is not hidden. */
+function shown(): Promise<void> {
+  return new Promise((resolve) => {
+    const look = () => {
+      if (document.hidden) return;
+      document.removeEventListener("visibilitychange", look);
+      resolve();
+    };
+    document.addEventListener("visibilitychange", look);
+    look();
+  });
+}
+
 function hear(heard: LiveNews) {
+  store.refused.value = null;
   const before = store.history.value;
   const problems = JSON.stringify(heard.problems ?? []);
   const known = JSON.stringify(store.log.value?.problems ?? []);

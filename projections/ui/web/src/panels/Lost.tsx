@@ -11,7 +11,8 @@ import * as store from "../state/store";
 import { type LostAnswer, type Truth, overlayOf } from "./lost_answer";
 import { CommandLine, ThingLink } from "./Told";
 
-const MOST_BYTES = 16 * 1024 * 1024;
+/** As the server takes. */
+const MOST_BYTES = 1_000_000;
 
 const keyframe = signal("");
 const question = signal<{ name: string; text: string } | null>(null);
@@ -20,6 +21,8 @@ const truth = signal<Truth | null>(null);
 /** Whether to ask the map as it was before it knew the keyframe's run. */
 const before = signal(true);
 const failed = signal<string | null>(null);
+/** Which question is the newest: the answers of others are not shown. */
+let newest = 0;
 
 interface QuestionAnswer {
   question: unknown;
@@ -47,16 +50,20 @@ export function Lost() {
   if (history === null) return null;
 
   const ask = async (body: () => Promise<unknown>) => {
+    const turn = ++newest;
     setBusy(true);
     failed.value = null;
     try {
       const asked = await body();
-      answer.value = await postJson<LostAnswer>(address("/api/relocalize", { at: store.at.value }), asked);
+      const found = await postJson<LostAnswer>(address("/api/relocalize", { at: store.at.value }), asked);
+      if (turn !== newest) return;
+      answer.value = found;
     } catch (error) {
+      if (turn !== newest) return;
       answer.value = null;
       failed.value = sentence(error);
     } finally {
-      setBusy(false);
+      if (turn === newest) setBusy(false);
     }
   };
   const askKeyframe = () => {
@@ -71,7 +78,7 @@ export function Lost() {
   const askFile = async (file: File | undefined) => {
     if (file === undefined) return;
     if (file.size > MOST_BYTES) {
-      failed.value = `${file.name} has ${(file.size / 2 ** 20).toFixed(1)} MiB; a question has at most 16 MiB.`;
+      failed.value = `${label(file.name, 60)} has ${file.size.toLocaleString("en")} bytes; a question has at most ${MOST_BYTES.toLocaleString("en")}.`;
       return;
     }
     const text = await file.text();
@@ -82,7 +89,7 @@ export function Lost() {
       parsed = JSON.parse(text);
     } catch (error) {
       answer.value = null;
-      failed.value = `${file.name} is not JSON: ${sentence(error)}`;
+      failed.value = `${label(file.name, 60)} is not JSON: ${sentence(error)}`;
       return;
     }
     await ask(() => Promise.resolve(parsed));
@@ -122,7 +129,7 @@ export function Lost() {
           void askFile(event.dataTransfer?.files[0]);
         }}
       >
-        <input type="file" accept=".json,.jsonl,application/json" onChange={(event) => void askFile(event.currentTarget.files?.[0])} />
+        <input type="file" accept=".json,.jsonl,application/json" onChange={({ currentTarget: input }) => void askFile(input.files?.[0]).finally(() => (input.value = ""))} />
         Drop a question here, or choose a file: an envelope, a list of detections, or crops as JSON
         {question.value !== null && <bdi class="dim">{label(question.value.name, 60)}</bdi>}
       </label>

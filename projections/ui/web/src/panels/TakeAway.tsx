@@ -10,6 +10,7 @@ import { tell } from "../state/pointer";
 import { writtenAddress } from "../state/url";
 import * as store from "../state/store";
 import { Icon } from "../ui/icons";
+import { moveInMenu } from "../ui/menu_keys";
 import { copy } from "./Told";
 
 const open = signal(false);
@@ -22,7 +23,13 @@ export function TakeAway() {
     ref.current?.querySelector<HTMLButtonElement>("[role=menuitem]")?.focus();
     const close = (event: Event) => {
       const outside = !(event.target instanceof Node) || !ref.current?.contains(event.target);
-      if (outside || (event instanceof KeyboardEvent && event.key === "Escape")) open.value = false;
+      const key = event instanceof KeyboardEvent ? event.key : null;
+      if (outside || key === "Tab") open.value = false;
+      if (key === "Escape") {
+        open.value = false;
+        event.stopPropagation();
+        ref.current?.querySelector("button")?.focus();
+      }
     };
     document.addEventListener("pointerdown", close, true);
     document.addEventListener("keydown", close, true);
@@ -42,7 +49,7 @@ export function TakeAway() {
         <Icon name="out" />
       </button>
       {shown && (
-        <div class="menu" role="menu" aria-label="Take away">
+        <div class="menu" role="menu" aria-label="Take away" onKeyDown={(event) => moveInMenu(event, ref.current)}>
           {item("Picture as PNG", savePng)}
           {item("Picture as SVG", saveSvg)}
           {item("State as JSON", saveJson)}
@@ -71,7 +78,8 @@ function savePng(): Promise<void> {
   const canvas = document.querySelector<HTMLCanvasElement>("canvas.map");
   return new Promise((resolve) => {
     canvas?.toBlob((blob) => {
-      if (blob !== null) save(blob, "png");
+      if (blob === null) tell("The browser makes no picture of a map of this size; make the window smaller, or take the SVG.");
+      else save(blob, "png");
       resolve();
     }, "image/png");
   });

@@ -77,7 +77,7 @@ export function Steps({ steps }: { steps: readonly Step[] }) {
 export function Linked({ text, refs }: { text: string; refs: readonly Ref[] }) {
   const names = new Map<string, store.Thing>();
   for (const { kind, id } of refs) {
-    if (!KINDS.includes(kind) || kind === "merge") continue;
+    if (!KINDS.includes(kind) || kind === "merge" || id === "") continue;
     const thing = { kind, id } as store.Thing;
     names.set(id, thing);
     if (kind === "keyframe") names.set(id.replace(/\/(?=[^/]*$)/, ":"), thing);

@@ -8,6 +8,8 @@ import * as store from "./store";
 import { applyAddress } from "./url";
 
 const AGAIN_MS = 1500;
+/** Refusals that may be over a moment later. */
+const PASSING: ReadonlySet<string> = new Set([LOST, "too_much", "log"]);
 
 export const progress = signal<{ folded: number; events: number } | null>(null);
 
@@ -27,7 +29,7 @@ export async function load() {
     });
   } catch (error) {
     store.failure.value = sentence(error);
-    if (error instanceof ApiError && error.kind === LOST) setTimeout(() => void load(), AGAIN_MS);
+    if (error instanceof ApiError && PASSING.has(error.kind)) setTimeout(() => void load(), AGAIN_MS);
   } finally {
     watching();
   }
@@ -62,7 +64,7 @@ let again = false;
 /** Adds what was recorded since; loads all anew if the past has changed. */
 export async function grow() {
   const before = store.history.value;
-  if (before === null) return load();
+  if (before === null) return; // `load` is at it
   if (growing) {
     again = true;
     return;
@@ -75,6 +77,7 @@ export async function grow() {
     batch(() => {
       store.history.value = next;
       store.log.value = info;
+      store.failure.value = null;
       if (store.live.value) store.at.value = next.through;
       else store.at.value = Math.min(store.at.value, next.through);
     });

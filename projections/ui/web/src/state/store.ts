@@ -27,6 +27,8 @@ export const history = signal<History | null>(null);
 /** Why there is no map to show: a sentence. */
 export const failure = signal<string | null>(null);
 export const serverLost = signal(false);
+/** Why the page does not follow the log: a sentence. */
+export const refused = signal<string | null>(null);
 
 /** W: the map after the first `at` events. */
 export const at = signal(0);

@@ -1,6 +1,7 @@
 /** Light or dark: as the system says, until somebody chooses. */
 
 import { effect } from "@preact/signals";
+import { storage } from "./kept";
 import * as store from "./store";
 
 const KEY = "mapfold theme";
@@ -11,11 +12,12 @@ export function keepTheme() {
   query.addEventListener("change", () => {
     store.systemDark.value = query.matches;
   });
-  const kept = localStorage.getItem(KEY);
+  const keeper = storage("localStorage");
+  const kept = keeper?.getItem(KEY);
   if (kept === "light" || kept === "dark") store.theme.value = kept;
   effect(() => {
     document.documentElement.dataset["theme"] = store.dark.value ? "dark" : "light";
-    if (store.theme.value === "auto") localStorage.removeItem(KEY);
-    else localStorage.setItem(KEY, store.theme.value);
+    if (store.theme.value === "auto") keeper?.removeItem(KEY);
+    else keeper?.setItem(KEY, store.theme.value);
   });
 }

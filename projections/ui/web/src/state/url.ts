@@ -68,6 +68,7 @@ export function keepAddress() {
   effect(() => {
     const written = writtenAddress();
     clearTimeout(timer);
+    if (store.history.value === null) return; // what the address says is not shown yet
     timer = window.setTimeout(() => {
       if (location.hash !== written) window.history.replaceState(null, "", written);
     }, WRITE_AFTER_MS);

@@ -72,10 +72,12 @@ function settingsOf(side: "main" | "other"): string {
 function Banner() {
   const problems = store.history.value === null ? [] : (store.log.value?.problems ?? []);
   const lost = store.serverLost.value && store.history.value !== null;
-  if (problems.length === 0 && !lost) return null;
+  const refused = lost ? null : store.refused.value;
+  if (problems.length === 0 && !lost && refused === null) return null;
   return (
     <div class="banner" role="alert">
       {lost && <p>The server does not answer. The map stays as it was; why, compare and find need the server. Is mapfold ui still running?</p>}
+      {refused !== null && <p>{refused}</p>}
       {problems.map((problem) => (
         <p key={problem}>{problem}</p>
       ))}

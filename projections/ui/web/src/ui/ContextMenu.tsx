@@ -6,6 +6,7 @@ import { copy } from "../panels/Told";
 import { openPanel, select } from "../state/actions";
 import { menu } from "../state/pointer";
 import * as store from "../state/store";
+import { moveInMenu } from "./menu_keys";
 
 export function ContextMenu() {
   const ref = useRef<HTMLDivElement>(null);
@@ -32,14 +33,10 @@ export function ContextMenu() {
   items.push(["Compare from this moment", () => { store.compareWith.value = store.at.value; store.compareMode.value = "moments"; openPanel("compare"); }]);
   const corrections = thing === null ? [] : correctionsFor(thing);
   const keys = (event: KeyboardEvent) => {
-    const by = { ArrowDown: 1, ArrowUp: -1 }[event.key];
-    if (event.key === "Escape") menu.value = null;
-    if (by === undefined) return;
-    event.preventDefault();
-    event.stopPropagation();
-    const buttons = [...(ref.current?.querySelectorAll<HTMLButtonElement>("button:not(:disabled)") ?? [])];
-    const at = buttons.indexOf(document.activeElement as HTMLButtonElement);
-    buttons[(at + by + buttons.length) % buttons.length]?.focus();
+    if (event.key === "Escape" || event.key === "Tab") {
+      menu.value = null;
+      event.stopPropagation();
+    } else moveInMenu(event, ref.current);
   };
   const item = (says: string, act: () => void) => (
     <button key={says} type="button" role="menuitem" onClick={() => { menu.value = null; act(); }}>

@@ -1,0 +1,10 @@
+/** What goes wrong in the page itself is told to the person, not only to the console. */
+
+import { sentence } from "../state/loading";
+import { tell } from "../state/pointer";
+
+export function keepFaults() {
+  const told = (error: unknown) => tell(`The page itself failed: ${sentence(error)}. Load it again; if it happens again, please report it.`);
+  window.addEventListener("error", (event) => told(event.error ?? event.message));
+  window.addEventListener("unhandledrejection", (event) => told(event.reason));
+}
