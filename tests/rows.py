@@ -55,9 +55,21 @@ def vector_rows(url: str) -> list[tuple[Any, ...]]:
         ).fetchall()
 
 
+def map_rows(url: str) -> list[tuple[Any, ...]]:
+    """All rows of the table of occupancy maps, and the key that the checkpoint has for them."""
+    with psycopg.connect(url) as connection:
+        rows = connection.execute(
+            "SELECT log_offset, floor, map_id, source, resolution, origin_x, origin_y, origin_yaw,"
+            " width, height, png, digest FROM mapfold.occupancy_map ORDER BY log_offset"
+        ).fetchall()
+        key = "SELECT maps FROM mapfold.checkpoint WHERE sink = 'graph'"
+        return rows + connection.execute(key).fetchall()
+
+
 def all_rows(targets: Targets) -> tuple[Mapping[str, Any], list[tuple[Any, ...]]]:
     """Every row of both."""
-    return graph_rows(targets.graph_url), vector_rows(targets.vector_url)
+    graph: dict[str, Any] = dict(graph_rows(targets.graph_url))
+    return graph | {"maps": map_rows(targets.graph_url)}, vector_rows(targets.vector_url)
 
 
 def expected_graph(view: MapView) -> dict[str, list[tuple[Any, ...]]]:

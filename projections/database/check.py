@@ -22,11 +22,12 @@ import psycopg
 from psycopg import IsolationLevel, sql
 
 from eventsrc.envelope import FIRST_OFFSET, Offset
+from eventsrc.grey_images import BadImage
 from eventsrc.log import Event, LogReader
 from projections.errors import ProjectionMissing
 from projections.settings import Settings
 
-from . import checkpoints
+from . import checkpoints, map_table
 from .connection import (
     Connection,
     Targets,
@@ -38,8 +39,9 @@ from .connection import (
 from .cypher import PARENTS
 from .graph_render import Row, expected_rows
 from .inputs import LogInputs, SettingsOf
-from .labels import GRAPH, LABELS, TABLE, VERTEX_LABELS
+from .labels import GRAPH, LABELS, MAP_TABLE, TABLE, VERTEX_LABELS
 from .live_fold import LiveFold, batches
+from .map_rows import MapRow, map_of, map_rows
 from .origin import command_for, refuse_mismatch, rows_dropped
 from .sink import Checkpoint, SinkName
 from .statements import statements
@@ -112,7 +114,10 @@ BATCH_EVENTS: Final = 256
 _NO_ROWS_TEXT: Final[dict[SinkName, str]] = {"graph": "no graph has", "vectors": "no vectors have"}
 
 _TABLES: Final[dict[SinkName, list[sql.Identifier]]] = {
-    "graph": [sql.Identifier(GRAPH, label) for label in LABELS],
+    "graph": [
+        *(sql.Identifier(GRAPH, label) for label in LABELS),
+        sql.Identifier("mapfold", MAP_TABLE),
+    ],
     "vectors": [sql.Identifier("public", TABLE)],
 }
 _VECTORS: Final = """
@@ -285,6 +290,8 @@ def _compare_graph(
             cursor.execute(query.format(ids, table, sql.Identifier(label)))
             expected = (_graph_row(row) for row in expected_rows(fold.view, label))
             comparison.merge(label, expected, (_graph_row(row) for row in cursor))
+    maps = map_rows(fold.view), map_table.read(connection)
+    comparison.merge(MAP_TABLE, *(map(_map_row, rows) for rows in maps))
 
 
 def _compare_vectors(
@@ -327,6 +334,15 @@ def _vector_row(row: VectorRow) -> Keyed:
         added.run_id, added.det_id, added.keyframe_id, added.class_name, added.confidence,
         list(row.bbox), *pose, added.embedding_model, row.embedding.tolist(), row.ingested_us,
     )  # fmt: skip
+
+
+def _map_row(row: MapRow) -> Keyed:
+    """With the digest of the image instead of its bytes: zlib's versions pack them differently."""
+    try:
+        image = map_of(row).digest()
+    except BadImage as error:
+        image = f"png: {error}"
+    return row.log_offset, (*row[1:-2], row.digest, image)
 
 
 def _shortened(value: Any) -> str:

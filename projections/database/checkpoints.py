@@ -124,7 +124,12 @@ def rows_exist(connection: Connection, sink: SinkName) -> bool:
 
 
 def at_offset(
-    log_id: str, inputs: MapInputs, next_offset: Offset, last_event: str, digest: str | None = None
+    log_id: str,
+    inputs: MapInputs,
+    next_offset: Offset,
+    last_event: str,
+    digest: str | None = None,
+    maps: str | None = None,
 ) -> Checkpoint:
     """The checkpoint of a map of ``inputs`` with ``next_offset`` events."""
     return Checkpoint(
@@ -136,6 +141,7 @@ def at_offset(
         digest,
         inputs.known_at,
         inputs.observed,
+        maps,
     )
 
 

@@ -57,6 +57,13 @@ def copy_privileges(
             _grant(connection, privilege, sql.Identifier(new, each), role)
 
 
+def copy_table_privileges(connection: Connection, schema: str, old: str, new: str) -> None:
+    """Grant on table ``new`` of a schema what is granted on ``old``."""
+    rows = connection.execute(_TABLE_GRANTS, [schema, old, old]).fetchall()
+    for _, role, privilege in rows:
+        _grant(connection, privilege, sql.Identifier(schema, new), role)
+
+
 def _grant(connection: Connection, privilege: str, what: sql.Composable, role: str) -> None:
     if privilege in _PRIVILEGES:
         # The catalogue has no name for PUBLIC.

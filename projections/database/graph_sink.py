@@ -10,7 +10,7 @@ from projections.errors import DatabaseError
 from projections.model.changes import BatchChanges
 from projections.model.view import MapView
 
-from . import graph_schema
+from . import graph_schema, map_table
 from .connection import Connection, describe_connection, ensure_extension
 from .cypher import policies_apply
 from .grants import copy_privileges
@@ -20,12 +20,14 @@ from .labels import (
     EDGE_LABELS,
     GRAPH,
     LABELS,
+    MAP_TABLE,
     NEXT_GRAPH,
     OLD_GRAPH,
     VERTEX_LABELS,
     Label,
 )
 from .loader import InsertLoader, Load, Loader, LoaderName, loader_of, unnest_columns
+from .map_rows import MapRow, map_rows
 from .replaced_tables import try_drop_lock, wait_for_drop, wait_for_earlier_transactions
 from .sink import PreparedWrite, SinkName
 from .statements import statements
@@ -52,18 +54,28 @@ class GraphSink:
         ensure_extension(connection, "age")
         if graph_schema.exists(connection, GRAPH):
             graph_schema.refuse_older(connection, GRAPH)
+            map_table.refuse_missing(connection)
             return False
         graph_schema.create(connection, GRAPH)
         graph_schema.index(connection, GRAPH)
+        map_table.ensure(connection)
+        map_table.replace(connection, [])
         return True
 
     def prepare(self, changes: BatchChanges, view: MapView) -> PreparedWrite[Connection]:
         """Rows that a batch changed."""
         rows = changed_rows(changes, view)
-        is_small = sum(map(len, rows.inserted.values())) < SMALL_BATCH
-        return PreparedWrite(partial(self._write, rows, is_small), is_small)
+        maps = map_rows(view) if changes.maps else None
+        is_small = maps is None and sum(map(len, rows.inserted.values())) < SMALL_BATCH
+        return PreparedWrite(partial(self._write, rows, maps, is_small), is_small)
 
-    def _write(self, rows: GraphRows, is_small: bool, connection: Connection) -> None:
+    def _write(
+        self,
+        rows: GraphRows,
+        maps: list[MapRow] | None,
+        is_small: bool,
+        connection: Connection,
+    ) -> None:
         copies = not is_small and not policies_apply(connection)
         loader = self._loader if copies else InsertLoader()
         for label, inserted in rows.inserted.items():
@@ -76,6 +88,8 @@ class GraphSink:
             _new_rows(InsertLoader(), GRAPH, label, replaced)(connection)
         for label, ids in rows.deleted.items():
             _delete(connection, label, ids)
+        if maps is not None:
+            map_table.replace(connection, maps)
 
     def drop_leftovers(self, connection: Connection) -> None:
         """Drop a replaced graph that a reader held on to; refuse a graph that is not ours.
@@ -120,12 +134,16 @@ class GraphShadow:
         numbers by label."""
         load, counts = self._load(changing_rows(view)), view.counts()
         expected = {label: counts[COUNT_KEYS[label]] for label in LABELS}
+        maps = map_rows(view)
 
         def finish(connection: Connection) -> Mapping[str, int]:
             load(connection)
+            map_table.ensure(connection)
+            map_table.replace(connection, maps)
             graph_schema.index(connection, NEXT_GRAPH, LATE)
             graph_schema.analyze(connection, NEXT_GRAPH)
-            return _compared(connection, expected)
+            found = _compared(connection, expected)
+            return {**found, MAP_TABLE: len(maps)} if maps else found
 
         return finish
 

@@ -12,19 +12,22 @@ from projections.model.view import MapView
 
 from .graph_rows import GraphRows, changed_rows, changing_rows, fixed_rows
 from .labels import LABELS, TABLE, Label
+from .map_rows import MapRow, map_rows
 from .sink import PreparedWrite
 from .vector_rows import VectorRow, new_rows
 
 
 @dataclass(slots=True)
 class MemoryTables:
-    """``graph[label][graphid]`` and ``vectors[det_pk]``; ``next_offset`` is their checkpoint."""
+    """``graph[label][graphid]``, ``vectors[det_pk]`` and ``maps``; ``next_offset`` is their
+    checkpoint."""
 
     next_offset: int = 0
     graph: dict[Label, dict[int, Any]] = field(
         default_factory=lambda: {name: {} for name in LABELS}
     )
     vectors: dict[int, VectorRow] = field(default_factory=dict)
+    maps: list[MapRow] = field(default_factory=list)
 
     def add(self, rows_of: Mapping[Label, list[Any]]) -> None:
         """Insert or replace rows of the graph."""
@@ -46,10 +49,13 @@ class MemorySink:
     def prepare(self, changes: BatchChanges, view: MapView) -> PreparedWrite[MemoryTables]:
         """Rows that a batch changed."""
         graph, vectors = changed_rows(changes, view), new_rows(changes, view)
+        maps = map_rows(view) if changes.maps else None
 
         def send(tables: MemoryTables) -> None:
             _write_graph(tables, graph)
             tables.add_vectors(vectors)
+            if maps is not None:
+                tables.maps = maps
 
         return PreparedWrite(send, is_small=True)
 
@@ -87,10 +93,11 @@ class MemoryShadow:
 
     def finish(self, view: MapView) -> Callable[[MemoryTables], Mapping[str, int]]:
         """All other rows."""
-        graph = changing_rows(view)
+        graph, maps = changing_rows(view), map_rows(view)
 
         def finish(_: MemoryTables) -> Mapping[str, int]:
             self._new.add(graph)
+            self._new.maps = maps
             rows: dict[str, int] = {label: len(rows) for label, rows in self._new.graph.items()}
             return {**rows, TABLE: len(self._new.vectors)}
 
@@ -102,6 +109,7 @@ class MemoryShadow:
     def swap_in(self, connection: MemoryTables) -> None:
         """Replace the tables' rows."""
         connection.graph, connection.vectors = self._new.graph, self._new.vectors
+        connection.maps = self._new.maps
 
 
 def _write_graph(tables: MemoryTables, rows: GraphRows) -> None:

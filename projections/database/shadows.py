@@ -38,6 +38,7 @@ from .connection import Connection, database_errors
 from .inputs import MapInputs
 from .live_fold import LiveFold
 from .loading_thread import LoadingThread, short_turns
+from .map_rows import maps_key
 from .sink import Checkpoint, Shadow
 from .stores import DatabaseSink, Store
 from .vector_table import HnswReport, build_hnsw
@@ -226,6 +227,7 @@ def swap_in_new_map(
             fold.map.next_offset,
             checkpoints.event_hash(folded.last),
             digest,
+            maps_key(fold.view),
         )
         for writer in writers:
             writer.store.run(

@@ -47,7 +47,8 @@ class Checkpoint:
     under the corrections of the commands before ``known_at``; ``fingerprint`` is of both.
     ``last_event`` is `event_hash` of the last event, "" for none: it tells a log that was cut and
     continued differently. ``digest`` is the map's, when known. ``observed`` is as in
-    `inputs.MapInputs`. Checkpoints of older versions have neither ``known_at`` nor ``observed``.
+    `inputs.MapInputs`. ``maps`` tells the occupancy maps from others, None for none. Checkpoints of
+    older versions have neither ``known_at`` nor ``observed`` nor ``maps``.
     """
 
     log_id: str
@@ -58,6 +59,7 @@ class Checkpoint:
     digest: str | None = None
     known_at: Offset | None = None
     observed: str | None = None
+    maps: str | None = None
 
     @property
     def known_to(self) -> Offset:

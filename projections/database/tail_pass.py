@@ -23,6 +23,7 @@ from .checkpoints import DeadLetter, dead_letter, event_hash
 from .connection import Targets, database_errors
 from .inputs import LogInputs, MapInputs, SettingsOf, commands_between
 from .live_fold import LiveFold, batches
+from .map_rows import maps_key
 from .origin import (
     origin_fault,
     refuse_mismatch,
@@ -326,7 +327,7 @@ class TailPass:
         """Write a batch to the sinks that do not have it yet."""
         next_offset = Offset(last.offset + 1)
         self._use_names(fold, last.offset)
-        changes = fold.tracker.drain()
+        changes, maps = fold.tracker.drain(), maps_key(fold.view)
         written = 0
         for writer in writers:
             parts = [
@@ -335,7 +336,9 @@ class TailPass:
                     sink.prepare(changes, fold.view),
                     tuple(self.letters),
                     at,
-                    checkpoints.at_offset(at.log_id, self.current, next_offset, event_hash(last)),
+                    checkpoints.at_offset(
+                        at.log_id, self.current, next_offset, event_hash(last), maps=maps
+                    ),
                 )
                 for sink in writer.store.sinks
                 if (at := self.checkpoints[sink.name]).next_offset < next_offset

@@ -53,7 +53,7 @@ class BatchChanges:
     moved to another place or out of one, absorbed ones among them. ``links`` are pairs of places
     whose shared transitions changed; one that is not in `MapView.adjacency` any more is gone.
     ``embedded`` is in the order of the observations. ``formed`` are the places that are new,
-    ``floors`` the numbers of new floors.
+    ``floors`` the numbers of new floors. ``maps`` is whether `MapView.maps_in_force` changed.
     """
 
     keyframes: range
@@ -68,6 +68,7 @@ class BatchChanges:
     reassigned: list[ObservationOrdinal]
     formed: list[PlaceOrdinal]
     floors: range
+    maps: bool = False
 
 
 class ChangeTracker:
@@ -116,6 +117,7 @@ class ChangeTracker:
             sorted(self._reassigned),
             sorted(self._formed),
             range(self._floors, len(self.view.floors)),
+            self._maps != self.view.maps_in_force(),
         )
         self._start()
         return changes
@@ -133,6 +135,7 @@ class ChangeTracker:
         self._reassigned: set[ObservationOrdinal] = set()
         self._formed: set[PlaceOrdinal] = set()
         self._floors = len(self.view.floors)
+        self._maps = self.view.maps_in_force()
         self.view.contents.touched.clear()
 
     def _place_formed(self, delta: PlaceFormed) -> None:

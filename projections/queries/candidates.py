@@ -24,6 +24,7 @@ from projections.database.connection import (
 )
 from projections.database.graph_render import text
 from projections.database.labels import LABEL_IDS
+from projections.database.map_table import read_with_key
 from projections.database.statements import statements, tables
 from projections.deltas import ObservationOrdinal, PlaceOrdinal
 from projections.errors import ProjectionMismatch, ProjectionMissing, QuestionError
@@ -156,12 +157,22 @@ class CandidateSearch:
 
     def _along(self, rows: _Rows, origin: str | None) -> "_Along":
         """Learn the settings and check the origin."""
-        settings, graph = next((row[0] for row in rows if row[0] is not None), (None, None))
+        settings, graph, maps = next(
+            (row[0] for row in rows if row[0] is not None), (None, None, None)
+        )
         if graph != origin or settings is not None:
             place = describe_target(self._targets.graph_url)
             refuse_mixed(origin, graph, describe_target(self._targets.vector_url), place)
             self._known = self._known.with_settings(settings, place)
+        if maps is not None:
+            self._known = self._with_maps(maps[0])
         return _Along.of(rows)
+
+    def _with_maps(self, key: str | None) -> KnownConstants:
+        if key is None:
+            return self._known.with_maps(None, {})
+        with _query_errors(self._targets.graph_url):
+            return self._known.with_maps(*read_with_key(self._graph))
 
     def _class_names(self) -> list[str]:
         with _query_errors(self._targets.graph_url):
@@ -182,7 +193,7 @@ def _statement(name: str, crops: int = 0) -> sql.Composed:
     return run[name].format(
         questions=questions,
         of_vectors=run["of_vectors"].format(cosines=run["cosines"]),
-        of_graph=run["of_graph"].format(settings=run["settings"]),
+        of_graph=run["of_graph"].format(settings=run["settings"], maps=run["maps"]),
         observed=run["observed"],
         along=run["along"],
         followed=run["followed"].format(**tables()),
@@ -250,7 +261,7 @@ def _assemble(crops: int, near: _Rows, along: _Along, known: KnownConstants) -> 
             )
         )
     ordered = (tuple(sorted(row, key=lambda m: (-m.similarity, m.observation))) for row in matches)
-    return Candidates(tuple(ordered), dict(along.places.values()), known.constants)
+    return Candidates(tuple(ordered), dict(along.places.values()), known.constants, known.walls)
 
 
 def _thing(properties: str) -> _Thing:

@@ -1,17 +1,20 @@
-"""A map's constants in the databases, remembered between questions.
+"""A map's constants and walls in the databases, remembered between questions.
 
 A question carries the keys of what is known; the databases send cosines and settings again only
 where theirs have other keys. So constants cost no round trip, and little time after the first
-question.
+question. Where the key of the occupancy maps is another one, they are read by a statement of their
+own.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, Self
 
 from pydantic import ValidationError
 
+from eventsrc.occupancy_map import OccupancyMap
 from projections.errors import ProjectionMismatch
-from projections.relocalize import MapConstants
+from projections.relocalize import MapConstants, WallMap
 from projections.relocalize.constants import FOLLOWERS, SAMPLED, Cosines
 from projections.settings import Settings
 
@@ -25,6 +28,8 @@ class KnownConstants:
     settings_key: str | None = None
     settings: Settings = field(default_factory=Settings)
     constants: MapConstants = field(default_factory=MapConstants)
+    maps_key: str | None = None
+    walls: Mapping[str | None, WallMap] = field(default_factory=dict)
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -32,6 +37,7 @@ class KnownConstants:
         return {
             "known_cosines": self.cosines_key,
             "known_settings": self.settings_key,
+            "known_maps": self.maps_key,
             "sampled": SAMPLED,
             "followers": FOLLOWERS,
         }
@@ -62,13 +68,18 @@ class KnownConstants:
         constants = MapConstants.of(settings, self.cosines)
         return replace(self, settings_key=sent[0], settings=settings, constants=constants)
 
+    def with_maps(self, key: str | None, maps: Mapping[str | None, OccupancyMap]) -> Self:
+        """What is known after the maps of a key were read."""
+        walls = {floor: WallMap(given) for floor, given in maps.items()}
+        return replace(self, maps_key=key, walls=walls)
+
 
 NOTHING_KNOWN: Final = KnownConstants()
 
 
 class ConstantsMemory:
-    """The constants that the last question has learned; for any thread, as they are replaced as a
-    whole."""
+    """The constants and walls that the last question has learned; for any thread, as they are
+    replaced as a whole."""
 
     def __init__(self) -> None:
         self.known = NOTHING_KNOWN

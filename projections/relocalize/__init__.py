@@ -34,6 +34,7 @@ from .reading import (
     read_question,
 )
 from .track import Track, Tracked, movement_of
+from .walls import WallMap
 
 __all__ = [
     "DEFAULT_CAMERA",
@@ -56,6 +57,7 @@ __all__ = [
     "Track",
     "Tracked",
     "View",
+    "WallMap",
     "describe_value",
     "movement_of",
     "parse_json",

@@ -6,6 +6,8 @@ from pathlib import Path
 import psycopg
 import pytest
 
+from eventsrc.log import LogWriter
+from eventsrc.system_events import MAP_KEY
 from projections.database import rebuild, tail
 from projections.database.check import check
 from projections.database.connection import Targets, connect, extension_version
@@ -16,7 +18,8 @@ from projections.errors import DatabaseError, ExtensionMissing
 from projections.settings import Settings
 from tests.drops import wait_for_drops
 from tests.logs import bridge, walk, write_log
-from tests.rows import all_rows
+from tests.maps import drawn_map
+from tests.rows import all_rows, map_rows
 
 pytestmark = pytest.mark.usefixtures("server_roles")
 
@@ -231,3 +234,23 @@ def test_a_writer_tails_many_events_at_once(log: Path, projected: Targets) -> No
     writer = as_role(projected, "a_writer")
     assert tail(log, writer, SETTINGS, once=True, batch_events=300).events == 300
     assert [r.differing for r in check(log, projected, SETTINGS)] == [0, 0]
+
+
+def test_roles_reach_the_maps_also_after_an_older_version(log: Path, projected: Targets) -> None:
+    """The table of maps gets the grants of the checkpoints where an older version made none."""
+    given = drawn_map("####.###", 0.5)
+    with connect(projected.graph_url, autocommit=True) as connection:
+        connection.execute("DROP TABLE mapfold.occupancy_map")
+        connection.execute("ALTER TABLE mapfold.checkpoint DROP COLUMN maps")
+    rebuild(log, projected, SETTINGS)
+    with LogWriter(log) as writer:
+        writer.append(MAP_KEY, given.encode())
+    assert tail(log, as_role(projected, "a_writer"), SETTINGS, once=True).events == 1
+    reader = as_role(projected, "a_reader")
+    assert [row[-1] for row in map_rows(reader.graph_url)[:-1]] == [given.digest()]
+    assert check(log, reader, SETTINGS)[0].differing == 0
+    with (
+        connect(reader.graph_url) as connection,
+        pytest.raises(psycopg.errors.InsufficientPrivilege),
+    ):
+        connection.execute("DELETE FROM mapfold.occupancy_map")

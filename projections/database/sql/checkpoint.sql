@@ -21,7 +21,8 @@ CREATE TABLE mapfold.checkpoint (
     known_at     bigint,                  -- the corrections are those of the commands before it
     observed     text,                    -- fingerprint of what the observations depend on
     refold_done  bigint,                  -- events that a tail's refold has folded …
-    refold_total bigint                   -- … of so many; null when there is none
+    refold_total bigint,                  -- … of so many; null when there is none
+    maps         text                     -- key of the rows of mapfold.occupancy_map, null for none
 );
 CREATE TABLE mapfold.dead_letter (
     sink       text NOT NULL,
@@ -34,19 +35,21 @@ CREATE TABLE mapfold.dead_letter (
 );
 
 -- name: lacks_columns
--- No row when the table was made before there were corrections.
+-- No row when an older version made the table.
 SELECT 1 FROM pg_attribute
-WHERE attrelid = 'mapfold.checkpoint'::regclass AND attname = 'refold_total'
+WHERE attrelid = 'mapfold.checkpoint'::regclass AND attname = 'maps'
 
 -- name: add_columns
 ALTER TABLE mapfold.checkpoint
     ADD COLUMN IF NOT EXISTS known_at bigint, ADD COLUMN IF NOT EXISTS observed text,
-    ADD COLUMN IF NOT EXISTS refold_done bigint, ADD COLUMN IF NOT EXISTS refold_total bigint
+    ADD COLUMN IF NOT EXISTS refold_done bigint, ADD COLUMN IF NOT EXISTS refold_total bigint,
+    ADD COLUMN IF NOT EXISTS maps text
 
 -- name: load
 -- By name through JSON, as a reader may meet a table that an older version made.
 SELECT c.log_id, c.fingerprint, c.settings, c.next_offset, c.last_event, c.digest,
-       (to_jsonb(c) ->> 'known_at')::bigint, to_jsonb(c) ->> 'observed'
+       (to_jsonb(c) ->> 'known_at')::bigint, to_jsonb(c) ->> 'observed',
+       to_jsonb(c) ->> 'maps'
 FROM mapfold.checkpoint c WHERE c.sink = %(sink)s
 
 -- name: rows_exist
@@ -64,7 +67,7 @@ ON CONFLICT (sink) DO NOTHING
 UPDATE mapfold.checkpoint
 SET next_offset = %(next_offset)s, last_event = %(last_event)s, digest = NULL,
     fingerprint = %(fingerprint)s, known_at = %(known_at)s, observed = %(observed)s,
-    moved_at = now(), heartbeat_at = now()
+    maps = %(maps)s, moved_at = now(), heartbeat_at = now()
 WHERE sink = %(sink)s AND next_offset = %(expected)s
   AND log_id = %(log_id)s AND fingerprint = %(expected_fingerprint)s
 RETURNING next_offset
@@ -72,14 +75,14 @@ RETURNING next_offset
 -- name: replace
 -- A rebuild overwrites whatever was there.
 INSERT INTO mapfold.checkpoint
-    (sink, log_id, fingerprint, settings, next_offset, last_event, digest, known_at, observed)
+    (sink, log_id, fingerprint, settings, next_offset, last_event, digest, known_at, observed, maps)
 VALUES (%(sink)s, %(log_id)s, %(fingerprint)s, %(settings)s, %(next_offset)s, %(last_event)s,
-        %(digest)s, %(known_at)s, %(observed)s)
+        %(digest)s, %(known_at)s, %(observed)s, %(maps)s)
 ON CONFLICT (sink) DO UPDATE
 SET log_id = EXCLUDED.log_id, fingerprint = EXCLUDED.fingerprint, settings = EXCLUDED.settings,
     next_offset = EXCLUDED.next_offset, last_event = EXCLUDED.last_event,
     digest = EXCLUDED.digest, known_at = EXCLUDED.known_at, observed = EXCLUDED.observed,
-    moved_at = now(), heartbeat_at = NULL, refold_done = NULL, refold_total = NULL
+    maps = EXCLUDED.maps, moved_at = now(), heartbeat_at = NULL, refold_done = NULL, refold_total = NULL
 
 -- name: write_heartbeat
 UPDATE mapfold.checkpoint SET heartbeat_at = now() WHERE sink = %(sink)s

@@ -36,6 +36,13 @@
     THEN json_build_array(fingerprint, settings) END
  FROM mapfold.checkpoint WHERE sink = 'graph')
 
+-- name: maps
+-- Key of the occupancy maps, which is null if there are none, in an array; null when the key is the one
+-- already known (through JSON, as a table of an older version has no column for it).
+(SELECT CASE WHEN to_jsonb(c) ->> 'maps' IS DISTINCT FROM %(known_maps)s::text
+    THEN json_build_array(to_jsonb(c) ->> 'maps') END
+ FROM mapfold.checkpoint c WHERE sink = 'graph')
+
 -- name: of_vectors
 -- What is to know of the vectors as a whole, in one of the rows.
 CASE WHEN row_number() OVER () = 1 THEN json_build_array({cosines}, (
@@ -46,7 +53,7 @@ CASE WHEN row_number() OVER () = 1 THEN json_build_array({cosines}, (
 -- The same of the graph.
 CASE WHEN row_number() OVER () = 1 THEN json_build_array({settings}, (
     SELECT log_id || ' ' || coalesce(to_jsonb(c) ->> 'observed', fingerprint)
-    FROM mapfold.checkpoint c WHERE sink = 'graph')) END
+    FROM mapfold.checkpoint c WHERE sink = 'graph'), {maps}) END
 
 -- name: observed
 near.det_pk, near.det_id, near.run_id, near.class_name, near.bbox, near.map_x, near.map_y, near.map_yaw,

@@ -1,0 +1,223 @@
+"""The same question to a log, to its databases and to a service over HTTP and Zenoh gets the same
+answer in a house with walls, also after a tail has followed the log to another map."""
+
+import json
+import threading
+import urllib.request
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import psycopg
+import pytest
+
+from eventsrc.log import ALWAYS, LogReader, LogWriter
+from eventsrc.occupancy_map import OccupancyMap
+from eventsrc.sim import build_house, simulate_run
+from eventsrc.sim.house import occupancy_map
+from eventsrc.system_events import MAP_KEY
+from eventsrc.transport.session import Session
+from projections.database import TailProgress, rebuild, tail
+from projections.database.connection import Targets
+from projections.errors import ProjectionMismatch
+from projections.model.fold import fold_log
+from projections.queries.relocalize import CandidateReader, relocalize
+from projections.relocalize import ExactIndex, parse_question, rank
+from projections.relocalize.ranking import Answer
+from projections.serve import Answerer, FairQueue, Pools, ZenohService
+from projections.serve.guard import Guard
+from projections.serve.http import create_app
+from projections.serve.listening import bind, serving
+from projections.settings import Settings
+from tests.candidates import assert_equal
+from tests.envelopes import envelope, payload
+from tests.fixtures_log import KEY
+
+WAIT_S = 60.0
+SEED = 7
+SETTINGS = Settings()
+
+
+@cache
+def _drive(run: str) -> list[bytes]:
+    return list(simulate_run(SEED, run).payloads)
+
+
+def _questions() -> list[bytes]:
+    """What another drive sees, two crops or more."""
+    seen = [payload for payload in _drive("b")[:120:4] if payload.count(b'"class"') > 1]
+    return seen[:6]
+
+
+@cache
+def _house() -> OccupancyMap:
+    return occupancy_map(build_house(SEED))
+
+
+def _other_house() -> OccupancyMap:
+    """The house moved by half a metre, so that its walls cut rooms."""
+    given = _house()
+    return OccupancyMap(None, given.resolution, (0.0, -0.5, 0.0), "moved", given.cells)
+
+
+def _append(log: Path, *items: OccupancyMap | bytes) -> int:
+    with LogWriter(log, fsync=ALWAYS) as writer:
+        for item in items:
+            if isinstance(item, OccupancyMap):
+                writer.append(MAP_KEY, item.encode())
+            else:
+                writer.append(KEY, item)
+        return writer.next_offset
+
+
+def _exact(log: Path) -> ExactIndex:
+    with LogReader(log) as reader:
+        return ExactIndex(fold_log(reader, SETTINGS)[1])
+
+
+class _Services:
+    """One question over HTTP and over Zenoh."""
+
+    def __init__(self, port: int, session: Session) -> None:
+        self._port, self._session = port, session
+
+    def ask(self, question: bytes) -> list[object]:
+        url = f"http://127.0.0.1:{self._port}/relocalize"
+        asked = urllib.request.Request(url, question, {"Content-Type": "application/json"})
+        with urllib.request.urlopen(asked, timeout=WAIT_S) as reply:
+            over_http = json.load(reply)
+        replies = self._session.get_replies("mapfold/relocalize", question, timeout_s=WAIT_S)
+        ((good, over_zenoh),) = replies
+        assert good
+        return [over_http, json.loads(over_zenoh)]
+
+
+@pytest.fixture(params=["one_database", "two_databases"])
+def targets(request: pytest.FixtureRequest) -> Targets:
+    found: Targets = request.getfixturevalue(request.param)
+    return found
+
+
+@pytest.fixture
+def services(
+    targets: Targets, connected: Callable[[], Session]
+) -> Iterator[Callable[[], _Services]]:
+    """Call it once there is a projection; the services run until the end of the test."""
+    with ExitStack() as running:
+
+        def start() -> _Services:
+            pools = running.enter_context(Pools(targets, 2))
+            answerer = Answerer(pools, per_second=10_000.0)
+            queue = running.enter_context(FairQueue(2, max_wait_s=WAIT_S))
+            app = Guard(create_app(answerer, queue))
+            port = running.enter_context(serving(app, bind("127.0.0.1", 0)))
+            running.enter_context(ZenohService(connected(), answerer, queue))
+            return _Services(port, connected())
+
+        yield start
+
+
+def _check_answers(log: Path, targets: Targets, services: _Services) -> float:
+    """All answers agree; by how many metres walls move them, in the mean."""
+    index, moved = _exact(log), []
+    with CandidateReader(targets) as reader:
+        for question in _questions():
+            asked = parse_question(question)
+            exact = index.search(asked.crops)
+            live = reader.candidates(asked.crops)
+            assert_equal(live, exact)
+            assert live.walls.keys() == exact.walls.keys()
+            ours, theirs = rank(asked, live), rank(asked, exact)
+            assert ours.pose is not None
+            assert theirs.pose is not None
+            assert (ours.pose.x, ours.pose.y) == pytest.approx(
+                (theirs.pose.x, theirs.pose.y), abs=1e-4
+            )
+            assert ours.pose.floor == theirs.pose.floor
+            document = relocalize(targets, asked).document()
+            assert document == ours.document()
+            assert services.ask(question) == [document, document]
+            moved.append(_apart(theirs, rank(asked, replace(exact, walls={}))))
+    return float(np.mean(moved))
+
+
+def _apart(one: Answer, other: Answer) -> float:
+    assert one.pose is not None
+    assert other.pose is not None
+    return float(np.hypot(one.pose.x - other.pose.x, one.pose.y - other.pose.y))
+
+
+def test_walls_count_the_same_wherever_the_question_goes(
+    tmp_path: Path, targets: Targets, services: Callable[[], _Services]
+) -> None:
+    log, drive = tmp_path / "log", _drive("a")
+    _append(log, *drive[:100])
+    rebuild(log, targets, SETTINGS)
+    asked = services()
+    assert _check_answers(log, targets, asked) == 0.0, "no map yet"
+    stop, progress = threading.Event(), TailProgress()
+    following = threading.Thread(
+        target=tail, args=(log, targets, SETTINGS), kwargs={"stop": stop, "progress": progress}
+    )
+    following.start()
+    try:
+        distances = []
+        steps: Sequence[Sequence[OccupancyMap | bytes]] = (
+            [_house()],
+            [*drive[100:110], _house(), *drive[110:120]],
+            [_other_house(), *drive[120:125]],
+        )
+        for step in steps:
+            assert progress.wait(_append(log, *step), WAIT_S)
+            distances.append(_check_answers(log, targets, asked))
+        assert min(distances) > 0.02, "walls do move answers"
+    finally:
+        stop.set()
+        following.join(WAIT_S)
+    rebuild(log, targets, SETTINGS)
+    assert _check_answers(log, targets, asked) > 0.02
+    empty = replace(_house(), cells=np.zeros_like(_house().cells))
+    _append(log, empty)
+    tail(log, targets, SETTINGS, once=True)
+    assert _check_answers(log, targets, asked) == 0.0, "a map without walls"
+
+
+def test_each_floor_has_its_walls_in_answers(
+    tmp_path: Path, targets: Targets, services: Callable[[], _Services]
+) -> None:
+    """The house on two floors; upstairs another map."""
+    log, documents = tmp_path / "log", [json.loads(each) for each in _drive("a")[:90]]
+    for number, document in enumerate(documents):
+        document["floor"] = "0" if number < 45 else "1"
+    upstairs = replace(_other_house(), floor="1")
+    _append(log, _house(), upstairs, *map(payload, documents))
+    rebuild(log, targets, SETTINGS)
+    _check_answers(log, targets, services())
+    index = _exact(log)
+    asked = parse_question(_questions()[0])
+    assert set(index.search(asked.crops).walls) == {"0", "1"}
+
+
+def test_a_projection_of_an_older_version_is_answered_without_walls(
+    tmp_path: Path, one_database: Targets
+) -> None:
+    """It has no table of maps; a tail refuses it, a replay makes it anew."""
+    log = tmp_path / "log"
+    _append(log, _house(), *_drive("a")[:60])
+    rebuild(log, one_database, SETTINGS)
+    with psycopg.connect(one_database.graph_url) as connection:
+        connection.execute("DROP TABLE mapfold.occupancy_map")
+        connection.execute("ALTER TABLE mapfold.checkpoint DROP COLUMN maps")
+    asked = parse_question(_questions()[0])
+    with CandidateReader(one_database) as reader:
+        assert reader.candidates(asked.crops).walls == {}
+        with pytest.raises(ProjectionMismatch, match=r"no table mapfold\.occupancy_map") as told:
+            tail(log, one_database, SETTINGS, once=True)
+        assert "run mapfold replay" in str(told.value)
+        rebuild(log, one_database, SETTINGS)
+        assert list(reader.candidates(asked.crops).walls) == [None]
+    _append(log, payload(envelope(9_000, 1.0, 1.0, run_id="late")))
+    assert tail(log, one_database, SETTINGS, once=True).events == 1
