@@ -66,10 +66,13 @@ def map_rows(url: str) -> list[tuple[Any, ...]]:
         return rows + connection.execute(key).fetchall()
 
 
-def all_rows(targets: Targets) -> tuple[Mapping[str, Any], list[tuple[Any, ...]]]:
-    """Every row of both."""
-    graph: dict[str, Any] = dict(graph_rows(targets.graph_url))
-    return graph | {"maps": map_rows(targets.graph_url)}, vector_rows(targets.vector_url)
+AllRows = tuple[Mapping[str, Any], list[tuple[Any, ...]], list[tuple[Any, ...]]]
+
+
+def all_rows(targets: Targets) -> AllRows:
+    """Every row of the graph, of the vectors and of the occupancy maps."""
+    graph, vectors = graph_rows(targets.graph_url), vector_rows(targets.vector_url)
+    return graph, vectors, map_rows(targets.graph_url)
 
 
 def expected_graph(view: MapView) -> dict[str, list[tuple[Any, ...]]]:
