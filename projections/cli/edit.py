@@ -1,7 +1,7 @@
-"""`mapfold edit`: corrections as events of the log.
+"""`mapfold edit` and `mapfold edits`: corrections as events of the log, and a list of them.
 
-It is a group: each kind of command is a subcommand with arguments of its own, and the options that
-all of them share (`edit_command`).
+`edit` is a group: each kind of command is a subcommand with arguments of its own, and the options
+that all of them share (`edit_command`).
 """
 
 import functools
@@ -13,9 +13,12 @@ import typer
 from eventsrc.commands import Command
 from eventsrc.envelope import KeyframeId
 from eventsrc.errors import MisuseError
+from eventsrc.log import LogReader
 from projections.edit import make
 from projections.edit.correct_poses import Span, by_trajectory, by_transform
 from projections.edit.current import CurrentMap
+from projections.edit.effect import effects_of
+from projections.edit.listing import edits_document, edits_text
 from projections.edit.make import Stamp
 from projections.edit.poses import DEFAULT_SLACK_S
 from projections.edit.record import MakeCommand
@@ -23,11 +26,13 @@ from projections.edit.trajectory import read_trajectory
 
 from .edit_command import kind_of
 from .options import (
+    JsonOption,
     LogArgument,
     SetOption,
+    SettingsOption,
     settings_from,
 )
-from .terminal import say
+from .terminal import display, emit, say
 
 PlaceArgument = Annotated[
     str, typer.Argument(metavar="PLACE", help="A place's id, or RUN:KEYFRAME for its place.")
@@ -233,6 +238,35 @@ def _undo(
     return lambda current, stamp: make.undo(current, stamp, undone)
 
 
+def edits(
+    log: LogArgument,
+    effects: Annotated[
+        bool,
+        typer.Option(
+            "--effects", help="Work out the effects that are not known yet: two folds for each."
+        ),
+    ] = False,
+    json_: JsonOption = False,
+    set_: SetOption = None,
+    settings_file: SettingsOption = None,
+) -> None:
+    """The commands in a log: who gave which when and why, what it changed, and what is undone.
+
+    An effect counts the places, objects and keyframes that were changed in the map of the events
+    before the command. `mapfold edit` keeps that of its command beside the log.
+    """
+    settings_of = functools.partial(settings_from, settings_file, set_)
+    with LogReader(log) as reader:
+        current = CurrentMap(reader, settings_of, note=say)
+        found = effects_of(current, known_only=not effects)
+        times = {event.offset: event.logged_ns for event in current.command_events()}
+    if json_:
+        emit(edits_document(found, times))
+    else:
+        display(edits_text(found, times))
+
+
 def register(program: typer.Typer) -> None:
-    """Add `edit` to the program."""
+    """Add `edit` and `edits` to the program."""
     program.add_typer(app, name="edit")
+    program.command()(edits)

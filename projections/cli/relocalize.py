@@ -1,23 +1,38 @@
-"""`mapfold relocalize`: which Place is this, from a few object crops or classes."""
+"""`mapfold relocalize`: which Place is this, from a few object crops or classes.
+
+With ``--track`` it answers questions one after the other, each with a line of JSON. A line that is
+no question is answered with what is wrong, and the next one is read.
+"""
 
 import contextlib
 import math
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, cast, get_args
+from typing import Annotated, Any, Final, cast, get_args
 
 import typer
 
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
+from eventsrc.text import counted
+from projections.errors import QuestionError
 from projections.model.log_commands import read_corrections
 from projections.relocalize import (
     UNKNOWN_BELOW,
     Answer,
+    Camera,
+    Candidates,
+    Crop,
     ExactIndex,
     Method,
     Question,
     RankedPlace,
+    Track,
+    movement_of,
+    parse_json,
     rank,
+    read_moved,
     read_question,
 )
 
@@ -38,8 +53,7 @@ from .options import (
     question_from,
     say_defaults,
 )
-from .terminal import display, emit, say
-from .tracking import Search, print_tracked, question_lines
+from .terminal import display, emit, emit_lines, say
 
 
 def relocalize(
@@ -202,3 +216,64 @@ def _place_lines(number: int, place: RankedPlace) -> list[str]:
 def register(app: typer.Typer) -> None:
     """Add `relocalize` to the program."""
     app.command()(relocalize)
+
+
+Search = Callable[[Sequence[Crop]], Candidates]
+_MAX_LINE: Final = 16 * 1024 * 1024
+
+
+@contextlib.contextmanager
+def question_lines(query: str) -> Iterator[Iterator[bytes]]:
+    """The lines of a file, or of stdin for ``-``, as they come; without empty ones.
+
+    Raises QuestionError that names the file.
+    """
+    if query == "-":
+        yield _lines(sys.stdin.buffer.readline, query)
+        return
+    with contextlib.ExitStack() as stack:
+        try:
+            file = stack.enter_context(Path(query).open("rb"))
+        except OSError as error:
+            raise QuestionError(f"{query}: {error.strerror}; give a file of lines, or -") from None
+        yield _lines(file.readline, query)
+
+
+def _lines(read: Callable[[int], bytes], name: str) -> Iterator[bytes]:
+    while line := read(_MAX_LINE + 1):
+        if len(line) > _MAX_LINE:
+            raise QuestionError(f"{name}: a line of more than {_MAX_LINE} bytes; send fewer crops")
+        if line.strip():
+            yield line
+
+
+def print_tracked(
+    lines: Iterator[bytes], search: Search, *, top: int, camera: Camera | None
+) -> None:
+    """Answer each line as soon as it comes. Raises QuestionError at the end if any was wrong."""
+    track, asked, wrong = Track("relocalize --track"), 0, 0
+    for line in lines:
+        asked += 1
+        try:
+            document = _tracked(line, track, search, top, camera)
+        except QuestionError as error:
+            wrong += 1
+            document = {"error": {"kind": "bad_question", "message": str(error)}}
+        emit_lines([document])
+        sys.stdout.flush()
+    if wrong:
+        raise QuestionError(
+            f"{wrong} of {counted(asked, 'question')} could not be answered; stdout says why"
+        )
+
+
+def _tracked(
+    line: bytes, track: Track, search: Search, top: int, camera: Camera | None
+) -> dict[str, Any]:
+    document = parse_json(line)
+    question, moved = read_question(document), read_moved(document)
+    answer = rank(question, search(question.crops), top=top, camera=camera)
+    tracked = track.step(
+        movement_of(moved, question), answer.hypotheses, answer.confidence, answer.known
+    )
+    return answer.document() | {"track": tracked.document()}

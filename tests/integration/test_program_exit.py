@@ -48,7 +48,7 @@ def mapfold(tmp_path: Path) -> Commands:
         ("contextlib", ("log", "info", "log")),  # the first thing that is imported
         ("projections.cli.program", ("log", "info", "log")),
         ("typer", ("state", "log")),
-        ("projections.cli.state", ("state", "log")),
+        ("projections.cli.maps", ("state", "log")),
         ("numpy", ("state", "log")),
         ("projections.demo", ("demo",)),  # imported when the command runs already
     ],

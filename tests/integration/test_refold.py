@@ -17,7 +17,7 @@ from eventsrc import commands
 from eventsrc.commands import Command, UseSettings
 from eventsrc.envelope import Offset
 from eventsrc.log import LogReader
-from projections.cli.status import _sink_line
+from projections.cli.db import _sink_line
 from projections.database import TailProgress, TailReport, rebuild, tail
 from projections.database.check import check
 from projections.database.connection import Targets

@@ -1,4 +1,5 @@
-"""`mapfold draw`: a picture of the map folded to a point in the log."""
+"""`mapfold state` and `mapfold draw`: the map folded to a point in the log, as text, JSON or a
+picture."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,14 +7,19 @@ from typing import Annotated
 import typer
 
 from eventsrc.envelope import FIRST_OFFSET
+from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 from eventsrc.text import counted, visible
-from projections.model.fold import fold_events
+from projections.model.advice import places_advice
+from projections.model.digest import map_digest
+from projections.model.export import state_document, state_text
+from projections.model.fold import fold_events, fold_log_cached
 from projections.model.log_commands import read_corrections
 from projections.model.view import MapView
 from projections.reducers.semantic_map import SemanticMap
 
 from .options import (
+    JsonOption,
     KnownAtOption,
     SetOption,
     SettingsOption,
@@ -23,7 +29,44 @@ from .options import (
     point,
     settings_from,
 )
-from .terminal import say
+from .terminal import display, emit, say
+
+
+def state(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="The log's folder.")],
+    at: Annotated[
+        str,
+        typer.Option("--at", metavar="W", help=f"Fold to here: {W}."),
+    ] = "end",
+    known_at: KnownAtOption = None,
+    json_: JsonOption = False,
+    digest: Annotated[bool, typer.Option("--digest", help="Print only the digest.")] = False,
+    set_: SetOption = None,
+    settings_file: SettingsOption = None,
+) -> None:
+    """The map folded to a point in the log.
+
+    Counts, settings, digest, and each place with its size and neighbours; --json prints all.
+    """
+    if json_ and digest:
+        raise MisuseError("--json and --digest together: --json prints the digest too")
+    settings_from(settings_file, set_)  # a bad value is an error before the log is opened
+    with LogReader(log) as reader:
+        end = point(reader, at)
+        known = known_point(reader, known_at, end)
+        corrections = read_corrections(reader, known)
+        settings = settings_from(settings_file, set_, corrections)
+        _, view = fold_log_cached(reader, settings, end, note=say, corrections=corrections)
+    hexdigits = map_digest(view)
+    if json_:
+        emit(state_document(view, hexdigits, known))
+    elif digest:
+        display(f"{hexdigits}\n")
+    else:
+        display(state_text(view, hexdigits, known))
+    advice = None if digest else places_advice(view.counts(), settings)
+    if advice is not None:
+        say(advice)
 
 
 def draw(
@@ -92,5 +135,6 @@ def draw(
 
 
 def register(app: typer.Typer) -> None:
-    """Add `draw` to ``app``."""
-    app.command()(draw)
+    """Add `state` and `draw` to the program."""
+    for command in (state, draw):
+        app.command()(command)
