@@ -79,14 +79,12 @@ def cos_sin(angle: float) -> tuple[float, float]:
     x = rest - low
     low = (rest - x) - low
     square = x * x
-    p = 0.0
-    for coefficient in _SIN[:5]:
-        p = p * square + coefficient
+    s0, s1, s2, s3, s4, s5 = _SIN
+    p = (((s0 * square + s1) * square + s2) * square + s3) * square + s4
     cube = square * x
-    sine = x - ((square * (0.5 * low - cube * p) - low) - cube * _SIN[5])
-    q = 0.0
-    for coefficient in _COS:
-        q = q * square + coefficient
+    sine = x - ((square * (0.5 * low - cube * p) - low) - cube * s5)
+    c0, c1, c2, c3, c4, c5 = _COS
+    q = ((((c0 * square + c1) * square + c2) * square + c3) * square + c4) * square + c5
     half = 0.5 * square
     one = 1.0 - half
     cosine = one + (((1.0 - one) - half) + (square * square * q - x * low))
@@ -125,15 +123,15 @@ def exp(x: float) -> float:
     """e to the x: 0 below −708, and e⁷⁰⁹ above 709."""
     if x < _MIN_EXP:
         return 0.0
-    x = min(x, _MAX_EXP)
+    if x > _MAX_EXP:
+        x = _MAX_EXP
     twos = round(x * _LOG2_E)
     high = x - twos * _LN2[0]
     low = twos * _LN2[1]
     rest = high - low
     square = rest * rest
-    p = 0.0
-    for coefficient in _EXP:
-        p = p * square + coefficient
+    e0, e1, e2, e3, e4 = _EXP
+    p = (((e0 * square + e1) * square + e2) * square + e3) * square + e4
     c = rest - square * p
     return math.ldexp(1.0 - ((low - (rest * c) / (2.0 - c)) - high), twos)
 
@@ -148,9 +146,8 @@ def log(x: float) -> float:
     f = mantissa - 1.0
     s = f / (2.0 + f)
     square = s * s
-    p = 0.0
-    for coefficient in _LOG:
-        p = p * square + coefficient
-    p *= square
+    l0, l1, l2, l3, l4, l5, l6 = _LOG
+    p = ((((l0 * square + l1) * square + l2) * square + l3) * square + l4) * square + l5
+    p = (p * square + l6) * square
     half = 0.5 * f * f
     return twos * _LN2[0] - ((half - (s * (half + p) + twos * _LN2[1])) - f)
