@@ -26,7 +26,6 @@ from .sights import Sight
 from .spots import LEAST_ELEVATION_M2, LEAST_M, SLOPE, Estimate
 
 Floats = NDArray[np.float64]
-ESTIMATE_FIELDS = len(Estimate._fields)
 _WORST_CHI2 = 16.0
 _ANYWHERE = -1.5
 """log(0.56 rad / √2π): in front of one another for a picture, things are not spread evenly."""
@@ -38,6 +37,10 @@ _WORST_PART = -12.0
 _SIZE_KNOWN = 0.3
 _BEHIND_M2 = 0.04
 _SLOPE_GUESS, _GUESS_PAIRS = 0.01, 10.0
+LEAST_AGREEMENT = -5.0
+"""Below it the sight alone rules a pair out."""
+_SEEN = 13
+_SLACK, _SLACK_CHI2, _SLACK_M2 = 1.001, 0.01, 1e-4
 
 
 class Slopes:
@@ -72,88 +75,169 @@ class Pairs(NamedTuple):
     """Pairs of an estimate and a sight that may be of one thing: row, column and ratio of each."""
 
     rows: NDArray[np.intp]
-    columns: NDArray[np.intp]
-    ratios: Floats
+    columns: list[int]
+    ratios: list[float]
+
+
+_NO_PAIRS = Pairs(np.zeros(0, np.intp), [], [])
 
 
 class Agreement:
-    """Ratios for many estimates and the sights of a picture."""
+    """Ratios for many estimates and the sights of a picture. An estimate farther than ``reach_m``
+    from the camera is ruled out."""
 
-    def __init__(self, range_m: float, range_spread: float) -> None:
+    def __init__(self, range_m: float, range_spread: float, reach_m: float) -> None:
         self._log_range = log(range_m)
         self._range_variance = range_spread * range_spread
+        self._reach_m2 = reach_m * reach_m
 
-    def pairs(
-        self, estimates: Floats, sights: Sequence[Sight], slopes: float, least: float
-    ) -> Pairs:
-        """The pairs whose ratio is above ``least``. ``estimates`` has a column for each one."""
-        seen = np.array([_column_of(sight) for sight in sights]).T
-        # What the bearing rules out at its best is left out first, since that is nearly all.
-        dx = estimates[0, :, np.newaxis] - seen[0]
-        dy = estimates[1, :, np.newaxis] - seen[1]
-        ahead = dx * seen[2] + dy * seen[3]
-        across = dy * seen[2] - dx * seen[3]
-        trace = (estimates[2] + estimates[4])[:, np.newaxis]
-        bound = ahead * ahead * seen[4] + (trace + seen[5])
-        may_be = (across * across < _WORST_CHI2 * bound) & (
-            np.minimum(ahead, 0.0) * ahead < _WORST_CHI2 * (trace + _BEHIND_M2)
-        )
-        rows, columns = may_be.nonzero()
+    def pairs(self, estimates: Floats, sights: Sequence[Sight], slopes: float) -> Pairs:
+        """The pairs whose ratio is above `LEAST_AGREEMENT`; `is_ruled_out` may still rule some of
+        them out. ``estimates`` has a row for each one; the sights are of one picture."""
+        # What speaks for a pair at most: twice its ratio, less χ² of the bearing and the logarithm
+        # of the variance of the bearing.
+        most = 2.0 * (_ANYWHERE - LEAST_AGREEMENT)
+        most_whole = most + log_of(1.0 + _OTHER_SIZES / (_SIZE * _SIZE))
+        most_whole += log_of(1.0 + slopes / LEAST_ELEVATION_M2)
+        seen = np.array([self._row_of(sight, most, most_whole) for sight in sights])
+        rows, columns = self._sieve(estimates, seen)
         if not len(rows):
-            return Pairs(rows, columns, np.zeros(0))
-        ratios = self._ratios(
-            estimates.take(rows, axis=1),
-            seen.take(columns, axis=1),
-            ahead[may_be],
-            across[may_be],
-            slopes,
-        )
-        kept = (ratios > least).nonzero()[0]
-        return Pairs(rows[kept], columns[kept], ratios[kept])
+            return _NO_PAIRS
+        ratios = self._ratios(estimates.take(rows, axis=0).T, seen.take(columns, axis=0).T, slopes)
+        kept = (ratios > LEAST_AGREEMENT).nonzero()[0]
+        return Pairs(rows.take(kept), columns.take(kept).tolist(), ratios.take(kept).tolist())
 
-    def _ratios(
-        self, estimates: Floats, seen: Floats, ahead: Floats, across: Floats, slopes: float
-    ) -> Floats:
+    def is_ruled_out(self, estimate: Estimate, sight: Sight) -> bool:
+        """Whether the estimate is out of reach, or the bearing alone rules the pair out: what it is
+        at its best, if the estimate is as unsure in every direction as in all together."""
+        dx, dy = estimate[0] - sight[0], estimate[1] - sight[1]
+        if dx * dx + dy * dy > self._reach_m2:
+            return True
+        cos, sin = sight[2], sight[3]
+        ahead, across = dx * cos + dy * sin, dy * cos - dx * sin
+        trace = estimate[2] + estimate[4]
+        bound = ahead * ahead * sight[4] + (trace + sight[5])
+        if across * across >= _WORST_CHI2 * bound:
+            return True
+        return ahead < 0.0 and ahead * ahead >= _WORST_CHI2 * (trace + _BEHIND_M2)
+
+    def _row_of(self, sight: Sight, most: float, most_whole: float) -> tuple[float, ...]:
+        """What is compared of a sight: `_SEEN` numbers for `_ratios`, then those for `_sieve`."""
+        x, y, cos, sin, per_m2, least, height, slope, *_ = sight
+        if height is None:
+            height, slope, whole = 0.0, 0.0, 0.0
+        else:
+            whole, most = 1.0, most_whole
+        cc, ss, twice_cs = cos * cos, sin * sin, 2.0 * cos * sin
+        chi2 = (most - log_of(per_m2 + least / self._reach_m2)) * _SLACK + _SLACK_CHI2
+        return (
+            *(x, y, cos, sin, cc, twice_cs, ss, cc, per_m2, least, height, slope, whole),
+            *(cos, sin, 0.0, 0.0, 0.0),
+            *(-sin, cos, 0.0, 0.0, 0.0),
+            *(0.0, 0.0, chi2 * ss, chi2 * -twice_cs, chi2 * cc),
+            *(0.0, 0.0, chi2, 0.0, chi2),
+            chi2 * (least + LEAST_M * LEAST_M * per_m2) + _SLACK_M2,
+            chi2 * _BEHIND_M2 + _SLACK_M2,
+            chi2 * per_m2,
+        )
+
+    def _sieve(
+        self, estimates: Floats, seen: Floats
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """The pairs whose ratio is above `LEAST_AGREEMENT` and that are within reach, and some
+        more; quick, since most pairs are far from it.
+
+        A product of matrices gives, for each pair, the distance ahead, that across, and the most χ²
+        that a pair can have times the estimate's variance across, and along. The slack is far above
+        its rounding errors, which differ from machine to machine.
+        """
+        count = len(seen)
+        factors = seen[:, _SEEN : _SEEN + 20].reshape(4 * count, 5)
+        here = np.array((seen[0, 0], seen[0, 1], 0.0, 0.0, 0.0))
+        products = (estimates[:, :5] - here).dot(factors.T).reshape(-1, count, 4)
+        ahead, squares = products[:, :, 0], products[:, :, :2] * products[:, :, :2]
+        limits = products[:, :, 2:] + seen[:, -3:-1]
+        ahead2, across2 = squares[:, :, 0], squares[:, :, 1]
+        may_be = across2 < limits[:, :, 0] + ahead2 * seen[:, -1]
+        may_be &= ahead2 + across2 < self._reach_m2 * _SLACK
+        may_be &= np.minimum(ahead, 0.0) * ahead < limits[:, :, 1]
+        rows, columns = may_be.nonzero()
+        return rows, columns
+
+    def _ratios(self, estimates: Floats, seen: Floats, slopes: float) -> Floats:
         """The ratio of each pair: columns of the two matrices."""
-        _, _, xx, xy, yy = estimates[:5]
+        xx, yy = estimates[2], estimates[4]
         heights = estimates[5:].reshape(2, 4, -1)  # of log size and elevation
-        _, _, cos, sin, per_m2, least, height, slope, is_whole, cc, ss, twice_cs = seen
+        direction = seen[2:4]
+        offset = estimates[:2] - seen[:2]
+        both = offset * direction
+        ahead = both[0] + both[1]
+        both = offset[::-1] * direction
+        across = both[0] - both[1]
         along = np.maximum(ahead, LEAST_M)
         square = along * along
-        cs = twice_cs * xy
-        along_variance = xx * cc + cs + yy * ss
-        variance = xx * ss - cs + yy * cc + per_m2 * square + least
-        steep = np.array((1.0 / along, slope))
-        gx, gy = steep * cos - heights[:, 1], steep * sin - heights[:, 2]
-        spread = gx * (gx * xx + 2.0 * xy * gy) + gy * gy * yy + heights[:, 3]
+        both = estimates[2:5] * seen[4:7]
+        cs = both[1]
+        along_variance = both[0] + cs
+        along_variance += both[2]
+        both = estimates[2:5:2] * seen[6:8]
+        variance = both[0] - cs
+        variance += both[1]
+        variance += seen[8] * square
+        variance += seen[9]
+        slope = seen[11]
+        steep = np.empty((2, len(along)))
+        np.divide(1.0, along, out=steep[0])
+        steep[1] = slope
+        gx, gy = steep * direction[0], steep * direction[1]
+        gx -= heights[:, 1]
+        gy -= heights[:, 2]
+        spread = (2.0 * estimates[3]) * gy
+        spread += gx * xx
+        spread *= gx
+        gy *= gy
+        gy *= yy
+        spread += gy
+        spread += heights[:, 3]
         spread[0] += _SIZE * _SIZE
         spread[1] += (SLOPE * SLOPE) * square + LEAST_ELEVATION_M2
-        other = np.array((spread[0] + _OTHER_SIZES, spread[1] + slopes * square))
+        other = spread.copy()
+        other[0] += _OTHER_SIZES
+        other[1] += slopes * square
         wanted = np.empty((4, len(along)))
         wanted[0] = along
         np.divide(variance, square, out=wanted[1])
         np.divide(other, spread, out=wanted[2:])
         logarithms = logs(wanted)
         log_along = logarithms[0]
-        ratio = across * across / variance + logarithms[1]
+        ratio = across * across
+        ratio /= variance
+        ratio += logarithms[1]
         residual = log_along - self._log_range
-        ratio += residual * residual / (self._range_variance + along_variance / square)
+        residual *= residual
+        residual /= along_variance / square + self._range_variance
+        ratio += residual
         behind = np.minimum(ahead - LEAST_M, 0.0)
-        ratio += behind * behind / (along_variance + _BEHIND_M2)
-        rest = np.array((height + log_along, along * slope)) - heights[:, 0]
-        part = np.maximum(rest * rest * (1.0 / other - 1.0 / spread) + logarithms[2:], _WORST_PART)
-        whole: Floats = (part[0] + part[1]) * (is_whole * (heights[0, 3] < _SIZE_KNOWN))
+        behind *= behind
+        behind /= along_variance + _BEHIND_M2
+        ratio += behind
+        rest = np.empty((2, len(along)))
+        np.add(seen[10], log_along, out=rest[0])
+        np.multiply(along, slope, out=rest[1])
+        rest -= heights[:, 0]
+        rest *= rest
+        np.divide(1.0, other, out=other)
+        np.divide(1.0, spread, out=spread)
+        other -= spread
+        rest *= other
+        rest += logarithms[2:]
+        part = np.maximum(rest, _WORST_PART)
+        whole: Floats = part[0] + part[1]
+        whole *= seen[12] * (heights[0, 3] < _SIZE_KNOWN)
         whole -= ratio
         whole *= 0.5
         whole += _ANYWHERE
         return whole
-
-
-def _column_of(sight: Sight) -> tuple[float, ...]:
-    """What `Agreement` compares of a sight, and products of its direction's parts."""
-    _, _, cos, sin, *_ = sight
-    whole = (0.0, 0.0, 0.0) if sight.log_height is None else (sight.log_height, sight.slope, 1.0)
-    return *sight[:6], *whole, cos * cos, sin * sin, 2.0 * cos * sin
 
 
 def log_of(value: float) -> float:
@@ -168,8 +252,16 @@ def log_of(value: float) -> float:
 def logs(values: Floats) -> Floats:
     """Natural logarithms of positive numbers, right to some 10⁻⁵, the same bits everywhere."""
     mantissas, twos = np.frexp(values)
-    s = (mantissas - 0.7071067811865476) / (mantissas + 0.7071067811865476)
+    s = mantissas - 0.7071067811865476
+    mantissas += 0.7071067811865476
+    s /= mantissas
     square = s * s
-    series = (square * 0.4 + 2.0 / 3.0) * square + 2.0
-    result: Floats = (twos - 0.5) * 0.6931471805599453 + s * series
+    series = square * 0.4
+    series += 2.0 / 3.0
+    series *= square
+    series += 2.0
+    series *= s
+    result: Floats = twos - 0.5
+    result *= 0.6931471805599453
+    result += series
     return result

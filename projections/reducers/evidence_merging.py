@@ -8,6 +8,8 @@ apart. Of several the one with the most evidence is taken, of equal ones that fo
 """
 
 import math
+from operator import itemgetter
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,19 +18,34 @@ from projections.deltas import MergeEvidence, ObjectOrdinal
 from projections.exact_functions import log
 from projections.pair_groups import PairGroups
 
-from .agreement import logs
+from .agreement import log_of
 from .label_counts import LABEL_WEIGHT, LabelCounts
-from .looks import LookRatios, LookScale
+from .looks import Exemplar, LookRatios, LookScale
+from .spots import COMMON_M2
 from .thing_index import ThingIndex
-from .things import INVERSE, RUN, SIDE_COS, SIDE_SIN, Thing
+from .things import INVERSE, ROW, RUN, SIDE_COS, SIDE_SIN, Thing
 
 _LOG_AREA = log(9.0) - 1.8378770664093453
 """log(9 m² / 2π)."""
 _WORST_CHI2 = 40.0
 _LEAST_GEOMETRY = -3.0
+_FARTHEST_CHI2 = 2.0 * (_LOG_AREA - _LEAST_GEOMETRY) - 2.0 * log(2.0 * COMMON_M2) + 0.1
+"""Above χ² of every pair of estimates that speaks enough: the variance of their difference is at
+least twice the common one in every direction."""
 _SHARE_OF_PICTURES = 10
 _MOST_PER_PAIR = 6.0
 _UNIT = 1 << 20
+
+
+class _Candidate(NamedTuple):
+    """An Object that may be the same; in how many pictures both are, how much the estimates speak
+    for one thing, and their squared distance in m²."""
+
+    ordinal: ObjectOrdinal
+    thing: Thing
+    both: int
+    geometry: float
+    far2: float
 
 
 class Merging:
@@ -54,44 +71,47 @@ class Merging:
         if thing.count < thing.checked:
             return None
         thing.checked = thing.count + 1 + thing.count // 2
-        x, y, xx, xy, yy = self._index.estimates[:5, ordinal].tolist()
-        near = self._index.near(x, y)
-        near = near[near != ordinal]
-        if not len(near):
-            return None
-        others = self._index.estimates[:5, near]
-        dx, dy = others[0] - x, others[1] - y
-        a, b, c = others[2] + xx, others[3] + xy, others[4] + yy
-        det = a * c - b * b
-        chi2 = (c * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / det
-        geometry = np.minimum(chi2, _WORST_CHI2) * -0.5 - 0.5 * logs(det) + _LOG_AREA
-        kept = (geometry > _LEAST_GEOMETRY).nonzero()[0]
-        candidates: list[tuple[int, ObjectOrdinal, Thing, int]] = []
-        for row, number in zip(kept.tolist(), near[kept].tolist(), strict=True):
-            partner = ObjectOrdinal(number)
+        candidates: list[_Candidate] = []
+        for partner in self._around(thing):
+            if partner == ordinal:
+                continue
             other = self._index.thing(partner)
             both = thing.met.get(partner, 0)
             if both * _SHARE_OF_PICTURES > min(thing.count, other.count):
                 continue
             if self._groups is not None and self._groups.conflicts(thing.groups, other.groups):
                 continue
-            candidates.append((row, partner, other, both))
+            geometry, far2 = _geometry(thing, other)
+            if geometry > _LEAST_GEOMETRY:
+                candidates.append(_Candidate(partner, other, both, geometry, far2))
         if not candidates:
             return None
         best: tuple[float, ObjectOrdinal, MergeEvidence] | None = None
-        looks = self._looks(thing, [other for _, _, other, _ in candidates])
-        for (row, partner, other, both), look in zip(candidates, looks, strict=True):
-            value = look + float(geometry[row])
+        looks = self._looks(thing, [candidate.thing for candidate in candidates])
+        for (partner, other, both, geometry, far2), look in zip(candidates, looks, strict=True):
+            value = look + geometry
             if value > 0.0 and (best is None or value > best[0]):
                 evidence = MergeEvidence(
                     round(look * 1000.0),
-                    round(float(geometry[row]) * 1000.0),
-                    round(math.sqrt(dx[row] * dx[row] + dy[row] * dy[row]) * 1e6),
+                    round(geometry * 1000.0),
+                    round(math.sqrt(far2) * 1e6),
                     both,
                     thing.count + other.count - both,
                 )
                 best = value, partner, evidence
         return None if best is None else best[1:]
+
+    def _around(self, thing: Thing) -> list[ObjectOrdinal]:
+        """The Objects within reach that are not too far for χ², at its best, and some more."""
+        x, y, xx, _, yy, *_ = thing.where()
+        listed = self._index.listed(x, y)
+        estimates = self._index.estimates.take(listed, axis=0).T
+        dx, dy = estimates[0] - x, estimates[1] - y
+        far2 = dx * dx + dy * dy
+        near = far2 < (estimates[2] + estimates[4] + (xx + yy)) * _FARTHEST_CHI2
+        near &= far2 <= self._index.reach_m * self._index.reach_m
+        around: list[ObjectOrdinal] = listed[near].tolist()
+        return around
 
     def look(self, one: Thing, other: Thing) -> float:
         """How much the looks of two things speak for one, as the logarithm of a ratio of two
@@ -100,12 +120,12 @@ class Merging:
 
     def _looks(self, one: Thing, others: list[Thing]) -> list[float]:
         """`look` for each of several others: their exemplars are columns of one matrix."""
-        counts = [other.exemplars for other in others]
+        counts = [len(other.marks) for other in others]
         agree = [o.class_name in one.classes or one.class_name in o.classes for o in others]
-        a = one.marks[: one.exemplars]
-        b = np.concatenate([other.marks[: other.exemplars] for other in others])
-        looks = np.concatenate([other.looks[: other.exemplars] for other in others])
-        dots = (one.looks[: one.exemplars] @ looks.T).astype(np.float64)
+        a = np.array(_by_row(one))
+        b = np.array([mark for other in others for mark in _by_row(other)])
+        looks = np.concatenate([other.looks[: len(other.marks)] for other in others])
+        dots = (one.looks[: len(one.marks)] @ looks.T).astype(np.float64)
         cosines = dots * a[:, INVERSE, np.newaxis] * b[:, INVERSE]
         different = self._scale.different()
         ratios = self._look_ratios.ratios(
@@ -121,7 +141,7 @@ class Merging:
         first = 0
         for other, count in zip(others, counts, strict=True):
             total = int(sums[first : first + count].sum())
-            mean = total / (one.exemplars * count * _UNIT)
+            mean = total / (len(one.marks) * count * _UNIT)
             values.append(mean + self._by_labels(one, other))
             first += count
         return values
@@ -130,5 +150,21 @@ class Merging:
         """The part of the labels in `look`."""
         labels = 0.0
         for label, count in other.classes.items():
-            labels += count * self._labels.ratio(one, label)
+            labels += count * self._labels.ratio(one, label, self._labels.usual(label))
         return LABEL_WEIGHT * labels / other.count
+
+
+def _geometry(thing: Thing, other: Thing) -> tuple[float, float]:
+    """How much two estimates speak for one thing, and their squared distance in m²."""
+    x, y, xx, xy, yy, *_ = thing.where()
+    other_x, other_y, a, b, c, *_ = other.where()
+    dx, dy, a, b, c = other_x - x, other_y - y, a + xx, b + xy, c + yy
+    det = a * c - b * b
+    chi2 = (c * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / det
+    geometry = min(chi2, _WORST_CHI2) * -0.5 - 0.5 * log_of(det) + _LOG_AREA
+    return geometry, dx * dx + dy * dy
+
+
+def _by_row(thing: Thing) -> list[Exemplar]:
+    """The exemplars in the order of the rows of their looks."""
+    return sorted(thing.marks, key=itemgetter(ROW))

@@ -80,7 +80,7 @@ class EvidenceObjects:
         self._index = ThingIndex(constants)
         self._object_of: dict[int, ObjectOrdinal] = {}  # group → its Object
         self._matching = Matching(
-            Agreement(constants.range_m, constants.range_spread),
+            Agreement(constants.range_m, constants.range_spread, self._index.reach_m),
             self._index,
             self._look_ratios,
             self._scale,
@@ -111,7 +111,6 @@ class EvidenceObjects:
         chosen = self._matching.choose(
             run, pose, labels, looks, inverses, sights, sightings, self._object_of
         )
-        inverse_of = inverses.tolist()  # 1 / length of each look
         deltas: list[ObjectDelta] = []
         seen: list[ObjectOrdinal] = []
         named: dict[ObjectOrdinal, str] = {}  # the classes before
@@ -128,7 +127,7 @@ class EvidenceObjects:
             sight = sights[k]
             spot = thing.spots.add(sight, share)
             if share >= _SURE:
-                thing.keep(looks[k], inverse_of[k], sight.side_cos, sight.side_sin, run)
+                thing.keep(looks[k], inverses[k], sight.side_cos, sight.side_sin, run)
             self._index.solve(ordinal, spot)
             seen.append(ordinal)
             deltas.append(
@@ -187,7 +186,7 @@ class EvidenceObjects:
         """Make an Object found elsewhere one with the one that stood here before, and estimate it
         from the later observations only."""
         thing, later = self._index.thing(moved.old), self._index.thing(moved.new)
-        before, after = self._index.estimates[:2, [moved.old, moved.new]].T.tolist()
+        before, after = thing.where()[:2], later.where()[:2]
         dx, dy = after[0] - before[0], after[1] - before[1]
         evidence = MergeEvidence(
             round(moved.look * 1000.0),

@@ -1,14 +1,10 @@
 """How much a label speaks for a thing: labels flicker, so agreement is evidence and no gate."""
 
-from collections.abc import Iterable, Sequence
-
-import numpy as np
-from numpy.typing import NDArray
+from collections.abc import Iterable
 
 from projections.reducers import State
 
-from .agreement import log_of, logs
-from .looks import Floats
+from .agreement import log_of
 from .things import Thing
 
 LABEL_WEIGHT = 0.5
@@ -30,27 +26,12 @@ class LabelCounts:
             self._counts[label] = self._counts.get(label, 0) + 1
             self._total += 1
 
-    def ratios(
-        self, things: Sequence[Thing], labels: Sequence[str]
-    ) -> tuple[Floats, NDArray[np.bool_]]:
-        """For each pair, log of the label's probability for the thing, over its usual one; and
-        whether the thing had the label before."""
-        usual_of = {label: self._usual(label) for label in set(labels)}
-        counts = np.array([thing.count for thing in things])
-        same = np.array(
-            [thing.classes.get(label, 0) for thing, label in zip(things, labels, strict=True)]
-        )
-        usual = np.array([usual_of[label] for label in labels])
-        own = (same + _DOUBT * usual) / (counts + _DOUBT)
-        return logs(own / usual), same > 0
-
-    def ratio(self, thing: Thing, label: str) -> float:
-        """The same of one pair."""
-        usual = self._usual(label)
+    def ratio(self, thing: Thing, label: str, usual: float) -> float:
+        """The logarithm of the label's probability for the thing, over its ``usual`` one."""
         own = (thing.classes.get(label, 0) + _DOUBT * usual) / (thing.count + _DOUBT)
         return log_of(own / usual)
 
-    def _usual(self, label: str) -> float:
+    def usual(self, label: str) -> float:
         """The label's probability among all observations."""
         return (self._counts.get(label, 0) + 1.0) / (self._total + 10.0)
 

@@ -13,6 +13,8 @@ Looks are kept as integer multiples of 2⁻¹¹ in float32: by Cauchy and Schwar
 product is at most about 2²², below 2²⁴, so products of matrices are exact with every BLAS.
 """
 
+import math
+from array import array
 from collections.abc import Sequence
 
 import numpy as np
@@ -27,24 +29,30 @@ Floats = NDArray[np.float64]
 Looks = NDArray[np.float32]
 """Rows of multiples of 2⁻¹¹."""
 LOOK_UNIT = 1 << 11
+Exemplar = tuple[float, float, float, int, int, int]
+"""1 / length of a look, line of sight (cosine, sine), run, kind of exemplar, row in the matrix."""
 _STEPS = 32
 _WORST = 8.0
 _LOOK_ALIKE = 0.05
 _SHARES = (0.02, 0.1, 0.88), (0.15, 0.85, 0.1)
 """Of look-alikes, others of the class, others, among two things whose labels differ or agree."""
 _LEAST_LIKENESS, _PER_LIKENESS, _LIKENESSES = -1.0, 128.0, 289
+_OF_ONE_RUN = (_STEPS + 1) * _LIKENESSES
+"""Numbers of the table for labels that agree, or do not, and one run or two."""
+_BEST = 4
+_MISSING = 0.125
+"""Of the exemplars the best four count; each that is missing costs an eighth."""
 _RECENT = 8
 _ENOUGH_PAIRS = 3_000
 _FIRST_GUESS, _GUESS_WEIGHT = 0.5, 0.5
 
 
-def looks_of(vectors: Sequence[Floats]) -> tuple[Looks, Floats]:
+def looks_of(vectors: Sequence[Floats]) -> tuple[Looks, list[float]]:
     """Looks of unit vectors in multiples of 2⁻²⁰, and the inverses of their lengths."""
     scaled = np.array(vectors)
     scaled *= LOOK_UNIT / UNIT
     looks = np.rint(scaled, out=scaled).astype(np.float32)
-    squares = np.einsum("ij,ij->i", looks, looks).astype(np.float64)
-    return looks, 1.0 / np.sqrt(np.maximum(squares, 1.0))
+    return looks, [1.0 / math.sqrt(max(float(look.dot(look)), 1.0)) for look in looks]
 
 
 class LookRatios:
@@ -72,13 +80,54 @@ class LookRatios:
             one = other * other * -0.5 + (log(shares[2]) + other_height)
             parts.append(same - np.maximum(different, one))
         self._table = np.array(parts).ravel()  # agree, other run, side, likeness
+        self._flat = array("d", self._table.tobytes())  # quicker for one number
         self._best = [-log(shares[0]) for shares in _SHARES]
 
-    def at_best(self, labels_agree: NDArray[np.bool_]) -> Floats:
+    def at_best(self, labels_agree: bool) -> float:
         """The largest ratio at likenesses that occur. Far below those, where the likelihood of one
         thing is cut off at `_WORST` and that of two is not, ratios are larger."""
-        best: Floats = np.where(labels_agree, self._best[1], self._best[0])
-        return best
+        return self._best[labels_agree]
+
+    def of_exemplars(
+        self,
+        dots: list[float],
+        exemplars: Sequence[Exemplar],
+        inverse: float,
+        cos: float,
+        sin: float,
+        run: int,
+        labels_agree: bool,
+        different: float,
+    ) -> tuple[float, float]:
+        """The ratio of a look and the exemplars of a thing, and the best cosine. ``dots`` are the
+        products of the look and each exemplar by its row."""
+        per_cosine = 1.0 / (1.0 - different)
+        table, first = self._flat, labels_agree * (2 * _OF_ONE_RUN)
+        best = -1.0
+        ratios: list[float] = []
+        for other_inverse, other_cos, other_sin, other_run, _, row in exemplars:
+            cosine = dots[row] * other_inverse * inverse
+            if cosine > best:
+                best = cosine
+            place = round(((cosine - different) * per_cosine - _LEAST_LIKENESS) * _PER_LIKENESS)
+            if place < 0:
+                place = 0
+            elif place >= _LIKENESSES:
+                place = _LIKENESSES - 1
+            step = round((other_cos * cos + other_sin * sin + 1.0) * (_STEPS / 2))
+            if step < 0:
+                step = 0
+            elif step > _STEPS:
+                step = _STEPS
+            if other_run != run:
+                place += _OF_ONE_RUN
+            ratios.append(table[first + step * _LIKENESSES + place])
+        ratios.sort(reverse=True)
+        count = min(len(ratios), _BEST)
+        total = ratios[0]
+        for rank in range(1, count):
+            total += ratios[rank]
+        return total / count - _MISSING * (_BEST - count), best
 
     def ratios(
         self,

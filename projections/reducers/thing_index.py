@@ -15,29 +15,29 @@ from projections.evidence import EvidenceConstants
 from projections.exact_functions import exp
 from projections.reducers import State, part, prefixed
 
-from .agreement import ESTIMATE_FIELDS
 from .class_heights import ClassHeights
 from .looks import Floats
 from .spots import PART_SIZE, Estimate, Part, Solver, Spot, Spots
-from .things import Thing
+from .things import ROW, Thing
 
 _REACH_SPREADS, _REACH_MORE_M = 1.5, 1.5
 _UM, _UM2 = 1e6, 1e12
 
 
 class ThingIndex:
-    """Objects by ordinal, their estimates as one matrix, and the grid. Absorbed ones are None."""
+    """Objects by ordinal, their estimates as rows of one matrix, and the grid. Absorbed ones are
+    None."""
 
     def __init__(self, constants: EvidenceConstants) -> None:
         spreads = exp(_REACH_SPREADS * constants.range_spread)
-        self._reach_m = constants.range_m * spreads + _REACH_MORE_M
+        self.reach_m = constants.range_m * spreads + _REACH_MORE_M
         self._solver = Solver(constants.range_m, constants.range_spread)
         self._heights = ClassHeights(constants.sizes_m, constants.size_spread)
         self._things: list[Thing | None] = []
         self._survivors: dict[ObjectOrdinal, ObjectOrdinal] = {}
         self._near: dict[tuple[int, int], list[ObjectOrdinal]] = {}
         self._sorted: dict[tuple[int, int], NDArray[np.int64]] = {}  # `_near` as arrays
-        self.estimates: Floats = np.zeros((ESTIMATE_FIELDS, 64))
+        self.estimates: Floats = np.zeros((64, len(Estimate._fields)))
 
     def thing(self, ordinal: ObjectOrdinal) -> Thing:
         """An Object that is not absorbed."""
@@ -63,39 +63,32 @@ class ThingIndex:
         """Estimate anew where an Object stands, and list it there; one spot has changed, or all."""
         thing = self.thing(ordinal)
         prior = self._heights.prior(thing.class_name)
-        is_new = thing.estimate is None
-        if thing.estimate is None:
+        before = thing.estimate
+        if before is None:
             made = self._solver.first(thing.spots, prior)
         else:
-            made = self._solver.next(thing.spots, prior, thing.estimate, spot)
+            made = self._solver.next(thing.spots, prior, before, spot)
         thing.estimate = made
-        self.estimates[:, ordinal] = made
-        cell = int(made.x // self._reach_m), int(made.y // self._reach_m)
-        if is_new or cell != thing.cell:
-            if not is_new:
+        self.estimates[ordinal] = made
+        x, y, xx, _, yy, log_size, _, _, log_size_variance, elevation, *_ = made
+        cell = int(x // self.reach_m), int(y // self.reach_m)
+        if before is None or cell != thing.cell:
+            if before is not None:
                 self._unlist(ordinal, thing.cell)
             self._list(ordinal, thing, cell)
         thing.given = self._heights.give(
             thing.given,
             thing.class_name,
-            made.log_size,
-            made.log_size_variance,
-            made.elevation,
-            made.xx + made.yy,
+            log_size,
+            log_size_variance,
+            elevation,
+            xx + yy,
             thing.spots.seen_from,
         )
 
-    def near(self, x: float, y: float) -> NDArray[np.int64]:
-        """The Objects within reach of a point, ascending."""
-        reach = self._reach_m
-        ordinals = self._listed((int(x // reach), int(y // reach)))
-        dx = self.estimates[0].take(ordinals) - x
-        dy = self.estimates[1].take(ordinals) - y
-        near: NDArray[np.int64] = ordinals[dx * dx + dy * dy <= reach * reach]
-        return near
-
-    def _listed(self, cell: tuple[int, int]) -> NDArray[np.int64]:
-        """The Objects listed in a cell, ascending; kept until the list changes."""
+    def listed(self, x: float, y: float) -> NDArray[np.int64]:
+        """The Objects within reach of a point and some around, ascending; kept until it changes."""
+        cell = int(x // self.reach_m), int(y // self.reach_m)
         ordinals = self._sorted.get(cell)
         if ordinals is None:
             ordinals = self._sorted[cell] = np.array(sorted(self._near.get(cell, ())), np.int64)
@@ -129,7 +122,8 @@ class ThingIndex:
 
     def estimated(self, offset: Offset, ordinal: ObjectOrdinal) -> ObjectEstimated:
         """The delta of an Object's estimate."""
-        x, y, xx, xy, yy = self.estimates[:5, ordinal].tolist()
+        thing = self.thing(ordinal)
+        x, y, xx, xy, yy, *_ = thing.where()
         return ObjectEstimated(
             offset,
             ordinal,
@@ -138,12 +132,12 @@ class ThingIndex:
             round(xx * _UM2),
             round(xy * _UM2),
             round(yy * _UM2),
-            self.thing(ordinal).spots.seen_from,
+            thing.spots.seen_from,
         )
 
     def _make_room(self, count: int) -> None:
-        while self.estimates.shape[1] < count:
-            self.estimates = np.concatenate([self.estimates, self.estimates * 0.0], axis=1)
+        while len(self.estimates) < count:
+            self.estimates = np.concatenate([self.estimates, self.estimates * 0.0])
 
     def _list(self, ordinal: ObjectOrdinal, thing: Thing, cell: tuple[int, int]) -> None:
         thing.cell = cell
@@ -160,15 +154,15 @@ class ThingIndex:
         """Everything, for a snapshot. The looks are one matrix, a row for each exemplar."""
         alive = [(o, thing) for o, thing in enumerate(self._things) if thing is not None]
         things = [thing for _, thing in alive]
-        looks = [thing.looks[: thing.exemplars] for thing in things]
-        marks = [thing.marks[: thing.exemplars] for thing in things]
+        looks = [thing.looks[[mark[ROW] for mark in thing.marks]] for thing in things]
+        marks = [mark[:ROW] for thing in things for mark in thing.marks]
         spots = [spot + part for t in things for spot, part in _spots_and_parts(t)]
         return {
             "size": len(self._things),
             "survivors": sorted(map(list, self._survivors.items())),
             "ordinals": [ordinal for ordinal, _ in alive],
             "sums": [
-                [t.count, t.sum_x_um, t.sum_y_um, t.checked, t.exemplars, len(t.spots.spots)]
+                [t.count, t.sum_x_um, t.sum_y_um, t.checked, len(t.marks), len(t.spots.spots)]
                 for t in things
             ],
             "spots_ever": [thing.spots.seen_from for thing in things],
@@ -181,7 +175,7 @@ class ThingIndex:
             "spots": np.array(spots),
             "normal": np.array([[*t.spots.at, *t.spots.total] for t in things]),
             "looks": np.concatenate(looks).astype(np.int16) if looks else np.zeros((0, 0)),
-            "marks": np.concatenate(marks) if marks else np.zeros((0, 5)),
+            "marks": np.array(marks, np.float64).reshape(-1, ROW),
         } | prefixed("heights", self._heights.dump())
 
     def load(self, state: State) -> None:
@@ -190,7 +184,7 @@ class ThingIndex:
         self._survivors = {ObjectOrdinal(a): ObjectOrdinal(b) for a, b in state["survivors"]}
         self._heights.load(part("heights", state))
         self._make_room(state["size"])
-        looks, marks, spots = state["looks"], state["marks"], state["spots"].tolist()
+        looks, marks, spots = state["looks"], state["marks"].tolist(), state["spots"].tolist()
         seen, estimates = state["seen"].tolist(), state["estimates"].tolist()
         first_look = first_spot = 0
         for row, ordinal in enumerate(state["ordinals"]):
@@ -207,14 +201,18 @@ class ThingIndex:
                 dict(classes),
                 Spots(),
                 looks[first_look : first_look + exemplars].astype(np.float32),
-                exemplars=exemplars,
+                [
+                    (inverse, cos, sin, int(run), int(kind), number)
+                    for number, (inverse, cos, sin, run, kind) in enumerate(
+                        marks[first_look : first_look + exemplars]
+                    )
+                ],
                 met={ObjectOrdinal(other): n for other, n in state["met"][row]},
                 checked=checked,
                 given=None if given is None else (given[0], given[1], given[2]),
                 estimate=Estimate(*estimates[row]),
                 groups=set(state["groups"][row]),
             )
-            thing.marks[:exemplars] = marks[first_look : first_look + exemplars]
             thing.spots.seen_from = state["spots_ever"][row]
             for numbers in spots[first_spot : first_spot + spot_count]:
                 thing.spots.spots.append(numbers[:-PART_SIZE])
@@ -223,10 +221,10 @@ class ThingIndex:
             thing.spots.at = at_x, at_y
             first_look, first_spot = first_look + exemplars, first_spot + spot_count
             self._things[ordinal] = thing
-            self.estimates[:, ordinal] = estimates[row]
+            self.estimates[ordinal] = estimates[row]
             cell = (
-                int(estimates[row][0] // self._reach_m),
-                int(estimates[row][1] // self._reach_m),
+                int(estimates[row][0] // self.reach_m),
+                int(estimates[row][1] // self.reach_m),
             )
             self._list(ObjectOrdinal(ordinal), thing, cell)
 

@@ -5,6 +5,7 @@ eighth of the directions the newest `_OF_A_KIND`, and `MOST_EXEMPLARS` in all; t
 """
 
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,19 +13,24 @@ from numpy.typing import NDArray
 from projections.deltas import ObjectOrdinal
 
 from .class_heights import Given
+from .looks import Exemplar
 from .spots import Estimate, Spots
 
 MOST_EXEMPLARS = 6
 _OF_A_KIND = 3
-INVERSE, SIDE_COS, SIDE_SIN, RUN, KIND = range(5)
-"""Columns of ``marks``: 1 / length of the look, line of sight, run, kind of exemplar."""
+INVERSE, SIDE_COS, SIDE_SIN, RUN = range(4)
+KIND: Final = 4
+ROW: Final = 5
+"""Fields of an exemplar in ``marks``."""
 
 
 @dataclass(slots=True, eq=False)
 class Thing:
-    """``classes`` counts observations by class, the class seen first being first; ``met`` the
+    """``classes`` counts observations by class, the class seen first being first. ``marks`` are the
+    exemplars, the oldest first; their looks are the first rows of ``looks``. ``met`` counts the
     pictures that show another thing too. ``checked`` is at how many observations the next search
-    for a thing to merge with is due."""
+    for a thing to merge with is due. The kind of an exemplar is its run and the eighth of the
+    directions."""
 
     count: int
     sum_x_um: int
@@ -35,8 +41,7 @@ class Thing:
     classes: dict[str, int]
     spots: Spots
     looks: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
-    marks: NDArray[np.float64] = field(default_factory=lambda: np.zeros((MOST_EXEMPLARS, 5)))
-    exemplars: int = 0
+    marks: list[Exemplar] = field(default_factory=list)
     cell: tuple[int, int] = (0, 0)
     met: dict[ObjectOrdinal, int] = field(default_factory=dict)
     checked: int = 2
@@ -48,18 +53,24 @@ class Thing:
         self, look: NDArray[np.float32], inverse: float, cos: float, sin: float, run: int
     ) -> None:
         """Make a look an exemplar."""
-        kind = run * 8 + _eighth(cos, sin)
-        count = self.exemplars
-        alike = [i for i, other in enumerate(self.marks[:count, KIND].tolist()) if other == kind]
+        kind = run * 8 + (cos > 0.0) * 4 + (sin > 0.0) * 2 + (abs(cos) > abs(sin))
+        marks = self.marks
+        row = len(marks)
+        alike = [i for i, mark in enumerate(marks) if mark[KIND] == kind]
         if len(alike) >= _OF_A_KIND:
-            count = self._drop(alike[0])
-        elif count >= MOST_EXEMPLARS:
-            count = self._drop(0)
-        elif count >= len(self.looks):
-            self._grow(min(max(2 * count, 1), MOST_EXEMPLARS), len(look))
-        self.looks[count] = look
-        self.marks[count] = inverse, cos, sin, run, kind
-        self.exemplars = count + 1
+            row = marks.pop(alike[0])[ROW]
+        elif row >= MOST_EXEMPLARS:
+            row = marks.pop(0)[ROW]
+        elif row >= len(self.looks):
+            self._grow(min(max(2 * row, 1), MOST_EXEMPLARS), len(look))
+        self.looks[row] = look
+        marks.append((inverse, cos, sin, run, kind, row))
+
+    def where(self) -> Estimate:
+        """The estimate, which every thing has that is in the index."""
+        if self.estimate is None:
+            raise ValueError("this thing was never estimated")
+        return self.estimate
 
     def count_label(self, label: str) -> None:
         """Count an observation's label. As `reclassify`, without a look at all classes."""
@@ -87,26 +98,13 @@ class Thing:
             self.classes[class_name] = self.classes.get(class_name, 0) + count
         self.spots.take_in(other.spots)
         self.groups |= other.groups
-        for look, mark in zip(
-            other.looks[: other.exemplars], other.marks[: other.exemplars].tolist(), strict=True
-        ):
-            self.keep(look, mark[INVERSE], mark[SIDE_COS], mark[SIDE_SIN], int(mark[RUN]))
+        for inverse, cos, sin, run, _, row in other.marks:
+            self.keep(other.looks[row], inverse, cos, sin, run)
         self.reclassify()
 
-    def _drop(self, index: int) -> int:
-        last = self.exemplars - 1
-        self.looks[index:last] = self.looks[index + 1 : last + 1].copy()
-        self.marks[index:last] = self.marks[index + 1 : last + 1].copy()
-        return last
-
     def _grow(self, size: int, dim: int) -> None:
-        count = self.exemplars
+        count = len(self.looks)
         looks = np.zeros((size, dim), np.float32)
         if count:
             looks[:count] = self.looks
         self.looks = looks
-
-
-def _eighth(cos: float, sin: float) -> int:
-    """Which eighth of the directions, 0 to 7."""
-    return (cos > 0.0) * 4 + (sin > 0.0) * 2 + (abs(cos) > abs(sin))
