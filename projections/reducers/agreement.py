@@ -39,6 +39,7 @@ _BEHIND_M2 = 0.04
 _SLOPE_GUESS, _GUESS_PAIRS = 0.01, 10.0
 LEAST_AGREEMENT = -5.0
 """Below it the sight alone rules a pair out."""
+_FEW = 12
 _SEEN = 13
 _SLACK, _SLACK_CHI2, _SLACK_M2 = 1.001, 0.01, 1e-4
 
@@ -99,11 +100,20 @@ class Agreement:
         most = 2.0 * (_ANYWHERE - LEAST_AGREEMENT)
         most_whole = most + log_of(1.0 + _OTHER_SIZES / (_SIZE * _SIZE))
         most_whole += log_of(1.0 + slopes / LEAST_ELEVATION_M2)
-        seen = np.array([self._row_of(sight, most, most_whole) for sight in sights])
+        of_sights = [self._row_of(sight, most, most_whole) for sight in sights]
+        seen = np.array(of_sights)
         rows, columns = self._sieve(estimates, seen)
         if not len(rows):
             return _NO_PAIRS
-        ratios = self._ratios(estimates.take(rows, axis=0).T, seen.take(columns, axis=0).T, slopes)
+        if len(rows) <= _FEW:
+            of_rows = estimates.take(rows, axis=0).tolist()
+            places, numbers = columns.tolist(), range(len(rows))
+            found = [self.ratio(of_rows[n], of_sights[places[n]], slopes) for n in numbers]
+            few = [n for n in numbers if found[n] > LEAST_AGREEMENT]
+            return Pairs(rows.take(few), [places[n] for n in few], [found[n] for n in few])
+        ratios = self.ratios(
+            estimates.take(rows, axis=0).T.copy(), seen.take(columns, axis=0).T.copy(), slopes
+        )
         kept = (ratios > LEAST_AGREEMENT).nonzero()[0]
         return Pairs(rows.take(kept), columns.take(kept).tolist(), ratios.take(kept).tolist())
 
@@ -141,9 +151,7 @@ class Agreement:
             chi2 * per_m2,
         )
 
-    def _sieve(
-        self, estimates: Floats, seen: Floats
-    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def _sieve(self, estimates: Floats, seen: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """The pairs whose ratio is above `LEAST_AGREEMENT` and that are within reach, and some
         more; quick, since most pairs are far from it.
 
@@ -152,19 +160,62 @@ class Agreement:
         its rounding errors, which differ from machine to machine.
         """
         count = len(seen)
-        factors = seen[:, _SEEN : _SEEN + 20].reshape(4 * count, 5)
         here = np.array((seen[0, 0], seen[0, 1], 0.0, 0.0, 0.0))
-        products = (estimates[:, :5] - here).dot(factors.T).reshape(-1, count, 4)
-        ahead, squares = products[:, :, 0], products[:, :, :2] * products[:, :, :2]
-        limits = products[:, :, 2:] + seen[:, -3:-1]
-        ahead2, across2 = squares[:, :, 0], squares[:, :, 1]
-        may_be = across2 < limits[:, :, 0] + ahead2 * seen[:, -1]
-        may_be &= ahead2 + across2 < self._reach_m2 * _SLACK
-        may_be &= np.minimum(ahead, 0.0) * ahead < limits[:, :, 1]
-        rows, columns = may_be.nonzero()
+        factors = seen[:, _SEEN : _SEEN + 20].reshape(count, 4, 5).transpose(1, 0, 2)
+        products = factors.reshape(4 * count, 5).dot((estimates[:, :5] - here).T)
+        products = products.reshape(4, count, -1)
+        more, behind, per_m2 = seen[:, -3:].T[:, :, np.newaxis]
+        ahead, squares = products[0], products[:2] * products[:2]
+        limit = squares[0] * per_m2
+        limit += products[2]
+        limit += more
+        may_be: NDArray[np.bool_] = squares[1] < limit
+        limit = squares[0] + squares[1]
+        may_be &= limit < self._reach_m2 * _SLACK
+        limit = np.minimum(ahead, 0.0)
+        limit *= ahead
+        products[3] += behind
+        may_be &= limit < products[3]
+        rows, columns = may_be.T.nonzero()
         return rows, columns
 
-    def _ratios(self, estimates: Floats, seen: Floats, slopes: float) -> Floats:
+    def ratio(self, estimate: Sequence[float], seen: Sequence[float], slopes: float) -> float:
+        """`ratios` of one pair, to the last bit; quicker for few."""
+        x, y, xx, xy, yy, size, size_x, size_y, size_variance, *elevation = estimate
+        px, py, cos, sin, cc, twice_cs, ss, _, per_m2, least, height, slope, whole = seen[:_SEEN]
+        dx, dy = x - px, y - py
+        ahead, across = dx * cos + dy * sin, dy * cos - dx * sin
+        along = max(LEAST_M, ahead)
+        square = along * along
+        cs = twice_cs * xy
+        along_variance = xx * cc + cs + yy * ss
+        variance = xx * ss - cs + yy * cc + per_m2 * square + least
+        ratio = across * across / variance + log_of(variance / square)
+        log_along = log_of(along)
+        residual = log_along - self._log_range
+        ratio += residual * residual / (self._range_variance + along_variance / square)
+        if ahead < LEAST_M:
+            behind = ahead - LEAST_M
+            ratio += behind * behind / (along_variance + _BEHIND_M2)
+        if not (whole and size_variance < _SIZE_KNOWN):
+            return -ratio * 0.5 + _ANYWHERE
+        gx, gy = 1.0 / along * cos - size_x, 1.0 / along * sin - size_y
+        spread = gx * (gx * xx + 2.0 * xy * gy) + gy * gy * yy + size_variance + _SIZE * _SIZE
+        other = spread + _OTHER_SIZES
+        rest = height + log_along - size
+        part = rest * rest * (1.0 / other - 1.0 / spread) + log_of(other / spread)
+        speaks = max(_WORST_PART, part)
+        height, height_x, height_y, height_variance = elevation
+        gx, gy = slope * cos - height_x, slope * sin - height_y
+        spread = gx * (gx * xx + 2.0 * xy * gy) + gy * gy * yy + height_variance
+        spread += (SLOPE * SLOPE) * square + LEAST_ELEVATION_M2
+        other = spread + slopes * square
+        rest = along * slope - height
+        part = rest * rest * (1.0 / other - 1.0 / spread) + log_of(other / spread)
+        speaks += max(_WORST_PART, part)
+        return (speaks - ratio) * 0.5 + _ANYWHERE
+
+    def ratios(self, estimates: Floats, seen: Floats, slopes: float) -> Floats:
         """The ratio of each pair: columns of the two matrices."""
         xx, yy = estimates[2], estimates[4]
         heights = estimates[5:].reshape(2, 4, -1)  # of log size and elevation

@@ -52,19 +52,15 @@ class ClassHeights:
         sums = self._sums.get(class_name)
         if sums is None or sums[0] == 0:
             return stated
-        count = sums[0]
+        count, sizes, sizes2, elevations, elevations2 = sums
         share = (1.0 + 1.0 / count) / (count + _UNKNOWN - 1.0)
-        log_size, size_spread = _moments(count, sums[1], sums[2])
-        elevation, elevation_spread = _moments(count, sums[3], sums[4])
-        learned = HeightPrior(
-            log_size,
-            1.0 / ((size_spread + _UNKNOWN * _SPREAD * _SPREAD) * share),
-            elevation,
-            1.0 / ((elevation_spread + _UNKNOWN * _SPREAD * _SPREAD) * share),
-        )
-        if class_name not in self._stated:
-            return learned
-        return HeightPrior(stated[0], stated[1], learned[2], learned[3])
+        elevation, spread = _moments(count, elevations, elevations2)
+        of_elevation = elevation, 1.0 / ((spread + _UNKNOWN * _SPREAD * _SPREAD) * share)
+        if class_name in self._stated:
+            return HeightPrior(stated[0], stated[1], *of_elevation)
+        log_size, spread = _moments(count, sizes, sizes2)
+        weight = 1.0 / ((spread + _UNKNOWN * _SPREAD * _SPREAD) * share)
+        return HeightPrior(log_size, weight, *of_elevation)
 
     def give(
         self,
@@ -77,12 +73,15 @@ class ClassHeights:
         spots: int,
     ) -> Given | None:
         """Replace what a thing gave before; nothing if it is not sure enough now."""
-        if before is not None:
-            self.take_back(before)
         if spots < 2 or variance_m2 >= _SURE_M2 or size_variance >= _SURE_SIZE:
+            if before is not None:
+                self._add(before, -1)
             return None
         given = class_name, round(log_size * _UNIT), round(elevation * _UNIT)
-        self._add(given, 1)
+        if given != before:
+            if before is not None:
+                self._add(before, -1)
+            self._add(given, 1)
         return given
 
     def take_back(self, given: Given) -> None:
@@ -91,7 +90,9 @@ class ClassHeights:
 
     def _add(self, given: Given, sign: int) -> None:
         class_name, size, elevation = given
-        sums = self._sums.setdefault(class_name, [0, 0, 0, 0, 0])
+        sums = self._sums.get(class_name)
+        if sums is None:
+            sums = self._sums[class_name] = [0, 0, 0, 0, 0]
         sums[0] += sign
         sums[1] += sign * size
         sums[2] += sign * size * size

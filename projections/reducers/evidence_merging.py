@@ -66,10 +66,9 @@ class Merging:
         self._groups = groups
 
     def partner_of(self, ordinal: ObjectOrdinal) -> tuple[ObjectOrdinal, MergeEvidence] | None:
-        """The Object that is the same, and why; None if there is none or no search is due."""
+        """The Object that is the same, and why; None if there is none. Call it where the Object has
+        as many observations as its ``checked``, or more."""
         thing = self._index.thing(ordinal)
-        if thing.count < thing.checked:
-            return None
         thing.checked = thing.count + 1 + thing.count // 2
         candidates: list[_Candidate] = []
         for partner in self._around(thing):

@@ -115,20 +115,28 @@ class EvidenceObjects:
         seen: list[ObjectOrdinal] = []
         named: dict[ObjectOrdinal, str] = {}  # the classes before
         to_unite: list[tuple[ObjectOrdinal, ObjectOrdinal]] = []
+        index, groups, group, own = self._index, self._groups, None, None
         for k, sighting in enumerate(sightings):
             wanted, cosine, share = chosen[k]
-            group = None if self._groups is None else self._groups.group_of.get(sighting.det_id)
-            own = None if group is None else self._object_of.get(group)
-            if group is not None:
-                wanted = self._allowed(group, own, wanted)
-            ordinal, found = self._take(offset, sighting, wanted, pose, timestamp, named)
-            deltas += found
-            thing = self._index.thing(ordinal)
+            if groups is not None:
+                group = groups.group_of.get(sighting.det_id)
+                own = None if group is None else self._object_of.get(group)
+                if group is not None:
+                    wanted = self._allowed(group, own, wanted)
+            if wanted is None:
+                ordinal, found = self._found(offset, sighting, pose, timestamp)
+                named[ordinal] = sighting.class_name
+                deltas.append(found)
+                thing = index.thing(ordinal)
+            else:
+                ordinal, thing = wanted, index.thing(wanted)
+                named.setdefault(ordinal, thing.class_name)
+                _count(thing, ordinal, sighting.class_name, pose, timestamp)
             sight = sights[k]
             spot = thing.spots.add(sight, share)
             if share >= _SURE:
                 thing.keep(looks[k], inverses[k], sight.side_cos, sight.side_sin, run)
-            self._index.solve(ordinal, spot)
+            index.solve(ordinal, thing, spot)
             seen.append(ordinal)
             deltas.append(
                 ObjectSeen(
@@ -149,22 +157,28 @@ class EvidenceObjects:
                     self._object_of[group] = ordinal
                 elif own != ordinal:
                     to_unite.append((own, ordinal))
-        self._index.count_meetings(seen)
+        index.count_meetings(seen)
         changed = set(seen)
         for pair in to_unite:
-            one, other = map(self._index.survivor_of, pair)
+            one, other = map(index.survivor_of, pair)
             if one != other:
                 deltas.append(self._unite(offset, one, other, changed, named, None))
         for ordinal in sorted(changed):
-            partner = self._merging.partner_of(ordinal) if ordinal in changed else None
+            if ordinal not in changed:
+                continue
+            thing = index.thing(ordinal)
+            if thing.count < thing.checked:
+                continue
+            partner = self._merging.partner_of(ordinal)
             if partner is not None:
                 other, why = partner
                 deltas.append(self._unite(offset, ordinal, other, changed, named, why))
-        for ordinal in sorted(changed):
-            class_name = self._index.thing(ordinal).class_name
+        ascending = sorted(changed)
+        for ordinal in ascending:
+            class_name = index.thing(ordinal).class_name
             if class_name != named[ordinal]:
                 deltas.append(ObjectClassified(offset, ordinal, class_name))
-        deltas += [self._index.estimated(offset, ordinal) for ordinal in sorted(changed)]
+        deltas += [index.estimated(offset, ordinal) for ordinal in ascending]
         return deltas
 
     def class_of(self, ordinal: ObjectOrdinal) -> str:
@@ -235,38 +249,15 @@ class EvidenceObjects:
         others = self._index.thing(wanted).groups
         return own if wanted != own and self._groups.conflicts(inside, others) else wanted
 
-    def _take(
-        self,
-        offset: Offset,
-        sighting: Sighting,
-        wanted: ObjectOrdinal | None,
-        pose: Pose,
-        timestamp: float,
-        named: dict[ObjectOrdinal, str],
-    ) -> tuple[ObjectOrdinal, list[ObjectFound]]:
-        """Add the observation to the wanted Object's sums, or found one."""
-        label = sighting.class_name
-        if wanted is None:
-            times = timestamp, timestamp
-            thing = Thing(1, pose.x_um, pose.y_um, *times, label, {label: 1}, Spots())
-            ordinal = self._index.add(thing)
-            named[ordinal] = label
-            identity = object_id(sighting.det_id)
-            return ordinal, [ObjectFound(offset, ordinal, identity, label, sighting.observation)]
-        thing = self._index.thing(wanted)
-        if thing.count >= MAX_IN_A_SUM:
-            raise OverflowError(
-                f"object {wanted} of class {thing.class_name!r} has {MAX_IN_A_SUM} observations, "
-                "the bound of its exact arithmetic"
-            )
-        named.setdefault(wanted, thing.class_name)
-        thing.count += 1
-        thing.sum_x_um += pose.x_um
-        thing.sum_y_um += pose.y_um
-        thing.first_seen = min(thing.first_seen, timestamp)
-        thing.last_seen = max(thing.last_seen, timestamp)
-        thing.count_label(label)
-        return wanted, []
+    def _found(
+        self, offset: Offset, sighting: Sighting, pose: Pose, timestamp: float
+    ) -> tuple[ObjectOrdinal, ObjectFound]:
+        """Found an Object."""
+        label, times = sighting.class_name, (timestamp, timestamp)
+        thing = Thing(1, pose.x_um, pose.y_um, *times, label, {label: 1}, Spots())
+        ordinal = self._index.add(thing)
+        identity = object_id(sighting.det_id)
+        return ordinal, ObjectFound(offset, ordinal, identity, label, sighting.observation)
 
     def _unite(
         self,
@@ -297,3 +288,20 @@ class EvidenceObjects:
             thing.last_seen,
             evidence,
         )
+
+
+def _count(thing: Thing, ordinal: ObjectOrdinal, label: str, pose: Pose, timestamp: float) -> None:
+    """Add an observation to an Object's sums."""
+    if thing.count >= MAX_IN_A_SUM:
+        raise OverflowError(
+            f"object {ordinal} of class {thing.class_name!r} has {MAX_IN_A_SUM} observations, "
+            "the bound of its exact arithmetic"
+        )
+    thing.count += 1
+    thing.sum_x_um += pose.x_um
+    thing.sum_y_um += pose.y_um
+    if timestamp > thing.last_seen:
+        thing.last_seen = timestamp
+    elif timestamp < thing.first_seen:
+        thing.first_seen = timestamp
+    thing.count_label(label)

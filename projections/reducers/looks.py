@@ -49,9 +49,9 @@ _FIRST_GUESS, _GUESS_WEIGHT = 0.5, 0.5
 
 def looks_of(vectors: Sequence[Floats]) -> tuple[Looks, list[float]]:
     """Looks of unit vectors in multiples of 2⁻²⁰, and the inverses of their lengths."""
-    scaled = np.array(vectors)
-    scaled *= LOOK_UNIT / UNIT
-    looks = np.rint(scaled, out=scaled).astype(np.float32)
+    looks = np.array(vectors, np.float32)  # exact: 21 bits
+    looks *= np.float32(LOOK_UNIT / UNIT)
+    np.rint(looks, out=looks)
     return looks, [1.0 / math.sqrt(max(float(look.dot(look)), 1.0)) for look in looks]
 
 
@@ -115,10 +115,6 @@ class LookRatios:
             elif place >= _LIKENESSES:
                 place = _LIKENESSES - 1
             step = round((other_cos * cos + other_sin * sin + 1.0) * (_STEPS / 2))
-            if step < 0:
-                step = 0
-            elif step > _STEPS:
-                step = _STEPS
             if other_run != run:
                 place += _OF_ONE_RUN
             ratios.append(table[first + step * _LIKENESSES + place])

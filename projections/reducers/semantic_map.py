@@ -18,7 +18,6 @@ The fold has no clock, chance, disk, network or database. The same events give t
 
 from collections.abc import Sequence
 from functools import reduce
-from itertools import zip_longest
 from operator import or_
 from typing import TypeAlias
 
@@ -386,10 +385,11 @@ class SemanticMap:
         self, fused: Sequence[Delta], keyframe: KeyframeOrdinal, place: PlaceOrdinal | None
     ) -> None:
         """Tell located-in what was seen, what became one and what stands elsewhere."""
-        for delta, following in zip_longest(fused, fused[1:]):
+        for number, delta in enumerate(fused, start=1):
             if type(delta) is ObjectSeen:
                 self.located_in.object_seen(delta.object, keyframe, place)
             elif type(delta) is ObjectsMerged:
+                following = fused[number] if number < len(fused) else None
                 if type(following) is ObjectRelocated and following.object == delta.survivor:
                     self.located_in.object_left(delta.survivor)
                 self.located_in.objects_merged(delta.survivor, delta.absorbed)

@@ -79,7 +79,9 @@ class Sights:
     """Makes the sights of a picture's detections."""
 
     def __init__(self, constants: EvidenceConstants) -> None:
-        self._constants = constants
+        self._pose_m2 = constants.pose_m * constants.pose_m
+        self._bearing_rad2 = constants.bearing_rad * constants.bearing_rad
+        self._cut_rad2 = constants.bearing_cut_rad * constants.bearing_cut_rad
         self._by_heading = constants.side_by == "heading"
 
     def of(self, pose: Pose, camera: Camera, sightings: Sequence[Sighting]) -> list[Sight]:
@@ -100,9 +102,9 @@ class Sights:
         camera: Camera,
         sighting: Sighting,
     ) -> Sight:
-        constants = self._constants
-        pose_m2 = constants.pose_m * constants.pose_m
-        there = _position_in_range(sighting, x, y)
+        pose_m2 = self._pose_m2
+        position = sighting.position
+        there = None if position is None else _position_in_range(position, x, y)
         if there is not None:
             dx, dy, error = there
             side = cos, sin
@@ -114,12 +116,18 @@ class Sights:
             var = max(error, _LEAST_ERROR_M) * max(error, _LEAST_ERROR_M)
             measured = max(far, _LEAST_M), var
             return Sight(x, y, cos, sin, 0.0, var, None, 0.0, *side, measured)
-        left, top, right, bottom = (min(max(at, -_FAR_PX), _FAR_PX) for at in sighting.bbox)
+        left, top, right, bottom = sighting.bbox
+        if not (
+            -_FAR_PX <= left <= _FAR_PX
+            and -_FAR_PX <= top <= _FAR_PX
+            and -_FAR_PX <= right <= _FAR_PX
+            and -_FAR_PX <= bottom <= _FAR_PX
+        ):
+            left, top, right, bottom = (min(max(at, -_FAR_PX), _FAR_PX) for at in sighting.bbox)
         aside = camera.width_px * 0.5 - (left + right) * 0.5
         slant = math.sqrt(focal * focal + aside * aside)
         ahead, aside = focal / slant, aside / slant
         is_cut = left <= _CUT_PX or right >= camera.width_px - _CUT_PX
-        bearing = constants.bearing_cut_rad if is_cut else constants.bearing_rad
         log_height, slope, known = None, 0.0, None
         if sighting.depth is not None:
             depth, error = sighting.depth
@@ -137,7 +145,7 @@ class Sights:
             y,
             to_cos,
             to_sin,
-            bearing * bearing,
+            self._cut_rad2 if is_cut else self._bearing_rad2,
             pose_m2,
             log_height,
             slope,
@@ -147,11 +155,11 @@ class Sights:
         )
 
 
-def _position_in_range(sighting: Sighting, x: float, y: float) -> tuple[float, float, float] | None:
-    """The offset of the stated position from (x, y) and its error; None where it is farther away
-    than a depth may be."""
-    if sighting.position is None:
-        return None
-    there_x, there_y, error = sighting.position
+def _position_in_range(
+    position: tuple[float, float, float], x: float, y: float
+) -> tuple[float, float, float] | None:
+    """The offset of a stated position from (x, y) and its error; None where it is farther away than
+    a depth may be."""
+    there_x, there_y, error = position
     dx, dy = there_x - x, there_y - y
     return (dx, dy, error) if dx * dx + dy * dy <= MAX_DEPTH_M * MAX_DEPTH_M else None

@@ -96,13 +96,14 @@ class Spots:
 
     def add(self, sight: Sight, share: float) -> int:
         """Take in a sight; the index of its spot, whose part is out of date then."""
-        weight = share / (sight.across_per_m2 + sight.across_m2)
-        height, heights = (0.0, 0.0) if sight.log_height is None else (sight.log_height, share)
-        depth, depth_weight = (0.0, 0.0)
-        if sight.measured is not None:
-            depth, depth_weight = sight.measured[0], share / sight.measured[1]
-        spot = [*sight[:6], weight, share, height, heights, sight.slope, depth, depth_weight]
-        return self._take(spot)
+        x, y, cos, sin, per_m2, least, height, slope, _, _, measured = sight
+        weight, heights, depth, depth_weight = share / (per_m2 + least), share, 0.0, 0.0
+        if height is None:
+            height, heights = 0.0, 0.0
+        if measured is not None:
+            depth, depth_weight = measured[0], share / measured[1]
+        numbers = (x, y, cos, sin, per_m2, least, weight, share, height, heights, slope)
+        return self._take([*numbers, depth, depth_weight])
 
     def take_in(self, other: "Spots") -> None:
         """Take in the spots of another thing, which has turned out to be the same. All parts are
@@ -112,11 +113,14 @@ class Spots:
 
     def _take(self, new: Spot) -> int:
         found, best = -1, SPOT_M * SPOT_M
+        x, y, cos, sin, per_m2, least, weight, count, height, heights, slope, *depth = new
         for index, spot in enumerate(self.spots):
-            dx, dy = spot[0] - new[0], spot[1] - new[1]
-            far = dx * dx + dy * dy
-            if far < best:
-                found, best = index, far
+            dx = spot[0] - x
+            if -SPOT_M < dx < SPOT_M:
+                dy = spot[1] - y
+                far = dx * dx + dy * dy
+                if far < best:
+                    found, best = index, far
         if found < 0:
             self.seen_from += 1
             self.spots.append(new)
@@ -125,25 +129,35 @@ class Spots:
                 self._drop(1)  # the first one holds the view that founded the thing
             return len(self.spots) - 1
         nearest = self.spots[found]
-        total = nearest[_WEIGHT] + new[_WEIGHT]
-        share = new[_WEIGHT] / total
-        for index in range(_WEIGHT):
-            nearest[index] += (new[index] - nearest[index]) * share
-        length = math.sqrt(nearest[2] * nearest[2] + nearest[3] * nearest[3])
+        nx, ny, mean_cos, mean_sin, n_per_m2, n_least, total, *_ = nearest
+        total += weight
+        share = weight / total
+        mean_cos += (cos - mean_cos) * share
+        mean_sin += (sin - mean_sin) * share
+        length = math.sqrt(mean_cos * mean_cos + mean_sin * mean_sin)
         if length > 0.0:
-            nearest[2] /= length
-            nearest[3] /= length
-        nearest[_WEIGHT] = total
-        nearest[_COUNT] += new[_COUNT]
-        if new[_HEIGHTS] > 0.0:
-            nearest[_HEIGHTS] += new[_HEIGHTS]
-            share = new[_HEIGHTS] / nearest[_HEIGHTS]
-            nearest[_HEIGHT] += (new[_HEIGHT] - nearest[_HEIGHT]) * share
-            nearest[_SLOPED] += (new[_SLOPED] - nearest[_SLOPED]) * share
-        if new[_DEPTH_WEIGHT] > 0.0:
-            nearest[_DEPTH_WEIGHT] += new[_DEPTH_WEIGHT]
-            share = new[_DEPTH_WEIGHT] / nearest[_DEPTH_WEIGHT]
-            nearest[_DEPTH] += (new[_DEPTH] - nearest[_DEPTH]) * share
+            mean_cos /= length
+            mean_sin /= length
+        nearest[: _WEIGHT + 1] = (
+            nx + (x - nx) * share,
+            ny + (y - ny) * share,
+            mean_cos,
+            mean_sin,
+            n_per_m2 + (per_m2 - n_per_m2) * share,
+            n_least + (least - n_least) * share,
+            total,
+        )
+        nearest[_COUNT] += count
+        if heights > 0.0:
+            nearest[_HEIGHTS] += heights
+            share = heights / nearest[_HEIGHTS]
+            nearest[_HEIGHT] += (height - nearest[_HEIGHT]) * share
+            nearest[_SLOPED] += (slope - nearest[_SLOPED]) * share
+        depth_m, depth_weight = depth
+        if depth_weight > 0.0:
+            nearest[_DEPTH_WEIGHT] += depth_weight
+            share = depth_weight / nearest[_DEPTH_WEIGHT]
+            nearest[_DEPTH] += (depth_m - nearest[_DEPTH]) * share
         return found
 
     def _drop(self, index: int) -> None:
@@ -227,9 +241,9 @@ class Solver:
         gx, gy = cos / along, sin / along
         here = gx * x + gy * y
         aim = self._log_range - log_along + here
-        part = [xx, xy, yy, bx, by, gx * gx, gx * gy, gy * gy, gx * aim, gy * aim]
+        usual = gx * gx, gx * gy, gy * gy, gx * aim, gy * aim
         if heights == 0.0:
-            return part + _NO_HEIGHT
+            return [xx, xy, yy, bx, by, *usual, *_NO_HEIGHT]
         share = min(VIEWS_OF_A_SPOT, heights)
         value = height + log_along
         w = share / (SIZE * SIZE)
@@ -239,12 +253,12 @@ class Solver:
         # log size = value + g·(p − here)
         constant = value - here
         wx, wy = w * gx, w * gy
-        part[0] += wx * gx
-        part[1] += wx * gy
-        part[2] += wy * gy
-        part[3] -= wx * constant
-        part[4] -= wy * constant
-        part += [w, wx, wy, w * constant]
+        xx += wx * gx
+        xy += wx * gy
+        yy += wy * gy
+        bx -= wx * constant
+        by -= wy * constant
+        size = w, wx, wy, w * constant
         value = along * slope
         w = share / (SLOPE * SLOPE * along * along + LEAST_ELEVATION_M2)
         if about is not None:
@@ -253,13 +267,12 @@ class Solver:
         gx, gy = slope * cos, slope * sin
         constant = value - gx * x - gy * y
         wx, wy = w * gx, w * gy
-        part[0] += wx * gx
-        part[1] += wx * gy
-        part[2] += wy * gy
-        part[3] -= wx * constant
-        part[4] -= wy * constant
-        part += [w, wx, wy, w * constant]
-        return part
+        xx += wx * gx
+        xy += wx * gy
+        yy += wy * gy
+        bx -= wx * constant
+        by -= wy * constant
+        return [xx, xy, yy, bx, by, *usual, *size, w, wx, wy, w * constant]
 
     def _solve(self, spots: Spots, prior: HeightPrior) -> Estimate | None:
         """Solve the normal equations of all parts; None where rounding errors decide the result,
@@ -287,21 +300,10 @@ class Solver:
         is_near = abs(x - spots.at[0]) <= _FARTHEST_M and abs(y - spots.at[1]) <= _FARTHEST_M
         if not (is_near and (xx + yy) / det <= _MOST_VARIANCE_M2):
             return None
-        return Estimate(
-            x,
-            y,
-            yy / det + COMMON_M2,
-            -xy / det,
-            xx / det + COMMON_M2,
-            (zr + zx * x + zy * y) / zw,
-            zx / zw,
-            zy / zw,
-            1.0 / zw,
-            (er + ex * x + ey * y) / ew,
-            ex / ew,
-            ey / ew,
-            1.0 / ew,
-        )
+        position = x, y, yy / det + COMMON_M2, -xy / det, xx / det + COMMON_M2
+        size = (zr + zx * x + zy * y) / zw, zx / zw, zy / zw, 1.0 / zw
+        elevation = (er + ex * x + ey * y) / ew, ex / ew, ey / ew, 1.0 / ew
+        return Estimate._make(position + size + elevation)
 
 
 def _anywhere(x: float, y: float, prior: HeightPrior) -> Estimate:
@@ -311,4 +313,4 @@ def _anywhere(x: float, y: float, prior: HeightPrior) -> Estimate:
     return Estimate(x, y, _MOST_VARIANCE_M2, 0.0, _MOST_VARIANCE_M2, *size, *elevation)
 
 
-_NO_HEIGHT = [0.0] * 8
+_NO_HEIGHT = (0.0,) * 8

@@ -5,6 +5,7 @@ nine cells of that side around its estimate, so one look-up finds all that are w
 """
 
 from collections.abc import Iterable
+from struct import pack_into
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,8 @@ from .things import ROW, Thing
 
 _REACH_SPREADS, _REACH_MORE_M = 1.5, 1.5
 _UM, _UM2 = 1e6, 1e12
+_FIELDS = len(Estimate._fields)
+_ROW, _ROW_BYTES = f"{_FIELDS}d", _FIELDS * 8
 
 
 class ThingIndex:
@@ -37,7 +40,7 @@ class ThingIndex:
         self._survivors: dict[ObjectOrdinal, ObjectOrdinal] = {}
         self._near: dict[tuple[int, int], list[ObjectOrdinal]] = {}
         self._sorted: dict[tuple[int, int], NDArray[np.int64]] = {}  # `_near` as arrays
-        self.estimates: Floats = np.zeros((64, len(Estimate._fields)))
+        self.estimates: Floats = np.zeros((64, _FIELDS))
 
     def thing(self, ordinal: ObjectOrdinal) -> Thing:
         """An Object that is not absorbed."""
@@ -59,9 +62,8 @@ class ThingIndex:
         self._make_room(len(self._things))
         return ordinal
 
-    def solve(self, ordinal: ObjectOrdinal, spot: int | None = None) -> None:
+    def solve(self, ordinal: ObjectOrdinal, thing: Thing, spot: int | None = None) -> None:
         """Estimate anew where an Object stands, and list it there; one spot has changed, or all."""
-        thing = self.thing(ordinal)
         prior = self._heights.prior(thing.class_name)
         before = thing.estimate
         if before is None:
@@ -69,7 +71,7 @@ class ThingIndex:
         else:
             made = self._solver.next(thing.spots, prior, before, spot)
         thing.estimate = made
-        self.estimates[ordinal] = made
+        pack_into(_ROW, self.estimates.data, ordinal * _ROW_BYTES, *made)
         x, y, xx, _, yy, log_size, _, _, log_size_variance, elevation, *_ = made
         cell = int(x // self.reach_m), int(y // self.reach_m)
         if before is None or cell != thing.cell:
@@ -96,12 +98,11 @@ class ThingIndex:
 
     def count_meetings(self, seen: list[ObjectOrdinal]) -> None:
         """One picture shows them all."""
-        for index, one in enumerate(seen):
-            for other in seen[:index]:
+        things = [self.thing(ordinal).met for ordinal in seen]
+        for index, (one, met) in enumerate(zip(seen, things, strict=True)):
+            for other, met_too in zip(seen[:index], things, strict=False):
                 if one != other:
-                    for a, b in ((one, other), (other, one)):
-                        met = self.thing(a).met
-                        met[b] = met.get(b, 0) + 1
+                    met[other] = met_too[one] = met.get(other, 0) + 1
 
     def unite(self, survivor: ObjectOrdinal, absorbed: ObjectOrdinal) -> None:
         """Merge two Objects."""
@@ -118,7 +119,7 @@ class ThingIndex:
                 met = self.thing(third).met
                 del met[absorbed]
                 thing.met[third] = met[survivor] = thing.met.get(third, 0) + count
-        self.solve(survivor)
+        self.solve(survivor, thing)
 
     def estimated(self, offset: Offset, ordinal: ObjectOrdinal) -> ObjectEstimated:
         """The delta of an Object's estimate."""
