@@ -39,7 +39,7 @@ _BEHIND_M2 = 0.04
 _SLOPE_GUESS, _GUESS_PAIRS = 0.01, 10.0
 LEAST_AGREEMENT = -5.0
 """Below it the sight alone rules a pair out."""
-_FEW = 12
+_FEW = 16
 _SEEN = 13
 _SLACK, _SLACK_CHI2, _SLACK_M2 = 1.001, 0.01, 1e-4
 

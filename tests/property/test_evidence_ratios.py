@@ -3,19 +3,23 @@
 import math
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from projections.evidence import EvidenceConstants
+from projections.exact_functions import cos_sin
 from projections.reducers.agreement import log_of, logs
 from projections.reducers.evidence_objects import EvidenceObjects
 from projections.reducers.label_counts import LabelCounts
+from projections.reducers.looks import LookRatios
 from projections.reducers.spots import Spots
 from projections.reducers.things import Thing
 from tests.evidence_pictures import a_room, fold_one, pictures_of
 
 LABELS = st.sampled_from(["chair", "table", "bed", "lamp"])
 POSITIVE = st.floats(1e-12, 1e12)
+_ANGLE = st.floats(-4.0, 4.0)
 
 
 @given(st.lists(POSITIVE, min_size=1, max_size=9))
@@ -29,28 +33,75 @@ def test_a_logarithm_is_right_to_five_digits(value: float) -> None:
 
 
 @given(
-    st.lists(LABELS, max_size=30),
-    st.lists(
-        st.tuples(st.dictionaries(LABELS, st.integers(1, 40), min_size=1), LABELS),
-        min_size=1,
-        max_size=9,
-    ),
+    st.lists(LABELS, max_size=30), st.dictionaries(LABELS, st.integers(1, 40), min_size=1), LABELS
 )
-def test_the_ratio_of_one_label_is_that_of_a_pair_among_many(
-    learned: list[str], pairs: list[tuple[dict[str, int], str]]
+def test_a_label_speaks_by_how_much_likelier_it_is_for_the_thing(
+    learned: list[str], classes: dict[str, int], label: str
 ) -> None:
     counts = LabelCounts()
     counts.learn(learned)
-    things = [
-        Thing(sum(classes.values()), 0, 0, 0.0, 0.0, next(iter(classes)), classes, Spots())
-        for classes, _ in pairs
+    total = sum(classes.values())
+    thing = Thing(total, 0, 0, 0.0, 0.0, next(iter(classes)), classes, Spots())
+    usual = counts.usual(label)
+    assert usual == pytest.approx((learned.count(label) + 1) / (len(learned) + 10))
+    own = (classes.get(label, 0) + 0.3 * usual) / (total + 0.3)
+    assert abs(counts.ratio(thing, label, usual) - math.log(own / usual)) < 2e-5
+
+
+@given(
+    st.lists(st.tuples(st.floats(-1.0, 1.0), _ANGLE, st.integers(0, 2)), min_size=1, max_size=6),
+    _ANGLE,
+    st.integers(0, 2),
+    st.booleans(),
+    st.floats(-0.5, 0.9),
+)
+def test_a_look_and_exemplars_one_by_one_are_as_in_arrays(
+    exemplars: list[tuple[float, float, int]],
+    toward: float,
+    run: int,
+    agree: bool,
+    different: float,
+) -> None:
+    ratios = LookRatios(EvidenceConstants())
+    rows = list(range(len(exemplars)))[::-1]  # looks are in another order than exemplars
+    marks = [
+        (1.0 / 2048, *cos_sin(angle), own, own * 8, row)
+        for (_, angle, own), row in zip(exemplars, rows, strict=True)
     ]
-    labels = [label for _, label in pairs]
-    ratios, agree = counts.ratios(things, labels)
-    assert ratios.tolist() == [
-        counts.ratio(thing, label) for thing, label in zip(things, labels, strict=True)
-    ]
-    assert agree.tolist() == [label in classes for classes, label in pairs]
+    dots = [0.0] * len(rows)
+    for (cosine, _, _), row in zip(exemplars, rows, strict=True):
+        dots[row] = float(round(cosine * 2048 * 2048))
+    cos, sin = cos_sin(toward)
+    ratio, best = ratios.of_exemplars(dots, marks, 1.0 / 2048, cos, sin, run, agree, different)
+    cosines = np.array([dots[row] for row in rows]) / 2048 / 2048
+    each = ratios.ratios(
+        (cosines - different) * (1.0 / (1.0 - different)),
+        np.array([mark[1] * cos + mark[2] * sin for mark in marks]),
+        np.array([mark[3] != run for mark in marks]),
+        np.array([agree] * len(marks)),
+    )
+    four = sorted(each.tolist(), reverse=True)[:4]
+    assert best == cosines.max()
+    assert ratio == pytest.approx(sum(four) / len(four) - 0.125 * (4 - len(four)), abs=1e-12)
+
+
+@given(st.lists(st.tuples(st.integers(0, 2), _ANGLE), max_size=40))
+def test_exemplars_are_the_newest_of_their_kind(kept: list[tuple[int, float]]) -> None:
+    """Against a plain list: of a kind the last three, of all the last six."""
+    thing, naive = Thing(0, 0, 0, 0.0, 0.0, "chair", {}, Spots()), list[tuple[int, int, int]]()
+    for number, (run, angle) in enumerate(kept):
+        cos, sin = cos_sin(angle)
+        thing.keep(np.full(4, number, np.float32), 0.5, cos, sin, run)
+        eighth = (cos > 0, sin > 0, abs(cos) > abs(sin))
+        kind = run * 8 + sum(bit * flag for bit, flag in zip((4, 2, 1), eighth, strict=True))
+        alike = [other for other in naive if other[1] == kind]
+        if len(alike) == 3:
+            naive.remove(alike[0])
+        elif len(naive) == 6:
+            naive.pop(0)
+        naive.append((number, kind, run))
+    assert [(thing.looks[row][0], kind, run) for *_, run, kind, row in thing.marks] == naive
+    assert sorted(row for *_, row in thing.marks) == list(range(len(naive)))
 
 
 @settings(max_examples=10, deadline=None)
