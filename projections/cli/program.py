@@ -34,7 +34,7 @@ from typer.core import TyperGroup
 from eventsrc.errors import MapfoldError
 
 from .presets import add_presets
-from .terminal import EXIT_FAILED, say
+from .terminal import EXIT_FAILED, OutputLost, say
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
@@ -126,10 +126,6 @@ def _main_options(
     ] = False,
 ) -> None:  # without a callback typer would drop the name of a single command
     pass
-
-
-class OutputLost(Exception):
-    """A write to stdout failed; the text says why."""
 
 
 class _Stdout(io.FileIO):

@@ -4,6 +4,7 @@ Everything printed goes through `eventsrc.text`, which escapes control character
 reasons come from the network.
 """
 
+import contextlib
 import json
 import sys
 from collections.abc import Iterable
@@ -21,10 +22,19 @@ people = Console(stderr=True, highlight=False, soft_wrap=True, markup=False)
 """Stderr. Without markup, since ids and reasons may hold any text."""
 
 
+class OutputLost(Exception):
+    """A write to stdout failed; the text says why."""
+
+
 def say(message: str) -> None:
     """Print a message of one or several lines to stderr, and before it what stdout still buffers,
-    so that both are in order where they go to one pipe."""
-    sys.stdout.flush()
+    so that both are in order where they go to one pipe.
+
+    What stdout does not take stays in its buffer: the command goes on, and at its end
+    `program.run_app` writes it again and reports the failure.
+    """
+    with contextlib.suppress(BrokenPipeError, OutputLost):
+        sys.stdout.flush()
     people.print(visible_lines(message))
 
 
