@@ -68,7 +68,7 @@ class NaiveConstrainedPlaces:
         self.cores = {int(core) for core in self.cores}
         fresh = sorted(self.cores - older)
         entered = {p for p in fresh if self._is_anchor(p) and self.labels[p] is None}
-        self._take_in(fresh, are_near)
+        self._add_fresh(fresh, are_near)
         for point in sorted(set(range(n)) - self.cores):
             if self.labels[point] is None:
                 near = {self.cell_places[self.cell_of(c)] for c in self.cores if are_near[point][c]}
@@ -83,7 +83,7 @@ class NaiveConstrainedPlaces:
         for anchor in sorted(entered):
             self._join(anchor)
 
-    def _take_in(self, fresh: list[int], are_near: np.ndarray) -> None:
+    def _add_fresh(self, fresh: list[int], are_near: np.ndarray) -> None:
         cells: dict[Hashable, list[int]] = {}
         for core in sorted(self.cores):
             cells.setdefault(self.cell_of(core), []).append(core)

@@ -52,7 +52,7 @@ class NaiveRooms:
         self.last[run] = cell
         drives = self._drives()
         if is_new:
-            self._settle(point, cell, drives)
+            self._give_place(point, cell, drives)
         self.points.append(cell)
         self._merge_all(drives)
         self._obey_joins(point, drives)
@@ -108,7 +108,7 @@ class NaiveRooms:
         total = sum(drives[a][b] for a in some for b in others)
         return Fraction(total, len(some) * len(others))
 
-    def _settle(self, point: int, cell: int, drives: list[list[int]]) -> None:
+    def _give_place(self, point: int, cell: int, drives: list[list[int]]) -> None:
         means = [
             (self._mean([cell], self._cells(place), drives), place)
             for place in sorted(set(self.place_of))

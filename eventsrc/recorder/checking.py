@@ -93,12 +93,11 @@ class Checker:
 
     @property
     def waiting(self) -> int:
-        """Messages that were taken from the queue and checked, and not taken from here."""
+        """Messages from the queue that are checked and in no batch yet."""
         return len(self._ahead.messages)
 
-    def take(self, timeout_s: float) -> Batch | None:
-        """The next batch; an empty one if nothing came in time, None if nothing will come any
-        more."""
+    def next_batch(self, timeout_s: float) -> Batch | None:
+        """The next batch; an empty one if nothing came in time, None after the last one."""
         closed = self._queue.closed  # read first: what was put before closing is still recorded
         self._add(_BATCH, timeout_s if self._ahead.empty else 0.0)
         batch, self._ahead = self._ahead, Batch()

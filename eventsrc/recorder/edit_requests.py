@@ -168,15 +168,15 @@ class Edits:
             self._writer.append(COMMAND_KEY, encode_command(command))
             self._known.add(command, offset)
 
-    def settle(self, durable: Offset) -> None:
+    def reply_to_durable(self, durable: Offset) -> None:
         """Reply to the commands before ``durable``."""
         while self._waiting and self._waiting[0].offset < durable:
             _, request, recorded = self._waiting.popleft()
             request.reply(recorded)
             self.recorded += not recorded.repeated
 
-    def lose(self, lost: Iterable[tuple[Offset, Offset]]) -> None:
-        """Take no more commands: events in these ranges were lost with a file of the log, and
+    def refuse_lost(self, lost: Iterable[tuple[Offset, Offset]]) -> None:
+        """Refuse commands from now on: events in these ranges were lost with a file of the log, and
         commands may be among them."""
         ranges = list(lost)
         self._known = "a file of the log was lost while it was recorded; start the recorder again"
@@ -188,8 +188,8 @@ class Edits:
                 kept.append(each)
         self._waiting = deque(kept)
 
-    def fail(self, error: str) -> None:
-        """Say to all that still wait that the log could not be written."""
+    def refuse_all(self, error: str) -> None:
+        """Refuse all commands that wait, because the log could not be written."""
         for each in self._waiting:
             each.request.refuse(f"not known to be recorded: {error}")
         self._waiting.clear()

@@ -190,7 +190,7 @@ class WriterThread:
             self._failed = True
             self._process_synced()  # what was synced before the error
             if self._edits is not None:
-                self._edits.fail(str(error))
+                self._edits.refuse_all(str(error))
             raise
         finally:
             self._writer.work_while_syncing(None)
@@ -228,7 +228,7 @@ class WriterThread:
     def _step(self) -> bool:
         """Record one batch; False when there will be no more."""
         waiting = self._writer.durable_offset < self._writer.next_offset
-        batch = self._checker.take(_COMMIT_POLL_S if waiting else _IDLE_S)
+        batch = self._checker.next_batch(_COMMIT_POLL_S if waiting else _IDLE_S)
         if batch is None:
             return False
         self.append(batch)
@@ -282,7 +282,7 @@ class WriterThread:
         if self._unsynced and self._unsynced[0][0] < durable:
             self._acknowledge(durable, now_ns)
         if self._edits is not None:
-            self._edits.settle(durable)
+            self._edits.reply_to_durable(durable)
         while self._announcements and self._announcements[0].offset <= durable:
             sent = self._announcements.popleft().sent
             self._ledger.expect(sent.run_id, sent.last, now_ns)
@@ -313,7 +313,7 @@ class WriterThread:
         if not lost:
             return
         if self._edits is not None:
-            self._edits.lose(lost)
+            self._edits.refuse_lost(lost)
         kept = [e for e in self._unsynced if not any(a <= e[0] < b for a, b in lost)]
         self._unsynced = deque(kept)
         if self._saves_ledger:

@@ -84,8 +84,8 @@ class ClassHeights:
             self._add(given, 1)
         return given
 
-    def take_back(self, given: Given) -> None:
-        """The thing is gone."""
+    def remove(self, given: Given) -> None:
+        """Remove what a thing gave."""
         self._add(given, -1)
 
     def _add(self, given: Given, sign: int) -> None:

@@ -79,7 +79,7 @@ class ConstrainedPlaces(Places):
         self._anchors = PlaceAnchors(groups)
         # Refused links by first core points of cells, both ways round: known to change nothing
         # while the places are the same.
-        self._settled: set[tuple[int, int]] = set()
+        self._refused_links: set[tuple[int, int]] = set()
         # Of the event that is being folded:
         self._refusals: list[Refusal] = []
         self._undecided: list[int] = []  # anchors that are not core and could join a place
@@ -106,8 +106,8 @@ class ConstrainedPlaces(Places):
         self._anchors.load(state, self.place_of)
 
     def _fold_changes(self, offset: Offset, newcomer: int, fresh: list[int]) -> list[Delta]:
-        if self._settled and fresh == [newcomer] and not self._is_anchor(newcomer):
-            older = self.core_index.enclosing_core_beside(newcomer, self._settled)
+        if self._refused_links and fresh == [newcomer] and not self._is_anchor(newcomer):
+            older = self.core_index.enclosing_core_beside(newcomer, self._refused_links)
             if older is not None:
                 place = self.survivors.find(self.joined[older])
                 self._join(newcomer, place)
@@ -130,7 +130,7 @@ class ConstrainedPlaces(Places):
             if free is not None:
                 joining[point] = entered[point] = free
                 self._enter_point(point, free)
-        self._settled.update(pair for r in self._refusals for pair in _both_ways(r.link))
+        self._refused_links.update(pair for r in self._refusals for pair in _both_ways(r.link))
         for link, apart in self._refusals:
             one, other = (self.survivors.find(self.joined[cell]) for cell in link[:2])
             self._refuse(offset, newcomer, (one, other), link[2:], apart, deltas)
@@ -163,7 +163,7 @@ class ConstrainedPlaces(Places):
         touched: dict[PlaceOrdinal, tuple[int, int]],
     ) -> PlacesMerged:
         delta = super()._merge(offset, newcomer, survivor, touched)
-        self._settled.clear()
+        self._refused_links.clear()
         self._anchors.merge(survivor, delta.absorbed)
         return delta
 

@@ -87,8 +87,8 @@ class Floors:
         column, row = (x_um + STEP_UM // 2) // STEP_UM, (y_um + STEP_UM // 2) // STEP_UM
         return row * _FLOORS_A_ROW + column
 
-    def settle(self, groups: PairGroups[Any], thing: Any, kind: str, floor: int) -> None:
-        """``thing``, on this floor, belongs to its group only if that is on this floor."""
+    def keep_to_floor(self, groups: PairGroups[Any], thing: Any, kind: str, floor: int) -> None:
+        """Remove ``thing``, which is on this floor, from its group if that is on another one."""
         group = groups.group_of.get(thing)
         if group is not None and self._homes.setdefault((kind, group), floor) != floor:
             del groups.group_of[thing]

@@ -102,7 +102,7 @@ class Presence:
 
         One delta for each Object that is missing now or no longer is, ascending.
         """
-        seen = self._take_in(run, fused)
+        seen = self._apply(run, fused)
         changed = self._look(run, pose, camera, seen)
         for ordinal in seen:
             known = self.attendance[ordinal]
@@ -157,7 +157,7 @@ class Presence:
         for (column, row, ordinal), at in zip(state["cells"], state["poses"].tolist(), strict=True):
             self._list(ordinal, (column, row), (at[0], at[1]))
 
-    def _take_in(self, run: RunOrdinal, fused: Iterable[Delta]) -> list[ObjectOrdinal]:
+    def _apply(self, run: RunOrdinal, fused: Iterable[Delta]) -> list[ObjectOrdinal]:
         """Bring estimates and merges up to date; the Objects seen, ascending."""
         attendance, seen = self.attendance, set[ObjectOrdinal]()
         for delta in fused:

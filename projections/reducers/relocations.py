@@ -88,7 +88,7 @@ class Relocations:
         ``fused`` are the deltas of fusion; `Presence` must have taken them in.
         """
         pairs: list[Moved] = []
-        due = self._take_in(fused)
+        due = self._apply(fused)
         for ordinal in self._presence.missed:
             misses = self._presence.attendance[ordinal].run_misses
             if misses & (misses - 1) == 0:
@@ -117,8 +117,8 @@ class Relocations:
             for ordinal in ordinals:
                 self._classify(ordinal, name)
 
-    def _take_in(self, fused: Iterable[Delta]) -> list[ObjectOrdinal]:
-        """Follow the deltas; the newcomers whose comparison is due."""
+    def _apply(self, fused: Iterable[Delta]) -> list[ObjectOrdinal]:
+        """Apply the deltas; the newcomers whose comparison is due."""
         due: list[ObjectOrdinal] = []
         for delta in fused:
             if type(delta) is ObjectFound:

@@ -109,7 +109,7 @@ class Rooms(PlaceMembers):
                 return [KeyframePlaced(offset, keyframe, place), self.place_changed(offset, place)]
         else:
             cell = self._cells.add(x_um, y_um)
-            deltas = self._settle(offset, point, cell, last)
+            deltas = self._give_place(offset, point, cell, last)
         self._last_cells[run] = cell
         place = self._place_of_cell(cell)
         if is_anchor:
@@ -175,7 +175,7 @@ class Rooms(PlaceMembers):
         self._closeness[b][a] = self._closeness[a][b]
         return Pair(min(a, b), max(a, b))
 
-    def _settle(self, offset: Offset, founder: int, cell: int, last: int | None) -> list[Delta]:
+    def _give_place(self, offset: Offset, founder: int, cell: int, last: int | None) -> list[Delta]:
         """Give a new cell its place (rule 3), and merge what comes closer by it."""
         closer = set[Pair]()
         around = self._cells.with_a_way_to(cell)

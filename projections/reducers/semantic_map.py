@@ -187,7 +187,7 @@ class SemanticMap:
         if pose is not None:
             pose = self.floors.laid_out(pose, ground)
             for seen in fusible if self._named.group_of else ():
-                self.floors.settle(self._named, seen[1], "object", ground)
+                self.floors.keep_to_floor(self._named, seen[1], "object", ground)
             place = self._place(offset, keyframe, run, envelope.run_id, pose, deltas)
             objects, timestamp = self.objects, envelope.timestamp
             if isinstance(objects, EvidenceFusion):
@@ -265,7 +265,7 @@ class SemanticMap:
             self.names.add_anchor(keyframe, anchor)
             if isinstance(self.places, ConstrainedPlaces | Rooms):
                 if floor is not None:
-                    self.floors.settle(self._grouped, anchor, "place", floor)
+                    self.floors.keep_to_floor(self._grouped, anchor, "place", floor)
                 self.places.add_anchor(keyframe, anchor)
 
     def _observe(

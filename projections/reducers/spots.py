@@ -103,15 +103,15 @@ class Spots:
         if measured is not None:
             depth, depth_weight = measured[0], share / measured[1]
         numbers = (x, y, cos, sin, per_m2, least, weight, share, height, heights, slope)
-        return self._take([*numbers, depth, depth_weight])
+        return self._add_spot([*numbers, depth, depth_weight])
 
-    def take_in(self, other: "Spots") -> None:
-        """Take in the spots of another thing, which has turned out to be the same. All parts are
+    def add_all(self, other: "Spots") -> None:
+        """Add the spots of another thing, which has turned out to be the same. All parts are
         out of date then."""
         for spot in other.spots:
-            self._take(spot)
+            self._add_spot(spot)
 
-    def _take(self, new: Spot) -> int:
+    def _add_spot(self, new: Spot) -> int:
         found, best = -1, SPOT_M * SPOT_M
         x, y, cos, sin, per_m2, least, weight, count, height, heights, slope, *depth = new
         for index, spot in enumerate(self.spots):

@@ -109,7 +109,7 @@ class ThingIndex:
         thing, other = self.thing(survivor), self.thing(absorbed)
         self._unlist(absorbed, other.cell)
         if other.given is not None:
-            self._heights.take_back(other.given)
+            self._heights.remove(other.given)
         self._things[absorbed] = None
         self._survivors[absorbed] = survivor
         thing.absorb(other)

@@ -96,7 +96,7 @@ class Thing:
         self.last_seen = max(self.last_seen, other.last_seen)
         for class_name, count in other.classes.items():
             self.classes[class_name] = self.classes.get(class_name, 0) + count
-        self.spots.take_in(other.spots)
+        self.spots.add_all(other.spots)
         self.groups |= other.groups
         for inverse, cos, sin, run, _, row in other.marks:
             self.keep(other.looks[row], inverse, cos, sin, run)

@@ -329,9 +329,9 @@ def test_nothing_is_answered_before_it_is_durable(tmp_path: Path) -> None:
         edits.append(EditRequest(query))  # type: ignore[arg-type]
         repeated = _Query(_forget("id"))
         edits.append(EditRequest(repeated))  # type: ignore[arg-type]
-        edits.settle(writer.durable_offset)
+        edits.reply_to_durable(writer.durable_offset)
         assert (query.replies, repeated.replies) == ([], []), "a repetition waits as well"
-        edits.settle(writer.sync())
+        edits.reply_to_durable(writer.sync())
     assert query.replies == [(True, {"command_id": "id", "offset": 0, "repeated": False})]
     assert repeated.replies == [(True, {"command_id": "id", "offset": 0, "repeated": True})]
 
@@ -341,9 +341,9 @@ def test_what_was_lost_with_a_file_is_refused_and_so_is_all_that_follows(tmp_pat
     with LogWriter(tmp_path / "log") as writer:
         edits = Edits(writer, KnownCommands())
         edits.append(EditRequest(lost))  # type: ignore[arg-type]
-        edits.lose([(0, 1)])
+        edits.refuse_lost([(0, 1)])
         edits.append(EditRequest(later))  # type: ignore[arg-type]
-        edits.settle(writer.sync())
+        edits.reply_to_durable(writer.sync())
     for query in (lost, later):
         ((good, reply),) = query.replies
         assert not good
@@ -355,7 +355,7 @@ def test_the_error_of_a_log_goes_to_those_who_wait(tmp_path: Path) -> None:
     with LogWriter(tmp_path / "log") as writer:
         edits = Edits(writer, KnownCommands())
         edits.append(EditRequest(query))  # type: ignore[arg-type]
-        edits.fail("no space left")
+        edits.refuse_all("no space left")
     ((good, reply),) = query.replies
     assert not good
     assert "no space left" in str(reply["error"])
