@@ -92,7 +92,7 @@ def sightings_of(rows: Iterable[Row]) -> Sightings:
         by_camera.setdefault(row.camera, []).append(i)
     for camera, of in by_camera.items():
         lens = pinhole.Camera(camera.width_px, camera.height_px, camera.hfov_deg)
-        read = pinhole.views(lens, [rows[i].bbox for i in of])
+        read = pinhole.views(lens, pinhole.box_rows([rows[i].bbox for i in of]))
         off_axis[of], cut[of], boxed[of] = np.arctan(read.slope), read.cut_x, read.known
         whole = read.known & ~read.cut_y
         height[of] = np.where(whole, read.height_px / lens.focal_px, np.nan)

@@ -70,13 +70,19 @@ class Views:
     known: Flags
 
 
-def views(camera: Camera, boxes: Sequence[tuple[float, float, float, float] | None]) -> Views:
-    """Read boxes (x_min, y_min, x_max, y_max in pixels); None or an empty box is unknown."""
-    rows = np.array(
-        [(0.0, 0.0, 0.0, 0.0) if box is None else box for box in boxes], dtype=np.float64
-    ).reshape(-1, 4)
-    rows = np.clip(rows, -_FARTHEST_PX, _FARTHEST_PX)
-    x0, y0, x1, y1 = rows.T
+_Box = tuple[float, float, float, float]
+_NO_BOX = (0.0, 0.0, 0.0, 0.0)
+
+
+def box_rows(boxes: Sequence[_Box | None]) -> Floats:
+    """Boxes (n, 4): x_min, y_min, x_max, y_max in pixels; None as an empty box, an unknown one."""
+    rows = [_NO_BOX if box is None else box for box in boxes]
+    return np.array(rows, dtype=np.float64).reshape(-1, 4)
+
+
+def views(camera: Camera, rows: Floats) -> Views:
+    """Read boxes of `box_rows`."""
+    x0, y0, x1, y1 = np.minimum(np.maximum(rows.T, -_FARTHEST_PX), _FARTHEST_PX)
     known = (x1 > x0) & (y1 > y0)
     slope = (camera.width_px / 2.0 - (x0 + x1) / 2.0) / camera.focal_px
     return Views(
@@ -114,15 +120,23 @@ class Sights:
         both: Flags = self.whole[UPPER] & self.whole[LOWER]
         return both
 
+    def take(self, index: NDArray[np.intp] | slice) -> "Sights":
+        """Those at ``index``."""
+        return Sights(
+            self.bearing[index],
+            self.log_height[index],
+            self.rise[:, index],
+            self.whole[:, index],
+            self.cut[index],
+            self.known[index],
+        )
 
-def sights(camera: Camera, boxes: Sequence[tuple[float, float, float, float] | None]) -> Sights:
-    """Read boxes as `views` does; what is farther outside the picture than the picture is large is
+
+def sights(camera: Camera, rows: Floats) -> Sights:
+    """Read boxes of `box_rows`; what is farther outside the picture than the picture is large is
     left out."""
-    rows = np.array(
-        [(0.0, 0.0, 0.0, 0.0) if box is None else box for box in boxes], dtype=np.float64
-    ).reshape(-1, 4)
-    most = np.array((camera.width_px, camera.height_px) * 2)
-    x0, y0, x1, y1 = np.minimum(np.maximum(rows, -most), 2.0 * most).T
+    most = np.array((camera.width_px, camera.height_px) * 2)[:, None]
+    x0, y0, x1, y1 = np.minimum(np.maximum(rows.T, -most), 2.0 * most)
     known = (x1 > x0) & (y1 > y0)
     tangent = (camera.width_px / 2.0 - (x0 + x1) / 2.0) / camera.focal_px
     per_px = 1.0 / (camera.focal_px * np.sqrt(1.0 + tangent * tangent))

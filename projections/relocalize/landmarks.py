@@ -3,32 +3,22 @@
 Where the map knows Objects with an estimate (fusion by evidence), a crop's matches are grouped by
 Object, whose position and covariance count. All others are triangulated from the matches themselves
 (`triangulation`).
-
-What a box tells about the distance takes two quantities of a landmark, each the mean over the
-observations whose boxes the picture's border does not cut there:
-
-size        logarithm of the box's height in metres, log(height at 1 m) + log(distance)
-elevation   of the upper or lower edge above the camera: rise of the line of sight × distance
-
-Both rest on the estimated position, so an error of it is in them: they come with their gradient by
-the position. A thing seen from one spot may stand half as far again, but then it is larger, too,
-and looks from that spot as it did.
 """
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from projections.evidence import EvidenceConstants
-
 from .appearance import DIRECTIONS, appearance_tables, relative
-from .camera import LOWER, UPPER, Camera, Floats, Sights, sights, views
-from .candidates import Match
+from .camera import Camera, Floats, Sights, box_rows, sights, views
+from .candidates import Match, Stand
 from .constants import MapConstants
+from .cues import Cue, cues, with_class_sizes
 from .model import Model
 from .question import Crop
 from .sessions import subtract_shifts
@@ -38,27 +28,14 @@ Indices = NDArray[np.intp]
 
 MAX_LANDMARKS: Final = 10
 _MAX_OF_CLASS: Final = 96
-_NEAREST_M: Final = 0.3
-_PRIOR_EDGES: Final = 4.0
 _SPOT_M: Final = 0.175
 _RELEVANT_BELOW_BEST: Final = 0.15
 _FULL_WEIGHT: Final = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Cue:
-    """A quantity of n landmarks with its gradient by their position and its variance at a given
-    position, infinite where nothing is known."""
-
-    mean: Floats
-    by_x: Floats
-    by_y: Floats
-    variance: Floats
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Landmarks:
-    """Of one crop. ``xy`` (n, 2) metres, ``spread`` (n, 3) the covariance xx, xy, yy in m².
+    """Of crops. ``xy`` (n, 2) metres, ``spread`` (n, 3) the covariance xx, xy, yy in m².
 
     ``ratios`` (n, DIRECTIONS) are likelihood ratios by looks. ``seen_from`` (m, 2) are the
     positions from which they were seen, one landmark after the other from ``starts`` (n,) on.
@@ -74,16 +51,62 @@ class Landmarks:
     starts: Indices
     likeness: Floats
 
+    def part(self, start: int, end: int) -> "Landmarks":
+        """Those from ``start`` to ``end``."""
+        rows = slice(start, end)
+        begin = int(self.starts[start])
+        stop = int(self.starts[end]) if end < len(self.starts) else len(self.seen_from)
+        return Landmarks(
+            self.xy[rows],
+            self.spread[rows],
+            self.ratios[rows],
+            self.size.part(rows),
+            (self.edges[0].part(rows), self.edges[1].part(rows)),
+            self.seen_from[begin:stop],
+            self.starts[rows] - begin,
+            self.likeness[rows],
+        )
+
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CropEvidence:
-    """A crop with its landmarks. ``bearing`` (radians, left positive) is None without a box;
-    ``has_look`` is False where only the class is known."""
+class CropGroup:
+    """Crops of one view that all have a box, or all have none, and their landmarks: those of one
+    crop after the other from ``first`` (c,) on. ``has_look`` (c,) is False where only the class is
+    known."""
 
     landmarks: Landmarks
-    bearing: float | None
+    first: Indices
     sight: Sights
-    has_look: bool = True
+    has_look: tuple[bool, ...]
+    owner: Indices = field(init=False)
+    """Number of the crop of each landmark."""
+    edges: Cue = field(init=False)
+    """Those of the landmarks, as arrays (2, n)."""
+
+    def __post_init__(self) -> None:
+        counts = np.diff(self.first, append=len(self.landmarks.xy))
+        object.__setattr__(self, "owner", np.arange(len(counts)).repeat(counts))
+        one, two = self.landmarks.edges
+        both = Cue(
+            np.array((one.mean, two.mean)),
+            np.array((one.by_x, two.by_x)),
+            np.array((one.by_y, two.by_y)),
+            np.array((one.variance, two.variance)),
+        )
+        object.__setattr__(self, "edges", both)
+
+    @property
+    def boxed(self) -> bool:
+        """Whether its crops have boxes."""
+        return bool(self.sight.known[0])
+
+    def of_each(self) -> list[Landmarks]:
+        """The landmarks of each crop."""
+        ends = [*self.first[1:].tolist(), len(self.landmarks.xy)]
+        return [
+            self.landmarks.part(start, end)
+            for start, end in zip(self.first.tolist(), ends, strict=True)
+        ]
 
 
 def likeness_of(crop: Crop, row: Sequence[Match], constants: MapConstants) -> Floats:
@@ -94,26 +117,53 @@ def likeness_of(crop: Crop, row: Sequence[Match], constants: MapConstants) -> Fl
     return relative(cosines, constants)
 
 
-def crop_evidence(
-    crop: Crop,
-    row: Sequence[Match],
-    likeness: Floats,
-    shifts: Mapping[str, float],
-    constants: MapConstants,
-    camera: Camera,
-    model: Model,
-) -> CropEvidence | None:
-    """The evidence of a crop; None if no match has a pose. ``likeness`` is of `likeness_of`."""
-    posed = [index for index, match in enumerate(row) if match.pose is not None]
-    if not posed:
-        return None
-    matches = [row[index] for index in posed]
-    raw = likeness[posed]
-    less = subtract_shifts(matches, raw, shifts)
-    found = _landmarks(crop, matches, raw, less, constants, model)
-    own = sights(camera, [crop.bbox])
-    bearing = float(own.bearing[0]) if own.known[0] else None
-    return CropEvidence(found, bearing, own, crop.vector is not None)
+class Seen(NamedTuple):
+    """A crop, its matches that have a pose, and their relative likenesses: as they are, and less
+    the shifts of their runs."""
+
+    crop: Crop
+    matches: Sequence[Match]
+    raw: Floats
+    likeness: Floats
+
+    @classmethod
+    def of(
+        cls, crop: Crop, row: Sequence[Match], likeness: Floats, shifts: Mapping[str, float]
+    ) -> "Seen | None":
+        """None if no match has a pose. ``likeness`` is of `likeness_of`."""
+        matches = [match for match in row if match.pose is not None]
+        if not matches:
+            return None
+        if len(matches) < len(row):
+            likeness = likeness[[match.pose is not None for match in row]]
+        return cls(crop, matches, likeness, subtract_shifts(matches, likeness, shifts))
+
+
+def crop_groups(
+    views_seen: Sequence[Sequence[Seen]], constants: MapConstants, camera: Camera, model: Model
+) -> list[list[CropGroup]]:
+    """The evidence of the crops of each view, in two groups at most; there is at least one crop.
+
+    What can be is computed for all crops at once: an array operation takes a microsecond or more,
+    however few numbers it has.
+    """
+    seen = [each for view in views_seen for each in view]
+    view_of = [number for number, view in enumerate(views_seen) for _ in view]
+    boxes = sights(camera, box_rows([each.crop.bbox for each in seen]))
+    known = boxes.known.tolist()
+    order = sorted(range(len(seen)), key=lambda crop: (view_of[crop], not known[crop]))
+    seen, boxes = [seen[crop] for crop in order], boxes.take(np.array(order))
+    marks, first = _landmarks(seen, constants, model)
+    found: list[list[CropGroup]] = [[] for _ in views_seen]
+    begin = 0
+    for (view, _), crops in itertools.groupby(order, lambda crop: (view_of[crop], known[crop])):
+        end = begin + len(list(crops))
+        part = marks.part(int(first[begin]), int(first[end]))
+        looks = tuple(each.crop.vector is not None for each in seen[begin:end])
+        within = first[begin:end] - first[begin]
+        found[view].append(CropGroup(part, within, boxes.take(slice(begin, end)), looks))
+        begin = end
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,154 +177,144 @@ class _Thing:
 
 
 def _landmarks(
-    crop: Crop,
-    matches: Sequence[Match],
-    raw: Floats,
-    likeness: Floats,
-    constants: MapConstants,
-    model: Model,
-) -> Landmarks:
+    seen: Sequence[Seen], constants: MapConstants, model: Model
+) -> tuple[Landmarks, Indices]:
+    """The landmarks of all crops, and where each crop's begin: one number more than crops."""
+    matches = [match for each in seen for match in each.matches]
+    begins = np.cumsum([0, *(len(each.matches) for each in seen[:-1])])
     poses = np.array([match.pose for match in matches], dtype=np.float64)
-    things = _things(crop, matches, poses, likeness, constants)
+    rows = box_rows([match.bbox for match in matches])
+    likeness = np.concatenate([each.likeness for each in seen])
+    of_crops = _things(seen, begins, poses, rows, likeness, constants)
+    things = [thing for of_crop in of_crops for thing in of_crop]
+    first = np.cumsum([0, *(len(of_crop) for of_crop in of_crops)])
     members = np.concatenate([thing.members for thing in things])
-    counts = [len(thing.members) for thing in things]
-    starts = np.cumsum([0, *counts[:-1]])
-    owner = np.repeat(np.arange(len(things)), counts)
-    boxes = sights(constants.camera, [matches[i].bbox for i in members])
-    poses, raw, likeness = poses[members], raw[members], likeness[members]
+    counts = np.array([len(thing.members) for thing in things])
+    starts = np.cumsum(counts) - counts
+    owner = np.arange(len(things)).repeat(counts)
+    boxes = sights(constants.camera, rows.take(members, axis=0))
+    poses, likeness = poses.take(members, axis=0), likeness.take(members)
+    raw = np.concatenate([each.raw for each in seen]).take(members)
     xy = np.array([(thing.x, thing.y) for thing in things])
     sight = poses[:, 2] + boxes.bearing
-    ratios = _ratios(crop, raw, likeness, sight, poses[:, 2], starts, constants, model)
-    size, edges = _cues(boxes, poses, sight, xy[owner], starts, model)
+    by_heading = constants.evidence.side_by == "heading"
+    sides = poses[:, 2] if by_heading else sight
+    ratios = _ratios(seen, first, raw, likeness, sides, starts, constants, model)
+    size, edges = cues(boxes, poses, sight, xy.take(owner, axis=0), starts, model)
     classes = [matches[thing.members[0]].class_name for thing in things]
     spots, of_spots = _spots(poses, owner)
-    return Landmarks(
+    marks = Landmarks(
         xy,
         np.array([thing.spread for thing in things]),
         ratios,
-        _with_class_sizes(size, classes, constants.evidence, model),
+        with_class_sizes(size, classes, constants.evidence, model),
         edges,
         spots,
         of_spots,
         np.maximum.reduceat(raw, starts),
     )
+    return marks, first
 
 
 def _things(
-    crop: Crop,
-    matches: Sequence[Match],
+    seen: Sequence[Seen],
+    begins: Indices,
     poses: Floats,
+    boxes: Floats,
     likeness: Floats,
     constants: MapConstants,
-) -> list[_Thing]:
-    """The landmarks, those with the most similar observation first."""
-    by_object: dict[str, list[int]] = {}
-    others: list[int] = []
-    for index, match in enumerate(matches):
-        if match.object_stand is None or match.object_id is None:
-            others.append(index)
-        else:
-            by_object.setdefault(match.object_id, []).append(index)
-    found = []
-    for members in by_object.values():
-        stand = matches[members[0]].object_stand
-        if stand is not None:
-            spread = (stand.xx, stand.xy, stand.yy)
-            found.append(_Thing(np.array(members, dtype=np.intp), stand.x, stand.y, spread))
-    most = MAX_LANDMARKS if crop.vector is not None else _MAX_OF_CLASS
-    if others:
-        found += _triangulated(matches, others, poses, likeness, constants, most)
-    found.sort(key=lambda thing: (-float(likeness[thing.members].max()), int(thing.members[0])))
-    return found[:most]
+) -> list[list[_Thing]]:
+    """The landmarks of each crop, those with the most similar observation first. The arrays are of
+    all crops' matches, ``begins`` tells where each crop's begin."""
+    found: list[list[_Thing]] = []
+    others: list[list[int]] = []
+    for begin, each in zip(begins.tolist(), seen, strict=True):
+        by_object: dict[str, tuple[Stand, list[int]]] = {}
+        rest: list[int] = []
+        for index, match in enumerate(each.matches, begin):
+            if match.object_stand is None or match.object_id is None:
+                rest.append(index)
+            else:
+                by_object.setdefault(match.object_id, (match.object_stand, []))[1].append(index)
+        found.append(
+            [
+                _Thing(np.array(members, dtype=np.intp), at.x, at.y, (at.xx, at.xy, at.yy))
+                for at, members in by_object.values()
+            ]
+        )
+        others.append(rest)
+    if any(others):
+        _add_triangulated(found, seen, others, poses, boxes, likeness, constants)
+    for of_crop, each in zip(found, seen, strict=True):
+        best = [float(likeness[thing.members].max()) for thing in of_crop]
+        order = sorted(range(len(best)), key=lambda i: (-best[i], int(of_crop[i].members[0])))
+        of_crop[:] = [of_crop[i] for i in order[: _most(each)]]
+    return found
 
 
-def _triangulated(
-    matches: Sequence[Match],
-    others: list[int],
+def _most(seen: Seen) -> int:
+    return MAX_LANDMARKS if seen.crop.vector is not None else _MAX_OF_CLASS
+
+
+def _add_triangulated(
+    found: Sequence[list[_Thing]],
+    seen: Sequence[Seen],
+    others: Sequence[list[int]],
     poses: Floats,
+    boxes: Floats,
     likeness: Floats,
     constants: MapConstants,
-    most: int,
-) -> list[_Thing]:
-    index = np.array(others, dtype=np.intp)
-    alike = likeness[index]
-    least = min(constants.evidence.same_class, float(alike.max()) - _RELEVANT_BELOW_BEST)
-    index = index[alike >= least]
-    weight = np.minimum(np.maximum((likeness[index] - least) / _FULL_WEIGHT, 0.1), 1.0)
-    turned = poses[index] + (0.0, 0.0, constants.camera.yaw_rad)
-    boxes = views(constants.camera, [matches[i].bbox for i in index])
-    found: list[Triangulated] = triangulate(turned, boxes, weight, constants.evidence, most)
-    return [_Thing(index[thing.members], thing.x, thing.y, thing.spread) for thing in found]
+) -> None:
+    """Add the landmarks of each crop's ``others``, observations of no Object with a position."""
+    crops, indices, weights = [], [], []
+    for crop, rest in enumerate(others):
+        if not rest:
+            continue
+        index = np.array(rest, dtype=np.intp)
+        alike = likeness[index]
+        least = min(constants.evidence.same_class, float(alike.max()) - _RELEVANT_BELOW_BEST)
+        index, alike = index[alike >= least], alike[alike >= least]
+        crops.append(crop)
+        indices.append(index)
+        weights.append(np.minimum(np.maximum((alike - least) / _FULL_WEIGHT, 0.1), 1.0))
+    index = np.concatenate(indices)
+    sizes = np.array([len(each) for each in indices])
+    turned = poses.take(index, axis=0)
+    turned[:, 2] += constants.camera.yaw_rad
+    looked = views(constants.camera, boxes.take(index, axis=0))
+    rows: list[list[Triangulated]] = triangulate(
+        turned,
+        looked,
+        np.concatenate(weights),
+        np.cumsum(sizes) - sizes,
+        [_most(seen[crop]) for crop in crops],
+        constants.evidence,
+    )
+    for crop, row in zip(crops, rows, strict=True):
+        found[crop].extend(_Thing(index[t.members], t.x, t.y, t.spread) for t in row)
 
 
 def _ratios(
-    crop: Crop,
+    seen: Sequence[Seen],
+    first: Indices,
     raw: Floats,
     likeness: Floats,
-    sight: Floats,
-    heading: Floats,
+    sides: Floats,
     starts: Indices,
     constants: MapConstants,
     model: Model,
 ) -> Floats:
-    if crop.vector is None:
+    if all(each.crop.vector is None for each in seen):
         return np.full((len(starts), DIRECTIONS), math.exp(model.class_ratio))
-    by_heading = constants.evidence.side_by == "heading"
     very = np.where(raw > model.same_picture, raw, likeness)
-    tables = appearance_tables(very, heading if by_heading else sight, starts, constants, model)
-    if crop.is_text:
-        tables = model.text_weight * tables.mean(1, keepdims=True) + np.zeros(DIRECTIONS)
+    tables = appearance_tables(very, sides, starts, constants, model)
+    for each, begin, end in zip(seen, first[:-1].tolist(), first[1:].tolist(), strict=True):
+        if each.crop.vector is None:
+            tables[begin:end] = model.class_ratio
+        elif each.crop.is_text:
+            tables[begin:end] = model.text_weight * tables[begin:end].mean(1, keepdims=True)
     ratios: Floats = np.exp(tables)
     return ratios
-
-
-def _cues(
-    boxes: Sights, poses: Floats, sight: Floats, at: Floats, starts: Indices, model: Model
-) -> tuple[Cue, tuple[Cue, Cue]]:
-    ux, uy = np.cos(sight), np.sin(sight)
-    ahead = (at[:, 0] - poses[:, 0]) * ux + (at[:, 1] - poses[:, 1]) * uy
-    ahead = np.maximum(ahead, _NEAREST_M)
-    per = 1.0 / ahead
-    tall = boxes.tall.astype(np.float64)
-    size, _, count = _mean_cue(boxes.log_height + np.log(ahead), ux * per, uy * per, tall, starts)
-    size = Cue(
-        size.mean, size.by_x, size.by_y, np.where(count > 0.0, model.size_spread**2, math.inf)
-    )
-    edges = []
-    for edge in (UPPER, LOWER):
-        rise, whole = boxes.rise[edge], boxes.whole[edge].astype(np.float64)
-        cue, scatter, count = _mean_cue(rise * ahead, rise * ux, rise * uy, whole, starts)
-        part = model.edge_part * cue.mean
-        prior = _PRIOR_EDGES * (model.edge_m**2 + part * part)
-        variance = np.where(count > 0.0, (scatter + prior) / (count + _PRIOR_EDGES), math.inf)
-        edges.append(Cue(cue.mean, cue.by_x, cue.by_y, variance))
-    return size, (edges[0], edges[1])
-
-
-def _mean_cue(
-    value: Floats, by_x: Floats, by_y: Floats, weight: Floats, starts: Indices
-) -> tuple[Cue, Floats, Floats]:
-    """Weighted means over each landmark's observations, the sum of squared deviations, and the
-    weight; the variance is left 0."""
-    count = np.add.reduceat(weight, starts)
-    safe = np.maximum(count, 1e-9)
-    rows = np.stack((value, value * value, by_x, by_y)) * weight
-    mean, square, x, y = np.add.reduceat(rows, starts, axis=1) / safe
-    scatter = np.maximum(square - mean * mean, 0.0) * count
-    return Cue(mean, x, y, np.zeros_like(mean)), scatter, count
-
-
-def _with_class_sizes(
-    size: Cue, classes: Sequence[str], evidence: EvidenceConstants, model: Model
-) -> Cue:
-    """Where no box of a landmark has a height, the size of its class, if that is known."""
-    mean, variance = size.mean.copy(), size.variance.copy()
-    for index in np.flatnonzero(~np.isfinite(variance)).tolist():
-        height = evidence.sizes_m.get(classes[index])
-        if height is not None:
-            mean[index] = math.log(height)
-            variance[index] = evidence.size_spread**2 + model.size_spread**2
-    return Cue(mean, size.by_x, size.by_y, variance)
 
 
 def _spots(poses: Floats, owner: Indices) -> tuple[Floats, Indices]:

@@ -17,23 +17,26 @@ whatever the box says, as the plain method has it. k is below 1, so one unknown 
 not outvote the others.
 
 Errors of the landmark's position, of the pose and of the box add up; all are linearised. The
-position's part is computed once for many headings (`Terms`).
+position's part is computed once for many headings (`Terms`), and for all crops of a group at once.
+Landmarks that were seen from so far away that they add nothing are left out where that saves time.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .appearance import DIRECTIONS
-from .camera import LOWER, UPPER, Camera, Floats
+from .camera import Camera, Floats
 from .constants import MapConstants
-from .landmarks import CropEvidence, Cue
+from .landmarks import CropGroup
 from .model import Model
 from .walls import Walls
 
+Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
 _TURN: Final = 2.0 * math.pi
@@ -45,28 +48,57 @@ _LEAST_LOOKS: Final = 0.02
 """Part of the largest from which it is worth to look whether a wall is between."""
 _ROUGH_BEARING: Final = 0.05
 """Variance added to bearings where no heading is considered."""
+_FAR: Final = 120.0
+"""χ² of the distance to where a landmark was seen from: beyond it, seen_from is below 1e-26."""
+_LEAST_PART: Final = 1e-24
+"""``looks`` times seen_from below which a landmark does not change the mixture."""
+_MANY: Final = 4_000
+"""Landmarks times positions from which it pays to leave those out."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Terms:
-    """Of n landmarks and h positions, arrays (n, h): ``looks`` times seen_from, ``box`` without the
-    bearing, ``towards`` the direction to the landmark in the map and ``variance`` of its bearing,
-    ``near`` whether it is within twice the usual distance."""
+    """Of pairs of a landmark and a position, arrays of one shape: ``looks`` times seen_from,
+    ``box`` without the bearing, ``heading`` that puts the landmark where the crop shows it (in the
+    middle of the picture without a box), ``variance`` of its bearing, and ``near``, whether it is
+    within twice the usual distance.
+
+    The shape is (n, h) for all pairs of n landmarks and h positions, or one axis for some of them.
+    ``slot`` is the number of the landmark's crop times h, plus that of the position.
+    """
 
     looks: Floats
     box: Floats
-    towards: Floats
+    heading: Floats
     variance: Floats
-    near: NDArray[np.bool_]
+    near: Flags
+    slot: Indices
+    crops: int
+    positions: int
 
     def take(self, index: Indices) -> "Terms":
-        """Those of the positions at ``index``."""
+        """Those of the positions at ``index``; only of terms of all pairs."""
+        slot = self.slot[:, :1] // self.positions * len(index) + np.arange(len(index))
+        return self._at(lambda values: values.take(index, axis=1), slot, len(index))
+
+    def that_count(self) -> "Terms":
+        """Without the pairs that change nothing, if there may be many."""
+        if self.looks.size < _MANY:
+            return self
+        index = np.flatnonzero(self.looks > _LEAST_PART)
+        slot = self.slot.ravel().take(index)
+        return self._at(lambda values: values.ravel().take(index), slot, self.positions)
+
+    def _at(self, part: Callable[[Any], Any], slot: Indices, positions: int) -> "Terms":
         return Terms(
-            self.looks.take(index, axis=1),
-            self.box.take(index, axis=1),
-            self.towards.take(index, axis=1),
-            self.variance.take(index, axis=1),
-            self.near.take(index, axis=1),
+            part(self.looks),
+            part(self.box),
+            part(self.heading),
+            part(self.variance),
+            part(self.near),
+            slot,
+            self.crops,
+            positions,
         )
 
 
@@ -80,104 +112,187 @@ class Scene:
     walls: Walls | None = None
 
 
-def terms_at(crop: CropEvidence, xy: Floats, error_m2: float, scene: Scene) -> Terms:
+class _Pairs:
+    """Pairs of a landmark and a position: all, or those that are near enough."""
+
+    def __init__(self, group: CropGroup, xy: Floats, reach_m: float | None) -> None:
+        marks = group.landmarks
+        owner = group.owner
+        self._marks: Indices | None = None
+        if reach_m is None or len(owner) * len(xy) < _MANY:
+            self.x, self.y = xy[None, :, 0], xy[None, :, 1]
+            self.slot = owner[:, None] * len(xy) + np.arange(len(xy))
+            self.row = np.arange(len(owner))[:, None]
+        else:
+            self._marks, places = _near_pairs(marks.seen_from, marks.starts, xy, reach_m)
+            self.x, self.y = xy[:, 0].take(places), xy[:, 1].take(places)
+            self.slot = owner.take(self._marks) * len(xy) + places
+            self.row = self._marks
+
+    def of(self, values: Any) -> Any:
+        """A quantity of the landmarks, in the last axis, for each pair."""
+        return values[..., None] if self._marks is None else values.take(self._marks, axis=-1)
+
+    def nearest(self, points: Floats, starts: Indices) -> Floats:
+        """Squared distance of each pair's position to the nearest of its landmark's points."""
+        if self._marks is None:
+            dx, dy = points[:, 0, None] - self.x, points[:, 1, None] - self.y
+            squared: Floats = np.minimum.reduceat(dx * dx + dy * dy, starts, axis=0)
+            return squared
+        if not len(self._marks):
+            return np.zeros(0)
+        counts = np.diff(starts, append=len(points)).take(self._marks)
+        begin = np.cumsum(counts) - counts
+        which = np.arange(int(counts.sum())) + (starts.take(self._marks) - begin).repeat(counts)
+        dx = points[:, 0].take(which) - self.x.repeat(counts)
+        dy = points[:, 1].take(which) - self.y.repeat(counts)
+        nearest: Floats = np.minimum.reduceat(dx * dx + dy * dy, begin)
+        return nearest
+
+
+def _near_pairs(
+    points: Floats, starts: Indices, xy: Floats, reach_m: float
+) -> tuple[Indices, Indices]:
+    """Landmark and position of the pairs where the position is in the rectangle around the
+    landmark's points, larger by ``reach_m`` on each side."""
+    least = np.minimum.reduceat(points, starts, axis=0) - reach_m
+    most = np.maximum.reduceat(points, starts, axis=0) + reach_m
+    order = np.argsort(xy[:, 0], kind="stable")
+    ordered = xy[:, 0].take(order)
+    begin = np.searchsorted(ordered, least[:, 0])
+    counts = np.searchsorted(ordered, most[:, 0], side="right") - begin
+    marks = np.arange(len(starts)).repeat(counts)
+    places = np.arange(len(marks)) + (begin - np.cumsum(counts) + counts).repeat(counts)
+    places = order.take(places)
+    y = xy[:, 1].take(places)
+    near = np.flatnonzero((y >= least[:, 1].take(marks)) & (y <= most[:, 1].take(marks)))
+    return marks.take(near), places.take(near)
+
+
+def terms_at(
+    group: CropGroup, xy: Floats, error_m2: float, scene: Scene, *, every: bool = False
+) -> Terms:
     """The terms at positions ``xy`` (h, 2) that have the variance ``error_m2`` in each direction,
-    beside that of every pose."""
-    marks, evidence, model = crop.landmarks, scene.constants.evidence, scene.model
+    beside that of every pose; with ``every`` of all pairs, also of those that change nothing."""
+    marks, evidence, model = group.landmarks, scene.constants.evidence, scene.model
     pose_m2 = model.pose_m**2 + error_m2
-    dx = marks.xy[:, 0, None] - xy[None, :, 0]
-    dy = marks.xy[:, 1, None] - xy[None, :, 1]
+    seen_m2 = model.seen_from_m**2 + error_m2
+    far = None if every else math.sqrt(_FAR * seen_m2)
+    pairs = _Pairs(group, xy, far)
+    x, y = pairs.of(marks.xy.T)
+    dx, dy = x - pairs.x, y - pairs.y
     square = np.maximum(dx * dx + dy * dy, _NEAREST_M2)
     reach = np.sqrt(square)
     towards = np.arctan2(dy, dx)
-    ux, uy = dx / reach, dy / reach
-    xx, xy_, yy = (marks.spread[:, i, None] for i in range(3))
+    per = 1.0 / reach
+    ux, uy = dx * per, dy * per
+    xx, xy_, yy = spread = tuple(pairs.of(marks.spread.T))
     across = (xx * uy * uy - 2.0 * xy_ * ux * uy + yy * ux * ux + pose_m2) / square
-    bearing = evidence.bearing_cut_rad if crop.sight.cut[0] else evidence.bearing_rad
-    seen = -0.5 * _nearest(marks.seen_from, marks.starts, xy) / (model.seen_from_m**2 + error_m2)
-    if crop.bearing is None:
-        off = (np.log(reach) - math.log(evidence.range_m)) / evidence.range_spread
-        box = np.maximum(-0.5 * off * off, -_MOST_BY_SIZE)
+    seen = -0.5 * pairs.nearest(marks.seen_from, marks.starts) / seen_m2
+    log_reach = np.log(reach)
+    if group.boxed:
+        offset = _Offset(ux, uy, per, log_reach, pose_m2, spread)
+        box = _by_size(group, pairs, offset, model) + _by_edges(group, pairs, offset, model)
+        heading = towards - pairs.of(group.sight.bearing.take(group.owner))
     else:
-        box = np.zeros_like(reach)
-        offset = (ux, uy, reach, pose_m2, (xx, xy_, yy))
-        box += _by_size(crop, offset, model)
-        for edge in (UPPER, LOWER):
-            if crop.sight.whole[edge, 0]:
-                box += _by_edge(marks.edges[edge], float(crop.sight.rise[edge, 0]), offset, model)
-    looks = _ratio_towards(crop, towards, scene) * np.exp(seen)
+        off = (log_reach - math.log(evidence.range_m)) / evidence.range_spread
+        box = np.maximum(-0.5 * off * off, -_MOST_BY_SIZE)
+        heading = towards - scene.camera.yaw_rad
+    by_heading = evidence.side_by == "heading" and group.boxed
+    looks = _ratio_towards(marks.ratios, pairs.row, heading if by_heading else towards)
+    looks *= np.exp(seen)
     if scene.walls is not None:
-        counts = looks > _LEAST_LOOKS * looks.max(initial=0.0)
-        looks[scene.walls.hides(marks.xy, xy, counts)] *= model.through_walls
+        looks[_hidden(group, pairs, xy, looks, scene.walls)] *= model.through_walls
+    bearing = np.where(group.sight.cut, evidence.bearing_cut_rad, evidence.bearing_rad)
     return Terms(
         looks,
         np.exp(box),
-        towards,
-        across + bearing * bearing,
+        heading,
+        across + pairs.of((bearing * bearing).take(group.owner)),
         reach < model.twice * evidence.range_m,
+        pairs.slot,
+        len(group.first),
+        len(xy),
     )
 
 
-_Offset = tuple[Floats, Floats, Floats, float, tuple[Floats, Floats, Floats]]
+def _hidden(group: CropGroup, pairs: _Pairs, xy: Floats, looks: Floats, walls: Walls) -> Flags:
+    """Which pairs have a wall between; of those that look little like their crop it is not
+    asked."""
+    crop, place = np.divmod(pairs.slot, len(xy))
+    most = np.zeros(len(group.first))
+    np.maximum.at(most, crop, looks)
+    asked = np.zeros((len(group.owner), len(xy)), dtype=np.bool_)
+    asked[pairs.row, place] = looks > _LEAST_LOOKS * most.take(crop)
+    found: Flags = walls.hides(group.landmarks.xy, xy, asked)[pairs.row, place]
+    return found
 
 
-def _nearest(points: Floats, starts: Indices, xy: Floats) -> Floats:
-    """Squared distances of each position to the nearest of each landmark's points."""
-    dx = points[:, 0, None] - xy[None, :, 0]
-    dy = points[:, 1, None] - xy[None, :, 1]
-    squared: Floats = np.minimum.reduceat(dx * dx + dy * dy, starts, axis=0)
-    return squared
+class _Offset(NamedTuple):
+    """Where landmarks lie from positions: unit vector, inverse and logarithm of the distance, the
+    variance of the position and the covariance of the landmark."""
+
+    ux: Floats
+    uy: Floats
+    per: Floats
+    log_reach: Floats
+    pose_m2: float
+    spread: tuple[Floats, ...]
 
 
-def _ratio_towards(crop: CropEvidence, towards: Floats, scene: Scene) -> Floats:
+def _ratio_towards(ratios: Floats, row: Indices, towards: Floats) -> Floats:
     """The ratios by looks, between two directions of the table in proportion."""
-    by_heading = scene.constants.evidence.side_by == "heading" and crop.bearing is not None
-    turned = towards - (crop.bearing or 0.0) if by_heading else towards
-    place = turned * (DIRECTIONS / _TURN)
+    place = towards * (DIRECTIONS / _TURN)
     low = np.floor(place)
     part = place - low
-    row = np.arange(len(towards))[:, None] * DIRECTIONS
-    flat = crop.landmarks.ratios.ravel()
     first = low.astype(np.intp) % DIRECTIONS
     second = np.where(first == DIRECTIONS - 1, 0, first + 1)
-    ratios: Floats = flat.take(row + first) * (1.0 - part) + flat.take(row + second) * part
-    return ratios
+    row, flat = row * DIRECTIONS, ratios.ravel()
+    found: Floats = flat.take(row + first) * (1.0 - part) + flat.take(row + second) * part
+    return found
 
 
-def _by_size(crop: CropEvidence, offset: _Offset, model: Model) -> Floats:
+def _by_size(group: CropGroup, pairs: _Pairs, offset: _Offset, model: Model) -> Floats:
     """By the box's height; by a cut box's only whether the thing is too far away for it."""
-    ux, uy, reach, pose_m2, spread = offset
-    size = crop.landmarks.size
-    per = 1.0 / reach
-    known = np.isfinite(size.variance)[:, None]
-    own = np.where(np.isfinite(size.variance), size.variance, 1.0)[:, None]
-    variance = _variance(size.by_x[:, None] - ux * per, size.by_y[:, None] - uy * per, spread)
-    variance += own + pose_m2 * per * per
+    size, per = group.landmarks.size, offset.per
+    known = np.isfinite(size.variance)
+    own = np.where(known, size.variance, 1.0)
+    by_x, by_y = pairs.of(size.by_x) - offset.ux * per, pairs.of(size.by_y) - offset.uy * per
+    variance = _variance(by_x, by_y, offset.spread)
+    variance += pairs.of(own) + offset.pose_m2 * per * per
     # how much taller it should be than the box
-    taller = size.mean[:, None] - float(crop.sight.log_height[0]) - np.log(reach)
-    if not crop.sight.tall[0]:
+    height = group.sight.log_height.take(group.owner)
+    taller = pairs.of(size.mean - height) - offset.log_reach
+    tall = group.sight.tall.take(group.owner)
+    fit: Floats = np.zeros(1)
+    if not tall.all():
         shorter = np.minimum(taller, 0.0)
         fit = np.maximum(-0.5 * shorter * shorter / variance, -_MOST_BY_EDGE)
-    else:
-        fit = _gain(taller, variance, model.other_sizes**2, _MOST_BY_SIZE)
-    return np.where(known, fit, 0.0)
+    if tall.any():
+        gain = _gain(taller, variance, model.other_sizes**2, _MOST_BY_SIZE)
+        fit = np.where(pairs.of(tall), gain, fit)
+    return np.where(pairs.of(known), fit, 0.0)
 
 
-def _by_edge(edge: Cue, rise: float, offset: _Offset, model: Model) -> Floats:
-    ux, uy, reach, pose_m2, spread = offset
-    per = 1.0 / reach
-    known = np.isfinite(edge.variance)[:, None]
-    own = np.where(np.isfinite(edge.variance), edge.variance, 1.0)[:, None]
-    expected = edge.mean[:, None] * per
-    gx = (edge.by_x[:, None] - expected * ux) * per
-    gy = (edge.by_y[:, None] - expected * uy) * per
-    variance = _variance(gx, gy, spread)
-    variance += (own + expected * expected * pose_m2) * per * per + model.edge_rise**2
+def _by_edges(group: CropGroup, pairs: _Pairs, offset: _Offset, model: Model) -> Any:
+    """By the upper and the lower edge, where the picture's border does not cut them."""
+    edges, per = group.edges, offset.per
+    counts = np.isfinite(edges.variance) & group.sight.whole.take(group.owner, axis=1)
+    if not counts.any():
+        return 0.0
+    own = np.where(counts, edges.variance, 1.0)
+    expected = pairs.of(edges.mean) * per
+    gx = (pairs.of(edges.by_x) - expected * offset.ux) * per
+    gy = (pairs.of(edges.by_y) - expected * offset.uy) * per
+    variance = _variance(gx, gy, offset.spread)
+    variance += (pairs.of(own) + expected * expected * offset.pose_m2) * (per * per)
+    variance += model.edge_rise**2
+    rise = pairs.of(group.sight.rise.take(group.owner, axis=1))
     fit = _gain(rise - expected, variance, model.other_rises**2, _MOST_BY_EDGE)
-    return np.where(known, fit, 0.0)
+    return np.where(pairs.of(counts), fit, 0.0).sum(0)
 
 
-def _variance(gx: Floats, gy: Floats, spread: tuple[Floats, Floats, Floats]) -> Floats:
+def _variance(gx: Floats, gy: Floats, spread: tuple[Floats, ...]) -> Floats:
     xx, xy, yy = spread
     found: Floats = gx * (gx * xx + 2.0 * gy * xy) + gy * gy * yy
     return found
@@ -186,65 +301,68 @@ def _variance(gx: Floats, gy: Floats, spread: tuple[Floats, Floats, Floats]) -> 
 def _gain(off: Floats, variance: Floats, other: float, most: float) -> Floats:
     """Log ratio of the normal density of ``off`` to that of other things."""
     wide = variance + other
-    chi = off * off
-    fit = -0.5 * (chi * (1.0 / variance - 1.0 / wide) + np.log(variance / wide))
+    fit = -0.5 * (off * off * (1.0 / variance - 1.0 / wide) + np.log(variance / wide))
     return np.minimum(np.maximum(fit, -most), most)
 
 
 def log_likelihood(
-    crop: CropEvidence, terms: Terms, yaw: Floats, yaw_variance: float, scene: Scene
+    group: CropGroup, terms: Terms, yaw: Floats, yaw_variance: float, scene: Scene
 ) -> Floats:
-    """Logarithm of the mixture at h poses: the terms' positions with ``yaw`` (h,)."""
+    """Logarithms of the crops' mixtures, shape (c, k, h), at the terms' positions with ``yaw``
+    (k, h)."""
     half = scene.camera.half_field_rad
-    middle = scene.camera.yaw_rad
-    if crop.bearing is None:
-        ahead = np.abs(_wrap(terms.towards - (yaw + middle))) < half
-        return _mixture(terms, ahead * terms.box + scene.model.tail * (ahead & terms.near), scene)
-    off = _wrap(terms.towards - (yaw + crop.bearing))
-    variance = terms.variance + yaw_variance
-    chi = np.minimum(off * off / variance, _MOST_CHI2)
-    fit = np.exp(-0.5 * chi) * (2.0 * half) / np.sqrt(_TURN * variance)
-    in_front = (np.abs(off) < half) & terms.near
-    return _mixture(terms, fit * terms.box + scene.model.tail * in_front, scene)
-
-
-def log_likelihood_of_place(crop: CropEvidence, terms: Terms, scene: Scene) -> Floats:
-    """About the logarithm of the mixture at the best heading, for h positions."""
-    rough: Floats = np.ones(1)
-    if crop.bearing is not None:
-        wide = terms.variance + _ROUGH_BEARING
-        rough = 2.0 * scene.camera.half_field_rad / np.sqrt(_TURN * wide)
-    return _mixture(terms, rough * terms.box + scene.model.tail * terms.near, scene)
-
-
-def log_likelihood_unaimed(terms: Terms, scene: Scene) -> Floats:
-    """About the logarithm of the mixture at headings that no landmark's bearing fits."""
-    in_view = scene.camera.half_field_rad / math.pi
-    tail: Floats = scene.model.tail * in_view * terms.near.astype(np.float64)
-    return _mixture(terms, tail, scene)
-
-
-def _mixture(terms: Terms, fit: Floats, scene: Scene) -> Floats:
-    model = scene.model
-    total = (terms.looks * fit).sum(0)
-    found: Floats = np.log((1.0 - model.in_map) + (model.in_map * model.share) * total)
+    at = yaw[:, None] if terms.looks.ndim == 2 else yaw.take(terms.slot % terms.positions, axis=1)
+    off = terms.heading - at
+    off -= _TURN * np.rint(off / _TURN)
+    fit = (np.abs(off) < half) * (
+        scene.model.tail * terms.near + (0.0 if group.boxed else terms.box)
+    )
+    if group.boxed:
+        variance = terms.variance + yaw_variance
+        chi = np.minimum(off * off / variance, _MOST_CHI2)
+        fit += np.exp(-0.5 * chi) * (terms.box * (2.0 * half) / np.sqrt(_TURN * variance))
+    found: Floats = _mixture(terms, fit, scene).swapaxes(0, 1)
     return found
 
 
-def _wrap(angle: Floats) -> Floats:
-    return angle - _TURN * np.rint(angle / _TURN)
+def log_likelihood_of_place(group: CropGroup, terms: Terms, scene: Scene) -> Floats:
+    """About the logarithms of the mixtures at the best heading, shape (c, h)."""
+    fit: Any = terms.box
+    if group.boxed:
+        wide = terms.variance + _ROUGH_BEARING
+        fit = fit * (2.0 * scene.camera.half_field_rad / np.sqrt(_TURN * wide))
+    found: Floats = _mixture(terms, fit + scene.model.tail * terms.near, scene)[0]
+    return found
 
 
-def headings(crop: CropEvidence, terms: Terms, scene: Scene) -> tuple[Floats, Floats, Floats]:
+def log_likelihood_unaimed(terms: Terms, scene: Scene) -> Floats:
+    """About the logarithms of the mixtures at headings that no landmark's bearing fits, shape
+    (c, h)."""
+    in_view = scene.camera.half_field_rad / math.pi
+    tail: Floats = terms.near.astype(np.float64) * (scene.model.tail * in_view)
+    found: Floats = _mixture(terms, tail, scene)[0]
+    return found
+
+
+def _mixture(terms: Terms, fit: Floats, scene: Scene) -> Floats:
+    """Of shape (k, c, h); ``fit`` has that of the terms, or one axis of k more."""
+    model, parts, count = scene.model, terms.looks * fit, terms.crops * terms.positions
+    slot, times = terms.slot, 1
+    if parts.ndim > slot.ndim:
+        times = len(parts)
+        slot = slot[None] + (np.arange(times) * count).reshape(-1, *(1,) * slot.ndim)
+    total = np.bincount(slot.ravel(), parts.ravel(), times * count)
+    found: Floats = np.log((1.0 - model.in_map) + (model.in_map * model.share) * total)
+    return found.reshape(times, terms.crops, terms.positions)
+
+
+def headings(group: CropGroup, terms: Terms, scene: Scene) -> tuple[Floats, Floats, Floats]:
     """For each landmark and position the heading that puts the landmark where the crop shows it,
     its variance, and how likely it is, up to a factor that all crops share."""
-    half, variance = scene.camera.half_field_rad, terms.variance
-    if crop.bearing is None:
-        variance = np.full_like(variance, (0.5 * half) ** 2)
-        bearing = scene.camera.yaw_rad
-    else:
-        bearing = crop.bearing
-    return terms.towards - bearing, variance, terms.looks * terms.box / np.sqrt(variance)
+    variance = terms.variance
+    if not group.boxed:
+        variance = np.full_like(variance, (0.5 * scene.camera.half_field_rad) ** 2)
+    return terms.heading, variance, terms.looks * terms.box / np.sqrt(variance)
 
 
 def unexplained(model: Model) -> float:

@@ -15,8 +15,9 @@ median; a mean could lie between two look-alike spots), moved to the mean of the
 which is then computed anew on a grid of 0.12 m.
 """
 
+import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -27,8 +28,8 @@ from .appearance import usual_likeness
 from .camera import Floats
 from .candidates import Match
 from .features import Features, confidence_of, features_of
-from .grid import cells_near, likely_spots, log_prior
-from .landmarks import CropEvidence, crop_evidence, likeness_of
+from .grid import cells_near, likely_spots, log_prior, square_to_nearest
+from .landmarks import CropGroup, Landmarks, Seen, crop_groups, likeness_of
 from .likelihood import (
     Scene,
     Terms,
@@ -53,6 +54,8 @@ _HEADINGS: Final = 8
 _TURN: Final = 2.0 * math.pi
 _FINE_M: Final = 0.12
 _FINE: Final = np.arange(-3, 4) * _FINE_M
+_FINE_SQUARE: Final = np.array([(dx, dy) for dx in _FINE for dy in _FINE])
+_QUARTERS: Final = np.array([(x, y) for x in (-1, 1) for y in (-1, 1)]) * (CELL_M / 2)
 _FINE_YAW: Final = np.array([-0.16, -0.08, 0.0, 0.08, 0.16])
 _MAX_ERROR_M: Final = 2.5
 _NEAR_M: Final = 1.0
@@ -81,9 +84,10 @@ class Posterior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sighted:
-    """The crops of a view that have evidence, and the movement since the view before."""
+    """The crops of a view that have evidence, those with a box and those without, and the movement
+    since the view before."""
 
-    crops: tuple[CropEvidence, ...]
+    groups: tuple[CropGroup, ...]
     movement: Movement
 
 
@@ -93,21 +97,25 @@ def locate(
     """The posterior over poses at the last view; ``matches`` run parallel to the crops of all
     views. None if no match has a pose."""
     sighted = _sighted(views, matches, scene)
-    crops = [crop for view in sighted for crop in view.crops]
-    if not crops:
+    marks = [each for view in sighted for group in view.groups for each in group.of_each()]
+    if not marks:
         return None
     behind = behind_last([view.movement for view in sighted])
-    been = likely_spots([crop.landmarks for crop in crops], CELL_M / 2)
-    coarse = cells_near(been, 2.0 * CELL_M, scene.model.reach_m)
-    score, _ = _score_places(coarse, sighted, behind, been, 2.0 * CELL_M, scene)
-    kept = _best(score, max(_COARSE_KEPT, _COARSE_IN_ALL // len(crops)))
-    quarter = CELL_M / 2
-    corners = np.array([(x, y) for x in (-quarter, quarter) for y in (-quarter, quarter)])
-    cells = (coarse[kept][:, None] + corners[None]).reshape(-1, 2)
-    score, terms = _score_places(cells, sighted, behind, been, CELL_M, scene)
-    kept = _best(score, max(_KEPT, _IN_ALL // len(crops)))
+    been = likely_spots(marks, CELL_M / 2)
+    coarse, apart = cells_near(been, 2.0 * CELL_M, scene.model.reach_m)
+    prior = log_prior(coarse, apart, scene.model, scene.walls)
+    terms = _terms_at(coarse, sighted, behind, 2.0 * CELL_M, scene)
+    score = prior + _score_of_places(sighted, terms, scene)
+    kept = _best(score, max(_COARSE_KEPT, _COARSE_IN_ALL // len(marks)))
+    cells = (coarse[kept][:, None] + _QUARTERS).reshape(-1, 2)
+    prior = log_prior(cells, square_to_nearest(cells, been), scene.model, scene.walls)
+    terms = _terms_at(cells, sighted, behind, CELL_M, scene, every=True)
+    score = prior + _score_of_places(sighted, terms, scene)
+    kept = _best(score, max(_KEPT, _IN_ALL // len(marks)))
     terms = [[each.take(kept) for each in of_view] for of_view in terms]
-    return _weigh(cells[kept], terms, sighted, behind, been, len(matches), scene)
+    return _weigh(
+        cells[kept], prior[kept], terms, sighted, behind, marks, been, len(matches), scene
+    )
 
 
 def _sighted(
@@ -124,42 +132,48 @@ def _sighted(
         evidence.session_shift,
     )
     rows = iter(zip(crops, matches, likeness, strict=True))
-    found = []
+    seen = []
     for view in views:
         of_view = [
-            crop_evidence(
-                *next(rows),
-                shifts if crop.vector is not None and not crop.is_text else {},
-                constants,
-                scene.camera,
-                scene.model,
-            )
-            for crop in view.crops
+            Seen.of(crop, row, alike, {} if crop.vector is None or crop.is_text else shifts)
+            for crop, row, alike in itertools.islice(rows, len(view.crops))
         ]
-        present = tuple(crop for crop in of_view if crop is not None)
-        found.append(_Sighted(present, (view.dx, view.dy, view.dyaw)))
-    return found
+        seen.append([each for each in of_view if each is not None])
+    if not any(seen):
+        return []
+    groups = crop_groups(seen, constants, scene.camera, scene.model)
+    return [
+        _Sighted(tuple(of_view), (view.dx, view.dy, view.dyaw))
+        for view, of_view in zip(views, groups, strict=True)
+    ]
 
 
-def _score_places(
+def _terms_at(
     xy: Floats,
     sighted: Sequence[_Sighted],
     behind: Sequence[Behind],
-    been: Floats,
     cell_m: float,
     scene: Scene,
-) -> tuple[Floats, _TermsOfViews]:
-    """The log-likelihood of cells whatever the heading, and the terms there. A view from elsewhere
-    counts as one from here with a larger error."""
-    total = log_prior(xy, been, scene.model, scene.walls)
+    *,
+    every: bool = False,
+) -> _TermsOfViews:
+    """The terms at cells. A view from elsewhere counts as one from here with a larger error."""
     found = []
     for view, back in zip(sighted, behind, strict=True):
         error = cell_m * cell_m / 12.0 + back.m2 + 0.5 * back.away_m**2
-        of_view = [terms_at(crop, xy, error, scene) for crop in view.crops]
-        for crop, terms in zip(view.crops, of_view, strict=True):
-            total += log_likelihood_of_place(crop, terms, scene)
-        found.append(of_view)
-    return total, found
+        found.append([terms_at(each, xy, error, scene, every=every) for each in view.groups])
+    return found
+
+
+def _score_of_places(sighted: Sequence[_Sighted], terms: _TermsOfViews, scene: Scene) -> Floats:
+    """The log-likelihood at the terms' positions whatever the heading."""
+    scores = [
+        log_likelihood_of_place(group, each, scene).sum(0)
+        for view, of_view in zip(sighted, terms, strict=True)
+        for group, each in zip(view.groups, of_view, strict=True)
+    ]
+    total: Floats = np.sum(scores, axis=0)
+    return total
 
 
 def _best(score: Floats, count: int) -> Indices:
@@ -168,29 +182,32 @@ def _best(score: Floats, count: int) -> Indices:
 
 def _weigh(
     cells: Floats,
+    prior: Floats,
     terms: _TermsOfViews,
     sighted: Sequence[_Sighted],
     behind: Sequence[Behind],
+    marks: Sequence[Landmarks],
     been: Floats,
     asked: int,
     scene: Scene,
 ) -> Posterior:
-    prior = log_prior(cells, been, scene.model, scene.walls)
-    error = CELL_M * CELL_M / 12.0
-    which, yaw, density = _hypotheses(sighted, behind, terms, scene)
-    poses = np.column_stack((cells[which], yaw))
-    each = np.stack(list(_crop_likelihoods(poses, which, sighted, behind, terms, error, scene)))
+    yaw, density = _hypotheses(sighted, behind, terms, scene)
+    terms = [[each.that_count() for each in of_view] for of_view in terms]
+    poses = np.empty((yaw.size, 3))
+    poses[:, :2] = np.tile(cells, (len(yaw), 1))
+    poses[:, 2] = yaw.ravel()
+    each = _crop_likelihoods(poses, sighted, behind, terms, CELL_M * CELL_M / 12.0, scene)
     anywhere = prior.copy()
     for of_view in terms:
         for there in of_view:
-            anywhere += log_likelihood_unaimed(there, scene)
-    score = each.sum(0) + prior[which]
+            anywhere += log_likelihood_unaimed(there, scene).sum(0)
+    score = each.sum(0).reshape(yaw.shape) + prior
     most = max(float(score.max()), float(anywhere.max()))
     rest = np.exp(anywhere - most)
-    weights = np.maximum(np.exp(score - most) - rest[which], 0.0) / density
-    of_cell = weights.reshape(-1, len(cells)).sum(0) + _TURN * (len(which) // len(cells)) * rest
+    weights = np.maximum(np.exp(score - most) - rest, 0.0) / density
+    of_cell = weights.sum(0) + _TURN * len(yaw) * rest
     weights, of_cell = weights / of_cell.sum(), of_cell / of_cell.sum()
-    return _choose(cells, of_cell, poses, which, weights, each, sighted, behind, been, asked, scene)
+    return _choose(cells, of_cell, poses, weights, each, sighted, behind, marks, been, asked, scene)
 
 
 def _hypotheses(
@@ -198,56 +215,60 @@ def _hypotheses(
     behind: Sequence[Behind],
     terms: _TermsOfViews,
     scene: Scene,
-) -> tuple[Indices, Floats, Floats]:
-    """Headings at the cells: the cell's index, the heading at the last view, and how densely the
-    headings of that cell lie there."""
+) -> tuple[Floats, Floats]:
+    """Headings (k, h) of the last view at the cells, and how densely the headings of a cell lie
+    there."""
     found = []
     for view, back, of_view in zip(sighted, behind, terms, strict=True):
-        for crop, each in zip(view.crops, of_view, strict=True):
-            yaw, variance, weight = headings(crop, each, scene)
+        for group, each in zip(view.groups, of_view, strict=True):
+            yaw, variance, weight = headings(group, each, scene)
             found.append((yaw + back.turn, variance + back.yaw2, weight))
-    yaws, variances, weights = (np.concatenate(part) for part in zip(*found, strict=True))
+    yaws, variances, weights = (
+        part[0] if len(part) == 1 else np.concatenate(part) for part in zip(*found, strict=True)
+    )
     chosen = np.argsort(-weights, axis=0, kind="stable")[:_HEADINGS]
-    yaw = np.take_along_axis(yaws, chosen, 0)
-    variance = np.take_along_axis(variances, chosen, 0)
+    chosen = chosen * yaws.shape[1] + np.arange(yaws.shape[1])
+    yaw, variance = yaws.take(chosen), variances.take(chosen)
     off = yaw[:, None] - yaw[None]
     off -= _TURN * np.rint(off / _TURN)
     bells = np.exp(-0.5 * np.minimum(off * off / variance[None], 40.0))
-    density = (bells / np.sqrt(_TURN * variance)[None]).mean(1)
-    which = np.tile(np.arange(yaw.shape[1]), len(yaw))
-    return which, yaw.ravel(), density.ravel()
+    return yaw, (bells / np.sqrt(_TURN * variance)[None]).mean(1)
 
 
 def _crop_likelihoods(
     poses: Floats,
-    which: Indices,
     sighted: Sequence[_Sighted],
     behind: Sequence[Behind],
     terms: _TermsOfViews,
     error: float,
     scene: Scene,
-) -> Iterator[Floats]:
-    """The log-likelihood of each crop at poses of the last view. ``terms`` at the positions that
-    ``which`` names serve the views from the same spot."""
+) -> Floats:
+    """The log-likelihood of each crop at poses of the last view, shape (c, k · h): k times the h
+    positions of ``terms``, which serve the views from the same spot."""
+    found = []
     at_views = poses_at_views(poses, [view.movement for view in sighted])
-    for number, (view, back, here) in enumerate(zip(sighted, behind, at_views, strict=True)):
-        for index, crop in enumerate(view.crops):
-            if back.away_m < _SAME_SPOT_M:
-                there = terms[number][index].take(which)
+    for view, back, here, of_view in zip(sighted, behind, at_views, terms, strict=True):
+        same_spot = back.away_m < _SAME_SPOT_M
+        for index, group in enumerate(view.groups):
+            if same_spot:
+                there = of_view[index]
             else:
-                there = terms_at(crop, here[:, :2], error + back.m2, scene)
-            yield log_likelihood(crop, there, here[:, 2], back.yaw2, scene)
+                there = terms_at(group, here[:, :2], error + back.m2, scene)
+            yaw = here[:, 2].reshape(-1, there.positions)
+            likelihood = log_likelihood(group, there, yaw, back.yaw2, scene)
+            found.append(likelihood.reshape(-1, len(poses)))
+    return found[0] if len(found) == 1 else np.concatenate(found)
 
 
 def _choose(
     cells: Floats,
     of_cell: Floats,
     poses: Floats,
-    which: Indices,
     weights: Floats,
     each: Floats,
     sighted: Sequence[_Sighted],
     behind: Sequence[Behind],
+    marks: Sequence[Landmarks],
     been: Floats,
     asked: int,
     scene: Scene,
@@ -259,14 +280,14 @@ def _choose(
     best = int(np.argmin(expected))
     near = np.maximum(of_cell, _LEAST_WEIGHT) * (apart[best] < _NEAR_M)
     x, y = (float((cells[:, axis] * near).sum() / near.sum()) for axis in (0, 1))
-    close = np.maximum(weights, _LEAST_WEIGHT) * near[which].astype(np.bool_)
+    close = (np.maximum(weights, _LEAST_WEIGHT) * near.astype(np.bool_)).ravel()
     yaw = _mean_yaw(poses[:, 2], close / close.sum())
     x, y = _refine(x, y, float(poses[int(np.argmax(close)), 2]), sighted, behind, been, scene)
     likeliest = int(np.argmax(weights))
     squared = (cells[:, 0] - x) ** 2 + (cells[:, 1] - y) ** 2
-    crops = [crop for view in sighted for crop in view.crops]
+    looks = [has_look for view in sighted for group in view.groups for has_look in group.has_look]
     found = features_of(
-        [crop.landmarks for crop in crops if crop.has_look],
+        list(itertools.compress(marks, looks)),
         each[:, likeliest],
         asked,
         float(of_cell[squared < 1.5**2].sum()),
@@ -274,7 +295,7 @@ def _choose(
         scene.model,
     )
     order = np.argsort(-of_cell, kind="stable")
-    heaviest = weights.reshape(-1, len(cells)).argmax(0) * len(cells) + np.arange(len(cells))
+    heaviest = weights.argmax(0) * len(cells) + np.arange(len(cells))
     return Posterior(
         poses[heaviest[order]],
         of_cell[order],
@@ -297,19 +318,20 @@ def _refine(
     scene: Scene,
 ) -> tuple[float, float]:
     """The mean position of the posterior on a finer grid about a pose."""
-    at = np.array([(x + dx, y + dy) for dx in _FINE for dy in _FINE])
-    which = np.repeat(np.arange(len(at)), len(_FINE_YAW))
-    poses = np.column_stack((at[which], np.tile(yaw + _FINE_YAW, len(at))))
+    at = _FINE_SQUARE + np.array((x, y))
+    poses = np.empty((len(_FINE_YAW) * len(at), 3))
+    poses[:, :2] = np.tile(at, (len(_FINE_YAW), 1))
+    poses[:, 2] = (yaw + _FINE_YAW).repeat(len(at))
     error = _FINE_M * _FINE_M / 12.0
     terms = [
-        [terms_at(crop, at, error + back.m2, scene) for crop in view.crops]
+        [terms_at(group, at, error + back.m2, scene) for group in view.groups]
         if back.away_m < _SAME_SPOT_M
         else []
         for view, back in zip(sighted, behind, strict=True)
     ]
-    score = log_prior(at, been, scene.model, scene.walls)[which]
-    for one in _crop_likelihoods(poses, which, sighted, behind, terms, error, scene):
-        score = score + one
+    prior = log_prior(at, square_to_nearest(at, been), scene.model, scene.walls)
+    score = _crop_likelihoods(poses, sighted, behind, terms, error, scene).sum(0)
+    score += np.tile(prior, len(_FINE_YAW))
     weights = np.exp(score - score.max())
     weights /= weights.sum()
     return float((poses[:, 0] * weights).sum()), float((poses[:, 1] * weights).sum())

@@ -197,26 +197,32 @@ def _answer(
 def _place_shares(candidates: Candidates, posterior: Posterior) -> dict[PlaceOrdinal, float]:
     """The weight of the poses by the Place of the nearest placed candidate keyframe; at most 1,
     which a rounded sum may exceed."""
-    placed = sorted({spot for row in candidates.matches for m in row if (spot := _placed(m))})
+    placed = sorted(
+        {
+            (match.pose[0], match.pose[1], place)
+            for row in candidates.matches
+            for match in row
+            if match.pose is not None
+            and (place := _either(match.keyframe_place, match.object_place)) is not None
+        }
+    )
     if not placed:
         return {}
-    where = np.array([spot[:2] for spot in placed])
-    dx = posterior.poses[:, 0][:, None] - where[None, :, 0]
-    dy = posterior.poses[:, 1][:, None] - where[None, :, 1]
-    nearest = np.argmin(dx * dx + dy * dy, axis=1)
-    owners = np.array([spot[2] for spot in placed])[nearest]
+    x, y, places = zip(*placed, strict=True)
+    dx = posterior.poses[:, 0, None] - np.array(x)
+    dy = posterior.poses[:, 1, None] - np.array(y)
+    dx *= dx
+    dy *= dy
+    dx += dy
+    owners = np.array(places).take(dx.argmin(axis=1))
     return {
-        PlaceOrdinal(int(place)): min(float(posterior.weights[owners == place].sum()), 1.0)
-        for place in np.unique(owners)
+        PlaceOrdinal(place): min(float(posterior.weights[owners == place].sum()), 1.0)
+        for place in sorted(set(owners.tolist()))
     }
 
 
-def _placed(match: Match) -> tuple[float, float, PlaceOrdinal] | None:
-    """A match's keyframe position and Place."""
-    place = match.object_place if match.keyframe_place is None else match.keyframe_place
-    if match.pose is None or place is None:
-        return None
-    return match.pose[0], match.pose[1], place
+def _either(first: PlaceOrdinal | None, second: PlaceOrdinal | None) -> PlaceOrdinal | None:
+    return second if first is None else first
 
 
 def _ranked_places(

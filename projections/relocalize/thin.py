@@ -6,7 +6,7 @@ seen them from. It shows in the candidates, so no question costs more.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 from eventsrc.text import counted
@@ -30,7 +30,7 @@ def thinness(crops: Sequence[Crop], matches: Sequence[Sequence[Match]]) -> str |
         return None
     seen = {match.observation: match for row in rows for match in row}
     few = max(len(row) for row in rows) < NEIGHBOURS
-    spots = _spots([match for _, match in sorted(seen.items())])
+    spots = _spots(seen[ordinal] for ordinal in sorted(seen))
     if not few and spots >= LEAST_SPOTS:
         return None
     number = counted(len(seen), "observation") if few else "its most similar observations"
@@ -38,14 +38,17 @@ def thinness(crops: Sequence[Crop], matches: Sequence[Sequence[Match]]) -> str |
     return f"{number} from {where}"
 
 
-def _spots(matches: Sequence[Match]) -> int:
+def _spots(matches: Iterable[Match]) -> int:
     """How many places to stand the matches were seen from, counted up to `LEAST_SPOTS`."""
     spots: list[tuple[float, float]] = []
     for match in matches:
         if match.pose is None:
             continue
         x, y = match.pose[:2]
-        if all(math.hypot(x - a, y - b) >= SPOT_M for a, b in spots):
+        for a, b in spots:
+            if math.hypot(x - a, y - b) < SPOT_M:
+                break
+        else:
             spots.append((x, y))
             if len(spots) == LEAST_SPOTS:
                 break

@@ -17,8 +17,11 @@ of log size.
 No BLAS, and results depend on no order but the candidates'.
 """
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from functools import lru_cache
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,10 +32,16 @@ from .camera import Flags, Floats, Views
 
 Indices = NDArray[np.intp]
 
-_DEPTHS: Final = np.exp(np.linspace(np.log(0.5), np.log(9.0), 22))
+_LOG_DEPTHS: Final = np.linspace(np.log(0.5), np.log(9.0), 22)
+_DEPTHS: Final = np.exp(_LOG_DEPTHS)
 _FOR_DEPTH: Final = 40
 """How many of the most similar matches are used to find the size; all pairs are compared."""
 _AGREE_M: Final = 0.3
+_MOST_APART: Final = 80.0 * _AGREE_M**2
+"""Pairs of points that are farther apart at every depth, in square metres, agree by less than
+exp(-40)."""
+_LEAST_SQUARE: Final = 1e-300
+_PER_AGREED: Final = -2.0 * _AGREE_M**2
 _CUT_WEIGHT: Final = 0.2
 _MIN_RANGE_M: Final = 0.3
 _MIN_WEIGHT: Final = 0.05
@@ -57,53 +66,115 @@ class Triangulated:
 
 
 def triangulate(
-    poses: Floats, boxes: Views, weight: Floats, evidence: EvidenceConstants, most: int
-) -> list[Triangulated]:
-    """Landmarks, the densest first. ``poses`` (n, 3) in metres and radians, most similar first,
-    ``weight`` (n,) how much each counts; n ≥ 1."""
+    poses: Floats,
+    boxes: Views,
+    weight: Floats,
+    starts: Indices,
+    most: Sequence[int],
+    evidence: EvidenceConstants,
+) -> list[list[Triangulated]]:
+    """For each crop its landmarks, the densest first and at most ``most``. ``poses`` (n, 3) in
+    metres and radians and ``weight`` (n,), how much each counts, are of the observations, those of
+    one crop after the other from ``starts`` on, each crop's most similar first; all have some."""
+    counts = np.diff(starts, append=len(poses))
     cut = boxes.cut_x | boxes.cut_y | ~boxes.known
     weight = np.where(cut, _CUT_WEIGHT * weight, weight)
-    rays = _rays(poses, boxes)
-    first = np.arange(min(_FOR_DEPTH, len(poses)))
-    depth, sigma = _common_depth(poses[first], rays[first], weight[first], evidence)
-    points = points_of(poses[:, :2], depth * rays, cut, sigma, evidence)
-    found = []
-    for members in cluster_points(points, weight, most):
-        at = estimate_position(points.subset(members))
-        (xx, xy, yy), (sx, sy) = at.spread, at.slide
-        size = sigma * sigma
-        spread = (xx + size * sx * sx, xy + size * sx * sy, yy + size * sy * sy)
-        found.append(Triangulated(members, at.x, at.y, spread))
+    rays = _rays(poses, boxes, starts, counts)
+    depth, sigma = _common_depths(poses, rays, weight, starts, counts, evidence)
+    sigma_of = sigma.repeat(counts)
+    points = points_of(poses.T[:2], depth.repeat(counts) * rays, cut, sigma_of, evidence)
+    members, owners = [], []
+    for crop, (start, count) in enumerate(zip(starts.tolist(), counts.tolist(), strict=True)):
+        part = slice(start, start + count)
+        clusters = cluster_points(points.part(start, start + count), weight[part], most[crop])
+        members += [start + each for each in clusters]
+        owners += [crop] * len(clusters)
+    sizes = np.array([len(each) for each in members])
+    at = estimate_positions(points.subset(np.concatenate(members)), np.cumsum(sizes) - sizes)
+    size = sigma[owners] ** 2
+    sx, sy = at.slide
+    spread = at.spread + size * np.array((sx * sx, sx * sy, sy * sy))
+    found: list[list[Triangulated]] = [[] for _ in counts]
+    rows = zip(owners, members, *at.xy.tolist(), *spread.tolist(), strict=True)
+    for crop, of_it, x, y, xx, xy, yy in rows:
+        found[crop].append(Triangulated(of_it, x, y, (xx, xy, yy)))
     return found
 
 
-def _rays(poses: Floats, boxes: Views) -> Floats:
-    """(n, 2) vectors from pose to thing, for a box of median height at a depth of 1 m."""
+def _rays(poses: Floats, boxes: Views, starts: Indices, counts: Indices) -> Floats:
+    """Vectors (2, n) from pose to thing, for a box of its crop's median height at a depth of
+    1 m."""
+    heights = boxes.height_px
+    medians = [
+        _median(heights[start : start + count])
+        for start, count in zip(starts.tolist(), counts.tolist(), strict=True)
+    ]
+    relative = np.repeat(medians, counts) / heights
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    median_px = float(np.median(boxes.height_px))
-    relative = median_px / boxes.height_px
-    ahead = np.stack((cos, sin), axis=1)
-    left = np.stack((-sin, cos), axis=1)
-    rays: Floats = (ahead + boxes.slope[:, None] * left) * relative[:, None]
-    return rays
+    along: Floats = np.array((cos - boxes.slope * sin, sin + boxes.slope * cos))
+    return along * relative
 
 
-def _common_depth(
-    poses: Floats, rays: Floats, weight: Floats, evidence: EvidenceConstants
-) -> tuple[float, float]:
-    """The depth of a box of median height under which points from different poses agree best, and
-    the standard error of its logarithm, with the score taken as a log-likelihood."""
-    dp = poses[:, None, :2] - poses[None, :, :2]
-    dr = rays[:, None] - rays[None]
-    pp, pr, rr = (dp * dp).sum(2), (dp * dr).sum(2), (dr * dr).sum(2)
-    apart = np.clip((np.sqrt(pp) - 0.3) / 0.7, 0.0, 1.0) * weight[:, None] * weight[None]
-    upper = np.nonzero(np.triu(apart, 1))  # pairs that can agree by more than chance
-    pp, pr, rr, apart = pp[upper], pr[upper], rr[upper], apart[upper]
-    squared = pp + 2.0 * _DEPTHS[:, None] * pr + (_DEPTHS * _DEPTHS)[:, None] * rr
-    agreed = 2.0 * (apart * np.exp(squared / (-2.0 * _AGREE_M**2))).sum(1)
+def _median(values: Floats) -> float:
+    ordered = np.sort(values)
+    return float(ordered[(len(values) - 1) // 2] + ordered[len(values) // 2]) / 2.0
+
+
+@lru_cache(maxsize=_FOR_DEPTH)
+def _pairs(count: int) -> tuple[Indices, Indices]:
+    """Each two of so many."""
+    return np.triu_indices(count, 1)
+
+
+def _common_depths(
+    poses: Floats,
+    rays: Floats,
+    weight: Floats,
+    starts: Indices,
+    counts: Indices,
+    evidence: EvidenceConstants,
+) -> tuple[Floats, Floats]:
+    """For each crop the depth of a box of median height under which points from different poses
+    agree best, and the standard error of its logarithm, with the score taken as a
+    log-likelihood."""
+    used = np.minimum(counts, _FOR_DEPTH).tolist()
+    pairs = [_pairs(each) for each in used]
+    first, second = (
+        np.concatenate(
+            [start + pair[side] for start, pair in zip(starts.tolist(), pairs, strict=True)]
+        )
+        for side in (0, 1)
+    )
+    crop = np.repeat(np.arange(len(counts)), [len(pair[0]) for pair in pairs])
+    px, py, rx, ry = (
+        values.take(first) - values.take(second)
+        for values in (*np.ascontiguousarray(poses.T[:2]), *rays)
+    )
+    pp, pr, rr = px * px + py * py, px * rx + py * ry, rx * rx + ry * ry
+    apart = np.minimum(np.maximum((np.sqrt(pp) - 0.3) / 0.7, 0.0), 1.0)
+    # only pairs that can agree by more than chance, and do so at one of the depths
+    nearest = pp - pr * pr / np.maximum(rr, _LEAST_SQUARE)
+    can = np.flatnonzero((apart > 0.0) & (nearest < _MOST_APART))
+    apart = apart.take(can) * weight.take(first.take(can)) * weight.take(second.take(can))
+    # (pp + 2 pr · depth + rr · depth²) / (-2 · agree²)
+    agree = (rr.take(can) / _PER_AGREED) * _DEPTHS[:, None]
+    agree += pr.take(can) * (2.0 / _PER_AGREED)
+    agree *= _DEPTHS[:, None]
+    agree += pp.take(can) / _PER_AGREED
+    np.exp(agree, out=agree)
+    agree *= apart
+    crop = crop.take(can)
     usual = (np.log(_DEPTHS / evidence.range_m) / evidence.range_spread) ** 2
-    score = 6.0 * agreed / max(1.0, float(weight.sum())) - 0.5 * usual
-    return _peak(score), max(_LEAST_SIZE_ERROR, _width(score))
+    ends = np.searchsorted(crop, np.arange(len(counts)), side="right").tolist()
+    depth, sigma, begin = [], [], 0
+    for start, count, end in zip(starts.tolist(), used, ends, strict=True):
+        agreed = 2.0 * agree[:, begin:end].sum(1)
+        total = float(weight[start : start + count].sum())
+        score = 6.0 * agreed / max(1.0, total) - 0.5 * usual
+        depth.append(_peak(score))
+        sigma.append(max(_LEAST_SIZE_ERROR, _width(score)))
+        begin = end
+    return np.array(depth), np.array(sigma)
 
 
 def _peak(score: Floats) -> float:
@@ -120,116 +191,161 @@ def _peak(score: Floats) -> float:
 def _width(score: Floats) -> float:
     """The standard deviation of log depth under exp(score)."""
     share = np.exp(score - score.max())
-    share = share / share.sum()
-    logs = np.log(_DEPTHS)
-    off = logs - float((share * logs).sum())
-    return float(np.sqrt((share * off * off).sum()))
+    share /= share.sum()
+    off = _LOG_DEPTHS - float((share * _LOG_DEPTHS).sum())
+    return math.sqrt(float((share * off * off).sum()))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Points:
-    """Points ``xy`` (n, 2) with the rays (n, 2) to them from where they were seen, in metres.
+    """n points with the rays to them from where they were seen, in metres, as ``rows`` (15, n).
 
-    ``sigma_along`` and ``sigma_across`` (n,) are their standard errors in and square to the ray's
-    direction, whose unit vectors are ``direction`` (2, n). ``moments`` (7, n) are what weighted
-    sums are made of: the inverse of a point's covariance (xx, xy, yy), that times the point, and
-    that times the ray.
+    ``sigma`` (2, n) are their standard errors in and square to the ray's direction, whose unit
+    vectors are ``direction`` (2, n). ``moments`` (7, n) are what weighted sums are made of: the
+    inverse of a point's covariance (xx, xy, yy), that times the point, and that times the ray.
     """
 
-    xy: Floats
-    ray: Floats
-    sigma_along: Floats
-    sigma_across: Floats
-    direction: Floats
-    moments: Floats
+    rows: Floats
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return len(self.rows[0])
+
+    @property
+    def xy(self) -> Floats:
+        """Positions (2, n)."""
+        return self.rows[:2]
+
+    @property
+    def ray(self) -> Floats:
+        """Rays (2, n)."""
+        return self.rows[2:4]
+
+    @property
+    def sigma(self) -> Floats:
+        """Standard errors (2, n)."""
+        return self.rows[4:6]
+
+    @property
+    def direction(self) -> Floats:
+        """Unit vectors (2, n)."""
+        return self.rows[6:8]
+
+    @property
+    def moments(self) -> Floats:
+        """Moments (7, n)."""
+        return self.rows[8:]
 
     def subset(self, index: Indices) -> "Points":
         """Those at ``index``."""
-        return Points(
-            self.xy[index],
-            self.ray[index],
-            self.sigma_along[index],
-            self.sigma_across[index],
-            self.direction[:, index],
-            self.moments[:, index],
-        )
+        return Points(self.rows.take(index, axis=1))
+
+    def part(self, start: int, end: int) -> "Points":
+        """Those from ``start`` to ``end``."""
+        return Points(self.rows[:, start:end])
 
 
 def points_of(
-    origin: Floats, ray: Floats, cut: Flags, sigma_size: float, evidence: EvidenceConstants
+    origin: Floats, ray: Floats, cut: Flags, sigma_size: Floats, evidence: EvidenceConstants
 ) -> Points:
-    """Points at the ends of the rays; ``cut`` marks boxes that are cut off or missing."""
-    length = np.sqrt(ray[:, 0] ** 2 + ray[:, 1] ** 2)
+    """Points at the ends of the rays (2, n) from ``origin`` (2, n); ``cut`` marks boxes that are
+    cut off or missing, ``sigma_size`` (n,) is the error of the logarithm of the size."""
+    found = Points(np.empty((15, len(cut))))
+    length = np.sqrt(ray[0] * ray[0] + ray[1] * ray[1])
     reach = np.maximum(length, _MIN_RANGE_M)
     depth = np.where(cut, _LOG_DEPTH_CUT, _LOG_DEPTH)
     bearing = np.where(cut, evidence.bearing_cut_rad, evidence.bearing_rad)
     square, pose = reach * reach, evidence.pose_m**2
-    along = np.sqrt((depth * depth + sigma_size**2) * square + pose)
-    across = np.sqrt(bearing * bearing * square + pose)
+    sigma = found.sigma
+    sigma[0] = np.sqrt((depth * depth + sigma_size * sigma_size) * square + pose)
+    sigma[1] = np.sqrt(bearing * bearing * square + pose)
     safe = np.where(length > 0, length, 1.0)
-    ux, uy = np.where(length > 0, ray[:, 0] / safe, 1.0), ray[:, 1] / safe  # no length: along x
-    a, b = 1.0 / (along * along), 1.0 / (across * across)
-    xy = origin + ray
-    m_xx, m_xy, m_yy = a * ux * ux + b * uy * uy, (a - b) * ux * uy, a * uy * uy + b * ux * ux
-    rows = [m_xx, m_xy, m_yy]
-    for x, y in (xy.T, ray.T):
-        rows += [m_xx * x + m_xy * y, m_xy * x + m_yy * y]
-    return Points(xy, ray, along, across, np.stack((ux, uy)), np.stack(rows))
+    ux, uy = np.where(length > 0, ray[0] / safe, 1.0), ray[1] / safe  # no length: along x
+    a, b = 1.0 / (sigma * sigma)
+    found.xy[:], found.ray[:] = origin + ray, ray
+    found.direction[:] = ux, uy
+    moments = found.moments
+    moments[0] = m_xx = a * ux * ux + b * uy * uy
+    moments[1] = m_xy = (a - b) * ux * uy
+    moments[2] = m_yy = a * uy * uy + b * ux * ux
+    for row, (x, y) in ((3, found.xy), (5, found.ray)):
+        moments[row] = m_xx * x + m_xy * y
+        moments[row + 1] = m_xy * x + m_yy * y
+    return found
 
 
 def cluster_points(points: Points, weight: Floats, most: int) -> list[Indices]:
     """Indices of the points of each cluster: around the densest point, then around the densest of
     the rest, and so on, at most ``most`` clusters."""
-    near = np.exp(-0.5 * _chi_squared(points, points.xy[:, None, :]))
+    near = np.exp(-0.5 * _chi_squared(points, points.xy[:, :, None]))
     free = np.ones(len(weight), dtype=bool)
+    left = weight.copy()
+    support = (near * left).sum(1)
     found: list[Indices] = []
-    while free.any() and len(found) < most:
-        support = (near * (weight * free)).sum(1)
-        centre = int(np.argmax(np.where(free, support, -1.0)))
+    while True:
+        centre = int(np.argmax(support))
         mean = _weighted_mean(points, near[centre] * free)
-        members = free & (_chi_squared(points, np.array(mean)) < _GATE)
+        members = free & (_chi_squared(points, mean) < _GATE)
         members[centre] = True
-        found.append(np.flatnonzero(members))
-        free &= ~members
-    return found
+        cluster = np.flatnonzero(members)
+        found.append(cluster)
+        free[cluster] = False
+        if len(found) == most or not free.any():
+            return found
+        left[cluster] = 0.0
+        # the support of points that are not near one of these is what it was
+        lost = np.flatnonzero(near.take(cluster, axis=1).any(1))
+        support[lost] = np.where(free[lost], (near.take(lost, axis=0) * left).sum(1), -1.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Position:
-    """A landmark's position in metres, its covariance (xx, xy, yy) in m², and its slide."""
+class Positions:
+    """Of n landmarks the positions ``xy`` (2, n) in metres, their covariances ``spread`` (3, n),
+    xx, xy and yy in m², and their slides (2, n)."""
 
-    x: float
-    y: float
-    spread: tuple[float, float, float]
-    slide: tuple[float, float]
+    xy: Floats
+    spread: Floats
+    slide: Floats
 
 
-def estimate_position(points: Points) -> Position:
-    """The position of the thing that all ``points`` show; outliers have little weight."""
-    centre = np.array(_weighted_mean(points, np.ones(len(points.xy))))
-    weight = np.maximum(np.exp(-0.5 * _chi_squared(points, centre)), _MIN_WEIGHT)
-    weight = weight * _share_of_spot(points.xy - points.ray)
-    sxx, sxy, syy, x, y, ray_x, ray_y = (points.moments * weight).sum(1).tolist()
+def estimate_positions(points: Points, starts: Indices) -> Positions:
+    """The positions of the things that ``points`` show, those of one thing after the other from
+    ``starts`` on; outliers have little weight."""
+    counts = np.diff(starts, append=points.count)
+    centre = np.array(_solve(*np.add.reduceat(points.moments[:5], starts, axis=1)))
+    chi = _chi_squared(points, centre.repeat(counts, axis=1))
+    weight = np.maximum(np.exp(-0.5 * chi), _MIN_WEIGHT)
+    weight = weight * _share_of_spot(points.xy - points.ray, starts, counts)
+    sums = np.add.reduceat(points.moments * weight, starts, axis=1)
+    sxx, sxy, syy, x, y, ray_x, ray_y = sums
     det, least = sxx * syy - sxy * sxy, _LEAST_ERROR_M**2
-    spread = (syy / det + least, -sxy / det, sxx / det + least)
-    return Position(*_solve(sxx, sxy, syy, x, y), spread, slide=_solve(sxx, sxy, syy, ray_x, ray_y))
+    spread = np.array((syy / det + least, -sxy / det, sxx / det + least))
+    slide = np.array(_solve(sxx, sxy, syy, ray_x, ray_y))
+    return Positions(np.array(_solve(sxx, sxy, syy, x, y)), spread, slide)
 
 
-def _share_of_spot(origin: Floats) -> Floats:
-    """How much each point counts beside those from its spot."""
-    dx = origin[:, 0, None] - origin[None, :, 0]
-    dy = origin[:, 1, None] - origin[None, :, 1]
-    near = (dx * dx + dy * dy < _SPOT_M * _SPOT_M).sum(1)
+def _share_of_spot(origin: Floats, starts: Indices, counts: Indices) -> Floats:
+    """How much each point counts beside those of its thing from its spot."""
+    others = counts.repeat(counts)
+    begin = np.cumsum(others) - others
+    first = np.arange(len(others)).repeat(others)
+    second = np.arange(len(first)) + (starts.repeat(counts) - begin).repeat(others)
+    dx, dy = (values.take(first) - values.take(second) for values in origin)
+    is_near = (dx * dx + dy * dy < _SPOT_M * _SPOT_M).view(np.int8)
+    near = np.add.reduceat(is_near, begin, dtype=np.int64)
     share: Floats = np.minimum(_SPOT_COUNT / near, 1.0)
     return share
 
 
-def _chi_squared(points: Points, to: Floats) -> Floats:
-    """χ² of each point being at ``to``, of shape (2,) or (m, 1, 2)."""
+def _chi_squared(points: Points, to: Floats | tuple[float, float]) -> Floats:
+    """χ² of each point being at ``to``, of shape (2,), (2, n) or (2, m, 1)."""
     ux, uy = points.direction
-    dx, dy = to[..., 0] - points.xy[:, 0], to[..., 1] - points.xy[:, 1]
-    along = (dx * ux + dy * uy) / points.sigma_along
-    across = (dy * ux - dx * uy) / points.sigma_across
+    sigma_along, sigma_across = points.sigma
+    x, y = points.xy
+    dx, dy = to[0] - x, to[1] - y
+    along = (dx * ux + dy * uy) / sigma_along
+    across = (dy * ux - dx * uy) / sigma_across
     chi: Floats = along * along + across * across
     return chi
 
@@ -239,7 +355,10 @@ def _weighted_mean(points: Points, weight: Floats) -> tuple[float, float]:
     return _solve(*(points.moments[:5] * weight).sum(1).tolist())
 
 
-def _solve(xx: float, xy: float, yy: float, x: float, y: float) -> tuple[float, float]:
-    """The vector that the symmetric matrix takes to (x, y)."""
+Number = TypeVar("Number", float, Floats)
+
+
+def _solve(xx: Number, xy: Number, yy: Number, x: Number, y: Number) -> tuple[Number, Number]:
+    """The vector that the symmetric matrix takes to (x, y); of many at once if they are arrays."""
     det = xx * yy - xy * xy
     return (yy * x - xy * y) / det, (xx * y - xy * x) / det

@@ -2,19 +2,20 @@
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from projections.evidence import EvidenceConstants
 from projections.relocalize import Camera
-from projections.relocalize.camera import views
+from projections.relocalize.camera import box_rows, views
 from projections.relocalize.triangulation import (
     Points,
     cluster_points,
-    estimate_position,
+    estimate_positions,
     points_of,
     triangulate,
 )
@@ -28,9 +29,28 @@ SIZE_ERROR = 0.05
 def seen(things: Sequence[Spot], origins: Sequence[Spot], stretch: float = 1.0) -> Points:
     """Every thing from every origin, the range wrong by the factor ``stretch``."""
     pairs = [(origin, thing) for thing in things for origin in origins]
-    origin = np.array([pair[0] for pair in pairs])
-    ray = stretch * (np.array([pair[1] for pair in pairs]) - origin)
-    return points_of(origin, ray, np.zeros(len(pairs), dtype=bool), SIZE_ERROR, SURE)
+    origin = np.array([pair[0] for pair in pairs]).T
+    ray = stretch * (np.array([pair[1] for pair in pairs]).T - origin)
+    size = np.full(len(pairs), SIZE_ERROR)
+    return points_of(origin, ray, np.zeros(len(pairs), dtype=bool), size, SURE)
+
+
+class Position(NamedTuple):
+    """A landmark's."""
+
+    x: float
+    y: float
+    spread: tuple[float, float, float]
+    slide: tuple[float, float]
+
+
+def estimate_position(points: Points) -> Position:
+    """Of one thing that all points show."""
+    found = estimate_positions(points, np.zeros(1, dtype=np.intp))
+    (x,), (y,) = found.xy.tolist()
+    (xx,), (xy,), (yy,) = found.spread.tolist()
+    (sx,), (sy,) = found.slide.tolist()
+    return Position(x, y, (xx, xy, yy), (sx, sy))
 
 
 def test_neighbours_half_a_metre_apart_are_two_things() -> None:
@@ -45,7 +65,7 @@ def test_crossing_bearings_give_the_position_though_the_range_is_wrong() -> None
     """Two views square to each other, ranges a tenth too long: the crossing is nearer."""
     points = seen([(0.0, 0.0)], [(3.0, 0.0), (0.0, 3.0)], stretch=1.1)
     found = estimate_position(points)
-    plain = points.xy.mean(0)
+    plain = points.xy.mean(1)
     assert math.hypot(found.x, found.y) < 0.5 * math.hypot(*plain)
 
 
@@ -70,12 +90,60 @@ def test_every_point_is_in_one_group_and_every_spread_is_a_covariance(
     things: list[Spot], origins: list[Spot]
 ) -> None:
     points = seen(things, origins)
-    groups = cluster_points(points, np.ones(len(points.xy)), len(points.xy))
-    assert sorted(i for group in groups for i in group.tolist()) == list(range(len(points.xy)))
-    for group in groups:
-        xx, xy, yy = estimate_position(points.subset(group)).spread
+    groups = cluster_points(points, np.ones(points.count), points.count)
+    assert sorted(i for group in groups for i in group.tolist()) == list(range(points.count))
+    sizes = [len(group) for group in groups]
+    together = estimate_positions(
+        points.subset(np.concatenate(groups)), np.cumsum(sizes) - np.array(sizes)
+    )
+    for number, group in enumerate(groups):
+        found = estimate_position(points.subset(group))
+        xx, xy, yy = found.spread
         assert min(xx, yy) > 0
         assert xx * yy > xy * xy
+        assert together.xy[:, number].tolist() == pytest.approx([found.x, found.y])
+        assert together.spread[:, number].tolist() == pytest.approx(found.spread)
+        assert together.slide[:, number].tolist() == pytest.approx(found.slide)
+
+
+def slow_clusters(points: Points, weight: list[float], most: int) -> list[list[int]]:
+    """Densest first, with every support summed anew for every cluster."""
+    count = points.count
+    (x, y), (ux, uy), (along, across) = points.xy, points.direction, points.sigma
+
+    def chi(i: int, at: tuple[float, float]) -> float:
+        dx, dy = at[0] - x[i], at[1] - y[i]
+        one, two = (dx * ux[i] + dy * uy[i]) / along[i], (dy * ux[i] - dx * uy[i]) / across[i]
+        return float(one * one + two * two)
+
+    near = [[math.exp(-0.5 * chi(j, (x[i], y[i]))) for j in range(count)] for i in range(count)]
+    free, found = set(range(count)), []
+    while free and len(found) < most:
+        support = {i: sum(near[i][j] * weight[j] for j in free) for i in free}
+        centre = max(sorted(free), key=lambda i: support[i])
+        part = np.array([near[centre][j] * (j in free) for j in range(count)])
+        xx, xy, yy, mx, my = (points.moments[:5] * part).sum(1).tolist()
+        det = xx * yy - xy * xy
+        at = ((yy * mx - xy * my) / det, (xx * my - xy * mx) / det)
+        members = {i for i in free if chi(i, at) < 5.0} | {centre}
+        found.append(sorted(members))
+        free -= members
+    return found
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 8))
+@settings(deadline=None)
+def test_clusters_are_those_of_supports_summed_anew(seed: int, most: int) -> None:
+    """Also where some of the points are so far away that they are of no account to each other."""
+    rng = np.random.default_rng(seed)
+    things = [(float(x), float(y)) for x, y in rng.uniform(-3, 3, (3, 2))]
+    things += [(float(x) + 300.0, float(y)) for x, y in rng.uniform(-3, 3, (3, 2))]
+    origins = [(float(x), float(y)) for x, y in rng.uniform(-3, 3, (3, 2))]
+    here, there = seen(things[:3], origins), seen(things[3:], [(x + 300.0, y) for x, y in origins])
+    points = Points(np.concatenate((here.rows, there.rows), axis=1))
+    weight = rng.uniform(0.1, 1.0, points.count)
+    found = [group.tolist() for group in cluster_points(points, weight, most)]
+    assert found == slow_clusters(points, weight.tolist(), most)
 
 
 def test_more_views_from_one_spot_do_not_make_a_position_sure() -> None:
@@ -98,6 +166,12 @@ def test_views_that_cross_find_the_position_whatever_the_usual_distance() -> Non
         poses.append((far * math.cos(angle), far * math.sin(angle), angle + math.pi))
     for usual in (1.0, 2.0, 4.0):
         evidence = EvidenceConstants(range_m=usual)
-        found = triangulate(np.array(poses), views(Camera(), boxes), np.ones(8), evidence, 5)
-        assert [len(each.members) for each in found] == [8]
-        assert math.hypot(found[0].x, found[0].y) < 0.1
+        # of two crops: the other's things lie 50 m away
+        beside = [*poses, *((x + 50.0, y, angle) for x, y, angle in poses)]
+        rows = box_rows([*boxes, *boxes])
+        crops = triangulate(
+            np.array(beside), views(Camera(), rows), np.ones(16), np.array([0, 8]), [5, 5], evidence
+        )
+        for number, found in enumerate(crops):
+            assert [each.members.tolist() for each in found] == [[8 * number + i for i in range(8)]]
+            assert math.hypot(found[0].x - 50.0 * number, found[0].y) < 0.1

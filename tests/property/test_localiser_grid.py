@@ -3,12 +3,14 @@
 import math
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from projections.relocalize.appearance import DIRECTIONS
-from projections.relocalize.grid import cells_near, distinct, likely_spots
-from projections.relocalize.landmarks import Cue, Landmarks, _spots
+from projections.relocalize.cues import Cue
+from projections.relocalize.grid import cells_near, distinct, likely_spots, square_to_nearest
+from projections.relocalize.landmarks import Landmarks, _spots
 
 _METRES = st.floats(-8.0, 8.0)
 _POINTS = st.lists(st.tuples(_METRES, _METRES), min_size=1, max_size=8)
@@ -35,7 +37,7 @@ def landmarks(looks: list[float], spots: list[list[tuple[float, float]]]) -> Lan
 def test_every_position_within_reach_is_in_a_cell_and_no_cell_is_far(
     points: list[tuple[float, float]], reach: float
 ) -> None:
-    cells = cells_near(np.array(points), 0.7, reach)
+    cells, squared = cells_near(np.array(points), 0.7, reach)
     keys = {(round(x / 0.7), round(y / 0.7)) for x, y in cells.tolist()}
     assert len(keys) == len(cells)
     for x, y in points:
@@ -43,16 +45,29 @@ def test_every_position_within_reach_is_in_a_cell_and_no_cell_is_far(
             there = x + 0.7 * reach * math.cos(turn), y + 0.7 * reach * math.sin(turn)
             nearest = min(math.dist(there, cell) for cell in cells.tolist())
             assert nearest <= 0.7  # half a cell's diagonal, and what the points are rounded by
-    for cell in cells.tolist():
-        assert min(math.dist(cell, point) for point in points) <= reach + 0.85
+    for cell, found in zip(cells.tolist(), squared.tolist(), strict=True):
+        nearest = min(math.dist(cell, point) for point in points)
+        assert nearest <= reach + 0.85
+        assert found == pytest.approx(nearest**2, abs=1e-9)
+    assert cells.tolist() == sorted(cells.tolist())
+    expected = square_to_nearest(cells, np.array(points))
+    assert squared.tolist() == pytest.approx(expected.tolist(), abs=1e-9)
 
 
-@given(_POINTS)
+_FLOORS = st.lists(
+    st.tuples(st.integers(0, 200), _METRES, st.sampled_from([-9.9e6, 0.0, 9.9e6]), _METRES),
+    min_size=1,
+    max_size=6,
+).map(lambda rows: [(floor * 1e8 + x, far + y) for floor, x, far, y in rows])
+
+
+@given(_POINTS | _FLOORS)
 def test_points_in_one_square_count_once(points: list[tuple[float, float]]) -> None:
     found = distinct(np.array(points), 0.175)
     expected = {(round(x / 0.175), round(y / 0.175)) for x, y in points}
     assert {(round(x / 0.175), round(y / 0.175)) for x, y in found.tolist()} == expected
     assert len(found) == len(expected)
+    assert found.tolist() == sorted(found.tolist())
 
 
 def test_few_crops_are_looked_for_at_all_their_landmarks() -> None:

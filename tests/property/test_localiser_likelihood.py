@@ -10,9 +10,16 @@ from hypothesis import strategies as st
 from projections.evidence import EvidenceConstants
 from projections.relocalize import Camera, MapConstants
 from projections.relocalize.appearance import DIRECTIONS, appearance_tables
-from projections.relocalize.camera import Sights, sights
-from projections.relocalize.landmarks import CropEvidence, Cue, Landmarks
-from projections.relocalize.likelihood import Scene, log_likelihood, terms_at
+from projections.relocalize.camera import Sights, box_rows, sights
+from projections.relocalize.cues import Cue
+from projections.relocalize.landmarks import CropGroup, Landmarks
+from projections.relocalize.likelihood import (
+    Scene,
+    log_likelihood,
+    log_likelihood_of_place,
+    log_likelihood_unaimed,
+    terms_at,
+)
 from projections.relocalize.model import MODEL, Model
 from tests.thorough import examples
 
@@ -20,53 +27,71 @@ TURN = 2.0 * math.pi
 seeds = st.integers(0, 2**32 - 1)
 
 
-def random_crop(rng: np.random.Generator, count: int, camera: Camera) -> CropEvidence:
-    """A crop with ``count`` landmarks; some cues are missing, some boxes cut or absent."""
+def random_group(
+    rng: np.random.Generator,
+    counts_of: list[int],
+    camera: Camera,
+    *,
+    boxed: bool,
+    wide_m: float = 4.0,
+) -> CropGroup:
+    """Crops with so many landmarks each; some cues are missing, some boxes cut."""
+    count = sum(counts_of)
 
     def cue(scale: float) -> Cue:
         variance = np.where(rng.random(count) < 0.25, math.inf, rng.uniform(0.01, 0.2, count))
         gradients = rng.normal(0, 0.3, (2, count))
         return Cue(rng.normal(0, scale, count), gradients[0], gradients[1], variance)
 
+    places = rng.uniform(-wide_m, wide_m, (count, 2))
     root = rng.normal(0, 0.4, (count, 2, 2))
     spread = root @ root.transpose(0, 2, 1) + 0.01 * np.eye(2)
     counts = rng.integers(1, 4, count)
     marks = Landmarks(
-        rng.uniform(-4, 4, (count, 2)),
+        places,
         np.stack((spread[:, 0, 0], spread[:, 0, 1], spread[:, 1, 1]), axis=1),
         np.exp(rng.normal(0, 2, (count, DIRECTIONS))),
         cue(0.5),
         (cue(0.5), cue(0.5)),
-        rng.uniform(-4, 4, (int(counts.sum()), 2)),
+        places.repeat(counts, axis=0) + rng.uniform(-4, 4, (int(counts.sum()), 2)),
         np.cumsum([0, *counts[:-1].tolist()]),
         rng.uniform(0, 1, count),
     )
-    left, top = rng.uniform(0, 300), rng.uniform(0, 200)
-    box = (left, top, left + rng.uniform(5, 340), top + rng.uniform(5, 200))
-    if rng.random() < 0.3:
-        box = (0.0, *box[1:])
-    if rng.random() < 0.3:
-        box = (*box[:3], camera.height_px)
-    own = sights(camera, [None if rng.random() < 0.2 else box])
-    return CropEvidence(marks, float(own.bearing[0]) if own.known[0] else None, own)
+    boxes: list[tuple[float, float, float, float] | None] = []
+    for _ in counts_of:
+        left, top = rng.uniform(0, 300), rng.uniform(0, 200)
+        box = (left, top, left + rng.uniform(5, 340), top + rng.uniform(5, 200))
+        if rng.random() < 0.3:
+            box = (0.0, *box[1:])
+        if rng.random() < 0.3:
+            box = (*box[:3], camera.height_px)
+        boxes.append(box if boxed else None)
+    first = np.cumsum([0, *counts_of[:-1]])
+    return CropGroup(marks, first, sights(camera, box_rows(boxes)), (True,) * len(counts_of))
 
 
-def slow(crop: CropEvidence, pose: np.ndarray, error: float, turn: float, scene: Scene) -> float:  # type: ignore[type-arg]
-    """The mixture at one pose."""
+def one_crop(group: CropGroup, crop: int) -> CropGroup:
+    """Only that crop."""
+    sight = group.sight.take(np.array([crop]))
+    return CropGroup(group.of_each()[crop], np.zeros(1, dtype=np.intp), sight, (True,))
+
+
+def slow(group: CropGroup, pose: np.ndarray, error: float, turn: float, scene: Scene) -> float:  # type: ignore[type-arg]
+    """The mixture of a group's only crop at one pose."""
     x, y, yaw = (float(v) for v in pose)
     total = 0.0
-    marks, model = crop.landmarks, scene.model
+    marks, model = group.landmarks, scene.model
     ends = [*marks.starts[1:].tolist(), len(marks.seen_from)]
     for i in range(len(marks.xy)):
         points = marks.seen_from[int(marks.starts[i]) : ends[i]]
         nearest = min((px - x) ** 2 + (py - y) ** 2 for px, py in points)
         seen = math.exp(-0.5 * nearest / (model.seen_from_m**2 + error))
-        total += seen * fit_of(crop, i, (x, y, yaw), error, turn, scene)
+        total += seen * fit_of(group, i, (x, y, yaw), error, turn, scene)
     return math.log(1 - model.in_map + model.in_map * model.share * total)
 
 
 def fit_of(
-    crop: CropEvidence,
+    crop: CropGroup,
     i: int,
     pose: tuple[float, float, float],
     error: float,
@@ -82,9 +107,9 @@ def fit_of(
     covariance = np.array([[xx, xy], [xy, yy]])
     pose2 = model.pose_m**2 + error
     towards = math.atan2(dy, dx)
-    looked = towards
-    if evidence.side_by == "heading" and crop.bearing is not None:
-        looked -= crop.bearing
+    looked, bearing = towards, float(crop.sight.bearing[0])
+    if evidence.side_by == "heading" and crop.boxed:
+        looked -= bearing
     looks = float(
         np.interp(
             looked % TURN,
@@ -94,7 +119,7 @@ def fit_of(
     )
     half = scene.camera.half_field_rad
     near = reach < model.twice * evidence.range_m
-    if crop.bearing is None:
+    if not crop.boxed:
         off = math.remainder(towards - yaw - scene.camera.yaw_rad, TURN)
         usual = (math.log(reach) - math.log(evidence.range_m)) / evidence.range_spread
         at_distance = math.exp(max(-0.5 * usual * usual, -6.0))
@@ -102,7 +127,7 @@ def fit_of(
     across = np.array([-u[1], u[0]])
     sigma = evidence.bearing_cut_rad if crop.sight.cut[0] else evidence.bearing_rad
     variance = (float(across @ covariance @ across) + pose2) / reach**2 + sigma**2 + turn
-    off = math.remainder(towards - yaw - crop.bearing, TURN)
+    off = math.remainder(towards - yaw - bearing, TURN)
     bell = math.exp(-0.5 * min(off * off / variance, 40.0)) / math.sqrt(TURN * variance)
     boxed = size_fit(crop, i, u, reach, covariance, pose2, model)
     for edge in (0, 1):
@@ -142,23 +167,71 @@ def edge_fit(crop, edge, i, u, reach, covariance, pose2, model: Model) -> float:
     return min(max(ratio, -4.0), 4.0)
 
 
-@given(seeds, st.integers(1, 5), st.sampled_from(["sight", "heading"]))
+@given(
+    seeds,
+    st.lists(st.integers(1, 4), min_size=1, max_size=3),
+    st.sampled_from(["sight", "heading"]),
+    st.booleans(),
+)
 @settings(max_examples=examples(60), deadline=None)
 def test_the_likelihood_is_that_written_out_for_each_landmark(
-    seed: int, count: int, side_by: str
+    seed: int, counts: list[int], side_by: str, boxed: bool
 ) -> None:
     rng = np.random.default_rng(seed)
     camera = Camera(yaw_rad=float(rng.choice([0.0, 0.4])))
     evidence = EvidenceConstants.model_validate({"side_by": side_by})
     scene = Scene(MapConstants(evidence=evidence), camera, MODEL)
-    crop = random_crop(rng, count, camera)
-    poses = np.column_stack((rng.uniform(-4, 4, (6, 2)), rng.uniform(-10, 10, 6)))
+    group = random_group(rng, counts, camera, boxed=boxed)
+    places, yaws = rng.uniform(-4, 4, (6, 2)), rng.uniform(-10, 10, (2, 6))
     error, turn = float(rng.uniform(0, 0.1)), float(rng.uniform(0, 0.05))
-    terms = terms_at(crop, poses[:, :2], error, scene)
-    found = log_likelihood(crop, terms, poses[:, 2], turn, scene)
-    expected = [slow(crop, pose, error, turn, scene) for pose in poses]
-    assert found.tolist() == pytest.approx(expected, abs=1e-9)
-    assert min(found) >= math.log(1 - MODEL.in_map) - 1e-12
+    terms = terms_at(group, places, error, scene)
+    found = log_likelihood(group, terms, yaws, turn, scene)
+    assert found.shape == (len(counts), 2, 6)
+    for crop, of_crop in enumerate(found):
+        alone = one_crop(group, crop)
+        for headed, row in zip(yaws, of_crop, strict=True):
+            poses = np.column_stack((places, headed))
+            expected = [slow(alone, pose, error, turn, scene) for pose in poses]
+            assert row.tolist() == pytest.approx(expected, abs=1e-9)
+    assert found.min() >= math.log(1 - MODEL.in_map) - 1e-12
+
+
+@given(seeds, st.booleans(), st.sampled_from(["sight", "heading"]))
+@settings(max_examples=examples(20), deadline=None)
+def test_landmarks_that_are_left_out_as_too_far_away_change_nothing(
+    seed: int, boxed: bool, side_by: str
+) -> None:
+    """With many landmarks and positions, over some 200 m; the oracle has all of them."""
+    rng = np.random.default_rng(seed)
+    evidence = EvidenceConstants.model_validate({"side_by": side_by})
+    scene = Scene(MapConstants(evidence=evidence), Camera(), MODEL)
+    group = random_group(rng, [30, 1, 25], Camera(), boxed=boxed, wide_m=100.0)
+    beside = group.landmarks.xy[rng.integers(0, 56, 60)] + rng.uniform(-4, 4, (60, 2))
+    places = np.concatenate((beside, rng.uniform(-120, 120, (60, 2))))
+    yaws = rng.uniform(-4, 4, (3, len(places)))
+    error = float(rng.uniform(0, 0.1))
+    some, every = (terms_at(group, places, error, scene, every=all_) for all_ in (False, True))
+    assert every.looks.shape == (56, 120)
+    assert 0 < some.looks.size < 0.2 * every.looks.size
+    thinned = every.that_count()
+    assert thinned.looks.size < 0.2 * every.looks.size
+    for terms in (some, thinned):
+        pairs = [
+            (log_likelihood(group, each, yaws, 0.01, scene) for each in (terms, every)),
+            (log_likelihood_of_place(group, each, scene) for each in (terms, every)),
+            (log_likelihood_unaimed(each, scene) for each in (terms, every)),
+        ]
+        for found, expected in pairs:
+            assert np.abs(found - expected).max() < 1e-11
+    nowhere = terms_at(group, places + 1e4, error, scene)
+    assert nowhere.looks.size == 0
+    unexplained = log_likelihood(group, nowhere, yaws, 0.0, scene)
+    assert unexplained.shape == (3, 3, 120)
+    assert np.abs(unexplained - math.log(1 - MODEL.in_map)).max() < 1e-12
+    index = rng.permutation(len(places))[:40]
+    taken = log_likelihood(group, every.take(index), yaws[:, index], 0.0, scene)
+    whole = log_likelihood(group, every, yaws, 0.0, scene)
+    assert np.abs(taken - whole[:, :, index]).max() < 1e-12
 
 
 def slow_table(
@@ -231,7 +304,7 @@ def test_looks_are_those_written_out_for_each_observation(seed: int, counts: lis
     )
 )
 def test_whatever_a_box_holds_its_sights_are_finite(boxes: list[tuple[float, ...] | None]) -> None:
-    found: Sights = sights(Camera(), boxes)  # type: ignore[arg-type]
+    found: Sights = sights(Camera(), box_rows(boxes))  # type: ignore[arg-type]
     for values in (found.bearing, found.log_height, found.rise):
         assert np.isfinite(values).all()
     assert (np.abs(found.bearing) < math.pi / 2).all()

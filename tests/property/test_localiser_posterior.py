@@ -51,15 +51,14 @@ def slow_posterior(question: Question, candidates: Candidates) -> tuple[np.ndarr
     """All cells within reach and their weights, summed over 72 headings."""
     shared = Shared(candidates.constants, candidates.constants.camera, MODEL)
     (view,) = _sighted(question.views, candidates.matches, shared)
-    been = distinct(np.concatenate([c.landmarks.seen_from for c in view.crops]), CELL_M / 2)
-    cells = cells_near(been, CELL_M, MODEL.reach_m)
-    total = np.tile(log_prior(cells, been, MODEL)[:, None], (1, len(HEADINGS)))
-    for crop in view.crops:
-        terms = terms_at(crop, cells, CELL_M**2 / 12, shared)
-        for column, yaw in enumerate(HEADINGS):
-            headed = np.full(len(cells), yaw)
-            total[:, column] += log_likelihood(crop, terms, headed, 0.0, shared)
-    weights = np.exp(total - total.max()).sum(1)
+    been = distinct(np.concatenate([g.landmarks.seen_from for g in view.groups]), CELL_M / 2)
+    cells, squared = cells_near(been, CELL_M, MODEL.reach_m)
+    total = np.tile(log_prior(cells, squared, MODEL), (len(HEADINGS), 1))
+    yaws = np.tile(HEADINGS[:, None], (1, len(cells)))
+    for group in view.groups:
+        terms = terms_at(group, cells, CELL_M**2 / 12, shared, every=True)
+        total += log_likelihood(group, terms, yaws, 0.0, shared).sum(0)
+    weights = np.exp(total - total.max()).sum(0)
     return cells, weights / weights.sum()
 
 
