@@ -188,7 +188,7 @@ def _stamps(segment: OpenSegment) -> Iterator[int]:
     for chunk in segment.chunks:
         try:
             body = segment.read_chunk(chunk)
-        except LogDamaged:  # reported to whoever reads the events
+        except LogDamaged:  # reported when the events are read
             continue
         robot_channels = _robot_channels(segment.channels_of(body))
         for channel, _, _, stamp_ns, _, _ in _mcap.iter_messages(body):

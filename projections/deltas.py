@@ -334,7 +334,7 @@ class ObjectMissing(msgspec.Struct, frozen=True, gc=False):
 
 
 class ObjectRelocated(msgspec.Struct, frozen=True, gc=False):
-    """An Object that was missing stands elsewhere; its estimate begins anew there.
+    """An Object that was missing stands elsewhere; its estimate leaves out what was seen before.
 
     ``from_x_um`` … is the estimate that it had, ``to_x_um`` … the first one at the new position.
     """

@@ -4,7 +4,7 @@ Naive Bayes over `place_type_table`: every type is as likely beforehand, and eac
 the place says how much likelier it is in a room of one type than of another. Of n Objects of a
 class the √n-th power of that counts, since six chairs are hardly more telling than three; an Object
 that was observed once is often a phantom or a wrong label and counts a quarter. What is *not* there
-says nothing, for nobody knows what the robot has not looked at. The sum is tempered by `_TEMPER`,
+says nothing, since the robot may not have looked there. The sum is tempered by `_TEMPER`,
 and more where there is more than `_MOST_WEIGHT` of it, because classes are not independent: it
 makes probabilities as high as types are right.
 

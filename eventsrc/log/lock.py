@@ -1,7 +1,7 @@
 """Lock a log for its one writer: an flock on ``LOG/lock``, released when its process ends.
 
 The file's text names the holder for error messages. Only the lock counts, so a file left behind by
-a killed writer blocks nobody. The log's folder is locked as well where the file system allows it:
+a killed writer blocks no other. The log's folder is locked as well where the file system allows it:
 if somebody deletes the lock file, a second writer would make a new one, lock that, and treat the
 first writer's growing segment as left over.
 """

@@ -1,6 +1,6 @@
 """Recovery of a damaged log (`mapfold log recover`): keep every readable event, report the rest.
 
-Nothing is changed in place. A damaged segment is written anew, synced and renamed; an original in
+Nothing is changed in place. A damaged segment is rewritten, synced and renamed; an original in
 which something recorded is damaged is kept as ``….damaged`` for a person to look at. A torn end
 that was never synced is cut off, as on any restart. Lost offsets become loss events (see
 `rebuild_segment`). A rewritten segment also holds the hash that its successor has of the original,

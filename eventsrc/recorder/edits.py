@@ -3,7 +3,7 @@
 A recorder started with ``--accept-edits`` answers queries to ``mapfold/edit/<log id>``. The payload
 is a command's JSON (`eventsrc.commands`). The parameter ``known_at=N`` says that the sender made
 the command knowing all commands before offset N; if the log has a later one, the command is not
-recorded, so that nobody edits a map that has changed meanwhile. Without it the command is recorded
+recorded, so that a map that has changed meanwhile is not edited. Without it the command is recorded
 whatever came before.
 
 The reply is a `Recorded`, sent when the event is durable. A command whose ``command_id`` the log

@@ -1,6 +1,6 @@
 """The robot's sending thread: from the spool to a recorder, until the recorder has it on disk.
 
-* Nothing is sent while nobody subscribes; the spool grows. When a subscriber appears, sending
+* Nothing is sent while there is no subscriber; the spool grows. When a subscriber appears, sending
   starts again at the oldest envelope that is not acknowledged.
 * At most ``window`` envelopes are in transit, so that a long spool does not flood the recorder's
   queue. An ack makes room for more.

@@ -125,7 +125,7 @@ def publish_run(
     publisher = session.publisher(key)
     if not publisher.wait_for_subscriber(wait_s):
         raise TransportError(
-            f"nobody subscribed to {key!r} within {wait_s:g} s; start `mapfold record LOG` first "
+            f"no one subscribed to {key!r} within {wait_s:g} s; start `mapfold record LOG` first "
             "or wait longer with --wait"
         )
     sent = 0

@@ -109,7 +109,7 @@ class Publisher:
         self.departures += not status.matching
 
     def put(self, payload: bytes) -> None:
-        """Send. Returns when Zenoh has accepted the message; nobody need have received it yet."""
+        """Send. Returns when Zenoh has accepted the message; it may not have been received yet."""
         with transport_errors(f"key {self.key!r}: not sent"):
             self._sender.put(payload)
 

@@ -65,6 +65,6 @@ def transport_errors(place: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def ignore_transport_errors() -> Iterator[None]:
-    """Ignore what Zenoh raises while something is closed: nobody could act on it."""
+    """Ignore what Zenoh raises while something is closed: there is nothing left to do about it."""
     with contextlib.suppress(TransportError), transport_errors("closing"):
         yield

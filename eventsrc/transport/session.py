@@ -114,7 +114,7 @@ class Session:
     def confirm(self) -> None:
         """Return when the router or peer has processed everything declared so far.
 
-        It sends a query that nobody replies to. The query follows the declarations on the same
+        It sends a query without a reply. The query follows the declarations on the same
         link, so when it ends, they have been read.
         """
         self.get(f"mapfold/confirm/{self.raw.zid()}", timeout_s=_CONFIRM_TIMEOUT_S)

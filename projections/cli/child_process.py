@@ -1,7 +1,7 @@
 """``python -m projections.cli.child_process``: a mapfold command that ends with its parent process.
 
-Its stdin is a pipe that nobody writes to. At the end of the pipe the parent process has ended, in
-whatever way; the command gets SIGTERM then, so a recorder drains its queue and closes its log.
+Its stdin is a pipe that is never written to. The pipe ends when the parent process does, for any
+reason; the command gets SIGTERM then, so a recorder drains its queue and closes its log.
 """
 
 import os

@@ -143,7 +143,7 @@ def kind_of(
 
 def _edit(log: Path, make_: MakeCommand, common: _Common) -> None:
     if not common.reason.strip() and not common.dry_run:
-        raise MisuseError("--reason TEXT is missing: say why, for whoever reads the log later")
+        raise MisuseError("--reason TEXT is missing: say why, for those who read the log later")
     stamp = Stamp(
         command_id=uuid.uuid4().hex if common.command_id is None else common.command_id,
         issued_by=user_at_host() if common.issued_by is None else common.issued_by,

@@ -147,7 +147,7 @@ def _editor(service: "UiService", connect: list[str] | None, config: Path | None
 def _tails(
     stack: ExitStack, log: Path, db: str, vector_db: str | None
 ) -> "Callable[[], list[dict[str, Any]]]":
-    """What the databases' sinks do, asked anew at each call."""
+    """What the databases' sinks do now, read at each call."""
     from projections.database.connection import open_targets
     from projections.database.status import projection_status
 

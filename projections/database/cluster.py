@@ -1,7 +1,7 @@
 """A PostgreSQL data folder: make it, start a server on it, stop the server.
 
 * The server listens on a unix socket only. The socket is in the data folder, which is 0700, so the
-  folder's permissions are the authentication (``trust`` means: whoever may open the socket). Where
+  folder's permissions are the authentication (``trust`` means: all who may open the socket). Where
   the path is too long for a socket (107 bytes), the socket has a folder of its own. A data folder
   that belongs to another user, or that others may write, is refused.
 * A new data folder is made under another name and renamed, so a killed ``initdb`` leaves no partial

@@ -2,7 +2,7 @@
 
 The graph and the vectors share one database (the default) or have one each. Their URLs come from
 ``--db`` and ``--vector-db``, else MAPFOLD_DB and MAPFOLD_VECTOR_DB, else the embedded server. The
-vectors go into the graph's database unless told otherwise.
+vectors go into the graph's database unless an option says otherwise.
 
 Messages show host, port and database, never a password, and no part of a URL that cannot be parsed.
 """

@@ -72,7 +72,7 @@ def _open_no_follow(path: str, flags: int) -> int:
 
 @contextlib.contextmanager
 def _signals_blocked() -> Iterator[None]:
-    """Block SIGINT and SIGTERM, so that no server is left half-started, with nobody to stop it."""
+    """Block SIGINT and SIGTERM, so that no half-started server is left running."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
     try:
         yield
@@ -114,7 +114,7 @@ class EmbeddedServer:
 
     @property
     def running(self) -> bool:
-        """True when the server runs, whoever started it."""
+        """True when the server runs, also when another process started it."""
         return self._cluster.running()
 
     @property

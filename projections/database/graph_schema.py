@@ -79,7 +79,7 @@ def refuse_older(connection: Connection, graph: str) -> None:
     if missing:
         raise ProjectionMismatch(
             f"{describe_connection(connection)}: an older mapfold made the graph there: it has no"
-            f" {', '.join(missing)}; run mapfold replay, which makes it anew"
+            f" {', '.join(missing)}; run mapfold replay, which makes it again"
         )
 
 

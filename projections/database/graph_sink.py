@@ -34,7 +34,7 @@ from .statements import statements
 
 EARLY: Final[frozenset[Label]] = frozenset({"Observation"})
 """Labels that a rebuild indexes before it writes them. That costs the server more than indexing
-afterwards, but the server has the time while the fold goes on and nobody waits for it."""
+afterwards, but the server has the time while the fold goes on."""
 LATE: Final = frozenset(LABELS) - EARLY
 SMALL_BATCH: Final = 200
 """Below this many rows an INSERT, sent down the pipeline, beats COPY's extra round trips."""

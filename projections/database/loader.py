@@ -135,7 +135,7 @@ INSERT_CHUNK: Final = 5_000
 VECTOR_CHUNK: Final = 500
 COPY_CHUNK: Final = 60
 """Vectors encoded and sent together: 128 kB, psycopg's own size. Larger ones are slower, as their
-memory is allocated by the system anew each time."""
+memory is allocated by the system each time."""
 
 
 class Loader(Protocol):

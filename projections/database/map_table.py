@@ -26,7 +26,7 @@ def refuse_missing(connection: Connection) -> None:
         raise ProjectionMismatch(
             f"{describe_connection(connection)}: the graph there has no table mapfold.{MAP_TABLE}:"
             " an older mapfold made it, or somebody dropped the table; run mapfold replay, which"
-            " makes it anew"
+            " makes it again"
         )
 
 
@@ -66,7 +66,7 @@ def _map_of(connection: Connection, row: MapRow) -> OccupancyMap:
     except BadImage as error:
         raise DatabaseError(
             f"{describe_connection(connection)}: mapfold.{MAP_TABLE} at log_offset"
-            f" {row.log_offset}: png: {error}; run mapfold replay, which writes it anew"
+            f" {row.log_offset}: png: {error}; run mapfold replay, which writes it again"
         ) from None
 
 

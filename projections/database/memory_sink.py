@@ -1,6 +1,6 @@
 """The sink that keeps rows in memory: the same rows as the databases, in plain dictionaries.
 
-Tests compare the databases with it; it also serves whoever wants the rows without a database.
+Tests compare the databases with it; it also gives the rows where there is no database.
 """
 
 from collections.abc import Callable, Mapping

@@ -1,6 +1,6 @@
 """A refold's progress where other processes can read it: in the checkpoints, as heartbeats are.
 
-The refold's own connections are in the transaction of the swap, and nobody sees what they write
+The refold's own connections are in the transaction of the swap, and what they write is not seen
 before its end. So a thread writes over connections of its own, also while the others wait.
 """
 

@@ -2,14 +2,14 @@
 
 PostgreSQL does not run as root. For root it runs as the system user ``pgserver``, made on first
 use. That user must be able to *enter* the folders above the data and the programs: those that
-forbid it get ``o+x``, which lets nobody list or read them.
+forbid it get ``o+x``, which lets no one list or read them.
 
 The socket folder is in ``/tmp``, where everybody may make folders, so no name is trusted:
 
-* It is made under a random name, 0700, so nobody can have made it before.
+* It is made under a random name, 0700, so it cannot have been made before.
 * Its name is in the file ``pg.socket`` beside the data folder, with the data folder's inode: the
   copy of a home is another server.
-* It is used only while it is a folder, no link, that the server's user owns and nobody else can
+* It is used only while it is a folder, no link, that the server's user owns and no one else can
   enter. Else the server gets a new one.
 """
 

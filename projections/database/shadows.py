@@ -266,7 +266,7 @@ def _errors_after_swap() -> Iterator[None]:
     try:
         yield
     except DatabaseError as error:
-        raise type(error)(f"{error}; the new map is in place all the same") from error
+        raise type(error)(f"{error}; the new map is in place nevertheless") from error
 
 
 def drop_replaced(stores: Sequence[Store], notify: Notify, *, hnsw: bool) -> HnswReport | None:

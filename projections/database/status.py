@@ -196,7 +196,7 @@ def _condition(
     unknown = inputs.since(found.known_to)
     if found.next_offset == end and not unknown:
         return "idle", None
-    note = f"nobody writes it; run: {command_for('tail', reader.path, inputs.latest)}"
+    note = f"no process writes it; run: {command_for('tail', reader.path, inputs.latest)}"
     if unknown:
         commands, last = counted(len(unknown), "command"), unknown[-1].offset
         note = f"{commands} came since, the last at offset {last:,}; {note}"

@@ -2,7 +2,7 @@
 
 Searchable means: it has an embedding of the map's own space. Rows are written once and never
 change. ``det_pk`` is the observation's ordinal + 1 and ``ingested_at`` is when the event was
-*logged*, so a row follows from the log alone, to the last bit, whoever writes it and when.
+*logged*, so a row follows from the log alone, to the last bit.
 """
 
 import math

@@ -7,7 +7,7 @@
 CSV and JSON lines name ``keyframe_id`` or ``stamp`` (or ``timestamp``), then ``x``, ``y`` and
 ``yaw`` (or ``map_x``, ``map_y``, ``map_yaw``), or instead of yaw the quaternion ``qx``, ``qy``,
 ``qz``, ``qw``. Metres, radians and seconds; poses of the robot in the map frame, whose z axis is
-up. Other columns are ignored. Which format a file has is told by its first line, and by its name's
+up. Other columns are ignored. The format follows from the first line, and by its name's
 ending where the line leaves it open.
 """
 

@@ -158,7 +158,7 @@ class History:
 
     @property
     def neighbours(self) -> Neighbours:
-        """Neighbourhoods of the keyframes so far; made anew when there are more."""
+        """Neighbourhoods of the keyframes so far; made again when there are more."""
         count = len(self.keyframes)
         if self._neighbours is None or self._neighbours[0] != count:
             self._neighbours = count, Neighbours(self.keyframes, self.settings)
@@ -166,7 +166,7 @@ class History:
 
     @property
     def seen_from(self) -> SeenFrom:
-        """What was seen from where so far; made anew when there is more."""
+        """What was seen from where so far; made again when there is more."""
         if self._seen_from is None or self._seen_from[0] != self.next_offset:
             self._seen_from = self.next_offset, SeenFrom(self)
         return self._seen_from[1]

@@ -7,7 +7,7 @@ one place, over points that this event made core, to an old core point of the ot
 such path is the chain.
 
 Places by rooms have no chains: they merge when their cells are a short drive apart on the mean.
-What both have seen is told beside it, for who reads it; the rule does not use it.
+The Objects that both have seen are printed beside it for the reader; the rule does not use them.
 
 When an event joins several places, the chains form a tree: each further place is joined to one that
 is joined already. A place that a ``join`` command brought has no chain: the two keyframes that the

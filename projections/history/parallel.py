@@ -317,7 +317,7 @@ def _fold_share(
         if _done is not None:
             with _done.get_lock():
                 if _done.value == _STOP:
-                    raise MapfoldError("given up")  # nobody reads it: the caller raised
+                    raise MapfoldError("given up")  # never read: the caller raised
                 _done.value += folded - reported
         reported = folded
 

@@ -28,7 +28,7 @@ def view_at(history: History, latest: MapView, end: Offset) -> MapView:
 
     ``latest`` is a view of at least as many events. What never changes after its event
     (observations, poses) is shared with it; places, objects and the place of a keyframe are made
-    anew, so that changing one view does not change another.
+    again, so that changing one view does not change another.
     """
     view = MapView(
         history.settings,

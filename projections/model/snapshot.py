@@ -321,7 +321,7 @@ def snapshot(
     """The bytes of a map and its view without embeddings, as of ``semantic_map.next_offset``.
 
     ``segments`` is the `eventsrc.log.segment_signatures` of the events they were folded from. Names
-    of places are not in it: `restore` gives them anew, so it is good under other names, too.
+    of places are not in it: `restore` is given them, so it also holds under other names.
     """
     about = {
         "fold_version": FOLD_VERSION,

@@ -15,7 +15,7 @@ from projections.model.view import MapView
 @dataclass(frozen=True, slots=True)
 class PlaceNode:
     """A Place; ``ordinal`` is its founding order, the centroid is in metres. ``name`` is None where
-    nobody named it, ``type`` where it is not sure what kind of room it is."""
+    it has no name, ``type`` where it is not sure what kind of room it is."""
 
     ordinal: int
     place_id: str

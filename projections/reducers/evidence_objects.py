@@ -12,7 +12,7 @@ The rules, for the observations of one picture:
     and each Object gets one observation of a picture: two things in one picture are not one. What
     is left founds Objects. Where other Objects, or a new one, were nearly as probable, the sight
     weighs only its probability in the estimate, and below 0.85 the look is no exemplar.
-4.  The Object's estimate is solved anew from its spots (`spots`), its class is that of most of its
+4.  The Object's estimate is solved again from its spots (`spots`), its class is that of most of its
     observations.
 5.  Two Objects are merged when better views show that they are one (`evidence_merging`).
 

@@ -1,7 +1,7 @@
 """Anchors: the keyframes that ``join`` and ``keep-apart`` name, and which places they are in.
 
 Anchors that are one by command are a group. Places with anchors of groups that are kept apart
-*conflict*: they are never merged. A refusal is told once for each pair of places.
+*conflict*: they are never merged. A refusal is reported once for each pair of places.
 """
 
 from collections.abc import Callable, Iterable, Iterator

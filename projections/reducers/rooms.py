@@ -133,7 +133,7 @@ class Rooms(PlaceMembers):
         return super().dump() | own | parts
 
     def load(self, state: State) -> None:
-        """Take over what `dump` gave. Closeness is added up anew."""
+        """Take over what `dump` gave. Closeness is added up again."""
         super().load(state)
         self._cells.load(part("cells", state))
         self._anchors.load(part("anchors", state), self.place_of)

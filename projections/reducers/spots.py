@@ -19,8 +19,8 @@ box tells its distance as a change of bearing does. Gauss-Newton in information 
 eliminated (Schur's complement). A residual beyond about two standard errors weighs less (Cauchy).
 
 Each spot's part of the normal equations is kept, linearised where the estimate was; a sight changes
-the part of its spot alone. All are made anew once the estimate has moved by more than `_MOVED_M`
-since. +, −, ×, ÷, √ in one fixed order: the same bits on every machine.
+the part of its spot alone. All are computed again once the estimate has moved by more than
+`_MOVED_M` since. +, −, ×, ÷, √ in one fixed order: the same bits on every machine.
 
 What all poses have in common (a session's drift, a box whose centre is not the thing's) does not
 fade with their number: `COMMON_M2` is added to the variance of the estimate.
@@ -207,7 +207,7 @@ class Solver:
         return estimate
 
     def _linearise(self, spots: Spots, x: float, y: float, about: Estimate | None) -> None:
-        """Make all parts anew."""
+        """Compute all parts again."""
         spots.at = x, y
         spots.parts = [self._part(spot, x, y, about) for spot in spots.spots]
         total = [0.0] * PART_SIZE

@@ -63,7 +63,7 @@ class ThingIndex:
         return ordinal
 
     def solve(self, ordinal: ObjectOrdinal, thing: Thing, spot: int | None = None) -> None:
-        """Estimate anew where an Object stands, and list it there; one spot has changed, or all."""
+        """Estimate where an Object stands, and list it there; one spot has changed, or all."""
         prior = self._heights.prior(thing.class_name)
         before = thing.estimate
         if before is None:

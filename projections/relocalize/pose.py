@@ -12,7 +12,7 @@ Several views: each pose at the last view gives a pose at every view before (`mo
 
 The answer is the cell with the least expected error, errors above 2.5 m counting as 2.5 m (like a
 median; a mean could lie between two look-alike spots), moved to the mean of the weights near it,
-which is then computed anew on a grid of 0.12 m.
+which is then computed again on a grid of 0.12 m.
 """
 
 import itertools

@@ -59,7 +59,7 @@ class RankedPlace:
     """A Place and its score: the share of the poses' weight that lies in it.
 
     With the plain method the score is the sum of similarities. The centroid is in metres.
-    ``name`` is None where nobody named the Place, ``floor`` where the log names no floor.
+    ``name`` is None where the Place has no name, ``floor`` where the log names no floor.
     """
 
     place_id: str

@@ -6,7 +6,7 @@ posterior over poses gives them: with probability c, the answer's confidence, th
 of the posterior's poses (Gaussians of 0.4 m and 0.35 rad about them), else it may be anywhere. Two
 hypotheses are weighed: the robot is where the particles are, or anywhere (``lost`` is the
 probability of that; before each question the robot may have been carried elsewhere). By Bayes' rule
-the second says how many particles are drawn anew from the posterior: few while the particles
+the second says how many particles are replaced by draws from the posterior: few while the particles
 explain what is seen, nearly all once they do not and another place does. So a kidnapped robot is
 found again after a few questions, and a single wrong answer moves little.
 

@@ -1,8 +1,8 @@
 """Sessions of robots whose questions are tracked, by the names they give.
 
-At most ``MOST`` are kept. One that has been silent for ``SILENT_S`` is forgotten, and when there
-are more, the one that has been silent for longest. A forgotten session that asks again begins anew;
-its answer has ``questions`` 1. A question that cannot be answered does not count: the robot's next
+At most ``MOST`` are kept. One without a question for ``SILENT_S`` is removed, and when there are
+more, the one that asked longest ago. If it asks again, a new session begins, and the answer has
+``questions`` 1. A question that cannot be answered does not count: the robot's next
 movement is since the last one that was.
 """
 

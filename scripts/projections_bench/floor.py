@@ -88,7 +88,7 @@ def _tell(size: int, whole: float, least: Seconds, reading: float, folding: floa
 
 def _rebuild(log: Path, targets: Targets) -> float:
     seconds = rebuild(log, targets, Settings(), hnsw=False).total_s
-    with connect(targets.graph_url) as connection:  # so that it is nobody else's time
+    with connect(targets.graph_url) as connection:  # so that its time counts for no other step
         wait_for_drop(connection, "graph")
         wait_for_drop(connection, "vectors")
     return seconds

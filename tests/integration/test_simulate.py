@@ -40,7 +40,7 @@ def test_simulate_without_a_subscriber_is_one_line(
     program = start("simulate", "--wait", "0.2", "--connect", endpoint)
     assert program.wait() == 1
     (line,) = program.lines
-    assert "nobody subscribed to 'tb/detections' within 0.2 s" in line
+    assert "no one subscribed to 'tb/detections' within 0.2 s" in line
     assert "mapfold record" in line
 
 

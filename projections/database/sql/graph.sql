@@ -61,7 +61,7 @@ SELECT ag_catalog.create_elabel(%(graph)s, %(label)s)
 
 -- name: no_statistics
 -- Nothing asks for statistics of whole property maps, and they take most of ANALYZE's time. Those of
--- the indexed keys are gathered all the same.
+-- the indexed keys are gathered nevertheless.
 ALTER TABLE {table} ALTER COLUMN properties SET STATISTICS 0
 
 -- name: label_ids
