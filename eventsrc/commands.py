@@ -1,4 +1,4 @@
-"""Commands: what a person or a SLAM back end knows better than the log, as events on
+"""Commands: corrections of the map by a person or a SLAM back end, as events on
 ``mapfold/command``.
 
 A command is appended like any event and never changed. What it names, it names by things of the

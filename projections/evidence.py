@@ -1,4 +1,4 @@
-"""Constants of fusion by evidence (``fusion = "evidence"``): what a map's own revisits can tell.
+"""Constants of fusion by evidence (``fusion = "evidence"``), calibrated from a map's own revisits.
 
 The defaults are priors, chosen on buildings of the developing half of our trial data;
 `mapfold calibrate` replaces them by a map's own and records them as a ``use-settings`` command.

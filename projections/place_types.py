@@ -1,4 +1,4 @@
-"""What kind of room a place is: kitchen, office, bathroom … from the classes of its Objects.
+"""Types of places: kitchen, office, bathroom …, from the classes of their Objects.
 
 Naive Bayes over `place_type_table`: every type is as likely beforehand, and each class that is in
 the place says how much likelier it is in a room of one type than of another. Of n Objects of a

@@ -1,4 +1,4 @@
-"""Ranges, errors of bearings and poses, and sizes of classes, read off things that qualified."""
+"""Ranges, errors of bearings and poses, and sizes of classes, read off triangulated things."""
 
 from collections import Counter
 from collections.abc import Sequence

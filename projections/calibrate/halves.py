@@ -1,4 +1,4 @@
-"""How far two halves of a thing's views disagree, in units of what their errors let expect.
+"""Error inflation: how far two halves of a thing's views disagree, in units of their errors.
 
 Lines of sight err together: a box shows the near side of a thing, or what a table leaves of it; a
 stretch of a drive is off as a whole. Their residuals about one position do not tell. Two positions

@@ -1,4 +1,4 @@
-"""What a map shows, drawn towards what is usual while it shows it rarely."""
+"""Shrinkage: a constant read off a map, drawn towards its prior when few observations back it."""
 
 import math
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The observations of a folded map as columns: who saw what in which direction.
+"""The observations of a folded map as columns: pose, direction, class, box and look of each.
 
 `Sightings` is what all readings are made from. Cosines of looks are exact: unit vectors are whole
 multiples of 2⁻²⁰ (`projections.exact`), so a product of two does not depend on the machine.

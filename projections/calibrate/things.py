@@ -1,4 +1,4 @@
-"""Things whose place their bearings tell: triangulated from bearings alone.
+"""Things that a calibration uses: those that their bearings alone triangulate well.
 
 A thing qualifies by three observations or more, spots at least 0.8 m apart, lines of sight that
 cross well (the smallest eigenvalue of the normal matrix Σ (I − d dᵀ) is at least 0.08 of their

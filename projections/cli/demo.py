@@ -1,4 +1,4 @@
-"""`mapfold demo`: the whole story on one machine."""
+"""`mapfold demo`: record, replay, map and re-localise a simulated robot on one machine."""
 
 from pathlib import Path
 from typing import Annotated
@@ -24,7 +24,7 @@ def demo(
     vector_db: VectorDbOption = None,
     json_: JsonOption = False,
 ) -> None:
-    """The whole story on one machine, each part real.
+    """Record, replay, map and re-localise a simulated robot on this machine.
 
     A robot explores a simulated house and is recorded through a Zenoh router; the log is replayed
     into databases; a second, lost robot asks where it is. The databases are the demo's own, in DIR,

@@ -1,4 +1,4 @@
-"""The swap: a new map is written into shadows while the old one is read, and takes its place.
+"""Shadows: a new map is written beside the one that readers use, then swapped in for it.
 
 Creating the shadow, COPY, indexes, comparing numbers, the checkpoint and the swap are *one*
 transaction per database. So an interruption of any kind at any moment leaves the old map in place

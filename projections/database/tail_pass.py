@@ -1,4 +1,4 @@
-"""One pass of a tail, from the checkpoints to the end of the log; `tail` says how it goes."""
+"""One pass of a tail, from the checkpoints to the end of the log; `tail` has the rules."""
 
 import contextlib
 import threading

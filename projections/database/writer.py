@@ -1,4 +1,4 @@
-"""Write each batch exactly once, whatever the server does meanwhile.
+"""Write each batch exactly once, also when the server restarts or the connection breaks.
 
 Rows and checkpoint move in one transaction, the checkpoint by compare-and-set. When a transaction
 fails because the server or the connection did, it is unknown whether it was committed. So the batch

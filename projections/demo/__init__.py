@@ -1,4 +1,4 @@
-"""`mapfold demo`: record, replay, map and re-localise on one machine, each part real."""
+"""`mapfold demo`: record, replay, map and re-localise on one machine, with real parts."""
 
 from .play import DemoOptions, run_demo
 

@@ -1,4 +1,4 @@
-"""Run B re-localised: questions of a few crops without a pose, and how far the answers are off.
+"""Re-localise run B: questions of a few crops without a pose, and the errors of the answers.
 
 The question is not chosen for its answer: it is the picture from around the start with the most
 detections, counting at most three; of several the first. It is asked with the most confident of

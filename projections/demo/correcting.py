@@ -1,4 +1,4 @@
-"""Two corrections as a person gives them: a merge of two rooms is undone, and one gets its name.
+"""Two corrections: undo a merge of two rooms, and name one of them.
 
 They are recorded as ``mapfold edit`` records them, and the databases are rebuilt under them.
 """

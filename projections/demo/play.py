@@ -1,6 +1,6 @@
 """The demo's stages in order: record, replay, map, correct, ask, draw; then commands to go on with.
 
-House and runs are made before the clock starts: they stand for the world, not for mapfold.
+House and runs are made before the time is taken: simulating them is no part of mapfold.
 """
 
 import contextlib

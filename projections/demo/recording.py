@@ -1,4 +1,4 @@
-"""Run A recorded: one process publishes it, another records, over a router in this process.
+"""Record run A: one process publishes it, another records, over a router in this process.
 
 Meanwhile a tail in a thread of this process writes the log into the databases.
 """

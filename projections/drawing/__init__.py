@@ -1,4 +1,4 @@
-"""A picture of a map: rooms, drive, places, objects, which place is next to which.
+"""A picture of a map: rooms, drive, places, objects, adjacent places.
 
 matplotlib is used through its objects alone: no pyplot, no global state.
 """

@@ -1,4 +1,4 @@
-"""Commands that stand in the way of a new one: contradictions, and repetitions."""
+"""Commands that a new one contradicts or repeats."""
 
 from collections.abc import Callable, Collection, Hashable, Iterable
 from typing import TypeVar

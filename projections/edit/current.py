@@ -1,4 +1,4 @@
-"""The map of a log as it is now, with its corrections, and what is called what in it."""
+"""The map of a log as it is now, with its corrections, and look-up of what a person typed in it."""
 
 import re
 from collections.abc import Callable, Iterator, Sequence

@@ -1,4 +1,4 @@
-"""What comes of a command: found by folding the log with it, before it is recorded.
+"""The effect of a command, found by folding the log with it before it is recorded.
 
 A command that no fold can obey, or that would not do what it says, is refused. An undo may be
 recorded where the map cannot be folded without it either: it may be a step on the way out.

@@ -1,4 +1,4 @@
-"""What a few lines do without mapfold's ranking: every score stands beside theirs.
+"""Baselines of re-localisation, which every score is compared with.
 
 *Plain*: the ten observations most similar to each crop; the answer is the median of where their
 robots stood, in x and y each. *Best cosine*: the greatest cosine of a crop and an observation; the

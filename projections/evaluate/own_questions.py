@@ -1,4 +1,4 @@
-"""The map's own questions: what it would answer if it had not been where it was asked from.
+"""Questions from a map's own keyframes, asked as if the visit they are from were not in the map.
 
 Each is a keyframe of the map, asked with crops that it has. Its *visit* is taken out of the map:
 what was observed in its run within `VISIT` keyframes of it. A robot that comes another day sees

@@ -1,4 +1,4 @@
-"""The history of one log under one knowledge: the commands before a point, and the settings.
+"""The history of one log under given settings and the commands recorded before a point.
 
 It folds the log once, at the first question that needs the history, and keeps what happened; after
 that every question is a look-up. An event at offset o, and a merge it causes, shows in

@@ -1,4 +1,4 @@
-"""What a map's numbers say about its settings: all in one place, or hardly anything in any."""
+"""Advice on settings from a map's counts: all poses are in one place, or hardly any is in one."""
 
 from collections.abc import Mapping
 from typing import Final

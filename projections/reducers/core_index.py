@@ -214,7 +214,7 @@ class CoreIndex:
         }
 
     def load(self, state: State) -> None:
-        """Take over what `dump` gave. Links between cells and reach indexes are found again."""
+        """Take over what `dump` gave. Links between cells and reach indexes are computed again."""
         self.x = array("q", state["x"].tobytes())
         self.y = array("q", state["y"].tobytes())
         self._counts = dict(zip(state["loose"].tolist(), state["counts"].tolist(), strict=True))

@@ -1,4 +1,4 @@
-"""Corrections of single events: an envelope as it would be, had the robot known better.
+"""Apply corrections to single events: leave out keyframes and detections, correct poses.
 
 An event is corrected before it is folded, so the map is that of a log with the corrected events:
 without forgotten keyframes, without dropped detections, with the corrected poses written in. A

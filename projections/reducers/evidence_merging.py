@@ -1,4 +1,4 @@
-"""Which Object turns out to be the same as another, now that it was seen better.
+"""Merging of Objects by evidence: pairs that further observations show to be one thing.
 
 An Object is compared with those around it each time it has half as many more observations. Two
 are one while the evidence is above 0: of their estimates (χ² of the difference, against anywhere in

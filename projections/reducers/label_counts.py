@@ -1,4 +1,4 @@
-"""How much a label speaks for a thing: labels flicker, so agreement is evidence and no gate."""
+"""Label evidence: the log-likelihood ratio of a label, given the labels that a thing had before."""
 
 from collections.abc import Iterable
 

@@ -1,4 +1,4 @@
-"""Places by rooms (``places = "rooms"``): what the robot drives around in, not through.
+"""Places by rooms (``places = "rooms"``): clusters by the mean distance driven between cells.
 
 The rules (docs/places.md says what they were chosen among):
 

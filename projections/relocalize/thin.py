@@ -1,4 +1,4 @@
-"""Whether a map is too thin for its answers to be trusted.
+"""Whether a map has too few observations for its answers to be trusted.
 
 Nothing that is measured of other maps holds for one that a robot has just begun: whatever it is
 shown, the few things it has seen are the most similar, and every pose is near the few spots it has
