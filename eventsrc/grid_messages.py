@@ -1,9 +1,10 @@
-"""nav_msgs/OccupancyGrid as JSON: from a message to an occupancy map.
+"""nav_msgs/OccupancyGrid as JSON or in CDR: from a message to an occupancy map.
 
-The JSON has the fields of the ROS message: ``info`` with ``resolution``, ``width``, ``height`` and
-``origin`` (``position`` and the quaternion ``orientation``), and ``data``, row by row from the
-origin: -1 for unknown, else 0 to 100. ``header`` may be there or not, and so may ``floor``, which
-ROS does not have: the floor that the map is of, as in envelopes.
+CDR is read by `eventsrc.cdr_grids`. The JSON has the fields of the ROS message: ``info`` with
+``resolution``, ``width``, ``height`` and ``origin`` (``position`` and the quaternion
+``orientation``), and ``data``, row by row from the origin: -1 for unknown, else 0 to 100.
+``header`` may be there or not, and so may ``floor``, which ROS does not have: the floor that the
+map is of, as in envelopes.
 """
 
 import math
@@ -12,6 +13,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
+from .cdr_grids import decode_cdr_grid, is_cdr
 from .occupancy_map import UNKNOWN, InvalidMap, OccupancyMap, check_size
 from .text import visible
 
@@ -59,12 +61,26 @@ _CELLS = msgspec.json.Decoder(list[Annotated[int, msgspec.Meta(ge=-1, le=100)]])
 
 
 def is_grid_message(payload: bytes) -> bool:
-    """Whether a payload that is no envelope means to be an occupancy grid."""
+    """Whether a payload that is no envelope means to be an occupancy grid: any CDR does, because no
+    other message in CDR is taken."""
+    if is_cdr(payload):
+        return True
     return payload.lstrip()[:1] == b"{" and all(mark in payload for mark in _MARKS)
 
 
 def read_grid_message(payload: bytes, source: str) -> OccupancyMap:
     """The map of a message that came from ``source``, a key or a file. Raises InvalidMap."""
+    return _read_cdr(payload, source) if is_cdr(payload) else _read_json(payload, source)
+
+
+def _read_cdr(payload: bytes, source: str) -> OccupancyMap:
+    read = decode_cdr_grid(payload)
+    origin = (*read.position, _yaw(_Quaternion(*read.orientation)))
+    grid = read.data.astype(np.uint8).reshape(read.height, read.width)  # -1 is 255
+    return OccupancyMap(None, read.resolution, origin, source, grid)
+
+
+def _read_json(payload: bytes, source: str) -> OccupancyMap:
     try:
         head = _HEAD.decode(payload)
     except (msgspec.DecodeError, RecursionError) as error:

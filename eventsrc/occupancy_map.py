@@ -89,7 +89,8 @@ class OccupancyMap:
         try:
             encoded = json.dumps(document, allow_nan=False, separators=(",", ":")).encode()
         except ValueError:
-            raise InvalidMap("resolution or origin is NaN or infinite") from None
+            given = f"got {self.resolution}, {self.origin}"
+            raise InvalidMap(f"resolution or origin is NaN or infinite ({given})") from None
         _parse(encoded)
         return encoded
 

@@ -1,6 +1,7 @@
 """Occupancy maps for tests: drawn as text, and as the files of a map server."""
 
 import json
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -74,3 +75,36 @@ def grid_message(map_: OccupancyMap, **info: Any) -> dict[str, Any]:
         },
         "data": np.where(values == UNKNOWN, -1, values).ravel().tolist(),
     }
+
+
+def cdr_message(
+    map_: OccupancyMap,
+    *,
+    big: bool = False,
+    frame: str = "map",
+    stamp: tuple[int, int] = (1, 2),
+    loaded: tuple[int, int] = (0, 0),
+) -> bytes:
+    """A map as nav_msgs/OccupancyGrid in CDR, by the rules of the format: every number at a
+    multiple of its size, from the end of the four bytes that it begins with."""
+    body = b""
+
+    def add(kind: str, value: float) -> None:
+        nonlocal body
+        body += bytes(-len(body) % struct.calcsize(kind))
+        body += struct.pack((">" if big else "<") + kind, value)
+
+    x, y, yaw = map_.origin
+    name = frame.encode() + b"\0"
+    for kind, value in [("i", stamp[0]), ("I", stamp[1]), ("I", len(name))]:
+        add(kind, value)
+    body += name
+    for kind, value in [("i", loaded[0]), ("I", loaded[1]), ("f", map_.resolution)]:
+        add(kind, value)
+    add("I", map_.width)
+    add("I", map_.height)
+    for value in (x, y, 0.0, 0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2))):
+        add("d", value)
+    add("I", map_.cells.size)
+    body += map_.cells.tobytes()  # 255 is -1 as int8
+    return (b"\0\0\0\0" if big else b"\0\1\0\0") + body

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+from eventsrc.cdr_grids import GRID_SCHEMA
 from eventsrc.errors import MapfoldError
 from eventsrc.log import LogReader
 from eventsrc.log.foreign_mcap import ForeignDamage, foreign_messages
@@ -14,7 +15,8 @@ MCAP_MAGIC = b"\x89MCAP0\r\n"
 
 
 class McapFile:
-    """Any MCAP file. Messages that are not ``json`` (images, ROS) are skipped and counted."""
+    """Any MCAP file. Messages that are neither ``json`` nor occupancy grids in ``cdr`` (images,
+    other messages of ROS) are skipped and counted."""
 
     def __init__(self, name: str, file: BinaryIO, size_bytes: int | None) -> None:
         self.name = name
@@ -30,12 +32,13 @@ class McapFile:
         return self._file.tell() if self.size_bytes else self._read
 
     def messages(self) -> Iterator[ImportedMessage]:
-        """The JSON messages."""
+        """The JSON messages, and occupancy grids."""
         try:
             for number, message in enumerate(foreign_messages(self._file), start=1):
                 self.at = number
                 self._read += len(message.payload)
-                if message.encoding == "json":
+                is_grid = message.encoding == "cdr" and message.schema == GRID_SCHEMA
+                if is_grid or message.encoding == "json":
                     yield ImportedMessage(
                         message.payload,
                         message.key,

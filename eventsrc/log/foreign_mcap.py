@@ -18,7 +18,7 @@ from lz4.frame import LZ4FrameDecompressor
 from . import mcap_records as _mcap
 from .crc import crc32
 from .format import ENVELOPE_VERSION_KEY, envelope_version
-from .mcap_records import FRAME, MAGIC, BadRecord, Channel, Opcode
+from .mcap_records import FRAME, MAGIC, BadRecord, Channel, Opcode, Schema
 
 MAX_FOREIGN_BYTES: Final = 64 * 1024 * 1024
 """Limit for a chunk, compressed or not, and for a message. A message of that size that is no
@@ -85,7 +85,7 @@ def _decompress_zstd(data: bytes, size: int) -> bytes:
 _PIECE_BYTES: Final = 1024 * 1024
 _MESSAGE: Final = struct.Struct("<HIQQ")
 _CRC: Final = struct.Struct("<I")
-_MESSAGE_OPCODES: Final = (Opcode.CHANNEL, Opcode.MESSAGE)
+_MESSAGE_OPCODES: Final = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 
 
 class ForeignDamage(ValueError):
@@ -106,11 +106,13 @@ class ForeignRecord(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ForeignMessage:
-    """One message. ``key`` is its MCAP topic; times are int nanoseconds; ``version`` is the
-    envelope version that a mapfold log has it in, None in other files."""
+    """One message. ``key`` is its MCAP topic; times are int nanoseconds; ``schema`` is the name of
+    its channel's schema, empty without one; ``version`` is the envelope version that a mapfold log
+    has it in, None in other files."""
 
     key: str
     encoding: str
+    schema: str
     version: int | None
     logged_ns: int
     published_ns: int
@@ -118,10 +120,12 @@ class ForeignMessage:
 
 
 class _ChannelName(NamedTuple):
-    """The topic and message encoding of a channel, and its envelope version if it has one."""
+    """The topic, message encoding and schema of a channel, and its envelope version if it has
+    one."""
 
     key: str
     encoding: str
+    schema: str
     version: int | None
 
 
@@ -227,7 +231,9 @@ def _check_data_crc(content: bytes, crc: int) -> None:
 def _messages(records: Iterator[ForeignRecord]) -> Iterator[ForeignMessage]:
     channels = _Channels()
     for opcode, content, _ in records:
-        if opcode == Opcode.CHANNEL:
+        if opcode == Opcode.SCHEMA:
+            channels.add_schema(content)
+        elif opcode == Opcode.CHANNEL:
             channels.add(content)
         else:
             yield channels.message(content)
@@ -236,7 +242,15 @@ def _messages(records: Iterator[ForeignRecord]) -> Iterator[ForeignMessage]:
 class _Channels:
     def __init__(self) -> None:
         self._names: dict[int, _ChannelName] = {}
+        self._schemas: dict[int, str] = {}
         self._names_size = 0
+
+    def add_schema(self, content: bytes) -> None:
+        schema = _mcap.decode_as(Schema, content)
+        if self._schemas.get(schema.id) != schema.name:
+            self._names_size += len(schema.name)
+            _mcap.check_definitions(self._names_size)
+            self._schemas[schema.id] = schema.name
 
     def add(self, content: bytes) -> None:
         _mcap.check_definitions(len(content))
@@ -244,10 +258,11 @@ class _Channels:
         name = _ChannelName(
             channel.topic,
             channel.message_encoding,
+            self._schemas.get(channel.schema_id, ""),
             envelope_version(channel) if ENVELOPE_VERSION_KEY in channel.metadata else None,
         )
         if self._names.get(channel.id) != name:
-            self._names_size += len(name.key) + len(name.encoding)
+            self._names_size += len(name.key) + len(name.encoding) + len(name.schema)
             _mcap.check_definitions(self._names_size)
             self._names[channel.id] = name
 

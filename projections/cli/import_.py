@@ -142,7 +142,7 @@ def _summary(log: Path, report: ImportReport) -> str:
     if report.system:
         parts.append(f"{counted(report.system, 'event')} of mapfold's own taken over")
     if report.skipped:
-        parts.append(f"{counted(report.skipped, 'message')} other than JSON passed over")
+        parts.append(f"{counted(report.skipped, 'message')} of other encodings passed over")
     parts.append(f"{report.rejected} rejected")
     hint = f"; `mapfold log cat {log} --key mapfold/rejected` shows them" if report.rejected else ""
     return ", ".join(parts) + hint

@@ -17,7 +17,7 @@ from tests.envelopes import envelope, payload
 from tests.fixtures_log import KEY, flip, read_log
 from tests.fixtures_zenoh import DEADLINE_S, Program
 from tests.integration.test_recorder import recording
-from tests.maps import cells, drawn_map, grid_message, write_map_yaml
+from tests.maps import cdr_message, cells, drawn_map, grid_message, write_map_yaml
 
 DRAWING = "##### #..?# #...#"
 MESSAGE = payload(grid_message(drawn_map(DRAWING, 0.05, (1.0, 2.0, 0.0))))
@@ -116,6 +116,37 @@ def test_grid_messages_of_a_logger_and_of_mcap_become_maps(run: Commands) -> Non
     assert (kept.key, kept.raw) == (KEY, bad)
 
 
+def test_grids_in_cdr_of_an_mcap_file_become_maps(run: Commands) -> None:
+    """As a ROS 2 bag has them; other messages in CDR are passed over."""
+    given = drawn_map(DRAWING, 0.05, (1.0, 2.0, 0.5))
+    good = cdr_message(given)
+    with (run.folder / "bag.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        for number, (name, content) in enumerate(
+            [
+                ("nav_msgs/msg/OccupancyGrid", good),
+                ("sensor_msgs/msg/LaserScan", good),
+                ("nav_msgs/msg/OccupancyGrid", good[:-1]),
+                ("nav_msgs/msg/OccupancyGrid", cdr_message(given, big=True)),
+            ]
+        ):
+            schema = writer.register_schema(name, "ros2msg", b"")
+            channel = writer.register_channel(f"/t{number}", "cdr", schema)
+            writer.add_message(channel, 70 + number, content, 70)
+        writer.finish()
+    said = run("import", "L", "bag.mcap", code=3)
+    assert "rejected: no nav_msgs/OccupancyGrid in CDR: data would end at byte" in said.err
+    assert "2 maps" in said.err
+    assert "1 message of other encodings passed over" in said.err
+    events = read_log(run.folder / "L")
+    assert [event.key for event in events] == [MAP_KEY, REJECTED_KEY, MAP_KEY]
+    assert {decode_map(events[n].payload).digest() for n in (0, 2)} == {given.digest()}
+    assert decode_map(events[0].payload).source == "/t0"
+    (kept,) = _rejected(run.folder / "L")
+    assert kept.raw == good[:-1]
+
+
 def test_a_map_of_another_log_is_taken_over_unchanged_or_kept_as_rejected(run: Commands) -> None:
     run("import", "A", "--map", "map.yaml")
     with LogWriter(run.folder / "A") as writer:
@@ -159,10 +190,12 @@ def test_a_recorder_takes_grids_on_a_key_and_nobody_can_send_the_event_itself(
     connected: Callable[[], Session], publish: Callable[..., Program], tmp_path: Path
 ) -> None:
     event = drawn_map(DRAWING).encode()
-    with recording(connected(), tmp_path / "log", ["tb/*", MAP_KEY]) as running:
+    with recording(connected(), tmp_path / "log", ["tb/**", MAP_KEY]) as running:
         session = connected()
         for key, content in [
             ("tb/map", MESSAGE),
+            ("tb/ros/map", cdr_message(drawn_map(DRAWING))),
+            ("tb/ros/map", cdr_message(drawn_map(DRAWING))[:-2]),
             ("tb/detections", payload(envelope(1))),
             ("tb/map", MESSAGE.replace(b'"width": 5', b'"width": 6')),
             (MAP_KEY, event),
@@ -170,14 +203,15 @@ def test_a_recorder_takes_grids_on_a_key_and_nobody_can_send_the_event_itself(
             publisher = session.publisher(key)
             assert publisher.wait_for_subscriber(DEADLINE_S)
             publisher.put(content)
-        running.wait_until(lambda report: report.recorded == 2 and report.rejected == 2)
+        running.wait_until(lambda report: report.recorded == 3 and report.rejected == 3)
         running.finish()
     events = read_log(tmp_path / "log")
-    (taken,) = (e for e in events if e.key == MAP_KEY)
-    made = decode_map(taken.payload)
+    made, in_cdr = (decode_map(e.payload) for e in events if e.key == MAP_KEY)
+    assert (in_cdr.source, in_cdr.digest()) == ("tb/ros/map", drawn_map(DRAWING).digest())
     assert (made.source, made.origin) == ("tb/map", (1.0, 2.0, 0.0))
     assert np.array_equal(made.cells, cells(DRAWING))
     kept = {r.key: r for r in _rejected(tmp_path / "log")}
     assert kept["tb/map"].reason == "data: 15 values, where 6 × 3 cells take 18"
+    assert "in CDR: data would end at byte" in kept["tb/ros/map"].reason
     assert kept[MAP_KEY].raw == event
     assert "is reserved for mapfold's own events" in kept[MAP_KEY].reason
