@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from projections.model.view import MapView
 
-from . import canvas as palette
+from . import palette
 from .canvas import Canvas
 from .labels import Extent
 from .scene import Box, Floor, drives, place_spots

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from eventsrc.occupancy_map import MIN_WALL, OCCUPIED, UNKNOWN, OccupancyMap
 from projections.model.view import MapView
 
-from . import canvas as palette
+from . import palette
 from .canvas import Canvas
 from .scene import drives
 

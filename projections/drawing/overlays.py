@@ -12,7 +12,7 @@ from matplotlib.patches import Circle, Ellipse
 from projections.model.records import ObjectRecord
 from projections.model.view import MapView
 
-from . import canvas as palette
+from . import palette
 from .canvas import HALO, Canvas
 from .labels import Extent, LabelRequest, place_labels
 from .scene import (

@@ -13,7 +13,7 @@ from projections.deltas import PlacesMerged
 from projections.model.fold import FoldedEvent
 from projections.model.view import MapView
 
-from . import canvas as palette
+from . import palette
 from .base_layers import draw_drives, draw_floor, draw_regions, draw_walls
 from .canvas import Canvas, check_suffix, new_canvas
 from .labels import Extent
