@@ -26,6 +26,7 @@ COMMANDS: "Mapping[str, str]" = {
     "state": "projections.cli.maps",
     "draw": "projections.cli.maps",
     "export": "projections.cli.export",
+    "foxglove": "projections.cli.export",
     "relocalize": "projections.cli.relocalize",
     "evaluate": "projections.cli.evaluate",
     "query": "projections.cli.query",

@@ -1,16 +1,21 @@
-"""`mapfold export`: the map folded to a point in the log, in the formats of other programs."""
+"""The map for other programs: `mapfold export` writes files, `mapfold foxglove` serves Foxglove."""
 
 import math
+import threading
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from eventsrc.envelope import Offset
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 from eventsrc.text import counted
+from eventsrc.transport.config import is_loopback
+from projections.corrections import Corrections
 from projections.model.fold import fold_log_cached
 from projections.model.log_commands import read_corrections
+from projections.settings import Settings
 
 from .options import (
     KnownAtOption,
@@ -21,8 +26,13 @@ from .options import (
     known_point,
     point,
     settings_from,
+    writing,
 )
-from .terminal import say
+from .signals import stop_on_signals
+from .terminal import Bar, say
+
+if TYPE_CHECKING:
+    from projections.foxglove.playback import Playback
 
 
 def export(
@@ -49,6 +59,20 @@ def export(
         Path | None,
         typer.Option(metavar="FILE", help="A waypoint for each Place, as Nav2's RViz panel loads."),
     ] = None,
+    foxglove: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.mcap", help="How the map came about, event by event (extra [foxglove])."
+        ),
+    ] = None,
+    every: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            min=1,
+            help="A scene every N events, for --foxglove [default: such that there are 500].",
+        ),
+    ] = None,
     origin: Annotated[
         str | None,
         typer.Option(
@@ -67,47 +91,79 @@ def export(
 ) -> None:
     """Write the map folded to a point in the log for other programs.
 
-    GraphML, Graphviz, GeoJSON, CSV and Nav2 waypoints, one or several at once. The same log and
-    settings give the same bytes.
+    GraphML, Graphviz, GeoJSON, CSV, Nav2 waypoints and a recording for Foxglove, one or several at
+    once. The same log and settings give the same bytes.
     """
     from projections import export as formats
     from projections.drawing.one_floor import view_of_floor
 
-    wanted = {"graphml": graphml, "dot": dot, "geojson": geojson, "csv": csv, "nav2": nav2}
-    if not any(wanted.values()):
-        raise MisuseError("nothing to write: give " + ", ".join(f"--{name}" for name in wanted))
+    files = {"graphml": graphml, "dot": dot, "geojson": geojson, "csv": csv, "nav2": nav2}
+    if not any(files.values()) and foxglove is None:
+        names = ", ".join(f"--{name}" for name in (*files, "foxglove"))
+        raise MisuseError(f"nothing to write: give {names}")
     if origin is not None and geojson is None:
         raise MisuseError("--origin is for --geojson")
+    if every is not None and foxglove is None:
+        raise MisuseError("--every is for --foxglove")
+    if floor is not None and foxglove is not None:
+        raise MisuseError("--foxglove shows all floors, one above the other; leave --floor out")
     where = None if origin is None else formats.Origin(*_degrees(origin))
     settings_from(settings_file, set_)  # a bad value is an error before the log is opened
     with LogReader(log) as reader:
         end = point(reader, at)
         corrections = read_corrections(reader, known_point(reader, known_at, end))
         settings = settings_from(settings_file, set_, corrections)
+        if foxglove is not None:
+            _record(reader, foxglove, settings, end, corrections, every)
+        if not any(files.values()):
+            return
         _, view = fold_log_cached(reader, settings, end, note=say, corrections=corrections)
     if floor is not None:
         view = view_of_floor(view, floor)
-    files: dict[Path, str] = {}
+    texts: dict[Path, str] = {}
     if graphml is not None:
-        files[graphml] = formats.graphml(view)
+        texts[graphml] = formats.graphml(view)
     if dot is not None:
-        files[dot] = formats.dot(view)
+        texts[dot] = formats.dot(view)
     if geojson is not None:
-        files[geojson] = formats.geojson(view, where)
+        texts[geojson] = formats.geojson(view, where)
     if nav2 is not None:
-        files[nav2] = formats.nav2_waypoints(view)
+        texts[nav2] = formats.nav2_waypoints(view)
     if csv is not None:
-        files |= {csv / name: text for name, text in formats.tables(view).items()}
-    for path, text in files.items():
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
+        texts |= {csv / name: text for name, text in formats.tables(view).items()}
+    for path, text in texts.items():
+        with writing(path):
             path.write_text(text, "utf-8", newline="")
-        except OSError as error:
-            raise MisuseError(
-                f"{path}: cannot be written: {error.strerror}; choose another"
-            ) from None
     places, objects = counted(len(view.places), "place"), counted(len(view.objects), "object")
-    say(f"wrote {', '.join(map(str, files))}: {places}, {objects}")
+    say(f"wrote {', '.join(map(str, texts))}: {places}, {objects}")
+
+
+def _record(
+    reader: LogReader,
+    path: Path,
+    settings: Settings,
+    end: Offset,
+    corrections: Corrections,
+    every: int | None,
+) -> None:
+    try:
+        from projections.foxglove.recording import write_recording
+    except ModuleNotFoundError as error:
+        raise MisuseError(
+            f"--foxglove needs {error.name}, which is not installed;"
+            " pip install 'mapfold[foxglove]'"
+        ) from None
+    with writing(path), Bar() as bar:
+        scenes = write_recording(
+            reader,
+            path,
+            settings,
+            end,
+            corrections=corrections,
+            every=every,
+            progress=bar.show_fold,
+        )
+    say(f"wrote {path}: {counted(end, 'event')}, {counted(scenes, 'scene')}")
 
 
 def _degrees(text: str) -> tuple[float, ...]:
@@ -123,6 +179,88 @@ def _degrees(text: str) -> tuple[float, ...]:
     return values
 
 
+def foxglove(
+    log: LogArgument,
+    host: Annotated[str, typer.Option(metavar="ADDRESS", help="Listen here.")] = "127.0.0.1",
+    port: Annotated[
+        int, typer.Option(metavar="N", min=0, max=65_535, help="0 takes a free one.")
+    ] = 8765,
+    layout: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Write a layout there first, for Foxglove to import from file."
+        ),
+    ] = None,
+    known_at: KnownAtOption = None,
+    set_: SetOption = None,
+    settings_file: SettingsOption = None,
+) -> None:
+    """Show a log's map in Foxglove, whose timeline sets the time.
+
+    Seek, play and pause show the map as it was. In Foxglove: Open connection, Foxglove WebSocket.
+    Whoever can reach the address can read the log. Ctrl-C ends it.
+    """
+    try:
+        from projections.foxglove.layout import layout_json
+        from projections.foxglove.playback import PastMaps, Playback
+    except ModuleNotFoundError as error:
+        raise MisuseError(
+            f"mapfold foxglove needs {error.name}, which is not installed;"
+            " pip install 'mapfold[foxglove]'"
+        ) from None
+    settings_from(settings_file, set_)  # a bad value is an error before the log is opened
+    if layout is not None:
+        with writing(layout):
+            layout.write_text(layout_json(), "utf-8")
+        say(f"wrote {layout}")
+    with LogReader(log) as reader:
+        end = reader.next_offset
+        corrections = read_corrections(reader, known_point(reader, known_at, end))
+        settings = settings_from(settings_file, set_, corrections)
+        with Bar() as bar:
+            maps = PastMaps(reader, settings, corrections, end, bar.show_fold)
+        if maps.moments.backwards:
+            say(
+                f"{counted(maps.moments.backwards, 'event')} with a stamp before that of an earlier"
+                " one; the timeline shows them at the time of that one"
+            )
+        try:
+            playback = Playback(maps, log.resolve().name, host, port)
+        except OSError as error:
+            raise MisuseError(
+                f"cannot listen on {host}:{port}: {error}; give another --port"
+            ) from None
+        with stop_on_signals() as stop:
+            if not is_loopback(host):
+                say(f"warning: others can reach {host}, and can read the log; there is no token")
+            shown = f"[{host}]" if ":" in host else host
+            say(f"showing {counted(end, 'event')} of {log} at ws://{shown}:{playback.server.port}")
+            say("in Foxglove: Open connection, Foxglove WebSocket; Ctrl-C ends it")
+            _run(playback, stop)
+    say("closed")
+
+
+def _run(playback: "Playback", stop: threading.Event) -> None:
+    """Play until ``stop``; an error of the player ends it and is raised."""
+    failed: list[BaseException] = []
+
+    def play() -> None:
+        try:
+            playback.run()
+        except BaseException as error:  # noqa: BLE001 - raised below
+            failed.append(error)
+            stop.set()
+
+    player = threading.Thread(target=play, name="playback")
+    player.start()
+    stop.wait()
+    playback.end()
+    player.join()
+    if failed:
+        raise failed[0]
+
+
 def register(app: typer.Typer) -> None:
-    """Add `export` to ``app``."""
-    app.command()(export)
+    """Add `export` and `foxglove` to the program."""
+    for command in (export, foxglove):
+        app.command()(command)

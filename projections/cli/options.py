@@ -294,3 +294,13 @@ def check_picture(out: Path | None) -> None:
     from projections.drawing.canvas import check_suffix
 
     check_suffix(out)
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Make the folder of a file that is written inside; what fails is a MisuseError."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield
+    except OSError as error:
+        raise MisuseError(f"{path}: cannot be written: {error.strerror}; choose another") from None

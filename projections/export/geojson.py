@@ -18,7 +18,7 @@ _WGS84_E2: Final = 6.694_379_990_141_316e-3
 _DECIMALS: Final = 9
 """Of a degree: 0.1 mm."""
 
-_Point = tuple[float, float]
+Point = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class Origin:
     longitude: float
     yaw: float = 0.0
 
-    def geographic(self, x: float, y: float) -> _Point:
+    def geographic(self, x: float, y: float) -> Point:
         """Longitude and latitude of a point of the map frame, metres. The plane that touches the
         ellipsoid at the origin: 1 km away from it this is off by a few centimetres."""
         turn, latitude = math.radians(self.yaw), math.radians(self.latitude)
@@ -62,7 +62,7 @@ def geojson(view: MapView, origin: Origin | None = None) -> str:
     return json.dumps(document, ensure_ascii=True, allow_nan=False) + "\n"
 
 
-_Placing = Callable[[float, float], _Point]
+_Placing = Callable[[float, float], Point]
 
 
 def _feature(kind: str, shape: str, coordinates: Any, **values: Any) -> dict[str, Any]:
@@ -77,7 +77,7 @@ def _feature(kind: str, shape: str, coordinates: Any, **values: Any) -> dict[str
 def _places(view: MapView, at: _Placing) -> Iterable[dict[str, Any]]:
     for place in view.places.values():
         poses = (view.keyframes[member].pose for member in place.members)
-        ring = _hull([(pose.x_m, pose.y_m) for pose in poses if pose is not None])
+        ring = hull([(pose.x_m, pose.y_m) for pose in poses if pose is not None])
         kind = view.type_of(place.ordinal)
         values = {
             "place_id": place.place_id,
@@ -94,11 +94,11 @@ def _places(view: MapView, at: _Placing) -> Iterable[dict[str, Any]]:
             yield _feature("place", "Polygon", [closed], **values)
 
 
-def _hull(points: Sequence[_Point]) -> list[_Point]:
+def hull(points: Sequence[Point]) -> list[Point]:
     """Corners of the convex hull, counter-clockwise (Andrew's monotone chain)."""
 
-    def chain(ordered: Iterable[_Point]) -> list[_Point]:
-        corners: list[_Point] = []
+    def chain(ordered: Iterable[Point]) -> list[Point]:
+        corners: list[Point] = []
         for x, y in ordered:
             while len(corners) > 1:
                 (ax, ay), (bx, by) = corners[-2:]
@@ -141,7 +141,7 @@ def _edges(view: MapView, at: _Placing) -> Iterable[dict[str, Any]]:
 
 
 def _runs(view: MapView, at: _Placing) -> Iterable[dict[str, Any]]:
-    paths: dict[str, list[_Point]] = {run.run_id: [] for run in view.runs}
+    paths: dict[str, list[Point]] = {run.run_id: [] for run in view.runs}
     for k in view.keyframes:
         if k.pose is not None:
             paths[k.run_id].append(at(k.pose.x_m, k.pose.y_m))

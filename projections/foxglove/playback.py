@@ -1,0 +1,227 @@
+"""A server whose time is set by Foxglove's timeline: seek, play and pause show the map as it was.
+
+The SDK calls the ``on_`` methods in its own thread; they only note what is asked. The thread that
+runs `Playback.run` folds and publishes.
+"""
+
+import math
+import threading
+import time
+from bisect import bisect_left
+from collections.abc import Callable
+from typing import Final
+
+from foxglove import Capability, Context, start_server
+from foxglove.websocket import (
+    ChannelView,
+    Client,
+    PlaybackCommand,
+    PlaybackControlRequest,
+    PlaybackState,
+    PlaybackStatus,
+    ServerListener,
+    WebSocketServer,
+)
+
+from eventsrc.envelope import FIRST_OFFSET, Offset
+from eventsrc.log import LogReader
+from projections.corrections import Corrections
+from projections.deltas import PlacesMerged
+from projections.history.history import History
+from projections.history.past_view import view_at
+from projections.model.digest import map_digest
+from projections.model.fold import READ_AHEAD, fold_events, gc_paused
+from projections.model.view import MapView
+from projections.reducers.semantic_map import SemanticMap
+from projections.settings import Settings
+
+from .messages import MapTopics, change_lines
+from .moments import Moments
+
+TICK_S: Final = 0.05
+"""Between two moments that are shown while it plays."""
+ANSWERED_S: Final = 0.02
+"""The SDK sends the answer to a request after the call that makes it, and has no way to say when. A
+client clears what it shows at the answer to a seek, so what it is to see comes so much later."""
+
+
+class PastMaps:
+    """Every past map of a log's first ``end`` events under ``corrections``, from one fold, which
+    raises FoldError at an event that cannot be folded."""
+
+    def __init__(
+        self,
+        reader: LogReader,
+        settings: Settings,
+        corrections: Corrections,
+        end: Offset,
+        progress: Callable[[int, int], None] = lambda *_: None,
+    ) -> None:
+        self.reader = reader
+        self.moments = Moments(reader.read(FIRST_OFFSET, end))
+        self._lines: list[tuple[Offset, str]] = []
+        self._merges: list[PlacesMerged] = []
+        self._history = History(settings, corrections)
+        self._latest = MapView(settings, keep_embeddings=False, corrections=corrections)
+        semantic_map = SemanticMap(settings, corrections=corrections)
+        events = reader.read(FIRST_OFFSET, end)
+        with gc_paused():
+            for offset, deltas in fold_events(events, semantic_map, ahead=READ_AHEAD):
+                self._latest.apply_event(offset, deltas)
+                self._history.apply(offset, deltas)
+                self._lines += ((offset, line) for line in change_lines(self._latest, deltas))
+                self._merges += (delta for delta in deltas if isinstance(delta, PlacesMerged))
+                progress(offset, end)
+
+    @property
+    def floors(self) -> list[str | None]:
+        """The floors that the log's occupancy maps name."""
+        return list(self._latest.maps)
+
+    def lines_between(self, start: Offset, end: Offset) -> list[tuple[Offset, str]]:
+        """What the events from ``start`` to before ``end`` changed, each line with its event."""
+        first, last = (
+            bisect_left(self._lines, at, key=lambda each: each[0]) for at in (start, end)
+        )
+        return self._lines[first:last]
+
+    def at(self, end: Offset) -> tuple[MapView, list[PlacesMerged]]:
+        """The map after ``end`` events, and its merges of places."""
+        merges = self._merges[: bisect_left(self._merges, end, key=lambda merge: merge.offset)]
+        with gc_paused():
+            return view_at(self._history, self._latest, end), merges
+
+
+class Playback(ServerListener):
+    """A server of past maps, which listens from its making until `run` has ended.
+
+    Raises OSError where it cannot listen. At first it shows the end of the log, paused.
+    """
+
+    def __init__(self, maps: PastMaps, name: str, host: str, port: int) -> None:
+        self._maps = maps
+        self._first_ns, self._last_ns = maps.moments.span_ns
+        self._changed = threading.Condition()
+        # What the SDK's thread writes, too, is read and written under _changed.
+        self._now_ns, self._shown = self._last_ns, Offset(len(maps.moments.times_ns))
+        self._playing, self._speed = False, 1.0
+        self._to_show, self._ended = False, False
+        context = Context()
+        self._topics = MapTopics(context)
+        self._topics.declare(maps.moments.keys, maps.floors)
+        try:
+            self.server: WebSocketServer = start_server(
+                name=name,
+                host=host,
+                port=port,
+                capabilities=[Capability.PlaybackControl, Capability.Time],
+                server_listener=self,
+                playback_time_range=(self._first_ns, self._last_ns),
+                context=context,
+            )
+        except RuntimeError as error:
+            raise OSError(str(error)) from error
+
+    def end(self) -> None:
+        """Let `run` end, and with it the server."""
+        with self._changed:
+            self._ended = True
+            self._changed.notify()
+
+    def on_playback_control_request(
+        self, playback_control_request: PlaybackControlRequest
+    ) -> PlaybackState | None:
+        """Take over what a client asks; the SDK answers with what this returns."""
+        asked = playback_control_request
+        with self._changed:
+            self._playing = asked.playback_command is PlaybackCommand.Play
+            self._speed = asked.playback_speed if 0 < asked.playback_speed < math.inf else 1.0
+            if asked.seek_time is not None:
+                self._now_ns = min(max(asked.seek_time, self._first_ns), self._last_ns)
+                self._shown = self._maps.moments.offset_at(self._now_ns)
+                self._to_show = True
+            if self._now_ns >= self._last_ns:
+                self._playing = False
+            self._changed.notify()
+            return self._state(asked.request_id, did_seek=asked.seek_time is not None)
+
+    def on_subscribe(self, client: Client, channel: ChannelView) -> None:  # noqa: ARG002
+        """Show the moment to who begins to read a topic."""
+        with self._changed:
+            self._to_show = True
+            self._changed.notify()
+
+    def run(self) -> None:
+        """Publish what clients ask for, and let time pass, until `end`; then stop the server."""
+        try:
+            self._run()
+        finally:
+            self.server.stop()  # here: the SDK's server must not be used by two threads at once
+
+    def _run(self) -> None:
+        before = time.monotonic()
+        while True:
+            with self._changed:
+                self._changed.wait_for(
+                    lambda: self._ended or self._to_show, TICK_S if self._playing else None
+                )
+                if self._to_show:
+                    self._changed.wait_for(lambda: self._ended, ANSWERED_S)
+                if self._ended:
+                    return
+                to_show = self._to_show
+            if to_show:
+                self._show()
+            now = time.monotonic()
+            self._pass(now - before)
+            before = now
+
+    def _state(self, request_id: str = "", *, did_seek: bool = False) -> PlaybackState:
+        if self._playing:
+            status = PlaybackStatus.Playing
+        else:
+            at_end = self._now_ns >= self._last_ns
+            status = PlaybackStatus.Ended if at_end else PlaybackStatus.Paused
+        return PlaybackState(status, self._now_ns, self._speed, did_seek, request_id)
+
+    def _show(self) -> None:
+        """The whole moment, for who knows nothing of it."""
+        with self._changed:
+            self._to_show, now, shown = False, self._now_ns, self._shown
+        view, merges = self._maps.at(shown)
+        self.server.broadcast_time(now)
+        for given in view.maps.values():
+            self._topics.walls(view, given, now)
+        self._topics.robot(view, now)
+        self._topics.scene(view, merges, now, digest=map_digest(view))
+
+    def _pass(self, seconds: float) -> None:
+        """Let time pass, where it plays, and publish what happened."""
+        with self._changed:
+            if not self._playing or self._to_show:
+                return
+            self._now_ns = min(self._now_ns + int(seconds * self._speed * 1e9), self._last_ns)
+            before, self._shown = self._shown, self._maps.moments.offset_at(self._now_ns)
+            now, shown = self._now_ns, self._shown
+            ended = now >= self._last_ns
+            self._playing = not ended
+        self.server.broadcast_time(now)
+        if shown > before:
+            self._publish(before, shown, now)
+        if ended:
+            with self._changed:
+                state = self._state()
+            self.server.broadcast_playback_state(state)
+
+    def _publish(self, start: Offset, end: Offset, now: int) -> None:
+        view, merges = self._maps.at(end)
+        times = self._maps.moments.times_ns
+        for event in self._maps.reader.read(start, end):
+            self._topics.event(event, times[event.offset])
+        for offset, line in self._maps.lines_between(start, end):
+            self._topics.changes([line], times[offset])
+        for given in view.maps.values():
+            if given.offset >= start:
+                self._topics.walls(view, given, now)
+        self._topics.robot(view, now)
+        self._topics.scene(view, merges, now)
