@@ -35,7 +35,7 @@ def test_what_was_acknowledged_and_is_not_there_is_lost(oracle: Oracle, log_path
     assert oracle.judge(log_path) == Judgement(3, 0, 0)
 
 
-def test_what_nobody_sent_is_invented(oracle: Oracle, log_path: Path) -> None:
+def test_an_event_that_was_not_sent_counts_as_invented(oracle: Oracle, log_path: Path) -> None:
     write_log(log_path, PAYLOADS)
     assert oracle.judge(log_path) == Judgement(3, 0, 1)
 

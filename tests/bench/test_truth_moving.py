@@ -47,7 +47,7 @@ def test_each_thing_is_counted_once_for_what_the_map_says_of_it():
     )
 
 
-def test_a_map_without_reports_has_told_of_nothing():
+def test_a_map_without_reports_has_no_score_of_moved_things():
     scores = score()
     assert (scores.moved, scores.missing, scores.wronged, scores.gone) == (0, 0, 0, 0)
     assert (scores.knowable, scores.others) == (3, 2)

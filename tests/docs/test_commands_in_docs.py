@@ -31,7 +31,7 @@ def test_commands_print_what_the_document_says(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", DOCUMENTS)
-def test_who_follows_a_document_leaves_nothing_that_git_would_show(name: str) -> None:
+def test_commands_of_documents_leave_no_untracked_files(name: str) -> None:
     for part in read(ROOT / name):
         if isinstance(part, Command):
             written = re.findall(r"(?:> (?!\d)|--out |--picture |mapfold import )(\S+)", part.text)

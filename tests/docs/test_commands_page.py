@@ -21,7 +21,7 @@ LISTED += ["whatif", "query where", "query contents", "query holding", "query pa
 
 
 @pytest.mark.parametrize("path", LISTED)
-def test_what_a_list_of_commands_says_of_it_is_whole(path: str) -> None:
+def test_short_help_is_not_cut_off(path: str) -> None:
     """On a terminal of 80 columns the lists of --help have this much for each."""
     said = COMMANDS[f"mapfold {path}"].get_short_help_str(62)
     assert said.endswith(".")

@@ -41,7 +41,7 @@ def test_images_are_pinned(compose: dict[str, Any]) -> None:
     assert re.search(r":\d+\.\d+\.\d+", base[1])
 
 
-def test_what_is_waited_for_is_there_and_says_that_it_is_well(compose: dict[str, Any]) -> None:
+def test_services_waited_for_exist_and_have_health_checks(compose: dict[str, Any]) -> None:
     services = compose["services"]
     waited = [(n, d, c) for n, s in services.items() for d, c in s.get("depends_on", {}).items()]
     assert waited

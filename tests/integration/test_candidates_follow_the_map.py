@@ -118,7 +118,7 @@ class TestClasses:
         return write_log(tmp_path / "log", documents)
 
     @pytest.mark.parametrize(("bound", "value"), [("OBJECTS_OF_A_CLASS", 2), ("MOST_OBJECTS", 5)])
-    def test_they_are_bounded_and_those_seen_most(
+    def test_candidates_are_bounded_to_the_objects_seen_most(
         self,
         log: Path,
         targets: Targets,

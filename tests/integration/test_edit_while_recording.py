@@ -117,7 +117,7 @@ def test_a_log_with_an_event_that_is_no_command_is_recorded_without_edits(
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_whoever_is_killed_a_command_is_recorded_once(
+def test_a_command_is_recorded_once_whichever_process_is_killed(
     mapfold: Commands, recorder: Start, endpoint: str, seed: int
 ) -> None:
     """The recorder or `edit` is killed in the middle; the same command is then given again."""

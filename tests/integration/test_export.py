@@ -108,7 +108,7 @@ def test_an_origin_places_the_map_on_earth(mapfold: Commands, log: Path) -> None
         (("--dot", "m.dot", "--floor", "roof"), "no floor 'roof' in this map"),
     ],
 )
-def test_what_cannot_be_written_is_said(
+def test_an_output_that_cannot_be_written_is_an_error(
     mapfold: Commands, log: Path, options: tuple[str, ...], says: str
 ) -> None:
     (mapfold.folder / "file").touch()

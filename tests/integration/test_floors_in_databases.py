@@ -79,7 +79,7 @@ def test_check_names_a_wrong_floor(log: Path, one_database: Targets) -> None:
     assert (difference.table, difference.kind) == ("PART_OF", "missing")
 
 
-def test_a_graph_that_an_older_version_made_is_refused_and_made_anew(
+def test_a_graph_of_an_older_version_is_refused_until_a_replay(
     log: Path, one_database: Targets
 ) -> None:
     rebuild(log, one_database, SETTINGS)

@@ -186,7 +186,7 @@ def test_a_segment_names_the_schema_of_maps(run: Commands) -> None:
     assert json.loads(schema.data) == OccupancyMapEvent.model_json_schema()
 
 
-def test_a_recorder_takes_grids_on_a_key_and_nobody_can_send_the_event_itself(
+def test_a_recorder_takes_grids_on_a_key_and_rejects_map_events_from_outside(
     connected: Callable[[], Session], publish: Callable[..., Program], tmp_path: Path
 ) -> None:
     event = drawn_map(DRAWING).encode()

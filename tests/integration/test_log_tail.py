@@ -154,7 +154,7 @@ def test_a_tail_of_a_log_that_is_gone_ends(log_path: Path) -> None:
         list(events)
 
 
-def test_a_tail_gets_what_recovery_found_behind_the_last_mark(log_path: Path) -> None:
+def test_a_tail_reads_events_that_recovery_found_behind_the_last_mark(log_path: Path) -> None:
     writer = LogWriter(log_path, fsync=BY_HAND)
     for payload in (b"zero", b"one"):
         writer.append(KEY, payload)

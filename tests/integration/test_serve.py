@@ -448,7 +448,7 @@ class TestKilledServer:
         assert told[1:] == ["the database answers again"]
 
 
-def test_all_connections_in_use_is_no_outage(
+def test_a_full_pool_is_not_reported_as_an_outage(
     targets: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("FIRST_WAIT_S", "LAST_WAIT_S"):

@@ -49,7 +49,9 @@ def mapfold(tmp_path: Path) -> Commands:
     ],
     ids=lambda args: " ".join(args[:2]),
 )
-def test_it_is_told(mapfold: Commands, args: tuple[str, ...]) -> None:
+def test_stamps_that_run_backwards_are_reported_on_stderr(
+    mapfold: Commands, args: tuple[str, ...]
+) -> None:
     said = mapfold(*args)
     assert [line for line in said.err.splitlines() if line.startswith(WARNING)]
     assert "backwards" not in said.out

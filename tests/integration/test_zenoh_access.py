@@ -119,7 +119,7 @@ def test_only_robots_get_into_the_log(
     assert runs == ["robot-1"] * 4
 
 
-def test_nobody_but_the_recorder_can_acknowledge(
+def test_only_the_recorder_can_acknowledge(
     session: Callable[[str], Session],
 ) -> None:
     heard: queue.Queue[Received] = queue.Queue()

@@ -18,7 +18,7 @@ _SPEAKING = (("record", "log"), ("router",), ("simulate",))
         ("--zenoh-config", "no-file", "no-file: no such Zenoh configuration file"),
     ],
 )
-def test_it_is_misuse(
+def test_a_bad_zenoh_option_is_misuse(
     tmp_path: Path, command: tuple[str, ...], option: str, value: str, complaint: str
 ) -> None:
     said = Commands.in_folder(tmp_path)(*command, option, value, code=2)

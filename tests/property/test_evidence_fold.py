@@ -241,7 +241,7 @@ def test_same_and_different_objects_are_obeyed(
 
 @SLOW
 @given(documents=drives(), data=st.data())
-def test_what_is_forgotten_or_dropped_might_never_have_been(
+def test_forgotten_and_dropped_events_fold_as_if_absent(
     documents: list[dict[str, Any]], data: st.DataObject
 ) -> None:
     """But for ordinals of keyframes, the map is that of the events without it."""

@@ -197,7 +197,7 @@ def test_a_growing_segment_whose_header_is_damaged_is_not_taken_for_another_prog
 
 
 @pytest.mark.parametrize("torn", [10, 100, 140])
-def test_a_forged_mark_in_a_key_stops_nobody(folder: Path, torn: int) -> None:
+def test_a_forged_mark_in_a_key_does_not_stop_readers(folder: Path, torn: int) -> None:
     path = folder / "log"
     writer = LogWriter(path, fsync=BY_HAND)
     writer.append(KEY, b"first")

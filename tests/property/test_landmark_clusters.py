@@ -133,7 +133,7 @@ def slow_clusters(points: Points, weight: list[float], most: int) -> list[list[i
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 8))
 @settings(deadline=None)
-def test_clusters_are_those_of_supports_summed_anew(seed: int, most: int) -> None:
+def test_clusters_are_those_of_supports_summed_from_scratch(seed: int, most: int) -> None:
     """Also where some of the points are so far away that they are of no account to each other."""
     rng = np.random.default_rng(seed)
     things = [(float(x), float(y)) for x, y in rng.uniform(-3, 3, (3, 2))]

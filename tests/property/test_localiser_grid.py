@@ -88,7 +88,7 @@ def test_of_many_crops_each_is_looked_for_at_its_best_landmarks() -> None:
         assert any(abs(x - 10 * best) <= 1 and abs(y - 100 * crop) <= 1 for x, y in found)
 
 
-def test_landmarks_that_look_all_the_same_are_all_looked_for() -> None:
+def test_landmarks_that_look_alike_are_all_considered() -> None:
     """A class has no best Object."""
     many = [landmarks([4.0] * 30, [[(7.0 * k, 9.0 * c)] for k in range(30)]) for c in range(3)]
     assert len(likely_spots(many, 0.175)) == 90

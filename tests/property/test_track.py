@@ -191,7 +191,7 @@ def test_things_that_the_map_has_change_nothing(known: float) -> None:
     assert one.particles.tobytes() == other.particles.tobytes()
 
 
-def test_one_unknown_picture_is_soon_forgiven() -> None:
+def test_one_unknown_picture_has_little_effect() -> None:
     track, before = converged(0.95)
     after = track.step((1.0, 0.0, 0.0), hypotheses((50.0, 9.0, 1.0, 1.0)), 0.05, 0.0)
     assert 0.9 < after.confidence < before

@@ -16,7 +16,7 @@ def advice(poses: int, noise: int, places: int, settings: Settings = PAGE) -> st
 @pytest.mark.parametrize(
     ("poses", "noise", "places"), [(0, 0, 0), (19, 0, 1), (19, 19, 0), (100, 0, 2), (100, 79, 3)]
 )
-def test_nothing_stands_out(poses: int, noise: int, places: int, settings: Settings) -> None:
+def test_no_advice_for_a_usual_map(poses: int, noise: int, places: int, settings: Settings) -> None:
     assert advice(poses, noise, places, settings) is None
 
 

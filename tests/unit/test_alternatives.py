@@ -37,7 +37,7 @@ def test_the_same_settings_are_tried_once() -> None:
     assert names(["eps_m=1"], ["eps_m=1.0", "eps_m=1.00"], []) == ["eps_m=1.0"]
 
 
-def test_nothing_to_try() -> None:
+def test_no_alternatives_for_no_options() -> None:
     assert names([], [], []) == []
 
 

@@ -67,7 +67,7 @@ def test_boxes_that_show_the_near_side_of_a_thing_do() -> None:
     assert _inflation(_moved(rows, aside)) > 1.7
 
 
-def test_what_is_seen_ever_again_does_not_make_errors_grow_without_end() -> None:
+def test_many_views_of_a_thing_inflate_errors_to_a_bound() -> None:
     """An estimate of the fold rests on so many views at most, however many there are."""
     known = Known(things=24, looks=40)
     rows = rows_of(known)

@@ -52,7 +52,7 @@ def test_the_order_of_crops_does_not_matter(rows: list[list[float]], random: obj
 
 
 @given(st.lists(st.floats(0.0, 0.9), min_size=1, max_size=4), st.floats(0.02, 0.1))
-def test_what_is_more_alike_is_likelier_in_the_map(crops: list[float], more: float) -> None:
+def test_known_rises_with_likeness(crops: list[float], more: float) -> None:
     flat = MapConstants(different=0.0)
     assert _known([[c + more] * 4 for c in crops], flat) > _known([[c] * 4 for c in crops], flat)
 

@@ -42,7 +42,7 @@ COSTLY = {
 
 
 @pytest.mark.parametrize("name", COSTLY)
-def test_it_is_refused_in_seconds(name: str) -> None:
+def test_a_costly_command_is_refused_in_seconds(name: str) -> None:
     before = time.process_time()
     with pytest.raises(InvalidCommand):
         parse_command(COSTLY[name])

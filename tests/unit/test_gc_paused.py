@@ -11,7 +11,7 @@ def _is_young(thing: object) -> bool:
     return any(thing is other for n in (0, 1) for other in gc.get_objects(generation=n))
 
 
-def test_nothing_is_searched_inside_and_what_was_made_is_old_afterwards() -> None:
+def test_the_collector_is_off_inside_and_skips_what_was_made_afterwards() -> None:
     before = [[]]  # type: ignore[var-annotated]
     assert _is_young(before)
     with gc_paused():
@@ -23,7 +23,7 @@ def test_nothing_is_searched_inside_and_what_was_made_is_old_afterwards() -> Non
     assert gc.get_freeze_count() == 0  # old, yet still searched when its time comes
 
 
-def test_it_ends_also_with_an_error_and_leaves_off_what_was_off() -> None:
+def test_the_collector_is_as_before_after_an_error_too() -> None:
     with pytest.raises(ZeroDivisionError), gc_paused():
         raise ZeroDivisionError
     assert gc.isenabled()

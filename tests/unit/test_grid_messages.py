@@ -44,7 +44,7 @@ def test_the_first_value_is_the_cell_at_the_origin() -> None:
     assert read_grid_message(payload(document), "k").cells[0].tolist() == [1, 2, 3]
 
 
-def test_an_orientation_that_nobody_set_is_no_turn() -> None:
+def test_an_orientation_that_is_not_set_is_no_turn() -> None:
     document = grid_message(MAP)
     document["info"]["origin"]["orientation"] = {"x": 0, "y": 0, "z": 0, "w": 0}
     assert read_grid_message(payload(document), "k").origin[2] == 0.0

@@ -226,7 +226,7 @@ def test_a_command_that_stands_in_the_way_is_named(
         make(log, then[0], *then[1])
 
 
-def test_what_a_chain_of_commands_says_stands_in_the_way_too(log: Path) -> None:
+def test_a_command_that_a_chain_of_commands_contradicts_is_refused(log: Path) -> None:
     give(log, by.join, FAR, RIGHT, command_id="first")
     by_another_fold = Join(
         command_id="second", issued_by="me@here", places=(IN_FAR, _anchor("run-a", 3))

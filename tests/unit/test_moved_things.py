@@ -123,7 +123,7 @@ def test_a_second_chair_beside_the_first_is_no_moved_one(monkeypatch):
     assert len(of_class(folded, "chair")) == 2
 
 
-def test_nothing_is_missing_where_nothing_is_carried_away():
+def test_no_object_is_missing_where_none_was_carried_away():
     folded = Folded.start(SETTINGS)
     for name in ("a", "b", "c"):
         folded.extend(run(name, ROOM))

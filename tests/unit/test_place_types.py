@@ -50,7 +50,7 @@ def test_the_rooms_of_the_simulated_house(room: str) -> None:
     assert type_of(counts) == type_of_name(room)
 
 
-def test_nothing_known_says_nothing() -> None:
+def test_unknown_classes_give_no_type() -> None:
     assert place_type({}) is None
     assert place_type({"gadget": 3, "": 1}) is None
     assert place_type({"toilet": 0.0}) is None

@@ -78,7 +78,7 @@ def test_a_thing_behind_a_wall_is_hidden_and_one_at_it_is_not() -> None:
     ]
 
 
-def test_nothing_is_asked_or_all_is_near() -> None:
+def test_walls_hide_nothing_without_landmarks_or_close_by() -> None:
     walls = WallMap(drawn_map("#" * 9, 0.1))
     spots = np.zeros((2, 2))
     assert not walls.hides(spots, spots, np.zeros((2, 2), bool)).any()

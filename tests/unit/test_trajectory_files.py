@@ -138,7 +138,7 @@ def test_an_endless_file_is_refused_at_once() -> None:
 
 
 @pytest.mark.parametrize("name", ["missing", "."])
-def test_what_is_no_file(tmp_path: Path, name: str) -> None:
+def test_a_missing_file_or_a_folder_is_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(TrajectoryError, match=r"No such file|Is a directory"):
         read_trajectory(tmp_path / name)
 

@@ -44,7 +44,7 @@ def _lose_the_end(file: Path) -> None:
 @pytest.mark.parametrize(
     ("rotate_events", "lose"), [(1000, _lose_the_second_chunk), (2, _lose_the_end)]
 )
-def test_what_a_power_cut_took_from_the_middle(
+def test_a_segment_missing_in_the_middle_is_recovered_around(
     log_path: Path, rotate_events: int, lose: Callable[[Path], None]
 ) -> None:
     lose(_power_cut(log_path, rotate_events))
