@@ -14,7 +14,7 @@ def followed_and_rebuilt(
     log: Path, settings: Settings, size: int, corrections: Corrections = NO_CORRECTIONS
 ) -> tuple[MemoryTables, MemoryTables]:
     """The tables of a tail and those of a rebuild, both in batches of ``size`` events."""
-    live, anew = MemoryTables(), MemoryTables()
+    live, fresh = MemoryTables(), MemoryTables()
     following, folding = (LiveFold(settings, corrections=corrections) for _ in range(2))
     sink, shadow = MemorySink(), MemorySink().shadow()
     with LogReader(log) as reader:
@@ -22,7 +22,7 @@ def followed_and_rebuilt(
             assert not any(following.feed(batch))
             sink.prepare(following.tracker.drain(), following.view).send(live)
             assert not any(folding.feed(batch))
-            shadow.load(folding.tracker.drain(), folding.view)(anew)
-    shadow.finish(folding.view)(anew)
-    shadow.swap_in(anew)
-    return live, anew
+            shadow.load(folding.tracker.drain(), folding.view)(fresh)
+    shadow.finish(folding.view)(fresh)
+    shadow.swap_in(fresh)
+    return live, fresh

@@ -1,4 +1,4 @@
-"""Database servers that a test may kill, and data folders that are copied, not made anew."""
+"""Database servers that a test may kill, and data folders that are copied, not initialised."""
 
 import contextlib
 import fcntl

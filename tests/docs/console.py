@@ -1,4 +1,4 @@
-"""Documents whose commands are run: reading them, running them, comparing, writing anew.
+"""Documents whose commands are run: reading them, running them, comparing, rewriting.
 
 In a fenced block ``console`` a line that starts with ``$ `` is a command, and what follows it, up
 to the next one, is what it prints, stdout and stderr together. A block ``python NAME.py`` is a file
@@ -8,7 +8,7 @@ which documents know as ``HOME_OF_DOCS``.
 What differs from time to time is put out of sight on both sides before comparing (`_VARYING`). A
 line that is only ``…`` stands for any lines, a ``…`` within a line for any text.
 
-    python -m tests.docs.console README.md          writes the document's outputs anew
+    python -m tests.docs.console README.md          rewrites the outputs in the document
 """
 
 import os

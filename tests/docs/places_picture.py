@@ -1,6 +1,6 @@
 """docs/images/place-merge.svg: a merge, drawn from what the reducer itself knows before and after.
 
-python -m tests.docs.places_picture        draws it anew
+python -m tests.docs.places_picture        draws it again
 """
 
 from pathlib import Path

@@ -4,7 +4,7 @@ from tests.docs.places_picture import PICTURE, drawn
 
 
 def test_the_picture_of_a_merge_is_what_the_reducer_knows() -> None:
-    told = "draw it anew: python -m tests.docs.places_picture"
+    told = "draw it again: python -m tests.docs.places_picture"
     assert PICTURE.read_text("utf-8") == drawn(), told
 
 

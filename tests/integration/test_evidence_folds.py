@@ -69,8 +69,8 @@ def test_the_log_has_what_these_tests_are_about(log: Path) -> None:
 
 @pytest.mark.parametrize("size", [1, 17])
 def test_batches_of_any_size_give_the_rows_of_the_fold(log: Path, size: int) -> None:
-    live, anew = followed_and_rebuilt(log, EVIDENCE, size)
-    assert live.graph == anew.graph
+    live, fresh = followed_and_rebuilt(log, EVIDENCE, size)
+    assert live.graph == fresh.graph
     view = view_of(log)
     for label in LABELS:
         rows = [live.graph[label][key] for key in sorted(live.graph[label])]

@@ -130,9 +130,9 @@ def test_the_table_has_the_maps_in_force_after_every_step(
 def test_memory_has_the_rows_of_the_database(tmp_path: Path, one_database: Targets) -> None:
     log = tmp_path / "log"
     _append(log, *EVENTS)
-    live, anew = followed_and_rebuilt(log, Settings(), 3)
+    live, fresh = followed_and_rebuilt(log, Settings(), 3)
     tail(log, one_database, Settings(), once=True)
-    assert live.maps == anew.maps
+    assert live.maps == fresh.maps
     assert [tuple(row) for row in live.maps] == map_rows(one_database.graph_url)[:-1]
 
 

@@ -66,8 +66,8 @@ def test_live_rows_and_a_rebuild_are_what_the_view_says(
 @pytest.mark.parametrize("size", [1, 7, 1_000])
 def test_batches_of_any_size_give_the_rows_of_a_rebuild(log: Path, size: int) -> None:
     _, corrections = fold(log)
-    live, anew = followed_and_rebuilt(log, SETTINGS, size, corrections)
-    assert live.graph == anew.graph
+    live, fresh = followed_and_rebuilt(log, SETTINGS, size, corrections)
+    assert live.graph == fresh.graph
 
 
 def test_an_object_is_found_and_absorbed_by_one_event(tmp_path: Path) -> None:

@@ -204,7 +204,7 @@ def test_each_floor_has_its_walls_in_answers(
 def test_a_projection_of_an_older_version_is_answered_without_walls(
     tmp_path: Path, one_database: Targets
 ) -> None:
-    """It has no table of maps; a tail refuses it, a replay makes it anew."""
+    """It has no table of maps; a tail refuses it, a replay makes it again."""
     log = tmp_path / "log"
     _append(log, _house(), *_drive("a")[:60])
     rebuild(log, one_database, SETTINGS)

@@ -38,10 +38,10 @@ def test_batches_and_a_rebuild_have_the_rows_of_the_view(
     settings = Settings(**raw)
     with TemporaryDirectory() as folder:
         log = write_log(Path(folder) / "log", documents)
-        live, anew = followed_and_rebuilt(log, settings, size)
+        live, fresh = followed_and_rebuilt(log, settings, size)
         with LogReader(log) as reader:
             view = fold_log(reader, settings)[1]
-    assert live.graph == anew.graph
+    assert live.graph == fresh.graph
     assert parsed(live) == expected_graph(view)
 
 

@@ -107,7 +107,7 @@ def test_every_point_is_in_one_group_and_every_spread_is_a_covariance(
 
 
 def slow_clusters(points: Points, weight: list[float], most: int) -> list[list[int]]:
-    """Densest first, with every support summed anew for every cluster."""
+    """Densest first, with every support summed from scratch for every cluster."""
     count = points.count
     (x, y), (ux, uy), (along, across) = points.xy, points.direction, points.sigma
 

@@ -1,4 +1,4 @@
-"""Presence beside a slow oracle that keeps every vantage and every look, and counts anew.
+"""Presence beside a slow oracle that keeps every vantage and every look, and counts from scratch.
 
 The oracle walks over all Objects and all poses each was seen from; it has no grid of Objects, no
 running odds and no order but that of the ordinals.

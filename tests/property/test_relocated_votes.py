@@ -1,4 +1,4 @@
-"""Located-in where Objects merge and stand elsewhere, against votes counted anew at each step."""
+"""Located-in where Objects merge and stand elsewhere, against votes recounted at each step."""
 
 from collections import Counter
 

@@ -88,9 +88,9 @@ def test_batches_of_any_size_and_a_rebuild_give_what_the_deltas_say(
     live = MemoryTables()
     followed(events, size, live)
     check_rows(live, events)
-    view, anew, counted = rebuilt(events, rebuild_size)
-    assert live.graph == anew.graph
-    assert live.vectors.keys() == anew.vectors.keys()
+    view, fresh, counted = rebuilt(events, rebuild_size)
+    assert live.graph == fresh.graph
+    assert live.vectors.keys() == fresh.vectors.keys()
     counts = view.counts()
     assert {label: counted[label] for label in LABELS} == {
         label: counts[COUNT_KEYS[label]] for label in LABELS

@@ -34,8 +34,8 @@ def test_batches_of_any_size_give_the_rows_of_a_rebuild(
     folded = Folded.start(rules, corrections=corrections).extend(documents)
     live = MemoryTables()
     followed(folded.deltas, size, live, rules, corrections)
-    _, anew, counted = rebuilt(folded.deltas, rebuild_size, rules, corrections)
-    assert live.graph == anew.graph
+    _, fresh, counted = rebuilt(folded.deltas, rebuild_size, rules, corrections)
+    assert live.graph == fresh.graph
     assert counted["Place"] == len(folded.view.places)
 
 

@@ -1,7 +1,7 @@
 """A map is freed with its last reference, not by the cyclic garbage collector.
 
 A rebuild leaves hundreds of megabytes behind, and whoever folds in one process again and again (a
-tail that starts anew, ``whatif``, ``serve``) would hold several of them.
+tail that restarts, ``whatif``, ``serve``) would hold several of them.
 """
 
 import gc

@@ -58,12 +58,12 @@ def rebuilt(log: Path, size: int, tables: MemoryTables) -> tuple[LiveFold, dict[
 @pytest.mark.parametrize("size", [1, 7, 1_000])
 def test_batches_of_any_size_give_the_rows_of_a_rebuild(log: Path, size: int) -> None:
     fold, tables = followed(log, size)
-    anew = MemoryTables()
-    _, rows = rebuilt(log, 50, anew)
-    assert tables.graph == anew.graph
-    assert tables.vectors.keys() == anew.vectors.keys()
+    fresh = MemoryTables()
+    _, rows = rebuilt(log, 50, fresh)
+    assert tables.graph == fresh.graph
+    assert tables.vectors.keys() == fresh.vectors.keys()
     assert all(
-        row.det_pk == key and row.added.det_id == anew.vectors[key].added.det_id
+        row.det_pk == key and row.added.det_id == fresh.vectors[key].added.det_id
         for key, row in tables.vectors.items()
     )
     counts = fold.view.counts()

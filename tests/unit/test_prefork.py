@@ -1,4 +1,4 @@
-"""Programs that tests have forked behave as programs started anew: `subprocess` is the oracle."""
+"""Programs that tests have forked behave as newly started programs: `subprocess` is the oracle."""
 
 import os
 import signal

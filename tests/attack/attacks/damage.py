@@ -46,7 +46,7 @@ def exchanged_names(_: Arena, log: Path, __: Oracle) -> int:
 
 
 def rewritten(_: Arena, log: Path, __: Oracle) -> int:
-    """Another tool wrote a segment anew, as `mcap sort` and `mcap filter` do."""
+    """Another tool rewrote a segment, as `mcap sort` and `mcap filter` do."""
     segment = sorted(log.glob("*.mcap"))[1]
     rewrite(segment, segment)
     return EVENTS
