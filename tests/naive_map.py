@@ -1,9 +1,9 @@
 """The whole fold once more, as slow and plain as can be: an oracle for `SemanticMap`.
 
 It shares no code with what it checks: it reads JSON documents, not validated envelopes; it computes
-in fractions and Python integers; after every keyframe it counts everything again. Only the rules are the same
-(docstrings in `projections.reducers`), and the text of `projections.model.digest`, which it
-writes by itself.
+in fractions and Python integers; after every keyframe it counts everything again. Only the rules
+are the same (docstrings in `projections.reducers`), and the text of `projections.model.digest`,
+which it writes by itself.
 """
 
 import base64
