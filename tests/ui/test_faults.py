@@ -204,3 +204,48 @@ def test_a_restarted_server_with_another_log_shows_that_one(
         expect(page.locator(".facts")).to_contain_text("9 keyframes")
         page.get_by_label("Search places").fill("first")
         expect(page.get_by_role("option").first).to_contain_text("Nothing in this log")
+
+
+def test_two_pages_correct_one_log(mapfold: Commands, visit: Visit, tmp_path: Path) -> None:
+    log = write_log(tmp_path / "log", [envelope(k, x=0.1 * k) for k in range(1, 9)])
+    with showing(mapfold, log, "--allow-edits") as server:
+        one, other = (visit(server, "#panel=correct") for _ in range(2))
+        for page, name in ((one, "kitchen"), (other, "bathroom")):
+            page.get_by_label("Place", exact=True).fill("run-a_p0")
+            page.get_by_label("Name", exact=True).fill(name)
+            page.get_by_role("button", name="Preview").click()
+            page.get_by_label("Reason").fill(f"it is the {name}")
+        one.get_by_role("button", name="Record it").click()
+        expect(other.locator(".corrections > li")).to_have_count(1)
+        expect(other.get_by_label("Reason")).to_have_value("it is the bathroom")
+        other.get_by_role("button", name="Record it").click()
+        for page in (one, other):
+            expect(page.locator(".corrections > li")).to_have_count(2)
+        for page in (one, other):  # both propose to undo the same one; the second is told
+            page.locator(".corrections > li").first.get_by_role("button", name="Undo").click()
+            page.get_by_role("button", name="Preview").click()
+            page.get_by_label("Reason").fill("it is no kitchen")
+        for page in (one, other):
+            page.get_by_role("button", name="Record it").click()
+        expect(other.locator("form [role=alert]")).to_contain_text("undone")
+        undone = [each["undone_by"] for each in server.api("corrections")["corrections"]]
+        assert len(undone) == 3
+        assert sum(each is not None for each in undone) == 1
+
+
+def test_a_log_that_vanishes_and_comes_back(
+    mapfold: Commands, visit: Visit, tmp_path: Path
+) -> None:
+    log = write_log(tmp_path / "log", [envelope(k, x=0.1 * k) for k in range(1, 9)])
+    with showing(mapfold, log) as server:
+        page = visit(server)
+        away = log.rename(tmp_path / "away")
+        expect(page.get_by_role("alert")).to_contain_text("is gone")
+        page.keyboard.press("ArrowLeft")
+        expect(page.locator(".facts")).to_contain_text("7 keyframes")
+        page.keyboard.press("End")
+        away.rename(log)
+        expect(page.get_by_role("alert")).to_have_count(0)
+        page.keyboard.press("l")
+        write_log(log, [envelope(9, x=0.9)])
+        expect(page.locator(".facts")).to_contain_text("9 keyframes")
