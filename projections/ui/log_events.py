@@ -5,7 +5,7 @@ own events in the log, which change nothing in a fold; they are read from the lo
 """
 
 import json
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
 from itertools import chain
 from operator import itemgetter
@@ -124,7 +124,7 @@ def event_columns(
         (each["offset"], _NUMBER[each["kind"]], each["stamp"], own + index)
         for index, each in enumerate(system)
     ]
-    marks += (mark for mark in _history_marks(history) if mark[0] >= start)
+    marks += _history_marks(history, start)
     marks.sort(key=itemgetter(0, 1))
     refused = [r for r in history.refusals if r.cause.offset >= start]
     header = {
@@ -140,10 +140,10 @@ def event_columns(
     }, header
 
 
-def _history_marks(history: History) -> Iterator[_Mark]:
-    stamps = {k.offset: k.timestamp for k in history.keyframes}
+def _history_marks(history: History, start: Offset) -> Iterator[_Mark]:
+    keyframes, offsets = history.keyframes, history.keyframe_offsets
     found = chain(
-        (("keyframe", k.offset, k.keyframe) for k in history.keyframes),
+        (("keyframe", k.offset, k.keyframe) for k in keyframes[bisect_left(offsets, start) :]),
         (("run_began", seen[0].offset, number) for number, seen in enumerate(history.runs)),
         (("place_founded", p.formed.offset, p.formed.place) for p in history.places),
         (("place_merged", m.cause.offset, p) for m in history.merges for p in m.absorbed),
@@ -158,10 +158,7 @@ def _history_marks(history: History) -> Iterator[_Mark]:
         (("object_moved", r.offset, r.object) for o in history.objects for r in o.relocations),
         (("skipped", s.offset, -1) for s in history.skipped),
     )
-    offsets = history.keyframe_offsets
     for kind, offset, ref in found:
-        stamp = stamps.get(offset)
-        if stamp is None:  # no keyframe: the stamp of the last one before
-            number = bisect_left(offsets, offset)
-            stamp = history.keyframes[number - 1].timestamp if number else np.nan
-        yield offset, _NUMBER[kind], stamp, ref
+        if offset >= start:
+            number = bisect_right(offsets, offset)  # the keyframe of the event, or the last before
+            yield offset, _NUMBER[kind], keyframes[number - 1].timestamp if number else np.nan, ref
