@@ -19,7 +19,6 @@ def log_document(opened: Opened, shown: LogMap, *, folded: bool = True) -> dict[
     """JSON. Before the log is ``folded`` it names no runs and no problems."""
     corrections = shown.timeline.corrections() if folded else Corrections()
     settings = opened.settings(corrections)
-    own = shown.log_events.events
     return {
         "name": shown.reader.path.name,
         "path": str(shown.reader.path),
@@ -36,8 +35,8 @@ def log_document(opened: Opened, shown: LogMap, *, folded: bool = True) -> dict[
         "places_rule": settings.places,
         "edits_allowed": opened.edits,
         "token_needed": opened.token_needed,
-        "losses": sum(each.get("count") or 0 for each in own if each["kind"] == "loss"),
-        "rejected": sum(each["kind"] == "rejected" for each in own),
+        "losses": shown.log_events.losses,
+        "rejected": shown.log_events.rejected,
         "walls": _walls(shown) if folded else [],
         "problems": shown.problems if folded else [],
     }

@@ -41,22 +41,50 @@ KINDS: Final = (
 _NUMBER: Final = {kind: number for number, kind in enumerate(KINDS)}
 _SYSTEM_KEYS: Final = {COMMAND_KEY: "correction", REJECTED_KEY: "rejected", LOSS_KEY: "loss"}
 _MAX_TEXT: Final = 300
+MOST_REPORTS: Final = 20_000
 _Mark = tuple[int, int, float, int]
 """Offset, number of the kind, stamp in seconds, and what it refers to."""
 
 
 class LogEvents:
-    """mapfold's own events of a log, read once; `read_on` adds those recorded since."""
+    """mapfold's own events of a log, read once; `read_on` adds those recorded since.
 
-    def __init__(self) -> None:
+    All commands are kept, of rejected payloads and losses the first ``most`` together: a robot that
+    sends junk for a day makes millions. All are counted.
+    """
+
+    def __init__(self, most: int = MOST_REPORTS) -> None:
+        self._most = most
+        self._reports = 0
         self.through = FIRST_OFFSET
         self.events: list[dict[str, Any]] = []
+        self.rejected = 0
+        self.losses = 0
+        """Messages that were lost."""
+
+    @property
+    def left_out(self) -> int:
+        """How many rejected payloads and losses are not among the events."""
+        return max(0, self._reports - self._most)
 
     def read_on(self, reader: LogReader, end: Offset) -> None:
         """Read those below ``end``. Raises LogDamaged."""
         for event in reader.read(self.through, end, keys=tuple(_SYSTEM_KEYS)):
-            self.events.append(_document(event))
+            self._add(event)
+            self.through = Offset(event.offset + 1)
         self.through = end
+
+    def _add(self, event: Event) -> None:
+        kind = _SYSTEM_KEYS[event.key]
+        if kind != "correction":
+            self._reports += 1
+            self.rejected += kind == "rejected"
+            if kind == "rejected" and self.left_out:
+                return
+        document = _document(event)
+        self.losses += document.get("count") or 0
+        if kind == "correction" or not self.left_out:
+            self.events.append(document)
 
     def count_before(self, offset: int) -> int:
         """How many are of events below ``offset``."""

@@ -21,7 +21,7 @@ from projections.errors import FoldError
 from projections.history import Progress, Timeline
 from projections.settings import Settings
 
-from .log_events import LogEvents
+from .log_events import MOST_REPORTS, LogEvents
 from .log_prefix import PrefixReader
 from .opened import Opened
 
@@ -83,6 +83,11 @@ class LogMap:
     def problems(self) -> list[str]:
         """Why the map may not be what a person expects: sentences."""
         found = [problem for problem in (self._lost, self._stopped) if problem is not None]
+        if left_out := self.log_events.left_out:
+            found.append(
+                f"the timeline marks the first {MOST_REPORTS:,} rejected payloads and losses,"
+                f" not the {left_out:,} after them"
+            )
         if self.through == 0 and not found:
             return ["the log has no events yet; this page shows them as they are recorded"]
         history = self.timeline.history

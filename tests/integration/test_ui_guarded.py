@@ -199,6 +199,10 @@ def test_every_answer_has_safe_headers(server: UiServer, exposed: UiServer) -> N
         assert got.headers["referrer-policy"] == "no-referrer"
         assert "access-control-allow-origin" not in got.headers
         assert "server" not in got.headers
+    for sent in (b"no HTTP\r\n\r\n", b"GET / HTTP/1.1\r\nX: " + b"y" * 99_999 + b"\r\n\r\n"):
+        refused = raw(server, sent).lower()
+        assert b"content-security-policy: default-src 'none'" in refused
+        assert b"x-content-type-options: nosniff" in refused
     assert server.ask("/api/log").headers["cache-control"] == "no-store"
     page = server.ask("/")
     assert page.headers["content-type"].startswith("text/html")
