@@ -95,6 +95,7 @@ class OccupancyMap:
         return encoded
 
 
+_SMALLER = "make the cells larger or cut the map to what the robot reaches"
 _VALUES = "0 is free, 100 occupied, 255 unknown"
 
 
@@ -124,11 +125,13 @@ def read_map_head(payload: bytes) -> OccupancyMapEvent:
 def check_size(width: int, height: int) -> None:
     """Raise InvalidMap for a map that is too large."""
     if not (1 <= width <= MAX_MAP_SIDE and 1 <= height <= MAX_MAP_SIDE):
-        raise InvalidMap(f"it has {width:,} × {height:,} cells; a side has 1 to {MAX_MAP_SIDE:,}")
+        step = "give one that has cells" if 0 in (width, height) else _SMALLER
+        raise InvalidMap(
+            f"it has {width:,} × {height:,} cells; a side has 1 to {MAX_MAP_SIDE:,}; {step}"
+        )
     if width * height > MAX_MAP_CELLS:
         raise InvalidMap(
-            f"it has {width:,} × {height:,} cells, more than {MAX_MAP_CELLS:,}; make the cells "
-            "larger or cut the map to what the robot reaches"
+            f"it has {width:,} × {height:,} cells, more than {MAX_MAP_CELLS:,}; {_SMALLER}"
         )
 
 

@@ -11,7 +11,7 @@ A pixel that is not opaque is unknown, but for ``raw``; Nav2 averages its alpha 
 """
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 import numpy as np
 import yaml
@@ -21,6 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from eventsrc.envelope import Position, describe_error
 from eventsrc.errors import MisuseError
 from eventsrc.grey_images import BadImage, decode_rgba
+from eventsrc.ingest import abbreviate
 from eventsrc.occupancy_map import MAX_MAP_CELLS, OCCUPIED, UNKNOWN, InvalidMap, OccupancyMap
 from eventsrc.system_events import MAX_MAP_SIDE, MapYaw, Resolution
 from eventsrc.text import visible
@@ -68,21 +69,51 @@ def _described(path: Path) -> _MapFile:
         document = yaml.safe_load(text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         reason = visible(" ".join(str(error).split()))
-        raise MisuseError(f"{path}: no YAML: {reason}") from None
+        raise MisuseError(f"{path}: no YAML: {reason}; give a map server's map.yaml") from None
     if not isinstance(document, dict):
-        raise MisuseError(f"{path}: no map.yaml: it has no fields such as image and resolution")
+        raise MisuseError(
+            f"{path}: no map.yaml: it has no fields such as image and resolution, but is"
+            f" {visible(abbreviate(document))}; give a map server's map.yaml"
+        )
     try:
         described = _MapFile.model_validate(document)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        field = visible(".".join(map(str, first["loc"])))
-        raise MisuseError(f"{path}: {field}: {describe_error(first)}") from None
+        raise MisuseError(f"{path}: {_fault(error, text)}") from None
     if described.free_thresh > described.occupied_thresh:
         raise MisuseError(
             f"{path}: free_thresh {described.free_thresh:g} is above occupied_thresh "
-            f"{described.occupied_thresh:g}"
+            f"{described.occupied_thresh:g}; lower the one or raise the other (often 0.25 and 0.65)"
         )
     return described
+
+
+def _fault(error: ValidationError, text: bytes) -> str:
+    """The first field that is wrong: the rule, its value and line, and what to write instead."""
+    first = error.errors(include_url=False)[0]
+    name = str(first["loc"][0])
+    field = visible(".".join(map(str, first["loc"])))
+    if first["type"] == "missing" and len(first["loc"]) == 1:
+        return f"{field}: {describe_error(first)}; add {_ADVICE[name]}"
+    value = first["input"]
+    line = next((n for n, row in enumerate(text.splitlines(), 1) if _is_of(row, name)), None)
+    where = "" if line is None else f" in line {line}"
+    given = f"got {visible(abbreviate(value))}{where}"
+    return f"{field}: {describe_error(first)} ({given}); give {_ADVICE[name]}"
+
+
+def _is_of(row: bytes, name: str) -> bool:
+    return row.split(b":", 1)[0].strip(b" \"'") == name.encode()
+
+
+_ADVICE: Final = {
+    "image": "the name of a PGM or PNG file",
+    "resolution": "the side of a pixel in metres, such as 0.05",
+    "origin": "[x, y, yaw] of the image's lower left corner, in metres and radians",
+    "negate": "0, or 1 where white is occupied",
+    "occupied_thresh": "a share from 0 to 1, such as 0.65",
+    "free_thresh": "a share from 0 to 1, such as 0.25",
+    "mode": "trinary, scale or raw",
+}
 
 
 def _content(path: Path, limit: int) -> bytes:

@@ -74,22 +74,27 @@ def import_files(
     """Append ``given_map``, if there is one, then every message of ``names`` in order. Messages
     without a key get ``key``.
 
+    The map is appended when the first message was read.
+
     ``step`` is entered for each message; one that defers Ctrl-C makes `ImportInterrupted` exact.
     Raises MisuseError and MapfoldError for files that cannot be read.
     """
     run = _Import(writer, key, on_reject or (lambda _place, _reason: None))
     try:
-        if given_map is not None:
-            run.append_map(given_map)
         with ExitStack() as files:
             for name in names:
                 source = open_source(name, files)
                 for number, message in enumerate(source.messages()):
                     with step or nullcontext():
+                        if given_map is not None:
+                            run.append_map(given_map, message.logged_ns)
+                            given_map = None
                         run.append(source, message)
                     if progress is not None and number % _PROGRESS_EVERY == 0:
                         progress(source)
                 run.skipped += source.skipped
+        if given_map is not None:
+            run.append_map(given_map, None)
     except KeyboardInterrupt:
         raise ImportInterrupted(run.report(), run.place) from None
     return run.report()
@@ -116,9 +121,12 @@ class _Import:
             self._append_envelope(source, message)
         self._last = source, source.at
 
-    def append_map(self, given: OccupancyMap) -> None:
-        """Append a map that comes from no message."""
-        self._writer.append(MAP_KEY, given.encode())
+    def append_map(self, given: OccupancyMap, next_ns: int | None) -> None:
+        """Append a map that comes from no message; ``next_ns`` is when the message after it was
+        logged. The map gets that time if it is past, so that log times grow."""
+        now_ns = self._writer.now_ns()
+        logged_ns = now_ns if next_ns is None else min(now_ns, next_ns)
+        self._writer.append(MAP_KEY, given.encode(), logged_ns=logged_ns)
         self.maps += 1
 
     def _append_map_event(self, source: Source, message: ImportedMessage) -> None:

@@ -5,6 +5,9 @@ offset.
 
 Gaps: a gap ledger is folded over the log, as by `log info` and `status`; late keyframes close gaps.
 
+Log times: each event should be logged after the one before. Occupancy maps are left out of this: a
+map is imported when it is at hand, before recordings of any age, and nothing depends on its time.
+
 Stamps: a robot numbers its keyframes in the order it took them, so its stamps should grow with
 their numbers, in whatever order they reached the log. A finding is a keyframe stamped before its
 predecessor by number (the robot's clock was set back), or more than a day after it (the clock was
@@ -189,9 +192,10 @@ class EventFindings:
 
     def check(self, event: Event) -> None:
         """Check the next event."""
-        if event.logged_ns < self._logged_ns:
-            self._add("time", "", event.offset, _BACKWARDS)
-        self._logged_ns = event.logged_ns
+        if event.key != MAP_KEY:
+            if event.logged_ns < self._logged_ns:
+                self._add("time", "", event.offset, _BACKWARDS)
+            self._logged_ns = event.logged_ns
         if event.key == LOSS_KEY:
             self._check_loss(event)
         elif event.key == REJECTED_KEY:

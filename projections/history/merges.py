@@ -31,7 +31,7 @@ from .history import History
 from .names import keyframe_name, log_name, place_name
 from .records import EdgeChange, Merge, ObjectMerge, Refusal
 
-_MOST_SEEN = 4
+MOST_SEEN = 4
 """Objects named in a text; of more, all but three are only counted."""
 
 
@@ -139,16 +139,17 @@ def _chain_of(
     return Chain(joined, absorbed, points, distances)
 
 
-def merge_reason(history: History, merge: Merge) -> str:
+def merge_reason(history: History, merge: Merge, *, most_seen: int | None = MOST_SEEN) -> str:
     """The bridging keyframe, the core points it made, and the chain to each absorbed place; of
-    places by rooms how long the drive between them is."""
+    places by rooms how long the drive between them is, and up to ``most_seen`` of the objects that
+    both saw, None for all."""
     if merge.cause.kind != "keyframe":
         return merge.cause.name
     commanded = "; ".join(_join_text(history, link) for link in join_links(merge))
     chains = chains_of(history, merge)
     bridge = keyframe_name(history, merge.bridge)
     if merge.drives:
-        return f"{bridge} brought them near: {_drive_text(history, merge)}"
+        return f"{bridge} brought them near: {_drive_text(history, merge, most_seen)}"
     if not chains:
         return commanded
     made = dict.fromkeys(point for chain in chains for point in chain.made_core)
@@ -159,7 +160,7 @@ def merge_reason(history: History, merge: Merge) -> str:
     return f"{bridge} made {_enumerated(names)} {what}: {joins}{also}"
 
 
-def _drive_text(history: History, merge: Merge) -> str:
+def _drive_text(history: History, merge: Merge, most_seen: int | None) -> str:
     """``5 cells of a_p0 and 7 of a_p3 are a drive of 3.812 m apart on the mean, at most 4 m joins
     them; nearest are those of run:2 and run:8, 0.900 m; both saw couch obj-7 and tv obj-2``."""
     (drive,), (link,) = merge.drives, merge.links
@@ -169,8 +170,8 @@ def _drive_text(history: History, merge: Merge) -> str:
     at = merge.cause.offset
     both = [history.objects[each] for each in seen_from_both(history, merge)]
     seen = [f"{each.class_name(at)} {each.object_id}" for each in both]
-    if len(seen) > _MOST_SEEN:
-        seen = [*seen[: _MOST_SEEN - 1], f"{len(seen) - _MOST_SEEN + 1} more"]
+    if most_seen is not None and len(seen) > most_seen:
+        seen = [*seen[: most_seen - 1], f"{len(seen) - most_seen + 1} more"]
     return (
         f"{cells} of {survivor} and {drive.absorbed_cells} of {absorbed} are a drive of "
         f"{drive.mean_um / 1e6:.3f} m apart on the mean, at most "

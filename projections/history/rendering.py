@@ -234,12 +234,18 @@ MOST_THINGS = 12
 
 
 def merges_text(history: History, merges: Sequence[Merge], end: Offset) -> str:
-    """The table of merges, or that there are none."""
+    """The table of merges, with the reasons of places by rooms; or that there are none."""
     if not merges:
         formed = sum(place.formed.offset < end for place in history.places)
         return f"no merges: {counted(end, 'event')} formed {counted(formed, 'place')}\n"
     rows = [merge_row(history, merge) for merge in merges]
-    return table(_MERGES_HEADER, rows, right=("#", "offset", "objects", "edges"))
+    header: tuple[str, ...] = _MERGES_HEADER
+    if history.settings.places == "rooms":
+        header = (*header, "because")
+        rows = [
+            (*row, merge_reason(history, merge)) for row, merge in zip(rows, merges, strict=True)
+        ]
+    return table(header, rows, right=("#", "offset", "objects", "edges"))
 
 
 def refusals_text(history: History, refusals: Sequence[Refusal]) -> str:
@@ -289,7 +295,7 @@ def merge_text(history: History, merge: Merge) -> str:
     cause, after = merge.cause, merge.cause.offset + 1
     lines = [
         f"merge {merge.number} at offset {cause.offset:,} ({cause.when}), shows from --at {after}",
-        f"because   {merge_reason(history, merge)}",
+        f"because   {merge_reason(history, merge, most_seen=None)}",
         f"survivor  {_place(history, merge, merge.survivor, merge.survivor_size)}",
     ]
     for place, size in zip(merge.absorbed, merge.absorbed_sizes, strict=True):

@@ -65,6 +65,25 @@ def test_a_map_is_of_the_floor_that_is_given(run: Commands) -> None:
     assert not (run.folder / "N").exists()
 
 
+@pytest.mark.parametrize("together", [True, False])
+def test_a_map_before_older_recordings_is_no_clock_that_ran_backwards(
+    run: Commands, together: bool
+) -> None:
+    lines = [payload({"ts": 100.0 + k, "key": KEY, "payload": envelope(k)}) for k in range(3)]
+    (run.folder / "old.jsonl").write_bytes(b"\n".join(lines))
+    if together:
+        run("import", "L", "old.jsonl", "--map", "map.yaml")
+        times = [event.logged_ns for event in read_log(run.folder / "L")]
+        assert times == [10**11, 10**11, 101 * 10**9, 102 * 10**9]
+    else:
+        run("import", "L", "--map", "map.yaml")
+        run("import", "L", "old.jsonl")
+    assert "all good" in run("log", "verify", "L").err
+    with LogWriter(run.folder / "L") as writer:  # the clock of a drive is still watched
+        writer.append(KEY, payload(envelope(3)), logged_ns=50 * 10**9)
+    assert "logged_ns runs backwards" in run("log", "verify", "L", code=3).out
+
+
 def test_a_bad_map_leaves_the_log_as_it_was(run: Commands) -> None:
     (run.folder / "map.png").unlink()
     said = run("import", "L", "drive.jsonl", "--map", "map.yaml", code=2)

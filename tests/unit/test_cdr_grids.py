@@ -124,7 +124,7 @@ def test_changed_bytes_give_a_map_or_a_reason(data: st.DataObject) -> None:
 def test_other_messages_are_refused() -> None:
     assert _refused(TEXT).startswith("no nav_msgs/OccupancyGrid in CDR: ")
     assert _refused(SCAN)
-    assert _refused(bytes(200)) == "it has 0 × 0 cells; a side has 1 to 10,000"
+    assert _refused(bytes(200)).startswith("it has 0 × 0 cells; a side has 1 to 10,000")
     assert _refused(b"\0\1").endswith("header.stamp would end at byte 12 of 4")
     for other in (b"\0\6\0\0", b"\0\2\0\0", b"\0\x0a\0\0"):
         assert not is_grid_message(other + LITTLE[4:]), "neither XCDR2 nor parameter lists"

@@ -100,6 +100,16 @@ def test_the_image_is_beside_the_yaml_or_where_its_absolute_path_says(tmp_path: 
         ({"occupied_thresh": 1.5}, "map.yaml: occupied_thresh: Input should be less than or equal"),
         ({"occupied_thresh": 0.1}, "map.yaml: free_thresh 0.196 is above occupied_thresh 0.1"),
         ({"mode": "colour"}, "map.yaml: mode: Input should be 'trinary', 'scale' or 'raw'"),
+        ({"image": None}, "image: Field required; add the name of a PGM or PNG file"),
+        ({"resolution": 0}, "0.001 (got 0 in line 3); give the side of a pixel in metres, such as"),
+        ({"resolution": "fine"}, "(got 'fine' in line 3); give the side of a pixel"),
+        ({"origin": [0, 0]}, "Field required (got [0, 0] in line 4); give [x, y, yaw] of the"),
+        ({"origin": [0, "a", 0]}, "origin.1: Input should be a valid number, unable to parse"),
+        ({"origin": [0, "a", 0]}, "(got 'a' in line 4); give [x, y, yaw] of the"),
+        ({"negate": 2}, "(got 2 in line 5); give 0, or 1 where white is occupied"),
+        ({"occupied_thresh": 1.5}, "(got 1.5 in line 6); give a share from 0 to 1, such as 0.65"),
+        ({"occupied_thresh": 0.1}, "; lower the one or raise the other (often 0.25 and 0.65)"),
+        ({"mode": "x" * 500}, "xxx... in line 2); give trinary, scale or raw"),
     ],
 )
 def test_what_is_wrong_is_named_in_one_line(
@@ -117,6 +127,7 @@ def test_what_is_wrong_is_named_in_one_line(
     [
         (b"", "no map.yaml"),
         (b"- a\n- b\n", "no map.yaml"),
+        (b"- a\n- b\n", "but is ['a', 'b']; give a map server's map.yaml"),
         (b"image: [", "no YAML: while parsing"),
         (b"\xff\xfe\xfd", "no YAML: "),
         (b"image: \x07", "no YAML: "),

@@ -15,7 +15,7 @@ from projections.history.merges import (
     refusal_document,
 )
 from projections.history.picture import draw_merge
-from projections.history.rendering import merge_text, refusals_text
+from projections.history.rendering import merge_text, merges_text, refusals_text
 from projections.settings import Settings
 from tests.envelopes import detection, envelope
 from tests.fixtures_corrections import anchor, write_mixed_log
@@ -93,6 +93,18 @@ def test_of_many_things_that_both_saw_three_are_named(opened: Open) -> None:
     assert reason.count("thing") == 3
     assert reason.endswith(" and 3 more")
     assert len(merge_document(timeline.history, merge)["seen_from_both"]) == 6
+    assert merge_text(timeline.history, merge).count("(thing") == 0
+    alone = merge_text(timeline.history, merge).splitlines()[1]
+    assert alone.startswith("because ")
+    assert alone.count("thing") == 6, "--show names all"
+
+
+def test_the_table_has_the_reason_of_each_merge(opened: Open) -> None:
+    timeline = opened(u_turn({2: "couch", 9: "couch"}))
+    (merge,) = timeline.merges()
+    header, row = merges_text(timeline.history, [merge], BACK + 1).splitlines()
+    assert header.split()[-1] == "because"
+    assert row.endswith(merge_reason(timeline.history, merge))
 
 
 def test_what_is_seen_only_later_or_from_one_place_is_not_told(opened: Open) -> None:
