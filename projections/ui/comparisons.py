@@ -4,6 +4,7 @@ from typing import Any, Final
 
 from starlette.datastructures import QueryParams
 
+from eventsrc.text import visible_lines
 from projections.history import Expression, ExpressionError
 from projections.history.condition_functions import FUNCTIONS
 from projections.history.merges import merge_document
@@ -31,7 +32,7 @@ def diff_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
     return {
         **found.document(),
         "known_at": known_at,
-        "lines": difference_text(found, most=MOST_LINES).splitlines(),
+        "lines": visible_lines(difference_text(found, most=MOST_LINES)).splitlines(),
         "command": command_line(shown.opened, "diff", *words, *settings),
     }
 
@@ -49,7 +50,7 @@ def bisect_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
     return {
         **found.document(),
         "known_at": moment.known_at,
-        "lines": search_text(found, most=MOST_LINES).splitlines(),
+        "lines": visible_lines(search_text(found, most=MOST_LINES)).splitlines(),
         "command": moment.command("bisect", *words, asked_at=False),
     }
 

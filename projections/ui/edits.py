@@ -16,7 +16,7 @@ from starlette.datastructures import QueryParams
 from eventsrc.commands import Command
 from eventsrc.envelope import describe_error
 from eventsrc.errors import LogError, MisuseError
-from eventsrc.text import counted, visible
+from eventsrc.text import counted, visible, visible_lines
 from projections.edit import make
 from projections.edit.correct_poses import Span, by_transform
 from projections.edit.current import CurrentMap
@@ -132,7 +132,7 @@ def corrections_answer(shown: LogMap, _: QueryParams) -> dict[str, Any]:
             for each in edits_document(found, times)
         ],
         "kinds": [{"kind": kind, "arguments": each.names} for kind, each in KINDS.items()],
-        "lines": edits_text(found, times).splitlines(),
+        "lines": visible_lines(edits_text(found, times)).splitlines(),
         "command": command_line(shown.opened, "edits", *shown.opened.words()),
     }
 
@@ -190,14 +190,16 @@ class Editor:
             "offset": made.offset,
             "command_id": made.command.command_id,
             "effect": None if effect is None else effect.document(),
-            "effect_text": outcome.unknown if effect is None else str(effect),
-            "notes": notes,
+            "effect_text": visible(str(outcome.unknown if effect is None else effect)),
+            "notes": [visible(note) for note in notes],
             "command": self._command(asked),
         }
         if asked.dry_run:
             difference = outcome.change.difference()
             found["difference"] = difference.document()
-            found["lines"] = difference_text(difference, most=MOST_LINES).splitlines()
+            found["lines"] = visible_lines(
+                difference_text(difference, most=MOST_LINES)
+            ).splitlines()
         return found
 
     def _command(self, asked: Edit) -> str:

@@ -4,6 +4,7 @@ import resource
 import sys
 from typing import Any, Final
 
+from eventsrc.text import visible
 from projections.corrections import Corrections
 from projections.settings import Settings
 
@@ -38,7 +39,7 @@ def log_document(opened: Opened, shown: LogMap, *, folded: bool = True) -> dict[
         "losses": shown.log_events.losses,
         "rejected": shown.log_events.rejected,
         "walls": _walls(shown) if folded else [],
-        "problems": shown.problems if folded else [],
+        "problems": [visible(each) for each in shown.problems] if folded else [],
     }
 
 

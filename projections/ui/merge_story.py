@@ -3,6 +3,7 @@
 from typing import Any, Final
 
 from eventsrc.envelope import Offset
+from eventsrc.text import visible, visible_lines
 from projections.deltas import KeyframeOrdinal
 from projections.errors import QuestionError
 from projections.history import NoSuchThing
@@ -44,14 +45,14 @@ def merge_answer(moment: Moment, name: str) -> dict[str, Any]:
         **moment.document(),
         "kind": "merge",
         "subject": name,
-        "summary": _summary(history, merges) or texts[0].splitlines()[0],
-        "lines": [line for text in texts for line in text.splitlines()],
+        "summary": visible(_summary(history, merges) or texts[0].partition("\n")[0]),
+        "lines": [line for text in texts for line in visible_lines(text).splitlines()],
         "steps": [
             {
                 "offset": offset,
                 "time": merge.cause.time,
                 "what": "merged",
-                "text": f"{_summary(history, [merge])}; {merge_reason(history, merge)}",
+                "text": visible(f"{_summary(history, [merge])}; {merge_reason(history, merge)}"),
                 "refs": _refs(history, merge),
             }
             for merge in merges

@@ -6,6 +6,7 @@ from typing import Any, Final
 from starlette.datastructures import QueryParams
 
 from eventsrc.errors import LogError, MapfoldError, MisuseError
+from eventsrc.text import visible_lines
 from projections.errors import DatabaseError, LogPointError, QuestionError, SettingsError
 from projections.history import ExpressionError, NoSuchThing
 from projections.serve.answering import TooMuchError
@@ -31,7 +32,7 @@ def refusal(error: MapfoldError) -> tuple[int, dict[str, Any]]:
     for kind, name, status in _KINDS:
         if isinstance(error, kind):
             more = {"column": error.column} if isinstance(error, ExpressionError) else {}
-            return status, {"error": {"kind": name, "message": str(error), **more}}
+            return status, {"error": {"kind": name, "message": visible_lines(str(error)), **more}}
     raise AssertionError(error)  # the last kind is the base class
 
 

@@ -15,6 +15,7 @@ from typing import Any, Final, Self, TypeVar
 
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.errors import LogError, MapfoldError
+from eventsrc.text import visible
 from projections.serve import FairQueue
 from projections.serve.answering import TooMuchError
 
@@ -184,7 +185,7 @@ class UiService:
                 self._document = log_document(self.opened, self._map)
                 self._through = self._map.through
         except MapfoldError as error:
-            self._document |= {"problems": [str(error)]}
+            self._document |= {"problems": [visible(str(error))]}
             raise
         return changed
 

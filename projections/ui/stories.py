@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from starlette.datastructures import QueryParams
 
+from eventsrc.text import visible, visible_lines
 from projections.errors import QuestionError
 from projections.history.explanation import Entry, Explanation
 from projections.history.history import History
@@ -63,8 +64,8 @@ def _keyframe_story(moment: Moment, name: str) -> dict[str, Any]:
     return _document(moment, found, told) | {
         "kind": "keyframe",
         "subject": names[0],
-        "summary": where,
-        "lines": [f"{names[0]}: {where}", *(_line(entry) for entry in found.entries)],
+        "summary": visible(where),
+        "lines": [visible(f"{names[0]}: {where}"), *map(_line, found.entries)],
     }
 
 
@@ -75,7 +76,7 @@ def _keyframe_name(name: str) -> str:
 
 
 def _line(entry: Entry) -> str:
-    return f"  {entry.cause.offset}  {entry.cause.when}  {entry.text}"
+    return visible(f"  {entry.cause.offset}  {entry.cause.when}  {entry.text}")
 
 
 def _document(moment: Moment, found: Explanation, command: str) -> dict[str, Any]:
@@ -83,9 +84,9 @@ def _document(moment: Moment, found: Explanation, command: str) -> dict[str, Any
         **moment.document(),
         "kind": found.kind,
         "subject": found.subject,
-        "summary": found.summary,
+        "summary": visible(found.summary),
         "facts": found.facts,
-        "lines": explanation_text(found).splitlines(),
+        "lines": visible_lines(explanation_text(found)).splitlines(),
         "steps": [_step(moment.known.history, entry) for entry in found.entries],
         "command": command,
     }
@@ -96,7 +97,7 @@ def _step(history: History, entry: Entry) -> dict[str, Any]:
         "offset": entry.cause.offset,
         "time": entry.cause.time,
         "what": entry.what,
-        "text": entry.text,
+        "text": visible(entry.text),
         "refs": list(_refs(history, entry))[:_MOST_REFS],
     }
 

@@ -9,6 +9,7 @@ from starlette.datastructures import QueryParams
 from eventsrc.envelope import Offset
 from eventsrc.errors import MisuseError
 from eventsrc.log.seek import resolve
+from eventsrc.text import visible_lines
 from projections.corrections import compile_corrections
 from projections.history.parallel import Rules
 from projections.history.whatif import alternatives, command_trials, setting_trials, what_if
@@ -54,7 +55,7 @@ def whatif_answer(
         "known_at": known_at,
         **found.document(),
         "names": [each.name for each in found.all],
-        "lines": whatif_text(found, most=MOST_LINES).splitlines(),
+        "lines": visible_lines(whatif_text(found, most=MOST_LINES)).splitlines(),
         "seconds": round(perf_counter() - started, 3),
         "command": command_line(opened, "whatif", *words),
     }

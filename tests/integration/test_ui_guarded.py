@@ -7,10 +7,12 @@ import socket
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from eventsrc.system_events import LOSS_KEY, REJECTED_KEY
+from eventsrc.text import visible
 from projections.ui.live import MOST_STREAMS
 from tests.commands import Commands
 from tests.envelopes import detection, envelope
@@ -304,6 +306,17 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Iterator[UiServer]:
         yield started
 
 
+def texts_of(answer: dict[str, Any]) -> Iterator[str]:
+    """What an answer says to people: not the ids, which are exact."""
+    for field in ("summary", "effect_text", "message", "command"):
+        if field in answer:
+            yield answer[field]
+    for field in ("lines", "notes", "problems"):
+        yield from answer.get(field, ())
+    for step in answer.get("steps", ()):
+        yield step["text"]
+
+
 class TestHostileNames:
     """What a log holds comes back as it is, as JSON text."""
 
@@ -327,6 +340,24 @@ class TestHostileNames:
         found = hostile.api("search", q=name)["found"]
         assert {"run", "object"} <= {each["kind"] for each in found}
         assert hostile.ask("/api/why", what=f"object:{name}").json["error"]["kind"] == "not_found"
+
+    def test_texts_for_people_turn_no_direction(self, hostile: UiServer) -> None:
+        """The page shows them as they are; names are in them between other words."""
+        name = HOSTILE[2]
+        offset = str(HOSTILE.index(name) * 3 + 3)
+        answers = [
+            hostile.api("why", what=f"place:{name}_p0"),
+            hostile.api("why", what=f"keyframe:{name}/2"),
+            hostile.api("diff", **{"from": "0", "to": offset}),
+            hostile.api("bisect", condition=f"size('{name}_p0') > 1"),
+            hostile.api("whatif", eps_m="0.1"),
+            hostile.api("corrections"),
+            hostile.edit("name-place", f"{name}_p0", name).json,
+            hostile.ask("/api/why", what=f"place:{name}").json["error"],
+        ]
+        texts = [text for answer in answers for text in texts_of(answer)]
+        assert any(ascii(name)[1:-1] in text for text in texts)
+        assert [text for text in texts if visible(text) != text] == []
 
     def test_what_mapfold_itself_never_writes(self, mapfold: Commands, tmp_path: Path) -> None:
         """Half a surrogate pair in events of mapfold's own keys, as an imported log may have."""

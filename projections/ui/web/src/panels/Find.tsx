@@ -3,6 +3,7 @@
 import { signal } from "@preact/signals";
 import { useEffect, useRef, useState } from "preact/hooks";
 import { ApiError, address, getJson } from "../api/client";
+import { label } from "../model/names";
 import { showEvent } from "../state/actions";
 import { sentence } from "../state/loading";
 import * as store from "../state/store";
@@ -227,7 +228,7 @@ function Found({ found }: { found: Search }) {
 }
 
 function readings({ before, after }: Turn): string {
-  const value = (each: unknown) => (each === null || each === undefined ? "none" : String(each));
+  const value = (each: unknown) => (each === null || each === undefined ? "none" : label(String(each), 60));
   return Object.keys(after)
     .map((name) => `${name}: ${value(before[name])} → ${value(after[name])}`)
     .join(", ");
