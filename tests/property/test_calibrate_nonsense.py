@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from projections.calibrate.reading import _bounded, read
+from projections.calibrate.rounds import _bounded, read
 from projections.calibrate.shrinking import Reading
 from projections.calibrate.sightings import Row, sightings_of
 from projections.deltas import Pose

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from projections.calibrate.halves import inflation
-from projections.calibrate.reading import read
+from projections.calibrate.rounds import read
 from projections.calibrate.sightings import Row, sightings_of
 from projections.calibrate.things import qualified
 from projections.deltas import Pose

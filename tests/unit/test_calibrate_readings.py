@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from projections.calibrate.reading import Round, read
+from projections.calibrate.rounds import Round, read
 from projections.calibrate.shrinking import Reading
 from projections.calibrate.sightings import sightings_of
 from projections.evidence import EvidenceConstants
