@@ -111,7 +111,7 @@ def check(
         for report in repaired:
             say(f"{report.sink}: rebuilt")
         if wrong and not repair:
-            say(f"to mend it run: mapfold db check --repair {log}")
+            say(f"to repair it run: mapfold db check --repair {log}")
         elif len(repaired) < len(wrong):
             say("graph: not rebuilt, as that would drop what is not ours; remove it first")
     finish(findings=not all(report.sound for report in reports))

@@ -204,11 +204,11 @@ def _server_errors(what: str, data: Path) -> Iterator[None]:
         reason = _last_lines(log.read_text("utf-8", "replace")) if log.exists() else ""
         reason = reason or _last_lines(str(error.output))
         raise EmbeddedServerError(
-            f"{data}: the embedded server did not {what}: {reason} (log: {log}); mend it, {advice}"
+            f"{data}: the embedded server did not {what}: {reason} (log: {log}); fix it, {advice}"
         ) from None
     except OSError as error:
         raise EmbeddedServerError(
-            f"{data}: the embedded server did not {what}: {error}; mend it, {advice}"
+            f"{data}: the embedded server did not {what}: {error}; fix it, {advice}"
         ) from None
 
 

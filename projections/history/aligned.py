@@ -12,7 +12,7 @@ from typing import TypeVar
 from eventsrc.envelope import DetId
 
 from .history import NEVER
-from .parallel import FoldResult
+from .parallel import NO_NUMBER, FoldResult
 
 _K = TypeVar("_K", bound=Hashable)
 _V = TypeVar("_V")
@@ -51,9 +51,9 @@ def _with(
         posed=array("q", (i for i, offset in enumerate(keyframes) if offset in posed)),
         keyframe_offsets=array("q", keyframes),
         placed_offsets=array("q", _values(keyframes, own, result.placed_offsets, int(NEVER))),
-        placed_in=array("q", _values(keyframes, own, result.placed_in, -1)),
+        placed_in=array("q", _values(keyframes, own, result.placed_in, NO_NUMBER)),
         objects=tuple(_values(observations, seen, result.objects, None)),
-        fused_into=array("q", _values(observations, seen, result.fused_into, -1)),
+        fused_into=array("q", _values(observations, seen, result.fused_into, NO_NUMBER)),
         observation_offsets=array("q", (offset for offset, _ in observations)),
         det_ids=tuple(det_id for _, det_id in observations),
     )

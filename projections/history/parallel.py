@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Final, TypeAlias
 
 from eventsrc.envelope import FIRST_OFFSET, DetId, Offset
 from eventsrc.errors import MapfoldError
@@ -62,6 +62,8 @@ _OBJECT_DELTAS = frozenset({ObjectFound, ObjectSeen, ObjectsMerged})
 _done: "Synchronized[int] | None" = None
 """In a worker process: the number of events that all workers have folded, or `_STOP`."""
 _STOP = -1
+NO_NUMBER: Final = -1
+"""In the arrays of a `FoldResult`: no place, or no object."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,7 +87,7 @@ class FoldResult:
     ``posed`` are the ordinals of keyframes with a pose. By keyframe, ``keyframe_offsets`` is its
     event, ``placed_offsets`` the event that placed it and ``placed_in`` the number of the place it
     joined; ``merged`` are the merges as (offset, absorbed, survivor). By observation,
-    ``fused_into`` is the number of its object after its own event (-1 for none),
+    ``fused_into`` is the number of its object after its own event (`NO_NUMBER` for none),
     ``observation_offsets`` its event and ``det_ids`` its det_id; ``fused_later`` are the merges of
     objects by later events as (offset, absorbed, survivor). An object's number follows from its id.
     ``names`` are the names of places by id. ``seconds`` is the time of the fold.
@@ -117,9 +119,9 @@ class FoldResult:
 def fold_result(view: MapView, history: History, truth: Truth | None, seconds: float) -> FoldResult:
     """The result of a fold that took ``seconds``."""
     numbers = _place_numbers(history.places)
-    fused = array("q", (-1 if o.object is None else o.object for o in view.observations))
+    fused = array("q", (NO_NUMBER if o.object is None else o.object for o in view.observations))
     numbers_of = [_object_number(o.object_id) for o in view.all_objects]
-    first = array("q", (-1 if o < 0 else numbers_of[o] for o in fused))
+    first = array("q", (NO_NUMBER if o < 0 else numbers_of[o] for o in fused))
     for each in history.objects:
         for seen in each.sightings:
             at_once = history.object_survivor(each.found.object, Offset(seen.offset + 1))
@@ -135,7 +137,7 @@ def fold_result(view: MapView, history: History, truth: Truth | None, seconds: f
         posed=array("q", (k.ordinal for k in view.keyframes if k.pose is not None)),
         keyframe_offsets=offsets,
         placed_offsets=history.placed_offsets,
-        placed_in=array("q", (-1 if p < 0 else numbers[p] for p in history.placed_in)),
+        placed_in=array("q", (NO_NUMBER if p < 0 else numbers[p] for p in history.placed_in)),
         merged=tuple(
             (merge.cause.offset, numbers[place], numbers[merge.survivor])
             for merge in history.merges
