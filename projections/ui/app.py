@@ -5,6 +5,7 @@ of `UiService` answer them.
 """
 
 import asyncio
+import contextlib
 import functools
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
@@ -125,7 +126,10 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
                 return await apart(request, lambda end, go_on: encoded(work(end, go_on)))
             future = service.ask_apart(work)  # recorded also when the page leaves meanwhile
             document = await asyncio.wrap_future(future)
-            await asyncio.wrap_future(service.refresh())
+            with contextlib.suppress(
+                MapfoldError
+            ):  # it is recorded; the log's problems say the rest
+                await asyncio.wrap_future(service.refresh())
             return _json(document | {"through": service.log_document()["through"]})
 
     @app.get("/api/live", summary="Server-sent events: what is new in the log")

@@ -89,8 +89,14 @@ class LiveWatch:
     def _look(self) -> None:
         while not self._closing.wait(LOOK_S):
             looked = self._service.refresh()
-            while not self._closing.is_set() and not _is_done(looked):
-                pass
+            while not self._closing.is_set():
+                try:
+                    error = looked.exception(LOOK_S)
+                except TimeoutError:
+                    continue
+                if error is not None and not isinstance(error, MapfoldError):
+                    raise error  # to stderr; that the page follows no more is among the problems
+                break
 
     def _ask_tails(self) -> None:
         while self._tails is not None and not self._closing.is_set():
@@ -99,12 +105,3 @@ class LiveWatch:
             except MapfoldError as error:
                 self._fault = str(error)
             self._closing.wait(TAILS_S)
-
-
-def _is_done(looked: Any) -> bool:
-    """Wait a little for a refresh. What went wrong is among the log's problems."""
-    try:
-        looked.exception(LOOK_S)
-    except TimeoutError:
-        return False
-    return True

@@ -187,6 +187,10 @@ class UiService:
         except MapfoldError as error:
             self._document |= {"problems": [visible(str(error))]}
             raise
+        except Exception as error:
+            told = f"the page does not follow the log any more: {error!r}; see the program's stderr"
+            self._document |= {"problems": [visible(told)]}
+            raise
         return changed
 
     def _alternative(self, sets: tuple[str, ...]) -> tuple[LogMap, float]:

@@ -13,12 +13,14 @@ from starlette.datastructures import QueryParams
 from eventsrc.envelope import Offset
 from eventsrc.errors import LogError, MapfoldError
 from eventsrc.log import LogReader
+from projections.corrections import Corrections
 from projections.history import parallel
 from projections.history.parallel import Rules, fold_all
 from projections.model.digest import map_digest
 from projections.model.fold import fold_log
 from projections.settings import Settings
 from projections.ui.edits import Edit, Editor
+from projections.ui.live import LiveWatch
 from projections.ui.log_map import MOST_ALTERNATIVES, LogMap
 from projections.ui.opened import Opened
 from projections.ui.service import GivenUp, UiService
@@ -133,6 +135,29 @@ def test_another_log_in_the_same_place_is_not_folded(tmp_path: Path) -> None:
         write_log(here, walk(20, seed=7))
         with pytest.raises(LogError, match="another log"):
             service.ask(["eps_m=0.9"], digest).result(WAIT_S)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_an_error_that_nobody_expected_is_said_and_raised(tmp_path: Path) -> None:
+    """It ends the following of the log, not the answers."""
+    log = write_log(tmp_path / "log", walk(5))
+    failing: list[bool] = []
+
+    def settings(_: Corrections) -> Settings:
+        if failing:
+            raise ZeroDivisionError("a fault of the program")
+        return Settings()
+
+    with UiService(Opened(log, settings)) as service:
+        assert service.refresh().result(WAIT_S) is False
+        failing.append(True)
+        write_log(log, walk(3, seed=9, first=5))
+        with LiveWatch(service) as watch:
+            watch._threads[0].join(WAIT_S)
+            assert not watch._threads[0].is_alive()
+            (problem,) = watch.document()["problems"]
+        assert "a fault of the program" in problem
+        assert "stderr" in problem
 
 
 def test_the_state_names_the_log(log: Path, tmp_path: Path) -> None:

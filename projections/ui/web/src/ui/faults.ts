@@ -5,6 +5,6 @@ import { tell } from "../state/pointer";
 
 export function keepFaults() {
   const told = (error: unknown) => tell(`The page itself failed: ${sentence(error)}. Load it again; if it happens again, please report it.`);
-  window.addEventListener("error", (event) => told(event.error ?? event.message));
-  window.addEventListener("unhandledrejection", (event) => told(event.reason));
+  window.addEventListener("error", ({ error }) => error && told(error)); // without one it is a browser's remark
+  window.addEventListener("unhandledrejection", ({ reason }) => reason?.name !== "AbortError" && told(reason));
 }
