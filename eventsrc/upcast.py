@@ -48,7 +48,7 @@ _DETECTION_FIELDS = tuple(field.alias or name for name, field in Detection.model
 
 
 class VersionedEvent(Protocol):
-    """What an upcaster may know of the event around a payload; `eventsrc.log.Event` is one."""
+    """What an upcaster is given of the event around a payload; `eventsrc.log.Event` is one."""
 
     @property
     def offset(self) -> int: ...
@@ -164,9 +164,9 @@ def _upcast_detection(detection: dict[str, Any]) -> dict[str, Any]:
 _NEW_IN_ENVELOPE: Mapping[int, frozenset[str]] = MappingProxyType(
     {2: frozenset({"camera"}), 3: frozenset({"floor", "map_z"})}
 )
-"""Fields of an envelope that these versions did not know and the next one does."""
+"""Fields of an envelope that the next version added to these."""
 _NEW_IN_DETECTION = frozenset({"depth_m", "depth_sigma_m", "position", "position_sigma_m"})
-"""Fields of a detection that version 2 did not know."""
+"""Fields of a detection that version 2 did not have."""
 _SAME_BUT_FOR_NEW_FIELDS = (2, 3, 4)
 
 

@@ -1,4 +1,4 @@
-"""Give every segment file the name that its head asks for: the first step of a recovery.
+"""Rename every segment file by the base offset in its head: the first step of a recovery.
 
 Log id and base in the head of a segment say which log and which offsets it holds. Its name may be
 wrong, because people copy, restore and rename files. The rules:

@@ -1,4 +1,4 @@
-"""What fusion by evidence knows of an object, in words and as JSON.
+"""Facts of fusion by evidence about an object, as text and as JSON.
 
 Where it stands and how sure that is, the votes of classes, why objects were fused, since when it is
 missing and where it moved.
@@ -97,7 +97,7 @@ def _ordered(votes: Counter[str]) -> list[tuple[str, int]]:
 def evidence_entries(
     record: ObjectHistory,
 ) -> Iterator[tuple[Offset, str, str, dict[str, Any]]]:
-    """Offset, kind, text and facts of each event that only fusion by evidence knows."""
+    """Offset, kind, text and facts of each event that only fusion by evidence has."""
     spots = 0
     for estimated in record.estimates:
         if _is_milestone(spots, estimated.spots):

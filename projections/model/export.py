@@ -110,12 +110,12 @@ def _places(view: MapView) -> list[dict[str, Any]]:
 
 
 def _floor(name: str | None) -> dict[str, str]:
-    """The floor's name, where the log tells it."""
+    """The floor's name, where the log has it."""
     return {} if name is None else {"floor": name}
 
 
 def _type(found: PlaceType | None) -> dict[str, Any]:
-    """What kind of room it is; None where unsure. Nothing where nothing tells."""
+    """The type of room; None where unsure. Nothing where no Object of a known class is in it."""
     if found is None:
         return {}
     return {
@@ -144,7 +144,7 @@ def _objects(view: MapView) -> list[dict[str, Any]]:
 
 
 def _evidence(view: MapView, found: ObjectRecord) -> dict[str, Any]:
-    """What fusion by evidence knows of an Object."""
+    """Facts of fusion by evidence about an Object."""
     at = found.estimate
     return {
         "est_x": None if at is None else at.est_x,

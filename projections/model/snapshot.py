@@ -269,7 +269,7 @@ def _load_objects(view: MapView, state: State) -> None:
 
 
 def _dump_evidence(view: MapView) -> State:
-    """What fusion by evidence knows of Objects; nothing under the page's rule."""
+    """Facts of fusion by evidence about Objects; nothing under the page's rule."""
     if view.settings.fusion != "evidence":
         return {}
     return {

@@ -117,7 +117,7 @@ class MapView:
         return None if place is None else self.all_places[place].place_id
 
     def floor_of(self, place: PlaceOrdinal) -> str | None:
-        """The name of the floor that a place is on; None if the log tells none."""
+        """The name of the floor that a place is on; None if the log has none."""
         return self.keyframes[self.all_places[place].founder].floor
 
     @property
@@ -142,7 +142,7 @@ class MapView:
         return bool(self.floors) and self.floor_of(a) != self.floor_of(b)
 
     def type_of(self, place: PlaceOrdinal) -> PlaceType | None:
-        """What kind of room a place is, by its Objects or its name; None if nothing tells."""
+        """The type of room that a place is, by its Objects or its name; None if neither says."""
         return place_type(self.contents.of(place), self.all_places[place].name)
 
     def class_counts(self, found: ObjectRecord) -> dict[str, int]:

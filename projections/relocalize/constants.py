@@ -1,4 +1,4 @@
-"""What the localiser has to know of a map beside its observations: `MapConstants`.
+"""Constants of a map that the localiser needs beside its observations: `MapConstants`.
 
 How alike different things look depends on the embedding model, so it is measured on the map itself:
 two detections of one picture with different labels are two things. The sample is bounded and
