@@ -47,7 +47,7 @@ def map_rows(view: MapView) -> list[MapRow]:
 
 
 def maps_key(view: MapView) -> str | None:
-    """A key that differs between different maps of a view; None without any."""
+    """SHA-256 of the maps in force, by floor; None without any."""
     maps = [(floor, given.map.digest()) for floor, given in view.maps_in_force().items()]
     return hashlib.sha256(json.dumps(maps).encode()).hexdigest() if maps else None
 

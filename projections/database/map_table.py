@@ -50,7 +50,7 @@ def read(connection: Connection) -> list[MapRow]:
 
 
 def read_with_key(connection: Connection) -> tuple[str | None, dict[str | None, OccupancyMap]]:
-    """The maps by floor, and their key, which differs for other maps.
+    """The maps by floor, and their `maps_key`.
 
     Raises DatabaseError for a row that mapfold has not written.
     """
