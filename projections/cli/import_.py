@@ -1,20 +1,10 @@
 """`mapfold import`: messages from files into a log."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Final
 
 import typer
-from rich.progress import (
-    BarColumn,
-    Progress,
-    TaskProgressColumn,
-    TextColumn,
-    TimeRemainingColumn,
-    TransferSpeedColumn,
-)
 
 from eventsrc.errors import MisuseError
 from eventsrc.importers import (
@@ -34,7 +24,7 @@ from eventsrc.transport.config import check_key
 from .options import JsonOption
 from .recorder_text import restart_as_json, say_restart
 from .signals import ctrl_c_between_steps
-from .terminal import emit, finish, people, say
+from .terminal import FileBars, emit, finish, say
 
 _MOST_REJECTS: Final = 5
 
@@ -83,14 +73,14 @@ def import_(
     given_map = None if map_ is None else read_map_yaml(map_, floor)
     rejects = _RejectPrinter()
     try:
-        with LogWriter(log, fsync=IMPORT_FSYNC) as writer, _progress() as show:
+        with LogWriter(log, fsync=IMPORT_FSYNC) as writer, FileBars() as bars:
             say_restart(log, writer)
             with ctrl_c_between_steps() as step:
                 report = import_files(
                     writer,
                     names,
                     key=key,
-                    progress=show,
+                    progress=lambda source: _show(bars, source),
                     on_reject=rejects.say,
                     step=step,
                     given_map=given_map,
@@ -148,36 +138,8 @@ def _summary(log: Path, report: ImportReport) -> str:
     return ", ".join(parts) + hint
 
 
-@contextmanager
-def _progress() -> Iterator["_ProgressBar | None"]:
-    """A progress bar on a terminal, nothing elsewhere."""
-    if not people.is_terminal:
-        yield None
-        return
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TaskProgressColumn(),
-        TransferSpeedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=people, transient=True) as progress:
-        yield _ProgressBar(progress)
-
-
-class _ProgressBar:
-    """A line of progress for each file."""
-
-    def __init__(self, progress: Progress) -> None:
-        self._progress = progress
-        self._tasks: dict[int, int] = {}
-
-    def __call__(self, source: Source) -> None:
-        task = self._tasks.get(id(source))
-        if task is None:
-            task = self._progress.add_task(visible(source.name), total=source.size_bytes)
-            self._tasks[id(source)] = task
-        self._progress.update(task, completed=source.bytes_read())  # type: ignore[arg-type]
+def _show(bars: FileBars, source: Source) -> None:
+    bars.show(id(source), source.name, source.bytes_read(), source.size_bytes)
 
 
 def register(app: typer.Typer) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 import typer
 from rich.console import Console
 
-from eventsrc.text import visible_json, visible_lines
+from eventsrc.text import visible, visible_json, visible_lines
 
 EXIT_FAILED = 1
 EXIT_FINDINGS = 3
@@ -118,3 +118,35 @@ class Bar:
     def stop(self) -> None:
         """Remove the bar. May be called twice."""
         self._progress.stop()
+
+
+class FileBars:
+    """A progress bar for each file that is read, by its bytes; nothing without a terminal."""
+
+    def __init__(self) -> None:
+        from rich import progress
+
+        self._progress = progress.Progress(
+            progress.TextColumn("{task.description}", markup=False),
+            progress.BarColumn(),
+            progress.TaskProgressColumn(),
+            progress.TransferSpeedColumn(),
+            progress.TimeRemainingColumn(),
+            console=people,
+            transient=True,
+            disable=not people.is_terminal,
+        )
+        self._tasks: dict[int, progress.TaskID] = {}
+
+    def __enter__(self) -> "FileBars":
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def show(self, file: int, name: str, done: int, size: int | None) -> None:
+        """Show that ``done`` bytes of a file are read; ``file`` is a number of its own."""
+        if file not in self._tasks:
+            self._tasks[file] = self._progress.add_task(visible(name), total=size)
+        self._progress.update(self._tasks[file], completed=done)
