@@ -8,7 +8,6 @@ apart. Of several the one with the most evidence is taken, of equal ones that fo
 """
 
 import math
-from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -20,10 +19,10 @@ from projections.pair_groups import PairGroups
 
 from .agreement import log_of
 from .label_counts import LABEL_WEIGHT, LabelCounts
-from .looks import Exemplar, LookRatios, LookScale
+from .looks import LookRatios, LookScale
 from .spots import COMMON_M2
 from .thing_index import ThingIndex
-from .things import INVERSE, ROW, RUN, SIDE_COS, SIDE_SIN, Thing
+from .things import INVERSE, RUN, SIDE_COS, SIDE_SIN, Thing
 
 _LOG_AREA = log(9.0) - 1.8378770664093453
 """log(9 m² / 2π)."""
@@ -112,17 +111,14 @@ class Merging:
         around: list[ObjectOrdinal] = listed[near].tolist()
         return around
 
-    def look(self, one: Thing, other: Thing) -> float:
-        """How much the looks of two things speak for one, as the logarithm of a ratio of two
-        likelihoods: the mean over pairs of exemplars, and the labels."""
-        return self._looks(one, [other])[0]
-
     def _looks(self, one: Thing, others: list[Thing]) -> list[float]:
-        """`look` for each of several others: their exemplars are columns of one matrix."""
+        """How much the looks of a thing and each of several others speak for one, as the logarithm
+        of a ratio of two likelihoods: the mean over pairs of exemplars, and the labels. The others'
+        exemplars are columns of one matrix."""
         counts = [len(other.marks) for other in others]
         agree = [o.class_name in one.classes or one.class_name in o.classes for o in others]
-        a = np.array(_by_row(one))
-        b = np.array([mark for other in others for mark in _by_row(other)])
+        a = np.array(one.by_row())
+        b = np.array([mark for other in others for mark in other.by_row()])
         looks = np.concatenate([other.looks[: len(other.marks)] for other in others])
         dots = (one.looks[: len(one.marks)] @ looks.T).astype(np.float64)
         cosines = dots * a[:, INVERSE, np.newaxis] * b[:, INVERSE]
@@ -146,7 +142,7 @@ class Merging:
         return values
 
     def _by_labels(self, one: Thing, other: Thing) -> float:
-        """The part of the labels in `look`."""
+        """The part of the labels in `_looks`."""
         labels = 0.0
         for label, count in other.classes.items():
             labels += count * self._labels.ratio(one, label, self._labels.usual(label))
@@ -162,8 +158,3 @@ def _geometry(thing: Thing, other: Thing) -> tuple[float, float]:
     chi2 = (c * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / det
     geometry = min(chi2, _WORST_CHI2) * -0.5 - 0.5 * log_of(det) + _LOG_AREA
     return geometry, dx * dx + dy * dy
-
-
-def _by_row(thing: Thing) -> list[Exemplar]:
-    """The exemplars in the order of the rows of their looks."""
-    return sorted(thing.marks, key=itemgetter(ROW))

@@ -58,6 +58,7 @@ from .sights import Sighting, Sights
 from .spots import Spots
 from .thing_index import ThingIndex
 from .things import Thing
+from .turned_looks import turned_looks
 
 ObjectDelta: TypeAlias = (
     ObjectFound | ObjectSeen | ObjectsMerged | ObjectRelocated | ObjectClassified | ObjectEstimated
@@ -189,12 +190,18 @@ class EvidenceObjects:
         """How many observations an Object has."""
         return self._index.thing(ordinal).count
 
-    def compare(self, one: ObjectOrdinal, other: ObjectOrdinal) -> float | None:
-        """The log-likelihood ratio of two Objects' looks; None where a command keeps them apart."""
-        thing, second = self._index.thing(one), self._index.thing(other)
-        if self._groups is not None and self._groups.conflicts(thing.groups, second.groups):
-            return None
-        return self._merging.look(thing, second)
+    def compare(self, one: ObjectOrdinal, others: Sequence[ObjectOrdinal]) -> list[float | None]:
+        """The log-likelihood ratio of the looks of an Object and of each of several others, however
+        they stand (`turned_looks`); None where a command keeps them apart."""
+        thing, things = self._index.thing(one), [self._index.thing(other) for other in others]
+        looks = turned_looks(thing, things, self._look_ratios, self._scale)
+        groups = self._groups
+        if groups is None:
+            return [*looks]
+        return [
+            None if groups.conflicts(thing.groups, other.groups) else look
+            for look, other in zip(looks, things, strict=True)
+        ]
 
     def relocate(self, offset: Offset, moved: Moved) -> list[ObjectDelta]:
         """Make an Object found elsewhere one with the one that stood here before, and estimate it

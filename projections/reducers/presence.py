@@ -4,21 +4,23 @@ A keyframe *looks for* an Object when its pose is in a cell of the grid next to 
 Object was seen from, along a similar line of sight and from a similar distance, and the Object's
 estimate lies well inside the picture. A look is a *hit* or a *miss*. Walls, furniture and the
 detector's habits are in the record of hits and misses: from such a place such a thing is seen so
-often.
+often. What hides a thing hides it from all poses nearby, so of one run and one cell of the grid the
+first miss counts whole, the second half, others not; so do hits.
 
 An Object's *odds* are how likely the looks of a run are if it is still there, over how likely they
 are if it is gone. In its home run, the one that found it, it is there. In another run every miss
-multiplies them by its share of misses so far (of `_PRIOR` looks at the map's rate and its own), and
-every sighting by `_SEEN`, within bounds: sightings of something else that took its place are
-assigned to it now and then, so one alone does not outweigh many misses. A new run starts with what
-was left, or with 1 if it was surely there.
+multiplies them by its share of misses so far (of `_PRIOR` looks at the map's rate and its own), one
+that counts half by the root of it, and every sighting by `_SEEN`, within bounds: sightings of
+something else that took its place are assigned to it now and then, so one alone does not outweigh
+many misses. A new run starts with what was left, or with 1 if it was surely there.
 
 It is *missing* when the odds fall below `_MISSING` with `_LEAST_MISSES` misses in the run, and no
 longer when they rise above that.
 
-Distances are metres in float64; with +, −, ×, ÷ only, in one order, so everything is bit-exact.
+Distances are metres in float64; with +, −, ×, ÷, √ only, in one order, so everything is bit-exact.
 """
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
@@ -51,30 +53,47 @@ _DISTANCES2 = 1.6 * 1.6
 """Square of the ratio of two distances up to which they are similar."""
 _TURN2 = 0.87 * 0.87
 """Square of the least cosine between similar lines of sight, 30°."""
-_PRIOR = 4.0
+_PRIOR = 8.0
+_WEIGHTS = 2, 1, 0
+"""Of the first, the second and each other look from one cell in one run, in halves of a look."""
 _SEEN, _SURE, _FLOOR = 8.0, 512.0, 1.0 / 1024.0
-_MISSING = 0.07
-_LEAST_MISSES, _LEAST_HITS = 2, 1
+_MISSING = 0.2
+_LEAST_MISSES, _LEAST_HITS = 2, 2
 _Cell = tuple[int, int]
 
 
 @dataclass(slots=True, eq=False)
 class Attendance:
     """What is known of one Object. ``hits`` and ``misses`` are those of all looks while it was not
-    missing; ``odds`` and ``run_misses`` those of ``run``, the last run that saw or missed it.
-    ``confirmed`` is the last run before ``run`` that it surely was there in."""
+    missing, in halves; ``odds`` and ``run_misses`` (keyframes) those of ``run``, the last run that
+    saw or missed it. ``confirmed`` is the last run before ``run`` that it surely was there in,
+    ``seen`` the last that has seen it. ``estimate`` is its position, metres, and the entries xx,
+    xy, yy of the covariance, m². ``looks`` are hits and misses by cell in ``looks_run``."""
 
     home: RunOrdinal
     run: RunOrdinal
     confirmed: RunOrdinal
-    x: float = 0.0
-    y: float = 0.0
+    seen: RunOrdinal
+    looks_run: RunOrdinal
+    estimate: tuple[float, ...] = (0.0,) * 5
     hits: int = 0
     misses: int = 0
     odds: float = 1.0
     run_misses: int = 0
     is_missing: bool = False
+    looks: dict[_Cell, list[int]] = field(default_factory=dict)
     cells: set[_Cell] = field(default_factory=set)
+
+    def weight(self, run: RunOrdinal, cell: _Cell, is_hit: bool) -> int:
+        """What a look from a cell counts, in halves; counted as one more."""
+        if run != self.looks_run:
+            self.looks_run = run
+            self.looks.clear()
+        counts = self.looks.setdefault(cell, [0, 0])
+        before = counts[is_hit]
+        if before < len(_WEIGHTS) - 1:
+            counts[is_hit] = before + 1
+        return _WEIGHTS[before]
 
     def enter(self, run: RunOrdinal) -> None:
         """What follows is of this run."""
@@ -106,6 +125,7 @@ class Presence:
         changed = self._look(run, pose, camera, seen)
         for ordinal in seen:
             known = self.attendance[ordinal]
+            known.seen = run
             if run != known.home:
                 known.enter(run)
                 known.odds = min(known.odds * _SEEN, _SURE)
@@ -137,10 +157,16 @@ class Presence:
         return {
             "looks": [self._hits, self._misses],
             "objects": [
-                [o, k.home, k.run, k.confirmed, k.hits, k.misses, k.run_misses, int(k.is_missing)]
+                [
+                    *(o, k.home, k.run, k.confirmed, k.seen, k.looks_run),
+                    *(k.hits, k.misses, k.run_misses, int(k.is_missing)),
+                ]
                 for o, k in known
             ],
-            "numbers": np.array([(k.x, k.y, k.odds) for _, k in known]).reshape(-1, 3),
+            "looks_of_run": [
+                [o, *cell, *counts] for o, k in known for cell, counts in sorted(k.looks.items())
+            ],
+            "numbers": np.array([(*k.estimate, k.odds) for _, k in known]).reshape(-1, 6),
             "cells": [list(row[:3]) for row in vantages],
             "poses": np.array([row[3:] for row in vantages]).reshape(-1, 2),
         }
@@ -149,11 +175,15 @@ class Presence:
         """Take over what `dump` gave."""
         self._hits, self._misses = state["looks"]
         numbers = state["numbers"].tolist()
-        for (ordinal, *known), (x, y, odds) in zip(state["objects"], numbers, strict=True):
-            home, run, confirmed, hits, misses, run_misses, is_missing = known
+        for (ordinal, *known), (*estimate, odds) in zip(state["objects"], numbers, strict=True):
+            home, run, confirmed, seen, looks_run, hits, misses, run_misses, is_missing = known
             self.attendance[ordinal] = Attendance(
-                home, run, confirmed, x, y, hits, misses, odds, run_misses, bool(is_missing)
+                *(home, run, confirmed, seen, looks_run),
+                (*estimate,),
+                *(hits, misses, odds, run_misses, bool(is_missing)),
             )
+        for ordinal, column, row, *counts in state["looks_of_run"]:
+            self.attendance[ordinal].looks[column, row] = counts
         for (column, row, ordinal), at in zip(state["cells"], state["poses"].tolist(), strict=True):
             self._list(ordinal, (column, row), (at[0], at[1]))
 
@@ -164,10 +194,12 @@ class Presence:
             if type(delta) is ObjectSeen:
                 seen.add(delta.object)
             elif type(delta) is ObjectEstimated:
-                known = attendance[delta.object]
-                known.x, known.y = delta.x_um / 1e6, delta.y_um / 1e6
+                attendance[delta.object].estimate = (
+                    *(delta.x_um / 1e6, delta.y_um / 1e6),
+                    *(delta.var_xx_um2 / 1e12, delta.var_xy_um2 / 1e12, delta.var_yy_um2 / 1e12),
+                )
             elif type(delta) is ObjectFound:
-                attendance[delta.object] = Attendance(run, run, run)
+                attendance[delta.object] = Attendance(run, run, run, run, run)
             elif type(delta) is ObjectsMerged:
                 self._merge(delta.survivor, delta.absorbed)
                 if delta.absorbed in seen:
@@ -180,6 +212,7 @@ class Presence:
         known, other = self.attendance[survivor], self.attendance[absorbed]
         known.hits += other.hits
         known.misses += other.misses
+        known.seen = max(known.seen, other.seen)
         if other.home != known.home:
             known.enter(max(known.run, other.run))
             known.odds = _SURE
@@ -191,7 +224,8 @@ class Presence:
     ) -> list[ObjectOrdinal]:
         """Count hits and misses; the Objects that are missing now."""
         self.missed = []
-        near = self._vantages.get((pose.x_um // _CELL_UM, pose.y_um // _CELL_UM))
+        cell = pose.x_um // _CELL_UM, pose.y_um // _CELL_UM
+        near = self._vantages.get(cell)
         if not near:
             return []
         missing: list[ObjectOrdinal] = []
@@ -200,30 +234,35 @@ class Presence:
         half_cos, half_sin = half_field(camera.hfov_deg)
         inner = half_sin / half_cos * _INNER
         hits = misses = 0
-        usual = _PRIOR * (self._misses + 1) / (self._hits + self._misses + 2)
+        usual = _PRIOR * (self._misses + 2) / (self._hits + self._misses + 4)
         attendance = self.attendance
         for ordinal, vantage in near.items():
             known = attendance[ordinal]
-            dx, dy = known.x - x, known.y - y
+            there_x, there_y, *_ = known.estimate
+            dx, dy = there_x - x, there_y - y
             ahead, aside = dx * cos + dy * sin, dy * cos - dx * sin
             if ahead < _LEAST_AHEAD_M or abs(aside) > ahead * inner:
                 continue
-            if not _is_similar(dx, dy, known.x - vantage[0], known.y - vantage[1]):
+            if not _is_similar(dx, dy, there_x - vantage[0], there_y - vantage[1]):
                 continue
-            if ordinal in seen:
-                known.hits += 1
-                hits += 1
+            is_hit = ordinal in seen
+            weight = known.weight(run, cell, is_hit)
+            if is_hit:
+                known.hits += weight
+                hits += weight
                 continue
             if run != known.home:
                 known.enter(run)
-                share = (usual + known.misses) / (_PRIOR + known.hits + known.misses)
-                known.odds = max(known.odds * share, _FLOOR)
+                if weight:
+                    share = (usual + known.misses) / (_PRIOR + known.hits + known.misses)
+                    share = share if weight == _WEIGHTS[0] else math.sqrt(share)
+                    known.odds = max(known.odds * share, _FLOOR)
                 known.run_misses += 1
                 self.missed.append(ordinal)
             if known.is_missing:
                 continue
-            known.misses += 1
-            misses += 1
+            known.misses += weight
+            misses += weight
             enough = known.run_misses >= _LEAST_MISSES and known.hits >= _LEAST_HITS
             if enough and known.odds < _MISSING:
                 known.is_missing = True

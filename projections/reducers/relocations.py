@@ -1,18 +1,26 @@
 """Relocations: which new Object is one that stood elsewhere in an earlier run.
 
 A *newcomer* is an Object with `_LEAST_NEW` observations or more. Whatever another run found before
-it, of the same class, with `_LEAST_OLD` observations and at least a metre away, may be the same
-thing, unless it was surely seen in the newcomer's run (`presence`). The evidence is the
-log-likelihood ratio of their looks, which must be `_LEAST_LOOK`, less `_ODDS_WEIGHT` of the
-logarithm of the older one's odds to be still where it was. The best candidate is the newcomer if
-its evidence is `_ENOUGH`; of equal ones the latest.
+it, of the same class and at least a metre away, may be the same thing, unless it was surely seen in
+that run where it stands: its odds to be still there (`presence`) are above `_STILL`. The evidence
+is
 
-A newcomer is compared when its observations have doubled, and with an Object whose misses have
-doubled. Of a class the latest `_MOST` Objects are kept, and of newcomers, so the cost of a keyframe
-is bounded.
+    the log-likelihood ratio of their looks, however they stand (`turned_looks`), at least
+    `_LEAST_LOOK`;
+    less the largest such ratio, if above 0, of one of them and a third Object: of the newcomer and
+    another older one, or of the older one and another that was seen since the newcomer's run began.
+    Where things look alike a look tells little;
+    less the logarithm of the older one's odds, or `_GONE` of it where they are below 1.
+
+The older Object with the largest ratio of looks less the part of its odds is the newcomer, if the
+evidence is `_ENOUGH`; of equal ones the latest.
+
+A newcomer is compared when its observations have doubled, and an Object whose misses have doubled
+with the newcomer that looks most like it. Of a class the latest `_MOST` Objects are kept, and of
+newcomers, so the cost of a keyframe is bounded.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple, Protocol
 
 from projections.deltas import (
@@ -29,12 +37,13 @@ from projections.reducers import State
 
 from .presence import Presence
 
-_LEAST_NEW, _LEAST_OLD = 4, 2
-_APART_M2 = 1.0
+_LEAST_NEW, _LEAST_RIVAL = 3, 2
+"""Fewest observations of a newcomer, and of a third Object."""
+_APART_M2, _APART_CHI2 = 1.0, 16.0
 _ONE_FLOOR_M2 = 5e7 * 5e7
 """Farther apart are only Objects on two floors, which are laid out beside each other."""
-_LEAST_LOOK, _ODDS_WEIGHT = 1.5, 0.3
-_ENOUGH = 2.25
+_LEAST_LOOK, _ENOUGH, _GONE = 2.0, 1.0, 0.5
+_STILL = 8.0
 _MOST = 128
 
 
@@ -47,8 +56,9 @@ class Comparing(Protocol):
     def observations_of(self, ordinal: ObjectOrdinal) -> int:
         """How many observations an Object has."""
 
-    def compare(self, one: ObjectOrdinal, other: ObjectOrdinal) -> float | None:
-        """The log-likelihood ratio of two Objects' looks; None where they are kept apart."""
+    def compare(self, one: ObjectOrdinal, others: Sequence[ObjectOrdinal]) -> list[float | None]:
+        """The log-likelihood ratio of the looks of an Object and of each of several others; None
+        where they are kept apart."""
 
 
 class Moved(NamedTuple):
@@ -62,9 +72,9 @@ class Moved(NamedTuple):
 
 
 class _Candidate(NamedTuple):
-    evidence: float
-    look: float
+    value: float
     old: ObjectOrdinal
+    look: float
 
 
 class _Newcomer(NamedTuple):
@@ -92,7 +102,7 @@ class Relocations:
         for ordinal in self._presence.missed:
             misses = self._presence.attendance[ordinal].run_misses
             if misses & (misses - 1) == 0:
-                due += self._newcomers_like(ordinal)
+                due += self._newcomer_like(ordinal)
         for newcomer in dict.fromkeys(due):
             best = self._best(newcomer)
             if best is not None:
@@ -138,40 +148,60 @@ class Relocations:
                 self._forget(delta.absorbed)
         return [ordinal for ordinal in due if ordinal in self._newcomers]
 
-    def _newcomers_like(self, old: ObjectOrdinal) -> list[ObjectOrdinal]:
-        """The newcomers for which an Object is a candidate."""
+    def _newcomer_like(self, old: ObjectOrdinal) -> list[ObjectOrdinal]:
+        """The newcomer that looks most like an Object, of equal ones the latest; none if it does
+        not look like it enough."""
         own = self._by_class.get(self._objects.class_of(old), {})
-        return [
+        newcomers = [
             ordinal
             for ordinal in own
             if ordinal in self._newcomers
             and self._objects.observations_of(ordinal) >= _LEAST_NEW
             and self._could_be(old, ordinal)
         ]
+        looks = zip(self._objects.compare(old, newcomers), newcomers, strict=True)
+        alike = [(look, new) for look, new in looks if look is not None and look >= _LEAST_LOOK]
+        return [max(alike)[1]] if alike else []
 
     def _best(self, newcomer: ObjectOrdinal) -> _Candidate | None:
         """The Object that the newcomer is, if it is one."""
-        candidates: list[_Candidate] = []
-        for old in self._by_class.get(self._objects.class_of(newcomer), {}):
-            if self._could_be(old, newcomer):
-                look = self._objects.compare(old, newcomer)
-                if look is not None:
-                    odds = min(self._presence.attendance[old].odds, 1.0)
-                    candidates.append(_Candidate(look - _ODDS_WEIGHT * log(odds), look, old))
-        best = max(candidates, default=None)
-        is_enough = best is not None and best.evidence >= _ENOUGH and best.look >= _LEAST_LOOK
-        return best if is_enough else None
+        own = self._by_class.get(self._objects.class_of(newcomer), {})
+        observations_of = self._objects.observations_of
+        mates = [o for o in own if o != newcomer]
+        if not any(self._could_be(old, newcomer) for old in mates):
+            return None
+        attendance = self._presence.attendance
+        home = attendance[newcomer].home
+        looks = dict(zip(mates, self._objects.compare(newcomer, mates), strict=True))
+        best: _Candidate | None = None
+        for old, look in looks.items():
+            if look is not None and look >= _LEAST_LOOK and self._could_be(old, newcomer):
+                odds = log(attendance[old].odds)
+                candidate = _Candidate(look - (_GONE * odds if odds < 0.0 else odds), old, look)
+                best = candidate if best is None else max(best, candidate)
+        if best is None or best.value < _ENOUGH:
+            return None
+        others = [o for o in mates if o != best.old and observations_of(o) >= _LEAST_RIVAL]
+        older = [looks[other] for other in others if attendance[other].home < home]
+        later = [other for other in others if attendance[other].seen >= home]
+        later_looks = self._objects.compare(best.old, later)
+        rival = max([look for look in (*older, *later_looks) if look is not None], default=0.0)
+        return best if best.value - max(rival, 0.0) >= _ENOUGH else None
 
     def _could_be(self, old: ObjectOrdinal, newcomer: ObjectOrdinal) -> bool:
         """Whether they can be one thing, whatever they look like."""
         before, now = self._presence.attendance[old], self._presence.attendance[newcomer]
-        dx, dy = now.x - before.x, now.y - before.y
+        pairs = zip(now.estimate, before.estimate, strict=True)
+        (x, before_x), (y, before_y), *variances = pairs
+        dx, dy = x - before_x, y - before_y
+        xx, xy, yy = (one + other for one, other in variances)
+        apart = yy * dx * dx - 2.0 * xy * dx * dy + xx * dy * dy
         return (
             old < newcomer
             and now.home not in (before.home, before.confirmed)
-            and before.odds <= 1.0
+            and before.odds <= _STILL
             and _APART_M2 <= dx * dx + dy * dy <= _ONE_FLOOR_M2
-            and self._objects.observations_of(old) >= _LEAST_OLD
+            and apart >= _APART_CHI2 * (xx * yy - xy * xy)
         )
 
     def _classify(self, ordinal: ObjectOrdinal, class_name: str) -> None:

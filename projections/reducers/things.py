@@ -5,6 +5,7 @@ eighth of the directions the newest `_OF_A_KIND`, and `MOST_EXEMPLARS` in all; t
 """
 
 from dataclasses import dataclass, field
+from operator import itemgetter
 from typing import Final
 
 import numpy as np
@@ -65,6 +66,10 @@ class Thing:
             self._grow(min(max(2 * row, 1), MOST_EXEMPLARS), len(look))
         self.looks[row] = look
         marks.append((inverse, cos, sin, run, kind, row))
+
+    def by_row(self) -> list[Exemplar]:
+        """The exemplars in the order of the rows of their looks."""
+        return sorted(self.marks, key=itemgetter(ROW))
 
     def where(self) -> Estimate:
         """The estimate, which every thing has that is in the index."""

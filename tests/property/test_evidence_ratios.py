@@ -113,4 +113,4 @@ def test_the_looks_of_one_thing_compare_as_among_several(seed: int) -> None:
     things = [thing for thing in objects._index._things if thing is not None]
     merging = objects._merging
     for one in things:
-        assert merging._looks(one, things) == [merging.look(one, other) for other in things]
+        assert merging._looks(one, things) == [merging._looks(one, [o])[0] for o in things]

@@ -1,7 +1,8 @@
 """Presence beside a slow oracle that keeps every vantage and every look, and counts from scratch.
 
 The oracle walks over all Objects and all poses each was seen from; it has no grid of Objects, no
-running odds and no order but that of the ordinals.
+running odds and no order but that of the ordinals. It counts looks in whole ones and odds in
+fractions, squared, so that the root of a share is one, too.
 """
 
 import math
@@ -44,15 +45,23 @@ class Known:
     run: int
     at: tuple[float, float] = (0.0, 0.0)
     seen_from: list[tuple[int, int]] = field(default_factory=list)
-    hits: int = 0
-    misses: int = 0
-    odds: Fraction = Fraction(1)
+    hits: Fraction = Fraction(0)
+    misses: Fraction = Fraction(0)
+    odds2: Fraction = Fraction(1)
     run_misses: int = 0
     is_missing: bool = False
+    seen: int = 0
+    looks: list[tuple[int, int, int, bool]] = field(default_factory=list)
 
     def enter(self, run: int) -> None:
         if run != self.run:
-            self.run, self.run_misses, self.odds = run, 0, min(self.odds, Fraction(1))
+            self.run, self.run_misses, self.odds2 = run, 0, min(self.odds2, Fraction(1))
+
+    def weight(self, run: int, pose: Pose, is_hit: bool) -> Fraction:
+        """The third look from a cell, with one outcome and no other run between, tells nothing."""
+        look = run, pose.x_um // CELL, pose.y_um // CELL, is_hit
+        self.looks = [known for known in self.looks if known[0] == run] + [look]
+        return {1: Fraction(1), 2: Fraction(1, 2)}.get(self.looks.count(look), Fraction(0))
 
 
 class Oracle:
@@ -60,13 +69,13 @@ class Oracle:
 
     def __init__(self) -> None:
         self.known: dict[int, Known] = {}
-        self.looks: list[bool] = []
+        self.hits, self.misses = Fraction(0), Fraction(0)
 
     def fold(self, offset: Offset, run: int, pose: Pose, fused: Sequence[Delta]) -> list[Delta]:
         seen: set[int] = set()
         for delta in fused:
             if isinstance(delta, ObjectFound):
-                self.known[delta.object] = Known(run, run)
+                self.known[delta.object] = Known(run, run, seen=run)
             elif isinstance(delta, ObjectSeen):
                 seen.add(delta.object)
             elif isinstance(delta, ObjectEstimated):
@@ -74,18 +83,21 @@ class Oracle:
             elif isinstance(delta, ObjectsMerged):
                 self.merge(delta.survivor, delta.absorbed)
                 seen = {delta.survivor if o == delta.absorbed else o for o in seen}
-        share = Fraction(self.looks.count(False) + 1, len(self.looks) + 2)
+        share = (self.misses + 1) / (self.hits + self.misses + 2)
         before = {o: k.is_missing for o, k in self.known.items()}
         for ordinal in sorted(self.known):
             if self.looks_for(ordinal, pose):
-                self.look(self.known[ordinal], run, share, ordinal in seen)
+                known = self.known[ordinal]
+                weight = known.weight(run, pose, ordinal in seen)
+                self.look(known, run, share, weight, ordinal in seen)
         for ordinal in seen:
             known = self.known[ordinal]
             known.seen_from.append((pose.x_um, pose.y_um))
+            known.seen = run
             if run != known.home:
                 known.enter(run)
-                known.odds = min(known.odds * 8, Fraction(512))
-                known.is_missing = known.is_missing and known.odds <= Fraction(0.07)
+                known.odds2 = min(known.odds2 * 64, Fraction(512) ** 2)
+                known.is_missing = known.is_missing and known.odds2 <= Fraction(1, 25)
         return [
             ObjectMissing(offset, ObjectOrdinal(o), RunOrdinal(run), k.run_misses, k.is_missing)
             for o, k in sorted(self.known.items())
@@ -97,9 +109,10 @@ class Oracle:
         known.hits += other.hits
         known.misses += other.misses
         known.seen_from += other.seen_from
+        known.seen = max(known.seen, other.seen)
         if other.home != known.home:
             known.enter(max(known.run, other.run))
-            known.odds = Fraction(512)
+            known.odds2 = Fraction(512) ** 2
 
     def relocate(self, old: int, new: int) -> None:
         self.known[old] = self.known.pop(new)
@@ -122,21 +135,25 @@ class Oracle:
             return False
         return dx * vx + dy * vy >= 0.87 * far * usual
 
-    def look(self, known: Known, run: int, share: Fraction, is_seen: bool) -> None:
+    def look(
+        self, known: Known, run: int, share: Fraction, weight: Fraction, is_seen: bool
+    ) -> None:
         if is_seen:
-            known.hits += 1
-            self.looks.append(True)
+            known.hits += weight
+            self.hits += weight
             return
         if run != known.home:
             known.enter(run)
             missed = (4 * share + known.misses) / (4 + known.hits + known.misses)
-            known.odds = max(known.odds * missed, Fraction(1, 1024))
+            for _ in range(int(2 * weight)):
+                known.odds2 *= missed
+            known.odds2 = max(known.odds2, Fraction(1, 1024) ** 2)
             known.run_misses += 1
         if not known.is_missing:
-            known.misses += 1
-            self.looks.append(False)
+            known.misses += weight
+            self.misses += weight
             enough = known.run_misses >= 2 and known.hits >= 1
-            known.is_missing = enough and known.odds < Fraction(0.07)
+            known.is_missing = enough and known.odds2 < Fraction(1, 25)
 
 
 class Step(NamedTuple):
@@ -222,8 +239,9 @@ def test_presence_tells_what_the_oracle_tells_also_from_a_snapshot(story, cut):
     assert presence.attendance.keys() == oracle.known.keys()
     for ordinal, known in oracle.known.items():
         attendance = presence.attendance[ObjectOrdinal(ordinal)]
-        assert (attendance.hits, attendance.misses) == (known.hits, known.misses)
-        assert attendance.odds == pytest.approx(float(known.odds))
+        assert (attendance.hits, attendance.misses) == (2 * known.hits, 2 * known.misses)
+        assert (attendance.seen, attendance.estimate[:2]) == (known.seen, known.at)
+        assert attendance.odds == pytest.approx(math.sqrt(known.odds2))
 
 
 def assert_equal(one: dict[str, Any], other: dict[str, Any]) -> None:
