@@ -15,7 +15,7 @@ find_python() {
     exit 1
 }
 
-ensure_venv() { # ensure_venv [run | a group of pyproject.toml's]
+ensure_venv() { # ensure_venv [run: mapfold with its web debugger | a group of pyproject.toml's]
     local stamp want
     stamp=".venv/.installed-${1:-run}"
     want=$(cksum pyproject.toml | cut -d' ' -f1)
@@ -28,7 +28,7 @@ ensure_venv() { # ensure_venv [run | a group of pyproject.toml's]
         if [ "${1:-run}" != run ]; then
             .venv/bin/python -m pip install --quiet --disable-pip-version-check --editable . --group "$1" >&2
         else
-            .venv/bin/python -m pip install --quiet --disable-pip-version-check --editable . >&2
+            .venv/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[ui]' >&2
         fi
         echo "$want" >"$stamp"
     fi

@@ -45,7 +45,7 @@ class UiServer(ReadyProgram):
         program = mapfold.start("ui", *args, stderr=write)
         os.close(write)
         super().__init__(program, read, ready_s=WAIT_S, end_s=WAIT_S)
-        found = re.search(r"showing .* at http://(\S+?):(\d+)/(?:\?token=(\S+))?", self.text)
+        found = re.search(r"showing .* at http://(\S+?):(\d+)/(?:\?token=([^\s#]+))?", self.text)
         assert found, self.text
         self.host, self.port, self.token = found[1], int(found[2]), found[3]
 

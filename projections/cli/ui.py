@@ -5,10 +5,12 @@ import secrets
 import webbrowser
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
+from urllib.parse import urlencode
 
 import typer
 
+from eventsrc.envelope import Offset
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 
@@ -18,6 +20,8 @@ from .options import (
     LogArgument,
     SetOption,
     SettingsOption,
+    W,
+    point,
     settings_of,
     zenoh_options,
 )
@@ -30,6 +34,9 @@ if TYPE_CHECKING:
     from projections.ui.edits import Editor
     from projections.ui.service import UiService
 
+_KINDS: Final = ("place", "object", "keyframe", "merge")
+"""What ``--select`` may name."""
+
 
 def ui(
     log: LogArgument,
@@ -40,6 +47,17 @@ def ui(
         int, typer.Option(metavar="N", min=0, max=65_535, help="0 takes a free one.")
     ] = 0,
     open_: Annotated[bool, typer.Option("--open", help="Open the page in a browser.")] = False,
+    at: Annotated[
+        str | None,
+        typer.Option(metavar="W", help=f"Print the link to this moment, as known then: {W}."),
+    ] = None,
+    select: Annotated[
+        str | None,
+        typer.Option(
+            metavar="THING",
+            help="And to the story of place:ID, object:ID, keyframe:RUN/ID or merge:OFFSET.",
+        ),
+    ] = None,
     allow_edits: Annotated[
         bool, typer.Option("--allow-edits", help="Let the page record corrections in the log.")
     ] = False,
@@ -76,8 +94,8 @@ def ui(
     settings = settings_of(settings_file, set_)
     if vector_db is not None and db is None:
         raise MisuseError("--vector-db is for the lag of the tails; give --db URL too")
-    with LogReader(log):  # a log that cannot be opened is an error before anything is served
-        pass
+    with LogReader(log) as reader:  # errors of log and options come before anything is served
+        shown_first = _moment(None if at is None else point(reader, at), select)
     try:
         from projections.serve.guard import Guard
         from projections.serve.listening import bind, is_loopback, serving
@@ -122,6 +140,7 @@ def ui(
         stack.callback(service.end)
         shown = f"[{host}]" if ":" in host else host
         url = f"http://{shown}:{bound}/" + ("" if token is None else f"?token={token}")
+        url += shown_first
         if not local:
             say(f"warning: others can reach {host}; who has the link below can read the log")
         say(f"showing {log} at {url}")
@@ -130,6 +149,20 @@ def ui(
             webbrowser.open(url)
         stop.wait()
     say("page closed")
+
+
+def _moment(at: Offset | None, select: str | None) -> str:
+    """The part of the page's address that leads to a moment and a thing. Raises MisuseError."""
+    parts = {} if at is None else {"at": str(at), "known": "then"}
+    if select is not None:
+        kind, _, name = select.partition(":")
+        if kind not in _KINDS or not name:
+            raise MisuseError(
+                f"--select {select!r} names nothing; write place:ID, object:ID, keyframe:RUN/ID or"
+                " merge:OFFSET"
+            )
+        parts |= {"select": select, "panel": "why"}
+    return "#" + urlencode(parts, safe=":/") if parts else ""
 
 
 def _editor(service: "UiService", connect: list[str] | None, config: Path | None) -> "Editor":

@@ -163,6 +163,8 @@ def _next_commands(
     yield f"   mapfold edits {log} {settings}"
     yield f"   mapfold relocalize {_quoted(folder.question(1))}"
     yield f"   mapfold status {log} {settings}"
+    shown = "" if merge is None else f" --at {merge.offset + 1} --select merge:{merge.offset}"
+    yield f"   mapfold ui {log} {settings}{shown}    # in a browser"
 
 
 def _relative(path: Path) -> Path:

@@ -6,13 +6,16 @@ from typing import Any
 from starlette.datastructures import QueryParams
 
 from eventsrc.envelope import Offset
+from projections.errors import QuestionError
 from projections.model.digest import map_digest
+from projections.model.view import MapView
 
 from .binary import packed_arrays
 from .columns import history_columns
 from .log_map import LogMap
 from .moment import Moment
 from .requests import number_of, text_of
+from .walls import wall_segments
 
 
 def history_answer(shown: LogMap, query: QueryParams, refold_s: float) -> bytes:
@@ -40,10 +43,38 @@ def history_answer(shown: LogMap, query: QueryParams, refold_s: float) -> bytes:
 
 
 def digest_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
-    """The digest at W, under the commands known at W or at ``known_at``, as ``state --at W``."""
+    """The digest at W, under the commands known at W or at ``known_at``, as ``state --at W``; and
+    what kind of room each place is."""
     moment = Moment.of(shown, query)
+    view = moment.known.at(moment.end)
     return {
         **moment.document(),
-        "digest": map_digest(moment.known.at(moment.end)),
+        "digest": map_digest(view),
+        "types": _types(view),
         "command": moment.command("state", "--digest"),
     }
+
+
+def _types(view: MapView) -> list[dict[str, Any]]:
+    """Of each place that anything tells about: its type, None where unsure, how probable that is,
+    and the likeliest types."""
+    found = ((place.place_id, view.type_of(place.ordinal)) for place in view.places.values())
+    return [
+        {
+            "place_id": place_id,
+            "type": each.type,
+            "probability": each.probability,
+            "candidates": each.candidates,
+        }
+        for place_id, each in found
+        if each is not None
+    ]
+
+
+def walls_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
+    """The walls of an occupancy map, by its number in ``maps`` of the log's document."""
+    maps = shown.timeline.history.maps
+    number = number_of(query, "number", 0)
+    if number >= len(maps):
+        raise QuestionError(f"there is no occupancy map {number}; the log has {len(maps)}")
+    return {"number": number, "walls": wall_segments(maps[number].map)}

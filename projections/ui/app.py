@@ -23,7 +23,7 @@ from eventsrc.text import visible
 from projections.serve.answering import TooMuchError
 from projections.serve.http import read_body
 
-from .answers import digest_answer, history_answer
+from .answers import digest_answer, history_answer, walls_answer
 from .binary import encoded
 from .comparisons import bisect_answer, conditions_answer, diff_answer, merges_answer
 from .edits import MOST_BYTES as MOST_EDIT_BYTES
@@ -79,7 +79,8 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
             content = await _answer(service, request, work)
             return Response(content, media_type="application/json")
 
-    answers("digest", "The digest of the map at W", digest_answer)
+    answers("digest", "The digest of the map at W, and the types of its places", digest_answer)
+    answers("walls", "The walls of an occupancy map of the log", walls_answer)
     answers("why", "Why a place, object or keyframe is what it is; why places merged", why_answer)
     answers("merges", "Every merge of places up to W", merges_answer)
     answers("diff", "What changed from one moment to another", diff_answer)

@@ -44,6 +44,7 @@ def history_columns(
     places = history.places[first["place_id"] :]
     objects = history.objects[first["object_id"] :]
     ids = all(_fits(k) for k in history.keyframes)
+    floors = _floor_numbers(history)
     header = {
         "from": start,
         "through": history.next_offset,
@@ -55,6 +56,7 @@ def history_columns(
             "object_id": [each.object_id for each in objects],
             "class": classes,
             "run_id": [seen[0].run_id for seen in history.runs],
+            "floor": list(floors),
         },
         "names": _names(history, start),
         "kf_number_is_id": ids,
@@ -62,6 +64,7 @@ def history_columns(
     events, event_header = event_columns(history, start, log_events)
     columns = {
         **_keyframe_columns(keyframes, origin, ids=ids),
+        "kf_floor": _ints(-1 if k.floor is None else floors[k.floor] for k in keyframes),
         **_place_columns(history, start),
         **object_columns(history, start, classes, origin),
         **_adjacency_columns(history, start),
@@ -87,6 +90,12 @@ def _counts(history: History, start: Offset) -> dict[str, int]:
         "object_id": sum(each.found.offset < start for each in history.objects),
         "refusals": sum(refusal.cause.offset < start for refusal in history.refusals),
     }
+
+
+def _floor_numbers(history: History) -> dict[str, int]:
+    """The floors that have a name, numbered by their first keyframe."""
+    names = (k.floor for k in history.keyframes if k.floor is not None)
+    return {name: number for number, name in enumerate(dict.fromkeys(names))}
 
 
 def _fits(keyframe: KeyframeAdded) -> bool:

@@ -69,6 +69,7 @@ class Localizer:
             "known_at": end,
             **found.document(),
             "poses": _poses(found.hypotheses),
+            **_floors(found.hypotheses),
             "crops": [
                 _crop(crop, matches, candidates)
                 for crop, matches in zip(crops, candidates.matches, strict=True)
@@ -103,6 +104,12 @@ def _poses(found: Hypotheses | None) -> list[list[float]]:
         return []
     rows: list[list[float]] = np.column_stack((found.poses, found.weights)).tolist()
     return rows
+
+
+def _floors(found: Hypotheses | None) -> dict[str, Any]:
+    """The floor of each of the poses, where any has a name."""
+    named = found is not None and any(name is not None for name in found.floors)
+    return {"pose_floors": list(found.floors)} if found is not None and named else {}
 
 
 def _crop(crop: Crop, matches: tuple[Match, ...], candidates: Candidates) -> dict[str, Any]:

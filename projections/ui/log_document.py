@@ -34,11 +34,13 @@ def log_document(opened: Opened, shown: LogMap, *, folded: bool = True) -> dict[
         "corrections": corrections.fingerprint(),
         "fusion": settings.fusion,
         "places_rule": settings.places,
+        "places_text": settings.places_text(),
         "edits_allowed": opened.edits,
         "token_needed": opened.token_needed,
         "losses": shown.log_events.losses,
         "rejected": shown.log_events.rejected,
         "walls": _walls(shown) if folded else [],
+        "maps": _maps(shown) if folded else [],
         "problems": [visible(each) for each in shown.problems] if folded else [],
     }
 
@@ -58,6 +60,12 @@ def _walls(shown: LogMap) -> list[list[float]]:
     """Those of the occupancy maps in force at the end of the log, of all floors."""
     last = {given.map.floor: given.map for given in shown.timeline.history.maps}
     return [segment for each in last.values() for segment in wall_segments(each)]
+
+
+def _maps(shown: LogMap) -> list[dict[str, Any]]:
+    """The occupancy maps that the log was given, with the floor that each names."""
+    given = shown.timeline.history.maps
+    return [{"offset": each.offset, "floor": each.map.floor} for each in given]
 
 
 def _runs(shown: LogMap) -> list[dict[str, Any]]:

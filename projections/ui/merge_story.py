@@ -16,7 +16,7 @@ from projections.history.merges import (
     refusal_document,
 )
 from projections.history.names import keyframe_name, place_name
-from projections.history.records import Merge
+from projections.history.records import Merge, ObjectMerge, Refusal
 from projections.history.rendering import merge_text, object_merges_text, refusals_text
 
 from .moment import Moment
@@ -45,7 +45,7 @@ def merge_answer(moment: Moment, name: str) -> dict[str, Any]:
         **moment.document(),
         "kind": "merge",
         "subject": name,
-        "summary": visible(_summary(history, merges) or texts[0].partition("\n")[0]),
+        "summary": visible(_summary(history, merges) or _other_summary(history, refusals, objects)),
         "lines": [line for text in texts for line in visible_lines(text).splitlines()],
         "steps": [
             {
@@ -76,6 +76,16 @@ def _summary(history: History, merges: list[Merge]) -> str:
         + ", ".join(place_name(history, place) for place in merge.absorbed)
         for merge in merges
     )
+
+
+def _other_summary(history: History, refusals: list[Refusal], objects: list[ObjectMerge]) -> str:
+    """Of an event that merged no places."""
+    refused = [
+        f"{place_name(history, each.a)} and {place_name(history, each.b)} did not merge: refused"
+        for each in refusals
+    ]
+    ids = [[history.objects[n].object_id for n in (m.survivor, m.absorbed)] for m in objects]
+    return "; ".join(refused or [f"{survivor} absorbed {absorbed}" for survivor, absorbed in ids])
 
 
 def _refs(history: History, merge: Merge) -> list[dict[str, str]]:

@@ -42,7 +42,8 @@ class Moment:
         words = [*map(str, arguments)]
         if asked_at:
             words += ["--at", str(self.end)]
-        if self.end != self.known_at:
+        span = sorted((self.end, self.known_at))
+        if self.shown.timeline.commands(*span):  # else it is the same map without saying it
             words += ["--known-at", str(self.known_at)]
         settings = self.shown.opened.words(*assignments_of(self.query))
         return command_line(self.shown.opened, name, *words, *settings)

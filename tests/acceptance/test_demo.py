@@ -4,6 +4,7 @@ import json
 import math
 import os
 import re
+import shlex
 import subprocess
 import sys
 import threading
@@ -22,8 +23,10 @@ from projections.cli.options import settings_from
 from projections.model.digest import map_digest
 from projections.model.fold import fold_log
 from projections.model.log_commands import read_corrections
+from tests.commands import Commands
 from tests.docs.console import ROOT, Command, matches, read
 from tests.prefork import folder_with_mapfold
+from tests.ui_server import showing
 
 _COMMAND = [sys.executable, "-m", "projections.cli", "demo", "--speed", "300"]
 _DEADLINE_S = 120.0
@@ -169,11 +172,12 @@ def test_the_picture_is_there(played: Played) -> None:
     assert picture.stat().st_size > 50_000
 
 
-def test_the_commands_it_ends_with_work_as_printed(played: Played) -> None:
+def test_the_commands_it_ends_with_work_as_printed(played: Played, tmp_path: Path) -> None:
     start = next(i for i, line in enumerate(played.story) if "Go on with it" in line)
     commands = [line.strip() for line in played.story[start + 1 :]]
     assert len(commands) >= 6
     assert "bin/activate" in commands[0]
+    page = shlex.split(commands.pop(), comments=True)
     commands.insert(1, f"PATH={folder_with_mapfold()}:$PATH")
     script = "set -e\n" + "\n".join(commands)
     done = subprocess.run(
@@ -186,6 +190,11 @@ def test_the_commands_it_ends_with_work_as_printed(played: Played) -> None:
     assert done.returncode == 0, done.stderr
     for asked in played.numbers["relocalize"]["questions"][:1]:
         assert asked["places"][0]["place_id"] in done.stdout
+    assert page[:2] == ["mapfold", "ui"]
+    at, merge = page[page.index("--at") + 1], page[page.index("--select") + 1]
+    with showing(Commands.in_folder(tmp_path), *page[2:]) as server:
+        assert f"#at={at}&known=then&select={merge}" in server.said[0]
+        assert server.api("why", what=merge, at=at)["merges"]
 
 
 def test_it_can_be_played_again_into_its_own_folder(played: Played) -> None:

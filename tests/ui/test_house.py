@@ -1,6 +1,5 @@
 """The page on a drive through a real house's layout, where the trial data is at hand."""
 
-import random
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,9 +8,8 @@ from playwright.sync_api import expect
 
 from tests.commands import Commands
 from tests.shared_data import shared_run
-from tests.thorough import rounds
 from tests.ui.conftest import Visit
-from tests.ui.test_moments import go, moment
+from tests.ui.test_moments import check_digests, moment
 from tests.ui_server import UiServer, showing
 
 SETTINGS = ("--set", "eps_m=0.75", "--set", "min_samples=8", "--set", "fusion=evidence")
@@ -27,14 +25,11 @@ def house(mapfold: Commands, tmp_path_factory: pytest.TempPathFactory) -> Iterat
         yield folder / "log", server
 
 
-def test_the_digest_shown_is_that_of_state(house: House, visit: Visit, mapfold: Commands) -> None:
+def test_the_digest_shown_is_that_of_state_at_200_moments(
+    house: House, visit: Visit, mapfold: Commands
+) -> None:
     log, server = house
-    page = visit(server)
-    chosen = random.Random(20)
-    for at in (chosen.randrange(912) for _ in range(rounds(200, 5))):
-        go(page, at)
-        wanted = mapfold("state", log, *SETTINGS, "--at", str(at), "--digest").out.strip()
-        expect(page.locator(".digest code")).to_have_attribute("data-digest", wanted)
+    check_digests(visit(server), mapfold, log, SETTINGS, seed=20)
 
 
 def test_each_merge_is_reached_and_explained(house: House, visit: Visit, mapfold: Commands) -> None:

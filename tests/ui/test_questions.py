@@ -93,7 +93,7 @@ def test_comparing_two_settings_shows_two_maps_with_one_view(
     slider.fill("0.75")
     expect(page.locator("canvas.map")).to_have_count(2)
     expect(page.locator(".panel")).to_contain_text("Folded in")
-    expect(page.locator(".pane-title").nth(1)).to_contain_text("ε 0.75 m, 8 neighbours: 10 places")
+    expect(page.locator(".pane-title").nth(1)).to_contain_text("10 places, ε 0.75 m, min_samples 8")
     expect(page.locator(".panel")).to_contain_text("The places part ways at event 31")
     assert "places differ from offset 31 on" in run_shown(page, mapfold)
     before = pixels(page), pixels(page, "other")

@@ -5,7 +5,8 @@ import "./styles/panels.css";
 import { render } from "preact";
 import { keepBench } from "./bench";
 import { keepLive } from "./panels/Live";
-import { load } from "./state/loading";
+import { keepWalls } from "./state/walls";
+import { keepKnown, load } from "./state/loading";
 import { keepPlaying, keepRested } from "./state/playing";
 import { keepTheme } from "./state/theme";
 import { keepAddress } from "./state/url";
@@ -22,5 +23,7 @@ keepRested();
 keepBench();
 void load().then(() => {
   keepAddress();
+  keepKnown();
+  keepWalls();
   keepLive();
 });

@@ -34,7 +34,7 @@ export function randomTables(seed: number, events = 120): Tables {
     const keyframe = rows.kf.length;
     const posed = next() > 0.1;
     const place = Number.NaN;
-    rows.kf.push({ offset, run: below(2), x: posed ? Math.fround(next() * 20) : place, y: posed ? Math.fround(next() * 10) : place, yaw: next(), stamp: 1000 + offset / 2, number: keyframe + 1, id: keyframe + 1 });
+    rows.kf.push({ offset, run: below(2), x: posed ? Math.fround(next() * 20) : place, y: posed ? Math.fround(next() * 10) : place, yaw: next(), stamp: 1000 + offset / 2, number: keyframe + 1, id: keyframe + 1, floor: below(3) - 1 });
     rows.ev.push({ offset, stamp: 1000 + offset / 2, kind: 0, ref: keyframe });
     if (posed) noise.push(keyframe);
     if (posed && (standing.length === 0 || next() < 0.1)) {
@@ -79,7 +79,7 @@ const TYPES: Record<string, string> = {
   ev_stamp: "f8", ev_kind: "u1",
 };
 const FIELDS: Record<string, string[]> = {
-  kf: ["offset", "run", "x", "y", "yaw", "stamp", "number", "id"],
+  kf: ["offset", "run", "x", "y", "yaw", "stamp", "number", "id", "floor"],
   pl: ["offset", "keyframe", "place"],
   pf: ["offset", "place", "founder"],
   mg: ["offset", "survivor", "absorbed", "keyframe"],
@@ -114,7 +114,7 @@ export function encoded(tables: Tables, from = 0, to = tables.through): ArrayBuf
         kinds: ["keyframe", "place_founded", "place_merged"],
         settings: {},
         names: tables.names.filter(inside),
-        strings: { place_id: founded, object_id: found, class: ["cup", "<b>", "☕"], run_id: ["a", "b"] },
+        strings: { place_id: founded, object_id: found, class: ["cup", "<b>", "☕"], run_id: ["a", "b"], floor: ["cellar", "10"] },
         arrays: arrays.map(({ name, dtype, values }, index) => ({ name, dtype, length: values.length, offset: String(offsets[index] ?? 0).padStart(9, "0") })).map((each) => ({ ...each, offset: Number(each.offset) })),
       }),
     );

@@ -13,10 +13,13 @@ export interface LogInfo {
   fingerprint: string;
   fusion: string;
   places_rule: string;
+  places_text: string;
   edits_allowed: boolean;
   token_needed: boolean;
   problems: string[];
   walls?: [number, number, number, number][];
+  /** The occupancy maps that events gave; one that names no floor is of the first. */
+  maps?: { offset: number; floor: string | null }[];
   loading?: { done: boolean; folded: number; events: number };
 }
 
@@ -36,4 +39,12 @@ export interface Step {
 export interface Answer {
   lines?: string[];
   command?: string;
+}
+
+/** What kind of room a place is; `type` is null where the probability is below a half. */
+export interface PlaceType {
+  place_id: string;
+  type: string | null;
+  probability: number;
+  candidates: [string, number][];
 }

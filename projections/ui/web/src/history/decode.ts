@@ -17,7 +17,7 @@ interface Header {
   refold_ms?: number;
   arrays: Listed[];
   origin?: [number, number];
-  strings: Record<"place_id" | "object_id" | "class" | "run_id", string[]>;
+  strings: Record<"place_id" | "object_id" | "class" | "run_id" | "floor", string[]>;
   names: { offset: number; place: number; name: string | null }[];
   kinds: string[];
   system?: SystemEvent[];
@@ -58,6 +58,7 @@ export function decodeHistory(answer: ArrayBuffer, before: History | null = null
     objectIds: [...(before?.objectIds ?? []), ...strings.object_id],
     classes: strings.class,
     runIds: strings.run_id,
+    floors: strings.floor,
     system: [...(before?.system ?? []), ...(header.system ?? [])],
     refusals: [...(before?.refusals ?? []), ...(header.refusals ?? [])],
     settings: header.settings,
@@ -101,6 +102,7 @@ function assembled(raw: Map<string, Column>, rest: Omit<History, Arrays>): Histo
       yaw: f4("kf_yaw"),
       stamp: read("kf_stamp", Float64Array),
       id: read("kf_id", BigInt64Array),
+      floor: i4("kf_floor"),
     },
     placed: { offset: i4("pl_offset"), keyframe: i4("pl_keyframe"), place: i4("pl_place") },
     founded: { offset: i4("pf_offset"), place: i4("pf_place"), founder: i4("pf_founder") },

@@ -9,6 +9,8 @@ export interface Keyframes {
   yaw: Float32Array;
   stamp: Float64Array;
   id: BigInt64Array;
+  /** An index of `floors`; -1 for none. */
+  floor: Int32Array;
 }
 
 export interface ObjectChanges {
@@ -59,6 +61,7 @@ export interface History {
   objectIds: string[];
   classes: string[];
   runIds: string[];
+  floors: string[];
   /** Commands, rejected payloads and losses; `events.ref` is an index of them. */
   system: SystemEvent[];
   refusals: { offset: number; a: number; b: number }[];

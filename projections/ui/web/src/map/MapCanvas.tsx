@@ -6,6 +6,7 @@ import { type D3ZoomEvent, type ZoomBehavior, zoom, zoomIdentity } from "d3-zoom
 import { useEffect, useRef } from "preact/hooks";
 import { select } from "../state/actions";
 import { shownBridge, shownLost } from "../state/overlays";
+import { walls } from "../state/walls";
 import { menu, tip } from "../state/pointer";
 import * as store from "../state/store";
 import { summary } from "../ui/summary";
@@ -134,7 +135,7 @@ function inputs(side: Side) {
   return [
     store.at, store.view, store.layers, store.selection, store.hovered, store.dark, store.log,
     side === "main" ? store.history : store.otherHistory,
-    store.panel, store.compareMode, store.compareWith, shownBridge, shownLost,
+    store.panel, store.compareMode, store.compareWith, shownBridge, shownLost, store.floor, store.types, walls,
   ];
 }
 
@@ -162,13 +163,12 @@ function keepZoomed(canvas: HTMLCanvasElement): () => void {
 
 function followPointer(canvas: HTMLCanvasElement, side: Side): () => void {
   const at = (event: MouseEvent): Picked | null => {
-    const history = side === "main" ? store.history.value : store.otherHistory.value;
-    const map = side === "main" ? store.map.value : store.otherMap.value;
+    const shown = side === "main" ? store.shown.value : store.otherShown.value;
     const view = store.view.value;
-    if (history === null || map === null || view === null) return null;
+    if (shown === null || view === null) return null;
     const regions = side === "main" ? store.regions.value : store.otherRegions.value;
     const box = canvas.getBoundingClientRect();
-    return pick(history, map, regions, view, event.clientX - box.left, event.clientY - box.top, store.layers.value.objects);
+    return pick(shown.history, shown.map, regions, view, event.clientX - box.left, event.clientY - box.top, store.layers.value.objects);
   };
   const move = (event: PointerEvent) => {
     if (event.buttons !== 0) return;

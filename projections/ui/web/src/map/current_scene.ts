@@ -1,6 +1,8 @@
 /** The scene of one of the two maps as things are now. */
 
 import { difference, shownBridge, shownLost } from "../state/overlays";
+import { differenceOn } from "../model/floors";
+import { walls } from "../state/walls";
 import * as store from "../state/store";
 import { DARK, LIGHT } from "./palette";
 import type { Scene } from "./scene";
@@ -9,23 +11,25 @@ export type Side = "main" | "other";
 
 export function currentScene(side: Side, width: number, height: number): Scene | null {
   const main = side === "main";
-  const history = main ? store.history.value : store.otherHistory.value;
-  const map = main ? store.map.value : store.otherMap.value;
+  const shown = main ? store.shown.value : store.otherShown.value;
   const view = store.view.value;
-  if (history === null || map === null || view === null) return null;
+  if (shown === null || view === null) return null;
+  const { history } = shown;
+  const floor = store.shownFloor.value;
+  const compared = main ? difference.value : null;
   return {
-    history,
-    map,
+    ...shown,
     regions: main ? store.regions.value : store.otherRegions.value,
     view,
     palette: store.dark.value ? DARK : LIGHT,
     width,
     height,
     layers: store.layers.value,
-    walls: store.log.value?.walls ?? [],
+    walls: walls.value,
+    types: main ? store.types.value : new Map(),
     selection: store.selection.value,
     hovered: store.hovered.value,
-    difference: main ? difference.value : null,
+    difference: compared === null ? null : { ...compared, difference: differenceOn(history, compared.difference, floor) },
     bridge: main ? shownBridge.value : null,
     lost: main ? shownLost.value : null,
     dots: null,

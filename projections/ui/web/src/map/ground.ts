@@ -1,5 +1,6 @@
 /** The lower layers of the map: the grid of metres, regions of places, walls. */
 
+import { outlinesOf } from "../model/walls";
 import { isPlaceLit } from "./lit";
 import { placeColour, withAlpha } from "./palette";
 import type { Scene } from "./scene";
@@ -57,13 +58,13 @@ export function drawRegions(on: Surface, scene: Scene) {
 export function drawWalls(on: Surface, scene: Scene) {
   const { view, palette, walls } = scene;
   on.beginPath();
-  for (const [x0, y0, x1, y1] of walls) {
-    on.moveTo(screenX(view, x0), screenY(view, y0));
-    on.lineTo(screenX(view, x1), screenY(view, y1));
+  for (const outline of outlinesOf(walls)) {
+    on.moveTo(screenX(view, outline[0]), screenY(view, outline[1]));
+    for (let i = 2; i < outline.length; i += 2) on.lineTo(screenX(view, outline[i]), screenY(view, outline[i + 1]));
+    on.closePath();
   }
-  on.strokeStyle = palette.wall;
-  on.lineWidth = Math.max(1.2, Math.min(4, view.k * 0.06));
-  on.lineCap = "square";
+  on.fillStyle = on.strokeStyle = palette.wall;
+  on.fill("evenodd");
+  on.lineWidth = 1; // so that thin walls are seen from afar
   on.stroke();
-  on.lineCap = "butt";
 }

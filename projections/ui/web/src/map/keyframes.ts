@@ -87,8 +87,8 @@ function ring(on: Surface, scene: Scene, keyframe: number, selected: boolean) {
 export function drawRobot(on: Surface, scene: Scene) {
   const { x, y, yaw } = scene.history.keyframes;
   let last = scene.map.keyframeCount - 1;
-  while (last >= 0 && Number.isNaN(x[last])) last--;
-  if (last < 0) return;
+  while (last >= 0 && Number.isNaN(yaw[last])) last--;
+  if (last < 0 || Number.isNaN(x[last])) return; // it is on another floor
   drawArrow(on, screenX(scene.view, x[last]), screenY(scene.view, y[last]), yaw[last], 11, scene.palette.ink, scene.palette.ground);
 }
 

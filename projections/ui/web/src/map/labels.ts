@@ -3,6 +3,7 @@
  * around its anchor; one for which there is none is left out.
  */
 
+import { floorOfPlace } from "../model/floors";
 import { isolated, label, objectClass, placeTitle } from "../model/names";
 import { isPlaceLit, litObject } from "./lit";
 import { placeColour, withAlpha } from "./palette";
@@ -45,14 +46,16 @@ export function drawLabels(on: Surface, scene: Scene) {
 }
 
 /** Where an answer is drawn that labels must not cover. */
-function reserved({ bridge, lost, difference, view }: Scene): Box[] {
+function reserved({ bridge, lost, difference, view, dots, width, height }: Scene): Box[] {
   const spots = [
     ...(bridge?.chains.flatMap((chain) => chain.points) ?? []),
     ...(lost === null ? [] : [lost.pose, lost.truth, ...lost.evidence]),
   ];
   const gone = difference === null ? [] : goneAt(difference).map(([x, y]) => ({ x: screenX(view, x) - 55, y: screenY(view, y) + 13, width: 110, height: 18 }));
   const marked = spots.flatMap((spot) => (spot === null ? [] : [{ x: screenX(view, spot.x) - 12, y: screenY(view, spot.y) - 24, width: 24, height: 48 }]));
-  return [...marked, ...gone];
+  // On the screen, not in a picture: the counts at the top left, the buttons at the bottom right.
+  const covered = dots === null ? [] : [{ x: 0, y: 0, width: 380, height: 64 }, { x: width - 50, y: height - 110, width: 50, height: 110 }];
+  return [...marked, ...gone, ...covered];
 }
 
 /** The middles, in metres, of places that a difference says are gone. */
@@ -70,7 +73,7 @@ function placeLabels(scene: Scene): Wanted[] {
     y: screenY(view, map.y[place]),
     away: 0,
     text: isolated(label(placeTitle(history, map, place))),
-    second: String(map.size[place]),
+    second: [map.size[place], map.name[place] === null && scene.types.get(history.placeIds[place])?.type].filter(Boolean).join(" · "),
     font: PLACE_FONT,
     colour: palette.ink,
     chip: placeColour(palette, history, place),
@@ -79,13 +82,13 @@ function placeLabels(scene: Scene): Wanted[] {
 }
 
 function edgeLabels(scene: Scene): Wanted[] {
-  const { map, view, palette } = scene;
+  const { history, map, view, palette } = scene;
   if (!scene.layers.edges) return [];
   return map.edges.map(({ a, b, count }) => ({
     x: screenX(view, (map.x[a] + map.x[b]) / 2),
     y: screenY(view, (map.y[a] + map.y[b]) / 2),
     away: 0,
-    text: `${count}×`,
+    text: floorOfPlace(history, a) === floorOfPlace(history, b) ? `${count}×` : `${count}× between floors`,
     font: SMALL_FONT,
     colour: palette.dim,
   }));

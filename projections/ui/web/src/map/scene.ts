@@ -1,8 +1,10 @@
 /** All that a picture of a map is made of. */
 
+import type { PlaceType } from "../api/types";
 import type { History } from "../history/types";
 import type { MapDifference } from "../model/compare";
 import type { MapState } from "../model/map_at";
+import type { Segment } from "../model/walls";
 import type { Regions } from "../model/regions";
 import type { LayerName, Thing } from "../state/store";
 import type { Palette } from "./palette";
@@ -34,7 +36,9 @@ export interface Scene {
   width: number;
   height: number;
   layers: Record<LayerName, boolean>;
-  walls: readonly (readonly [number, number, number, number])[];
+  walls: readonly Segment[];
+  /** By id of a place; empty until the server has told them for this W. */
+  types: ReadonlyMap<string, PlaceType>;
   selection: Thing | null;
   hovered: Thing | null;
   difference: { before: MapState; difference: MapDifference } | null;

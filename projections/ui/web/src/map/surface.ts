@@ -17,7 +17,7 @@ export interface Surface {
   arc(x: number, y: number, radius: number, from: number, to: number): void;
   ellipse(x: number, y: number, rx: number, ry: number, turn: number, from: number, to: number): void;
   rect(x: number, y: number, width: number, height: number): void;
-  fill(): void;
+  fill(rule?: CanvasFillRule): void;
   stroke(): void;
   fillText(text: string, x: number, y: number): void;
   strokeText(text: string, x: number, y: number): void;
@@ -75,8 +75,8 @@ export class SvgSurface implements Surface {
   rect(x: number, y: number, width: number, height: number) {
     this.path += `M${short(x)} ${short(y)}h${short(width)}v${short(height)}h${short(-width)}Z`;
   }
-  fill() {
-    this.add(`<path d="${this.path}" fill="${escaped(String(this.fillStyle))}" fill-rule="nonzero"${this.alpha()}/>`);
+  fill(rule: CanvasFillRule = "nonzero") {
+    this.add(`<path d="${this.path}" fill="${escaped(String(this.fillStyle))}" fill-rule="${rule}"${this.alpha()}/>`);
   }
   stroke() {
     const dash = this.dash.length > 0 ? ` stroke-dasharray="${this.dash.join(" ")}"` : "";

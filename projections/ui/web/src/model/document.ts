@@ -1,14 +1,16 @@
 /** The map at W as JSON. */
 
+import type { PlaceType } from "../api/types";
+import { floorOfPlace } from "./floors";
 import type { History } from "../history/types";
 import { placeNow } from "./compare";
 import type { MapState } from "./map_at";
 import { keyframeId } from "./names";
 
-export function stateDocument(history: History, map: MapState) {
+export function stateDocument(history: History, map: MapState, types: ReadonlyMap<string, PlaceType>) {
   const place = (number: number) => (number < 0 ? null : history.placeIds[number]);
   const [ox, oy] = history.origin;
-  const { keyframes, changes } = history;
+  const { keyframes, changes, floors } = history;
   return {
     at: map.at,
     known_at: history.knownAt,
@@ -17,6 +19,8 @@ export function stateDocument(history: History, map: MapState) {
       place_id: history.placeIds[each],
       name: map.name[each],
       keyframes: map.size[each],
+      ...(floors.length > 0 && { floor: floors[floorOfPlace(history, each)] ?? null }),
+      ...typeOf(types.get(history.placeIds[each])),
       centroid_x: map.x[each] + ox,
       centroid_y: map.y[each] + oy,
     })),
@@ -40,4 +44,8 @@ export function stateDocument(history: History, map: MapState) {
     })),
     adjacency: map.edges.map(({ a, b, count }) => ({ a: history.placeIds[a], b: history.placeIds[b], shared_transitions: count })),
   };
+}
+
+function typeOf(found: PlaceType | undefined) {
+  return found === undefined ? {} : { type: found.type, type_probability: found.probability };
 }

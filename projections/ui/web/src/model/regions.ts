@@ -94,7 +94,7 @@ function nearest(history: History, map: MapState, grid: Grid) {
   const squares = new Float32Array(columns * rows).fill((far / step) ** 2);
   for (let each = 0; each < map.keyframeCount; each++) {
     const place = map.placeOf[each];
-    if (place === NONE) continue;
+    if (place === NONE || Number.isNaN(xs[each])) continue;
     const x = (xs[each] - x0) / step;
     const y = (ys[each] - y0) / step;
     const column = Math.round(x);

@@ -62,7 +62,7 @@ function objects(history: History, map: MapState, wanted: string): Hit[] {
     const id = history.objectIds[object];
     if (!kind.toLowerCase().includes(wanted) && !id.toLowerCase().includes(wanted)) continue;
     const absorbed = map.objectStandsAs[object] >= 0 && map.objectStandsAs[object] !== object;
-    const more = row >= 0 ? `${id}, seen ${counted(history.changes.count[row], "time")}` : `${id}, ${absorbed ? "part of another object" : "not yet found"}`;
+    const more = row >= 0 ? `seen ${counted(history.changes.count[row], "time")}, ${id}` : `${id}, ${absorbed ? "part of another object" : "not yet found"}`;
     hits.push({
       thing: { kind: "object", id },
       title: kind,

@@ -6,9 +6,11 @@ import { DARK, LIGHT } from "../map/palette";
 import { paint } from "../map/paint";
 import type { Bridge, Scene } from "../map/scene";
 import { fitted } from "../map/view";
-import { type MapState, mapAt } from "../model/map_at";
+import { type Shown, onFloor } from "../model/floors";
+import { mapAt } from "../model/map_at";
 import { keyframeId } from "../model/names";
 import { gridOf, regionsOf } from "../model/regions";
+import { walls } from "../state/walls";
 import * as store from "../state/store";
 import { ThingLink } from "./Told";
 
@@ -63,9 +65,10 @@ export function BridgeView({ merge, history }: { merge: MergeStory; history: His
             , <ThingLink thing={{ kind: "place", id: side.place_id }} /> had {side.keyframes}
           </span>
         ))}{" "}
-        keyframes; <ThingLink thing={{ kind: "keyframe", id: keyframeId(history, merge.bridge) }} /> linked them.
-        {merge.eps_m !== null && ` A circle is ε = ${merge.eps_m} m; a point with ${merge.min_samples} neighbours in it, itself among them, is a core point (ringed).`} Blue points
-        became core points by this event; the thick line is the chain that links the places.
+        keyframes; <ThingLink thing={{ kind: "keyframe", id: keyframeId(history, merge.bridge) }} /> linked them.{" "}
+        {merge.eps_m === null
+          ? "The thick line joins the nearest of their keyframes."
+          : `A circle is ε = ${merge.eps_m} m; a point with ${merge.min_samples} neighbours in it, itself among them, is a core point (ringed). Blue points became core points by this event; the thick line is the chain that links the places.`}
       </figcaption>
     </figure>
   );
@@ -84,7 +87,7 @@ function MiniMap({ history, merge, at, title }: { history: History; merge: Merge
     canvas.height = height * ratio;
     const on = canvas.getContext("2d") as CanvasRenderingContext2D;
     on.setTransform(ratio, 0, 0, ratio, 0, 0);
-    const scene = miniScene(history, mapAt(history, at), merge, width, height, dark);
+    const scene = miniScene(onFloor({ history, map: mapAt(history, at) }, store.shownFloor.peek()), merge, width, height, dark);
     on.fillStyle = scene.palette.ground;
     on.fillRect(0, 0, width, height);
     paint(on, scene);
@@ -97,7 +100,7 @@ function MiniMap({ history, merge, at, title }: { history: History; merge: Merge
   );
 }
 
-function miniScene(history: History, map: MapState, merge: MergeStory, width: number, height: number, dark: boolean): Scene {
+function miniScene({ history, map }: Shown, merge: MergeStory, width: number, height: number, dark: boolean): Scene {
   const bridge = bridgeOf(history, [merge]);
   const points = bridge.chains.flatMap((chain) => chain.points);
   const around = bridge.epsM + AROUND_M;
@@ -118,7 +121,8 @@ function miniScene(history: History, map: MapState, merge: MergeStory, width: nu
     width,
     height,
     layers: { regions: true, path: true, keyframes: true, objects: false, ellipses: false, edges: false, walls: true, labels: true },
-    walls: store.log.peek()?.walls ?? [],
+    walls: walls.peek(),
+    types: store.types.peek(),
     selection: null,
     hovered: null,
     difference: null,

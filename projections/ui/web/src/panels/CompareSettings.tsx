@@ -39,6 +39,8 @@ export function CompareSettings() {
   const eps = store.otherEps.value ?? own?.["eps_m"] ?? 1;
   const neighbours = store.otherMinSamples.value ?? own?.["min_samples"] ?? 3;
   const through = store.history.value?.through ?? 0;
+  const byRooms = store.log.value?.places_rule === "rooms";
+  const trial = { eps_m: eps, min_samples: neighbours, set: byRooms ? "places=page" : null };
   const chosen = store.otherEps.value !== null || store.otherMinSamples.value !== null;
 
   useEffect(() => {
@@ -50,7 +52,7 @@ export function CompareSettings() {
     const timer = window.setTimeout(() => {
       const start = performance.now();
       setFolding(true);
-      getBinary(address("/api/history", { eps_m: eps, min_samples: neighbours }), abort.signal)
+      getBinary(address("/api/history", { ...trial, known_at: store.shownKnownAt.value }), abort.signal)
         .then((answer) => {
           const history = decodeHistory(answer);
           batch(() => {
@@ -70,7 +72,7 @@ export function CompareSettings() {
       clearTimeout(timer);
       abort.abort();
     };
-  }, [eps, neighbours, chosen, through]);
+  }, [eps, neighbours, chosen, through, store.shownKnownAt.value]);
   useEffect(() => () => {
     store.otherHistory.value = null;
   }, []);
@@ -78,12 +80,13 @@ export function CompareSettings() {
   const other = store.otherHistory.value;
   const folded = other?.settings as Record<string, number> | undefined;
   const current = folded !== undefined && folded["eps_m"] === eps && folded["min_samples"] === neighbours;
-  const path = current && chosen ? address("/api/whatif", { eps_m: eps, min_samples: neighbours }) : null;
+  const path = current && chosen ? address("/api/whatif", { ...trial, known_at: store.shownKnownAt.value }) : null;
   const asked = useAnswer<WhatIfAnswer>(path, through);
   return (
     <>
       <Slider name="ε, metres" value={eps} own={own?.["eps_m"]} least={0.1} most={Math.max(3, (own?.["eps_m"] ?? 1) * 2)} step={0.05} onChange={(value) => (store.otherEps.value = value)} />
       <Slider name="Neighbours of a core point" value={neighbours} own={own?.["min_samples"]} least={1} most={Math.max(30, (own?.["min_samples"] ?? 3) * 2)} step={1} onChange={(value) => (store.otherMinSamples.value = value)} />
+      {byRooms && <p class="note">This log’s places are by rooms. With ε and neighbours they are by density (places=page).</p>}
       {!chosen && <p class="dim">Move a slider: the log is folded again under the other settings, and both maps are shown side by side with one view and one timeline.</p>}
       {chosen && (
         <p class="summary" role="status">

@@ -3,7 +3,7 @@
 import { signal } from "@preact/signals";
 import { useEffect, useState } from "preact/hooks";
 import { address, getJson, postJson } from "../api/client";
-import { findKeyframe, findPlace, keyframeId, label } from "../model/names";
+import { findKeyframe, findPlace, isolated, keyframeId, label } from "../model/names";
 import { goTo } from "../state/actions";
 import { sentence } from "../state/loading";
 import { lostOverlay } from "../state/overlays";
@@ -28,6 +28,7 @@ interface QuestionAnswer {
   question: unknown;
   truth: [number, number, number] | null;
   ask_at: number;
+  number: number;
 }
 
 export function Lost() {
@@ -43,7 +44,7 @@ export function Lost() {
   }, [store.selection.value?.id]);
   useEffect(() => {
     lostOverlay.value = answer.value === null || history === null ? null : overlayOf(answer.value, truth.value, history);
-  }, [answer.value, history, store.at.value]);
+  }, [answer.value, history, store.at.value, store.shownFloor.value]);
   useEffect(() => () => {
     lostOverlay.value = null;
   }, []);
@@ -58,6 +59,7 @@ export function Lost() {
       const found = await postJson<LostAnswer>(address("/api/relocalize", { at: store.at.value }), asked);
       if (turn !== newest) return;
       answer.value = found;
+      if (store.shownFloor.value !== null && found.pose !== null) store.floor.value = history.floors.indexOf(found.pose.floor ?? "");
     } catch (error) {
       if (turn !== newest) return;
       answer.value = null;
@@ -70,7 +72,7 @@ export function Lost() {
     question.value = null;
     return ask(async () => {
       const found = await getJson<QuestionAnswer>(address("/api/question", { keyframe: keyframe.value, known_at: history.knownAt }));
-      truth.value = found.truth === null ? null : { x: found.truth[0], y: found.truth[1], yaw: found.truth[2] };
+      truth.value = found.truth === null ? null : { x: found.truth[0], y: found.truth[1], yaw: found.truth[2], floor: history.keyframes.floor[found.number] };
       if (before.value) goTo(found.ask_at);
       return found.question;
     });
@@ -151,7 +153,7 @@ function Answer({ answer: found }: { answer: LostAnswer }) {
           : unknown
             ? `Unknown: the confidence ${confidence.toFixed(2)} is too low. The likeliest places would be:`
             : `Confidence ${confidence.toFixed(2)}.`}
-        {pose !== null && ` Pose (${pose.x.toFixed(2)}, ${pose.y.toFixed(2)}) m${pose.yaw === null ? "" : `, facing ${Math.round((pose.yaw * 180) / Math.PI)}°`}, spread ${pose.spread_m.toFixed(2)} m.`}
+        {pose !== null && ` Pose (${pose.x.toFixed(2)}, ${pose.y.toFixed(2)}) m${pose.floor === undefined ? "" : ` on floor ${isolated(label(pose.floor))}`}${pose.yaw === null ? "" : `, facing ${Math.round((pose.yaw * 180) / Math.PI)}°`}, spread ${pose.spread_m.toFixed(2)} m.`}
         {truth.value !== null && pose !== null && ` The true pose is ${Math.hypot(truth.value.x - pose.x, truth.value.y - pose.y).toFixed(2)} m away.`}
       </p>
       <ol class="ranked">

@@ -1,7 +1,8 @@
 /** Every merge of the log and the places of the map now: where a person begins. */
 
 import type { History } from "../history/types";
-import { counted, label, placeTitle, shortPlace } from "../model/names";
+import { floorName, floorOfPlace, floorsOf } from "../model/floors";
+import { counted, isolated, label, placeTitle, shortPlace } from "../model/names";
 import { keyframeId } from "../model/names";
 import * as store from "../state/store";
 import { Moment, ThingLink } from "./Told";
@@ -12,6 +13,7 @@ export function Overview({ history }: { history: History }) {
   const map = store.restedMap.value;
   if (map === null) return null;
   const { offset, survivor, absorbed, keyframe } = history.merges;
+  const floors = floorsOf(history);
   const places = [...map.places].sort((a, b) => map.size[b] - map.size[a]);
   return (
     <section class="story">
@@ -42,7 +44,7 @@ export function Overview({ history }: { history: History }) {
           {places.slice(0, MOST).map((place) => (
             <li key={place}>
               <ThingLink thing={{ kind: "place", id: history.placeIds[place] }}>{label(placeTitle(history, map, place), 40)}</ThingLink>
-              <span class="dim">{counted(map.size[place], "keyframe")}</span>
+              <span class="dim">{[store.types.value.get(history.placeIds[place])?.type, floors.length > 1 && `floor ${isolated(label(floorName(history, floorOfPlace(history, place))))}`, counted(map.size[place], "keyframe")].filter(Boolean).join(", ")}</span>
             </li>
           ))}
         </ol>

@@ -2,11 +2,12 @@
 
 import { useEffect } from "preact/hooks";
 import { address } from "../api/client";
-import type { Step } from "../api/types";
+import type { PlaceType, Step } from "../api/types";
 import type { History } from "../history/types";
 import type { MapState } from "../model/map_at";
+import { floorName, floorOfObject, floorOfPlace, floorsOf } from "../model/floors";
 import { placeNow } from "../model/compare";
-import { counted, findKeyframe, findObject, findPlace, label, objectClass, placeTitle } from "../model/names";
+import { counted, findKeyframe, findObject, findPlace, isolated, label, objectClass, placeTitle } from "../model/names";
 import { openPanel, select } from "../state/actions";
 import { useAnswer } from "../state/answers";
 import { bridge } from "../state/overlays";
@@ -46,7 +47,7 @@ function momentOf(thing: store.Thing, history: History): number {
 
 function Story({ thing, history }: { thing: store.Thing; history: History }) {
   const at = momentOf(thing, history);
-  const path = address("/api/why", { what: `${thing.kind}:${thing.id}`, at, known_at: history.knownAt });
+  const path = address("/api/why", { what: `${thing.kind}:${thing.id}`, at, known_at: store.knownAt(at) });
   const asked = useAnswer<WhyAnswer>(path, history.state);
   const merges = thing.kind === "merge" ? asked.value?.merges : undefined;
   useEffect(() => {
@@ -138,11 +139,26 @@ function placeFacts(thing: store.Thing, history: History, map: MapState): Fact[]
   const inside = map.objects.filter((object) => placeNow(history, map, map.objectRow[object]) === place);
   const next = map.edges.filter(({ a, b }) => a === place || b === place);
   return [
+    ["type", typeText(store.types.value.get(thing.id))],
+    ...floorFact(history, floorOfPlace(history, place)),
     ["keyframes", map.size[place].toLocaleString("en")],
     ["centre", `(${map.x[place].toFixed(2)}, ${map.y[place].toFixed(2)}) m`],
     ["next to", next.length === 0 ? "nothing" : <ul class="chips">{next.map(({ a, b, count }) => <li key={`${a} ${b}`}>{placeLink(history, map, a === place ? b : a)} <span class="dim">{count}×</span></li>)}</ul>],
     ["objects", inside.length === 0 ? "none" : <ul class="chips">{inside.slice(0, 60).map((object) => <li key={object}><ThingLink thing={{ kind: "object", id: history.objectIds[object] }}>{label(objectClass(history, map, object), 20)}</ThingLink></li>)}{inside.length > 60 && <li class="dim">and {inside.length - 60} more</li>}</ul>],
   ];
+}
+
+/** What kind of room it is; the likeliest ones where that is unsure. */
+function typeText(found: PlaceType | undefined): string {
+  if (found === undefined) return store.toldNow.value === null ? "…" : "nothing tells";
+  const percent = (share: number) => `${Math.round(share * 100)} %`;
+  if (found.type !== null) return `${found.type} ${percent(found.probability)}`;
+  return `unsure: ${found.candidates.map(([type, share]) => `${type} ${percent(share)}`).join(", ")}`;
+}
+
+function floorFact(history: History, floor: number): Fact[] {
+  const floors = floorsOf(history);
+  return floors.length < 2 ? [] : [["floor", `${isolated(label(floorName(history, floor)))}, of ${floors.length} of the building`]];
 }
 
 function objectFacts(thing: store.Thing, history: History, map: MapState): Fact[] {
@@ -157,6 +173,7 @@ function objectFacts(thing: store.Thing, history: History, map: MapState): Fact[
     ["seen", `${counted(count[row], "time")}${missing[row] ? ", missing now" : ""}`],
     ["at", `(${x[row].toFixed(2)}, ${y[row].toFixed(2)}) m${Number.isNaN(xx[row]) ? "" : `, ± ${Math.sqrt(Math.max(xx[row], yy[row])).toFixed(2)} m`}`],
     ["in", placeLink(history, map, placeNow(history, map, row))],
+    ...floorFact(history, floorOfObject(history, object)),
   ];
 }
 
@@ -168,6 +185,7 @@ function keyframeFacts(thing: store.Thing, history: History, map: MapState): Fac
   return [
     ["pose", pose],
     ["in", placeLink(history, map, map.placeOf[keyframe])],
+    ...floorFact(history, history.keyframes.floor[keyframe]),
     ["ask", <button type="button" class="link" onClick={() => openPanel("lost")}>Where would a robot be that sees this?</button>],
   ];
 }

@@ -2,8 +2,9 @@
 
 import type { History } from "../history/types";
 import type { LostOverlay } from "../map/scene";
+import { floorOfObject } from "../model/floors";
 import { findObject, findPlace, isolated, label } from "../model/names";
-import { map } from "../state/store";
+import { map, shownFloor } from "../state/store";
 
 export interface LostAnswer {
   places: {
@@ -12,19 +13,22 @@ export interface LostAnswer {
     score: number;
     evidence: { similarity: number; class_name: string; object_id: string | null; det_id: string }[];
   }[];
-  pose: { x: number; y: number; yaw: number | null; spread_m: number } | null;
+  pose: { x: number; y: number; yaw: number | null; spread_m: number; floor?: string } | null;
   confidence: number;
   unknown: boolean;
   command?: string;
   seconds: number;
   /** The weighed poses: x, y, yaw and weight. */
   poses: [number, number, number | null, number][];
+  /** The floor of each of them, where floors have names. */
+  pose_floors?: (string | null)[];
 }
 
 export interface Truth {
   x: number;
   y: number;
   yaw: number | null;
+  floor: number;
 }
 
 /** Side of a cell of the heat map, metres. */
@@ -32,21 +36,24 @@ const CELL_M = 0.25;
 
 export function overlayOf(answer: LostAnswer, truth: Truth | null, history: History): LostOverlay {
   const shown = map.peek();
+  const floor = shownFloor.value;
+  const here = (number: number) => floor === null || number === floor;
+  const named = (name: string | null | undefined) => here(history.floors.indexOf(name ?? ""));
   const [ox, oy] = history.origin;
   const first = answer.places[0];
   const evidence = (first?.evidence ?? []).flatMap((each) => {
     const object = each.object_id === null ? -1 : findObject(history, each.object_id);
     const row = object < 0 || shown === null || shown.objectStandsAs[object] < 0 ? -1 : shown.objectRow[shown.objectStandsAs[object]];
-    if (row < 0) return [];
+    if (row < 0 || !here(floorOfObject(history, object))) return [];
     const text = `${isolated(label(each.class_name, 18))} ${each.similarity.toFixed(2)}`;
     const place = history.changes.place[row];
     const now = place < 0 || shown === null ? -1 : shown.standsAs[place];
     return [{ x: history.changes.x[row], y: history.changes.y[row], text, place: now }];
   });
   return {
-    cells: cellsOf(answer.poses, history),
-    pose: answer.pose === null || answer.pose === undefined ? null : { x: answer.pose.x - ox, y: answer.pose.y - oy, yaw: answer.pose.yaw, spread: answer.pose.spread_m },
-    truth: truth === null ? null : { ...truth, x: truth.x - ox, y: truth.y - oy },
+    cells: cellsOf(answer.poses.filter((_, each) => named(answer.pose_floors?.[each])), history),
+    pose: answer.pose === null || answer.pose === undefined || !named(answer.pose.floor) ? null : { x: answer.pose.x - ox, y: answer.pose.y - oy, yaw: answer.pose.yaw, spread: answer.pose.spread_m },
+    truth: truth === null || !here(truth.floor) ? null : { ...truth, x: truth.x - ox, y: truth.y - oy },
     evidence: unique(evidence),
     places: new Set(answer.places.slice(0, 1).map((place) => findPlace(history, place.place_id))),
   };

@@ -2,6 +2,7 @@
 
 import { batch } from "@preact/signals";
 import { findKeyframe, findObject, findPlace } from "../model/names";
+import { floorOfObject, floorOfPlace } from "../model/floors";
 import { rowsBefore } from "../model/map_at";
 import { neighbour, stepEvent } from "../model/moments";
 import * as store from "./store";
@@ -22,14 +23,14 @@ export function showEvent(offset: number) {
 }
 
 export function stepBy(kind: "event" | "change" | "merge", direction: 1 | -1): boolean {
-  const { history, moments, at } = store;
-  if (history.value === null || moments.value === null) return false;
+  const [history, moments, at] = [store.history.value, store.moments.value, store.at.value];
+  if (history === null || moments === null) return false;
   store.playing.value = false;
   const wanted =
     kind === "event"
-      ? stepEvent(history.value, at.value, direction)
-      : neighbour(kind === "merge" ? moments.value.merges : moments.value.changes, at.value, direction);
-  if (wanted === null || wanted === at.value) return false;
+      ? stepEvent(history, at, direction)
+      : neighbour(kind === "merge" ? moments.merges : moments.changes, at, direction);
+  if (wanted === null || wanted === at) return false;
   goTo(wanted);
   if (kind === "merge") select({ kind: "merge", id: String(wanted - 1) });
   return true;
@@ -38,6 +39,8 @@ export function stepBy(kind: "event" | "change" | "merge", direction: 1 | -1): b
 export function select(thing: store.Thing | null, open = false) {
   batch(() => {
     store.selection.value = thing;
+    const floor = thing === null ? null : floorOf(thing);
+    if (store.shownFloor.value !== null && floor !== null && floor !== store.shownFloor.value) store.floor.value = floor;
     if (open && thing !== null) store.panel.value = "why";
   });
 }
@@ -63,6 +66,19 @@ export function goLive(on: boolean) {
       store.at.value = store.history.value?.through ?? 0;
     }
   });
+}
+
+function floorOf({ kind, id }: store.Thing): number | null {
+  const history = store.history.value;
+  if (history === null) return null;
+  const { keyframes, merges } = history;
+  const floor = {
+    place: () => floorOfPlace(history, findPlace(history, id)),
+    object: () => floorOfObject(history, findObject(history, id)),
+    keyframe: () => keyframes.floor[findKeyframe(history, id)],
+    merge: () => keyframes.floor[merges.keyframe[merges.offset.indexOf(Number(id))]],
+  }[kind]();
+  return floor ?? null;
 }
 
 /** Where a thing is in the map now, metres; null where it is not. */

@@ -1,9 +1,11 @@
 /** Loads the log and its history, again when it grows; whatever goes wrong becomes a sentence. */
 
-import { batch, signal } from "@preact/signals";
+import { batch, effect, signal } from "@preact/signals";
 import { ApiError, LOST, address, getBinary, getJson, watchServer } from "../api/client";
 import type { LogInfo } from "../api/types";
 import { decodeHistory } from "../history/decode";
+import type { History } from "../history/types";
+import { tell } from "./pointer";
 import * as store from "./store";
 import { applyAddress } from "./url";
 
@@ -71,8 +73,10 @@ export async function grow() {
   }
   growing = true;
   try {
-    let next = decodeHistory(await getBinary(address("/api/history", { from: before.through })), before);
-    if (next.state !== before.state || next.through < before.through) next = decodeHistory(await getBinary("/api/history"));
+    const known_at = store.shownKnownAt.value;
+    let next = decodeHistory(await getBinary(address("/api/history", { from: before.through, known_at })), before);
+    if (next.state !== before.state || next.through < before.through) next = decodeHistory(await getBinary(address("/api/history", { known_at })));
+    kept.clear();
     const info = await getJson<LogInfo>("/api/log");
     batch(() => {
       store.history.value = next;
@@ -90,6 +94,36 @@ export async function grow() {
       void grow();
     }
   }
+}
+
+/** Histories under what was known at another time, by the offset of `wantedKnownAt`. */
+const kept = new Map<number | null, History>();
+const MOST_KEPT = 4;
+
+/** Shows the history that knows what is wanted; until it is there the one before stays. */
+export function keepKnown() {
+  effect(() => {
+    const wanted = store.wantedKnownAt.value;
+    const before = store.history.value;
+    if (before === null || wanted === store.shownKnownAt.value) return;
+    kept.set(store.shownKnownAt.peek(), before);
+    if (kept.size > MOST_KEPT) kept.delete([...kept.keys()][0]);
+    const show = (next: History) => {
+      if (store.wantedKnownAt.peek() !== wanted || next.through < (store.history.peek()?.through ?? 0)) return;
+      batch(() => {
+        store.history.value = next;
+        store.shownKnownAt.value = wanted;
+      });
+    };
+    const found = kept.get(wanted);
+    if (found !== undefined) queueMicrotask(() => show(found));
+    else {
+      getBinary(address("/api/history", { known_at: wanted })).then(
+        (answer) => show(decodeHistory(answer)),
+        (error: unknown) => tell(sentence(error)),
+      );
+    }
+  });
 }
 
 export function sentence(error: unknown): string {

@@ -9,13 +9,13 @@ const REST_MS = 200;
 export function keepPlaying() {
   let [frame, last, seconds, from] = [0, 0, 0, 0];
   const advance = (now: number) => {
-    const { history, moments, at, speed, playing } = store;
-    if (!playing.value || history.value === null || moments.value === null) return;
-    seconds += ((now - last) / 1000) * speed.value;
+    const [history, moments] = [store.history.value, store.moments.value];
+    if (!store.playing.value || history === null || moments === null) return;
+    seconds += ((now - last) / 1000) * store.speed.value;
     last = now;
-    const to = playedTo(history.value, moments.value, from, seconds);
-    if (to !== at.value) at.value = to;
-    if (to >= history.value.through) playing.value = false;
+    const to = playedTo(history, moments, from, seconds);
+    if (to !== store.at.value) store.at.value = to;
+    if (to >= history.through) store.playing.value = false;
     else frame = requestAnimationFrame(advance);
   };
   effect(() => {

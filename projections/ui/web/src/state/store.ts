@@ -1,8 +1,9 @@
 /** What the page shows, as signals. Panels and the canvas read them; actions.ts changes them. */
 
 import { computed, signal } from "@preact/signals";
-import type { LogInfo } from "../api/types";
+import type { LogInfo, PlaceType } from "../api/types";
 import type { History } from "../history/types";
+import { type Shown, firstFloor, floorsOf, onFloor } from "../model/floors";
 import { type MapState, mapAt } from "../model/map_at";
 import { type Moments, Stamps, momentsOf } from "../model/moments";
 import { type Bounds, type Grid, type Regions, boundsOf, gridOf, regionsOf } from "../model/regions";
@@ -32,6 +33,31 @@ export const refused = signal<string | null>(null);
 
 /** W: the map after the first `at` events. */
 export const at = signal(0);
+/** Which commands are in force: all of the log's, or those recorded before W. */
+export const known = signal<"now" | "then">("now");
+/** The commands before this offset are in force in `history`; null for all. */
+export const shownKnownAt = signal<number | null>(null);
+/** The same of the history that should be shown. */
+export const wantedKnownAt = computed<number | null>(() => {
+  const commands = (history.value?.system ?? []).filter(({ kind }) => kind === "correction");
+  const before = commands.filter(({ offset }) => offset < at.value);
+  if (known.value === "now" || before.length === commands.length) return null;
+  return (before[before.length - 1]?.offset ?? -1) + 1;
+});
+/** The `known_at` of a question about the map at some W. */
+export function knownAt(asked: number): number | null {
+  return known.value === "then" && asked === at.value ? null : (history.value?.knownAt ?? null);
+}
+
+/** What the server last told of one W: the types of places by id, and the digest. */
+export const told = signal<{ at: number; known_at: number; digest: string; types: PlaceType[] } | null>(null);
+/** What it told, if it was of the map that is shown. */
+export const toldNow = computed(() => {
+  const now = known.value === "then" ? at.value : history.value?.knownAt;
+  const fits = told.value?.at === at.value && told.value.known_at === now && wantedKnownAt.value === shownKnownAt.value;
+  return fits ? told.value : null;
+});
+export const types = computed<ReadonlyMap<string, PlaceType>>(() => new Map(toldNow.value?.types.map((each) => [each.place_id, each])));
 /** The command line that gives the map last asked about, and its W. */
 export const stateCommand = signal<{ at: number; command: string } | null>(null);
 /** W when dragging and playing have rested: what the server is asked about. */
@@ -82,6 +108,26 @@ export const restedMap = computed<MapState | null>(() =>
 export const otherMap = computed<MapState | null>(() =>
   otherHistory.value === null ? null : mapAt(otherHistory.value, at.value),
 );
+/** The floor that a person chose; null goes with the robot. */
+export const floor = signal<number | null>(null);
+/** The floor to show; null where there is only one. */
+export const shownFloor = computed<number | null>(() => {
+  const [all, now] = [history.value, map.value];
+  if (all === null || now === null || floorsOf(all).length < 2) return null;
+  if (floor.value !== null && floorsOf(all).includes(floor.value)) return floor.value;
+  const { floor: floors, yaw } = all.keyframes;
+  let last = now.keyframeCount - 1;
+  while (last >= 0 && Number.isNaN(yaw[last])) last--;
+  return last < 0 ? firstFloor(all) : floors[last];
+});
+
+function seen(from: History | null, state: MapState | null): Shown | null {
+  return from === null || state === null ? null : onFloor({ history: from, map: state }, shownFloor.value);
+}
+/** What the maps show: the part on the floor. */
+export const shown = computed(() => seen(history.value, map.value));
+export const otherShown = computed(() => seen(otherHistory.value, otherMap.value));
+
 export const moments = computed<Moments | null>(() => (history.value === null ? null : momentsOf(history.value)));
 export const stamps = computed<Stamps | null>(() => (history.value === null ? null : new Stamps(history.value)));
 export const bounds = computed<Bounds | null>(() => {
@@ -97,11 +143,11 @@ export const bounds = computed<Bounds | null>(() => {
 });
 const grid = computed<Grid | null>(() => (bounds.value === null ? null : gridOf(bounds.value)));
 
-function regionsIn(shown: History | null, state: MapState | null): Regions | null {
-  return shown === null || state === null || grid.value === null ? null : regionsOf(shown, state, grid.value);
+function regionsIn(part: Shown | null): Regions | null {
+  return part === null || grid.value === null ? null : regionsOf(part.history, part.map, grid.value);
 }
-export const regions = computed(() => regionsIn(history.value, map.value));
-export const otherRegions = computed(() => regionsIn(otherHistory.value, otherMap.value));
+export const regions = computed(() => regionsIn(shown.value));
+export const otherRegions = computed(() => regionsIn(otherShown.value));
 
 /** The map at the other moment of a comparison, while its panel is open. */
 export const comparedMap = computed<MapState | null>(() =>

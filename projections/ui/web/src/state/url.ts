@@ -23,6 +23,8 @@ export function readAddress(hash: string) {
     eps: number("eps_m"),
     minSamples: number("min_samples"),
     byTime: found.get("clock") === "time",
+    known: found.get("known") === "then" ? ("then" as const) : ("now" as const),
+    floor: found.get("floor"),
   };
 }
 
@@ -36,6 +38,9 @@ export function applyAddress(hash: string) {
     store.otherMinSamples.value = found.minSamples;
     if (found.eps !== null || found.minSamples !== null) store.compareMode.value = "settings";
     store.byTime.value = found.byTime;
+    store.known.value = found.known;
+    const floors = store.history.value?.floors ?? [];
+    store.floor.value = found.floor === null ? null : floors.indexOf(found.floor);
     const through = store.history.value?.through ?? 0;
     const at = found.at === null ? through : Math.max(0, Math.min(through, Math.round(found.at)));
     store.at.value = at;
@@ -59,6 +64,8 @@ export function writtenAddress(still = false): string {
     }
   }
   if (store.byTime.value) found.set("clock", "time");
+  if (store.known.value === "then") found.set("known", "then");
+  if (store.floor.value !== null) found.set("floor", store.history.value?.floors[store.floor.value] ?? "-");
   return `#${found.toString()}`;
 }
 

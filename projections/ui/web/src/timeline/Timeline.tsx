@@ -27,6 +27,7 @@ function Transport() {
   const history = store.history.value;
   const at = store.at.value;
   const stamps = store.stamps.value;
+  const corrected = history?.system.some(({ kind }) => kind === "correction");
   const jump = (kind: "event" | "change" | "merge", direction: 1 | -1, icon: IconName, says: string, key: string) => (
     <button class="icon" type="button" title={`${says} (${key})`} aria-label={says} onClick={() => stepBy(kind, direction)}>
       <Icon name={icon} />
@@ -63,6 +64,18 @@ function Transport() {
       </div>
       <MarkLegend />
       <span class="space" />
+      {corrected && <span class="dim known">as known</span>}
+      {corrected && (
+        <fieldset class="segments" title="then: under the corrections recorded before this moment; now: under all of them">
+          <legend class="hidden">Corrections in force</legend>
+          {(["then", "now"] as const).map((each) => (
+            <label key={each} class={store.known.value === each ? "on" : ""}>
+              <input type="radio" name="known" aria-label={`As known ${each}`} checked={store.known.value === each} onChange={() => (store.known.value = each)} />
+              {each}
+            </label>
+          ))}
+        </fieldset>
+      )}
       <fieldset class="segments">
         <legend class="hidden">Axis of the timeline</legend>
         {[false, true].map((time) => (

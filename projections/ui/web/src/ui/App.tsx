@@ -64,8 +64,9 @@ function settingsOf(side: "main" | "other"): string {
   const history = side === "main" ? store.history.value : store.otherHistory.value;
   const map = side === "main" ? store.map.value : store.otherMap.value;
   if (history === null || map === null) return "";
-  const { eps_m, min_samples } = history.settings as Record<string, number>;
-  return `${side === "main" ? "as recorded" : "what if"}: ε ${eps_m} m, ${min_samples} neighbours: ${counted(map.places.length, "place")}`;
+  const { eps_m, min_samples } = history.settings;
+  const settings = side === "main" ? store.log.value?.places_text : `ε ${eps_m} m, min_samples ${min_samples}`;
+  return `${side === "main" ? "as recorded" : "what if"}: ${counted(map.places.length, "place")}, ${settings}`;
 }
 
 /** What is wrong with the log or the server, in sentences. */

@@ -2,21 +2,23 @@
 
 import { useEffect } from "preact/hooks";
 import { address } from "../api/client";
-import { counted } from "../model/names";
+import type { History } from "../history/types";
+import { floorName, floorsOf } from "../model/floors";
+import { counted, isolated, label } from "../model/names";
 import { useAnswer } from "../state/answers";
 import * as store from "../state/store";
 
 export function Digest() {
   const [map, history] = [store.map.value, store.history.value];
   const at = store.restedAt.value;
-  const path = history === null || at > history.through ? null : address("/api/digest", { at, known_at: history.knownAt });
-  const asked = useAnswer<{ at: number; digest: string; command: string }>(path);
+  const path = history === null || at > history.through ? null : address("/api/digest", { at, known_at: store.knownAt(at) });
+  const asked = useAnswer<NonNullable<typeof store.told.value> & { command: string }>(path);
   useEffect(() => {
-    const found = asked.value;
+    const found = (store.told.value = asked.value);
     store.stateCommand.value = found === null ? null : { at: found.at, command: found.command.replace(/ --digest\b/, "") };
   }, [asked.value]);
   if (map === null || history === null) return null;
-  const current = asked.value !== null && asked.value.at === store.at.value;
+  const digest = store.toldNow.value?.digest ?? "";
   return (
     <div class="facts">
       <p>
@@ -25,9 +27,28 @@ export function Digest() {
         <span>{counted(map.objects.length, "object")}</span>
         {map.noise > 0 && <span>{map.noise.toLocaleString("en")} in no place</span>}
       </p>
-      <p class="digest" title={asked.value?.digest ?? ""}>
-        digest <code data-digest={current ? asked.value?.digest : ""}>{current ? asked.value?.digest.slice(0, 16) : "…"}</code>
+      <p class="digest" title={digest}>
+        digest <code data-digest={digest}>{digest.slice(0, 16) || "…"}</code>
       </p>
+      <FloorChoice history={history} />
     </div>
+  );
+}
+
+/** Which floor the map shows, where there are several. */
+function FloorChoice({ history }: { history: History }) {
+  const shown = store.shownFloor.value;
+  if (shown === null) return null;
+  const name = (floor: number) => isolated(label(floorName(history, floor)));
+  return (
+    <label class="floor">
+      floor
+      <select value={store.floor.value === null ? "" : String(shown)} onChange={({ currentTarget: { value } }) => (store.floor.value = value === "" ? null : Number(value))}>
+        <option value="">{store.floor.value === null ? `${name(shown)}, the robot’s` : "the robot’s"}</option>
+        {floorsOf(history).map((each) => (
+          <option key={each} value={String(each)}>{name(each)}</option>
+        ))}
+      </select>
+    </label>
   );
 }

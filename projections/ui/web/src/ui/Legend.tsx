@@ -9,9 +9,9 @@ import { KIND_NAMES, drawMark } from "../timeline/marks";
 
 const LAYERS: [store.LayerName, string, preact.JSX.Element][] = [
   ["regions", "place, keyframes in it", <rect x="2" y="4" width="16" height="10" rx="4" class="sign-region" />],
-  ["keyframes", "keyframe, hollow: no place", <><circle cx="6" cy="9" r="3.4" class="sign-dot" /><circle cx="15" cy="9" r="3" class="sign-hollow" /></>],
+  ["keyframes", "keyframe / in no place", <><circle cx="6" cy="9" r="3.4" class="sign-dot" /><circle cx="15" cy="9" r="3" class="sign-hollow" /></>],
   ["path", "drive", <><path d="M2 13 Q7 3 12 8" class="sign-line" /><path d="M18 8 11 4.6 12.6 8 11 11.4z" class="sign-fill" /></>],
-  ["objects", "object, hollow: missing", <><path d="M6 5l4 4-4 4-4-4z" class="sign-fill" /><path d="M15 5l4 4-4 4-4-4z" class="sign-missing" /></>],
+  ["objects", "object / missing", <><path d="M6 5l4 4-4 4-4-4z" class="sign-fill" /><path d="M15 5l4 4-4 4-4-4z" class="sign-missing" /></>],
   ["ellipses", "95 % area", <ellipse cx="10" cy="9" rx="8" ry="4.5" class="sign-hollow" />],
   ["edges", "drives between", <path d="M1 9H19" class="sign-dashed" />],
   ["walls", "wall", <path d="M2 14V5H18" class="sign-wall" />],

@@ -113,7 +113,7 @@ async function askServer(value: string) {
   const [history, map] = [store.history.value, store.map.value];
   if (history === null || map === null) return;
   try {
-    const answer = await getJson<{ found: ServerHit[] }>(address("/api/search", { q: value, kind: "detection" }));
+    const answer = await getJson<{ found: ServerHit[] }>(address("/api/search", { q: value, kind: "detection", known_at: history.knownAt }));
     if (text.value !== value) return;
     const more = answer.found.map(({ id, number, text: says, offset }): Hit => ({
       thing: { kind: "keyframe", id: keyframeId(history, number) },

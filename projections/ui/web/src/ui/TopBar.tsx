@@ -45,16 +45,13 @@ export function toggleTheme() {
 function SettingsNote() {
   const log = store.log.value;
   if (log === null) return null;
-  const { eps_m, min_samples } = log.settings as Record<string, number>;
   const runs = log.runs.map((run) => run.run_id);
   const title = Object.entries(log.changed_settings ?? {})
     .map(([name, value]) => `${name}=${String(value)}`)
     .join("\n");
   return (
     <p class="settings" title={title === "" ? "default settings" : title}>
-      <span>
-        ε {eps_m} m, {min_samples} neighbours
-      </span>
+      <span>{log.places_text}</span>
       {log.fusion !== "page" && <span>fusion: {log.fusion}</span>}
       <span class="runs">{runs.length === 1 ? <bdi>{isolated(label(runs[0], 24))}</bdi> : counted(runs.length, "run")}</span>
     </p>
