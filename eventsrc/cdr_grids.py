@@ -107,4 +107,4 @@ class _Fields:
             )
 
 
-_NOT_ONE: Final = "no nav_msgs/OccupancyGrid in CDR"
+_NOT_ONE: Final = "neither JSON nor nav_msgs/OccupancyGrid in CDR"

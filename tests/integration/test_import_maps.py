@@ -155,7 +155,10 @@ def test_grids_in_cdr_of_an_mcap_file_become_maps(run: Commands) -> None:
             writer.add_message(channel, 70 + number, content, 70)
         writer.finish()
     said = run("import", "L", "bag.mcap", code=3)
-    assert "rejected: no nav_msgs/OccupancyGrid in CDR: data would end at byte" in said.err
+    assert (
+        "rejected: neither JSON nor nav_msgs/OccupancyGrid in CDR: data would end at byte"
+        in said.err
+    )
     assert "2 maps" in said.err
     assert "1 message of other encodings passed over" in said.err
     events = read_log(run.folder / "L")

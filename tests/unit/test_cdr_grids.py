@@ -101,7 +101,7 @@ def test_cdr_and_json_give_one_map(
 def test_a_message_that_ends_too_soon_is_refused_with_the_field(message: bytes) -> None:
     for length in range(2, len(message)):
         reason = _refused(message[:length])
-        assert reason.startswith("no nav_msgs/OccupancyGrid in CDR: ")
+        assert reason.startswith("neither JSON nor nav_msgs/OccupancyGrid in CDR: ")
         assert f"of {max(length, 4)}" in reason or length < 4
     assert "header.stamp would end at byte 12 of 6" in _refused(message[:6])
     assert "the length of header.frame_id would end at byte 16 of 14" in _refused(message[:14])
@@ -122,7 +122,7 @@ def test_changed_bytes_give_a_map_or_a_reason(data: st.DataObject) -> None:
 
 
 def test_other_messages_are_refused() -> None:
-    assert _refused(TEXT).startswith("no nav_msgs/OccupancyGrid in CDR: ")
+    assert _refused(TEXT).startswith("neither JSON nor nav_msgs/OccupancyGrid in CDR: ")
     assert _refused(SCAN)
     assert _refused(bytes(200)).startswith("it has 0 × 0 cells; a side has 1 to 10,000")
     assert _refused(b"\0\1").endswith("header.stamp would end at byte 12 of 4")
