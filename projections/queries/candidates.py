@@ -85,7 +85,7 @@ class CandidateSearch:
         looked = [number for number, crop in enumerate(crops) if crop.vector is not None]
         named = [number for number, crop in enumerate(crops) if crop.vector is None]
         near: _Rows = []
-        along = _Along.of(())
+        along = _Along({}, {}, {})
         if looked or not named:
             near, along = self._nearest([crops[number] for number in looked], neighbours)
             if named:
@@ -101,10 +101,10 @@ class CandidateSearch:
     def _nearest(self, crops: Sequence[Crop], neighbours: int) -> "tuple[_Rows, _Along]":
         """Rows of crop, similarity, det_pk and what follows in ``near``; and what is along them."""
         one = self._vectors is self._graph
-        values: dict[str, Any] = {"neighbours": neighbours, "observation": LABEL_IDS["Observation"]}
+        values: dict[str, Any] = {"observation": LABEL_IDS["Observation"]}
         values |= {f"crop_{i}": crop.vector for i, crop in enumerate(crops)}
         with _query_errors(self._targets.vector_url):
-            statement = _statement("near_and_graph" if one else "near", len(crops))
+            statement = _statement("near_and_graph" if one else "near", len(crops), neighbours)
             rows = self._vectors.execute(statement, values | self._known.parameters).fetchall()
         near, origin = self._near(rows)
         model = next((row[-1] for row in near), None)
@@ -157,8 +157,8 @@ class CandidateSearch:
 
     def _along(self, rows: _Rows, origin: str | None) -> "_Along":
         """Learn the settings and check the origin."""
-        settings, graph, maps = next(
-            (row[0] for row in rows if row[0] is not None), (None, None, None)
+        settings, graph, maps, things, places = next(
+            (row[0] for row in rows if row[0] is not None), (None,) * 5
         )
         if graph != origin or settings is not None:
             place = describe_target(self._targets.graph_url)
@@ -166,7 +166,7 @@ class CandidateSearch:
             self._known = self._known.with_settings(settings, place)
         if maps is not None:
             self._known = self._with_maps(maps[0])
-        return _Along.of(rows)
+        return _Along.of(rows, things or {}, places or {})
 
     def _with_maps(self, key: str | None) -> KnownConstants:
         if key is None:
@@ -181,8 +181,13 @@ class CandidateSearch:
 
 
 @lru_cache(maxsize=128)
-def _statement(name: str, crops: int = 0) -> sql.Composed:
-    """``crops`` is the number of those that are searched for, in the statements that search."""
+def _statement(name: str, crops: int = 0, neighbours: int = 0) -> bytes:
+    """``crops`` is the number of those that are searched for, ``neighbours`` that of observations
+    for each, in the statements that search.
+
+    Without comments and line breaks: psycopg reads a short statement once, a long one for every
+    question.
+    """
     rows = [
         sql.SQL("({}::int, {}::vector)").format(sql.Literal(i), sql.Placeholder(f"crop_{i}"))
         for i in range(crops)
@@ -190,15 +195,18 @@ def _statement(name: str, crops: int = 0) -> sql.Composed:
     none = sql.SQL("SELECT 0, NULL::vector WHERE false")
     questions = sql.SQL("VALUES {}").format(sql.SQL(", ").join(rows)) if rows else none
     run = statements("relocalize")
-    return run[name].format(
+    composed = run[name].format(
         questions=questions,
+        neighbours=sql.Literal(neighbours),
         of_vectors=run["of_vectors"].format(cosines=run["cosines"]),
-        of_graph=run["of_graph"].format(settings=run["settings"], maps=run["maps"]),
+        of_graph=run["of_graph"].format(settings=run["settings"], maps=run["maps"], **tables()),
         observed=run["observed"],
         along=run["along"],
         followed=run["followed"].format(**tables()),
         **tables(),
     )
+    lines = [line.partition("--")[0].strip() for line in composed.as_string().splitlines()]
+    return " ".join(line for line in lines if line).encode()
 
 
 class _Thing(NamedTuple):
@@ -218,18 +226,15 @@ class _Along(NamedTuple):
     places: dict[str | None, tuple[PlaceOrdinal, CandidatePlace]]
 
     @classmethod
-    def of(cls, rows: Sequence[tuple[Any, ...]]) -> "_Along":
-        """Of rows of the statement ``graph``."""
-        found = cls({}, {}, {})
-        for _, det_pk, thing, thing_is, its, its_is, there, there_is in rows:
-            if det_pk is not None:
-                found.ids[det_pk] = thing, its, there
-            if thing_is is not None:
-                found.things[thing] = _thing(thing_is)
-            for place, place_is in ((its, its_is), (there, there_is)):
-                if place_is is not None:
-                    found.places[place] = _ordinal(place), _place(place_is)
-        return found
+    def of(
+        cls, rows: Sequence[tuple[Any, ...]], things: dict[str, str], places: dict[str, str]
+    ) -> "_Along":
+        """Of rows of the statement ``graph``, with the properties of Objects and Places by id."""
+        return cls(
+            {det_pk: (thing, its, there) for _, det_pk, thing, its, there in rows},
+            {thing: _thing(properties) for thing, properties in things.items()},
+            {place: (_ordinal(place), _place(properties)) for place, properties in places.items()},
+        )
 
     def and_more(self, more: "_Along") -> "_Along":
         """With those of ``more``."""
@@ -237,12 +242,10 @@ class _Along(NamedTuple):
 
 
 def _assemble(crops: int, near: _Rows, along: _Along, known: KnownConstants) -> Candidates:
+    ordered = sorted(near, key=lambda row: (row[0], -row[1], row[2]))
     matches: list[list[Match]] = [[] for _ in range(crops)]
-    ordinals: dict[str | None, PlaceOrdinal | None] = {
-        place: ordinal for place, (ordinal, _) in along.places.items()
-    }
-    ordinals[None] = None
-    for crop, similarity, det_pk, det_id, run_id, class_name, bbox, x, y, yaw, _ in near:
+    ordinals = {place: ordinal for place, (ordinal, _) in along.places.items()}
+    for crop, similarity, det_pk, det_id, run_id, class_name, bbox, x, y, yaw, _ in ordered:
         thing_id, its, there = along.ids.get(det_pk, _NO_THING)
         thing = along.things.get(thing_id)
         matches[crop].append(
@@ -255,13 +258,13 @@ def _assemble(crops: int, near: _Rows, along: _Along, known: KnownConstants) -> 
                 tuple(bbox),
                 class_name if thing is None else thing.class_name,
                 None if thing is None else thing.object_id,
-                ordinals[its],
-                ordinals[there],
+                ordinals.get(its),
+                ordinals.get(there),
                 None if thing is None else thing.stand,
             )
         )
-    ordered = (tuple(sorted(row, key=lambda m: (-m.similarity, m.observation))) for row in matches)
-    return Candidates(tuple(ordered), dict(along.places.values()), known.constants, known.walls)
+    rows = tuple(map(tuple, matches))
+    return Candidates(rows, dict(along.places.values()), known.constants, known.walls)
 
 
 def _thing(properties: str) -> _Thing:

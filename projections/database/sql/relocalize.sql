@@ -50,42 +50,42 @@ CASE WHEN row_number() OVER () = 1 THEN json_build_array({cosines}, (
     FROM mapfold.checkpoint c WHERE sink = 'vectors')) END
 
 -- name: of_graph
--- The same of the graph.
+-- The same of the graph, and the properties of the Objects and Places in `found`, by id.
 CASE WHEN row_number() OVER () = 1 THEN json_build_array({settings}, (
     SELECT log_id || ' ' || coalesce(to_jsonb(c) ->> 'observed', fingerprint)
-    FROM mapfold.checkpoint c WHERE sink = 'graph'), {maps}) END
+    FROM mapfold.checkpoint c WHERE sink = 'graph'), {maps},
+    (SELECT json_object_agg(id::text, properties::text) FROM {object}
+     WHERE id IN (SELECT thing FROM found)),
+    (SELECT json_object_agg(id::text, properties::text) FROM {place}
+     WHERE id IN (SELECT its FROM found UNION SELECT there FROM found))) END
 
 -- name: observed
 near.det_pk, near.det_id, near.run_id, near.class_name, near.bbox, near.map_x, near.map_y, near.map_yaw,
 near.embedding_model
 
 -- name: along
--- Ids of Object, its Place and the keyframe's Place; the properties of each only once, as they are long.
-near.det_pk, thing.id, CASE WHEN row_number() OVER (PARTITION BY thing.id) = 1 THEN thing.properties END,
-its.id, CASE WHEN row_number() OVER (PARTITION BY its.id) = 1 THEN its.properties END,
-there.id, CASE WHEN row_number() OVER (PARTITION BY there.id) = 1 THEN there.properties END
+-- Ids of Object, its Place and the keyframe's Place.
+observes.end_id AS thing, located.end_id AS its, in_place.end_id AS there
 
 -- name: followed
 -- Joins from `near.det_pk` along the graph.
 LEFT JOIN {observes} AS observes
     ON observes.start_id = ag_catalog._graphid(%(observation)s, coalesce(near.det_pk, 0))
-LEFT JOIN {object} AS thing ON thing.id = observes.end_id
-LEFT JOIN {located_in} AS located ON located.start_id = thing.id
-LEFT JOIN {place} AS its ON its.id = located.end_id
+LEFT JOIN {located_in} AS located ON located.start_id = observes.end_id
 LEFT JOIN {has_observation} AS has
     ON has.end_id = ag_catalog._graphid(%(observation)s, coalesce(near.det_pk, 0))
 LEFT JOIN {in_place} AS in_place ON in_place.start_id = has.start_id
-LEFT JOIN {place} AS there ON there.id = in_place.end_id
 
 -- name: near
--- The nearest `%(neighbours)s` observations of each crop, from the vectors' database; at least one row,
--- of nulls if there is no observation.
+-- The nearest observations of each crop, from the vectors' database; at least one row, of nulls if there
+-- is no observation. Their number is a constant: with a parameter the server would plan every question
+-- anew, because a plan for any number is dearer.
 WITH question (crop, wanted) AS ({questions})
 SELECT {of_vectors}, question.crop, 1 - near.distance, {observed}
 FROM question LEFT JOIN LATERAL (
     SELECT det_pk, det_id, run_id, class_name, bbox, map_x, map_y, map_yaw, embedding_model,
            embedding <=> question.wanted AS distance
-    FROM public.detection_embeddings ORDER BY embedding <=> question.wanted LIMIT %(neighbours)s
+    FROM public.detection_embeddings ORDER BY embedding <=> question.wanted LIMIT {neighbours}
 ) AS near ON true
 
 -- name: described
@@ -97,26 +97,33 @@ LEFT JOIN public.detection_embeddings AS near ON near.det_pk = ANY(%(det_pks)s::
 -- name: graph
 -- Object, its Place and the keyframe's Place of each observation, from the graph's database; at least
 -- one row.
-SELECT {of_graph}, {along}
-FROM (SELECT 1) AS one
-LEFT JOIN unnest(%(det_pks)s::bigint[]) AS near (det_pk) ON true
-{followed}
+WITH found AS MATERIALIZED (
+    SELECT near.det_pk, {along}
+    FROM (SELECT 1) AS one
+    LEFT JOIN unnest(%(det_pks)s::bigint[]) AS near (det_pk) ON true
+    {followed}
+)
+SELECT {of_graph}, det_pk, thing, its, there FROM found
 
 -- name: near_and_graph
 -- Both in one round trip and one snapshot, when they share a database.
-WITH question (crop, wanted) AS ({questions})
-SELECT {of_vectors}, question.crop, 1 - near.distance, {observed}, {of_graph}, {along}
-FROM question LEFT JOIN LATERAL (
-    SELECT det_pk, det_id, run_id, class_name, bbox, map_x, map_y, map_yaw, embedding_model,
-           embedding <=> question.wanted AS distance
-    FROM public.detection_embeddings ORDER BY embedding <=> question.wanted LIMIT %(neighbours)s
-) AS near ON true
-{followed}
+WITH question (crop, wanted) AS ({questions}), found AS MATERIALIZED (
+    SELECT question.crop, 1 - near.distance AS similarity, {observed}, {along}
+    FROM question LEFT JOIN LATERAL (
+        SELECT det_pk, det_id, run_id, class_name, bbox, map_x, map_y, map_yaw, embedding_model,
+               embedding <=> question.wanted AS distance
+        FROM public.detection_embeddings ORDER BY embedding <=> question.wanted LIMIT {neighbours}
+    ) AS near ON true
+    {followed}
+)
+SELECT {of_vectors}, crop, similarity, det_pk, det_id, run_id, class_name, bbox, map_x, map_y, map_yaw,
+       embedding_model, {of_graph}, det_pk, thing, its, there
+FROM found
 
 -- name: of_classes
 -- Observations of the Objects of each class, from the graph's database: the Objects that were seen most
 -- often, and of each some observations spread evenly over all. `%(patterns)s` are properties to match.
-SELECT wanted.number, seen.det_pk
+SELECT wanted.number, seen.starts[picked.position]::text::bigint & 281474976710655 AS det_pk
 FROM unnest(%(patterns)s::text[]) WITH ORDINALITY AS wanted (pattern, number)
 CROSS JOIN LATERAL (
     SELECT id FROM {object}
@@ -126,11 +133,13 @@ CROSS JOIN LATERAL (
     LIMIT %(objects)s
 ) AS thing
 CROSS JOIN LATERAL (
-    SELECT start_id::text::bigint & 281474976710655 AS det_pk,
-           row_number() OVER (ORDER BY start_id) AS position, count(*) OVER () AS total
-    FROM {observes} WHERE end_id = thing.id
+    SELECT array_agg(start_id ORDER BY start_id) AS starts FROM {observes} WHERE end_id = thing.id
 ) AS seen
-WHERE seen.position * %(of_each)s / seen.total > (seen.position - 1) * %(of_each)s / seen.total
+CROSS JOIN LATERAL (
+    SELECT DISTINCT (step * cardinality(seen.starts) + %(of_each)s - 1) / %(of_each)s AS position
+    FROM generate_series(1, %(of_each)s) AS step
+) AS picked
+WHERE seen.starts IS NOT NULL
 ORDER BY 1, 2
 
 -- name: class_names
