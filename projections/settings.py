@@ -58,7 +58,7 @@ class RoomsConstants(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     cell_m: _Length = 0.75
-    """A pose farther than this from all anchors becomes the anchor of a new cell."""
+    """A pose farther than this from the centres of all cells becomes the centre of a new one."""
     drive_m: Annotated[_Length, Field(validate_default=True)] = 4.0
     """Places join up to this mean driven distance between their cells."""
 

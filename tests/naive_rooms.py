@@ -23,7 +23,7 @@ class NaiveRooms:
     ) -> None:
         self.cell_um, self.drive_um = cell_um, drive_um
         self.joined, self.apart, self.way = joined, apart, way
-        self.anchors: list[tuple[int, int]] = []
+        self.centres: list[tuple[int, int]] = []
         self.links: dict[tuple[int, int], int | None] = {}  # how far, None for barred
         self.points: list[int] = []  # the cell of each
         self.last: dict[Hashable, int] = {}
@@ -43,8 +43,8 @@ class NaiveRooms:
             cell = None
         is_new = cell is None
         if cell is None:
-            cell = len(self.anchors)
-            self.anchors.append((x, y))
+            cell = len(self.centres)
+            self.centres.append((x, y))
             if self.way is not None:
                 self._link_by_ways(cell)
         if run in self.last and self.last[run] != cell:
@@ -60,7 +60,7 @@ class NaiveRooms:
     def _nearest(self, x: int, y: int) -> int | None:
         near = [
             ((ax - x) ** 2 + (ay - y) ** 2, i)
-            for i, (ax, ay) in enumerate(self.anchors)
+            for i, (ax, ay) in enumerate(self.centres)
             if self._way((ax, ay), (x, y)) is not None
         ]
         return min(near)[1] if near and min(near)[0] <= self.cell_um**2 else None
@@ -76,21 +76,21 @@ class NaiveRooms:
         """How far it is counts as of now, whatever walls there will be."""
         a, b = sorted((a, b))
         if (a, b) not in self.links:
-            self.links[a, b] = self._way(self.anchors[a], self.anchors[b])
+            self.links[a, b] = self._way(self.centres[a], self.centres[b])
 
     def _link_by_ways(self, cell: int) -> None:
         for other in range(cell):
             squared = sum(
-                (a - b) ** 2 for a, b in zip(self.anchors[other], self.anchors[cell], strict=True)
+                (a - b) ** 2 for a, b in zip(self.centres[other], self.centres[cell], strict=True)
             )
-            way = self._way(self.anchors[other], self.anchors[cell])
+            way = self._way(self.centres[other], self.centres[cell])
             if squared <= 4 * self.cell_um**2 and way is not None:
                 self._link(other, cell)
 
     def _drives(self) -> list[list[int]]:
         """Floyd and Warshall: the shortest drive from each cell to each, at most twice the
         limit."""
-        n, reach = len(self.anchors), 2 * self.drive_um
+        n, reach = len(self.centres), 2 * self.drive_um
         drives = [[0 if i == j else reach for j in range(n)] for i in range(n)]
         for (i, j), length in self.links.items():
             if length is not None:

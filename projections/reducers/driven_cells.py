@@ -1,23 +1,23 @@
-"""Cells about anchors, and how far the robot drives from one to another, up to a reach.
+"""Cells about centres, and how far the robot drives from one to another, up to a reach.
 
-A pose farther than ``cell_um`` from all anchors becomes the anchor of a new cell; every other
-belongs to the cell of the nearest anchor, of equally near ones to the earliest. Anchors never move.
-Where walls are known, only anchors count that a straight way leads to.
+A pose farther than ``cell_um`` from all centres becomes the centre of a new cell; every other
+belongs to the cell of the nearest centre, of equally near ones to the earliest. Centres never move.
+Where walls are known, only centres count that a straight way leads to.
 
-Two cells with one pose after the other in some run are *linked*, at the distance of their anchors.
+Two cells with one pose after the other in some run are *linked*, at the distance of their centres.
 Where walls are known, it is how far the straight way between them counts as, and cells whose
-anchors are up to two cells' radii apart are linked, too, if there is such a way: the robot could
+centres are up to two cells' radii apart are linked, too, if there is such a way: the robot could
 drive it. What is linked stays as it is when walls become known, or others.
 The driven distance of two cells is the length of the shortest way over links; from ``reach_um`` on
 it is not known and counts as ``reach_um``. It only ever gets shorter.
 
-There are at most some 2.3 anchors a ``cell_um``², so a cell has a bounded number of others within
-reach, however often the robot comes. A keyframe that makes no new link costs a look at the anchors
+There are at most some 2.3 centres a ``cell_um``², so a cell has a bounded number of others within
+reach, however often the robot comes. A keyframe that makes no new link costs a look at the centres
 in nine squares of a grid. A new link is taken into the distances of all pairs that it brings
 nearer: exactly those (a, b) with a nearer to one end through the link than around it, and b to the
 other.
 
-Distances are integer micrometres, those of two anchors rounded down.
+Distances are integer micrometres, those of two centres rounded down.
 """
 
 from collections.abc import Callable, Iterator
@@ -52,9 +52,9 @@ class DrivenCells:
         self._cell2 = cell_um * cell_um
         self.reach_um = reach_um
         self.way_at = way_at
-        self.anchors: list[tuple[int, int]] = []
-        # By square of the grid of side ``cell_um``: the cells with their anchors in it, and the
-        # cells that a position in it may belong to, with their anchors.
+        self.centres: list[tuple[int, int]] = []
+        # By square of the grid of side ``cell_um``: the cells with their centres in it, and the
+        # cells that a position in it may belong to, with their centres.
         self._squares: dict[tuple[int, int], list[int]] = {}
         self._around: dict[tuple[int, int], list[tuple[int, int, int]]] = {}
         # Per cell: the cells within reach, without itself, with their driven distances.
@@ -62,7 +62,7 @@ class DrivenCells:
         self._linked: list[set[int]] = []
 
     def find(self, x_um: int, y_um: int) -> int | None:
-        """The cell of a position; None if no anchor is near enough."""
+        """The cell of a position; None if no centre is near enough."""
         if self.way_at is not None and (way := self.way_at((x_um, y_um))) is not None:
             return self._find_between_walls((x_um, y_um), way)
         best, least = None, self._cell2 + 1
@@ -79,14 +79,14 @@ class DrivenCells:
         for squared, cell in near:
             if squared > self._cell2:
                 break
-            if way(self.anchors[cell], at) is not None:
+            if way(self.centres[cell], at) is not None:
                 return cell
         return None
 
     def add(self, x_um: int, y_um: int) -> int:
-        """A new cell with its anchor here, linked to none."""
-        cell = len(self.anchors)
-        self.anchors.append((x_um, y_um))
+        """A new cell with its centre here, linked to none."""
+        cell = len(self.centres)
+        self.centres.append((x_um, y_um))
         column, row = x_um // self._cell_um, y_um // self._cell_um
         self._squares.setdefault((column, row), []).append(cell)
         for dx in (-1, 0, 1):
@@ -108,7 +108,7 @@ class DrivenCells:
         """
         self._linked[a].add(b)
         self._linked[b].add(a)
-        start, end = self.anchors[a], self.anchors[b]
+        start, end = self.centres[a], self.centres[b]
         way = None if self.way_at is None else self.way_at(start)
         length = distance_um(*start, *end) if way is None else way(start, end)
         if length is None or length >= self.near[a].get(b, self.reach_um):
@@ -134,7 +134,7 @@ class DrivenCells:
 
     def with_a_way_to(self, cell: int) -> list[int]:
         """Where walls are known, the cells that are linked to a new one without being driven."""
-        at = self.anchors[cell]
+        at = self.centres[cell]
         way = None if self.way_at is None else self.way_at(at)
         if way is None:
             return []
@@ -146,10 +146,10 @@ class DrivenCells:
             for other in self._squares.get((column + dx, row + dy), ())
             if other != cell and self._is_within_two_radii(other, at)
         )
-        return [other for other in around if way(self.anchors[other], at) is not None]
+        return [other for other in around if way(self.centres[other], at) is not None]
 
     def _is_within_two_radii(self, cell: int, at: tuple[int, int]) -> bool:
-        x, y = self.anchors[cell]
+        x, y = self.centres[cell]
         return (x - at[0]) ** 2 + (y - at[1]) ** 2 <= 4 * self._cell2
 
     def dump(self) -> State:
@@ -157,7 +157,7 @@ class DrivenCells:
         links = [(a, b) for a, linked in enumerate(self._linked) for b in sorted(linked) if a < b]
         near = [(a, b, d) for a, each in enumerate(self.near) for b, d in sorted(each.items())]
         return {
-            "anchors": [[x, y] for x, y in self.anchors],
+            "anchors": [[x, y] for x, y in self.centres],
             "links": np.array(links, np.int32).reshape(-1, 2),
             "near": np.array([each for each in near if each[0] < each[1]], np.int64).reshape(-1, 3),
         }
