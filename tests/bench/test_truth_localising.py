@@ -15,8 +15,9 @@ from tests.bench.truth.localising import (
     score,
     stranger_of,
 )
-from tests.bench.truth.localising_table import against_plain, localise_table
-from tests.bench.truth.worlds import WORLDS, load_generator, make_case
+from tests.bench.truth.localising_table import localise_table
+from tests.bench.truth.worlds import make_case
+from tests.bench.truth_cases import trial_generator
 
 HALVES = SimpleNamespace(DEVELOP=["w1", "w2", "w3"], VALIDATE=["v1", "v2"])
 
@@ -95,7 +96,7 @@ def test_the_worst_beside_the_plain_recipe_stands_last_below_the_means() -> None
         LocaliseRow("rover two", "page", {"1 crop": _scores(0.9, 1.0)}),
         LocaliseRow("scout one", "page", {"1 crop": _scores(3.0, 4.0)}),
     ]
-    assert against_plain(rows[0].scores["1 crop"]) == 0.5
+    assert rows[0].scores["1 crop"].against_plain == 0.5
     lines = localise_table(rows).splitlines()
     names = [line[:26].strip() for line in lines]
     assert names[1:4] == ["rover one", "rover two", "scout one"]
@@ -129,9 +130,7 @@ def test_the_other_building_is_one_of_the_same_half() -> None:
 
 
 def test_a_building_is_mapped_by_both_rules_and_asked_with_known_and_unknown_things(tmp_path):
-    if not WORLDS.is_dir():
-        pytest.skip(f"the trial data {WORLDS} is absent; set MAPFOLD_SHARED_WORLDS to its folder")
-    generator = load_generator(WORLDS)
+    generator = trial_generator()
     case, other = (
         make_case(generator, "rover", world, limit=60, cache=tmp_path)
         for world in ("tb3_house", "aws_house")

@@ -6,13 +6,8 @@ import pytest
 
 from projections.settings import Camera, Settings
 from tests.bench.truth.folding import fold_timed
-from tests.bench.truth.worlds import (
-    WORLDS,
-    NoWorldsError,
-    load_generator,
-    make_case,
-    pairs,
-)
+from tests.bench.truth.worlds import NoWorldsError, load_generator, make_case, pairs
+from tests.bench.truth_cases import trial_generator
 
 NAMES = SimpleNamespace(
     DEVELOP=["w1", "w2", "w3"],
@@ -23,10 +18,7 @@ NAMES = SimpleNamespace(
 
 @pytest.fixture(scope="module")
 def generator() -> ModuleType:
-    """The generator; skips the test where the data is absent, and only there."""
-    if not WORLDS.is_dir():
-        pytest.skip(f"the trial data {WORLDS} is absent; set MAPFOLD_SHARED_WORLDS to its folder")
-    return load_generator(WORLDS)
+    return trial_generator()
 
 
 def test_absent_data_is_named_with_the_way_to_give_it(tmp_path):

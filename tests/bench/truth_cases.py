@@ -1,6 +1,7 @@
-"""Views made of deltas by hand, with their truth, for tests of the scores."""
+"""Views made of deltas by hand, with their truth, for tests of the scores; the trial data."""
 
 from collections.abc import Sequence
+from types import ModuleType
 
 from eventsrc.envelope import DetId
 from projections.deltas import (
@@ -19,6 +20,8 @@ from projections.deltas import (
 from projections.evaluate.truth import TrueKeyframe, Truth
 from projections.model.view import MapView
 from projections.settings import Settings
+from tests.bench.truth.worlds import load_generator
+from tests.shared_data import WORLDS, skip_without
 
 Sight = tuple[str, float, float, str | None, int]
 """Run, the robot's x and y in metres, true instance, Object."""
@@ -68,3 +71,9 @@ def hand_made(sights: Sequence[Sight], more: Sequence[Delta] = ()) -> tuple[MapV
         )
     view.apply_event(view.next_offset, more)
     return view, Truth(keyframes)
+
+
+def trial_generator() -> ModuleType:
+    """The generator of the trial data ``worlds``; skips the test where the data is absent."""
+    skip_without(WORLDS, "MAPFOLD_SHARED_WORLDS")
+    return load_generator(WORLDS)

@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 import typer
+import yaml
 
 from projections.cli import command_line
 
-yaml = pytest.importorskip("yaml", reason="PyYAML reads compose.yaml; it is in the dev group")
 ROOT = Path(__file__).resolve().parents[2]
 COMPOSE = ROOT / "docker" / "compose.yaml"
 SERVICES = {

@@ -2,7 +2,6 @@
 
 import gzip
 import json
-import os
 from pathlib import Path
 
 import pytest
@@ -11,9 +10,8 @@ from tests.commands import Commands
 from tests.logs import write_log
 from tests.relocalization.buildings import Building, Keyframe
 from tests.relocalization.drives import drive
+from tests.shared_data import shared_run_path
 from tests.thorough import rounds
-
-SHARED = Path(os.environ.get("MAPFOLD_SHARED_DATA", "../shared/data"))
 
 
 @pytest.fixture(scope="module")
@@ -179,18 +177,14 @@ def test_truth_that_fits_nothing_is_misuse(mapfold: Commands, runs: list[str]) -
     assert "--truth" in said.err
 
 
-@pytest.mark.skipif(
-    not (SHARED / "house" / "house-a.jsonl.gz").exists(),
-    reason=f"the trial data is absent: no {SHARED}/house/house-a.jsonl.gz (MAPFOLD_SHARED_DATA)",
-)
 def test_the_trial_house_is_found_again(mapfold: Commands) -> None:
     arguments: list[str] = []
     for flag, run in (("--map", "house-a"), ("--query", "house-c"), ("--query", "home-2")):
-        folder = SHARED / run.split("-")[0]
-        lines = gzip.decompress((folder / f"{run}.jsonl.gz").read_bytes()).splitlines(True)
+        path = shared_run_path(run)
+        lines = gzip.decompress(path.read_bytes()).splitlines(True)
         asked = len(lines) if flag == "--map" else rounds(len(lines), len(lines) // 6)
         mapfold("import", mapfold.folder / run, "-", stdin=b"".join(lines[:asked]))
-        truth = (folder / f"{run}.truth.jsonl.gz").resolve()
+        truth = path.with_name(f"{run}.truth.jsonl.gz").resolve()
         arguments += [flag, str(mapfold.folder / run), "--truth", str(truth)]
     scores = mapfold("evaluate", *arguments, "--json").json["relocalization"]
     assert scores["3"]["pose_error_m"]["p50"] <= 0.6

@@ -114,13 +114,14 @@ def test_every_message_of_every_publisher_is_recorded(
 
 @pytest.fixture(scope="session")
 def oldest_zenoh(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with Zenoh 1.0.0, from the package registry."""
+    """A folder with Zenoh 1.0.0; skips the test where the package registry is out of reach."""
     folder = tmp_path_factory.mktemp("zenoh-1.0")
     install = [sys.executable, "-m", "pip", "install", "--quiet", "--only-binary", ":all:"]
     install += ["--no-deps", "--target", str(folder), "eclipse-zenoh==1.0.0"]
     done = subprocess.run(install, check=False, capture_output=True, text=True, timeout=240)
-    if done.returncode:
-        pytest.skip(f"eclipse-zenoh 1.0.0 cannot be installed: {done.stderr.strip()[-300:]}")
+    if "connection broken by" in done.stderr:  # as pip says at each new try
+        pytest.skip(f"eclipse-zenoh 1.0.0: no package registry: {done.stderr.strip()[-300:]}")
+    assert done.returncode == 0, done.stderr
     return folder
 
 

@@ -62,6 +62,13 @@ class Scores:
     confidence_floor: float
     cpu_ms: float
 
+    @property
+    def against_plain(self) -> float | None:
+        """Our median error divided by that of the ten nearest observations."""
+        if self.p50_m is None or not self.plain_p50_m:
+            return None
+        return self.p50_m / self.plain_p50_m
+
 
 @dataclass(frozen=True, slots=True)
 class LocaliseRow:

@@ -1,39 +1,33 @@
 """The table of ``scripts/bench_truth --localise``."""
 
-import statistics
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 
 from .localising import LocaliseRow, Scores
+from .tables import mean_of
 
-_COLUMNS: tuple[tuple[str, int, int, Callable[[Scores], float | None]], ...] = (
-    ("asked", 6, 0, lambda s: s.questions),
-    ("known", 6, 0, lambda s: s.known),
-    ("p50 m", 6, 2, lambda s: s.p50_m),
-    ("p90 m", 6, 2, lambda s: s.p90_m),
-    ("plain", 6, 2, lambda s: s.plain_p50_m),
-    ("pl.p90", 6, 2, lambda s: s.plain_p90_m),
-    ("place", 6, 2, lambda s: s.place_p50_m),
-    ("×plain", 7, 2, lambda s: against_plain(s)),
-    ("in1.5", 6, 2, lambda s: s.within),
-    ("pl.1.5", 6, 2, lambda s: s.plain_within),
-    ("AUROC", 6, 3, lambda s: s.auroc),
-    ("cosine", 6, 3, lambda s: s.cosine_auroc),
-    ("k>unk", 6, 2, lambda s: s.known_called_unknown),
-    ("unk>k", 6, 2, lambda s: s.unknown_called_known),
-    ("ECE kn", 6, 3, lambda s: s.known_ece),
-    ("floor", 6, 3, lambda s: s.known_floor),
-    ("ECE co", 6, 3, lambda s: s.confidence_ece),
-    ("floor", 6, 3, lambda s: s.confidence_floor),
-    ("cpu ms", 6, 1, lambda s: s.cpu_ms),
+_COLUMNS = (
+    ("asked", 6, "questions", 0),
+    ("known", 6, "known", 0),
+    ("p50 m", 6, "p50_m", 2),
+    ("p90 m", 6, "p90_m", 2),
+    ("plain", 6, "plain_p50_m", 2),
+    ("pl.p90", 6, "plain_p90_m", 2),
+    ("place", 6, "place_p50_m", 2),
+    ("×plain", 7, "against_plain", 2),
+    ("in1.5", 6, "within", 2),
+    ("pl.1.5", 6, "plain_within", 2),
+    ("AUROC", 6, "auroc", 3),
+    ("cosine", 6, "cosine_auroc", 3),
+    ("k>unk", 6, "known_called_unknown", 2),
+    ("unk>k", 6, "unknown_called_known", 2),
+    ("ECE kn", 6, "known_ece", 3),
+    ("floor", 6, "known_floor", 3),
+    ("ECE co", 6, "confidence_ece", 3),
+    ("floor", 6, "confidence_floor", 3),
+    ("cpu ms", 6, "cpu_ms", 1),
 )
+"""Heads, widths, fields of `Scores`, digits."""
 _NAME = 26
-
-
-def against_plain(scores: Scores) -> float | None:
-    """Our median error divided by that of the ten nearest observations."""
-    if scores.p50_m is None or not scores.plain_p50_m:
-        return None
-    return scores.p50_m / scores.plain_p50_m
 
 
 def localise_table(rows: Sequence[LocaliseRow], *, lines: bool = True) -> str:
@@ -55,15 +49,13 @@ def _part(rule: str, kind: str, rows: Sequence[LocaliseRow], *, lines: bool) -> 
         own = [row.scores[kind] for row in rows if row.name.split()[0] == robot]
         text.append(_line(f"  {robot}", _cells(own)))
     text.append(_line("mean", _cells([row.scores[kind] for row in rows])))
-    worst = max(rows, key=lambda row: against_plain(row.scores[kind]) or 0.0)
+    worst = max(rows, key=lambda row: row.scores[kind].against_plain or 0.0)
     text.append(_line(f"worst {worst.name}", _cells([worst.scores[kind]])))
     return "\n".join(text)
 
 
 def _cells(scores: Sequence[Scores]) -> Iterable[str]:
-    for _, _, digits, value in _COLUMNS:
-        present = [each for one in scores if (each := value(one)) is not None]
-        yield f"{statistics.fmean(present):.{digits}f}" if present else "-"
+    return (mean_of(scores, field, digits) for _, _, field, digits in _COLUMNS)
 
 
 def _line(name: str, cells: Iterable[str]) -> str:

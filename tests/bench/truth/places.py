@@ -16,7 +16,7 @@ from projections.model.view import MapView
 from projections.settings import Settings
 
 from .folding import fold_into, fold_timed
-from .tables import HOUSE, number
+from .tables import HOUSE, mean_of, number
 from .walls import Walls
 from .worlds import Case
 
@@ -26,6 +26,7 @@ RULES = {
     "rooms": Settings(places="rooms"),
 }
 """The rules of the table by their names; shares and ratios are told of the last."""
+_OWN = ("homogeneity", "completeness", "noise", "late", "renamed", "ratio")
 LEAST_WALLED = 0.5
 """Rooms have walls where so much of the borders between them are walls; else they are zones."""
 
@@ -150,13 +151,8 @@ def _cells(rows: Sequence[PlacesRow]) -> list[str]:
     return [
         str(sum(row.keyframes for row in rows)),
         str(sum(row.rooms for row in rows)),
-        *(_mean((s.v_measure for s in scores), 3) for scores in by_rule),
-        _mean((s.homogeneity for s in own), 3),
-        _mean((s.completeness for s in own), 3),
-        _mean((s.noise for s in own), 3),
-        _mean((s.late for s in own), 3),
-        _mean((s.renamed for s in own), 3),
-        _mean((s.ratio for s in own), 2),
+        *(mean_of(scores, "v_measure", 3) for scores in by_rule),
+        *(mean_of(own, field, 2 if field == "ratio" else 3) for field in _OWN),
         number(page_s, 2),
         number(sum(s.seconds for s in own) / page_s if page_s else math.nan, 2),
     ]
@@ -164,11 +160,6 @@ def _cells(rows: Sequence[PlacesRow]) -> list[str]:
 
 def _line(name: str, cells: Iterable[str]) -> str:
     return name.ljust(26) + " ".join(cell.rjust(8) for cell in cells)
-
-
-def _mean(values: Iterable[float], digits: int) -> str:
-    present = list(values)
-    return number(sum(present) / len(present), digits)
 
 
 def _share(part: int, whole: int) -> float:

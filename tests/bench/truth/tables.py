@@ -94,12 +94,11 @@ def _mean_cells(title: str, rows: Sequence[Row]) -> Iterable[str]:
         str(sum(scores.instances for scores in pages)),
         str(sum(scores.objects for scores in pages)),
         str(sum(scores.objects for scores in evidences)),
-        _mean((scores.ratio for scores in pages), 2),
-        _mean((scores.ratio for scores in evidences), 2),
-        _mean((scores.v_measure for scores in pages), 3),
-        _mean((scores.v_measure for scores in evidences), 3),
-        _mean((scores.adjusted_rand for scores in pages), 3),
-        _mean((scores.adjusted_rand for scores in evidences), 3),
+        *(
+            mean_of(scores, field, digits)
+            for field, digits in (("ratio", 2), ("v_measure", 3), ("adjusted_rand", 3))
+            for scores in (pages, evidences)
+        ),
         number(errors[len(errors) // 2] if errors else math.nan, 2),
         number(_quotient(sum(scores.inside for scores in evidences), len(errors)), 2),
         number(page_s, 2),
@@ -157,8 +156,10 @@ def _moved_line(name: str, cells: Iterable[str]) -> str:
     return name.ljust(26) + " ".join(cell.rjust(7) for cell in cells)
 
 
-def _mean(values: Iterable[float], digits: int) -> str:
-    present = [value for value in values if not math.isnan(value)]
+def mean_of(scores: Iterable[object], field: str, digits: int) -> str:
+    """The mean of a field of those scores that have a number there; - where none has."""
+    found = (getattr(each, field) for each in scores)
+    present = [value for value in found if value is not None and not math.isnan(value)]
     return number(sum(present) / len(present) if present else math.nan, digits)
 
 

@@ -23,9 +23,8 @@ from typing import Any
 from eventsrc.ingest import Accepted, Rejected, ingest_all
 from projections.evaluate.truth import Truth, read_truth
 from projections.settings import Camera
-from tests.shared_data import DATA, ROOT
+from tests.shared_data import DATA, WORLDS
 
-WORLDS = Path(os.environ.get("MAPFOLD_SHARED_WORLDS", ROOT.parent / "shared" / "worlds"))
 CACHE = Path(
     os.environ.get(
         "MAPFOLD_BENCH_CACHE",
