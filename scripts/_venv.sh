@@ -2,6 +2,9 @@
 # up to date already. Needs Python 3.11 or later with pip and venv, nothing else.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
+# Where this is set, as in many containers, every process compiles all modules that it imports, which
+# takes longer than most commands and tests.
+unset PYTHONDONTWRITEBYTECODE
 
 find_python() {
     local candidate

@@ -197,6 +197,7 @@ def test_the_commands_it_ends_with_work_as_printed(played: Played, tmp_path: Pat
         assert server.api("why", what=merge, at=at)["merges"]
 
 
+@pytest.mark.slow
 def test_it_can_be_played_again_into_its_own_folder(played: Played) -> None:
     done = _run("--out", str(played.out), "--seed", "3", "--json")
     assert done.returncode == 0, done.stderr

@@ -25,6 +25,7 @@ from tests import prefork
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows
 from tests.servers import server_to_kill
+from tests.thorough import rounds
 
 SETTINGS = Settings()
 WAIT_S = 240.0
@@ -62,7 +63,7 @@ def at_stage(stage: str, act: Callable[[], None]) -> Callable[[RebuildProgress],
     return tell
 
 
-@pytest.mark.parametrize("kind", ["one_database", "two_databases"])
+@pytest.mark.parametrize("kind", ["two_databases", "one_database"][: rounds(2, 1)])
 def test_killed_at_any_statement(log: Path, kind: str, request: pytest.FixtureRequest) -> None:
     targets: Targets = request.getfixturevalue(kind)
     result = prefork.run(

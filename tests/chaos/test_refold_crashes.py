@@ -25,7 +25,7 @@ from tests.commands_in_logs import (
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows
 from tests.servers import kill_postgres, server_to_kill
-from tests.thorough import stride
+from tests.thorough import rounds, stride
 
 SETTINGS = Settings()
 WAIT_S = 280.0
@@ -51,7 +51,7 @@ def kills(log: Path, targets: Targets, every: int, mode: str) -> dict[str, Any]:
     return found
 
 
-@pytest.mark.parametrize("kind", ["one_database", "two_databases"])
+@pytest.mark.parametrize("kind", ["two_databases", "one_database"][: rounds(2, 1)])
 def test_a_tail_killed_at_any_statement_of_a_refold(
     log: Path, kind: str, request: pytest.FixtureRequest
 ) -> None:

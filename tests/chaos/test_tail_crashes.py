@@ -22,13 +22,14 @@ from tests import prefork
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows
 from tests.servers import kill_postgres, server_to_kill
+from tests.thorough import rounds
 
 SETTINGS = Settings()
 WAIT_S = 120.0
 ROOT = Path(__file__).resolve().parents[2]
 
 
-@pytest.mark.parametrize("kind", ["one_database", "two_databases"])
+@pytest.mark.parametrize("kind", ["two_databases", "one_database"][: rounds(2, 1)])
 def test_killed_between_any_two_statements(
     tmp_path: Path, kind: str, request: pytest.FixtureRequest
 ) -> None:

@@ -18,6 +18,7 @@ from tests.candidates import assert_equal, view_under_commands
 from tests.commands_in_logs import append_command, command, forget_keyframes
 from tests.flickering_house import flickering_house
 from tests.logs import WEIRD, walk, write_log
+from tests.thorough import rounds
 
 MANY = 500
 KNOWN = (Crop(None, None, "chair"), Crop(None, None, "oven"))
@@ -27,7 +28,7 @@ def settings_of(corrections: Any) -> Settings:
     return corrections.settings or Settings()
 
 
-@pytest.fixture(params=["one_database", "two_databases"])
+@pytest.fixture(params=["two_databases", "one_database"][: rounds(2, 1)])
 def targets(request: pytest.FixtureRequest) -> Targets:
     found: Targets = request.getfixturevalue(request.param)
     return found

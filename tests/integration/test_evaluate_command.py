@@ -1,8 +1,10 @@
 """`mapfold evaluate` on generated runs, and on the shared trial data where it is there."""
 
+import copy
 import gzip
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -64,10 +66,16 @@ def runs(mapfold: Commands) -> list[str]:
     return arguments
 
 
-def test_the_scores_have_their_shape_and_sense(mapfold: Commands, runs: list[str]) -> None:
+@pytest.fixture(scope="module")
+def scores(mapfold: Commands, runs: list[str]) -> Any:
+    """What `evaluate` says of them, for all tests."""
     picture = mapfold.folder / "fails.png"
-    scores = mapfold("evaluate", *runs, "--json", "--picture", picture).json
+    said = mapfold("evaluate", *runs, "--json", "--picture", picture)
     assert picture.read_bytes().startswith(b"\x89PNG")
+    return said.json
+
+
+def test_the_scores_have_their_shape_and_sense(scores: Any) -> None:
     assert set(scores["relocalization"]) == {"1", "2", "3", "5"}
     assert set(scores["views"]) == {"1", "3", "5"}
     assert "self" not in scores
@@ -84,18 +92,23 @@ def test_the_scores_have_their_shape_and_sense(mapfold: Commands, runs: list[str
         assert 0.0 < column["known_ece_floor"] < 0.2
 
 
-def test_a_pose_may_lie_in_a_room_the_map_never_entered(mapfold: Commands, runs: list[str]) -> None:
+def test_a_pose_may_lie_in_a_room_the_map_never_entered(
+    mapfold: Commands, runs: list[str], scores: Any
+) -> None:
     half = mapfold("evaluate", *runs, "--at", "25", "--json").json["relocalization"]["3"]
-    whole = mapfold("evaluate", *runs, "--json").json["relocalization"]["3"]
+    whole = scores["relocalization"]["3"]
     assert half["room_ceiling"] < whole["room_ceiling"]
     assert half["pose_room"] <= half["room_ceiling"]
     assert whole["room_at_pose"] > 0.8
 
 
-def test_it_is_deterministic_but_for_latencies(mapfold: Commands, runs: list[str]) -> None:
-    one, other = (mapfold("evaluate", *runs, "--json").json for _ in range(2))
-    for scores in (one, other):
-        for column in (*scores["relocalization"].values(), *scores["views"].values()):
+@pytest.mark.slow
+def test_it_is_deterministic_but_for_latencies(
+    mapfold: Commands, runs: list[str], scores: Any
+) -> None:
+    one, other = copy.deepcopy(scores), mapfold("evaluate", *runs, "--json").json
+    for found in (one, other):
+        for column in (*found["relocalization"].values(), *found["views"].values()):
             del column["latency_ms"]
     assert one == other
 
@@ -113,6 +126,12 @@ def test_the_map_is_asked_about_itself_without_truth(mapfold: Commands, runs: li
     assert 0 < own["known"] <= own["questions"] / 2
     assert own["pose_error_m"]["p50"] < own["plain"]["pose_error_m"]["p50"]
     assert own["known_called_unknown"] < 0.5 > own["taken_out_called_known"]
+
+
+@pytest.mark.slow
+def test_the_maps_own_questions_are_a_table_of_their_own(
+    mapfold: Commands, runs: list[str]
+) -> None:
     said = mapfold("evaluate", *runs[:2], "--self")
     first, *rest = said.out.splitlines()
     assert first.split() == ["the", "map's", "own", "questions", "1", "crop", "3", "crops"]
@@ -123,6 +142,7 @@ def test_the_map_is_asked_about_itself_without_truth(mapfold: Commands, runs: li
     assert "the map's own questions" in both
 
 
+@pytest.mark.slow
 def test_of_several_maps_the_worst_is_named(mapfold: Commands, runs: list[str]) -> None:
     other = ["--map", str(mapfold.folder / "x"), *runs]
     found = mapfold("evaluate", *other, "--json").json
@@ -182,7 +202,7 @@ def test_the_trial_house_is_found_again(mapfold: Commands) -> None:
     for flag, run in (("--map", "house-a"), ("--query", "house-c"), ("--query", "home-2")):
         path = shared_run_path(run)
         lines = gzip.decompress(path.read_bytes()).splitlines(True)
-        asked = len(lines) if flag == "--map" else rounds(len(lines), len(lines) // 6)
+        asked = len(lines) if flag == "--map" else rounds(len(lines), len(lines) // 12)
         mapfold("import", mapfold.folder / run, "-", stdin=b"".join(lines[:asked]))
         truth = path.with_name(f"{run}.truth.jsonl.gz").resolve()
         arguments += [flag, str(mapfold.folder / run), "--truth", str(truth)]

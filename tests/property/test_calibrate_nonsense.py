@@ -15,6 +15,7 @@ from projections.deltas import Pose
 from projections.evidence import EvidenceConstants
 from projections.exact import quantise
 from projections.settings import Camera
+from tests.thorough import examples
 
 FAR_UM = 10**13
 PIXELS = st.one_of(
@@ -49,7 +50,7 @@ def rows(draw: st.DrawFn) -> list[Row]:
 
 
 @given(rows())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=examples(150), deadline=None)
 def test_constants_are_always_such_as_the_settings_take(found: list[Row]) -> None:
     prior = EvidenceConstants()
     last = read(sightings_of(found), prior, prior)

@@ -19,6 +19,7 @@ from projections.reducers.spots import (
     Solver,
     Spots,
 )
+from tests.thorough import examples
 
 RANGE_M, RANGE_SPREAD = 3.0, 0.55
 
@@ -95,7 +96,7 @@ def _rational(spots: Spots, prior: HeightPrior, about: Estimate) -> list[Fractio
 _COORDINATE = st.floats(-5.0, 5.0)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=examples(60))
 @given(
     st.lists(st.tuples(_COORDINATE, _COORDINATE, st.booleans()), min_size=1, max_size=9),
     st.integers(0, 1000),

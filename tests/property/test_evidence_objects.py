@@ -34,6 +34,7 @@ from tests.evidence_pictures import (
     fold_one,
     pictures_of,
 )
+from tests.thorough import examples
 
 _SEEDS = st.integers(0, 10_000)
 
@@ -59,7 +60,7 @@ def _through_json(state: State) -> State:
     }
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=examples(15), deadline=None)
 @given(_SEEDS, st.integers(0, 40))
 def test_a_dump_taken_anywhere_goes_on_as_if_nothing_had_happened(seed: int, cut: int) -> None:
     pictures = pictures_of(a_room(seed), seed, 40)
@@ -71,7 +72,7 @@ def test_a_dump_taken_anywhere_goes_on_as_if_nothing_had_happened(seed: int, cut
     assert before + after == fold_all(pictures)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=examples(15), deadline=None)
 @given(_SEEDS)
 def test_two_things_in_one_picture_are_never_one(seed: int) -> None:
     pictures = pictures_of(a_room(seed, 12), seed, 40)
@@ -81,7 +82,7 @@ def test_two_things_in_one_picture_are_never_one(seed: int) -> None:
         assert len(set(seen)) == len(seen) == len(picture.sightings)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=examples(15), deadline=None)
 @given(_SEEDS)
 def test_deltas_are_complete_and_in_order(seed: int) -> None:
     pictures = pictures_of(a_room(seed, 12), seed, 60)
@@ -134,7 +135,7 @@ def test_deltas_are_complete_and_in_order(seed: int) -> None:
             assert counts[classes[ordinal]] == max(counts.values())
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=examples(10), deadline=None)
 @given(_SEEDS, st.data())
 def test_commands_are_obeyed(seed: int, data: st.DataObject) -> None:
     pictures = pictures_of(a_room(seed, 6), seed, 40)
@@ -187,7 +188,7 @@ def _truth(pictures: list[Picture]) -> dict[ObservationOrdinal, int]:
     }
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=examples(10), deadline=None)
 @given(_SEEDS)
 def test_the_grid_changes_nothing(seed: int) -> None:
     """The naive search goes through all Objects and keeps those within reach."""
@@ -216,7 +217,7 @@ _PIXEL = st.one_of(
 )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(st.lists(st.tuples(_PIXEL, _PIXEL, _PIXEL, _PIXEL), min_size=1, max_size=12), _SEEDS)
 def test_boxes_of_any_size_give_finite_estimates(
     boxes: list[tuple[float, float, float, float]], seed: int

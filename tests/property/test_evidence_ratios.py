@@ -16,6 +16,7 @@ from projections.reducers.looks import LookRatios
 from projections.reducers.spots import Spots
 from projections.reducers.things import Thing
 from tests.evidence_pictures import a_room, fold_one, pictures_of
+from tests.thorough import examples
 
 LABELS = st.sampled_from(["chair", "table", "bed", "lamp"])
 POSITIVE = st.floats(1e-12, 1e12)
@@ -104,7 +105,7 @@ def test_exemplars_are_the_newest_of_their_kind(kept: list[tuple[int, float]]) -
     assert sorted(row for *_, row in thing.marks) == list(range(len(naive)))
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=examples(10), deadline=None)
 @given(st.integers(0, 10_000))
 def test_the_looks_of_one_thing_compare_as_among_several(seed: int) -> None:
     objects = EvidenceObjects(EvidenceConstants())

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 from tests.fuzz.target import Target
 from tests.fuzz.targets import TARGETS
+from tests.thorough import examples
 
-EXAMPLES = 300
+EXAMPLES = examples(300)
 
 
 @pytest.mark.parametrize("target", TARGETS.values(), ids=TARGETS.keys())

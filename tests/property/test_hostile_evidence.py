@@ -22,6 +22,7 @@ from projections.reducers.things import Thing
 from projections.settings import Settings
 from tests.envelopes import detection, envelope, payload
 from tests.folds import Folded
+from tests.thorough import examples
 
 EVIDENCE = Settings(fusion="evidence", eps_m=1.0)
 _ODD = (0.0, -0.0, 1e308, -1e308, 5e-324, 1e-300, 1e6, -1e6, 1e9, -50.0, 320.0, 200.0, 639.9999)
@@ -74,7 +75,7 @@ def hostile_drive(seed: int) -> list[dict[str, Any]]:
     return documents
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=examples(60))
 @given(seed=st.integers(0, 2**32), is_commanded=st.booleans())
 def test_estimates_of_anything_are_finite_and_snapshots_go_on(
     seed: int, is_commanded: bool
