@@ -16,6 +16,7 @@ from projections.errors import DatabaseError, ProjectionMismatch, ProjectionMiss
 from projections.settings import Settings
 from tests.commands import Commands
 from tests.logs import append_raw, bridge, walk, write_log
+from tests.thorough import every_other
 
 SETTINGS = Settings()
 
@@ -90,7 +91,7 @@ DAMAGE = {
 }
 
 
-@pytest.mark.parametrize("damage", DAMAGE)
+@pytest.mark.parametrize("damage", every_other(DAMAGE))
 def test_every_kind_of_damage_is_named_and_repaired(
     log: Path, one_database: Targets, pg: psycopg.Connection, damage: str
 ) -> None:

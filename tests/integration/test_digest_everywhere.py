@@ -7,6 +7,7 @@ float32 product has more than one result among them, or this test would prove no
 import os
 import subprocess
 import sys
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ import pytest
 
 from tests.envelopes import detection, envelope, payload
 from tests.shared_data import shared_run
-from tests.thorough import stride
+from tests.thorough import every_other, stride
 
 KERNELS = ("Prescott", "Nehalem", "Haswell", "SkylakeX", "Zen")
 PLACES = [(kernel, "1", "0") for kernel in KERNELS] + [
@@ -87,8 +88,15 @@ def _fold_in(kernel: str, threads: str, seed: str, lines: Path, *rules: str) -> 
     return digest, product
 
 
-@pytest.mark.parametrize("rules", [("page", "page"), ("evidence", "page"), ("page", "rooms")])
-@pytest.mark.parametrize("run", ["synthetic", "house-a", "home-1"])
+@pytest.mark.parametrize(
+    ("run", "rules"),
+    every_other(
+        product(
+            ["synthetic", "house-a", "home-1"],
+            [("page", "page"), ("evidence", "page"), ("page", "rooms")],
+        )
+    ),
+)
 def test_one_digest_on_every_kernel_thread_count_and_hash_seed(
     run: str, rules: tuple[str, str], tmp_path: Path
 ) -> None:

@@ -235,15 +235,17 @@ def test_landmarks_that_are_left_out_as_too_far_away_change_nothing(
 
 
 def slow_table(
-    likeness: list[float], side: list[float], look: float, constants: MapConstants
+    likeness: list[float], side: list[float], look: float, constants: MapConstants, steps: int
 ) -> tuple[float, float]:
-    """For one landmark and direction: which thing, which side before it is made a density."""
+    """For one landmark and direction: which thing, which side before it is made a density. What
+    speaks for a thing takes cosines of changes of side rounded to ``1 / steps``."""
     e, m = constants.evidence, MODEL
     ratios, errors = [], []
     for u, seen in zip(likeness, side, strict=True):
-        mean = e.same_back - e.session_shift
-        mean += e.same_side * math.exp(e.same_kappa * (math.cos(look - seen) - 1.0))
-        errors.append(u - mean)
+        cosine, usual = math.cos(look - seen), e.same_back - e.session_shift
+        errors.append(u - usual - e.same_side * math.exp(e.same_kappa * (cosine - 1.0)))
+        rounded = round(cosine * steps) / steps
+        mean = usual + e.same_side * math.exp(e.same_kappa * (rounded - 1.0))
         same = max(-0.5 * (min(u - mean, 0.0) / e.same_spread) ** 2, -8.0)
         spread = constants.different_spread / (1.0 - constants.different)
 
@@ -267,6 +269,22 @@ def slow_table(
     return which, -0.5 * (scatter * number / own + common**2 / (variance - own + own / number))
 
 
+def slow_row(
+    likeness: list[float], side: list[float], constants: MapConstants, steps: int
+) -> list[float]:
+    """One landmark's table, in all directions."""
+    both = [
+        slow_table(likeness, side, k * TURN / DIRECTIONS, constants, steps)
+        for k in range(DIRECTIONS)
+    ]
+    fits = [max(fit - max(f for _, f in both), -8.0) for _, fit in both]
+    mean = math.log(sum(math.exp(f) for f in fits) / DIRECTIONS)
+    return [
+        min(which + MODEL.side_weight * (fit - mean), MODEL.most)
+        for (which, _), fit in zip(both, fits, strict=True)
+    ]
+
+
 @given(seeds, st.lists(st.integers(1, 9), min_size=1, max_size=4))
 @settings(max_examples=examples(40), deadline=None)
 def test_looks_are_those_written_out_for_each_observation(seed: int, counts: list[int]) -> None:
@@ -279,21 +297,11 @@ def test_looks_are_those_written_out_for_each_observation(seed: int, counts: lis
     tables = appearance_tables(likeness, side, starts, constants, MODEL)
     for row, (start, count) in enumerate(zip(starts.tolist(), counts, strict=True)):
         part = slice(start, start + count)
-        both = [
-            slow_table(
-                likeness[part].tolist(), side[part].tolist(), k * TURN / DIRECTIONS, constants
-            )
-            for k in range(DIRECTIONS)
-        ]
-        fits = [max(fit - max(f for _, f in both), -8.0) for _, fit in both]
-        mean = math.log(sum(math.exp(f) for f in fits) / DIRECTIONS)
-        expected = [
-            min(which + MODEL.side_weight * (fit - mean), MODEL.most)
-            for (which, _), fit in zip(both, fits, strict=True)
-        ]
-        # The table's cosines of the change of side are rounded to 1/16.
-        assert tables[row].tolist() == pytest.approx(expected, abs=0.4)
-        assert float(np.mean(np.abs(tables[row] - expected))) < 0.1
+        seen = likeness[part].tolist(), side[part].tolist()
+        assert tables[row].tolist() == pytest.approx(slow_row(*seen, constants, 16), abs=1e-9)
+        exact = slow_row(*seen, constants, 1 << 40)
+        assert tables[row].tolist() == pytest.approx(exact, abs=0.4)
+        assert float(np.mean(np.abs(tables[row] - exact))) < 0.1
 
 
 @given(

@@ -22,6 +22,7 @@ from eventsrc.log.recover import TooManyLosses
 from eventsrc.system_events import LOSS_KEY
 from tests.commands import Commands
 from tests.fixtures_log import KEY, envelope, read_log, read_with_gaps, write_log
+from tests.thorough import stride
 
 EACH = 3
 COUNT = 5
@@ -215,7 +216,7 @@ def by_hand(log_id: str, base: int, messages: list[tuple[int, bytes]]) -> bytes:
     return head + chunk + encode_mark(base + first, base + last + 1, 0)
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(0, 40, stride(4)))
 def test_any_permutation_of_names_keeps_every_event_at_its_offset(
     quick_path: Path, seed: int
 ) -> None:
