@@ -31,7 +31,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the tests of tests/unit that are quick and need neither a database nor a network."""
     for item in items:
-        slow = item.get_closest_marker("slow") is not None
+        slow = any(item.get_closest_marker(name) for name in ("slow", "seconds"))
         network = NETWORK & set(getattr(item, "fixturenames", ()))
         if UNIT in item.path.parents and not slow and not network:
             item.add_marker(pytest.mark.unit)

@@ -7,7 +7,6 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from sklearn.cluster import DBSCAN
 
 from eventsrc.ingest import Accepted, ingest
 from projections.corrections import NO_CORRECTIONS, Corrections
@@ -67,6 +66,8 @@ def fold(documents: Iterable[dict[str, Any]], **settings: Any) -> Folded:
 
 def batch_dbscan(are_near: np.ndarray, min_samples: int) -> tuple[np.ndarray, set[int]]:
     """scikit-learn's labels and core points; ``are_near`` is a boolean (n, n) matrix."""
+    from sklearn.cluster import DBSCAN  # takes a second, and few tests need it
+
     model = DBSCAN(eps=0.5, min_samples=min_samples, metric="precomputed")
     model.fit(np.where(are_near, 0.0, 1.0))
     return model.labels_, set(model.core_sample_indices_.tolist())

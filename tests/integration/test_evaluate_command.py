@@ -156,6 +156,7 @@ def test_of_several_maps_the_worst_is_named(mapfold: Commands, runs: list[str]) 
     assert "--picture draws one map; give one --map" in refused.err
 
 
+@pytest.mark.slow
 def test_of_several_maps_that_are_asked_about_themselves_the_worst_is_named(
     mapfold: Commands, runs: list[str]
 ) -> None:
@@ -207,11 +208,12 @@ def test_the_trial_house_is_found_again(mapfold: Commands) -> None:
         truth = path.with_name(f"{run}.truth.jsonl.gz").resolve()
         arguments += [flag, str(mapfold.folder / run), "--truth", str(truth)]
     scores = mapfold("evaluate", *arguments, "--json").json["relocalization"]
-    assert scores["3"]["pose_error_m"]["p50"] <= 0.6
-    assert scores["3"]["pose_error_m"]["p90"] <= 2.5
-    assert scores["1"]["pose_error_m"]["p50"] <= 1.0
-    assert scores["3"]["auroc"] >= 0.95
-    assert scores["3"]["known_called_unknown"] <= 0.05
+    assert scores["3"]["pose_error_m"]["p50"] <= 0.3
+    assert scores["3"]["pose_error_m"]["p90"] <= 0.8
+    assert scores["1"]["pose_error_m"]["p50"] <= 0.6
+    assert scores["3"]["auroc"] >= 0.99
+    assert scores["3"]["known_called_unknown"] <= 0.02
     # Uncalibrated, the confidence is too low on this easy map, most with one crop.
-    assert [scores[n]["ece"] for n in "123"] == pytest.approx([0.0] * 3, abs=0.25)
-    assert [scores[n]["known_ece"] for n in "123"] == pytest.approx([0.0] * 3, abs=0.12)
+    for crops, most in (("1", 0.24), ("2", 0.16), ("3", 0.12)):
+        assert scores[crops]["ece"] <= most
+        assert scores[crops]["known_ece"] <= 0.12

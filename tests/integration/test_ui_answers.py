@@ -89,6 +89,7 @@ def test_under_other_settings_too(mapfold: Commands, server: UiServer, sample: P
     check_digests_and_arrays(mapfold, server, sample, *WIDE)
 
 
+@pytest.mark.slow
 def test_on_a_real_house(mapfold: Commands, tmp_path: Path) -> None:
     house = [json.loads(line) for line in shared_run("house-a")]
     log = write_log(tmp_path / "log", house)

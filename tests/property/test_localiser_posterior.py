@@ -17,7 +17,7 @@ from projections.relocalize.model import MODEL
 from projections.relocalize.movements import poses_at_views
 from projections.relocalize.pose import CELL_M, Posterior, _sighted, locate
 from tests.relocalization.scenes import CONSTANTS, Pose, Scene, Thing, around, movement
-from tests.thorough import examples
+from tests.thorough import examples, rounds
 
 HEADINGS = np.arange(72) * (math.pi / 36)
 
@@ -77,6 +77,19 @@ def test_the_answer_is_about_as_good_as_that_of_a_sum_over_all_poses(
     assert float((np.minimum(off, 2.5) * weights).sum()) <= best + 0.1
     mass = float(weights[off < 1.5].sum())
     assert found.features.mass == pytest.approx(mass, abs=0.25)
+
+
+def test_the_mass_near_the_answer_is_on_average_that_of_a_sum_over_all_poses() -> None:
+    off = []
+    for seed in range(rounds(150, 30)):
+        scene, at, shown = random_scene(seed, has_estimates=seed % 2 == 0)
+        question, candidates = scene.ask([(at, shown)], noise=0.02)
+        found = posterior_of(question, candidates)
+        cells, weights = slow_posterior(question, candidates)
+        near = np.hypot(cells[:, 0] - found.x, cells[:, 1] - found.y) < 1.5
+        off.append(abs(found.features.mass - float(weights[near].sum())))
+    assert sum(off) / len(off) < 0.035
+    assert sum(each > 0.1 for each in off) <= 0.15 * len(off)
 
 
 @given(st.integers(0, 10_000))

@@ -78,6 +78,7 @@ def test_few_questions_leave_it_near_what_is_usual() -> None:
     assert 0.0 < sure < 0.5 * shifts[3]
 
 
+@pytest.mark.seconds
 def test_nonsense_is_bounded() -> None:
     wrong = [_answer(z < 0, probability(z), 0.5, None) for z in _spread_logits(40_000)]
     constants = correction(wrong)

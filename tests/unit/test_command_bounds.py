@@ -42,6 +42,7 @@ COSTLY = {
 
 
 @pytest.mark.parametrize("name", COSTLY)
+@pytest.mark.seconds
 def test_a_costly_command_is_refused_in_seconds(name: str) -> None:
     before = time.process_time()
     with pytest.raises(InvalidCommand):
@@ -49,6 +50,7 @@ def test_a_costly_command_is_refused_in_seconds(name: str) -> None:
     assert time.process_time() - before < MOST_S
 
 
+@pytest.mark.seconds
 def test_a_trajectory_of_an_hour_at_ten_hertz_fits() -> None:
     pose = b'{"keyframe_id":%d,"x":1.2345678901234567,"y":-7.6543210987654321,"yaw":0.123456789}'
     poses = b",".join(pose % k for k in range(36_000))

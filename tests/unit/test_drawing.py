@@ -125,6 +125,7 @@ def test_the_house_the_lost_robot_and_the_bridge_are_on_it() -> None:
     assert any("lost robot" in text for text in texts)
 
 
+@pytest.mark.seconds
 def test_labels_that_find_no_room_are_counted_on_the_picture() -> None:
     view = _two_places()
     for number in range(3, 300):
@@ -174,6 +175,7 @@ def test_a_class_may_be_called_anything(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["png", "svg", "pdf"])
+@pytest.mark.seconds
 def test_the_same_map_gives_the_same_bytes(tmp_path: Path, suffix: str) -> None:
     one, two = tmp_path / f"one.{suffix}", tmp_path / "sub" / f"two.{suffix}"
     draw_map(_two_places(), one, title="t")

@@ -152,6 +152,7 @@ def test_an_arrow_leads_from_where_a_moved_object_stood() -> None:
 
 
 @pytest.mark.parametrize("suffix", ["png", "svg"])
+@pytest.mark.seconds
 def test_the_same_map_gives_the_same_bytes(tmp_path: Path, suffix: str) -> None:
     one, two = tmp_path / f"one.{suffix}", tmp_path / f"two.{suffix}"
     for out in (one, two):

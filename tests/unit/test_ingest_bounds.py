@@ -83,6 +83,7 @@ with LogWriter(Path(sys.argv[1])) as log:
 
 
 @pytest.mark.parametrize("mib", [1, pytest.param(16, marks=pytest.mark.slow)])
+@pytest.mark.seconds
 def test_a_large_message_of_any_content_costs_little(tmp_path: Path, mib: int) -> None:
     done = subprocess.run(
         [sys.executable, "-c", HOSTILE, str(tmp_path / "log"), str(CPU_S), str(mib)],

@@ -32,6 +32,7 @@ ENDS = {
 
 
 @pytest.mark.parametrize("code", ENDS.values(), ids=ENDS)
+@pytest.mark.seconds
 def test_it_ends_and_says_what_a_new_process_does(code: str, tmp_path: Path) -> None:
     env, argv, stdin = {**os.environ, "ASKED": "ä\udcff"}, ["-c", "a b", "☕"], b"given"
     new = subprocess.run(
@@ -62,6 +63,7 @@ def test_one_that_runs_is_polled_waited_for_and_killed(tmp_path: Path) -> None:
         prefork.run(code, ["-c"], env=os.environ, cwd=tmp_path, timeout=0.01)
 
 
+@pytest.mark.seconds
 def test_the_mapfold_of_scripts(tmp_path: Path) -> None:
     path = f"{prefork.folder_with_mapfold()}{os.pathsep}{os.environ['PATH']}"
     (tmp_path / "in.jsonl").write_text("no JSON\n")

@@ -147,6 +147,7 @@ def test_fusion_is_inclusive_at_its_radius_and_exclusive_beyond() -> None:
     assert objects(3.000001) == 2
 
 
+@pytest.mark.seconds
 def test_more_than_4096_observations_of_an_object_stay_exact() -> None:
     """Beyond 2¹² observations it takes two products; the cosine stays what it is."""
     folded = Folded.start(Settings())

@@ -45,12 +45,14 @@ def _crops() -> tuple[NDArray[np.float32], list[str], list[str]]:
     return np.array(vectors), instances, [class_of[instance] for instance in instances]
 
 
+@pytest.mark.seconds
 def test_every_payload_is_an_envelope() -> None:
     for run in map(_run, "abc"):
         assert all(isinstance(ingest(payload), Accepted) for payload in run.payloads)
         assert [e["keyframe_id"] for e in run.envelopes] == list(range(1, len(run.envelopes) + 1))
 
 
+@pytest.mark.seconds
 def test_the_seed_makes_the_run_byte_for_byte() -> None:
     digest = hashlib.sha256(b"\n".join(simulate_run(7, "a").payloads)).hexdigest()
     assert digest == hashlib.sha256(b"\n".join(_run("a").payloads)).hexdigest()
@@ -88,6 +90,7 @@ def test_cosines_come_out_as_on_real_crops(which: str, low: float, high: float) 
     assert np.percentile(cosines, 95) == pytest.approx(high, abs=0.015)
 
 
+@pytest.mark.seconds
 def test_another_house_has_other_things_of_the_same_models() -> None:
     there = simulate_run(8, "a")
     assert not {t.instance for t in there.house.things} & {

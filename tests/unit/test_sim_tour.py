@@ -21,6 +21,7 @@ def driven(request: pytest.FixtureRequest) -> Drive:
     return house, run, list(drive(house.grid, plan_tour(house, run)))
 
 
+@pytest.mark.seconds
 def test_keeps_its_radius_from_walls_and_furniture(driven: Drive) -> None:
     house, _, poses = driven
     standing = [thing.footprint for thing in house.things if thing.model.stands]

@@ -236,6 +236,7 @@ def test_bytes_with_another_head_or_checksum_are_refused() -> None:
         unpack(MAGIC + b"0" * 32 + body)
 
 
+@pytest.mark.seconds
 def test_a_decompression_bomb_is_refused() -> None:
     squeeze = zlib.compressobj(1)
     body = b"".join(squeeze.compress(bytes(1_000_000)) for _ in range(500)) + squeeze.flush()
