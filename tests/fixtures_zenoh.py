@@ -27,7 +27,8 @@ with open_session(ZenohOptions(connect=(endpoint,)), mode="client") as session:
         publisher.put(payload.encode())
     session.confirm()
 """
-LOOPBACK = ZenohOptions(listen=("tcp/127.0.0.1:0",))
+LONG_LEASE = Path(__file__).with_name("long_lease.json5")
+LOOPBACK = ZenohOptions(listen=("tcp/127.0.0.1:0",), config_file=LONG_LEASE)
 DEADLINE_S = 30.0
 """Longer than any wait in a healthy run; only a broken one ever waits that long."""
 
@@ -51,7 +52,7 @@ def connected(endpoint: str) -> Iterator[Callable[[], Session]]:
     """Opens client sessions on the test's router; they are closed with the test."""
     with ExitStack() as sessions:
         yield lambda: sessions.enter_context(
-            open_session(ZenohOptions(connect=(endpoint,)), mode="client")
+            open_session(ZenohOptions(connect=(endpoint,), config_file=LONG_LEASE), mode="client")
         )
 
 
