@@ -127,9 +127,8 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
                 return await apart(request, lambda end, go_on: encoded(work(end, go_on)))
             future = service.ask_apart(work)  # recorded also when the page leaves meanwhile
             document = await asyncio.wrap_future(future)
-            with contextlib.suppress(
-                MapfoldError
-            ):  # it is recorded; the log's problems say the rest
+            # It is recorded; what is wrong with the log now is among the log's problems.
+            with contextlib.suppress(MapfoldError):
                 await asyncio.wrap_future(service.refresh())
             return _json(document | {"through": service.log_document()["through"]})
 

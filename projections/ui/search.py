@@ -1,6 +1,7 @@
 """Finding things by their names: places, objects, classes, detections, keyframes and runs."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
+from itertools import chain
 from typing import Any, Final
 
 from starlette.datastructures import QueryParams
@@ -12,7 +13,6 @@ from projections.history import NoSuchThing
 from projections.history.history import History
 from projections.history.names import find_keyframe, keyframe_name
 from projections.model.records import ObservationRecord
-from projections.model.view import MapView
 
 from .log_map import LogMap
 from .moment import Moment
@@ -20,7 +20,81 @@ from .requests import text_of
 
 MOST_FOUND: Final = 50
 _MOST_TEXT: Final = 300
+_NOT: Final = 4
 _Found = tuple[int, int, dict[str, Any]]
+
+
+def _rank(name: str, wanted: str) -> int:
+    if wanted not in name:
+        return _NOT
+    if name == wanted:
+        return 0
+    tail = name.rpartition("_")[2]
+    return 1 if tail == wanted or name.startswith(wanted) else 2 if name.endswith(wanted) else 3
+
+
+def _places(moment: Moment, _: str) -> Iterator[dict[str, Any]]:
+    for place in moment.known.history.places:
+        called = [named.name for named in place.names if named.name is not None]
+        yield {
+            "kind": "place", "id": place.place_id, "number": place.formed.place,
+            "offset": place.formed.offset, "stands": place.stands(moment.end),
+            "text": place.name(moment.end) or "", "names": [place.place_id, *called],
+        }  # fmt: skip
+
+
+def _objects(moment: Moment, _: str) -> Iterator[dict[str, Any]]:
+    for each in moment.known.history.objects:
+        class_name = each.class_name(moment.end)
+        yield {
+            "kind": "object", "id": each.object_id, "number": each.found.object,
+            "offset": each.found.offset, "stands": each.stands(moment.end), "text": class_name,
+            "names": [each.object_id, class_name],
+        }  # fmt: skip
+
+
+def _runs(moment: Moment, _: str) -> Iterator[dict[str, Any]]:
+    for number, seen in enumerate(moment.known.history.runs):
+        yield {
+            "kind": "run", "id": seen[0].run_id, "number": number, "offset": seen[0].offset,
+            "stands": seen[0].offset < moment.end, "text": "", "names": [seen[0].run_id],
+        }  # fmt: skip
+
+
+def _keyframes(moment: Moment, wanted: str) -> Iterator[dict[str, Any]]:
+    history = moment.known.history
+    for keyframe in history.keyframes:
+        name = keyframe_name(history, keyframe.keyframe)
+        if wanted in name.casefold():
+            yield {
+                "kind": "keyframe", "id": f"{keyframe.run_id}/{keyframe.keyframe_id}",
+                "number": keyframe.keyframe, "offset": keyframe.offset,
+                "stands": keyframe.offset < moment.end, "text": "", "names": [name],
+            }  # fmt: skip
+
+
+def _detections(moment: Moment, wanted: str) -> Iterator[dict[str, Any]]:
+    history = moment.known.history
+    for seen in moment.known.latest.observations:
+        if wanted in seen.det_id.casefold():
+            keyframe = history.keyframes[seen.keyframe]
+            yield {
+                "kind": "detection", "id": seen.det_id, "number": seen.keyframe,
+                "offset": keyframe.offset, "stands": keyframe.offset < moment.end,
+                "text": f"{seen.class_name}, {keyframe_name(history, keyframe.keyframe)}",
+                "names": [seen.det_id],
+            }  # fmt: skip
+
+
+_SOURCES: Final[Mapping[str, Callable[[Moment, str], Iterator[dict[str, Any]]]]] = {
+    "place": _places,
+    "object": _objects,
+    "run": _runs,
+    "keyframe": _keyframes,
+    "detection": _detections,
+}
+"""What has a name, by kind: its ``names``, and the ``offset`` of the event that brought it. Where
+there are very many, only those that contain what is wanted."""
 
 
 def search_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
@@ -29,11 +103,12 @@ def search_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
     moment = Moment.of(shown, query)
     wanted = text_of(query, "q")[:_MOST_TEXT].casefold().strip()
     kind = query.get("kind")
-    known = moment.known
+    sources = _SOURCES.values() if kind is None else [s for k, s in _SOURCES.items() if k == kind]
+    named = chain.from_iterable(source(moment, wanted) for source in sources) if wanted else ()
     found: list[_Found] = []
-    for number, each in enumerate(_named(known.history, known.latest, moment)):
+    for number, each in enumerate(named):
         rank = min(_rank(name.casefold(), wanted) for name in each.pop("names"))
-        if rank < _NOT and kind in (None, each["kind"]):
+        if rank < _NOT:
             found.append((rank, number, each))
     found.sort(key=lambda item: item[:2])
     return {
@@ -41,56 +116,6 @@ def search_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
         "found": [each for _, _, each in found[:MOST_FOUND]],
         "more": max(0, len(found) - MOST_FOUND),
     }
-
-
-_NOT: Final = 4
-
-
-def _rank(name: str, wanted: str) -> int:
-    if not wanted or wanted not in name:
-        return _NOT
-    if name == wanted:
-        return 0
-    tail = name.rpartition("_")[2]
-    return 1 if tail == wanted or name.startswith(wanted) else 2 if name.endswith(wanted) else 3
-
-
-def _named(history: History, latest: MapView, moment: Moment) -> Iterator[dict[str, Any]]:
-    """Everything that has a name, with its ``names``; ``offset`` is the event that brought it."""
-    for place in history.places:
-        called = [named.name for named in place.names if named.name is not None]
-        yield {
-            "kind": "place", "id": place.place_id, "number": place.formed.place,
-            "offset": place.formed.offset, "stands": place.stands(moment.end),
-            "text": place.name(moment.end) or "", "names": [place.place_id, *called],
-        }  # fmt: skip
-    for each in history.objects:
-        class_name = each.class_name(moment.end)
-        yield {
-            "kind": "object", "id": each.object_id, "number": each.found.object,
-            "offset": each.found.offset, "stands": each.stands(moment.end), "text": class_name,
-            "names": [each.object_id, class_name],
-        }  # fmt: skip
-    for number, seen in enumerate(history.runs):
-        yield {
-            "kind": "run", "id": seen[0].run_id, "number": number, "offset": seen[0].offset,
-            "stands": seen[0].offset < moment.end, "text": "", "names": [seen[0].run_id],
-        }  # fmt: skip
-    for keyframe in history.keyframes:
-        name = keyframe_name(history, keyframe.keyframe)
-        yield {
-            "kind": "keyframe", "id": f"{keyframe.run_id}/{keyframe.keyframe_id}",
-            "number": keyframe.keyframe, "offset": keyframe.offset,
-            "stands": keyframe.offset < moment.end, "text": "", "names": [name],
-        }  # fmt: skip
-    for seen_ in latest.observations:
-        keyframe = history.keyframes[seen_.keyframe]
-        yield {
-            "kind": "detection", "id": seen_.det_id, "number": seen_.keyframe,
-            "offset": keyframe.offset, "stands": keyframe.offset < moment.end,
-            "text": f"{seen_.class_name}, {keyframe_name(history, keyframe.keyframe)}",
-            "names": [seen_.det_id],
-        }  # fmt: skip
 
 
 def keyframe_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
