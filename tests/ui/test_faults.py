@@ -249,3 +249,33 @@ def test_a_log_that_vanishes_and_comes_back(
         page.keyboard.press("l")
         write_log(log, [envelope(9, x=0.9)])
         expect(page.locator(".facts")).to_contain_text("9 keyframes")
+
+
+def test_what_is_known_is_kept_when_a_late_answer_about_the_growing_log_comes(
+    mapfold: Commands, visit: Visit, tmp_path: Path
+) -> None:
+    """The late one knows the command, the map shown does not: it must not be put in its place."""
+    log = write_log(
+        tmp_path / "log",
+        [envelope(k, x=0.1 * k, run_id=run) for run in ("run-a", "run-b") for k in range(6)],
+    )
+    with showing(mapfold, log, "--allow-edits") as server:
+        server.edit("forget-run", "run-a", reason="the robot was carried", dry_run=False)
+        page = visit(server, "#panel=why")
+        expect(page.locator(".facts")).to_contain_text("6 keyframes")
+        held: list[Route] = []
+        page.route("**/api/history?from=*", lambda route: held.append(route))
+        write_log(log, [envelope(6, x=0.6, run_id="run-b")])
+        for _ in range(300):
+            page.wait_for_timeout(100)
+            if held:
+                break
+        page.evaluate("location.hash = '#at=12&known=then&panel=why'")
+        expect(page.locator(".facts")).to_contain_text("12 keyframes")
+        with page.expect_response("**/api/history?from=*"):
+            held[0].continue_()
+        page.unroute("**/api/history?from=*")
+        page.wait_for_timeout(1000)
+        expect(page.locator(".facts")).to_contain_text("12 keyframes")
+        page.keyboard.press("End")
+        expect(page.locator(".facts")).to_contain_text("7 keyframes")

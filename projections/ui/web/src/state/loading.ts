@@ -78,6 +78,10 @@ export async function grow() {
     if (next.state !== before.state || next.through < before.through) next = decodeHistory(await getBinary(address("/api/history", { known_at })));
     kept.clear();
     const info = await getJson<LogInfo>("/api/log");
+    if (store.history.value !== before) {
+      again = true; // meanwhile another history is shown: of other knowledge
+      return;
+    }
     batch(() => {
       store.history.value = next;
       store.log.value = info;

@@ -15,6 +15,7 @@ const hits = signal<Hit[]>([]);
 const active = signal(0);
 const open = signal(false);
 const ASK_AFTER_MS = 180;
+let asking = new AbortController();
 
 export function focusSearch() {
   document.querySelector<HTMLInputElement>("#search")?.focus();
@@ -110,10 +111,12 @@ interface ServerHit {
 
 /** The server knows what the page does not: det_ids. */
 async function askServer(value: string) {
+  asking.abort();
+  asking = new AbortController();
   const [history, map] = [store.history.value, store.map.value];
   if (history === null || map === null) return;
   try {
-    const answer = await getJson<{ found: ServerHit[] }>(address("/api/search", { q: value, kind: "detection", known_at: history.knownAt }));
+    const answer = await getJson<{ found: ServerHit[] }>(address("/api/search", { q: value, kind: "detection", known_at: history.knownAt }), asking.signal);
     if (text.value !== value) return;
     const more = answer.found.map(({ id, number, text: says, offset }): Hit => ({
       thing: { kind: "keyframe", id: keyframeId(history, number) },
