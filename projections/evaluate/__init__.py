@@ -1,4 +1,4 @@
-"""Scores of places, landmarks and re-localisation against ground truth."""
+"""Scores of places, Objects and re-localisation against ground truth."""
 
 from .run import Evaluation, evaluate
 from .truth import Truth, read_truth
