@@ -91,6 +91,7 @@ class Agreement:
         self._log_range = log(range_m)
         self._range_variance = range_spread * range_spread
         self._reach_m2 = reach_m * reach_m
+        self._farthest_m = reach_m * _SLACK
 
     def pairs(self, estimates: Floats, sights: Sequence[Sight], slopes: float) -> Pairs:
         """The pairs whose ratio is above `LEAST_AGREEMENT`; `is_ruled_out` may still rule some of
@@ -145,9 +146,7 @@ class Agreement:
             *(cos, sin, 0.0, 0.0, 0.0),
             *(-sin, cos, 0.0, 0.0, 0.0),
             *(0.0, 0.0, chi2 * ss, chi2 * -twice_cs, chi2 * cc),
-            *(0.0, 0.0, chi2, 0.0, chi2),
             chi2 * (least + LEAST_M * LEAST_M * per_m2) + _SLACK_M2,
-            chi2 * _BEHIND_M2 + _SLACK_M2,
             chi2 * per_m2,
         )
 
@@ -156,26 +155,22 @@ class Agreement:
         more; quick, since most pairs are far from it.
 
         A product of matrices gives, for each pair, the distance ahead, that across, and the most χ²
-        that a pair can have times the estimate's variance across, and along. The slack is far above
-        its rounding errors, which differ from machine to machine.
+        that a pair can have times the estimate's variance across. The slack is far above its
+        rounding errors, which differ from machine to machine.
         """
         count = len(seen)
+        factors = seen[:, _SEEN:-2].reshape(count, 3, 5).transpose(1, 0, 2).reshape(-1, 5)
+        more, per_m2 = seen[:, -2:].T[:, :, np.newaxis]
         here = np.array((seen[0, 0], seen[0, 1], 0.0, 0.0, 0.0))
-        factors = seen[:, _SEEN : _SEEN + 20].reshape(count, 4, 5).transpose(1, 0, 2)
-        products = factors.reshape(4 * count, 5).dot((estimates[:, :5] - here).T)
-        products = products.reshape(4, count, -1)
-        more, behind, per_m2 = seen[:, -3:].T[:, :, np.newaxis]
-        ahead, squares = products[0], products[:2] * products[:2]
-        limit = squares[0] * per_m2
-        limit += products[2]
+        ahead, across, limit = factors.dot((estimates[:, :5] - here).T).reshape(3, count, -1)
         limit += more
-        may_be: NDArray[np.bool_] = squares[1] < limit
-        limit = squares[0] + squares[1]
-        may_be &= limit < self._reach_m2 * _SLACK
-        limit = np.minimum(ahead, 0.0)
-        limit *= ahead
-        products[3] += behind
-        may_be &= limit < products[3]
+        square = np.maximum(ahead, 0.0)
+        square *= ahead
+        square *= per_m2
+        limit += square
+        across *= across
+        may_be: NDArray[np.bool_] = across < limit
+        may_be &= ahead < self._farthest_m
         rows, columns = may_be.T.nonzero()
         return rows, columns
 
