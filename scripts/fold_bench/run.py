@@ -6,14 +6,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
 
 from plain import fold_plain
-from streams import DIM, MODEL, house_walk, keyframes, random_walk
+from streams import DIM, MODEL, house_walk, keyframes, pictures, random_walk
 
 from eventsrc.ingest import Accepted, ingest
 from eventsrc.log import LogReader, LogWriter
@@ -144,21 +144,60 @@ def growth() -> None:
     print(f"memory of the fold and its view after {large} keyframes: {memory:.0f} MB")
 
 
-def _fold_time(count: int) -> float:
-    semantic_map, view = SemanticMap(Settings()), MapView(Settings(), keep_embeddings=False)
-    stream, seconds = keyframes(count, 3), 0.0
+def evidence() -> None:
+    small, large = (1_600, 16_000) if QUICK else (10_000, 100_000)
+    by_page = _Fold(Settings())
+    before = _resident()
+    by_evidence = _Fold(Settings(fusion="evidence"))
+    few = 0.0
     with gc_paused():
-        while chunk := list(islice(stream, READ_AHEAD)):
-            start = clock()
-            units = iter(unit_vectors([v for accepted in chunk for v in accepted.vectors]))
-            for accepted in chunk:
-                offset = semantic_map.next_offset
-                deltas = semantic_map.fold(offset, accepted, list(islice(units, 3)))
-                view.apply_event(offset, deltas)
-            seconds += clock() - start
+        for chunk in _chunks(pictures(large)):
+            by_evidence.fold(chunk)
+            if by_page.folded + len(chunk) <= small:  # in turn: the machine is the same for both
+                by_page.fold(chunk)
+                few = by_evidence.seconds
+    memory = (_resident() - before) / 1e6
+    each = by_page.seconds / by_page.folded * 1e6, by_evidence.seconds / large * 1e6
+    print(
+        f"pictures of a camera: by the page's rule {each[0]:.0f} µs, by evidence {each[1]:.0f} µs"
+    )
+    report("fold by evidence / fold by the page's rule", few / by_page.seconds, 2.5)
+    report(f"by evidence: time({large}) / time({small})", by_evidence.seconds / few, 12)
+    print(f"memory of the fold by evidence and its view: {memory:.0f} MB")
+
+
+def _fold_time(count: int) -> float:
+    fold = _Fold(Settings())
+    with gc_paused():
+        for chunk in _chunks(keyframes(count, 3)):
+            fold.fold(chunk)
     global kept
-    kept = semantic_map, view  # measured while it is there
-    return seconds
+    kept = fold  # measured while it is there
+    return fold.seconds
+
+
+class _Fold:
+    """A map and its view, and the processor time that folding keyframes into them has taken."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._map = SemanticMap(settings)
+        self._view = MapView(settings, keep_embeddings=False)
+        self.seconds, self.folded = 0.0, 0
+
+    def fold(self, chunk: list[Accepted]) -> None:
+        start = clock()
+        units = iter(unit_vectors([v for accepted in chunk for v in accepted.vectors]))
+        for accepted in chunk:
+            offset = self._map.next_offset
+            own = list(islice(units, len(accepted.vectors)))
+            self._view.apply_event(offset, self._map.fold(offset, accepted, own))
+        self.seconds += clock() - start
+        self.folded += len(chunk)
+
+
+def _chunks(stream: Iterator[Accepted]) -> Iterator[list[Accepted]]:
+    while chunk := list(islice(stream, READ_AHEAD)):
+        yield chunk
 
 
 def whole() -> None:
@@ -221,7 +260,7 @@ def _resident() -> int:
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
-BENCHMARKS = {f.__name__: f for f in (plain, peer, lifelong, rooms, growth, whole)}
+BENCHMARKS = {f.__name__: f for f in (plain, peer, lifelong, rooms, growth, evidence, whole)}
 
 if __name__ == "__main__":
     wanted = [name for name in sys.argv[1:] if not name.startswith("--")]

@@ -8,6 +8,7 @@ import numpy as np
 
 from eventsrc.envelope import Detection, DetId, Envelope
 from eventsrc.ingest import Accepted
+from projections.settings import Camera
 
 WIDTH_M, DEPTH_M = 20.0, 15.0
 DIM = 512
@@ -53,19 +54,61 @@ def keyframes(count: int, detections: int) -> Iterator[Accepted]:
         yield _accepted(index, x, y, [int(i) for i in nearest], vectors)
 
 
-def _accepted(index: int, x: float, y: float, seen: list[int], vectors: np.ndarray) -> Accepted:
+def pictures(count: int) -> Iterator[Accepted]:
+    """Keyframes of `house_walk` that look where the robot drives: of the 60 pieces of furniture the
+    nearest three in view, their boxes as a camera with the settings' defaults draws them."""
+    rng, camera = np.random.default_rng(9), Camera()
+    spots = rng.uniform((0, 0), (WIDTH_M, DEPTH_M), (60, 2))
+    heights, elevations = rng.uniform(0.3, 1.5, 60), rng.uniform(-0.4, 0.4, 60)
+    classes = rng.normal(size=(20, DIM))
+    looks = classes[np.arange(60) % 20] * 0.8 + rng.normal(size=(60, DIM)) * 0.5
+    half = camera.width_px / 2
+    focal = half / math.tan(math.radians(camera.hfov_deg / 2))
+    before, yaw = (5.0, 7.0), 0.0
+    for index, (x, y) in enumerate(house_walk(count)):
+        if (x, y) != before:
+            yaw = math.atan2(y - before[1], x - before[0])
+        before, (cos, sin) = (x, y), (math.cos(yaw), math.sin(yaw))
+        dx, dy = spots[:, 0] - x, spots[:, 1] - y
+        ahead, aside = dx * cos + dy * sin, dy * cos - dx * sin
+        in_view = (ahead > 0.5) & (ahead < 6.0) & (np.abs(aside) < ahead * half / focal)
+        nearest = [int(i) for i in np.argsort(np.where(in_view, ahead, np.inf))[:3] if in_view[i]]
+        seen = rng.normal(size=(len(nearest), 2)) * 3.0  # pixels
+        seen += np.array([half, camera.height_px / 2])
+        seen -= focal * np.array([aside[nearest], elevations[nearest]]).T / ahead[nearest, None]
+        tall = focal * heights[nearest] / ahead[nearest] / 2
+        most = camera.width_px, camera.height_px
+        boxes = [
+            tuple(float(min(max(at, 0.0), m)) for at, m in zip(box, most * 2, strict=True))
+            for box in np.column_stack((seen - tall[:, None], seen + tall[:, None]))
+        ]
+        noise = rng.normal(size=(len(nearest), DIM)) * 0.35
+        yield _accepted(index, x, y, nearest, (looks[nearest] + noise).astype("<f4"), yaw, boxes)
+
+
+def _accepted(
+    index: int,
+    x: float,
+    y: float,
+    seen: list[int],
+    vectors: np.ndarray,
+    yaw: float = 0.5,
+    boxes: list[tuple[float, ...]] | None = None,
+) -> Accepted:
     left, top = 120.0 + index % 64, 80.0 + index % 48  # objects of their own, as JSON gives them
+    if boxes is None:
+        boxes = [(left + i, top + i, left + i + 130.0, top + i + 230.0) for i in seen]
     detections = tuple(
         Detection.model_construct(
             det_id=None,
             class_name=f"class {which % 20}",
             confidence=0.5 + which / 128,
-            bbox=(left + which, top + which, left + which + 130.0, top + which + 230.0),
+            bbox=box,
             embedding=None,
             embedding_dim=DIM,
             embedding_model=MODEL,
         )
-        for which in seen
+        for which, box in zip(seen, boxes, strict=True)
     )
     envelope = Envelope.model_construct(
         run_id="robot",
@@ -73,7 +116,7 @@ def _accepted(index: int, x: float, y: float, seen: list[int], vectors: np.ndarr
         timestamp=1.7e9 + index,
         map_x=x,
         map_y=y,
-        map_yaw=0.5,
+        map_yaw=yaw,
         detections=detections,
     )
     det_ids = tuple(DetId(f"robot_kf{index}_d{i}") for i in range(len(seen)))
