@@ -5,6 +5,7 @@ import json
 import threading
 import urllib.request
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import cache
@@ -60,7 +61,7 @@ def _house() -> OccupancyMap:
 def _other_house() -> OccupancyMap:
     """The house moved by half a metre, so that its walls cut rooms."""
     given = _house()
-    return OccupancyMap(None, given.resolution, (0.0, -0.5, 0.0), "moved", given.cells)
+    return OccupancyMap(None, given.resolution, (0.0, -0.25, 0.0), "moved", given.cells)
 
 
 def _append(log: Path, *items: OccupancyMap | bytes) -> int:
@@ -221,3 +222,40 @@ def test_a_projection_of_an_older_version_is_answered_without_walls(
         assert list(reader.candidates(asked.crops).walls) == [None]
     _append(log, payload(envelope(9_000, 1.0, 1.0, run_id="late")))
     assert tail(log, one_database, SETTINGS, once=True).events == 1
+
+
+def test_readers_see_the_maps_of_one_projection_or_the_other_during_rebuilds(
+    tmp_path: Path, one_database: Targets
+) -> None:
+    """Questions go on while rebuilds put another map in, take it out, and make the table anew."""
+    logs = [tmp_path / name for name in ("plain", "house", "other")]
+    maps = [None, _house(), _other_house()]
+    for log, given in zip(logs, maps, strict=True):
+        _append(log, *([] if given is None else [given]), *_drive("a")[:60])
+    rebuild(logs[0], one_database, SETTINGS)
+    crops = parse_question(_questions()[0]).crops
+    stop = threading.Event()
+
+    def corner(reader: CandidateReader) -> float | None:
+        walls = reader.candidates(crops).walls
+        return float(walls[None]._corner[1]) if walls else None
+
+    def ask() -> set[float | None]:
+        found: set[float | None] = set()
+        with CandidateReader(one_database) as reader:
+            while not stop.is_set():
+                found.add(corner(reader))
+        return found
+
+    wanted = [None if given is None else given.origin[1] for given in maps]
+    with ThreadPoolExecutor(2) as pool:
+        readers = [pool.submit(ask) for _ in range(2)]
+        try:
+            for number in (1, 2, 0, 1, 2):
+                rebuild(logs[number], one_database, SETTINGS)
+                with CandidateReader(one_database) as fresh:
+                    assert corner(fresh) == wanted[number]
+        finally:
+            stop.set()
+        seen = [reader.result(WAIT_S) for reader in readers]
+    assert all(len(each) > 1 and each <= set(wanted) for each in seen)
