@@ -15,6 +15,7 @@ from projections.settings import Settings
 from tests.commands import PROGRAM
 from tests.logs import write_log
 from tests.property.test_hostile_evidence import hostile_drive
+from tests.thorough import rounds
 
 EVIDENCE = Settings(fusion="evidence")
 WAIT_S = 60
@@ -23,7 +24,7 @@ _NAMES = ("q'\"", "$$ DROP TABLE", "\\ \\' }) RETURN 1 //", "$q$", "{x}", "a`b",
 
 def _log(folder: Path) -> Path:
     """A log of hostile envelopes with class names that mean something to SQL and Cypher."""
-    documents = [document for seed in range(60) for document in hostile_drive(seed)]
+    documents = [document for seed in range(rounds(60, 20)) for document in hostile_drive(seed)]
     for number, document in enumerate(documents):
         document |= {"keyframe_id": number, "run_id": f"run'{number % 3}$$"}
         document["detections"] = [

@@ -16,6 +16,8 @@ from projections.drawing.picture import compose, legend_lines
 from projections.model.view import MapView
 from projections.settings import Settings
 
+pytestmark = pytest.mark.seconds
+
 
 def _two_places() -> MapView:
     """Ten keyframes along a line; the first five are p0, the last four p1, one between is noise."""
@@ -125,7 +127,6 @@ def test_the_house_the_lost_robot_and_the_bridge_are_on_it() -> None:
     assert any("lost robot" in text for text in texts)
 
 
-@pytest.mark.seconds
 def test_labels_that_find_no_room_are_counted_on_the_picture() -> None:
     view = _two_places()
     for number in range(3, 300):
@@ -175,7 +176,6 @@ def test_a_class_may_be_called_anything(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["png", "svg", "pdf"])
-@pytest.mark.seconds
 def test_the_same_map_gives_the_same_bytes(tmp_path: Path, suffix: str) -> None:
     one, two = tmp_path / f"one.{suffix}", tmp_path / "sub" / f"two.{suffix}"
     draw_map(_two_places(), one, title="t")

@@ -18,6 +18,8 @@ from projections.model.records import Estimate
 from projections.model.view import MapView
 from projections.settings import Settings
 
+pytestmark = pytest.mark.seconds
+
 EVIDENCE = Settings(fusion="evidence")
 COVARIANCES = st.builds(
     lambda wide, high, angle: (
@@ -152,7 +154,6 @@ def test_an_arrow_leads_from_where_a_moved_object_stood() -> None:
 
 
 @pytest.mark.parametrize("suffix", ["png", "svg"])
-@pytest.mark.seconds
 def test_the_same_map_gives_the_same_bytes(tmp_path: Path, suffix: str) -> None:
     one, two = tmp_path / f"one.{suffix}", tmp_path / f"two.{suffix}"
     for out in (one, two):

@@ -14,6 +14,8 @@ from tests.envelopes import envelope
 from tests.folds import fold
 from tests.maps import drawn_map
 
+pytestmark = pytest.mark.seconds
+
 
 def _view(given: OccupancyMap, *spots: tuple[float, float]) -> MapView:
     view = fold([envelope(k, x, y) for k, (x, y) in enumerate(spots)]).view

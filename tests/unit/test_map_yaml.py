@@ -138,6 +138,7 @@ def test_what_is_wrong_is_named_in_one_line(
         (b"!!python/object/apply:os.system ['true']", "no YAML: could not determine"),
     ],
 )
+@pytest.mark.seconds
 def test_hostile_yaml_is_one_line(tmp_path: Path, content: bytes, reason: str) -> None:
     path = tmp_path / "map.yaml"
     path.write_bytes(content)

@@ -133,6 +133,7 @@ def test_no_object_is_missing_where_none_was_carried_away():
 
 
 @pytest.mark.parametrize("cut", [96, 120, 150, 185])
+@pytest.mark.seconds
 def test_a_fold_goes_on_from_a_snapshot_between(cut):
     documents = run("a", ROOM) + run("b", ROOM | {"chair": (7.0, 2.0)})
     whole = Folded.start(SETTINGS).extend(documents)

@@ -10,6 +10,8 @@ from eventsrc.sim.house import House, build_house
 from eventsrc.sim.shapes import Segment, wrap
 from eventsrc.sim.tour import KEYFRAME_M, KEYFRAME_RAD, TruePose, drive, keyframes, plan_tour
 
+pytestmark = pytest.mark.seconds
+
 SEEDS_AND_RUNS = [(7, "a"), (7, "b"), (3, "a"), (12, "c")]
 Drive = tuple[House, str, list[TruePose]]
 
@@ -21,7 +23,6 @@ def driven(request: pytest.FixtureRequest) -> Drive:
     return house, run, list(drive(house.grid, plan_tour(house, run)))
 
 
-@pytest.mark.seconds
 def test_keeps_its_radius_from_walls_and_furniture(driven: Drive) -> None:
     house, _, poses = driven
     standing = [thing.footprint for thing in house.things if thing.model.stands]
