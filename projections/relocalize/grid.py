@@ -55,7 +55,8 @@ each (`floors`): some 240 of them."""
 def _keys(squares: Floats) -> tuple[Keys, Floats]:
     """Numbers of pairs (2, …) of whole numbers, in their order, and the least of each."""
     least = squares.reshape(2, -1).min(axis=1)
-    across, up = (squares.T - least).T.astype(np.uint64)
+    above = squares - least.reshape(2, *(1,) * (squares.ndim - 1))
+    across, up = above.astype(np.int64).view(np.uint64)
     return (across << _BITS) | up, least
 
 
@@ -77,7 +78,7 @@ def cells_near(points: Floats, cell_m: float, reach_m: float) -> tuple[Floats, F
     each to the nearest point."""
     steps, within = _steps(cell_m, reach_m)
     points = points.T[:, :, None]
-    squares = np.rint(points / cell_m) + steps.T[:, None]
+    squares = np.rint(points / cell_m) + steps[:, None]
     keys, least = _keys(squares)
     keys = keys.ravel()
     dx, dy = squares * cell_m - points
@@ -92,13 +93,14 @@ def cells_near(points: Floats, cell_m: float, reach_m: float) -> tuple[Floats, F
 
 @lru_cache(maxsize=8)
 def _steps(cell_m: float, reach_m: float) -> tuple[Floats, Flags]:
-    """Steps from the cell of a point, and which of them are within reach. The others lead to cells
-    whose nearest point it may be though another point has them within reach: both are rounded."""
+    """Steps (2, n) from the cell of a point, and which of them are within reach. The others lead to
+    cells whose nearest point it may be though another point has them within reach: both are
+    rounded."""
     most = math.ceil((reach_m + 2.0 * cell_m) / cell_m)
-    steps = np.array(list(itertools.product(range(-most, most + 1), repeat=2)), dtype=np.float64)
-    far = np.hypot(steps[:, 0], steps[:, 1]) * cell_m
+    steps = np.array(list(itertools.product(range(-most, most + 1), repeat=2)), dtype=np.float64).T
+    far = np.hypot(*steps) * cell_m
     near = far <= reach_m + 2.0 * cell_m
-    return steps[near], far[near] <= reach_m + cell_m / 2
+    return np.ascontiguousarray(steps[:, near]), far[near] <= reach_m + cell_m / 2
 
 
 def square_to_nearest(xy: Floats, points: Floats) -> Floats:
