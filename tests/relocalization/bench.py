@@ -1,4 +1,5 @@
-"""Speed of questions at 300,000 observations: library call, Zenoh, eight clients; and recall.
+"""Speed of questions at 300,000 observations: library call, with several views and with classes
+alone too; Zenoh, eight clients; and recall. Beside each the load of the machine.
 
 Generated buildings side by side, so that crops have look-alikes everywhere. The first call builds
 log and databases in ``--data`` (minutes: the HNSW index alone takes most of them); later calls
@@ -10,12 +11,14 @@ measure only.
 import argparse
 import base64
 import json
+import os
 import statistics
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +30,7 @@ from projections.database import rebuild
 from projections.database.connection import Targets
 from projections.database.embedded import EmbeddedServer
 from projections.queries.relocalize import CandidateReader
-from projections.relocalize import Crop, rank
+from projections.relocalize import Crop, Question, View, rank
 from projections.settings import Settings
 from tests.relocalization.buildings import Building
 from tests.relocalization.drives import drive
@@ -106,7 +109,42 @@ def library(targets: Targets, asked: Sequence[tuple[Crop, ...]]) -> None:
             fetched.append(time.perf_counter() - began)
             rank(crops, candidates)
             ranked.append(time.perf_counter() - began)
-    print(f"library call, {CROPS} crops: {percentiles(ranked)} (search: {percentiles(fetched)})")
+    both = f"{percentiles(ranked)} (search: {percentiles(fetched)})"
+    print(f"library call, {CROPS} crops: {both}{load()}")
+
+
+def other_questions(targets: Targets, asked: Sequence[tuple[Crop, ...]]) -> None:
+    """Questions of several views with `CROPS` crops each, and of one class or two."""
+    views = [View(0.3, 0.0, 0.5, crops) for crops in asked]
+    kinds = {
+        f"library call, {count} views": [
+            Question((replace(views[start], dx=0.0, dyaw=0.0), *views[start + 1 : start + count]))
+            for start in range(len(views) // 3)
+        ]
+        for count in (1, 2, 3)
+    }
+    names = sorted({crop.class_name for crops in asked for crop in crops if crop.class_name})
+    classes = [Crop(None, None, name) for name in names]
+    for count in (1, 2):
+        kinds[f"library call, classes alone, {count}"] = [
+            Question.of(tuple(classes[start : start + count]))
+            for start in range(len(classes) - count + 1)
+        ]
+    with CandidateReader(targets) as reader:
+        for kind, questions_of_it in kinds.items():
+            for question in questions_of_it[:10]:
+                rank(question, reader.candidates(question.crops))
+            seconds = []
+            for question in questions_of_it:
+                began = time.perf_counter()
+                rank(question, reader.candidates(question.crops))
+                seconds.append(time.perf_counter() - began)
+            print(f"{kind}: {percentiles(seconds)}{load()}")
+
+
+def load() -> str:
+    """The load of the machine in the last minute, in words."""
+    return f", at a load of {os.getloadavg()[0]:.1f}"
 
 
 def recall(targets: Targets, asked: Sequence[tuple[Crop, ...]]) -> None:
@@ -150,7 +188,7 @@ def over_zenoh(targets: Targets, asked: Sequence[tuple[Crop, ...]]) -> None:
         client(payloads[:30], [])
         seconds: list[float] = []
         client(payloads, seconds)
-        print(f"over Zenoh, one client: {percentiles(seconds)}")
+        print(f"over Zenoh, one client: {percentiles(seconds)}{load()}")
         seconds.clear()
         threads = [
             threading.Thread(target=client, args=(payloads[i::2], seconds)) for i in range(CLIENTS)
@@ -161,7 +199,9 @@ def over_zenoh(targets: Targets, asked: Sequence[tuple[Crop, ...]]) -> None:
         for thread in threads:
             thread.join()
         rate = len(seconds) / (time.perf_counter() - began)
-        print(f"over Zenoh, {CLIENTS} clients: {rate:.0f} questions/s, {percentiles(seconds)}")
+        print(
+            f"over Zenoh, {CLIENTS} clients: {rate:.0f} questions/s, {percentiles(seconds)}{load()}"
+        )
     finally:
         service.terminate()
         service.wait()
@@ -191,6 +231,7 @@ def main() -> None:
     try:
         targets = Targets(server.url, server.url)
         library(targets, asked)
+        other_questions(targets, asked)
         recall(targets, asked)
         over_zenoh(targets, asked)
     finally:
