@@ -4,7 +4,6 @@ A straight outline is one segment. Where a map has more than `MOST_SEGMENTS`, ce
 square of them is occupied if one of them is, so that no wall is lost.
 """
 
-from collections.abc import Iterator
 from functools import lru_cache
 from typing import Any, Final
 
@@ -20,11 +19,14 @@ _Mask = NDArray[np.bool_]
 @lru_cache(maxsize=8)
 def wall_segments(given: OccupancyMap) -> list[list[float]]:
     """x and y of both ends, metres in the map frame, to the millimetre."""
+    walls = (given.cells >= MIN_WALL) & (given.cells <= OCCUPIED)
     step = 1
     while True:
-        mask = _pooled((given.cells >= MIN_WALL) & (given.cells <= OCCUPIED), step)
-        ends = np.array([*_outline(mask), *(_swapped(_outline(mask.T)))]).reshape(-1, 2, 2)
-        if len(ends) <= MOST_SEGMENTS:
+        mask = _pooled(walls, step)
+        across, along = _turns(mask), _turns(mask.T)
+        # Each segment is two turns: counted before they are made, of noise there are millions.
+        if np.count_nonzero(across) + np.count_nonzero(along) <= 2 * MOST_SEGMENTS:
+            ends = np.concatenate([_segments(across), _segments(along)[..., ::-1]])
             return _in_map_frame(given, ends * step * given.resolution)
         step *= 2
 
@@ -36,21 +38,17 @@ def _pooled(mask: _Mask, step: int) -> _Mask:
     return np.asarray(padded.reshape(shape).any(axis=(1, 3)))
 
 
-def _outline(mask: _Mask) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
-    """The horizontal parts of the outline, as (column, row) of corners of cells."""
+def _turns(mask: _Mask) -> _Mask:
+    """Where the horizontal parts of the outline begin and end: by corners of cells."""
     framed = np.pad(mask, ((1, 1), (0, 0)))
     edges = np.pad(framed[1:] != framed[:-1], ((0, 0), (1, 1)))
-    turns = edges[:, 1:] != edges[:, :-1]
+    return np.asarray(edges[:, 1:] != edges[:, :-1])
+
+
+def _segments(turns: _Mask) -> NDArray[np.intp]:
+    """(column, row) of both ends of each; the turns of a row come in pairs, begin and end."""
     rows, columns = np.nonzero(turns)
-    for index in range(0, len(rows), 2):  # the turns of a row come in pairs: begin and end
-        row = int(rows[index])
-        yield (int(columns[index]), row), (int(columns[index + 1]), row)
-
-
-def _swapped(
-    ends: Iterator[tuple[tuple[int, int], tuple[int, int]]],
-) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
-    return (((b, a), (d, c)) for (a, b), (c, d) in ends)
+    return np.stack([columns, rows], axis=-1).reshape(-1, 2, 2)
 
 
 def _in_map_frame(given: OccupancyMap, ends: NDArray[Any]) -> list[list[float]]:

@@ -1,6 +1,7 @@
 """Walls of occupancy maps as segments, against the cells one by one."""
 
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -64,3 +65,15 @@ def test_noise_is_pooled_and_no_wall_is_lost() -> None:
     found = wall_segments(given(cells))
     assert 0 < len(found) <= MOST_SEGMENTS
     assert wall_segments(given(np.full((5, 5), UNKNOWN))) == []
+
+
+def test_a_map_of_noise_takes_little_memory() -> None:
+    """Its outline has millions of segments, of which none is made."""
+    cells = np.random.default_rng(2).integers(0, 2, (2000, 2000), np.uint8) * np.uint8(100)
+    noise = given(cells)
+    tracemalloc.start()
+    found = wall_segments(noise)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert 0 < len(found) <= MOST_SEGMENTS
+    assert peak < 20 * cells.nbytes
