@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from projections.ui.edits import Editor
     from projections.ui.service import UiService
 
+_EVERY_ADDRESS: Final = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # noqa: S104  not a bind
+"""What listens on every address is not called so: here, it is reached at these."""
 _KINDS: Final = ("place", "object", "keyframe", "merge")
 """What ``--select`` may name."""
 
@@ -138,12 +140,15 @@ def ui(
         # Before the server, which waits for its streams and answers to end.
         stack.callback(watch.close)
         stack.callback(service.end)
-        shown = f"[{host}]" if ":" in host else host
+        name = _EVERY_ADDRESS.get(host, host)
+        shown = f"[{name}]" if ":" in name else name
         url = f"http://{shown}:{bound}/" + ("" if token is None else f"?token={token}")
         url += shown_first
         if not local:
             say(f"warning: others can reach {host}; who has the link below can read the log")
         say(f"showing {log} at {url}")
+        if name != host:
+            say(f"on another machine write an address of this one there, not {name}")
         say("Ctrl-C ends it")
         if open_:
             webbrowser.open(url)
