@@ -72,7 +72,7 @@ export class Track {
             font: "11px system-ui, sans-serif",
             stroke: palette.dim,
             grid: { show: false },
-            ...(byTime ? { space: 76, values: (_: uPlot, at: number[]) => timeTexts(at) } : {}),
+            ...(byTime ? { space: 76, values: (_: uPlot, at: number[]) => timeTexts(at) } : { values: (_: uPlot, at: number[]) => at.map((each) => (each % 1 === 0 ? each.toLocaleString("en") : "")) }),
             ticks: { stroke: palette.faint, size: 4, width: 1 },
           },
           { show: false },

@@ -71,7 +71,7 @@ function settingsOf(side: "main" | "other"): string {
 
 /** What is wrong with the log or the server, in sentences. */
 function Banner() {
-  const problems = store.history.value === null ? [] : (store.log.value?.problems ?? []);
+  const problems = store.history.value?.through ? (store.log.value?.problems ?? []) : []; // else in the middle
   const lost = store.serverLost.value && store.history.value !== null;
   const refused = lost ? null : store.refused.value;
   if (problems.length === 0 && !lost && refused === null) return null;
@@ -99,7 +99,7 @@ function NoMap() {
       </div>
     );
   }
-  if (history.through === 0) return <div class="no-map"><p>This log has no events yet. The map appears here as they are recorded.</p></div>;
+  if (history.through === 0) return <div class="no-map"><p>{store.log.value?.problems.join(" ") || "This log has no events yet."}</p></div>;
   if (store.bounds.value === null) return <div class="no-map"><p>No keyframe of this log has a pose, so there is nothing to draw. The timeline, Find and the objects’ stories still work.</p></div>;
   return null;
 }

@@ -49,6 +49,7 @@ function FloorChoice({ history }: { history: History }) {
           <option key={each} value={String(each)}>{name(each)}</option>
         ))}
       </select>
+      <span class="dim">{counted(store.shown.value?.map.places.length ?? 0, "place")} on it</span>
     </label>
   );
 }
