@@ -2,7 +2,7 @@
 
 python -m tests.bench.truth [--half develop|validate] [--quick] [--world W…] [--profile P…]
     [--moved FRACTION] [--calibrated] [--places [--walls] | --types]
-    [--limit N] [--set NAME=VALUE…]
+    [--limit N] [--seed N] [--set NAME=VALUE…]
     [--worlds DIR] [--cache DIR] [--json FILE]
 python -m tests.bench.truth --localise [--every N] [--map page|evidence] [--brief] [--jobs N] …
 
@@ -38,6 +38,7 @@ from .worlds import (
     CACHE,
     LIMIT,
     QUICK_LIMIT,
+    SEED,
     WORLDS,
     Case,
     NoWorldsError,
@@ -106,7 +107,9 @@ def _write(path: Path | None, rows: Sequence[tables.Row | PlacesRow | TypesRow])
 def _localise(
     generator: ModuleType, chosen: list[tuple[str, str]], options: argparse.Namespace, limit: int
 ) -> None:
-    make = functools.partial(make_case, generator, limit=limit, cache=options.cache)
+    make = functools.partial(
+        make_case, generator, limit=limit, seed=options.seed, cache=options.cache
+    )
     rows: list[LocaliseRow] = []
     cases = [(p, w, stranger_of(generator, options.half, w)) for p, w in chosen]
     for profile, *worlds in cases:
@@ -130,7 +133,7 @@ def _localised(
     profile, world, other = case
     generator = load_generator(options.worlds)
     own, stranger = (
-        make_case(generator, profile, each, limit=limit, cache=options.cache)
+        make_case(generator, profile, each, limit=limit, seed=options.seed, cache=options.cache)
         for each in (world, other)
     )
     return localise(own, stranger, options.map, options.every)
@@ -160,6 +163,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--map", nargs="+", choices=MAPS, default=MAPS, help="rules of the maps")
     parser.add_argument("--brief", action="store_true", help="with --localise: means only")
     parser.add_argument("--jobs", type=int, default=1, help="with --localise: processes")
+    parser.add_argument("--seed", type=int, default=SEED, help=f"of the generator ({SEED})")
     parser.add_argument("--limit", type=int, help=f"most keyframes a run ({LIMIT})")
     parser.add_argument(
         "--set", nargs="+", default=[], metavar="NAME=VALUE", help="settings of the rule measured"
@@ -176,7 +180,13 @@ def _cases(
     for profile, world in chosen:
         print(f"\r{profile} {world} …\033[K", end="", file=sys.stderr, flush=True)
         yield make_case(
-            generator, profile, world, moved=options.moved, limit=limit, cache=options.cache
+            generator,
+            profile,
+            world,
+            moved=options.moved,
+            limit=limit,
+            seed=options.seed,
+            cache=options.cache,
         )
     print("\r\033[K", end="", file=sys.stderr, flush=True)
     if options.moved or options.world or options.profile:

@@ -117,15 +117,16 @@ def make_case(
     *,
     moved: float = 0.0,
     limit: int = LIMIT,
+    seed: int = SEED,
     cache: Path = CACHE,
 ) -> Case:
     """The runs of a profile in a world, generated unless the cache has them."""
     source = Path(str(generator.__file__))
     layout = source.parent / "layouts" / f"{world}.json"
     version = zlib.crc32(layout.read_bytes(), zlib.crc32(source.read_bytes()))
-    kept = cache / f"{version:08x}-seed{SEED}-moved{moved:g}-limit{limit}" / profile / world
+    kept = cache / f"{version:08x}-seed{seed}-moved{moved:g}-limit{limit}" / profile / world
     if not (kept / "looks-again.json").exists():
-        _generate(source, generator, profile, world, moved, limit, kept)
+        _generate(source, generator, profile, world, moved, limit, seed, kept)
     return read_case(kept, profile, world)
 
 
@@ -136,18 +137,19 @@ def _generate(
     world: str,
     moved: float,
     limit: int,
+    seed: int,
     kept: Path,
 ) -> None:
     """Into a temporary folder first, so that what is in the cache is complete."""
     kept.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=kept.parent) as temporary:
         command = [sys.executable, str(source), temporary, "--world", world, "--profile", profile]
-        command += ["--moved", str(moved), "--limit", str(limit), "--seed", str(SEED)]
+        command += ["--moved", str(moved), "--limit", str(limit), "--seed", str(seed)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             raise NoWorldsError(f"{' '.join(command)} failed:\n{done.stderr}")
         made = Path(temporary) / profile / world
-        looks = _looks_again(generator, made, profile, world, moved) if moved else {}
+        looks = _looks_again(generator, made, profile, world, moved, seed) if moved else {}
         (made / "looks-again.json").write_text(json.dumps(looks))
         if kept.exists():
             shutil.rmtree(kept)
@@ -155,7 +157,7 @@ def _generate(
 
 
 def _looks_again(
-    generator: ModuleType, made: Path, profile: str, world: str, moved: float
+    generator: ModuleType, made: Path, profile: str, world: str, moved: float, seed: int
 ) -> dict[str, int]:
     """How many keyframes after run a had the old spot of a moved thing in view.
 
@@ -164,8 +166,8 @@ def _looks_again(
     """
     building = generator.World(world)
     before = building.objects
-    seed = generator.crc(world, "moved", SEED)
-    after = generator.moved(building, moved, generator.np.random.default_rng(seed))
+    chance = generator.np.random.default_rng(generator.crc(world, "moved", seed))
+    after = generator.moved(building, moved, chance)
     ghosts = [old for old, new in zip(before, after, strict=True) if new.get("moved")]
     stated = {t.instance for t in _things(made) if t.moved_to is not None}
     if {f"{world}/{ghost['id']}" for ghost in ghosts} != stated:
