@@ -104,6 +104,8 @@ class CandidateReader:
     def disable_index(self) -> None:
         """From now on search exactly, without the HNSW index: slow."""
         self._vectors.execute("SET enable_indexscan = off")
+        # a plan that was made before does not know of it
+        self._vectors.execute("SET plan_cache_mode = force_custom_plan")
 
     def close(self) -> None:
         """Close the connections. May be called twice."""

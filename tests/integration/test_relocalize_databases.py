@@ -72,6 +72,32 @@ def test_candidates_are_those_of_exact_search(targets: Targets, view: MapView) -
         assert asked > 5
 
 
+def test_the_server_plans_a_question_a_few_times_only_until_the_index_is_disabled(
+    targets: Targets, view: MapView
+) -> None:
+    """A plan that the server has kept would search the index all the same."""
+    crops = next(questions())[:1]
+    expected = ExactIndex(view).search(crops)
+    with CandidateReader(targets) as reader:
+
+        def plans() -> tuple[int, int]:
+            """Times that a search was run by a plan that was kept, and by one made for it."""
+            counted = "SELECT sum(generic_plans), sum(custom_plans) FROM pg_prepared_statements"
+            where = " WHERE statement LIKE '%<=>%'"
+            row = reader._vectors.execute((counted + where).encode()).fetchone()
+            assert row is not None
+            return int(row[0]), int(row[1])
+
+        for _ in range(16):
+            assert_equal(reader.candidates(crops), expected)
+        kept, made = plans()
+        assert kept >= 5
+        reader.disable_index()
+        for _ in range(3):
+            assert_equal(reader.candidates(crops), expected)
+        assert plans() == (kept, made + 3)
+
+
 def test_the_library_call_answers(targets: Targets, view: MapView) -> None:
     index = ExactIndex(view)
     for crops in questions():
