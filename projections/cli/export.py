@@ -15,6 +15,7 @@ from eventsrc.transport.config import is_loopback
 from projections.corrections import Corrections
 from projections.model.fold import fold_log_cached
 from projections.model.log_commands import read_corrections
+from projections.model.one_floor import view_of_floor
 from projections.settings import Settings
 
 from .options import (
@@ -94,9 +95,6 @@ def export(
     GraphML, Graphviz, GeoJSON, CSV, Nav2 waypoints and a recording for Foxglove, one or several at
     once. The same log and settings give the same bytes.
     """
-    from projections import export as formats
-    from projections.drawing.one_floor import view_of_floor
-
     files = {"graphml": graphml, "dot": dot, "geojson": geojson, "csv": csv, "nav2": nav2}
     if not any(files.values()) and foxglove is None:
         names = ", ".join(f"--{name}" for name in (*files, "foxglove"))
@@ -107,6 +105,8 @@ def export(
         raise MisuseError("--every is for --foxglove")
     if floor is not None and foxglove is not None:
         raise MisuseError("--foxglove shows all floors, one above the other; leave --floor out")
+    from projections import export as formats  # here: with the imports of several formats
+
     where = None if origin is None else formats.Origin(*_degrees(origin))
     settings_from(settings_file, set_)  # a bad value is an error before the log is opened
     with LogReader(log) as reader:

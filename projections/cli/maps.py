@@ -105,8 +105,8 @@ def draw(
     # Imported here: matplotlib takes longer to import than most commands take to run.
     from eventsrc.sim import build_house
     from projections.drawing import draw_map, floor_of
-    from projections.drawing.one_floor import view_of_floor
     from projections.drawing.picture import bridges_of, fold_with_merges
+    from projections.model.one_floor import view_of_floor
 
     check_picture(out)
     settings_from(settings_file, set_)  # a bad value is an error before the log is opened

@@ -14,9 +14,9 @@ import numpy as np
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
+from projections import palette
 from projections.model.view import MapView
 
-from . import palette
 from .canvas import Canvas
 from .labels import Extent
 from .scene import Box, Floor, drives, place_spots

@@ -13,9 +13,9 @@ from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
 from eventsrc.occupancy_map import MIN_WALL, OCCUPIED, UNKNOWN, OccupancyMap
+from projections import palette
 from projections.model.view import MapView
 
-from . import palette
 from .canvas import Canvas
 from .scene import drives
 

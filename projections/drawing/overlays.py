@@ -9,10 +9,10 @@ from collections.abc import Sequence
 
 from matplotlib.patches import Circle, Ellipse
 
+from projections import palette
 from projections.model.records import ObjectRecord
 from projections.model.view import MapView
 
-from . import palette
 from .canvas import HALO, Canvas
 from .labels import Extent, LabelRequest, place_labels
 from .scene import (

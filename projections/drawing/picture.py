@@ -9,11 +9,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from eventsrc.text import counted
+from projections import palette
 from projections.deltas import PlacesMerged
 from projections.model.fold import FoldedEvent
 from projections.model.view import MapView
 
-from . import palette
 from .base_layers import draw_drives, draw_floor, draw_regions, draw_walls
 from .canvas import Canvas, check_suffix, new_canvas
 from .labels import Extent

@@ -6,17 +6,20 @@ place_id and object_id. A property that is unknown is left out.
 
 import re
 from collections.abc import Mapping
-from typing import Any, Final
-
-import networkx
+from typing import TYPE_CHECKING, Any, Final
 
 from eventsrc.text import visible
 from projections.model.view import MapView
 
+if TYPE_CHECKING:
+    import networkx
+
 _NOT_IN_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
-def _graph(view: MapView) -> networkx.Graph:
+def _graph(view: MapView) -> "networkx.Graph":
+    import networkx  # here: it takes longer to import than most commands take to run
+
     graph = networkx.Graph()
     for place in view.places.values():
         kind = view.type_of(place.ordinal)
@@ -64,6 +67,8 @@ def _known(**values: Any) -> dict[str, Any]:
 def graphml(view: MapView) -> str:
     """GraphML 1.0, for Gephi, yEd, Cytoscape and networkx. Characters that XML cannot hold are
     written as escapes (``\\x1b``)."""
+    import networkx
+
     graph = _graph(view)
     ids = {node: _in_xml(node) for node in graph}
     for _, values in graph.nodes(data=True):

@@ -28,9 +28,9 @@ from foxglove.messages import (
 )
 
 from projections.deltas import PlaceOrdinal, PlacesMerged
-from projections.drawing.palette import place_colour
 from projections.export import Point, hull
 from projections.model.view import MapView
+from projections.palette import place_colour
 
 FRAME: Final = "map"
 FLOOR_M: Final = 3.0

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from eventsrc.envelope import Offset
-from projections.drawing import palette
+from projections import palette
 from projections.drawing.base_layers import draw_drives, draw_regions
 from projections.drawing.canvas import HALO, Bounds, Canvas, check_suffix
 from projections.drawing.overlays import draw_place_names

@@ -11,11 +11,11 @@ import pytest
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.occupancy_map import OccupancyMap
 from eventsrc.system_events import MAP_KEY
-from projections.drawing.one_floor import view_of_floor
 from projections.errors import FoldError
 from projections.history import Timeline
 from projections.model.digest import map_digest
 from projections.model.fold import fold_events, fold_log
+from projections.model.one_floor import view_of_floor
 from projections.model.snapshot import restore, snapshot
 from projections.model.view import MapView
 from projections.settings import Settings

@@ -11,9 +11,9 @@ from eventsrc.sim import build_house
 from projections import deltas as d
 from projections.drawing import Bridge, Floor, LostRobot, Spot, draw_map, floor_of
 from projections.drawing.canvas import Canvas
-from projections.drawing.palette import place_colour
 from projections.drawing.picture import compose, legend_lines
 from projections.model.view import MapView
+from projections.palette import place_colour
 from projections.settings import Settings
 
 pytestmark = pytest.mark.seconds

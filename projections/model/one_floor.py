@@ -4,7 +4,8 @@ from dataclasses import replace
 
 from eventsrc.errors import MisuseError
 from eventsrc.text import visible
-from projections.model.view import MapView
+
+from .view import MapView
 
 UNNAMED = "-"
 """What `--floor` calls the floor of poses whose envelopes name none."""
