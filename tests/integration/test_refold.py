@@ -479,7 +479,7 @@ def test_checkpoints_of_an_older_version_are_used(
     log: Path, one_database: Targets, pg: psycopg.Connection, third_database: Targets
 ) -> None:
     rebuild(log, one_database, SETTINGS)
-    for column in ("known_at", "observed", "refold_done", "refold_total"):
+    for column in ("known_at", "observed", "refold_done", "refold_total", "maps"):
         pg.execute(f"ALTER TABLE mapfold.checkpoint DROP COLUMN {column}")  # type: ignore[arg-type]
     status = projection_status(log, one_database, SETTINGS)
     assert [s.condition for s in status.sinks] == ["idle", "idle"]
