@@ -3,7 +3,7 @@
 matplotlib is used through its objects alone: no pyplot, no global state.
 """
 
-from .picture import draw_map
+from .picture import draw_map, map_png
 from .scene import Bridge, Floor, LostRobot, Spot, floor_of
 
-__all__ = ["Bridge", "Floor", "LostRobot", "Spot", "draw_map", "floor_of"]
+__all__ = ["Bridge", "Floor", "LostRobot", "Spot", "draw_map", "floor_of", "map_png"]

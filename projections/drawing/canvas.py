@@ -4,8 +4,10 @@ Each place has a colour of its own; the rest of the picture is grey.
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
 
 from matplotlib import rc_context
@@ -61,24 +63,39 @@ class Canvas:
 
     def save(self, out: Path) -> None:
         """Write the picture; the same picture gives the same bytes."""
-        for text in self.figure.findobj(Text):
-            text.set_parse_math(False)  # a class may be called "$5 bill$"
+        self._take_texts_literally()
         # PDF and SVG carry a date, SVG also ids with a random salt: left out, or fixed.
         undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
         try:
             out.parent.mkdir(parents=True, exist_ok=True)
-            with (
-                rc_context({"svg.hashsalt": "mapfold", "svg.fonttype": "none"}),
-                warnings.catch_warnings(),
-            ):
-                warnings.filterwarnings(
-                    "ignore", message="Glyph .* missing from font"
-                )  # drawn as a box
+            with _drawing():
                 self.figure.savefig(out, dpi=_DPI, metadata=undated.get(out.suffix.lower()))
         except OSError as error:
             raise MisuseError(
                 f"{out}: cannot be written: {error.strerror}; choose another"
             ) from None
+
+    def png(self) -> bytes:
+        """The picture as a PNG."""
+        self._take_texts_literally()
+        out = BytesIO()
+        with _drawing():
+            self.figure.savefig(out, dpi=_DPI, format="png")
+        return out.getvalue()
+
+    def _take_texts_literally(self) -> None:
+        for text in self.figure.findobj(Text):
+            text.set_parse_math(False)  # a class may be called "$5 bill$"
+
+
+@contextmanager
+def _drawing() -> Iterator[None]:
+    with (
+        rc_context({"svg.hashsalt": "mapfold", "svg.fonttype": "none"}),
+        warnings.catch_warnings(),
+    ):
+        warnings.filterwarnings("ignore", message="Glyph .* missing from font")  # drawn as a box
+        yield
 
 
 def check_suffix(out: Path) -> None:

@@ -66,6 +66,11 @@ def draw_map(
     compose(view, title, floor or Floor(), lost, bridges, min_observations).save(out)
 
 
+def map_png(view: MapView, title: str) -> bytes:
+    """``view`` drawn as a PNG."""
+    return compose(view, title, Floor()).png()
+
+
 def compose(
     view: MapView,
     title: str,

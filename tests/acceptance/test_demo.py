@@ -61,8 +61,8 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Played]:
     assert _processes_of(out) == []
 
 
-def test_the_readme_shows_what_it_prints(played: Played) -> None:
-    parts = [part for part in read(ROOT / "README.md") if isinstance(part, Command)]
+def test_the_tour_shows_what_it_prints(played: Played) -> None:
+    parts = [part for part in read(ROOT / "docs" / "tour.md") if isinstance(part, Command)]
     (shown,) = [part for part in parts if part.text == "scripts/demo"]
     printed = "\n".join(played.story)
     printed = printed.replace("played 300 times as fast", "played 30 times as fast")

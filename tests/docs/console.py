@@ -1,9 +1,9 @@
 """Documents whose commands are run: reading them, running them, comparing, rewriting.
 
 In a fenced block ``console`` a line that starts with ``$ `` is a command, and what follows it, up
-to the next one, is what it prints, stdout and stderr together. A block ``python NAME.py`` is a file
-that commands after it may use. All commands of a document run in one bash, in one fresh folder,
-which documents know as ``HOME_OF_DOCS``.
+to the next one, is what it prints, stdout and stderr together. A block ``python title="NAME.py"``
+is a file that commands after it may use. All commands of a document run in one bash, in one fresh
+folder, which documents know as ``HOME_OF_DOCS``.
 
 What differs from time to time is put out of sight on both sides before comparing (`_VARYING`). A
 line that is only ``…`` stands for any lines, a ``…`` within a line for any text.
@@ -68,8 +68,8 @@ def read(document: Path) -> list[Command | File]:
         words = kind.split()
         if words[:1] == ["console"]:
             found += _commands(lines, first, end)
-        elif words[:1] == ["python"] and len(words) == 2:
-            found.append(File(words[1], "\n".join(lines[first:end]) + "\n"))
+        elif titled := re.fullmatch(r'python title="(.+)"', kind):
+            found.append(File(titled[1], "\n".join(lines[first:end]) + "\n"))
     return found
 
 

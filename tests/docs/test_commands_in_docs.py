@@ -14,7 +14,9 @@ DOCUMENTS = (
     "docs/export.md",
     "docs/fusion.md",
     "docs/simulator.md",
+    "docs/python.md",
     "docs/time-travel.md",
+    "docs/tour.md",
 )
 
 LONG = ("scripts/demo", "mapfold calibrate logs/mine")
@@ -55,7 +57,9 @@ def test_a_difference_is_seen_and_a_time_is_not() -> None:
 
 def test_files_in_a_document_are_read_whole(tmp_path: Path) -> None:
     document = tmp_path / "doc.md"
-    document.write_text("```python two.py\nprint(2)\n```\n```console\n$ python two.py\n2\n```\n")
+    document.write_text(
+        '```python title="two.py"\nprint(2)\n```\n```console\n$ python two.py\n2\n```\n'
+    )
     file, command = read(document)
     assert (file.name, file.text) == ("two.py", "print(2)\n")  # type: ignore[union-attr]
     assert isinstance(command, Command)
