@@ -11,6 +11,7 @@ ints and strings at run time; mypy keeps them apart.
 
 import math
 import unicodedata
+from collections.abc import Sequence
 from decimal import Decimal
 from typing import Annotated, Any, NewType
 
@@ -36,7 +37,7 @@ KeyframeId = NewType("KeyframeId", int)
 """The number a robot gives a keyframe within its run."""
 DetId = NewType("DetId", str)
 
-ENVELOPE_VERSION = 4
+ENVELOPE_VERSION = 5
 """The version of the models below; `eventsrc.upcast` converts older ones to it."""
 FIRST_ENVELOPE_VERSION = 2
 """Since this version payloads are envelopes, with a run, a keyframe id and a time."""
@@ -108,6 +109,50 @@ Floor = Annotated[str | None, PlainValidator(_floor_name), WithJsonSchema(_FLOOR
 """The name of a floor; an integer is its decimal digits, so 2 and "2" are one floor."""
 
 Position = Annotated[float, Field(ge=-MAX_POSITION_M, le=MAX_POSITION_M)]
+
+
+COVARIANCE_SIZE = 9
+MAX_VARIANCE = 1e6
+"""Bound of a pose's variances: a standard error of a kilometre, or of 1000 radians."""
+_SAME = 1e-6
+"""How far the two halves of a covariance may differ, of the greatest that they may be."""
+
+
+def covariance_fault(nine: Sequence[float]) -> str | None:
+    """Why these are no covariance of x, y and yaw, row by row; None if they are."""
+    if len(nine) != COVARIANCE_SIZE:
+        return f"has {len(nine)} numbers; give {COVARIANCE_SIZE}, row by row of x, y and yaw"
+    if not all(map(math.isfinite, nine)):
+        return "holds NaN or infinity"
+    for name, variance in zip(_OF_POSE, nine[::4], strict=True):
+        if not 0.0 <= variance <= MAX_VARIANCE:
+            return (
+                f"has the variance {variance:g} of {name}, which is not from 0 to {MAX_VARIANCE:g}"
+            )
+    for row, column in ((0, 1), (0, 2), (1, 2)):
+        one, other = nine[3 * row + column], nine[3 * column + row]
+        most = math.sqrt(nine[4 * row] * nine[4 * column])
+        names = f"{_OF_POSE[row]} and {_OF_POSE[column]}"
+        if abs(one - other) > _SAME * most:
+            return f"is not symmetric: {one:g} and {other:g} for {names}"
+        if abs(one) > most * (1.0 + _SAME):
+            return f"has {one:g} for {names}, more than their variances allow ({most:g})"
+    return None
+
+
+_OF_POSE = ("x", "y", "yaw")
+
+
+def _checked_covariance(nine: tuple[float, ...]) -> tuple[float, ...]:
+    fault = covariance_fault(nine)
+    if fault is not None:
+        raise ValueError(fault)
+    return nine
+
+
+_COVARIANCE = Field(min_length=COVARIANCE_SIZE, max_length=COVARIANCE_SIZE)
+PoseCovariance = Annotated[tuple[float, ...], _COVARIANCE, AfterValidator(_checked_covariance)]
+"""Of x, y (metres) and yaw (radians), row by row."""
 
 
 class NonFinite(Exception):
@@ -188,7 +233,9 @@ class Envelope(_Model):
     ``timestamp`` is the robot's time in seconds since the Unix epoch, ``map_x`` and ``map_y`` are
     metres and ``map_yaw`` radians in the map frame; all three are None when the robot has no pose.
     Without ``camera`` it is the one of the map's settings. ``floor`` names the floor that the robot
-    is on; without it the height ``map_z``, metres, tells which one it is.
+    is on; without it the height ``map_z``, metres, tells which one it is. ``pose_covariance`` is
+    the error of the pose: nine numbers, the covariance of map_x, map_y and map_yaw row by row; it
+    counts only beside a pose.
     """
 
     run_id: Annotated[RunId, TEXT]
@@ -200,6 +247,7 @@ class Envelope(_Model):
     camera: EnvelopeCamera | None = None
     floor: Floor = None
     map_z: Position | None = None
+    pose_covariance: PoseCovariance | None = None
     detections: Annotated[tuple[Detection, ...], Field(max_length=MAX_DETECTIONS), FailFast()]
 
     @model_validator(mode="after")

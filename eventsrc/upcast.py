@@ -12,7 +12,9 @@ current one and validates it like a new one.
     2   the envelope before it had a camera, and detections a depth or a position. It may have had
         unknown fields of these names, with any content: they are dropped.
     3   the envelope before it had a floor or a height; unknown fields of these names are dropped.
-    4   the envelope of `eventsrc.envelope`.
+    4   the envelope before it had the covariance of its pose; an unknown field of that name is
+        dropped.
+    5   the envelope of `eventsrc.envelope`.
 
 To change the envelope: raise ENVELOPE_VERSION, add the upcaster from the version before to
 ``UPCASTERS``, and a log of that version to the tests. Never change a released upcaster.
@@ -162,12 +164,16 @@ def _upcast_detection(detection: dict[str, Any]) -> dict[str, Any]:
 
 
 _NEW_IN_ENVELOPE: Mapping[int, frozenset[str]] = MappingProxyType(
-    {2: frozenset({"camera"}), 3: frozenset({"floor", "map_z"})}
+    {
+        2: frozenset({"camera"}),
+        3: frozenset({"floor", "map_z"}),
+        4: frozenset({"pose_covariance"}),
+    }
 )
 """Fields of an envelope that the next version added to these."""
 _NEW_IN_DETECTION = frozenset({"depth_m", "depth_sigma_m", "position", "position_sigma_m"})
 """Fields of a detection that version 2 did not have."""
-_SAME_BUT_FOR_NEW_FIELDS = (2, 3, 4)
+_SAME_BUT_FOR_NEW_FIELDS = (2, 3, 4, 5)
 
 
 def _must_convert(event: VersionedEvent, read: Accepted | Rejected) -> bool:
@@ -178,7 +184,12 @@ def _must_convert(event: VersionedEvent, read: Accepted | Rejected) -> bool:
         return False
     if isinstance(read, Rejected):
         return _has_new_fields(event)
-    return has_floor(read.envelope) or (event.version == 2 and has_evidence(read.envelope))
+    envelope = read.envelope
+    return (
+        envelope.pose_covariance is not None
+        or (event.version < 4 and has_floor(envelope))
+        or (event.version == 2 and has_evidence(envelope))
+    )
 
 
 def _has_new_fields(event: VersionedEvent) -> bool:
@@ -202,6 +213,10 @@ def _drop_floor(document: Any, _event: VersionedEvent) -> Any:
     return _without(document, _NEW_IN_ENVELOPE[3])
 
 
+def _drop_pose_covariance(document: Any, _event: VersionedEvent) -> Any:
+    return _without(document, _NEW_IN_ENVELOPE[4])
+
+
 def _without(document: Any, names: frozenset[str]) -> Any:
     if not isinstance(document, dict):
         return document
@@ -209,6 +224,6 @@ def _without(document: Any, names: frozenset[str]) -> Any:
 
 
 UPCASTERS: Mapping[int, Upcaster] = MappingProxyType(
-    {1: _upcast_bare_list, 2: _drop_camera, 3: _drop_floor}
+    {1: _upcast_bare_list, 2: _drop_camera, 3: _drop_floor, 4: _drop_pose_covariance}
 )
 """From each older version to the next."""

@@ -339,3 +339,39 @@ def test_a_wrong_floor_is_refused_with_the_field_and_the_value(value: Any) -> No
 @pytest.mark.parametrize("value", [1.1e7, "up", True, [0.0]])
 def test_a_wrong_height_is_refused(value: Any) -> None:
     assert refusal(payload(envelope(map_z=value))).startswith("map_z: ")
+
+
+_NINE = [0.04, 0.01, 0.0, 0.01, 0.09, 0.0, 0.0, 0.0, 0.02]
+
+
+def _covariance(**changed: float) -> list[float]:
+    """A covariance with these entries changed, by ``e`` and their index."""
+    return [changed.get(f"e{at}", value) for at, value in enumerate(_NINE)]
+
+
+@pytest.mark.parametrize("nine", [_NINE, [0.0] * 9, _covariance(e1=0.06, e3=0.06)])
+def test_the_covariance_of_a_pose_is_taken(nine: list[float]) -> None:
+    assert accepted(envelope(pose_covariance=nine)).envelope.pose_covariance == tuple(nine)
+    assert accepted(envelope()).envelope.pose_covariance is None
+
+
+@pytest.mark.parametrize(
+    ("nine", "said"),
+    [
+        (_covariance(e0=-0.1), "variance -0.1 of x"),
+        (_covariance(e8=2e6), "variance 2e+06 of yaw"),
+        (_covariance(e1=0.02), "not symmetric: 0.02 and 0.01 for x and y"),
+        (_covariance(e1=0.07, e3=0.07), "0.07 for x and y, more than their variances allow"),
+        (_covariance(e0=0.0), "0.01 for x and y, more than their variances allow (0)"),
+        (_covariance(e4=float("nan")), "finite"),
+        (_covariance(e2=float("inf")), "finite"),
+        (_NINE[:8], "at least 9 items"),
+        ([*_NINE, 0.0], "at most 9 items"),
+        ([*_NINE[:8], "0.02"], "number"),
+        ("none", "array"),
+    ],
+)
+def test_what_is_no_covariance_is_refused_by_name_and_rule(nine: object, said: str) -> None:
+    reason = refusal(envelope(pose_covariance=nine))
+    assert reason.startswith("pose_covariance")
+    assert said in reason

@@ -60,7 +60,7 @@ def test_there_is_an_upcaster_for_every_older_version() -> None:
 
 @pytest.mark.parametrize(
     ("payload", "version"),
-    [(BARE, 1), (b' \n[ {"class"', 1), (b"[1]", 4), (b"[]", 4), (b"{}", 4), (b"", 4)],
+    [(BARE, 1), (b' \n[ {"class"', 1), (b"[1]", 5), (b"[]", 5), (b"{}", 5), (b"", 5)],
 )
 def test_the_version_is_detected_from_the_payload(payload: bytes, version: int) -> None:
     assert detect_version(payload) == version
@@ -126,6 +126,18 @@ def test_fields_of_version_3_with_names_of_version_4_are_dropped() -> None:
     new = read_envelope(event(envelope(1, floor=2, map_z=1.0), 4))
     assert isinstance(new, Accepted)
     assert (new.envelope.floor, new.envelope.map_z) == ("2", 1.0)
+
+
+def test_a_field_of_version_4_with_the_name_of_one_of_version_5_is_dropped() -> None:
+    nine = [0.04, 0.0, 0.0, 0.0, 0.04, 0.0, 0.0, 0.0, 0.01]
+    for value in (nine, "unknown", [1.0]):
+        old = read_envelope(event(envelope(1, pose_covariance=value, floor=2), 4))
+        assert isinstance(old, Accepted)
+        assert (old.envelope.pose_covariance, old.envelope.floor) == (None, "2")
+    new = read_envelope(event(envelope(1, pose_covariance=nine), 5))
+    assert isinstance(new, Accepted)
+    assert new.envelope.pose_covariance == tuple(nine)
+    assert isinstance(read_envelope(event(envelope(1, pose_covariance=[1.0]), 5)), Rejected)
 
 
 def test_a_faulty_envelope_of_version_2_is_refused_with_its_own_fault() -> None:

@@ -1,0 +1,104 @@
+"""The one user of rosbags: types of messages, messages in CDR, and bags.
+
+rosbags is of the extra ``[ros]`` and imported when it is needed. It decodes by code that it makes
+from definitions of messages, so a bag's own definitions are parsed, never run as they stand.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+from eventsrc.errors import MapfoldError
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+_HEADER: Final = "std_msgs/Header header\n"
+VISION_MSGS: Final[Mapping[str, str]] = {
+    "vision_msgs/msg/Point2D": "float64 x\nfloat64 y\n",
+    "vision_msgs/msg/Pose2D": "vision_msgs/Point2D position\nfloat64 theta\n",
+    "vision_msgs/msg/BoundingBox2D": (
+        "vision_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y\n"
+    ),
+    "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score\n",
+    "vision_msgs/msg/ObjectHypothesisWithPose": (
+        "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n"
+    ),
+    "vision_msgs/msg/Detection2D": (
+        f"{_HEADER}vision_msgs/ObjectHypothesisWithPose[] results\n"
+        "vision_msgs/BoundingBox2D bbox\nstring id\n"
+    ),
+    "vision_msgs/msg/Detection2DArray": f"{_HEADER}vision_msgs/Detection2D[] detections\n",
+}
+"""The definitions of vision_msgs 4, which ROS does not ship with its own messages. Those of version
+3 differ in the name of a nested type only: in CDR both are the same bytes."""
+
+
+class NoRosbags(MapfoldError):
+    """rosbags is not installed."""
+
+
+class Undecodable(ValueError):
+    """Bytes that are no message of the type, or of a type that is not known."""
+
+
+class MessageTypes:
+    """Types of messages: those of ROS 2 itself, of vision_msgs, and what `define` adds."""
+
+    def __init__(self) -> None:
+        try:
+            from rosbags.serde import SerdeError
+            from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+        except ImportError as error:
+            raise NoRosbags(
+                f"rosbags is not installed ({error}), which reads messages of ROS 2: "
+                "pip install 'mapfold[ros]'"
+            ) from None
+        self._parse: Callable[[str, str], Any] = get_types_from_msg
+        self._faults = (SerdeError, TypesysError, KeyError)
+        self._store: Typestore = get_typestore(Stores.ROS2_JAZZY)
+        for name, text in VISION_MSGS.items():
+            self.define(name, text)
+
+    def define(self, type_name: str, text: str) -> None:
+        """Add a type, and those whose definitions follow in the same text, of which this one is
+        used although there is another. Raises Undecodable for a text that defines nothing."""
+        try:
+            types = self._parse(text, type_name)
+            for name in types:
+                if self._store.fielddefs.get(name) != types[name]:
+                    self._store.fielddefs.pop(name, None)
+                    self._store.cache.clear()
+            self._store.register(types)
+        except (*self._faults, ValueError, RecursionError) as error:
+            raise Undecodable(
+                f"the definition of {type_name:.80} cannot be read: {error}"
+            ) from None
+
+    def definition(self, type_name: str) -> str:
+        """The text of a type and all that it is made of, as bags keep it. Raises Undecodable."""
+        try:
+            text, _ = self._store.generate_msgdef(type_name, ros_version=2)
+        except self._faults as error:
+            raise Undecodable(f"{type_name:.80}: no such type is known ({error})") from None
+        return text
+
+    def knows(self, type_name: str) -> bool:
+        """Whether there is a definition of that name."""
+        return type_name in self._store.fielddefs
+
+    def decode(self, payload: bytes, type_name: str) -> Any:
+        """The message in CDR, as an object with the attributes of its type. Raises Undecodable."""
+        if not self.knows(type_name):
+            raise Undecodable(f"{type_name:.80}: no such type is known")
+        try:
+            return self._store.deserialize_cdr(payload, type_name)
+        except (*self._faults, MemoryError, IndexError, TypeError) as error:
+            raise Undecodable(f"no {type_name:.80} in CDR: {error}") from None
+
+    def encode(self, message: Any, type_name: str) -> bytes:
+        """The message in CDR."""
+        return bytes(self._store.serialize_cdr(message, type_name))
+
+    def make(self, type_name: str, **fields: Any) -> Any:
+        """A message of a type."""
+        return self._store.types[type_name](**fields)

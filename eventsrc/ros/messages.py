@@ -1,0 +1,263 @@
+"""Fields of ROS messages: from a decoded message to plain values.
+
+A message is any object with the attributes of its definition, such as one that rosbags decodes.
+What is missing or of another type raises BadMessage; NaN is passed on, for the door of the log to
+refuse with its reason.
+"""
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, NamedTuple, TypeVar
+
+import numpy as np
+import pybase64
+
+from eventsrc.envelope import covariance_fault
+
+from .transforms import Transform, unit_transform
+
+DETECTIONS: Final = "vision_msgs/msg/Detection2DArray"
+TF: Final = "tf2_msgs/msg/TFMessage"
+ODOMETRY: Final = "nav_msgs/msg/Odometry"
+POSE: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
+CAMERA_INFO: Final = "sensor_msgs/msg/CameraInfo"
+GRID: Final = "nav_msgs/msg/OccupancyGrid"
+TEXT: Final = "std_msgs/msg/String"
+FLOATS: Final = "std_msgs/msg/Float32MultiArray"
+
+UNCLASSIFIED: Final = "unclassified"
+"""The class of a detection without a hypothesis."""
+_POSE_OF_6D: Final = (0, 1, 5, 6, 7, 11, 30, 31, 35)
+"""x, y and yaw of the covariance of x, y, z, roll, pitch and yaw, row by row."""
+_NS: Final = 1_000_000_000
+_NS_DIGITS: Final = 9
+
+_Read = TypeVar("_Read")
+
+Covariance = tuple[float, ...]
+"""Nine numbers, row by row: of x, y (metres) and yaw (radians)."""
+
+
+class BadMessage(ValueError):
+    """A message that is not what its type says, or holds what no such message may hold."""
+
+
+class Stamped(NamedTuple):
+    """A transform of a TFMessage."""
+
+    parent: str
+    child: str
+    stamp_ns: int
+    pose: Transform
+
+
+class StampedPose(NamedTuple):
+    """A pose of odometry or localisation. ``child`` is empty where the message names none.
+    ``fault`` is why it has no covariance; None where the sender left it at zeros."""
+
+    parent: str
+    child: str
+    stamp_ns: int
+    pose: Transform
+    covariance: Covariance | None
+    fault: str | None = None
+
+
+class Lens(NamedTuple):
+    """A camera, of CameraInfo."""
+
+    frame: str
+    hfov_deg: float
+    width_px: float
+    height_px: float
+
+
+class Embeddings(NamedTuple):
+    """The embeddings of one Detection2DArray: base64 of float32 by index, or by Detection2D.id."""
+
+    stamp_ns: int
+    model: str | None
+    dim: int | None
+    by_index: Sequence[str | None]
+    by_id: Mapping[str, str]
+
+
+class Detected(NamedTuple):
+    """A Detection2DArray. ``detections`` are as in an envelope, without embeddings, and ``ids``
+    the Detection2D.id of each."""
+
+    stamp_ns: int
+    frame: str
+    detections: list[dict[str, Any]]
+    ids: list[str]
+    unclassified: int
+
+
+def stamp_of(stamp: Any) -> int:
+    """Nanoseconds of a builtin_interfaces/Time."""
+    return _integer(stamp.sec) * _NS + _integer(stamp.nanosec)
+
+
+def frame_name(name: Any) -> str:
+    """A frame's name without the slash that ROS 1 put before it."""
+    if not isinstance(name, str):
+        raise BadMessage(f"a frame's name is {type(name).__name__}, not text")
+    return name.removeprefix("/")
+
+
+def read(reader: Callable[[Any], _Read], message: Any) -> _Read:
+    """``reader(message)``; BadMessage where the message has not the fields of its type."""
+    try:
+        return reader(message)
+    except (
+        ArithmeticError,
+        AttributeError,
+        LookupError,
+        RecursionError,
+        TypeError,
+        ValueError,
+    ) as error:
+        if isinstance(error, BadMessage):
+            raise
+        raise BadMessage(str(error)) from None
+
+
+def transform_of(each: Any) -> Stamped:
+    """A TransformStamped, one of the ``transforms`` of a TFMessage."""
+    return Stamped(
+        frame_name(each.header.frame_id),
+        frame_name(each.child_frame_id),
+        stamp_of(each.header.stamp),
+        _transform(each.transform.translation, each.transform.rotation),
+    )
+
+
+def pose_of(message: Any) -> StampedPose:
+    """The pose of an Odometry or a PoseWithCovarianceStamped."""
+    at, nine = message.pose.pose, _of_x_y_yaw(message.pose.covariance)
+    fault = covariance_fault(nine) if any(nine) else None
+    return StampedPose(
+        frame_name(message.header.frame_id),
+        frame_name(getattr(message, "child_frame_id", "")),
+        stamp_of(message.header.stamp),
+        _transform(at.position, at.orientation),
+        nine if any(nine) and fault is None else None,
+        None if fault is None else f"the pose's covariance {fault}",
+    )
+
+
+def lens_of(message: Any) -> Lens:
+    """The camera of a CameraInfo. Raises BadMessage for one that is not calibrated."""
+    width, height, fx = float(message.width), float(message.height), float(message.k[0])
+    if not (width > 0.0 and height > 0.0 and fx > 0.0 and math.isfinite(fx)):
+        raise BadMessage(f"a camera of {width:g} × {height:g} pixels with k[0] = {fx:g}")
+    hfov = round(math.degrees(2.0 * math.atan(width / 2.0 / fx)), 9)
+    return Lens(frame_name(message.header.frame_id), hfov, width, height)
+
+
+def detections_of(message: Any, labels: Mapping[str, str]) -> Detected:
+    """The detections of a Detection2DArray of vision_msgs 2, 3 or 4. Of several hypotheses the one
+    with the highest score counts, of equal ones the first. ``labels`` names classes by id."""
+    made: list[dict[str, Any]] = []
+    ids: list[str] = []
+    unclassified = 0
+    for each in message.detections:
+        class_name, score = _best(each.results, labels)
+        unclassified += class_name == UNCLASSIFIED
+        made.append({"class": class_name, "confidence": score, "bbox": _box(each.bbox)})
+        ids.append(str(getattr(each, "id", "")))
+    header = message.header
+    return Detected(stamp_of(header.stamp), frame_name(header.frame_id), made, ids, unclassified)
+
+
+def embeddings_of_text(message: Any) -> Embeddings:
+    """The embeddings of a std_msgs/String of JSON; docs/ros.md has the form."""
+    document = json.loads(message.data)
+    if not isinstance(document, dict) or "stamp" not in document:
+        raise BadMessage('the embeddings are no JSON object with a "stamp"')
+    stamp, given = document["stamp"], document.get("embeddings")
+    stamp_ns = _integer(stamp["sec"]) * _NS + _integer(stamp["nanosec"])
+    model, dim = document.get("model"), document.get("dim")
+    if isinstance(given, list):
+        by_index = [_base64(each) for each in given]
+        return Embeddings(stamp_ns, model, dim, by_index, {})
+    if isinstance(given, dict):
+        by_id = {name: _base64(each) for name, each in given.items()}
+        kept = {name: each for name, each in by_id.items() if each is not None}
+        return Embeddings(stamp_ns, model, dim, (), kept)
+    raise BadMessage('"embeddings" is neither a list nor an object')
+
+
+def embeddings_of_floats(message: Any) -> Embeddings:
+    """The embeddings of a std_msgs/Float32MultiArray, a row for each detection. The label of its
+    first dimension is the stamp, as ``1714557600.250000000``; that of its second, the model."""
+    rows, columns = message.layout.dim
+    seconds, dot, fraction = rows.label.partition(".")
+    if not (dot and seconds.isdecimal() and fraction.isdecimal() and len(fraction) == _NS_DIGITS):
+        raise BadMessage(
+            f"the label of dimension 0 is {rows.label[:40]!r}, not a stamp as seconds, a dot and "
+            "nine digits of nanoseconds"
+        )
+    count, dim = int(rows.size), int(columns.size)
+    values = np.asarray(message.data, "<f4")
+    if count < 0 or dim < 0 or message.layout.data_offset != 0 or values.size != count * dim:
+        raise BadMessage(f"{values.size:,} values where {count:,} × {dim:,} are declared")
+    raw, size = values.tobytes(), 4 * dim
+    by_index = [
+        pybase64.b64encode(raw[at * size : (at + 1) * size]).decode() for at in range(count)
+    ]
+    return Embeddings(int(seconds) * _NS + int(fraction), columns.label or None, dim, by_index, {})
+
+
+def _best(results: Sequence[Any], labels: Mapping[str, str]) -> tuple[str, float]:
+    """Class and score of the best hypothesis."""
+    best, class_id = -math.inf, None
+    for result in results:
+        hypothesis = getattr(result, "hypothesis", result)  # vision_msgs 2 has none
+        score = float(hypothesis.score)
+        if class_id is None or score > best or math.isnan(best):
+            best = score
+            class_id = str(
+                hypothesis.class_id if hasattr(hypothesis, "class_id") else hypothesis.id
+            )
+    if not class_id:
+        return UNCLASSIFIED, max(best, 0.0)
+    return labels.get(class_id, class_id), best
+
+
+def _box(bbox: Any) -> list[float]:
+    """Left, top, right and bottom of what a box covers that may be turned."""
+    center, width, height = bbox.center, float(bbox.size_x), float(bbox.size_y)
+    at = getattr(center, "position", center)  # a geometry_msgs/Pose2D before vision_msgs 4
+    theta = float(center.theta)
+    if theta != 0.0:
+        if not math.isfinite(theta):
+            return [theta] * 4
+        cos, sin = abs(math.cos(theta)), abs(math.sin(theta))
+        width, height = width * cos + height * sin, width * sin + height * cos
+    x, y = float(at.x), float(at.y)
+    return [x - width / 2.0, y - height / 2.0, x + width / 2.0, y + height / 2.0]
+
+
+def _transform(position: Any, rotation: Any) -> Transform:
+    return unit_transform(
+        position.x, position.y, position.z, rotation.x, rotation.y, rotation.z, rotation.w
+    )
+
+
+def _of_x_y_yaw(values: Sequence[float]) -> Covariance:
+    """x, y and yaw of a 6 × 6 covariance."""
+    return tuple(float(values[at]) for at in _POSE_OF_6D)
+
+
+def _integer(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise BadMessage(f"a stamp holds {value!r:.40}, not an integer")
+    return int(value)
+
+
+def _base64(value: Any) -> str | None:
+    if value is None or isinstance(value, str):
+        return value
+    raise BadMessage(f"an embedding is {type(value).__name__}, not base64 text or null")
