@@ -34,7 +34,7 @@ from eventsrc.log.reader import LogReader
 
 from .envelope import FIRST_OFFSET, Int64, KeyframeId, Offset, RunId, has_keyframe_id
 from .gaps import DEFAULT_SETTLE_NS, GapLedger, RunState, gap_of, is_consistent
-from .system_events import LOSS_KEY, Loss, is_system_key
+from .system_events import LOSS_KEY, Loss
 
 MAX_BYTES: Final = 8 * 1024 * 1024
 """Half a million gaps. A larger ledger is not saved: reading it would take more memory than reading
@@ -240,7 +240,7 @@ def fold_ledger(events: Iterable[Event], ledger: GapLedger[RunId], now_ns: int) 
     for event in events:
         if event.key == LOSS_KEY:
             _add_loss(ledger, event.payload, now_ns)
-        elif not is_system_key(event.key):
+        elif event.is_envelope:
             identity = _identity(event)
             if identity is not None:
                 ledger.record(*identity, now_ns)

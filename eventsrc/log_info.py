@@ -1,9 +1,10 @@
 """Facts about a log (`mapfold log info`), counted from its indexes, reading hardly any events.
 
-First and last stamp are those of robots' events: mapfold's own events are stamped when they were
-written, which for an imported log is months after the run. A sealed segment names the bounds of all
-its stamps, which are exact if it has no events of ours. Otherwise its chunks are read if that could
-still change the answer; mostly it cannot, because the segments around it are exact.
+First and last stamp are those of envelopes: mapfold's own events are stamped when they were
+written, which for an imported log is months after the run, and verbatim messages by clocks of their
+own. A sealed segment names the bounds of all its stamps, which are exact if it has envelopes only.
+Otherwise its chunks are read if that could still change the answer; mostly it cannot, because the
+segments before and behind it have earlier and later stamps.
 """
 
 from collections import Counter
@@ -15,17 +16,18 @@ from pydantic import ValidationError
 
 from eventsrc.log import mcap_records as _mcap
 from eventsrc.log.active_file import ActiveFile
-from eventsrc.log.format import SegmentPath
+from eventsrc.log.format import SegmentPath, carries_envelopes
 from eventsrc.log.mcap_records import Channel
 from eventsrc.log.reader import OpenSegment
 from eventsrc.log.sealed_segment import SealedFile
+from eventsrc.log.segment import formats_of
 
 from .envelope import Offset
 from .errors import LogDamaged
 from .gap_history import ledger_of
 from .gaps import gap_of
 from .log import Event, LogReader
-from .system_events import LOSS_KEY, REJECTED_KEY, Loss, is_system_key
+from .system_events import LOSS_KEY, REJECTED_KEY, Loss
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +44,9 @@ class SegmentInfo:
 @dataclass(frozen=True, slots=True)
 class LogInfo:
     """A log at a glance. Times are int nanoseconds, None while the log is empty; the first is the
-    earliest and the last the latest, whatever their order in the log; stamps are those of robots'
-    events. ``lost`` is what the log reports as lost, less the keyframes that came late."""
+    earliest and the last the latest, whatever their order in the log; stamps are those of
+    envelopes. ``lost`` is what the log reports as lost, less the keyframes that came late.
+    ``formats`` are the encodings and schemas of verbatim messages, by topic."""
 
     log_id: str
     path: Path
@@ -57,37 +60,47 @@ class LogInfo:
     last_logged_ns: int | None
     first_stamp_ns: int | None
     last_stamp_ns: int | None
+    formats: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
 class _RobotStamps:
-    """The bounds of robots' stamps in int nanoseconds: ``first`` and ``last``, None while there
-    are none."""
+    """The bounds of the stamps of envelopes in int nanoseconds: ``first`` and ``last``, None while
+    there are none."""
 
     first: int | None = None
     last: int | None = None
     _doubtful: list[tuple[int, int, SegmentPath]] = field(default_factory=list)
 
     def add(self, stamp_ns: int) -> None:
-        """Add the stamp of one robot's event."""
+        """Add the stamp of one envelope."""
         self.first = stamp_ns if self.first is None else min(self.first, stamp_ns)
         self.last = stamp_ns if self.last is None else max(self.last, stamp_ns)
 
     def add_sealed(self, entry: SegmentPath, segment: SealedFile) -> None:
         """Add the bounds that a sealed segment names."""
         first, last = segment.first_stamp_ns, segment.last_stamp_ns
-        if _has_system_events(segment):
+        if _has_other_events(segment):
             self._doubtful.append((first, last, entry))
         else:
             self.add(first)
             self.add(last)
 
     def read_doubtful(self, reader: LogReader) -> None:
-        """Read the segments with events of ours that could still move the bounds."""
-        for first, last, entry in sorted(self._doubtful, key=lambda d: d[1], reverse=True):
-            if self.first is None or self.last is None or first < self.first or last > self.last:
-                for stamp_ns in _stamps(reader.open_segment(entry)):
-                    self.add(stamp_ns)
+        """Read the segments with other events that could still move the bounds."""
+        unread = []
+        for doubtful in sorted(self._doubtful, key=lambda d: d[1], reverse=True):
+            if self.last is None or doubtful[1] > self.last:
+                self._read(reader, doubtful[2])
+            else:
+                unread.append(doubtful)
+        for first, _, entry in sorted(unread, key=lambda d: d[0]):
+            if self.first is None or first < self.first:
+                self._read(reader, entry)
+
+    def _read(self, reader: LogReader, entry: SegmentPath) -> None:
+        for stamp_ns in _stamps(reader.open_segment(entry)):
+            self.add(stamp_ns)
 
 
 @dataclass(slots=True)
@@ -95,12 +108,13 @@ class _Tally:
     keys: Counter[str]
     logged: list[int]
     stamps: _RobotStamps
+    formats: dict[str, set[str]]
 
 
 def log_info(path: Path, *, note: Callable[[str], None] | None = None) -> LogInfo:
     """Count a log. Raises LogNotFound, NotALog or LogDamaged. ``note`` gets a line if a saved gap
     ledger is not used, with the reason."""
-    tally = _Tally(Counter(), [], _RobotStamps())
+    tally = _Tally(Counter(), [], _RobotStamps(), {})
     with LogReader(path) as reader:
         segments = tuple(_count(reader, entry, tally) for entry in reader.segments)
         tally.stamps.read_doubtful(reader)
@@ -117,6 +131,7 @@ def log_info(path: Path, *, note: Callable[[str], None] | None = None) -> LogInf
             last_logged_ns=max(tally.logged, default=None),
             first_stamp_ns=tally.stamps.first,
             last_stamp_ns=tally.stamps.last,
+            formats={key: tuple(sorted(tally.formats[key])) for key in sorted(tally.formats)},
         )
 
 
@@ -140,6 +155,7 @@ def _count_sealed(segment: SealedFile, tally: _Tally) -> None:
     statistics = segment.statistics
     for channel, count in statistics.channel_message_counts.items():
         tally.keys[segment.channels[channel].topic] += count
+    _add_formats(tally, segment, b"")
     tally.logged += (statistics.message_start_time, statistics.message_end_time)
 
 
@@ -147,12 +163,21 @@ def _count_growing(segment: ActiveFile, tally: _Tally) -> None:
     for chunk in segment.chunks:
         body = segment.read_chunk(chunk)
         channels = segment.channels_of(body)
+        _add_formats(tally, segment, body)
         robot_channels = _robot_channels(channels)
         for channel, _, log_ns, stamp_ns, _, _ in _mcap.iter_messages(body):
             tally.keys[channels[channel].topic] += 1
             tally.logged.append(log_ns)
             if channel in robot_channels:
                 tally.stamps.add(stamp_ns)
+
+
+def _add_formats(tally: _Tally, segment: OpenSegment, body: bytes) -> None:
+    """Add the formats of the verbatim messages that ``segment`` has in a chunk of this body."""
+    channels = segment.channels_of(body)
+    for id_, form in formats_of(channels, lambda: segment.schemas_of(body)).items():
+        text = f"{form.encoding} {form.schema}".rstrip()
+        tally.formats.setdefault(channels[id_].topic, set()).add(text)
 
 
 def _count_lost(reader: LogReader, note: Callable[[str], None] | None = None) -> int:
@@ -174,11 +199,11 @@ def _loss(event: Event) -> Loss | None:
 
 
 def _robot_channels(channels: dict[int, Channel]) -> set[int]:
-    """The ids of the channels that are not mapfold's own."""
-    return {id_ for id_, channel in channels.items() if not is_system_key(channel.topic)}
+    """The ids of the channels with envelopes."""
+    return {id_ for id_, channel in channels.items() if carries_envelopes(channel)}
 
 
-def _has_system_events(segment: SealedFile) -> bool:
+def _has_other_events(segment: SealedFile) -> bool:
     robot_channels = _robot_channels(segment.channels)
     counts = segment.statistics.channel_message_counts
     return any(count and channel not in robot_channels for channel, count in counts.items())

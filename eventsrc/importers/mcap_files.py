@@ -6,7 +6,7 @@ from typing import BinaryIO
 
 from eventsrc.cdr_grids import GRID_SCHEMA
 from eventsrc.errors import MapfoldError
-from eventsrc.log import LogReader
+from eventsrc.log import LogReader, VerbatimEvent
 from eventsrc.log.foreign_mcap import ForeignDamage, foreign_messages
 
 from .source import ImportedMessage
@@ -37,6 +37,15 @@ class McapFile:
             for number, message in enumerate(foreign_messages(self._file), start=1):
                 self.at = number
                 self._read += len(message.payload)
+                if message.verbatim is not None:
+                    yield ImportedMessage(
+                        message.payload,
+                        message.key,
+                        message.logged_ns,
+                        message.published_ns,
+                        form=message.verbatim,
+                    )
+                    continue
                 is_grid = message.encoding == "cdr" and message.schema == GRID_SCHEMA
                 if is_grid or message.encoding == "json":
                     yield ImportedMessage(
@@ -76,6 +85,6 @@ class OtherLog:
             for event in reader.read():
                 self.at = event.offset
                 self._read += len(event.payload)
-                yield ImportedMessage(
-                    event.payload, event.key, event.logged_ns, event.stamp_ns, event.version
-                )
+                form = event.format if isinstance(event, VerbatimEvent) else None
+                times = event.logged_ns, event.stamp_ns
+                yield ImportedMessage(event.payload, event.key, *times, event.version, form)

@@ -15,7 +15,7 @@ from eventsrc.append import NewMap, append_payload, rejected_event
 from eventsrc.envelope import Offset
 from eventsrc.errors import MisuseError
 from eventsrc.ingest import Rejected
-from eventsrc.log import FsyncPolicy, LogWriter
+from eventsrc.log import FsyncPolicy, LogWriter, MessageFormat
 from eventsrc.occupancy_map import InvalidMap, OccupancyMap, decode_map
 from eventsrc.system_events import LOSS_KEY, MAP_KEY, REJECTED_KEY
 from eventsrc.upcast import UPCASTERS
@@ -49,6 +49,8 @@ class ImportReport:
     next_offset: Offset
     maps: int = 0
     """Occupancy maps, given or among the messages."""
+    verbatim: int = 0
+    """Verbatim messages of another mapfold log, copied unchanged."""
 
 
 class ImportInterrupted(KeyboardInterrupt):
@@ -110,10 +112,14 @@ class _Import:
         self._first = writer.next_offset
         self._last: tuple[Source, int | None] | None = None
         self.accepted = self.rejected = self.system = self.skipped = self.maps = 0
+        self.verbatim = 0
 
     def append(self, source: Source, message: ImportedMessage) -> None:
-        """Append one message: a system event unchanged, anything else after validation."""
-        if message.key == REJECTED_KEY or message.key == LOSS_KEY:
+        """Append one message: a system event or a verbatim message unchanged, anything else after
+        validation."""
+        if message.form is not None:
+            self._append_verbatim(message, message.form)
+        elif message.key == REJECTED_KEY or message.key == LOSS_KEY:
             self._append_system_event(message.key, message)
         elif message.key == MAP_KEY:
             self._append_map_event(source, message)
@@ -152,6 +158,16 @@ class _Import:
         )
         self.system += 1
 
+    def _append_verbatim(self, message: ImportedMessage, form: MessageFormat) -> None:
+        self._writer.append(
+            message.key or self._key,
+            message.payload,
+            logged_ns=message.logged_ns,
+            stamp_ns=message.stamp_ns,
+            form=form,
+        )
+        self.verbatim += 1
+
     def _append_envelope(self, source: Source, message: ImportedMessage) -> None:
         outcome = append_payload(
             self._writer,
@@ -178,7 +194,7 @@ class _Import:
     def report(self) -> ImportReport:
         """Sync the log and count what was appended."""
         counts = (self.accepted, self.rejected, self.system, self.skipped)
-        return ImportReport(*counts, self._first, self._writer.sync(), self.maps)
+        return ImportReport(*counts, self._first, self._writer.sync(), self.maps, self.verbatim)
 
 
 def check_sources(names: Sequence[str]) -> None:

@@ -4,6 +4,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
+from eventsrc.log import MessageFormat
+
 
 @dataclass(frozen=True, slots=True)
 class ImportedMessage:
@@ -13,7 +15,8 @@ class ImportedMessage:
     any other payload is kept as rejected. ``logged_ns`` is when the source received it.
     ``stamp_ns`` is used for system events of another mapfold log only: the event of an envelope is
     stamped with the envelope's own time. ``version`` is the envelope version that another mapfold
-    log has it in; None if there is none.
+    log has it in; None if there is none. ``form`` is the format of a verbatim message of another
+    mapfold log, which is kept as it is, on topic ``key``.
     """
 
     payload: bytes
@@ -21,6 +24,7 @@ class ImportedMessage:
     logged_ns: int | None = None
     stamp_ns: int | None = None
     version: int | None = None
+    form: MessageFormat | None = None
 
 
 class Source(Protocol):

@@ -1,7 +1,7 @@
 """The log: an append-only directory of MCAP segments, the only truth (docs/log-format.md)."""
 
 from .durable_files import ALWAYS, GROUP_COMMIT, NEVER, FsyncPolicy, parse_fsync
-from .event import Event, NewEvent
+from .event import Event, MessageFormat, NewEvent, VerbatimEvent
 from .file_fault import FileFault
 from .log_identity import same_but_sealed, segment_signatures
 from .reader import LogReader
@@ -22,11 +22,13 @@ __all__ = [
     "FsyncPolicy",
     "LogReader",
     "LogWriter",
+    "MessageFormat",
     "NewEvent",
     "RecoveryReport",
     "Sealing",
     "SegmentRecovery",
     "Unreadable",
+    "VerbatimEvent",
     "Verification",
     "follow",
     "parse_fsync",

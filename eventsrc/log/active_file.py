@@ -12,7 +12,7 @@ from eventsrc.envelope import Offset
 from . import mcap_records as _mcap
 from .file_bytes import FileBytes
 from .format import SEALED, mark_seed, segment_path
-from .mcap_records import BadRecord, Channel
+from .mcap_records import BadRecord, Channel, Schema
 from .resync import DamagedBytes, skip_damaged
 from .segment import ChunkRef, SegmentFile, Unreadable
 
@@ -95,3 +95,8 @@ class ActiveFile(SegmentFile):
         """By id, from the records before the first message."""
         _, channels = _mcap.definitions(body, leading=True)
         return {channel.id: channel for channel in channels}
+
+    def schemas_of(self, body: bytes) -> dict[int, Schema]:
+        """By id, from the records before the first message."""
+        schemas, _ = _mcap.definitions(body, leading=True)
+        return {schema.id: schema for schema in schemas}

@@ -104,8 +104,13 @@ class ActiveSegment:
 
     @property
     def channels(self) -> int:
-        """Channels so far: one for each key and version."""
+        """Channels so far: one for each key and version, or topic and format."""
         return self._group.channels
+
+    @property
+    def definition_bytes(self) -> int:
+        """Bytes of all schemas and channels so far."""
+        return self._group.definition_bytes
 
     def add(self, events: Sequence[NewEvent], start: int) -> int:
         """Add events from index ``start`` on until a commit is needed; returns how many."""

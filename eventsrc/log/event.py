@@ -1,9 +1,15 @@
-"""An event of a log, and an event to be appended."""
+"""An event of a log, and an event to be appended.
 
-from dataclasses import dataclass
+Most events are JSON: an envelope, or one of mapfold's own. The others are *verbatim messages*:
+bytes of other programs (a message of ROS in CDR, a JPEG), kept beside them with a topic, a message
+encoding and a schema, so that readers of MCAP show them. No fold reads them.
+"""
+
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from eventsrc.envelope import ENVELOPE_VERSION, Offset
+from eventsrc.system_events import is_system_key
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +29,37 @@ class Event:
     payload: bytes
     version: int = ENVELOPE_VERSION
 
+    @property
+    def is_envelope(self) -> bool:
+        """Whether it carries an envelope: it is neither mapfold's own nor a verbatim message."""
+        return not is_system_key(self.key)
+
+
+class MessageFormat(NamedTuple):
+    """What a verbatim message is: the fields of its MCAP channel and schema.
+
+    ``encoding`` is the message encoding (``cdr``, ``jpeg``). ``schema`` is empty if there is none;
+    else its name, such as ``nav_msgs/msg/Odometry``, with the encoding of the schema (``ros2msg``)
+    and its text.
+    """
+
+    encoding: str
+    schema: str = ""
+    schema_encoding: str = ""
+    schema_text: bytes = b""
+
+
+@dataclass(frozen=True, slots=True)
+class VerbatimEvent(Event):
+    """A verbatim message; ``key`` is its topic."""
+
+    format: MessageFormat = field(kw_only=True)
+
+    @property
+    def is_envelope(self) -> bool:
+        """False."""
+        return False
+
 
 class NewEvent(NamedTuple):
     """An event to be appended; the log gives it an offset."""
@@ -32,3 +69,5 @@ class NewEvent(NamedTuple):
     logged_ns: int
     stamp_ns: int
     version: int = ENVELOPE_VERSION
+    format: MessageFormat | None = None
+    """Of a verbatim message; None for JSON."""

@@ -17,7 +17,8 @@ from lz4.frame import LZ4FrameDecompressor
 
 from . import mcap_records as _mcap
 from .crc import crc32
-from .format import ENVELOPE_VERSION_KEY, envelope_version
+from .event import MessageFormat
+from .format import ENVELOPE_VERSION_KEY, envelope_version, is_verbatim, message_format
 from .mcap_records import FRAME, MAGIC, BadRecord, Channel, Opcode, Schema
 
 MAX_FOREIGN_BYTES: Final = 64 * 1024 * 1024
@@ -108,25 +109,28 @@ class ForeignRecord(NamedTuple):
 class ForeignMessage:
     """One message. ``key`` is its MCAP topic; times are int nanoseconds; ``schema`` is the name of
     its channel's schema, empty without one; ``version`` is the envelope version that a mapfold log
-    has it in, None in other files."""
+    has it in, None in other files; ``verbatim`` is the format of a verbatim message of a mapfold
+    log."""
 
     key: str
     encoding: str
     schema: str
     version: int | None
+    verbatim: MessageFormat | None
     logged_ns: int
     published_ns: int
     payload: bytes
 
 
 class _ChannelName(NamedTuple):
-    """The topic, message encoding and schema of a channel, and its envelope version if it has
-    one."""
+    """The topic, message encoding and schema of a channel; if it has them, its envelope version
+    and the format of its verbatim messages."""
 
     key: str
     encoding: str
     schema: str
     version: int | None
+    verbatim: MessageFormat | None
 
 
 def foreign_messages(file: BinaryIO) -> Iterator[ForeignMessage]:
@@ -242,28 +246,33 @@ def _messages(records: Iterator[ForeignRecord]) -> Iterator[ForeignMessage]:
 class _Channels:
     def __init__(self) -> None:
         self._names: dict[int, _ChannelName] = {}
-        self._schemas: dict[int, str] = {}
-        self._names_size = 0
+        self._schemas: dict[int, Schema] = {}
+        self._size = self._text_size = 0
 
     def add_schema(self, content: bytes) -> None:
         schema = _mcap.decode_as(Schema, content)
-        if self._schemas.get(schema.id) != schema.name:
-            self._names_size += len(schema.name)
-            _mcap.check_definitions(self._names_size)
-            self._schemas[schema.id] = schema.name
+        if self._schemas.get(schema.id) != schema:
+            self._size += len(schema.name)
+            _mcap.check_definitions(self._size)
+            self._text_size += len(schema.data)
+            if self._text_size > _mcap.MAX_DEFINITIONS_BYTES:  # in no segment of a log
+                schema.data = b""
+            self._schemas[schema.id] = schema
 
     def add(self, content: bytes) -> None:
         _mcap.check_definitions(len(content))
         channel = _mcap.decode_as(Channel, content)
+        schema = self._schemas.get(channel.schema_id)
         name = _ChannelName(
             channel.topic,
             channel.message_encoding,
-            self._schemas.get(channel.schema_id, ""),
+            "" if schema is None else schema.name,
             envelope_version(channel) if ENVELOPE_VERSION_KEY in channel.metadata else None,
+            message_format(channel, schema) if is_verbatim(channel) else None,
         )
         if self._names.get(channel.id) != name:
-            self._names_size += len(name.key) + len(name.encoding) + len(name.schema)
-            _mcap.check_definitions(self._names_size)
+            self._size += len(name.key) + len(name.encoding) + len(name.schema)
+            _mcap.check_definitions(self._size)
             self._names[channel.id] = name
 
     def message(self, content: bytes) -> ForeignMessage:

@@ -37,7 +37,8 @@ from eventsrc.system_events import (
 )
 
 from . import mcap_records as _mcap
-from .mcap_records import BadRecord, Channel, Header, Metadata, Opcode
+from .event import MessageFormat
+from .mcap_records import BadRecord, Channel, Header, Metadata, Opcode, Schema
 
 FORMAT = "1"
 SEGMENT_METADATA = "mapfold.segment"
@@ -187,6 +188,40 @@ def envelope_version(channel: Channel) -> int:
     if said is None:
         return ENVELOPE_VERSION
     return int(said) if _A_VERSION.fullmatch(said) else UNREADABLE_VERSION
+
+
+VERBATIM_KEY = "mapfold.verbatim"
+"""In the metadata of the channel of verbatim messages, and of no other."""
+NO_SCHEMA = 0
+"""The schema id of a channel without a schema, by the specification of MCAP."""
+
+
+def verbatim_channel(channel_id: int, schema_id: int, topic: str, encoding: str) -> Channel:
+    """The channel of verbatim messages of one topic and format."""
+    return Channel(
+        id=channel_id,
+        topic=topic,
+        message_encoding=encoding,
+        schema_id=schema_id,
+        metadata={VERBATIM_KEY: "1"},
+    )
+
+
+def is_verbatim(channel: Channel) -> bool:
+    """Whether the messages of a channel are verbatim messages."""
+    return VERBATIM_KEY in channel.metadata
+
+
+def message_format(channel: Channel, schema: Schema | None) -> MessageFormat:
+    """The format of the messages on a verbatim channel; without its schema if that is lost."""
+    if schema is None:
+        return MessageFormat(channel.message_encoding)
+    return MessageFormat(channel.message_encoding, schema.name, schema.encoding, schema.data)
+
+
+def carries_envelopes(channel: Channel) -> bool:
+    """Whether the messages of a channel are envelopes, of any version."""
+    return not (is_system_key(channel.topic) or is_verbatim(channel))
 
 
 SEALED = ".mcap"

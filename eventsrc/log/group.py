@@ -7,15 +7,22 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
+from typing import Final
 
 from eventsrc.envelope import Offset
 
 from . import mcap_records as _mcap
 from .crc import crc32
 from .durable_files import FsyncPolicy
-from .event import NewEvent
-from .format import key_channel, schema_of
+from .event import MessageFormat, NewEvent
+from .format import NO_SCHEMA, key_channel, schema_of, verbatim_channel
 from .mcap_records import MESSAGE_HEAD, Channel, Schema, encode_message_head
+
+MAX_LEADING_BYTES: Final = 2 * 1024 * 1024
+"""Of the schemas and channels of one group; from this size on it takes no further event. A chunk
+may have eight times as much."""
+
+_ChannelKey = tuple[str, int, MessageFormat | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,13 +70,17 @@ class GroupBuilder:
         self._interval_ns = policy.interval_ns
         self._max_events = min(policy.max_events, _mcap.MAX_MESSAGES)
         self._max_bytes = min(policy.max_bytes, _mcap.MAX_GROUP_BYTES)
-        self._channels: dict[tuple[str, int], Channel] = {}
-        self._schemas: dict[str, int] = {}
-        self._schema_records: list[bytes] = []
+        self._channels: dict[_ChannelKey, Channel] = {}
+        self._schemas: dict[tuple[str, str, bytes], int] = {}
+        self._schema_records: dict[int, bytes] = {}
+        self.definition_bytes = 0
+        """Of all schemas and channels of the segment so far."""
         self._begin()
 
     def _begin(self) -> None:
-        self._ids: dict[tuple[str, int], int] = {}  # of the channels that lead this group
+        self._ids: dict[_ChannelKey, int] = {}  # of the channels that lead this group
+        self._leading_schemas: set[int] = set()
+        self._leading_bytes = 0
         self._definitions: list[bytes] = []
         self._parts: list[bytes] = []
         self._bytes = 0
@@ -83,7 +94,7 @@ class GroupBuilder:
 
     @property
     def channels(self) -> int:
-        """Channels of the segment so far: one for each key and version."""
+        """Channels of the segment so far: one for each key and version, or topic and format."""
         return len(self._channels)
 
     def add(self, events: Sequence[NewEvent], start: int) -> int:
@@ -96,8 +107,8 @@ class GroupBuilder:
         ids, size = self._ids, self._bytes
         first_ns, last_ns = self._first_ns, self._last_ns
         parts: list[bytes] = []
-        for key, payload, logged_ns, stamp_ns, version in islice(events, start, start + room):
-            channel = ids.get((key, version)) or self._add_channel(key, version)
+        for key, payload, logged_ns, stamp_ns, version, form in islice(events, start, start + room):
+            channel = ids.get((key, version, form)) or self._add_channel(key, version, form)
             length = len(payload)
             parts.append(encode_message_head(channel, sequence, logged_ns, stamp_ns, length))
             parts.append(payload)
@@ -107,7 +118,7 @@ class GroupBuilder:
             elif logged_ns > last_ns:
                 last_ns = logged_ns
             size += MESSAGE_HEAD + length
-            if size >= self._max_bytes:
+            if size >= self._max_bytes or self._leading_bytes >= MAX_LEADING_BYTES:
                 break
         # Stored at the end only: an interrupt in the loop leaves the group unchanged.
         self._parts += parts
@@ -116,34 +127,60 @@ class GroupBuilder:
         self.next_offset = Offset(self._base + sequence)
         return len(parts) // 2
 
-    def _add_channel(self, key: str, version: int) -> int:
-        """Id of the key's channel, whose record is put before the group's messages.
+    def _add_channel(self, key: str, version: int, form: MessageFormat | None) -> int:
+        """Id of an event's channel, whose record is put before the group's messages.
 
         Every chunk holds the records of its channels, so that it can be read without any other.
-        A schema, which follows from the key, is written once a segment.
+        The schema of an envelope or of our own event, which follows from the key, is written once a
+        segment, that of verbatim messages in every chunk.
         """
-        known = self._channels.get((key, version))
+        known = self._channels.get((key, version, form))
         if known is None:
-            known = self._channels[key, version] = self._define(key, version)
-        self._definitions.append(_mcap.encode(known))
-        self._ids[key, version] = known.id
+            known = self._channels[key, version, form] = self._define(key, version, form)
+            self.definition_bytes += len(_mcap.encode(known))
+        if form is not None and known.schema_id != NO_SCHEMA:
+            self._lead_schema(known.schema_id)
+        self._lead(_mcap.encode(known))
+        self._ids[key, version, form] = known.id
         return known.id
 
-    def _define(self, key: str, version: int) -> Channel:
-        name, text = schema_of(key)
-        schema = self._schemas.get(name)
+    def _lead_schema(self, schema: int) -> None:
+        """Put a schema before the group's messages, unless it is there."""
+        if schema not in self._leading_schemas:
+            self._leading_schemas.add(schema)
+            self._lead(self._schema_records[schema])
+
+    def _lead(self, record: bytes) -> None:
+        self._definitions.append(record)
+        self._leading_bytes += len(record)
+
+    def _define(self, key: str, version: int, form: MessageFormat | None) -> Channel:
+        number = len(self._channels) + 1
+        if form is None:
+            name, text = schema_of(key)
+            return key_channel(number, self._schema(name, "jsonschema", text), key, version)
+        schema = NO_SCHEMA
+        if form.schema:
+            schema = self._schema(form.schema, form.schema_encoding, form.schema_text)
+        return verbatim_channel(number, schema, key, form.encoding)
+
+    def _schema(self, name: str, encoding: str, text: bytes) -> int:
+        """The id of a schema, whose record is put before the group's messages if it is new."""
+        schema = self._schemas.get((name, encoding, text))
         if schema is None:
-            schema = self._schemas[name] = len(self._schemas) + 1
-            record = Schema(id=schema, name=name, encoding="jsonschema", data=text)
-            self._schema_records.append(_mcap.encode(record))
-            self._definitions.append(self._schema_records[-1])
-        return key_channel(len(self._channels) + 1, schema, key, version)
+            schema = self._schemas[name, encoding, text] = len(self._schemas) + 1
+            record = _mcap.encode(Schema(id=schema, name=name, encoding=encoding, data=text))
+            self._schema_records[schema] = record
+            self.definition_bytes += len(record)
+            self._lead_schema(schema)
+        return schema
 
     def due(self) -> bool:
         """Whether a commit is due by the fsync policy."""
         return self.waiting > 0 and (
             self.waiting >= self._max_events
             or self._bytes >= self._max_bytes
+            or self._leading_bytes >= MAX_LEADING_BYTES
             or time.monotonic_ns() - self._since_ns >= self._interval_ns
         )
 
@@ -157,7 +194,7 @@ class GroupBuilder:
             self._last_ns,
             self._definitions,
             self._parts,
-            list(self._schema_records),
+            list(self._schema_records.values()),
         )
         self._first = self.next_offset
         self._begin()

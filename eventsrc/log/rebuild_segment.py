@@ -18,7 +18,7 @@ from eventsrc.system_events import LOSS_KEY, Loss
 
 from . import mcap_records as _mcap
 from .active_file import ActiveFile
-from .format import SegmentPath, key_channel, schema_of
+from .format import NO_SCHEMA, SegmentPath, is_verbatim, key_channel, schema_of
 from .mcap_records import Channel, Schema
 from .scan import read_body
 from .seal import SegmentPlan, seal
@@ -60,6 +60,8 @@ def adjacent_times(before: SegmentPath | None, behind: SegmentPath | None) -> Ev
 
 
 _BATCH = 4096
+LOST_SCHEMA = "lost"
+"""The name of a schema that no readable chunk has."""
 
 
 @dataclass(slots=True)
@@ -84,13 +86,17 @@ class _Definitions:
         return id_
 
     def encode(self) -> bytes:
-        """All records, schemas first. A lost schema is generated again from its key."""
+        """All records, schemas first. A lost schema is generated again from its key; that of
+        verbatim messages, lost with all chunks that had it, is left empty."""
         for channel in self.channels.values():
-            if channel.schema_id not in self.schemas:
-                name, text = schema_of(channel.topic)
-                self.schemas[channel.schema_id] = Schema(
-                    id=channel.schema_id, name=name, encoding="jsonschema", data=text
-                )
+            if channel.schema_id in (NO_SCHEMA, *self.schemas):
+                continue
+            name, encoding, text = LOST_SCHEMA, "", b""
+            if not is_verbatim(channel):
+                (name, text), encoding = schema_of(channel.topic), "jsonschema"
+            self.schemas[channel.schema_id] = Schema(
+                id=channel.schema_id, name=name, encoding=encoding, data=text
+            )
         return _mcap.encode_all([*self.schemas.values(), *self.channels.values()])
 
 
@@ -107,7 +113,7 @@ def rebuild_segment(plan: SegmentPlan, source: Path | None, scan: Scan, times: E
 
 
 def _chunk_bodies(fd: int, scan: Scan, times: EventTimes) -> Iterator[bytes]:
-    definitions = _Definitions(dict(scan.channels))
+    definitions = _Definitions(dict(scan.channels), dict(scan.schemas))
     for chunk in scan.chunks:
         definitions.add(read_body(fd, chunk))
     loss_channel = definitions.loss_channel() if scan.gaps else 0
@@ -144,7 +150,7 @@ def _losses(base: Offset, channel: int, first: int, following: int, times: Event
 def slice_scan(source: Path, scan: Scan, first: Offset, end: Offset) -> Scan:
     """The part of a scan of ``source`` from offset ``first`` to before ``end``, as a segment of its
     own that ends with the last good event."""
-    rest = Scan(first, scan.log_id, next_offset=first, channels=scan.channels)
+    rest = Scan(first, scan.log_id, next_offset=first, channels=scan.channels, schemas=scan.schemas)
     for chunk in scan.chunks:
         start, stop = max(first, chunk.first), min(end, chunk.following)
         if start < stop:

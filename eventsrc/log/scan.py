@@ -25,7 +25,7 @@ from .format import HEAD_BYTES, WrongPlace, envelope_version, mark_seed, read_he
 from .mcap_records import BadRecord
 from .resync import DamagedBytes, skip_damaged
 from .rewritten import add_messages, is_rewritten
-from .segment import ChunkRef, Scan
+from .segment import ChunkRef, Scan, formats_of, verbatim_event
 
 _CHUNK_OPCODES = (_mcap.Opcode.SCHEMA, _mcap.Opcode.CHANNEL, _mcap.Opcode.MESSAGE)
 _MAX_PASSES: Final = 64
@@ -203,11 +203,14 @@ def read_body(fd: int, chunk: ChunkRef) -> bytes:
 def scanned_events(fd: int, scan: Scan, chunk: ChunkRef) -> Iterator[Event]:
     """The events of a chunk of ``scan``."""
     body = read_body(fd, chunk)
-    _, channels = _mcap.definitions(body)
-    known = {
-        channel.id: (channel.topic, envelope_version(channel))
-        for channel in (*scan.channels.values(), *channels)
-    }
+    schemas, channels = _mcap.definitions(body)
+    known = scan.channels | {channel.id: channel for channel in channels}
+    names = {id_: (channel.topic, envelope_version(channel)) for id_, channel in known.items()}
+    formats = formats_of(known, lambda: scan.schemas | {schema.id: schema for schema in schemas})
     for id_, sequence, log_ns, stamp_ns, at, stop in _mcap.iter_messages(body):
-        key, version = known[id_]
-        yield Event(Offset(scan.base + sequence), key, log_ns, stamp_ns, body[at:stop], version)
+        key, version = names[id_]
+        offset, payload = Offset(scan.base + sequence), body[at:stop]
+        if id_ in formats:
+            yield verbatim_event(offset, key, log_ns, stamp_ns, payload, formats[id_])
+        else:
+            yield Event(offset, key, log_ns, stamp_ns, payload, version)

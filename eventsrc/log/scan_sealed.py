@@ -36,7 +36,7 @@ def _scan(path: Path, data: FileBytes, base: Offset, following: Offset | None) -
     try:
         index = SealedFile(path, base)
         recorded_end = index.next_offset
-        scan.channels = index.channels
+        scan.channels, scan.schemas = index.channels, index.schemas
         places: Iterable[int] = [chunk.position for chunk in index.chunks]
     except (LogDamaged, NotALog) as error:
         scan.index_fault = str(error)

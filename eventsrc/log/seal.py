@@ -37,6 +37,7 @@ from .format import (
     SEGMENT_METADATA,
     file_head,
     head_metadata,
+    is_verbatim,
     segment_path,
 )
 from .mcap_records import (
@@ -121,7 +122,16 @@ def _split(body: bytes) -> Iterator[ChunkBody]:
             [start + shift for start in starts[first:last]],
             b"" if first else definitions,
         )
-        lead = lead or _mcap.encode_all(_mcap.definitions(definitions)[1])
+        lead = lead or _lead_of(definitions)
+
+
+def _lead_of(definitions: bytes) -> bytes:
+    """The records that lead a body which was split off: all channels, and the schemas of verbatim
+    messages, which follow from nothing else."""
+    schemas, channels = _mcap.definitions(definitions)
+    verbatim = {channel.schema_id for channel in channels if is_verbatim(channel)}
+    needed = {schema.id: schema for schema in schemas if schema.id in verbatim}
+    return _mcap.encode_all([*needed.values(), *channels])
 
 
 def _edges(size: int, starts: list[int]) -> list[int]:

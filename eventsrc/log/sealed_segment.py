@@ -16,6 +16,7 @@ from eventsrc.errors import LogDamaged
 
 from . import mcap_records as _mcap
 from .crc import crc32
+from .format import NO_SCHEMA, is_verbatim
 from .mcap_records import (
     BadRecord,
     Channel,
@@ -25,6 +26,7 @@ from .mcap_records import (
     Metadata,
     MetadataIndex,
     Opcode,
+    Schema,
     Statistics,
 )
 from .segment import ChunkRef, SegmentFile
@@ -42,6 +44,8 @@ class SealedFile(SegmentFile):
     def __init__(self, path: Path, base: Offset) -> None:
         super().__init__(path, base)
         self.channels: dict[int, Channel] = {}
+        self.schemas: dict[int, Schema] = {}
+        """Those of verbatim messages."""
         try:
             self._read_summary()
         except (ValueError, KeyError) as error:
@@ -57,6 +61,10 @@ class SealedFile(SegmentFile):
     def channels_of(self, body: bytes) -> dict[int, Channel]:  # noqa: ARG002
         """All channels, from the summary."""
         return self.channels
+
+    def schemas_of(self, body: bytes) -> dict[int, Schema]:  # noqa: ARG002
+        """All of them, from the summary."""
+        return self.schemas
 
     def _read_summary(self) -> None:
         size = self.size()
@@ -76,6 +84,7 @@ class SealedFile(SegmentFile):
 
     def _parse_summary(self, summary: bytes, size: int) -> None:
         indexes: list[tuple[int, int, frozenset[int]]] = []
+        schemas: list[bytes] = []
         statistics, seal = None, None
         definitions = 0
         for opcode, content in _mcap.records(summary):
@@ -83,6 +92,8 @@ class SealedFile(SegmentFile):
                 indexes.append(_chunk_position(_mcap.decode_as(ChunkIndex, content), size))
                 if len(indexes) > _MAX_CHUNKS:
                     raise BadRecord(f"an index of more than {_MAX_CHUNKS:,} chunks")
+            elif opcode == Opcode.SCHEMA:
+                schemas.append(content)
             elif opcode == Opcode.CHANNEL:
                 definitions += len(content)
                 _mcap.check_definitions(definitions)
@@ -98,10 +109,20 @@ class SealedFile(SegmentFile):
             raise BadRecord("no statistics or no seal")
         if not self.channels.keys() >= statistics.channel_message_counts.keys():
             raise BadRecord("statistics of channels that nothing defines")
+        self._keep_schemas(schemas)
         self.statistics, self.seal = statistics, seal
         self.first_stamp_ns = int(seal["first_stamp_ns"])
         self.last_stamp_ns = int(seal["last_stamp_ns"])
         self._set_chunks(indexes)
+
+    def _keep_schemas(self, contents: list[bytes]) -> None:
+        """Keep the schemas of verbatim messages; usually there are none."""
+        wanted = {c.schema_id for c in self.channels.values() if is_verbatim(c)} - {NO_SCHEMA}
+        if not wanted:
+            return
+        _mcap.check_definitions(sum(map(len, contents)))
+        schemas = (_mcap.decode_as(Schema, content) for content in contents)
+        self.schemas = {schema.id: schema for schema in schemas if schema.id in wanted}
 
     def _metadata(self, index: MetadataIndex, size: int) -> dict[str, str]:
         if index.length > _mcap.MAX_DEFINITIONS_BYTES or index.offset + index.length > size:

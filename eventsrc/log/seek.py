@@ -10,11 +10,12 @@ Times are the robots' (stamp_ns): a run of last week that is imported today has 
 Stamps may run backwards between runs and when a clock is set; "the last event at or before"
 includes every event of that time or earlier, wherever it is in the log.
 
-mapfold's own events are stamped when they were written, and the stamps of unreadable events are
-unknown. Both count as stamped like the robots' event before them, and at the start of the log as
-earlier than all. A range that ends at a time includes a damaged stretch if it includes the event
-before it or any event after it. Reading the range then raises LogDamaged. Only damage at the end of
-a growing segment, with no readable event after it, is reported here.
+mapfold's own events are stamped when they were written, verbatim messages by clocks of their own,
+and the stamps of unreadable events are unknown. All of them count as stamped like the robots' event
+before them, and at the start of the log as earlier than all. A range that ends at a time includes a
+damaged stretch if it includes the event before it or any event after it. Reading the range then
+raises LogDamaged. Only damage at the end of a growing segment, with no readable event after it, is
+reported here.
 """
 
 import re
@@ -25,7 +26,6 @@ from pydantic import BaseModel, ValidationError
 
 from eventsrc.envelope import KeyframeId, Offset, RunId
 from eventsrc.errors import MisuseError
-from eventsrc.system_events import is_system_key
 from eventsrc.text import counted
 
 from .event import Event
@@ -104,7 +104,7 @@ def resolve_start(reader: LogReader, text: str, *, on_gap: OnGap | None = None) 
     """
     time_ns = time_of(text)
     if time_ns is not None:
-        events = (e for e in reader.read(on_gap=on_gap) if not is_system_key(e.key))
+        events = (e for e in reader.read(on_gap=on_gap) if e.is_envelope)
         later = (e.offset for e in events if e.stamp_ns >= time_ns)
         return next(later, reader.next_offset)
     count = resolve(reader, text, on_gap=on_gap)
@@ -145,7 +145,7 @@ def _at_time(reader: LogReader, time_ns: int, on_gap: OnGap | None) -> tuple[Off
             included = gap.last + 1
 
     for event in reader.read(on_gap=include):
-        if not is_system_key(event.key):
+        if event.is_envelope:
             in_time = event.stamp_ns <= time_ns
             later += not in_time
         if in_time:
@@ -179,7 +179,7 @@ def _events_mentioning(
 ) -> Iterator[Event]:
     """Events whose text contains that keyframe id. Parsing all events takes 20 times as long."""
     for event in reader.read(on_gap=on_gap):
-        if not is_system_key(event.key) and any(
+        if event.is_envelope and any(
             int(m[1]) == keyframe_id for m in _KEYFRAME.finditer(event.payload)
         ):
             yield event

@@ -1,7 +1,7 @@
 """An open segment file: where each chunk is, and the events of one chunk."""
 
 import os
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -10,9 +10,9 @@ from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.errors import LogDamaged
 
 from . import mcap_records as _mcap
-from .event import Event
-from .format import HEAD_BYTES, envelope_version, read_head
-from .mcap_records import BadRecord, Channel
+from .event import Event, MessageFormat, VerbatimEvent
+from .format import HEAD_BYTES, envelope_version, is_verbatim, message_format, read_head
+from .mcap_records import BadRecord, Channel, Schema
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +57,8 @@ class Scan:
     """Whether another program has rewritten the file."""
     channels: dict[int, Channel] = field(default_factory=dict)
     """The channels in the segment's index; chunks define theirs as well."""
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    """The schemas of verbatim messages in the segment's index."""
 
     def add_chunk(self, chunk: ChunkRef) -> None:
         """Add the next good chunk; offsets missing before it become a gap."""
@@ -102,6 +104,10 @@ class SegmentFile:
         """The channels that the messages of a chunk's body may name, by id."""
         raise NotImplementedError
 
+    def schemas_of(self, body: bytes) -> dict[int, Schema]:
+        """The schemas of verbatim messages in a chunk's body, by id."""
+        raise NotImplementedError
+
     def size(self) -> int:
         """Bytes of the file now."""
         return os.fstat(self._fd).st_size
@@ -140,6 +146,7 @@ def _events(
     channels = segment.channels_of(body)
     names = {id_: channel.topic for id_, channel in channels.items()}
     versions = {id_: envelope_version(channel) for id_, channel in channels.items()}
+    formats = formats_of(channels, lambda: segment.schemas_of(body))
     base: int = segment.base
     expected: int = chunk.first
     for channel_id, sequence, log_ns, publish_ns, at, stop in _mcap.iter_messages(body):
@@ -153,8 +160,34 @@ def _events(
             return
         key = names[channel_id]
         if keys is None or key in keys:
+            if channel_id in formats:
+                form = formats[channel_id]
+                yield verbatim_event(Offset(offset), key, log_ns, publish_ns, body[at:stop], form)
+                continue
             version = versions[channel_id]
             # No call of Offset for each event: reading would take 5 % longer.
             yield Event(offset, key, log_ns, publish_ns, body[at:stop], version)  # type: ignore[arg-type]
     if expected != chunk.following:
         raise BadRecord(f"the chunk ends before offset {expected}")
+
+
+def formats_of(
+    channels: Mapping[int, Channel], schemas: Callable[[], Mapping[int, Schema]]
+) -> dict[int, MessageFormat]:
+    """The formats of those of ``channels`` that carry verbatim messages, by id. ``schemas`` is
+    called if there are any."""
+    verbatim = {id_: channel for id_, channel in channels.items() if is_verbatim(channel)}
+    if not verbatim:
+        return {}
+    known = schemas()
+    return {
+        id_: message_format(channel, known.get(channel.schema_id))
+        for id_, channel in verbatim.items()
+    }
+
+
+def verbatim_event(
+    offset: Offset, key: str, log_ns: int, publish_ns: int, payload: bytes, form: MessageFormat
+) -> VerbatimEvent:
+    """The event of a verbatim message."""
+    return VerbatimEvent(offset, key, log_ns, publish_ns, payload, format=form)

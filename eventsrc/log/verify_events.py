@@ -38,7 +38,6 @@ from eventsrc.system_events import (
     REJECTED_KEY,
     Loss,
     RejectedPayload,
-    is_system_key,
 )
 from eventsrc.text import visible
 from eventsrc.upcast import read_envelope
@@ -204,7 +203,7 @@ class EventFindings:
             self._check_command(event)
         elif event.key == MAP_KEY:
             self._check_map(event)
-        elif not is_system_key(event.key):
+        elif event.is_envelope:
             self._check_envelope(event)
 
     def _check_command(self, event: Event) -> None:

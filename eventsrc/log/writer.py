@@ -20,10 +20,12 @@ from typing import NamedTuple
 from eventsrc.clock import Clock, system_clock
 from eventsrc.envelope import ENVELOPE_VERSION, Offset
 from eventsrc.errors import LogError, MapfoldError, NotALog
+from eventsrc.system_events import is_system_key
+from eventsrc.text import visible
 
 from .active_segment import ActiveSegment
 from .durable_files import GROUP_COMMIT, FsyncPolicy, make_directory_durably, unlink_quietly
-from .event import NewEvent
+from .event import MessageFormat, NewEvent
 from .file_fault import FileFault
 from .format import LOCK, leftovers, list_segments
 from .lock import WriterLock
@@ -35,8 +37,14 @@ ROTATE_BYTES = 64 * 1024 * 1024
 ROTATE_EVENTS = 1_000_000
 ROTATE_SECONDS = 3600.0
 ROTATE_CHANNELS = 4_096
-"""Channels (keys and versions) after which a new segment begins. A segment keeps its channels in
-memory and writes them again when it is sealed; MCAP allows 65,535."""
+"""Channels (keys and versions, topics and formats) after which a new segment begins. A segment
+keeps its channels in memory and writes them again when it is sealed; MCAP allows 65,535."""
+ROTATE_DEFINITION_BYTES = 4 * 1024 * 1024
+"""Bytes of channels and schemas after which a new segment begins: a sealed one may have twice as
+much."""
+MAX_SCHEMA_BYTES = 256 * 1024
+MAX_NAME_BYTES = 16 * 1024
+"""Of the topic, encoding and schema names of a verbatim message, each in UTF-8."""
 _MAX_NS = 2**63
 
 
@@ -171,15 +179,17 @@ class LogWriter:
         stamp_ns: int | None = None,
         logged_ns: int | None = None,
         version: int = ENVELOPE_VERSION,
+        form: MessageFormat | None = None,
     ) -> int:
-        """Append one event; returns its offset. Commits when the fsync policy says so.
+        """Append one event, or with ``form`` a verbatim message on topic ``key``; returns its
+        offset. Commits when the fsync policy says so.
 
         ``logged_ns`` defaults to now by the writer's clock, ``stamp_ns`` to ``logged_ns``; both are
         int nanoseconds from 0 to 2^63 - 1.
         """
         logged = self._clock() if logged_ns is None else logged_ns
         stamp = logged if stamp_ns is None else stamp_ns
-        return self.append_all([NewEvent(key, payload, logged, stamp, version)])
+        return self.append_all([NewEvent(key, payload, logged, stamp, version, form)])
 
     def append_all(self, events: Sequence[NewEvent]) -> Offset:
         """Append several events in order; returns the offset of the first. Commits in between as
@@ -190,6 +200,8 @@ class LogWriter:
                     f"{self.path}: {len(event.payload):,} bytes under {event.key[:80]!r} are more "
                     f"than the {MAX_EVENT_BYTES:,} that one event may have"
                 )
+            if event.format is not None:
+                _check_format(self.path, event.key, event.format)
             if not (0 <= event.logged_ns < _MAX_NS and 0 <= event.stamp_ns < _MAX_NS):
                 raise LogError(
                     f"times {event.logged_ns} and {event.stamp_ns} are not nanoseconds "
@@ -222,6 +234,7 @@ class LogWriter:
         return events > 0 and (
             active.size >= self._rotate_bytes
             or active.channels >= ROTATE_CHANNELS
+            or active.definition_bytes >= ROTATE_DEFINITION_BYTES
             or events >= self._rotate_events
             or time.monotonic_ns() - self._begun >= self._rotate_ns
         )
@@ -297,6 +310,33 @@ class LogWriter:
             return
         with contextlib.suppress(MapfoldError):  # the first error is the one to report
             self.close()
+
+
+def _check_format(log: Path, topic: str, form: MessageFormat) -> None:
+    """Raise LogError for a verbatim message that no log takes."""
+    if is_system_key(topic):
+        raise LogError(f"{log}: a message on {visible(topic[:80])}: that key is mapfold's own")
+    for text in (topic, form.encoding, form.schema, form.schema_encoding):
+        if len(text.encode(errors="replace")) > MAX_NAME_BYTES or not _is_unicode(text):
+            raise LogError(
+                f"{log}: {visible(repr(text[:80]))} of a message on {visible(repr(topic[:80]))} is "
+                f"no name: longer than {MAX_NAME_BYTES:,} bytes, or no Unicode text"
+            )
+    if len(form.schema_text) > MAX_SCHEMA_BYTES:
+        raise LogError(
+            f"{log}: the schema {visible(form.schema[:80])} has {len(form.schema_text):,} bytes, "
+            f"more than {MAX_SCHEMA_BYTES:,}"
+        )
+    if not (topic and form.encoding):
+        raise LogError(f"{log}: a message without topic or encoding, on {visible(topic[:80])!r}")
+    if form.schema_text and not (form.schema and form.schema_encoding):
+        raise LogError(
+            f"{log}: a schema without a name or an encoding, of messages on {visible(topic[:80])}"
+        )
+
+
+def _is_unicode(text: str) -> bool:
+    return not any("\ud800" <= character <= "\udfff" for character in text)
 
 
 def _work_until(done: threading.Event, work: Callable[[], bool]) -> None:

@@ -129,6 +129,8 @@ def _summary(log: Path, report: ImportReport) -> str:
         parts.append(f"offsets {report.first_offset} to {report.next_offset - 1}")
     if report.maps:
         parts.insert(1, counted(report.maps, "map"))
+    if report.verbatim:
+        parts.append(f"{counted(report.verbatim, 'verbatim message')} taken over")
     if report.system:
         parts.append(f"{counted(report.system, 'event')} of mapfold's own taken over")
     if report.skipped:

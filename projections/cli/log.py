@@ -20,6 +20,7 @@ from eventsrc.log import (
     LogReader,
     SegmentRecovery,
     Unreadable,
+    VerbatimEvent,
     recover_log,
     verify_log,
 )
@@ -28,7 +29,7 @@ from eventsrc.log.recover import DEFAULT_MAX_LOSSES
 from eventsrc.log.seek import resolve, resolve_start, time_of
 from eventsrc.log_info import LogInfo, SegmentInfo, log_info
 from eventsrc.occupancy_map import InvalidMap, read_map_head
-from eventsrc.system_events import MAP_KEY, OccupancyMapEvent, is_system_key
+from eventsrc.system_events import MAP_KEY, OccupancyMapEvent
 from eventsrc.text import counted, visible
 
 from .options import JsonOption, LogArgument
@@ -48,22 +49,21 @@ def iso_time(time_ns: int) -> str:
 
 def event_document(event: Event) -> dict[str, Any]:
     """``{"offset", "logged_ns", "stamp_ns", "key", "payload"}``. The payload is its JSON value, or
-    its text when it is no JSON; bytes that are no text come as ``payload_base64`` beside null."""
+    its text when it is no JSON; bytes that are no text come as ``payload_base64`` beside null.
+    So does a verbatim message, with its ``encoding`` and ``schema``."""
     document: dict[str, Any] = {
         "offset": event.offset,
         "logged_ns": event.logged_ns,
         "stamp_ns": event.stamp_ns,
         "key": event.key,
     }
-    try:
-        text = event.payload.decode()
-    except UnicodeDecodeError:
-        return {
-            **document,
-            "payload": None,
-            "payload_base64": base64.b64encode(event.payload).decode(),
-        }
-    return {**document, "payload": _value(text)}
+    if isinstance(event, VerbatimEvent):
+        document |= {"encoding": event.format.encoding, "schema": event.format.schema}
+    else:
+        with contextlib.suppress(UnicodeDecodeError):
+            return {**document, "payload": _value(event.payload.decode())}
+    encoded = base64.b64encode(event.payload).decode()
+    return {**document, "payload": None, "payload_base64": encoded}
 
 
 def _value(text: str) -> Any:
@@ -84,6 +84,9 @@ def event_line(event: Event) -> str:
 
 
 def _summary(event: Event) -> str:
+    if isinstance(event, VerbatimEvent):
+        form = event.format
+        return f"{form.encoding} {form.schema}".rstrip() + f", {len(event.payload):,} bytes"
     if event.key == MAP_KEY:
         with contextlib.suppress(InvalidMap):  # `log verify` names it
             return _map_text(read_map_head(event.payload))
@@ -135,7 +138,7 @@ class RangeNotes:
     def _counted(self, events: Iterable[Event]) -> Iterator[Event]:
         for event in events:
             self._missing.pop(event.key, None)
-            if not is_system_key(event.key):  # these are stamped when they were written
+            if event.is_envelope:  # others are stamped when they were written
                 self._outside += self._is_outside(event.stamp_ns)
             yield event
 
@@ -197,9 +200,14 @@ def _info_text(report: LogInfo) -> str:
         rows.append(("logged", _span(report.first_logged_ns, report.last_logged_ns)))
     if report.first_stamp_ns is not None and report.last_stamp_ns is not None:
         rows.append(("stamped", _span(report.first_stamp_ns, report.last_stamp_ns)))
-    rows += [("key", f"{visible(key)}: {count}") for key, count in report.keys.items()]
+    rows += [("key", _key_text(key, report)) for key in report.keys]
     rows += [("segment", _segment_text(segment)) for segment in report.segments]
     return "".join(f"{name:<9} {value}\n" for name, value in rows)
+
+
+def _key_text(key: str, report: LogInfo) -> str:
+    formats = f" ({', '.join(report.formats[key])})" if key in report.formats else ""
+    return visible(f"{key}: {report.keys[key]}{formats}")
 
 
 def _segment_text(segment: SegmentInfo) -> str:

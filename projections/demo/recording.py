@@ -16,7 +16,6 @@ from eventsrc.errors import MapfoldError
 from eventsrc.log import LogReader
 from eventsrc.log_info import log_info
 from eventsrc.sim import SimulatedRun
-from eventsrc.system_events import is_system_key
 from eventsrc.transport.session import Router, ZenohOptions
 from projections.database import TailReport, rebuild, tail
 from projections.database.connection import Targets
@@ -93,7 +92,7 @@ def record_run(
     seconds = time.monotonic() - started
     info = log_info(folder.log)
     with LogReader(folder.log) as reader:
-        payloads = [event.payload for event in reader.read() if not is_system_key(event.key)]
+        payloads = [event.payload for event in reader.read() if event.is_envelope]
     recorded = Recorded(
         run_id=run.run_id,
         published=count,
@@ -162,6 +161,6 @@ class BackgroundTail:
             for event in reader.read(FIRST_OFFSET, self._commits[-1][0]):
                 while reached <= event.offset:
                     reached, committed_ns = next(commits)
-                if not is_system_key(event.key):
+                if event.is_envelope:
                     delays.append((committed_ns - event.logged_ns) / 1e9)
         return delays

@@ -19,7 +19,6 @@ from typing import TypeVar
 from eventsrc.errors import MisuseError
 from eventsrc.ingest import Accepted, ingest
 from eventsrc.log import LogReader
-from eventsrc.system_events import is_system_key
 from projections import relocalize
 from projections.exact import quantise, to_float32
 from projections.relocalize import Crop, View
@@ -61,7 +60,7 @@ def read_keyframes(logs: Iterable[Path]) -> Iterator[Accepted]:
     for log in logs:
         with LogReader(log) as reader:
             for event in reader.read():
-                if is_system_key(event.key):
+                if not event.is_envelope:
                     continue
                 found = ingest(event.payload, max_bytes=sys.maxsize)
                 if not isinstance(found, Accepted) or found.envelope.map_x is None:

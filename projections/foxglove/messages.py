@@ -8,13 +8,14 @@
 | ``/mapfold/state`` | JSON | counts of the map, and the number of events it is of |
 | ``/tf`` | foxglove.FrameTransforms | ``map`` → ``base_link``: the robot |
 | an event's key | JSON | the event, as it is in the log |
+| a message's topic | its own | a verbatim message; one on ``/tf`` is on ``/recorded/tf`` |
 """
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Final
 
-from foxglove import Channel, Context
+from foxglove import Channel, Context, Schema
 from foxglove.channels import (
     FrameTransformsChannel,
     GridChannel,
@@ -35,7 +36,7 @@ from foxglove.messages import (
     Vector3,
 )
 
-from eventsrc.log import Event
+from eventsrc.log import Event, MessageFormat
 from eventsrc.occupancy_map import OccupancyMap
 from eventsrc.text import visible
 from projections.deltas import (
@@ -58,11 +59,16 @@ from projections.deltas import (
 from projections.exact import UM_PER_M
 from projections.model.view import MapView
 
+from .moments import format_of
 from .scene import FRAME, height, map_scene, timestamp
 
 ROBOT_FRAME: Final = "base_link"
 _ANY_OBJECT: Final = {"type": "object"}
 """The JSON schema of events and states: Foxglove shows what a message holds without more."""
+
+_OWN_TOPICS: Final = ("/tf",)
+_RECORDED: Final = "/recorded"
+"""Before the topic of a verbatim message that is on one of ours."""
 
 
 class MapTopics:
@@ -77,27 +83,38 @@ class MapTopics:
             "/mapfold/state", message_encoding="json", schema=_ANY_OBJECT, context=context
         )
         self._walls: dict[str | None, GridChannel] = {}
-        self._events: dict[str, Channel] = {}
+        self._events: dict[tuple[str, MessageFormat | None], Channel] = {}
 
-    def declare(self, keys: Iterable[str], floors: Iterable[str | None]) -> None:
-        """Make the topics of these keys and of these floors' occupancy maps before they are needed:
-        a client that subscribes to a topic of a running server as soon as it appears may be
-        refused."""
-        for key in keys:
-            self._event_topic(key)
+    def declare(
+        self, topics: Iterable[tuple[str, MessageFormat | None]], floors: Iterable[str | None]
+    ) -> None:
+        """Make the topics of these keys and formats, and of these floors' occupancy maps before
+        they are needed: a client that subscribes to a topic of a running server as soon as it
+        appears may be refused."""
+        for key, form in topics:
+            self._event_topic(key, form)
         for floor in floors:
             self._walls_topic(floor)
 
     def event(self, event: Event, time_ns: int) -> None:
         """An event of the log, verbatim, on a topic of its key's name."""
-        self._event_topic(event.key).log(event.payload, log_time=time_ns)
+        self._event_topic(event.key, format_of(event)).log(event.payload, log_time=time_ns)
 
-    def _event_topic(self, key: str) -> Channel:
-        if key not in self._events:
-            self._events[key] = Channel(
-                key, message_encoding="json", schema=_ANY_OBJECT, context=self._context
-            )
-        return self._events[key]
+    def _event_topic(self, key: str, form: MessageFormat | None) -> Channel:
+        if (key, form) not in self._events:
+            self._events[key, form] = self._new_topic(key, form)
+        return self._events[key, form]
+
+    def _new_topic(self, key: str, form: MessageFormat | None) -> Channel:
+        if form is None:
+            return Channel(key, message_encoding="json", schema=_ANY_OBJECT, context=self._context)
+        schema = Schema(name=form.schema, encoding=form.schema_encoding, data=form.schema_text)
+        return Channel(
+            f"{_RECORDED}{key}" if key in _OWN_TOPICS else key,
+            message_encoding=form.encoding,
+            schema=schema if form.schema else None,
+            context=self._context,
+        )
 
     def changes(self, lines: Iterable[str], time_ns: int) -> None:
         """What changed the map, a message a line."""

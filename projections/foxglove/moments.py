@@ -10,22 +10,26 @@ from collections.abc import Iterable
 from itertools import accumulate
 
 from eventsrc.envelope import Offset
-from eventsrc.log import Event
-from eventsrc.system_events import is_system_key
+from eventsrc.log import Event, MessageFormat, VerbatimEvent
+
+
+def format_of(event: Event) -> MessageFormat | None:
+    """The format of a verbatim message, None for JSON."""
+    return event.format if isinstance(event, VerbatimEvent) else None
 
 
 class Moments:
     """Times, ns since the Unix epoch, of the events of a log from its first one on."""
 
     def __init__(self, events: Iterable[Event]) -> None:
-        keys: dict[str, None] = {}
+        topics: dict[tuple[str, MessageFormat | None], None] = {}
         stamps = []
         for event in events:
-            keys[event.key] = None
-            is_own = is_system_key(event.key)
+            topics[event.key, format_of(event)] = None
+            is_own = not event.is_envelope
             stamps.append((None if is_own else event.stamp_ns, event.logged_ns))
-        self.keys = tuple(keys)
-        """Of the events, in the order in which they appear."""
+        self.topics = tuple(topics)
+        """Keys and formats of the events, in the order in which they appear."""
         known = [stamp for stamp, _ in stamps if stamp is not None]
         first = known[0] if known else min((logged for _, logged in stamps), default=0)
         given = (first if stamp is None else stamp for stamp, _ in stamps)

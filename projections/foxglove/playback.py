@@ -108,7 +108,7 @@ class Playback(ServerListener):
         self._to_show, self._ended = False, False
         context = Context()
         self._topics = MapTopics(context)
-        self._topics.declare(maps.moments.keys, maps.floors)
+        self._topics.declare(maps.moments.topics, maps.floors)
         try:
             self.server: WebSocketServer = start_server(
                 name=name,

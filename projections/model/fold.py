@@ -12,7 +12,7 @@ from eventsrc.envelope import Offset
 from eventsrc.ingest import Accepted, Rejected
 from eventsrc.log import Event, LogReader
 from eventsrc.occupancy_map import InvalidMap, OccupancyMap, decode_map
-from eventsrc.system_events import MAP_KEY, is_system_key
+from eventsrc.system_events import MAP_KEY
 from eventsrc.upcast import read_envelopes
 from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.deltas import Delta
@@ -73,20 +73,20 @@ def fold_event(event: Event, semantic_map: SemanticMap) -> list[Delta]:
 
 def parse_events(events: Sequence[Event]) -> list[ParsedEvent]:
     """Validate events; for sixteen or so together this is quicker than one by one."""
-    enveloped = [event for event in events if not is_system_key(event.key)]
+    enveloped = [event for event in events if event.is_envelope]
     # No size limit: it applied when the event was recorded.
     outcomes = read_envelopes(enveloped, max_bytes=sys.maxsize)
     units = iter(unit_vectors([v for a in outcomes if isinstance(a, Accepted) for v in a.vectors]))
     coming, parsed_events = iter(outcomes), []
     for event in events:
-        parsed = _parse_own(event) if is_system_key(event.key) else next(coming)
+        parsed = next(coming) if event.is_envelope else _parse_own(event)
         count = len(parsed.vectors) if isinstance(parsed, Accepted) else 0
         parsed_events.append(ParsedEvent(event.offset, parsed, list(islice(units, count))))
     return parsed_events
 
 
 def _parse_own(event: Event) -> OccupancyMap | Rejected | None:
-    """One of mapfold's own events: a map, or None for one that a fold passes over."""
+    """An event that is no envelope: a map, or None for one that a fold passes over."""
     if event.key != MAP_KEY:
         return None
     try:
