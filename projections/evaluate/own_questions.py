@@ -160,7 +160,7 @@ def _crop(observation: ObservationRecord) -> Crop:
 def _another_day(row: Sequence[Match], run_id: RunId, lowered: float) -> tuple[Match, ...]:
     """The matches as if those of one run were of another day, most similar first."""
     moved = [
-        replace(match, similarity=match.similarity - lowered) if match.run_id == run_id else match
+        match._replace(similarity=match.similarity - lowered) if match.run_id == run_id else match
         for match in row
     ]
     return tuple(sorted(moved, key=lambda match: (-match.similarity, match.observation)))

@@ -35,6 +35,7 @@ from projections.relocalize.candidates import (
     objects_of_a_class,
     refuse_unknown_classes,
 )
+from projections.relocalize.question import Box
 
 from .known_constants import ConstantsMemory, KnownConstants
 
@@ -85,7 +86,7 @@ class CandidateSearch:
         looked = [number for number, crop in enumerate(crops) if crop.vector is not None]
         named = [number for number, crop in enumerate(crops) if crop.vector is None]
         near: _Rows = []
-        along = _Along({}, {}, {})
+        along = _NOTHING
         if looked or not named:
             near, along = self._nearest([crops[number] for number in looked], neighbours)
             if named:
@@ -105,14 +106,16 @@ class CandidateSearch:
         values |= {f"crop_{i}": crop.vector for i, crop in enumerate(crops)}
         with _query_errors(self._targets.vector_url):
             statement = _statement("near_and_graph" if one else "near", len(crops), neighbours)
-            rows = self._vectors.execute(statement, values | self._known.parameters).fetchall()
+            values |= self._known.parameters
+            rows = self._vectors.execute(statement, values, binary=True).fetchall()
         near, origin = self._near(rows)
         model = next((row[-1] for row in near), None)
         for crop in crops:
             check_space(crop, 0 if crop.vector is None else len(crop.vector), model)
         if not one:
             return near, self._follow([row[2] for row in near], origin)
-        return near, self._along([row[_NEAR:] for row in rows], origin)
+        of_graph = next((row[_NEAR:] for row in rows if row[_NEAR] is not None), None)
+        return near, _NOTHING if of_graph is None else self._along(of_graph, origin)
 
     def _of_classes(self, crops: Sequence[Crop], named: Sequence[int]) -> "tuple[_Rows, _Along]":
         """The same for crops of which only the class is known; ``named`` are their numbers."""
@@ -123,11 +126,11 @@ class CandidateSearch:
             "of_each": OBSERVATIONS_OF_EACH,
         }
         with _query_errors(self._targets.graph_url):
-            picked = self._graph.execute(_statement("of_classes"), values).fetchall()
+            picked = self._graph.execute(_statement("of_classes"), values, binary=True).fetchall()
         det_pks = sorted({det_pk for _, det_pk in picked})
         values = {"det_pks": det_pks, **self._known.parameters}
         with _query_errors(self._targets.vector_url):
-            rows = self._vectors.execute(_statement("described"), values).fetchall()
+            rows = self._vectors.execute(_statement("described"), values, binary=True).fetchall()
         found, origin = self._near(rows)
         described = {row[2]: row[1:] for row in found}
         along = self._follow(det_pks, origin)
@@ -152,21 +155,20 @@ class CandidateSearch:
         """Object and Places of observations; ``origin`` is that of the vectors."""
         values = {"det_pks": sorted(set(det_pks)), "observation": LABEL_IDS["Observation"]}
         with _query_errors(self._targets.graph_url):
-            rows = self._graph.execute(_statement("graph"), values | self._known.parameters)
-            return self._along(rows.fetchall(), origin)
+            values |= self._known.parameters
+            rows = self._graph.execute(_statement("graph"), values, binary=True).fetchall()
+            return self._along(rows[0], origin)
 
-    def _along(self, rows: _Rows, origin: str | None) -> "_Along":
-        """Learn the settings and check the origin."""
-        settings, graph, maps, things, places = next(
-            (row[0] for row in rows if row[0] is not None), (None,) * 5
-        )
+    def _along(self, row: tuple[Any, ...], origin: str | None) -> "_Along":
+        """Learn the settings and check the origin; ``row`` has the columns of ``of_graph``."""
+        settings, graph, maps, things, places = row[0]
         if graph != origin or settings is not None:
             place = describe_target(self._targets.graph_url)
             refuse_mixed(origin, graph, describe_target(self._targets.vector_url), place)
             self._known = self._known.with_settings(settings, place)
         if maps is not None:
             self._known = self._with_maps(maps[0])
-        return _Along.of(rows, things or {}, places or {})
+        return _Along.of(row[1:], things or {}, places or {})
 
     def _with_maps(self, key: str | None) -> KnownConstants:
         if key is None:
@@ -199,9 +201,10 @@ def _statement(name: str, crops: int = 0, neighbours: int = 0) -> bytes:
         questions=questions,
         neighbours=sql.Literal(neighbours),
         of_vectors=run["of_vectors"].format(cosines=run["cosines"]),
-        of_graph=run["of_graph"].format(settings=run["settings"], maps=run["maps"], **tables()),
+        of_graph=run["of_graph"].format(
+            settings=run["settings"], maps=run["maps"], edges=run["edges"], **tables()
+        ),
         observed=run["observed"],
-        along=run["along"],
         followed=run["followed"].format(**tables()),
         **tables(),
     )
@@ -215,25 +218,42 @@ class _Thing(NamedTuple):
     stand: Stand | None
 
 
-_NO_THING: Final = (None, None, None)
+_NONE: Final = 0
+"""In place of a graph id, of which none is 0."""
+_NO_EDGES: Final = (_NONE, _NONE, _NONE)
 
 
 class _Along(NamedTuple):
     """Ids of Object, its Place and the keyframe's Place by det_pk; and what is at these ids."""
 
-    ids: dict[int, tuple[str | None, str | None, str | None]]
-    things: dict[str | None, _Thing]
-    places: dict[str | None, tuple[PlaceOrdinal, CandidatePlace]]
+    ids: dict[int, tuple[int, int, int]]
+    things: dict[int, _Thing]
+    places: dict[int, tuple[PlaceOrdinal, CandidatePlace]]
 
     @classmethod
     def of(
-        cls, rows: Sequence[tuple[Any, ...]], things: dict[str, str], places: dict[str, str]
+        cls, edges: Sequence[list[int]], things: dict[str, str], places: dict[str, str]
     ) -> "_Along":
-        """Of rows of the statement ``graph``, with the properties of Objects and Places by id."""
+        """Of the edges in the statement ``graph``, and the properties of Objects and Places."""
+        observes, located, has, in_place = (
+            dict(zip(starts, ends, strict=True))
+            for starts, ends in zip(edges[::2], edges[1::2], strict=True)
+        )
+        ids = {
+            observation & _NUMBER_MASK: (
+                thing := observes.get(observation, _NONE),
+                located.get(thing, _NONE),
+                in_place.get(has.get(observation, _NONE), _NONE),
+            )
+            for observation in observes.keys() | has.keys()
+        }
         return cls(
-            {det_pk: (thing, its, there) for _, det_pk, thing, its, there in rows},
-            {thing: _thing(properties) for thing, properties in things.items()},
-            {place: (_ordinal(place), _place(properties)) for place, properties in places.items()},
+            ids,
+            {int(thing): _thing(properties) for thing, properties in things.items()},
+            {
+                int(place): (_ordinal(int(place)), _place(properties))
+                for place, properties in places.items()
+            },
         )
 
     def and_more(self, more: "_Along") -> "_Along":
@@ -241,12 +261,15 @@ class _Along(NamedTuple):
         return _Along(self.ids | more.ids, self.things | more.things, self.places | more.places)
 
 
+_NOTHING: Final = _Along({}, {}, {})
+
+
 def _assemble(crops: int, near: _Rows, along: _Along, known: KnownConstants) -> Candidates:
     ordered = sorted(near, key=lambda row: (row[0], -row[1], row[2]))
     matches: list[list[Match]] = [[] for _ in range(crops)]
     ordinals = {place: ordinal for place, (ordinal, _) in along.places.items()}
     for crop, similarity, det_pk, det_id, run_id, class_name, bbox, x, y, yaw, _ in ordered:
-        thing_id, its, there = along.ids.get(det_pk, _NO_THING)
+        thing_id, its, there = along.ids.get(det_pk, _NO_EDGES)
         thing = along.things.get(thing_id)
         matches[crop].append(
             Match(
@@ -255,7 +278,7 @@ def _assemble(crops: int, near: _Rows, along: _Along, known: KnownConstants) -> 
                 run_id,
                 float(similarity),
                 None if x is None else (x, y, yaw),
-                tuple(bbox),
+                _box(bbox),
                 class_name if thing is None else thing.class_name,
                 None if thing is None else thing.object_id,
                 ordinals.get(its),
@@ -265,6 +288,13 @@ def _assemble(crops: int, near: _Rows, along: _Along, known: KnownConstants) -> 
         )
     rows = tuple(map(tuple, matches))
     return Candidates(rows, dict(along.places.values()), known.constants, known.walls)
+
+
+def _box(array: str) -> Box:
+    """A box from the text of its array, which has the numbers of the log; in binary 0.1 would be
+    that of 32 bits."""
+    x0, y0, x1, y1 = array[1:-1].split(",")
+    return float(x0), float(y0), float(x1), float(y1)
 
 
 def _thing(properties: str) -> _Thing:
@@ -288,8 +318,8 @@ def _place(properties: str) -> CandidatePlace:
     )
 
 
-def _ordinal(graphid: str) -> PlaceOrdinal:
-    return PlaceOrdinal((int(graphid) & _NUMBER_MASK) - 1)
+def _ordinal(graphid: int) -> PlaceOrdinal:
+    return PlaceOrdinal((graphid & _NUMBER_MASK) - 1)
 
 
 @contextlib.contextmanager

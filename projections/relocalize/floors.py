@@ -133,8 +133,7 @@ class Layout:
         if not number:
             return match
         dx, pose, stand = number * STEP_M, match.pose, match.object_stand
-        return replace(
-            match,
+        return match._replace(
             pose=None if pose is None else (pose[0] + dx, pose[1], pose[2]),
             object_stand=None if stand is None else _stand(stand, dx),
         )

@@ -98,6 +98,12 @@ def test_the_server_plans_a_question_a_few_times_only_until_the_index_is_disable
         assert plans() == (kept, made + 3)
 
 
+def test_a_question_without_crops_has_no_candidates(targets: Targets) -> None:
+    with CandidateReader(targets) as reader:
+        found = reader.candidates(())
+    assert (found.matches, dict(found.places)) == ((), {})
+
+
 def test_the_library_call_answers(targets: Targets, view: MapView) -> None:
     index = ExactIndex(view)
     for crops in questions():

@@ -170,7 +170,7 @@ def test_turning_around_finds_the_pose_that_one_look_leaves_open() -> None:
     question, candidates = scene.ask([(at, [0]), (turned, [2])])
     # the chair's matches: its look-alike scores as high
     alike = tuple(
-        replace(m, similarity=0.5 + 0.5 * 0.67) if m.object_id in ("o0", "o1") else m
+        m._replace(similarity=0.5 + 0.5 * 0.67) if m.object_id in ("o0", "o1") else m
         for m in candidates.matches[0]
     )
     first = Candidates((alike,), {}, CONSTANTS)
@@ -208,11 +208,11 @@ def test_crops_without_boxes_or_looks_are_answered_near_their_things(kind: str) 
     if kind == "a text":
         crops = tuple(replace(crop, is_text=True) for crop in crops)
         shift = CONSTANTS.localizer.text_shift
-        rows = tuple(tuple(replace(m, similarity=m.similarity - shift) for m in r) for r in rows)
+        rows = tuple(tuple(m._replace(similarity=m.similarity - shift) for m in r) for r in rows)
     if kind == "classes":
         crops = tuple(replace(crop, vector=None) for crop in crops)
         rows = tuple(
-            tuple(replace(m, similarity=1.0) for m in row if m.class_name == crop.class_name)
+            tuple(m._replace(similarity=1.0) for m in row if m.class_name == crop.class_name)
             for crop, row in zip(crops, rows, strict=True)
         )
     asked = Question((replace(view, crops=crops),))
@@ -233,7 +233,7 @@ def test_a_class_is_no_likeness(seed: int, all_classes: bool) -> None:
         for crop, is_named in zip(view.crops, named, strict=True)
     )
     rows = tuple(
-        tuple(replace(m, similarity=1.0) for m in row) if is_named else row
+        tuple(m._replace(similarity=1.0) for m in row) if is_named else row
         for row, is_named in zip(candidates.matches, named, strict=True)
     )
     asked = Question((replace(view, crops=crops),))
@@ -263,7 +263,7 @@ def test_a_hostile_box_leaves_the_answer_near_what_was_seen(box: tuple[float, ..
     question, candidates = scene.ask([(at, shown[:1])])
     (view,) = question.views
     crops = tuple(replace(crop, bbox=box) for crop in view.crops)  # type: ignore[arg-type]
-    rows = tuple(tuple(replace(m, bbox=box) for m in row) for row in candidates.matches)  # type: ignore[arg-type]
+    rows = tuple(tuple(m._replace(bbox=box) for m in row) for row in candidates.matches)  # type: ignore[arg-type]
     for matches in (candidates.matches, rows):
         asked = Question((replace(view, crops=crops),))
         found = posterior_of(asked, replace(candidates, matches=matches))

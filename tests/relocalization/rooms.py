@@ -1,7 +1,6 @@
 """Candidates whose Places are the true rooms, so that ranking is tested without clustering."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 from projections.exact import quantise, to_float32
 from projections.model.view import MapView
@@ -58,4 +57,4 @@ class RoomMap:
     def _in_room(self, match: Match) -> Match:
         keyframe = self.view.observations[match.observation].keyframe
         room = self.rooms.index(self.run[keyframe].room)
-        return replace(match, object_place=room, keyframe_place=room)
+        return match._replace(object_place=room, keyframe_place=room)

@@ -50,31 +50,47 @@ CASE WHEN row_number() OVER () = 1 THEN json_build_array({cosines}, (
     FROM mapfold.checkpoint c WHERE sink = 'vectors')) END
 
 -- name: of_graph
--- The same of the graph, and the properties of the Objects and Places in `found`, by id.
+-- The same of the graph, and in the same row the properties of the Objects and Places in `followed`, by id.
 CASE WHEN row_number() OVER () = 1 THEN json_build_array({settings}, (
     SELECT log_id || ' ' || coalesce(to_jsonb(c) ->> 'observed', fingerprint)
     FROM mapfold.checkpoint c WHERE sink = 'graph'), {maps},
     (SELECT json_object_agg(id::text, properties::text) FROM {object}
-     WHERE id IN (SELECT thing FROM found)),
+     WHERE id = ANY(ARRAY(SELECT thing FROM observes))),
     (SELECT json_object_agg(id::text, properties::text) FROM {place}
-     WHERE id IN (SELECT its FROM found UNION SELECT there FROM found))) END
+     WHERE id = ANY(ARRAY(SELECT place FROM located UNION SELECT place FROM in_place)))) END,
+{edges}
+
+-- name: edges
+-- The edges in `followed`, also in that row: two columns each.
+CASE WHEN row_number() OVER () = 1 THEN ARRAY(SELECT observation FROM observes)::text::bigint[] END,
+CASE WHEN row_number() OVER () = 1 THEN ARRAY(SELECT thing FROM observes)::text::bigint[] END,
+CASE WHEN row_number() OVER () = 1 THEN ARRAY(SELECT thing FROM located)::text::bigint[] END,
+CASE WHEN row_number() OVER () = 1 THEN ARRAY(SELECT place FROM located)::text::bigint[] END,
+CASE WHEN row_number() OVER () = 1 THEN ARRAY(SELECT observation FROM has)::text::bigint[] END,
+CASE WHEN row_number() OVER () = 1 THEN ARRAY(SELECT keyframe FROM has)::text::bigint[] END,
+CASE WHEN row_number() OVER () = 1 THEN ARRAY(SELECT keyframe FROM in_place)::text::bigint[] END,
+CASE WHEN row_number() OVER () = 1 THEN ARRAY(SELECT place FROM in_place)::text::bigint[] END
 
 -- name: observed
-near.det_pk, near.det_id, near.run_id, near.class_name, near.bbox, near.map_x, near.map_y, near.map_yaw,
-near.embedding_model
-
--- name: along
--- Ids of Object, its Place and the keyframe's Place.
-observes.end_id AS thing, located.end_id AS its, in_place.end_id AS there
+near.det_pk, near.det_id, near.run_id, near.class_name, near.bbox::text AS bbox, near.map_x, near.map_y,
+near.map_yaw, near.embedding_model
 
 -- name: followed
--- Joins from `near.det_pk` along the graph.
-LEFT JOIN {observes} AS observes
-    ON observes.start_id = ag_catalog._graphid(%(observation)s, coalesce(near.det_pk, 0))
-LEFT JOIN {located_in} AS located ON located.start_id = observes.end_id
-LEFT JOIN {has_observation} AS has
-    ON has.end_id = ag_catalog._graphid(%(observation)s, coalesce(near.det_pk, 0))
-LEFT JOIN {in_place} AS in_place ON in_place.start_id = has.start_id
+-- From `found.det_pk` along the graph: to Objects and on to their Places, and to keyframes and on to theirs.
+-- Each table is read once for all ids, in their order: the observations of an Object lie close together.
+observes AS MATERIALIZED (
+    SELECT start_id AS observation, end_id AS thing FROM {observes}
+    WHERE start_id = ANY(ARRAY(SELECT ag_catalog._graphid(%(observation)s, coalesce(det_pk, 0)) FROM found))
+), located AS MATERIALIZED (
+    SELECT start_id AS thing, end_id AS place FROM {located_in}
+    WHERE start_id = ANY(ARRAY(SELECT thing FROM observes))
+), has AS MATERIALIZED (
+    SELECT end_id AS observation, start_id AS keyframe FROM {has_observation}
+    WHERE end_id = ANY(ARRAY(SELECT ag_catalog._graphid(%(observation)s, coalesce(det_pk, 0)) FROM found))
+), in_place AS MATERIALIZED (
+    SELECT start_id AS keyframe, end_id AS place FROM {in_place}
+    WHERE start_id = ANY(ARRAY(SELECT keyframe FROM has))
+)
 
 -- name: near
 -- The nearest observations of each crop, from the vectors' database; at least one row, of nulls if there
@@ -95,29 +111,24 @@ FROM (SELECT 1) AS one
 LEFT JOIN public.detection_embeddings AS near ON near.det_pk = ANY(%(det_pks)s::bigint[])
 
 -- name: graph
--- Object, its Place and the keyframe's Place of each observation, from the graph's database; at least
--- one row.
+-- Object, its Place and the keyframe's Place of these observations, from the graph's database, in one row.
 WITH found AS MATERIALIZED (
-    SELECT near.det_pk, {along}
-    FROM (SELECT 1) AS one
-    LEFT JOIN unnest(%(det_pks)s::bigint[]) AS near (det_pk) ON true
-    {followed}
-)
-SELECT {of_graph}, det_pk, thing, its, there FROM found
+    SELECT det_pk FROM unnest(%(det_pks)s::bigint[]) AS given (det_pk)
+), {followed}
+SELECT {of_graph}
 
 -- name: near_and_graph
 -- Both in one round trip and one snapshot, when they share a database.
 WITH question (crop, wanted) AS ({questions}), found AS MATERIALIZED (
-    SELECT question.crop, 1 - near.distance AS similarity, {observed}, {along}
+    SELECT question.crop, 1 - near.distance AS similarity, {observed}
     FROM question LEFT JOIN LATERAL (
         SELECT det_pk, det_id, run_id, class_name, bbox, map_x, map_y, map_yaw, embedding_model,
                embedding <=> question.wanted AS distance
         FROM public.detection_embeddings ORDER BY embedding <=> question.wanted LIMIT {neighbours}
     ) AS near ON true
-    {followed}
-)
+), {followed}
 SELECT {of_vectors}, crop, similarity, det_pk, det_id, run_id, class_name, bbox, map_x, map_y, map_yaw,
-       embedding_model, {of_graph}, det_pk, thing, its, there
+       embedding_model, {of_graph}
 FROM found
 
 -- name: of_classes
