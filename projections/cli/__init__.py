@@ -40,6 +40,8 @@ COMMANDS: "Mapping[str, str]" = {
     "calibrate": "projections.cli.calibrate",
     "edit": "projections.cli.edit",
     "edits": "projections.cli.edit",
+    "completion": "projections.cli.shell",
+    "help": "projections.cli.shell",
 }
 """The module of each command, in the order of ``--help``; commands of one module are adjacent."""
 

@@ -19,6 +19,7 @@ answer Ctrl-C with an empty line and a closed pipe with exit 1; `Program` passes
 import contextlib
 import gc
 import importlib
+import inspect
 import io
 import os
 import re
@@ -43,6 +44,9 @@ EXIT_INTERRUPTED: Final = 130
 EXIT_READER_GONE: Final = 141
 """128 + SIGPIPE, as a shell shows a program that writes to a closed pipe."""
 
+COMPLETION_VARIABLE: Final = "_MAPFOLD_COMPLETE"
+"""The environment variable by which a shell asks for completions."""
+
 # typer's own class or click's, depending on typer's version.
 _UsageError: Any = typer.BadParameter.__base__
 _DATABASE_OPTION: Final = re.compile(r"--(vector-)?db\b")
@@ -59,6 +63,10 @@ def start(
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when numpy is imported
     gc.disable()
     name = sys.argv[1] if len(sys.argv) > 1 else ""
+    if COMPLETION_VARIABLE in os.environ:
+        from typer._completion_classes import completion_init
+
+        completion_init()
     with _exit_on_ctrl_c():
         program = command_line({name: commands[name]} if name in commands else commands)
     gc.freeze()
@@ -101,12 +109,25 @@ def compose(names: Iterable[str], modules: Mapping[str, str]) -> typer.Typer:
         add_completion=False,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
+        context_settings={"help_option_names": ["--help", "-h"]},
     )
     app.callback()(_main_options)
     for module in dict.fromkeys(modules[name] for name in names):
         importlib.import_module(module).register(app)
     add_presets(app)
+    _list_whole_sentences(app)
     return app
+
+
+def _list_whole_sentences(app: typer.Typer) -> None:
+    """Make lists of commands show the first sentence of each one's help, which they would cut."""
+    for command in app.registered_commands:
+        said = inspect.getdoc(command.callback) or ""
+        command.short_help = said.split("\n\n")[0].replace("\n", " ")
+    for group in app.registered_groups:
+        if group.typer_instance is not None:
+            group.short_help = group.typer_instance.info.help
+            _list_whole_sentences(group.typer_instance)
 
 
 def _print_version(wanted: bool) -> None:
@@ -121,7 +142,11 @@ def _main_options(
     _version: Annotated[
         bool,
         typer.Option(
-            "--version", help="Print the version and exit.", callback=_print_version, is_eager=True
+            "--version",
+            "-V",
+            help="Print the version and exit.",
+            callback=_print_version,
+            is_eager=True,
         ),
     ] = False,
 ) -> None:  # without a callback typer would drop the name of a single command

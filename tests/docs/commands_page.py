@@ -1,6 +1,6 @@
-"""docs/commands.md, written from what ``mapfold --help`` knows, so that it cannot go stale.
+"""docs/commands.md and the man page, written from what ``mapfold --help`` knows.
 
-``scripts/update_docs`` writes it; a test holds it to the commands.
+``scripts/update_docs`` writes them; a test holds them to the commands.
 """
 
 import inspect
@@ -13,6 +13,7 @@ import typer
 from projections.cli import command_line
 
 PAGE = Path(__file__).parents[2] / "docs" / "commands.md"
+MAN_PAGE = Path(__file__).parents[2] / "projections" / "cli" / "mapfold.1"
 
 HEAD = """\
 # Commands
@@ -82,5 +83,46 @@ def _cell(text: str | None) -> str:
     return (text or "").replace("|", "\\|").replace("\n", " ")
 
 
+def man_page() -> str:
+    """The page for man(1), in roff; see man-pages(7) and groff_man(7)."""
+    about = [
+        '.TH MAPFOLD 1 "" "mapfold" "User Commands"',
+        ".SH NAME",
+        "mapfold \\- a robot's semantic map as a fold over an append-only log",
+        ".SH SYNOPSIS",
+        ".B mapfold",
+        ".I COMMAND",
+        "[ARGS]",
+        ".SH DESCRIPTION",
+        *(line for part in HEAD.split("\n\n")[1:-1] for line in (".PP", _roff(part))),
+        ".SH COMMANDS",
+    ]
+    return "\n".join([*about, *(_man_section(name, each) for name, each in commands())]) + "\n"
+
+
+def _man_section(name: str, command: Any) -> str:
+    lines = [f'.SS "{_roff(name)}"']
+    for part in inspect.cleandoc(command.help).split("\n\n"):
+        if part.startswith("\b\n"):
+            lines += [".PP", ".nf", _roff(part[2:]), ".fi"]
+        else:
+            lines += [".PP", _roff(part)]
+    for each in command.params:
+        if each.name == "help":
+            continue
+        is_argument = each.param_type_name == "argument"
+        lines += [".TP", f".B {_roff(_name(each) if is_argument else _flags(each))}"]
+        lines.append(_roff(each.help or ""))
+    return "\n".join(lines)
+
+
+def _roff(text: str) -> str:
+    """Text as it is: hyphens to type, no requests at the start of a line."""
+    escaped = text.replace("\\", "\\e").replace("-", "\\-").replace("`", "")
+    lines = (rf"\&{line}" if line[:1] in (".", "'") else line for line in escaped.split("\n"))
+    return "\n".join(line.rstrip() for line in lines)
+
+
 if __name__ == "__main__":
     PAGE.write_text(page(), encoding="utf-8")
+    MAN_PAGE.write_text(man_page(), encoding="utf-8")

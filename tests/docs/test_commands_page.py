@@ -1,10 +1,17 @@
 """Every command has help, and the page of commands says what the commands say."""
 
+import inspect
+import re
+import shutil
+import subprocess
 from typing import Any
 
 import pytest
+import typer
+from typer.testing import CliRunner
 
-from tests.docs.commands_page import PAGE, commands, page
+from projections.cli import command_line
+from tests.docs.commands_page import MAN_PAGE, PAGE, commands, man_page, page
 
 COMMANDS = dict(commands())
 
@@ -16,20 +23,40 @@ def test_every_command_and_parameter_has_help(name: str) -> None:
     assert [p.name for p in command.params if not getattr(p, "help", None)] == []
 
 
-LISTED = ["state", "relocalize", "evaluate", "serve", "draw", "merges", "why", "diff", "bisect"]
-LISTED += ["whatif", "query where", "query contents", "query holding", "query path"]
-
-
-@pytest.mark.parametrize("path", LISTED)
-def test_short_help_is_not_cut_off(path: str) -> None:
-    """On a terminal of 80 columns the lists of --help have this much for each."""
-    said = COMMANDS[f"mapfold {path}"].get_short_help_str(62)
-    assert said.endswith(".")
-    assert not said.endswith("...")
+@pytest.mark.parametrize("path", ["", "log", "db", "query", "edit"])
+def test_lists_of_commands_show_whole_sentences(path: str) -> None:
+    program = command_line()
+    group: Any = typer.main.get_command(program)
+    said = CliRunner().invoke(program, [*path.split(), "--help"], terminal_width=80).output
+    for name in path.split():
+        group = group.commands[name]
+    assert len(group.commands) > 2
+    for name, command in group.commands.items():
+        first = inspect.cleandoc(command.help).split("\n\n")[0]
+        assert f"{name} {' '.join(first.split())}" in " ".join(said.split())
 
 
 def test_the_page_is_what_the_commands_say() -> None:
     assert PAGE.read_text(encoding="utf-8") == page(), "run scripts/update_docs"
+    assert MAN_PAGE.read_text(encoding="utf-8") == man_page(), "run scripts/update_docs"
+
+
+def test_the_man_page_names_every_command_and_option() -> None:
+    said = man_page()
+    for name, command in COMMANDS.items():
+        assert name.replace("-", r"\-") in said
+        for option in (flag for each in command.params for flag in each.opts if flag[0] == "-"):
+            assert option.replace("-", r"\-") in said
+
+
+@pytest.mark.skipif(not shutil.which("groff"), reason="groff is not installed")
+def test_the_man_page_is_right_roff() -> None:
+    done = subprocess.run(
+        ["groff", "-man", "-Tutf8", "-ww", "-k", MAN_PAGE], capture_output=True, check=True
+    )
+    assert done.stderr == b""
+    bold = re.compile("(.)\b\\1")
+    assert "mapfold relocalize" in bold.sub(r"\1", done.stdout.decode())
 
 
 CONTRACT = ["demo", "simulate", "record", "import", "router", "replay", "tail", "status", "state"]

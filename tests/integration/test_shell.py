@@ -1,0 +1,80 @@
+"""What a shell asks of the program: help, version, completions, a man page."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.commands import PROGRAM, Commands
+
+
+@pytest.fixture
+def mapfold(tmp_path: Path) -> Commands:
+    return Commands.in_folder(tmp_path)
+
+
+def test_help_is_found_in_each_usual_way(mapfold: Commands) -> None:
+    for path in ([], ["db", "check"]):
+        said = mapfold(*path, "--help").out
+        assert mapfold(*path, "-h").out == said == mapfold("help", *path).out
+    refused = mapfold("help", "nope", code=2).err
+    assert "No such command 'nope'" in refused
+
+
+def test_the_version_is_printed(mapfold: Commands) -> None:
+    said = mapfold("-V").out
+    assert said == mapfold("--version").out
+    assert said.startswith("mapfold 0.")
+
+
+OFFERED = {
+    "mapfold stat": {"state", "status"},
+    "mapfold db ch": {"check"},
+    "mapfold state log --set": {"--set", "--settings"},
+    "mapfold draw log --preset ": {"page", "rooms"},
+    "mapfold state l": set(),  # so that bash offers files
+}
+
+
+@pytest.mark.seconds
+def test_bash_completes(tmp_path: Path) -> None:
+    (tmp_path / "log").mkdir()
+    script = f"""
+PATH={PROGRAM.parent}:$PATH
+eval "$(mapfold completion bash)"
+for typed in "$@"; do
+    IFS=' ' read -ra COMP_WORDS <<< "$typed"
+    case "$typed" in *" ") COMP_WORDS+=("");; esac
+    COMP_CWORD=$((${{#COMP_WORDS[@]}} - 1))
+    _mapfold_completion mapfold
+    IFS=' '
+    echo "${{COMPREPLY[*]}}"
+done
+"""
+    done = subprocess.run(
+        ["bash", "-c", script, "bash", *OFFERED],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        check=True,
+    )
+    assert done.stderr == ""
+    offered = [set(line.split()) for line in done.stdout.splitlines()]
+    assert dict(zip(OFFERED, offered, strict=True)) == OFFERED
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_there_is_a_script_for_each_shell(shell: str, mapfold: Commands) -> None:
+    script = mapfold("completion", shell).out
+    assert "_MAPFOLD_COMPLETE" in script
+    assert f"complete_{shell}" in script
+
+
+def test_another_shell_is_refused_with_the_ones_there_are(mapfold: Commands) -> None:
+    refused = mapfold("completion", "tcsh", code=2).err
+    assert "'tcsh' is not one of 'bash', 'zsh', 'fish'" in refused
+
+
+def test_the_man_page_is_installed() -> None:
+    assert (Path(sys.prefix) / "share" / "man" / "man1" / "mapfold.1").is_file()
