@@ -1,22 +1,24 @@
 """The map for other programs: `mapfold export` writes files, `mapfold foxglove` serves Foxglove."""
 
+import hashlib
 import math
 import threading
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from eventsrc.envelope import Offset
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 from eventsrc.text import counted
 from eventsrc.transport.config import is_loopback
-from projections.corrections import Corrections
+from projections.corrections import map_fingerprint
 from projections.model.fold import fold_log_cached
 from projections.model.log_commands import read_corrections
 from projections.model.one_floor import view_of_floor
-from projections.settings import Settings
+from projections.model.scenes import RecordedFold
 
 from .options import (
     KnownAtOption,
@@ -66,12 +68,17 @@ def export(
             metavar="FILE.mcap", help="How the map came about, event by event (extra [foxglove])."
         ),
     ] = None,
+    rerun: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.rrd", help="The same for the Rerun viewer (extra [rerun])."),
+    ] = None,
     every: Annotated[
         int | None,
         typer.Option(
             metavar="N",
             min=1,
-            help="A scene every N events, for --foxglove [default: such that there are 500].",
+            help="A scene every N events, for --foxglove and --rerun [default: such that there are"
+            " 500].",
         ),
     ] = None,
     origin: Annotated[
@@ -92,19 +99,22 @@ def export(
 ) -> None:
     """Write the map folded to a point in the log for other programs.
 
-    GraphML, Graphviz, GeoJSON, CSV, Nav2 waypoints and a recording for Foxglove, one or several at
-    once. The same log and settings give the same bytes.
+    GraphML, Graphviz, GeoJSON, CSV, Nav2 waypoints and recordings for Foxglove and Rerun, one or
+    several at once. The same log and settings give the same bytes; for Rerun, the same data.
     """
     files = {"graphml": graphml, "dot": dot, "geojson": geojson, "csv": csv, "nav2": nav2}
-    if not any(files.values()) and foxglove is None:
-        names = ", ".join(f"--{name}" for name in (*files, "foxglove"))
+    recordings = {"foxglove": foxglove, "rerun": rerun}
+    if not any((files | recordings).values()):
+        names = ", ".join(f"--{name}" for name in files | recordings)
         raise MisuseError(f"nothing to write: give {names}")
     if origin is not None and geojson is None:
         raise MisuseError("--origin is for --geojson")
-    if every is not None and foxglove is None:
-        raise MisuseError("--every is for --foxglove")
+    if every is not None and not any(recordings.values()):
+        raise MisuseError("--every is for --foxglove and --rerun")
     if floor is not None and foxglove is not None:
         raise MisuseError("--foxglove shows all floors, one above the other; leave --floor out")
+    if floor is not None and rerun is not None:
+        raise MisuseError("--rerun shows all floors, each in a view; leave --floor out")
     from projections import export as formats  # here: with the imports of several formats
 
     where = None if origin is None else formats.Origin(*_degrees(origin))
@@ -113,8 +123,22 @@ def export(
         end = point(reader, at)
         corrections = read_corrections(reader, known_point(reader, known_at, end))
         settings = settings_from(settings_file, set_, corrections)
-        if foxglove is not None:
-            _record(reader, foxglove, settings, end, corrections, every)
+        for name, file in recordings.items():
+            if file is not None:
+                write = _recorder(
+                    name, f"{reader.log_id} {map_fingerprint(settings, corrections)} {end} {every}"
+                )
+                with writing(file), Bar() as bar:
+                    fold = RecordedFold(
+                        reader,
+                        settings,
+                        end,
+                        corrections=corrections,
+                        every=every,
+                        progress=bar.show_fold,
+                    )
+                    scenes = write(fold, file)
+                say(f"wrote {file}: {counted(end, 'event')}, {counted(scenes, 'scene')}")
         if not any(files.values()):
             return
         _, view = fold_log_cached(reader, settings, end, note=say, corrections=corrections)
@@ -138,32 +162,20 @@ def export(
     say(f"wrote {', '.join(map(str, texts))}: {places}, {objects}")
 
 
-def _record(
-    reader: LogReader,
-    path: Path,
-    settings: Settings,
-    end: Offset,
-    corrections: Corrections,
-    every: int | None,
-) -> None:
+def _recorder(name: str, told_apart_by: str) -> Callable[[RecordedFold, Path], int]:
+    """What writes the recordings of an option. Raises MisuseError where its extra is missing."""
     try:
-        from projections.foxglove.recording import write_recording
+        if name == "foxglove":
+            from projections.foxglove.recording import write_recording
+
+            return write_recording
+        from projections.rerun import recording
     except ModuleNotFoundError as error:
         raise MisuseError(
-            f"--foxglove needs {error.name}, which is not installed;"
-            " pip install 'mapfold[foxglove]'"
+            f"--{name} needs {error.name}, which is not installed; pip install 'mapfold[{name}]'"
         ) from None
-    with writing(path), Bar() as bar:
-        scenes = write_recording(
-            reader,
-            path,
-            settings,
-            end,
-            corrections=corrections,
-            every=every,
-            progress=bar.show_fold,
-        )
-    say(f"wrote {path}: {counted(end, 'event')}, {counted(scenes, 'scene')}")
+    recording_id = hashlib.sha256(told_apart_by.encode()).hexdigest()[:32]
+    return partial(recording.write_recording, recording_id=recording_id)
 
 
 def _degrees(text: str) -> tuple[float, ...]:

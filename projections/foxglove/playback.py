@@ -29,14 +29,15 @@ from projections.corrections import Corrections
 from projections.deltas import PlacesMerged
 from projections.history.history import History
 from projections.history.past_view import view_at
+from projections.model.change_lines import change_lines
 from projections.model.digest import map_digest
 from projections.model.fold import READ_AHEAD, fold_events, gc_paused
+from projections.model.moments import Moments
 from projections.model.view import MapView
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 
-from .messages import MapTopics, change_lines
-from .moments import Moments
+from .messages import MapTopics
 
 TICK_S: Final = 0.05
 """Between two moments that are shown while it plays."""

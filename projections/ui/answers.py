@@ -9,13 +9,13 @@ from eventsrc.envelope import Offset
 from projections.errors import QuestionError
 from projections.model.digest import map_digest
 from projections.model.view import MapView
+from projections.wall_segments import wall_segments
 
 from .binary import packed_arrays
 from .columns import history_columns
 from .log_map import LogMap
 from .moment import Moment
 from .requests import number_of, text_of
-from .walls import wall_segments
 
 
 def history_answer(shown: LogMap, query: QueryParams, refold_s: float) -> bytes:

@@ -7,10 +7,10 @@ from typing import Any, Final
 from eventsrc.text import visible
 from projections.corrections import Corrections
 from projections.settings import Settings
+from projections.wall_segments import wall_segments
 
 from .log_map import MOST_ALTERNATIVES, MOST_HISTORIES, LogMap
 from .opened import Opened
-from .walls import wall_segments
 
 _KIB: Final = 1 if sys.platform == "darwin" else 1024
 """What ``ru_maxrss`` counts in."""

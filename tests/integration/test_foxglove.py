@@ -19,8 +19,8 @@ from websockets.typing import Subprotocol
 from eventsrc.envelope import Offset
 from eventsrc.log import LogReader
 from projections.corrections import NO_CORRECTIONS
-from projections.foxglove.moments import Moments
 from projections.foxglove.playback import PastMaps, Playback
+from projections.model.moments import Moments
 from projections.settings import Settings
 from tests.commands import Commands
 from tests.envelopes import detection, envelope

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from eventsrc.occupancy_map import UNKNOWN, OccupancyMap
-from projections.ui.walls import MOST_SEGMENTS, wall_segments
+from projections.wall_segments import MOST_SEGMENTS, wall_segments
 from tests.thorough import stride
 
 
