@@ -40,9 +40,9 @@ from eventsrc.log import Event, MessageFormat
 from eventsrc.occupancy_map import OccupancyMap
 from projections.deltas import MapGiven, PlacesMerged
 from projections.deltas import Pose as MapPose
+from projections.model.moments import format_of
 from projections.model.view import MapView
 
-from .moments import format_of
 from .scene import FRAME, height, map_scene, timestamp
 
 ROBOT_FRAME: Final = "base_link"

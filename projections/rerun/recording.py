@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 from rerun import blueprint
 
 from eventsrc.log import Event
-from eventsrc.system_events import is_system_key
 from eventsrc.text import visible
 from projections.model.change_lines import change_lines
 from projections.model.scenes import RecordedFold
@@ -160,7 +159,7 @@ class _Series:
             "counts/places": len(view.places),
             "counts/objects": len(view.objects),
         }
-        if not is_system_key(event.key):
+        if event.is_envelope:
             values["lag"] = (event.logged_ns - event.stamp_ns) / 1e9
         for name, value in values.items():
             column = self._series[name]
