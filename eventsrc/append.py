@@ -57,24 +57,26 @@ def append_payload(
     was recorded in before.
     """
     logged = writer.now_ns() if logged_ns is None else logged_ns
-    messages = [(key, payload)]
     (checked,) = check_payloads(
-        messages,
+        [(key, payload)],
         first=writer.next_offset,
         logged_ns=logged,
         max_bytes=max_bytes,
         version=version,
     )
+    writer.append_all([checked_event(key, payload, checked, logged)])
+    return checked.result
+
+
+def checked_event(key: str, payload: bytes, checked: Checked, logged_ns: int) -> NewEvent:
+    """The event of a payload that came under ``key`` and was checked."""
     version, result = checked
     if isinstance(result, Rejected):
-        event = rejected_event(key, payload, result.reason, logged)
-    elif isinstance(result, NewMap):
-        event = map_event(result.event, logged)
-    else:
-        stamp = checked.stamp_ns
-        event = NewEvent(key, payload, logged, logged if stamp is None else stamp, version)
-    writer.append_all([event])
-    return result
+        return rejected_event(key, payload, result.reason, logged_ns)
+    if isinstance(result, NewMap):
+        return map_event(result.event, logged_ns)
+    stamp = checked.stamp_ns
+    return NewEvent(key, payload, logged_ns, logged_ns if stamp is None else stamp, version)
 
 
 def check_payloads(

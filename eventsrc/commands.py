@@ -250,7 +250,7 @@ Command: TypeAlias = (
     | Undo
 )
 KINDS: tuple[str, ...] = tuple(c.model_fields["kind"].default for c in Command.__args__)
-_ADAPTER: TypeAdapter[Command] = TypeAdapter(Annotated[Command, Field(discriminator="kind")])
+COMMAND: TypeAdapter[Command] = TypeAdapter(Annotated[Command, Field(discriminator="kind")])
 
 
 class InvalidCommand(ValueError):
@@ -272,7 +272,7 @@ def parse_command(payload: bytes) -> Command:
     if len(payload) > _UNCOUNTED_BYTES:
         _check_cost(payload)
     try:
-        return _ADAPTER.validate_json(payload)
+        return COMMAND.validate_json(payload)
     except ValidationError as error:
         first = error.errors()[0]
         if first["type"] == "union_tag_invalid":

@@ -1,8 +1,8 @@
 """Facts about a log (`mapfold log info`), counted from its indexes, reading hardly any events.
 
 First and last stamp are those of envelopes: mapfold's own events are stamped when they were
-written, which for an imported log is months after the run, and verbatim messages by clocks of their
-own. A sealed segment names the bounds of all its stamps, which are exact if it has envelopes only.
+written, which for a correction may be months after the run, and verbatim messages by clocks of
+their own. A sealed segment names the bounds of all its stamps, which are exact if it has envelopes only.
 Otherwise its chunks are read if that could still change the answer; mostly it cannot, because the
 segments before and behind it have earlier and later stamps.
 """
@@ -16,7 +16,7 @@ from pydantic import ValidationError
 
 from eventsrc.log import mcap_records as _mcap
 from eventsrc.log.active_file import ActiveFile
-from eventsrc.log.format import SegmentPath, carries_envelopes
+from eventsrc.log.format import BEGUN, IMPORTED, SegmentPath, carries_envelopes
 from eventsrc.log.mcap_records import Channel
 from eventsrc.log.reader import OpenSegment
 from eventsrc.log.sealed_segment import SealedFile
@@ -32,13 +32,19 @@ from .system_events import LOSS_KEY, REJECTED_KEY, Loss
 
 @dataclass(frozen=True, slots=True)
 class SegmentInfo:
-    """One segment: ``events`` are the durable ones, ``size_bytes`` what the file takes."""
+    """One segment: ``events`` are the durable ones, ``size_bytes`` what the file takes.
+
+    ``begun_ns`` is when it was begun, by the clock of the machine that wrote it; None for segments
+    of earlier versions. Events that were ``imported`` have the time of the drive.
+    """
 
     name: str
     base: Offset
     events: int
     size_bytes: int
     sealed: bool
+    begun_ns: int | None
+    imported: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,6 +154,8 @@ def _count(reader: LogReader, entry: SegmentPath, tally: _Tally) -> SegmentInfo:
         events=segment.next_offset - segment.base,
         size_bytes=segment.size(),
         sealed=isinstance(segment, SealedFile),
+        begun_ns=int(segment.head[BEGUN]) if BEGUN in segment.head else None,
+        imported=IMPORTED in segment.head,
     )
 
 

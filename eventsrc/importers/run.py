@@ -9,18 +9,19 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
-from eventsrc.append import NewMap, append_payload, rejected_event
-from eventsrc.envelope import Offset
+from eventsrc.append import Checked, NewMap, check_payloads, checked_event, rejected_event
+from eventsrc.envelope import Envelope, Offset, RunId
 from eventsrc.errors import MisuseError
-from eventsrc.ingest import Rejected
+from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES, Rejected
 from eventsrc.log import FsyncPolicy, LogWriter, MessageFormat
 from eventsrc.occupancy_map import InvalidMap, OccupancyMap, decode_map
 from eventsrc.system_events import LOSS_KEY, MAP_KEY, REJECTED_KEY
 from eventsrc.upcast import UPCASTERS
 
 from .json_lines import JsonLines
+from .log_times import LogTimes
 from .mcap_files import MCAP_MAGIC, McapFile, OtherLog
 from .source import ImportedMessage, Source
 
@@ -74,41 +75,55 @@ def import_files(
     given_map: OccupancyMap | None = None,
 ) -> ImportReport:
     """Append ``given_map``, if there is one, then every message of ``names`` in order. Messages
-    without a key get ``key``.
+    without a key get ``key``. An envelope that does not say when it was received gets its stamp as
+    its log time (`log_times`), anything else that of the message before it.
 
     The map is appended when the first message was read.
 
     ``step`` is entered for each message; one that defers Ctrl-C makes `ImportInterrupted` exact.
     Raises MisuseError and MapfoldError for files that cannot be read.
     """
-    run = _Import(writer, key, on_reject or (lambda _place, _reason: None))
+    run = _Import(writer, key, on_reject or (lambda _place, _reason: None), given_map)
     try:
         with ExitStack() as files:
             for name in names:
                 source = open_source(name, files)
                 for number, message in enumerate(source.messages()):
                     with step or nullcontext():
-                        if given_map is not None:
-                            run.append_map(given_map, message.logged_ns)
-                            given_map = None
                         run.append(source, message)
                     if progress is not None and number % _PROGRESS_EVERY == 0:
                         progress(source)
                 run.skipped += source.skipped
-        if given_map is not None:
-            run.append_map(given_map, None)
+        run.append_given_map(None)
     except KeyboardInterrupt:
         raise ImportInterrupted(run.report(), run.place) from None
     return run.report()
 
 
+class _Keyframe(NamedTuple):
+    run_id: RunId
+    stamp_ns: int
+
+
+def _keyframe(checked: Checked) -> _Keyframe | None:
+    """Run and stamp of a payload; None if it is no envelope, or one of a form without them."""
+    stamp_ns, envelope = checked.stamp_ns, checked.result
+    if stamp_ns is None or not isinstance(envelope, Envelope):
+        return None
+    return _Keyframe(envelope.run_id, stamp_ns)
+
+
 class _Import:
     """Counts of what has been appended, and the place of the last message."""
 
-    def __init__(self, writer: LogWriter, key: str, on_reject: OnReject) -> None:
+    def __init__(
+        self, writer: LogWriter, key: str, on_reject: OnReject, given_map: OccupancyMap | None
+    ) -> None:
         self._writer = writer
         self._key = key
         self._on_reject = on_reject
+        self._given_map = given_map
+        self._times = LogTimes()
         self._first = writer.next_offset
         self._last: tuple[Source, int | None] | None = None
         self.accepted = self.rejected = self.system = self.skipped = self.maps = 0
@@ -127,20 +142,36 @@ class _Import:
             self._append_envelope(source, message)
         self._last = source, source.at
 
-    def append_map(self, given: OccupancyMap, next_ns: int | None) -> None:
-        """Append a map that comes from no message; ``next_ns`` is when the message after it was
-        logged. The map gets that time if it is past, so that log times grow."""
+    def append_given_map(self, next_ns: int | None) -> None:
+        """Append the map that comes from no message, once; ``next_ns`` is when the message after it
+        was logged. The map gets that time if it is past, so that log times grow."""
+        if self._given_map is None:
+            return
         now_ns = self._writer.now_ns()
         logged_ns = now_ns if next_ns is None else min(now_ns, next_ns)
-        self._writer.append(MAP_KEY, given.encode(), logged_ns=logged_ns)
+        self._writer.append(MAP_KEY, self._given_map.encode(), logged_ns=logged_ns)
         self.maps += 1
+        self._given_map = None
+
+    def _time_of(self, message: ImportedMessage, keyframe: _Keyframe | None = None) -> int:
+        """The log time of the next message, before which the given map is appended."""
+        if message.logged_ns is not None:
+            logged_ns = self._times.add(message.logged_ns)
+        elif keyframe is not None:
+            logged_ns = self._times.add_stamped(*keyframe)
+        elif self._times.last_ns is not None:
+            logged_ns = self._times.last_ns
+        else:
+            logged_ns = self._writer.now_ns()
+        self.append_given_map(logged_ns)
+        return logged_ns
 
     def _append_map_event(self, source: Source, message: ImportedMessage) -> None:
         """Append the map of another log, or its rejection."""
         try:
             decode_map(message.payload)
         except InvalidMap as error:
-            logged_ns = self._writer.now_ns() if message.logged_ns is None else message.logged_ns
+            logged_ns = self._time_of(message)
             event = rejected_event(MAP_KEY, message.payload, str(error), logged_ns)
             self._writer.append_all([event])
             self._count_rejected(source, str(error))
@@ -153,32 +184,34 @@ class _Import:
         self._on_reject(f"{source.name}: {source.unit} {source.at}", reason)
 
     def _append_system_event(self, key: str, message: ImportedMessage) -> None:
-        self._writer.append(
-            key, message.payload, logged_ns=message.logged_ns, stamp_ns=message.stamp_ns
-        )
+        logged_ns = self._time_of(message)
+        self._writer.append(key, message.payload, logged_ns=logged_ns, stamp_ns=message.stamp_ns)
         self.system += 1
 
     def _append_verbatim(self, message: ImportedMessage, form: MessageFormat) -> None:
         self._writer.append(
             message.key or self._key,
             message.payload,
-            logged_ns=message.logged_ns,
+            logged_ns=self._time_of(message),
             stamp_ns=message.stamp_ns,
             form=form,
         )
         self.verbatim += 1
 
     def _append_envelope(self, source: Source, message: ImportedMessage) -> None:
-        outcome = append_payload(
-            self._writer,
-            message.key or self._key,
-            message.payload,
-            logged_ns=message.logged_ns,
+        key = message.key or self._key
+        (checked,) = check_payloads(
+            [(key, message.payload)],
+            first=self._writer.next_offset,
+            logged_ns=self._writer.now_ns() if message.logged_ns is None else message.logged_ns,
+            max_bytes=DEFAULT_MAX_PAYLOAD_BYTES,
             version=message.version if message.version in UPCASTERS else None,
         )
-        if isinstance(outcome, Rejected):
-            self._count_rejected(source, outcome.reason)
-        elif isinstance(outcome, NewMap):
+        logged_ns = self._time_of(message, _keyframe(checked))
+        self._writer.append_all([checked_event(key, message.payload, checked, logged_ns)])
+        if isinstance(checked.result, Rejected):
+            self._count_rejected(source, checked.result.reason)
+        elif isinstance(checked.result, NewMap):
             self.maps += 1
         else:
             self.accepted += 1

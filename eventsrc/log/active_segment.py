@@ -1,6 +1,6 @@
 """Write to the growing segment of a log.
 
-    magic · Header · Metadata "mapfold.segment" · ( chunk · commit mark )*
+    magic · Header · Metadata "mapfold.segment:…" · ( chunk · commit mark )*
 
 One commit: write an uncompressed chunk, sync it, write its commit mark. Readers in other processes
 yield a chunk only if it has a mark, so what they yield is on the disk. A mark is not synced, as a
@@ -23,6 +23,7 @@ import secrets
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from eventsrc.clock import Clock, system_clock
 from eventsrc.envelope import Offset
 from eventsrc.errors import LogError
 
@@ -37,7 +38,7 @@ from .file_fault import (
     is_readable_segment,
     quarantine,
 )
-from .format import ACTIVE, MARK_SEED, NEW, file_head, head_metadata, segment_path
+from .format import ACTIVE, BEGUN, IMPORTED, MARK_SEED, NEW, file_head, head_metadata, segment_path
 from .group import Group, GroupBuilder
 
 
@@ -56,6 +57,9 @@ class ActiveSegment:
         policy: FsyncPolicy,
         on_fault: Callable[[FileFault], None] = lambda _: None,
         while_syncing: Callable[[Callable[[], None]], None] = lambda sync: sync(),
+        clock: Clock = system_clock,
+        *,
+        imported: bool = False,
     ) -> None:
         self.committed = base
         self.size = 0
@@ -64,6 +68,8 @@ class ActiveSegment:
         self._folder: Identity | None = None
         self._on_fault = on_fault
         self._while_syncing = while_syncing
+        self._clock = clock
+        self._notes = {IMPORTED: "1"} if imported else {}
         self._set_file(base)
         self._syncs = policy.syncs
         self._group = GroupBuilder(base, policy)
@@ -79,8 +85,8 @@ class ActiveSegment:
     def create(self) -> None:
         """Make the file, before the first commit. Raises OSError."""
         temporary = segment_path(self._log, self.base, NEW)
-        seed = {MARK_SEED: f"{self._mark_seed:08x}"}
-        head = file_head(head_metadata(self._log_id, self.base, seed))
+        notes = {MARK_SEED: f"{self._mark_seed:08x}", BEGUN: str(max(0, self._clock()))}
+        head = file_head(head_metadata(self._log_id, self.base, {**notes, **self._notes}))
         fd = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
         try:
             write_all(fd, head)

@@ -13,7 +13,7 @@ A segment is named by its base, the offset of its first event. While a sealed fi
 active one, both exist for an instant; the sealed one counts.
 
 The head is magic, MCAP header and metadata that name log and base. JSON schemas are generated from
-the models that validate the payloads.
+the models that validate the payloads, in the form that viewers read.
 """
 
 import functools
@@ -21,12 +21,15 @@ import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from pydantic import BaseModel
+from pydantic import BaseModel, TypeAdapter
 
+from eventsrc.commands import COMMAND
 from eventsrc.envelope import ENVELOPE_VERSION, Envelope, Offset
 from eventsrc.errors import LogDamaged, NotALog
 from eventsrc.system_events import (
+    COMMAND_KEY,
     LOSS_KEY,
     MAP_KEY,
     REJECTED_KEY,
@@ -38,10 +41,18 @@ from eventsrc.system_events import (
 
 from . import mcap_records as _mcap
 from .event import MessageFormat
+from .flat_schema import flat_schema
 from .mcap_records import BadRecord, Channel, Header, Metadata, Opcode, Schema
 
 FORMAT = "1"
 SEGMENT_METADATA = "mapfold.segment"
+"""First part of the name of a segment's head: see `metadata_name`."""
+BEGUN = "begun_ns"
+"""In the head of a segment: the clock of the machine that wrote it, when it was begun. Events that
+are imported have the time of the drive. Segments of earlier versions have none."""
+IMPORTED = "imported"
+"""In the head of a segment that an import wrote: the time of its first event may lie before the
+events before it."""
 PREVIOUS = "previous_sha256"
 """In the head of a sealed segment, and of no active one: the hash of the segment before."""
 MARK_SEED = "mark_seed"
@@ -49,14 +60,33 @@ MARK_SEED = "mark_seed"
 versions have none, which is seed 0."""
 _SEED = re.compile(r"[0-9a-f]{1,8}")
 _BASE = re.compile(r"\d{1,20}", re.ASCII)
+_NANOSECONDS = re.compile(r"[0-9]{1,19}")
 HEAD_BYTES = 4096
 """More than any head takes."""
+
+
+def metadata_name(kind: str, log_id: str, base: Offset) -> str:
+    """The name of a segment's metadata record of this kind, which no other segment of any log has:
+    `mcap merge` refuses files with metadata of the same name. Earlier versions wrote the kind
+    alone."""
+    return f"{kind}:{log_id}:{base}"
+
+
+def is_metadata_of(kind: str, name: str) -> bool:
+    """Whether ``name`` is a `metadata_name` of this kind, of any segment and version."""
+    return name == kind or name.startswith(f"{kind}:")
 
 
 def head_metadata(log_id: str, base: Offset, extra: dict[str, str] | None = None) -> Metadata:
     """The metadata at the head of a segment, active or sealed."""
     values = {"format": FORMAT, "log_id": log_id, "base": str(base), **(extra or {})}
-    return _mcap.metadata_with_crc(SEGMENT_METADATA, values)
+    return _mcap.metadata_with_crc(metadata_name(SEGMENT_METADATA, log_id, base), values)
+
+
+def origin_notes(head: dict[str, str]) -> dict[str, str]:
+    """What a sealed segment takes over from the head of the active one: when it was begun, and
+    whether by an import."""
+    return {name: head[name] for name in (BEGUN, IMPORTED) if name in head}
 
 
 def file_head(metadata: Metadata) -> bytes:
@@ -124,7 +154,7 @@ def _find_head(data: bytes) -> tuple[dict[str, str], int] | None:
                 ours = (header.profile, header.library) == (_mcap.PROFILE, _mcap.LIBRARY)
             elif opcode == Opcode.METADATA:
                 metadata = _mcap.decode_as(Metadata, content)
-                if metadata.name == SEGMENT_METADATA:
+                if is_metadata_of(SEGMENT_METADATA, metadata.name):
                     return _checked_head(metadata), at
     except BadRecord:
         if ours:
@@ -140,6 +170,8 @@ def _checked_head(metadata: Metadata) -> dict[str, str]:
         raise BadRecord("the segment's metadata names no log or no base")
     if not _SEED.fullmatch(values.get(MARK_SEED, "0")):
         raise BadRecord("the segment's metadata names no good mark seed")
+    if not _NANOSECONDS.fullmatch(values.get(BEGUN, "0")):
+        raise BadRecord("the segment's metadata names no good time")
     return values
 
 
@@ -160,15 +192,17 @@ def schema_of(key: str) -> tuple[str, bytes]:
     """Name and JSON schema text of the payloads under ``key``."""
     if not is_system_key(key):
         return "mapfold.Envelope", _json_schema(Envelope)
+    if key == COMMAND_KEY:
+        return "mapfold.Command", _json_schema(COMMAND)
     model = _SYSTEM_MODELS.get(key)
     if model is None:
-        return "mapfold.System", b'{"type": "object"}'
+        return "mapfold.System", b'{"properties": {}, "type": "object"}'
     return f"mapfold.{model.__name__}", _json_schema(model)
 
 
 @functools.cache
-def _json_schema(model: type[BaseModel]) -> bytes:
-    return json.dumps(model.model_json_schema(by_alias=True), sort_keys=True).encode()
+def _json_schema(model: type[BaseModel] | TypeAdapter[Any]) -> bytes:
+    return json.dumps(flat_schema(model), sort_keys=True).encode()
 
 
 def key_channel(channel_id: int, schema_id: int, key: str, version: int) -> Channel:

@@ -25,10 +25,12 @@ from .format import (
     LEDGER,
     SEALED,
     SegmentPath,
+    claims_of,
     half_renamed,
     head_of,
     leftovers,
     list_segments,
+    origin_notes,
     segment_path,
 )
 from .lock import WriterLock
@@ -222,7 +224,7 @@ class _Recovery:
                 scan.base,
                 file_sha256(self._previous.path) if self._previous else NO_PREVIOUS,
                 scan.next_offset,
-                _replaced_hash(following),
+                {**_origin(segment), **_replaced_hash(following)},
             )
             times = adjacent_times(self._previous, following)
             rebuild_segment(plan, segment.path if segment else None, scan, times)
@@ -278,6 +280,16 @@ def _damaged_bytes(segment: SegmentPath | None, scan: Scan) -> int:
     if segment is None:
         return 0
     return min(scan.lost_bytes, segment.path.stat().st_blocks * _BLOCK_BYTES)
+
+
+def _origin(segment: SegmentPath | None) -> dict[str, str]:
+    """Metadata that says when the original was begun, if it can be read."""
+    if segment is None:
+        return {}
+    try:
+        return origin_notes(claims_of(segment.path))
+    except (LogDamaged, NotALog):
+        return {}
 
 
 def _replaced_hash(following: SegmentPath | None) -> dict[str, str]:

@@ -34,6 +34,7 @@ from .format import (
     leftovers,
     list_segments,
     mark_seed,
+    origin_notes,
     segment_path,
 )
 from .log_identity import common_log_id
@@ -199,7 +200,8 @@ def _seal_now(log: Path, left: _Leftover) -> None:
     before = [s for s in list_segments(log) if s.base < left.segment.base]
     previous = file_sha256(before[-1].path) if before else NO_PREVIOUS
     file = ActiveFile(left.segment.path, left.segment.base)
-    plan = SegmentPlan(log, file.log_id, left.segment.base, previous, left.scan.next_offset)
+    base, end, notes = left.segment.base, left.scan.next_offset, origin_notes(file.head)
+    plan = SegmentPlan(log, file.log_id, base, previous, end, notes)
     seal(plan, (file.read_chunk(chunk) for chunk in left.scan.chunks))
     left.segment.path.unlink()
     sync_directory(log)

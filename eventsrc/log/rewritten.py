@@ -17,6 +17,7 @@ from eventsrc.envelope import FIRST_OFFSET, Offset
 
 from . import mcap_records as _mcap
 from .foreign_mcap import ForeignDamage, ForeignRecord, foreign_records
+from .format import is_metadata_of
 from .mcap_records import FRAME, BadRecord, Header, Opcode
 from .sealed_segment import SEAL_METADATA
 from .segment import ChunkRef, Scan
@@ -140,7 +141,7 @@ def _framed(opcode: int, content: bytes) -> bytes:
 def _event_count_of_seal(record: _mcap.Metadata) -> int:
     """How many events the segment held when it was sealed; 0 if this record is not its seal."""
     try:
-        if record.name == SEAL_METADATA:
+        if is_metadata_of(SEAL_METADATA, record.name):
             return int(_mcap.checked_metadata(record)["chunk_edges"].rsplit(",", 1)[-1])
     except (KeyError, ValueError):
         pass

@@ -1,7 +1,7 @@
 """Seal a segment: chunk, compress and index it, with every byte under a checksum.
 
-    magic · Header · Metadata "mapfold.segment" · ( chunk · message indexes )* ·
-    Metadata "mapfold.seal" · DataEnd with the CRC of all before it ·
+    magic · Header · Metadata "mapfold.segment:…" · ( chunk · message indexes )* ·
+    Metadata "mapfold.seal:…" · DataEnd with the CRC of all before it ·
     summary with its CRC · Footer · magic
 
 The file is written as ``.mcap.sealing``, synced and renamed, so a file with a sealed name is always
@@ -34,10 +34,10 @@ from .format import (
     ACTIVE,
     SEALED,
     SEALING,
-    SEGMENT_METADATA,
     file_head,
     head_metadata,
     is_verbatim,
+    metadata_name,
     segment_path,
 )
 from .mcap_records import (
@@ -242,7 +242,8 @@ class _Builder:
         )
         start = file_head(head)
         length = len(_mcap.encode(head))
-        self._metadata.append(MetadataIndex(len(start) - length, length, SEGMENT_METADATA))
+        self._metadata.append(MetadataIndex(len(start) - length, length, head.name))
+        self._seal_name = metadata_name(SEAL_METADATA, plan.log_id, plan.base)
         self._write(start)
 
     def _write(self, data: bytes) -> None:
@@ -304,14 +305,14 @@ class _Builder:
     def finish(self) -> None:
         """Write the seal, the end of data, the summary and the footer."""
         seal_record = _mcap.encode(self._seal())
-        self._metadata.append(MetadataIndex(self._at, len(seal_record), SEAL_METADATA))
+        self._metadata.append(MetadataIndex(self._at, len(seal_record), self._seal_name))
         self._write(seal_record)
         self._write(_mcap.encode(DataEnd(self._crc)))
         self._write_summary()
 
     def _seal(self) -> Metadata:
         return _mcap.metadata_with_crc(
-            SEAL_METADATA,
+            self._seal_name,
             {
                 "chunk_edges": ",".join(map(str, self._edges)),
                 "first_stamp_ns": str(min(self._stamp_ns)),

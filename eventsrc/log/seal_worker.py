@@ -20,7 +20,7 @@ from eventsrc.errors import LogDamaged, LogError, MapfoldError
 
 from .active_file import ActiveFile
 from .durable_files import sync_directory
-from .format import ACTIVE, SEALED, segment_path
+from .format import ACTIVE, SEALED, head_of, origin_notes, segment_path
 from .seal import SegmentPlan, seal
 from .seal_process import ProcessGone, SealingProcess
 
@@ -114,7 +114,9 @@ class Sealer:
         base, following = segment
         active = segment_path(self._log, base, ACTIVE)
         if active.exists():  # otherwise only the sync of the folder failed, the time before
-            plan = SegmentPlan(self._log, self._log_id, base, self._previous_sha256, following)
+            notes = origin_notes(head_of(active, base))
+            previous = self._previous_sha256
+            plan = SegmentPlan(self._log, self._log_id, base, previous, following, notes)
             self._sealed_sha256 = self._seal_in_process(plan) or self._seal_here(plan)
             active.unlink()
         elif not segment_path(self._log, base, SEALED).exists():

@@ -16,7 +16,7 @@ from eventsrc.errors import LogDamaged
 
 from . import mcap_records as _mcap
 from .crc import crc32
-from .format import NO_SCHEMA, is_verbatim
+from .format import NO_SCHEMA, is_metadata_of, is_verbatim
 from .mcap_records import (
     BadRecord,
     Channel,
@@ -32,6 +32,7 @@ from .mcap_records import (
 from .segment import ChunkRef, SegmentFile
 
 SEAL_METADATA = "mapfold.seal"
+"""First part of the name of a segment's seal: see `metadata_name`."""
 _MAX_CHUNKS = 1 << 16
 """In one segment: a chunk is 1 MiB or a single event, and a segment is full at 64 MiB."""
 _BLOCK = 1024 * 1024
@@ -103,7 +104,7 @@ class SealedFile(SegmentFile):
                 statistics = _mcap.decode_as(Statistics, content)
             elif opcode == Opcode.METADATA_INDEX:
                 index = _mcap.decode_as(MetadataIndex, content)
-                if index.name == SEAL_METADATA:
+                if is_metadata_of(SEAL_METADATA, index.name):
                     seal = self._metadata(index, size)
         if statistics is None or seal is None:
             raise BadRecord("no statistics or no seal")

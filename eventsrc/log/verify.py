@@ -12,7 +12,7 @@ from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.errors import LogDamaged, LogError, NotALog
 from eventsrc.text import counted
 
-from .format import SEALED, SegmentPath, WrongPlace, claims_of, head_of, segment_path
+from .format import IMPORTED, SEALED, SegmentPath, WrongPlace, claims_of, head_of, segment_path
 from .lock import is_held
 from .log_identity import majority_log_id
 from .reader import segments_of
@@ -105,6 +105,7 @@ class _Verifier:
             self._expected_hashes = set()  # it has no hash before it is sealed
         for first, last in scan.gaps:
             self._add("gap", "recorded events cannot be read", name, first, last)
+        self._events.begin_segment(imported=IMPORTED in head)
         self._verify_events(segment, scan)
         self._next_offset = scan.next_offset
         return segment.path.stat().st_size

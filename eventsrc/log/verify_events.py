@@ -189,6 +189,11 @@ class EventFindings:
         self._commands: dict[str, tuple[Offset, bytes]] = {}
         self._logged_ns = 0
 
+    def begin_segment(self, *, imported: bool) -> None:
+        """Go on with the next segment; one that was imported may be older than what is before."""
+        if imported:
+            self._logged_ns = 0
+
     def check(self, event: Event) -> None:
         """Check the next event."""
         if event.key != MAP_KEY:

@@ -63,7 +63,9 @@ class LogWriter:
     A segment file that somebody deletes, moves or cuts short while it is written is given up, and
     writing goes on in a new one behind the last recorded offset: see `faults`; `close` then raises
     LogError. Full segments are sealed in a thread of their own; with ``sealing_process`` in a
-    process, which costs its start and lets recording use a whole processor.
+    process, which costs its start and lets recording use a whole processor. With ``imported``
+    its segments say that their events come from files, so that these may be older than the events
+    before.
     """
 
     def __init__(
@@ -76,8 +78,10 @@ class LogWriter:
         rotate_events: int = ROTATE_EVENTS,
         rotate_seconds: float = ROTATE_SECONDS,
         sealing_process: bool = False,
+        imported: bool = False,
     ) -> None:
         self.path = path
+        self._imported = imported
         self._fsync = fsync
         self._clock = clock
         self._rotate_bytes = rotate_bytes
@@ -117,7 +121,14 @@ class LogWriter:
     def _new_segment(self, base: Offset) -> ActiveSegment:
         self._begun = time.monotonic_ns()
         return ActiveSegment(
-            self.path, self.log_id, base, self._fsync, self._note_fault, self._work_while_syncing
+            self.path,
+            self.log_id,
+            base,
+            self._fsync,
+            self._note_fault,
+            self._work_while_syncing,
+            self._clock,
+            imported=self._imported,
         )
 
     def work_while_syncing(self, work: Callable[[], bool] | None) -> None:

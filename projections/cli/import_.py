@@ -73,7 +73,7 @@ def import_(
     given_map = None if map_ is None else read_map_yaml(map_, floor)
     rejects = _RejectPrinter()
     try:
-        with LogWriter(log, fsync=IMPORT_FSYNC) as writer, FileBars() as bars:
+        with LogWriter(log, fsync=IMPORT_FSYNC, imported=True) as writer, FileBars() as bars:
             say_restart(log, writer)
             with ctrl_c_between_steps() as step:
                 report = import_files(

@@ -200,6 +200,9 @@ def _info_text(report: LogInfo) -> str:
         rows.append(("logged", _span(report.first_logged_ns, report.last_logged_ns)))
     if report.first_stamp_ns is not None and report.last_stamp_ns is not None:
         rows.append(("stamped", _span(report.first_stamp_ns, report.last_stamp_ns)))
+    begun = [segment.begun_ns for segment in report.segments if segment.begun_ns is not None]
+    if begun:
+        rows.append(("written", _span(begun[0], begun[-1])))
     rows += [("key", _key_text(key, report)) for key in report.keys]
     rows += [("segment", _segment_text(segment)) for segment in report.segments]
     return "".join(f"{name:<9} {value}\n" for name, value in rows)
@@ -212,12 +215,15 @@ def _key_text(key: str, report: LogInfo) -> str:
 
 def _segment_text(segment: SegmentInfo) -> str:
     state = "sealed" if segment.sealed else "active"
+    state += ", imported" if segment.imported else ""
     return (
         f"{segment.name}: {counted(segment.events, 'event')}, {segment.size_bytes:,} bytes, {state}"
     )
 
 
 def _span(first_ns: int, last_ns: int) -> str:
+    if first_ns == last_ns:
+        return iso_time(first_ns)
     return f"{iso_time(first_ns)} to {iso_time(last_ns)}"
 
 

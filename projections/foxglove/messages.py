@@ -37,6 +37,7 @@ from foxglove.messages import (
 )
 
 from eventsrc.log import Event, MessageFormat
+from eventsrc.log.format import schema_of
 from eventsrc.occupancy_map import OccupancyMap
 from projections.deltas import MapGiven, PlacesMerged
 from projections.deltas import Pose as MapPose
@@ -46,8 +47,9 @@ from projections.model.view import MapView
 from .scene import FRAME, height, map_scene, timestamp
 
 ROBOT_FRAME: Final = "base_link"
-_ANY_OBJECT: Final = {"type": "object"}
-"""The JSON schema of events and states: Foxglove shows what a message holds without more."""
+_ANY_OBJECT: Final = {"type": "object", "properties": {}}
+"""The JSON schema of states: Foxglove shows what a message holds without more, but reads no schema
+without properties."""
 
 _OWN_TOPICS: Final = ("/tf",)
 _RECORDED: Final = "/recorded"
@@ -90,7 +92,9 @@ class MapTopics:
 
     def _new_topic(self, key: str, form: MessageFormat | None) -> Channel:
         if form is None:
-            return Channel(key, message_encoding="json", schema=_ANY_OBJECT, context=self._context)
+            name, text = schema_of(key)
+            ours = Schema(name=name, encoding="jsonschema", data=text)
+            return Channel(key, message_encoding="json", schema=ours, context=self._context)
         schema = Schema(name=form.schema, encoding=form.schema_encoding, data=form.schema_text)
         return Channel(
             f"{_RECORDED}{key}" if key in _OWN_TOPICS else key,

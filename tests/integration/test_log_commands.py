@@ -36,7 +36,7 @@ def test_a_good_log(run: Commands) -> None:
 
 
 def test_a_rotten_log(run: Commands) -> None:
-    flip(segment(run), 300)
+    flip(segment(run), 500)
     findings = run("log", "verify", "L", "--json", code=3).json["findings"]
     assert [(f["kind"], f["first_offset"], f["last_offset"]) for f in findings] == [
         ("crc", None, None),

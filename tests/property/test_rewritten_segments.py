@@ -42,6 +42,7 @@ WAYS: dict[str, Callable[[Path], None]] = {
     "sort to lz4": lambda path: rewrite(path, compression=CompressionType.LZ4),
     "decompress": lambda path: rewrite(path, compression=CompressionType.NONE, in_log_time=False),
     "unchunked": lambda path: rewrite(path, chunked=False),
+    "sort, with the names of earlier versions": lambda path: rewrite(path, old_names=True),
     "without our seal": lambda path: rewrite(path, metadata=["mapfold.segment"]),
 }
 

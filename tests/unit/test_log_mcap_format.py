@@ -13,6 +13,7 @@ from mcap.stream_reader import StreamReader
 from eventsrc.envelope import Envelope
 from eventsrc.errors import LogDamaged, NotALog
 from eventsrc.log import Event, LogReader, LogWriter, verify_log
+from eventsrc.log.flat_schema import flat_schema
 from eventsrc.system_events import LOSS_KEY, Loss
 from tests.fixtures_log import BY_HAND, KEY, envelope, read_log
 
@@ -148,19 +149,25 @@ def sealed(log_path: Path) -> Path:
 def test_any_mcap_reader_opens_sealed_segments_with_the_right_schema(sealed: Path) -> None:
     seen: list[Event] = []
     schemas: dict[str, object] = {}
+    with LogReader(sealed) as log:
+        log_id = log.log_id
     for file in sorted(sealed.glob("*.mcap")):
         with file.open("rb") as stream:
             reader = SeekingReader(stream, validate_crcs=True)
-            assert {m.name for m in reader.iter_metadata()} == {"mapfold.segment", "mapfold.seal"}
+            base = int(file.stem)
+            assert {m.name for m in reader.iter_metadata()} == {
+                f"mapfold.segment:{log_id}:{base}",
+                f"mapfold.seal:{log_id}:{base}",
+            }
             for schema, channel, found in reader.iter_messages(log_time_order=False):
                 assert schema is not None
                 assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
                 schemas[channel.topic] = json.loads(schema.data)
-                offset = int(file.stem) + found.sequence
+                offset = base + found.sequence
                 times = (found.log_time, found.publish_time)
                 seen.append(Event(offset, channel.topic, *times, found.data))
     assert seen == read_log(sealed)
-    assert schemas == {KEY: Envelope.model_json_schema(), LOSS_KEY: Loss.model_json_schema()}
+    assert schemas == {KEY: flat_schema(Envelope), LOSS_KEY: flat_schema(Loss)}
 
 
 def test_the_index_finds_one_topic_and_one_time(sealed: Path) -> None:

@@ -1,0 +1,110 @@
+"""The schemas in a log, as viewers read them."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+from pydantic import create_model
+
+from eventsrc import system_events
+from eventsrc.commands import KINDS, KeepApart, encode_command
+from eventsrc.envelope import Envelope
+from eventsrc.log import LogWriter, verify_log
+from eventsrc.log.flat_schema import flat_schema
+from eventsrc.log.format import schema_of
+from tests.envelopes import detection, envelope, payload
+from tests.fixtures_log import read_log
+from tests.viewers import NotRead, parse_json_schema
+
+SYSTEM_KEYS = sorted(value for name, value in vars(system_events).items() if name.endswith("_KEY"))
+KEYS = ["tb/detections", "robots/7/seen", *SYSTEM_KEYS, "mapfold/of-a-later-version"]
+SAMPLE = Path(__file__).resolve().parents[2] / "logs" / "sample"
+
+
+def parsed(key: str) -> dict[str, dict[str, str]]:
+    name, text = schema_of(key)
+    return parse_json_schema(json.loads(text), name)
+
+
+def test_the_keys_of_our_own_are_known_here() -> None:
+    assert SYSTEM_KEYS == ["mapfold/command", "mapfold/loss", "mapfold/map", "mapfold/rejected"]
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_viewers_read_the_schema_of_every_key(key: str) -> None:
+    text = schema_of(key)[1].decode()
+    assert parsed(key)
+    assert not [word for word in ("$ref", "$defs", "anyOf", "oneOf", "prefixItems") if word in text]
+
+
+def test_the_schema_that_pydantic_makes_is_refused() -> None:
+    with pytest.raises(NotRead, match=r"map_x|floor|camera|detections"):
+        parse_json_schema(Envelope.model_json_schema(by_alias=True), "Envelope")
+
+
+def test_an_envelope_has_every_field_with_its_type() -> None:
+    types = parsed("tb/detections")
+    fields = types["mapfold.Envelope"]
+    assert set(fields) == {f.alias or n for n, f in Envelope.model_fields.items()}
+    assert fields["detections"] == "mapfold.Envelope.detections[]"
+    assert fields["camera"] == "mapfold.Envelope.camera"
+    assert (fields["map_x"], fields["keyframe_id"], fields["floor"]) == (
+        "float64",
+        "float64",
+        "string",
+    )
+    seen = types["mapfold.Envelope.detections"]
+    assert {"det_id", "class", "confidence", "bbox", "embedding", "position"} <= set(seen)
+    assert (seen["bbox"], seen["position"], seen["class"]) == ("float64[]", "float64[]", "string")
+    assert types["mapfold.Envelope.camera"]["yaw_rad"] == "float64"
+
+
+def test_a_command_has_the_fields_that_every_kind_has() -> None:
+    fields = parsed("mapfold/command")["mapfold.Command"]
+    assert fields == dict.fromkeys(["command_id", "issued_by", "reason", "kind"], "string")
+    assert "const" not in schema_of("mapfold/command")[1].decode()
+    assert len(KINDS) > 1
+
+
+@pytest.mark.parametrize("field", [list[list[float]], None])
+def test_a_model_with_a_field_that_viewers_cannot_read_is_refused(field: Any) -> None:
+    with pytest.raises(TypeError, match="'odd'"):
+        flat_schema(create_model("Odd", odd=(field, ...)))
+
+
+def segment_schemas(file: Path) -> dict[str, dict[str, Any]]:
+    with file.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    return {s.name: json.loads(s.data) for s in summary.schemas.values()}
+
+
+def test_an_older_log_keeps_its_schemas_and_goes_on_with_the_new_ones(tmp_path: Path) -> None:
+    """`logs/sample` was written by an earlier version."""
+    log = tmp_path / "log"
+    log.mkdir()
+    old = next(SAMPLE.glob("*.mcap"))
+    before = (log / old.name).write_bytes(old.read_bytes()) and (log / old.name).read_bytes()
+    events = read_log(log)
+    command = KeepApart.model_validate(
+        {
+            "command_id": "c",
+            "issued_by": "me",
+            "places": ({"run_id": "a", "keyframe_id": 1}, {"run_id": "a", "keyframe_id": 2}),
+        }
+    )
+    with LogWriter(log) as writer:
+        document = envelope(1, run_id="new", detections=[detection("cup", [1.0, 0.0])])
+        writer.append("tb/detections", payload(document), logged_ns=events[-1].logged_ns)
+        writer.append("mapfold/command", encode_command(command))
+    first, second = sorted(log.glob("*.mcap"))
+    assert first.read_bytes() == before
+    with pytest.raises(NotRead):
+        parse_json_schema(segment_schemas(first)["mapfold.Envelope"], "old")
+    schemas = segment_schemas(second)
+    assert sorted(schemas) == ["mapfold.Command", "mapfold.Envelope"]
+    assert all(parse_json_schema(schema, name) for name, schema in schemas.items())
+    assert read_log(log)[:-2] == events
+    assert not verify_log(log).findings
