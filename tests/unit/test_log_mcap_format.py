@@ -12,10 +12,12 @@ from mcap.stream_reader import StreamReader
 
 from eventsrc.envelope import Envelope
 from eventsrc.errors import LogDamaged, NotALog
+from eventsrc.importers import import_files
 from eventsrc.log import Event, LogReader, LogWriter, verify_log
 from eventsrc.log.flat_schema import flat_schema
 from eventsrc.system_events import LOSS_KEY, Loss
 from tests.fixtures_log import BY_HAND, KEY, envelope, read_log
+from tests.rewriting import DuplicateMetadata, merge
 
 MAGIC = bytes([0x89, 0x4D, 0x43, 0x41, 0x50, 0x30, 0x0D, 0x0A])
 NAME = "00000000000000000500.mcap.active"
@@ -168,6 +170,21 @@ def test_any_mcap_reader_opens_sealed_segments_with_the_right_schema(sealed: Pat
                 seen.append(Event(offset, channel.topic, *times, found.data))
     assert seen == read_log(sealed)
     assert schemas == {KEY: flat_schema(Envelope), LOSS_KEY: flat_schema(Loss)}
+
+
+def test_segments_of_two_logs_are_merged_without_an_option(sealed: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    with LogWriter(other) as writer:
+        writer.append(KEY, envelope(9), logged_ns=150)
+    files = [*sorted(sealed.glob("*.mcap")), *other.glob("*.mcap")]
+    assert len(files) == 4
+    merge(files, tmp_path / "merged.mcap")
+    with LogWriter(tmp_path / "both") as writer:
+        import_files(writer, [str(tmp_path / "merged.mcap")])
+    of_both = [(e.logged_ns, e.payload) for log in (sealed, other) for e in read_log(log)]
+    assert sorted((e.logged_ns, e.payload) for e in read_log(tmp_path / "both")) == sorted(of_both)
+    with pytest.raises(DuplicateMetadata):
+        merge([files[0], files[0]], tmp_path / "twice.mcap")
 
 
 def test_the_index_finds_one_topic_and_one_time(sealed: Path) -> None:
