@@ -2,9 +2,9 @@
 
 First and last stamp are those of envelopes: mapfold's own events are stamped when they were
 written, which for a correction may be months after the run, and verbatim messages by clocks of
-their own. A sealed segment names the bounds of all its stamps, which are exact if it has envelopes only.
-Otherwise its chunks are read if that could still change the answer; mostly it cannot, because the
-segments before and behind it have earlier and later stamps.
+their own. A sealed segment names the bounds of all its stamps, which are exact if it has envelopes
+only. Otherwise its chunks are read if that could still change the answer; mostly it cannot, because
+the segments before and behind it have earlier and later stamps.
 """
 
 from collections import Counter
