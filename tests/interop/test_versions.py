@@ -1,0 +1,90 @@
+"""mapfold with the oldest versions of its dependencies that pyproject.toml allows, and on each
+Python that is installed."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+SAMPLE = ROOT / "logs" / "sample"
+ROOMS = ("--set", "eps_m=0.75", "--set", "min_samples=8")
+DIGEST = "83caf24df6303ddf85522676f0ae726b671725573c6044e0743eb7af2691aab1"
+EXTRAS = "ui,foxglove,detector,ros,cluster"
+UV = Path(sys.executable).with_name("uv")
+
+pytestmark = pytest.mark.slow
+
+
+def installed(folder: Path, python: str, *options: str) -> Path:
+    """The folder of programs of a new environment with mapfold in it."""
+    venv = folder / "venv"
+    for arguments in (
+        ["venv", "--python", python, venv],
+        ["pip", "install", "--python", venv / "bin" / "python", *options, f"{ROOT}[{EXTRAS}]"],
+    ):
+        done = subprocess.run(
+            [UV, *arguments, "--quiet"], capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+    return venv / "bin"
+
+
+def check(programs: Path, folder: Path) -> None:
+    """Help of every command, a fold, a rebuild, a question, exports."""
+    clean = {k: v for k, v in os.environ.items() if not k.startswith(("MAPFOLD_", "PYTHON"))}
+    env = {**clean, "MAPFOLD_HOME": str(folder / "home"), "COLUMNS": "100"}
+
+    def mapfold(*arguments: object) -> str:
+        done = subprocess.run(
+            [programs / "mapfold", *map(str, arguments)],
+            capture_output=True, text=True, check=False, cwd=folder, env=env,
+        )  # fmt: skip
+        assert done.returncode == 0, f"{arguments}: {done.stderr}"
+        return done.stdout
+
+    helped = subprocess.run(
+        [programs / "python", "-c", HELP_OF_ALL], capture_output=True, text=True, check=False
+    )
+    assert helped.returncode == 0, helped.stderr
+    assert mapfold("state", SAMPLE, *ROOMS, "--digest").strip() == DIGEST
+    mapfold("replay", SAMPLE, *ROOMS)
+    mapfold("simulate", "--run", "b", "--out", "b.jsonl")
+    (folder / "question.json").write_text((folder / "b.jsonl").read_text().splitlines()[36])
+    assert mapfold("relocalize", "question.json").startswith("sim-7-a_p0 (confidence")
+    mapfold("import", "mine", "b.jsonl")
+    mapfold("tail", SAMPLE, "--once", *ROOMS)
+    mapfold("db", "check", SAMPLE)
+    mapfold("draw", SAMPLE, "--out", "map.png")
+    for kind in ("graphml", "dot", "geojson", "nav2", "foxglove"):
+        mapfold("export", SAMPLE, f"--{kind}", f"map.{kind}")
+    assert mapfold("completion", "bash")
+
+
+HELP_OF_ALL = """
+from typer.testing import CliRunner
+from projections.cli import COMMANDS, command_line
+program = command_line()
+for name in ["", *COMMANDS, "log cat", "db check", "query path", "edit join"]:
+    done = CliRunner().invoke(program, [*name.split(), "--help"])
+    assert done.exit_code == 0, (name, done.output, done.exception)
+"""
+
+
+@pytest.mark.timeout(900)
+def test_the_oldest_allowed_versions(tmp_path: Path) -> None:
+    check(installed(tmp_path, sys.executable, "--resolution", "lowest-direct"), tmp_path)
+
+
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("version", ["3.12", "3.13", "3.14"])
+def test_other_pythons(version: str, tmp_path: Path) -> None:
+    python = shutil.which(f"python{version}")
+    if version == f"{sys.version_info[0]}.{sys.version_info[1]}" or not python:
+        pytest.skip(f"Python {version} is not installed, or runs the other tests")
+    if subprocess.run([python, "--version"], capture_output=True, check=False).returncode:
+        pytest.skip(f"python{version} is there but does not start")
+    check(installed(tmp_path, python), tmp_path)
