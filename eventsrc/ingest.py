@@ -37,6 +37,10 @@ MAX_JSON_VALUES = 500_000
 some hundred bytes and a microsecond a value, however short the value."""
 _UNCOUNTED_BYTES: Final = 64 * 1024
 """In payloads up to this size values are not counted."""
+_EMPTY_LIST: Final = (
+    "an empty list: of the older form without an envelope, a picture with no detections, which "
+    "names no run, keyframe, time or pose"
+)
 _MAX_SHOWN: Final = 80
 """How many characters of a value a reason shows."""
 
@@ -150,6 +154,8 @@ def _error_reason(error: ValidationError, payload: bytes) -> str:
     if first["type"] == "json_invalid":
         return f"not JSON: {first['msg'].removeprefix('Invalid JSON: ')}"
     if first["type"] == "model_type" and not first["loc"]:
+        if from_json(payload) == []:
+            return _EMPTY_LIST
         return f"not a JSON object but {type(from_json(payload)).__name__}"
     more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
     path = _field_path(*first["loc"])

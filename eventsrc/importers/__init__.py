@@ -8,12 +8,14 @@ from .run import (
     check_sources,
     import_files,
 )
+from .topics import TopicChoice
 
 __all__ = [
     "DEFAULT_KEY",
     "IMPORT_FSYNC",
     "ImportInterrupted",
     "ImportReport",
+    "TopicChoice",
     "check_sources",
     "import_files",
 ]

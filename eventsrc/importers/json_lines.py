@@ -1,9 +1,15 @@
-"""JSON lines, plain or gzip, from a file or a stream; also the records of Zenoh loggers.
+"""JSON lines, plain or gzip, from a file or a stream; also records of Zenoh loggers and of
+``mapfold log cat --json``.
 
 A Zenoh logger writes one object a line: ``{"ts": 1740000000.123, "iso": "2025-…Z",
 "key": "tb/detections", "payload": …}``. The payload is parsed JSON, or a string: the raw text if it
 was no JSON, in some loggers always, in some as base64. An older logger wrote
 ``{"ts", "iso", "detections": [ … ]}`` with the bare list that its detector published.
+
+``mapfold log cat --json`` writes ``{"offset", "logged_ns", "stamp_ns", "key", "payload"}``; the
+payload is parsed JSON, text that is no JSON, or null beside ``payload_base64``. An older envelope
+has its ``version`` beside it. Of a verbatim message the text of the schema is missing, so it is not
+read.
 
 A JSON payload is cut out of the line as it stands, never parsed and written again, so that numbers,
 spaces and escapes reach the log unchanged.
@@ -16,7 +22,7 @@ import zlib
 from collections.abc import Iterator
 from decimal import Decimal, InvalidOperation
 from json.decoder import JSONDecodeError
-from typing import BinaryIO
+from typing import BinaryIO, TypeGuard
 
 from eventsrc.errors import MapfoldError, MisuseError
 from eventsrc.ingest import check_cost
@@ -26,11 +32,15 @@ from .source import ImportedMessage
 _DECODER = json.JSONDecoder()
 _SPACE = " \t\r\n"
 _PAYLOAD_FIELDS = ("payload", "detections")
+_SHOWN_FIELDS = frozenset({"offset", "logged_ns", "stamp_ns", "key", "payload"})
+_MAX_NS = 2**63
 
 
 def read_line(line: bytes) -> ImportedMessage:
-    """The message in one line: the payload of a logger's record, else the line itself."""
-    if b'"ts"' not in line or not any(b'"%s"' % f.encode() in line for f in _PAYLOAD_FIELDS):
+    """The message in one line: the payload of a record, else the line itself."""
+    if b'"ts"' not in line and b'"logged_ns"' not in line:
+        return ImportedMessage(line)
+    if not any(b'"%s"' % f.encode() in line for f in _PAYLOAD_FIELDS):
         return ImportedMessage(line)
     if check_cost(line, len(line)) is not None:  # too costly to parse; validation will reject it
         return ImportedMessage(line)
@@ -38,7 +48,11 @@ def read_line(line: bytes) -> ImportedMessage:
         fields = {name: (value, text) for name, value, text in _members(line.decode())}
     except (JSONDecodeError, UnicodeDecodeError, RecursionError):
         return ImportedMessage(line)
-    if "ts" not in fields or "run_id" in fields:
+    if "run_id" in fields:
+        return ImportedMessage(line)
+    if fields.keys() >= _SHOWN_FIELDS:
+        return _shown_event(line, fields)
+    if "ts" not in fields:
         return ImportedMessage(line)
     for name in _PAYLOAD_FIELDS:
         if name in fields:
@@ -49,6 +63,35 @@ def read_line(line: bytes) -> ImportedMessage:
                 logged_ns=_nanoseconds(fields["ts"][1]),
             )
     return ImportedMessage(line)
+
+
+def _shown_event(line: bytes, fields: dict[str, tuple[object, str]]) -> ImportedMessage:
+    """An event as `mapfold log cat --json` shows it; the line itself if a field is of another type,
+    which is kept as rejected."""
+    values = {name: value for name, (value, _) in fields.items()}
+    key, logged_ns, stamp_ns = values["key"], values["logged_ns"], values["stamp_ns"]
+    if not (isinstance(key, str) and key and _is_time(logged_ns) and _is_time(stamp_ns)):
+        return ImportedMessage(line)
+    if "encoding" in fields:
+        what = f"{values['encoding']} {values.get('schema') or ''}".strip()
+        return ImportedMessage(b"", key, unread=f"{what}, without the schema's text")
+    payload, encoded = values["payload"], values.get("payload_base64")
+    if isinstance(encoded, str):
+        try:
+            raw = binascii.a2b_base64(encoded, strict_mode=True)
+        except binascii.Error:
+            return ImportedMessage(line)
+    elif isinstance(payload, str):
+        raw = payload.encode("utf-8", "surrogatepass")
+    else:
+        raw = fields["payload"][1].encode()
+    version = values.get("version")
+    version = version if type(version) is int else None
+    return ImportedMessage(raw, key, logged_ns, stamp_ns, version)
+
+
+def _is_time(value: object) -> TypeGuard[int]:
+    return type(value) is int and 0 <= value < _MAX_NS
 
 
 def _members(text: str) -> Iterator[tuple[str, object, str]]:
@@ -97,7 +140,7 @@ def _nanoseconds(seconds: str) -> int | None:
         value = int(Decimal(seconds).scaleb(9).to_integral_value())
     except (InvalidOperation, OverflowError, ValueError):
         return None
-    return value if 0 <= value < 2**63 else None
+    return value if 0 <= value < _MAX_NS else None
 
 
 MAX_LINE_BYTES = 64 * 1024 * 1024

@@ -16,7 +16,7 @@ MCAP_MAGIC = b"\x89MCAP0\r\n"
 
 class McapFile:
     """Any MCAP file. Messages that are neither ``json`` nor occupancy grids in ``cdr`` (images,
-    other messages of ROS) are skipped and counted."""
+    other messages of ROS) are not read."""
 
     def __init__(self, name: str, file: BinaryIO, size_bytes: int | None) -> None:
         self.name = name
@@ -32,7 +32,7 @@ class McapFile:
         return self._file.tell() if self.size_bytes else self._read
 
     def messages(self) -> Iterator[ImportedMessage]:
-        """The JSON messages, and occupancy grids."""
+        """The messages in file order."""
         try:
             for number, message in enumerate(foreign_messages(self._file), start=1):
                 self.at = number
@@ -54,9 +54,11 @@ class McapFile:
                         message.logged_ns,
                         message.published_ns,
                         message.version,
+                        is_foreign=message.version is None,
                     )
                 else:
-                    self.skipped += 1
+                    what = f"{message.encoding} {message.schema}".strip()
+                    yield ImportedMessage(b"", message.key, message.logged_ns, unread=what)
         except ForeignDamage as error:
             raise MapfoldError(
                 f"{self.name}: {error}; the messages before it are in the log"

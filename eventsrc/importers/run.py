@@ -5,6 +5,7 @@ duplicate keyframes, so the map is the same.
 """
 
 import sys
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass
@@ -24,12 +25,14 @@ from .json_lines import JsonLines
 from .log_times import LogTimes
 from .mcap_files import MCAP_MAGIC, McapFile, OtherLog
 from .source import ImportedMessage, Source
+from .topics import NO_ENVELOPES, NOT_CHOSEN, PassedOver, TopicChoice, means_envelope
 
 DEFAULT_KEY = "tb/detections"
 STDIN = "-"
 IMPORT_FSYNC = FsyncPolicy(interval_ns=500_000_000, max_events=4096)
 """Larger commits than a recorder's: the source can be read again after a crash."""
 
+ALL_TOPICS = TopicChoice()
 _PROGRESS_EVERY = 64
 
 Progress = Callable[[Source], None]
@@ -46,12 +49,21 @@ class ImportReport:
     system: int
     """Rejected payloads, losses and maps of another mapfold log, copied unchanged."""
     skipped: int
+    """Messages that were passed over, in all."""
     first_offset: Offset
     next_offset: Offset
     maps: int = 0
     """Occupancy maps, given or among the messages."""
     verbatim: int = 0
     """Verbatim messages of another mapfold log, copied unchanged."""
+    passed_over: tuple[PassedOver, ...] = ()
+    """Messages that were passed over, by topic and what they are, in the order of the first."""
+
+    @property
+    def nothing_of_something(self) -> bool:
+        """Whether there were messages and none of them is in the log as what it is."""
+        imported = self.accepted + self.system + self.maps + self.verbatim
+        return not imported and bool(self.rejected or self.skipped)
 
 
 class ImportInterrupted(KeyboardInterrupt):
@@ -73,17 +85,20 @@ def import_files(
     on_reject: OnReject | None = None,
     step: AbstractContextManager[object] | None = None,
     given_map: OccupancyMap | None = None,
+    topics: TopicChoice = ALL_TOPICS,
 ) -> ImportReport:
     """Append ``given_map``, if there is one, then every message of ``names`` in order. Messages
     without a key get ``key``. An envelope that does not say when it was received gets its stamp as
     its log time (`log_times`), anything else that of the message before it.
 
-    The map is appended when the first message was read.
+    Messages of topics that are not among ``topics`` are passed over. So are the messages of an MCAP
+    file that no importer reads and, unless ``topics`` chooses them, those that do not look like
+    envelopes. The map is appended when the first message was read.
 
     ``step`` is entered for each message; one that defers Ctrl-C makes `ImportInterrupted` exact.
     Raises MisuseError and MapfoldError for files that cannot be read.
     """
-    run = _Import(writer, key, on_reject or (lambda _place, _reason: None), given_map)
+    run = _Import(writer, key, on_reject or (lambda _place, _reason: None), given_map, topics)
     try:
         with ExitStack() as files:
             for name in names:
@@ -117,12 +132,19 @@ class _Import:
     """Counts of what has been appended, and the place of the last message."""
 
     def __init__(
-        self, writer: LogWriter, key: str, on_reject: OnReject, given_map: OccupancyMap | None
+        self,
+        writer: LogWriter,
+        key: str,
+        on_reject: OnReject,
+        given_map: OccupancyMap | None,
+        topics: TopicChoice,
     ) -> None:
         self._writer = writer
         self._key = key
         self._on_reject = on_reject
         self._given_map = given_map
+        self._topics = topics
+        self._passed_over: Counter[tuple[str, str]] = Counter()
         self._times = LogTimes()
         self._first = writer.next_offset
         self._last: tuple[Source, int | None] | None = None
@@ -132,7 +154,12 @@ class _Import:
     def append(self, source: Source, message: ImportedMessage) -> None:
         """Append one message: a system event or a verbatim message unchanged, anything else after
         validation."""
-        if message.form is not None:
+        topic = message.key or self._key
+        if not self._topics.takes(topic):
+            self._passed_over[topic, NOT_CHOSEN] += 1
+        elif message.unread is not None:
+            self._passed_over[topic, message.unread] += 1
+        elif message.form is not None:
             self._append_verbatim(message, message.form)
         elif message.key == REJECTED_KEY or message.key == LOSS_KEY:
             self._append_system_event(message.key, message)
@@ -207,6 +234,10 @@ class _Import:
             max_bytes=DEFAULT_MAX_PAYLOAD_BYTES,
             version=message.version if message.version in UPCASTERS else None,
         )
+        is_rejected = isinstance(checked.result, Rejected)
+        if is_rejected and self._is_for_others(message):
+            self._passed_over[key, NO_ENVELOPES] += 1
+            return
         logged_ns = self._time_of(message, _keyframe(checked))
         self._writer.append_all([checked_event(key, message.payload, checked, logged_ns)])
         if isinstance(checked.result, Rejected):
@@ -215,6 +246,10 @@ class _Import:
             self.maps += 1
         else:
             self.accepted += 1
+
+    def _is_for_others(self, message: ImportedMessage) -> bool:
+        """Whether a message that is no envelope was never meant to be one."""
+        return message.is_foreign and not self._topics and not means_envelope(message.payload)
 
     @property
     def place(self) -> str | None:
@@ -226,8 +261,16 @@ class _Import:
 
     def report(self) -> ImportReport:
         """Sync the log and count what was appended."""
-        counts = (self.accepted, self.rejected, self.system, self.skipped)
-        return ImportReport(*counts, self._first, self._writer.sync(), self.maps, self.verbatim)
+        skipped = self.skipped + self._passed_over.total()
+        counts = (self.accepted, self.rejected, self.system, skipped)
+        return ImportReport(
+            *counts,
+            self._first,
+            self._writer.sync(),
+            self.maps,
+            self.verbatim,
+            tuple(PassedOver(*what, count) for what, count in self._passed_over.items()),
+        )
 
 
 def check_sources(names: Sequence[str]) -> None:

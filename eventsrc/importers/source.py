@@ -16,7 +16,10 @@ class ImportedMessage:
     ``stamp_ns`` is used for system events of another mapfold log only: the event of an envelope is
     stamped with the envelope's own time. ``version`` is the envelope version that another mapfold
     log has it in; None if there is none. ``form`` is the format of a verbatim message of another
-    mapfold log, which is kept as it is, on topic ``key``.
+    mapfold log, which is kept as it is, on topic ``key``. ``is_foreign`` says that another program
+    may have meant it for something else: if it does not look like an envelope, it is passed over.
+    ``unread`` is what a message is that no importer reads; it is passed over, and its payload
+    may be left out.
     """
 
     payload: bytes
@@ -25,6 +28,8 @@ class ImportedMessage:
     stamp_ns: int | None = None
     version: int | None = None
     form: MessageFormat | None = None
+    is_foreign: bool = False
+    unread: str | None = None
 
 
 class Source(Protocol):

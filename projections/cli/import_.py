@@ -1,5 +1,6 @@
 """`mapfold import`: messages from files into a log."""
 
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Final
@@ -12,11 +13,13 @@ from eventsrc.importers import (
     IMPORT_FSYNC,
     ImportInterrupted,
     ImportReport,
+    TopicChoice,
     check_sources,
     import_files,
 )
 from eventsrc.importers.map_yaml import read_map_yaml
 from eventsrc.importers.source import Source
+from eventsrc.importers.topics import NOT_CHOSEN
 from eventsrc.log import LogWriter
 from eventsrc.text import counted, visible
 from eventsrc.transport.config import check_key
@@ -27,6 +30,7 @@ from .signals import ctrl_c_between_steps
 from .terminal import FileBars, emit, finish, say
 
 _MOST_REJECTS: Final = 5
+_MOST_TOPICS: Final = 10
 
 
 def import_(
@@ -55,13 +59,21 @@ def import_(
             metavar="F", help="The floor that the map is of, as `floor` in envelopes names it."
         ),
     ] = None,
+    topic: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="GLOB",
+            help="Only topics (keys) like this, such as 'tb/*'; may be given again.",
+        ),
+    ] = None,
     json_: JsonOption = False,
 ) -> None:
     """Append recorded envelopes to a log, in the order of the files, after an occupancy map.
 
     A message that is neither a valid envelope nor an occupancy grid is kept with its bytes and the
-    reason under mapfold/rejected, and the command exits with 3. Ctrl-C keeps what is in the log and
-    says how far it got.
+    reason under mapfold/rejected, and the command exits with 3. Messages of an MCAP file that were
+    meant for something else are passed over and counted; if nothing is left, it exits with 3, too.
+    Ctrl-C keeps what is in the log and says how far it got.
     """
     names = files or []
     if not names and map_ is None:
@@ -70,6 +82,7 @@ def import_(
     check_key(key, "--key")
     if floor is not None and map_ is None:
         raise MisuseError(f"--floor {visible(floor)} is for a map; give one by --map, too")
+    topics = TopicChoice.of(topic or ())
     given_map = None if map_ is None else read_map_yaml(map_, floor)
     rejects = _RejectPrinter()
     try:
@@ -84,6 +97,7 @@ def import_(
                     on_reject=rejects.say,
                     step=step,
                     given_map=given_map,
+                    topics=topics,
                 )
     except ImportInterrupted as interrupted:
         rejects.say_rest()
@@ -93,7 +107,9 @@ def import_(
     if json_:
         emit({"log": str(log), **asdict(report), **restart_as_json(writer)})
     say(_summary(log, report))
-    finish(findings=report.rejected > 0)
+    for line in _passed_over(report):
+        say(line)
+    finish(findings=report.rejected > 0 or report.nothing_of_something)
 
 
 class _RejectPrinter:
@@ -134,10 +150,25 @@ def _summary(log: Path, report: ImportReport) -> str:
     if report.system:
         parts.append(f"{counted(report.system, 'event')} of mapfold's own taken over")
     if report.skipped:
-        parts.append(f"{counted(report.skipped, 'message')} of other encodings passed over")
+        parts.append(f"{counted(report.skipped, 'message')} passed over")
     parts.append(f"{report.rejected} rejected")
     hint = f"; `mapfold log cat {log} --key mapfold/rejected` shows them" if report.rejected else ""
     return ", ".join(parts) + hint
+
+
+def _passed_over(report: ImportReport) -> Iterator[str]:
+    for each in report.passed_over[:_MOST_TOPICS]:
+        yield visible(f"passed over: {each.topic}: {counted(each.count, 'message')}, {each.what}")
+    if len(report.passed_over) > _MOST_TOPICS:
+        yield f"… and {counted(len(report.passed_over) - _MOST_TOPICS, 'topic')} more"
+    chosen_away = any(each.what == NOT_CHOSEN for each in report.passed_over)
+    if report.nothing_of_something and not report.rejected and chosen_away:
+        yield "nothing was imported: --topic chooses none of these topics"
+    elif report.nothing_of_something and not report.rejected:
+        yield (
+            "nothing was imported: no message is an envelope (docs/recording.md); --topic GLOB "
+            "takes a topic of JSON all the same, and tells of each message what is wrong"
+        )
 
 
 def _show(bars: FileBars, source: Source) -> None:

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
-from eventsrc.envelope import FIRST_OFFSET, Offset
+from eventsrc.envelope import ENVELOPE_VERSION, FIRST_OFFSET, Offset
 from eventsrc.errors import LogError, MisuseError
 from eventsrc.log import (
     Event,
@@ -50,13 +50,16 @@ def iso_time(time_ns: int) -> str:
 def event_document(event: Event) -> dict[str, Any]:
     """``{"offset", "logged_ns", "stamp_ns", "key", "payload"}``. The payload is its JSON value, or
     its text when it is no JSON; bytes that are no text come as ``payload_base64`` beside null.
-    So does a verbatim message, with its ``encoding`` and ``schema``."""
+    So does a verbatim message, with its ``encoding`` and ``schema``. An envelope of an older form
+    has its ``version``."""
     document: dict[str, Any] = {
         "offset": event.offset,
         "logged_ns": event.logged_ns,
         "stamp_ns": event.stamp_ns,
         "key": event.key,
     }
+    if event.is_envelope and event.version != ENVELOPE_VERSION:
+        document["version"] = event.version
     if isinstance(event, VerbatimEvent):
         document |= {"encoding": event.format.encoding, "schema": event.format.schema}
     else:

@@ -52,6 +52,7 @@ def test_import_prints_its_counts(run: Commands) -> None:
         "system": 0,
         "skipped": 0,
         "maps": 0,
+        "passed_over": [],
         "verbatim": 0,
         "first_offset": 0,
         "next_offset": 6,

@@ -29,7 +29,8 @@ def run(tmp_path: Path) -> Commands:
 
 def test_json_channels_are_imported_unchanged(run: Commands) -> None:
     said = run("import", "L", "other.mcap", code=3)
-    assert "4 messages of other encodings passed over, 1 rejected" in said.err
+    assert "4 messages passed over, 1 rejected" in said.err
+    assert "passed over: camera: 4 messages, protobuf\n" in said.err
     events = read_log(run.folder / "L")
     assert [e.payload for e in events[:4]] == [payload(envelope(n)) for n in range(4)]
     assert [e.logged_ns for e in events] == [100, 99, 98, 97, 50]

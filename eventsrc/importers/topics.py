@@ -1,0 +1,64 @@
+"""Which topics of a file are imported, and what was passed over."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from fnmatch import translate
+from typing import Final
+
+from pydantic_core import from_json
+
+from eventsrc.errors import MisuseError
+
+NOT_CHOSEN: Final = "not chosen"
+NO_ENVELOPES: Final = "json, no envelopes"
+_FIELDS: Final = ("run_id", "keyframe_id", "timestamp", "detections")
+_ENOUGH_FIELDS: Final = 2
+_CLASS_FIELDS: Final = ("class", "class_name")
+
+
+@dataclass(frozen=True)
+class TopicChoice:
+    """The topics that match one of ``patterns`` as file names match those of a shell; all topics
+    if there is none. ``*`` stands for any characters, ``/`` included."""
+
+    patterns: tuple[str, ...] = ()
+    _expressions: list[re.Pattern[str]] = field(default_factory=list, compare=False)
+
+    @classmethod
+    def of(cls, patterns: Sequence[str]) -> "TopicChoice":
+        """Raises MisuseError for an empty pattern."""
+        if not all(patterns):
+            raise MisuseError("--topic is empty; give a topic, or a pattern such as 'tb/*'")
+        return cls(tuple(patterns), [re.compile(translate(pattern)) for pattern in patterns])
+
+    def __bool__(self) -> bool:
+        return bool(self.patterns)
+
+    def takes(self, topic: str) -> bool:
+        """Whether messages of ``topic`` are imported."""
+        return not self._expressions or any(e.match(topic) for e in self._expressions)
+
+
+@dataclass(frozen=True, slots=True)
+class PassedOver:
+    """Messages of one topic that are not in the log, and what they are: their encoding and schema,
+    `NO_ENVELOPES` or `NOT_CHOSEN`."""
+
+    topic: str
+    what: str
+    count: int
+
+
+def means_envelope(payload: bytes) -> bool:
+    """Whether a payload that is no valid envelope was meant to be one, by its fields; True for what
+    is no JSON, because a torn envelope may look like that."""
+    try:
+        value = from_json(payload)
+    except (ValueError, RecursionError):
+        return True
+    if isinstance(value, dict):
+        return sum(name in value for name in _FIELDS) >= _ENOUGH_FIELDS
+    if not isinstance(value, list) or not all(isinstance(each, dict) for each in value):
+        return False
+    return all(any(name in each for name in _CLASS_FIELDS) for each in value)
