@@ -59,7 +59,7 @@ def simulate_run(seed: int = DEFAULT_SEED, run: str = EXPLORER) -> SimulatedRun:
     """Simulate ``run`` through house ``seed``. Run ``a`` explores; each other name is a session."""
     house, run_id = build_house(seed), RunId(f"sim-{seed}-{run}")
     poses = tuple(keyframes(drive(house.grid, plan_tour(house, run))))
-    start_s = FIRST_START_S + _DAY_S * _day(run)
+    start_s = start_of(run)
     made = [
         _keyframe(house, run_id, number, pose, start_s)
         for number, pose in enumerate(poses, start=1)
@@ -67,6 +67,11 @@ def simulate_run(seed: int = DEFAULT_SEED, run: str = EXPLORER) -> SimulatedRun:
     return SimulatedRun(
         run_id, house, tuple(envelope for envelope, _ in made), tuple(t for _, t in made), poses
     )
+
+
+def start_of(run: str) -> float:
+    """When ``run`` starts, in seconds since 1970."""
+    return FIRST_START_S + _DAY_S * _day(run)
 
 
 def _day(run: str) -> int:
@@ -85,7 +90,7 @@ def _keyframe(
         "run_id": run_id,
         "keyframe_id": number,
         "timestamp": round(start_s + pose.time_s, 3),
-        **_noisy_pose(pose, rng),
+        **noisy_pose(pose, rng),
         "detections": [
             {"det_id": default_det_id(run_id, KeyframeId(number), index), **detection.fields}
             for index, detection in enumerate(detections)
@@ -100,7 +105,8 @@ def _keyframe(
     return envelope, truth
 
 
-def _noisy_pose(pose: TruePose, rng: np.random.Generator) -> dict[str, float]:
+def noisy_pose(pose: TruePose, rng: np.random.Generator) -> dict[str, float]:
+    """The pose of a localisation, a centimetre or two off the true one."""
     return {
         "map_x": round(pose.x + _POSITION_NOISE_M * normal(rng), 4),
         "map_y": round(pose.y + _POSITION_NOISE_M * normal(rng), 4),

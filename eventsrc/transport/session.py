@@ -111,6 +111,13 @@ class Session:
         with transport_errors(f"key {key!r}: not sent"):
             self.raw.put(key, payload, congestion_control=zenoh.CongestionControl.DROP)
 
+    def put(self, key: str, payload: bytes) -> None:
+        """Send one message under a key that is used once, reliably; blocks while the network is
+        full."""
+        check_key_length(key)
+        with transport_errors(f"key {key!r}: not sent"):
+            self.raw.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
+
     def confirm(self) -> None:
         """Return when the router or peer has processed everything declared so far.
 

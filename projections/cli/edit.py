@@ -14,6 +14,7 @@ from eventsrc.commands import Command
 from eventsrc.envelope import KeyframeId
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
+from eventsrc.trajectory import read_trajectory
 from projections.edit import make
 from projections.edit.correct_poses import Span, by_trajectory, by_transform
 from projections.edit.current import CurrentMap
@@ -22,7 +23,6 @@ from projections.edit.listing import edits_document, edits_text
 from projections.edit.make import Stamp
 from projections.edit.poses import DEFAULT_SLACK_S
 from projections.edit.record import MakeCommand
-from projections.edit.trajectory import read_trajectory
 
 from .edit_command import kind_of
 from .options import (

@@ -1,16 +1,15 @@
-"""`mapfold record`, `mapfold router` and `mapfold simulate`: from Zenoh to a log, a router for it,
-and a simulated robot that publishes."""
+"""`mapfold record` and `mapfold router`: from Zenoh to a log, and a router for it."""
 
 import dataclasses
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import typer
 
 from eventsrc.envelope import RunId
-from eventsrc.errors import LogDamaged, MisuseError
+from eventsrc.errors import LogDamaged
 from eventsrc.gap_history import fold_and_save_ledger
 from eventsrc.gaps import GapLedger
 from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES, MAX_PAYLOAD_BYTES
@@ -18,17 +17,14 @@ from eventsrc.log import LogReader, LogWriter, parse_fsync
 from eventsrc.recorder import DEFAULT_KEYS, DEFAULT_QUEUE_SIZE, Recorder
 from eventsrc.recorder.edit_requests import Edits, KnownCommands
 from eventsrc.recorder.edits import EDIT_PREFIX, edit_key
-from eventsrc.sim import DEFAULT_SEED, SimulatedRun, simulate_run
-from eventsrc.sim.run import publish_run, write_run
-from eventsrc.text import counted
-from eventsrc.transport.config import check_key, parse_address
-from eventsrc.transport.session import Router, ZenohOptions, check_keys, open_session
+from eventsrc.transport.config import parse_address
+from eventsrc.transport.session import Router, check_keys, open_session
 from projections.corrections import check_settings
 
 from .options import ConfigOption, ConnectOption, JsonOption, ListenOption, zenoh_options
 from .recorder_text import EVERY_S, RecorderSummary, say_restart, show_status
 from .signals import stop_on_signals
-from .terminal import emit, finish, say, say_metrics
+from .terminal import say, say_metrics
 
 _LARGEST_BYTES: Final = 128 * 1024 * 1024
 """Lower bound of Zenoh's own size limit, which drops messages silently: most messages that are too
@@ -175,80 +171,7 @@ def router(
     say("router ended")
 
 
-_MAX_NAME: Final = 100
-
-
-def simulate(
-    seed: Annotated[int, typer.Option(help="Which house.", min=0)] = DEFAULT_SEED,
-    run: Annotated[
-        str, typer.Option(help="Which run: a explores, b, c … are other sessions and tours.")
-    ] = "a",
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Write FILE.jsonl or .jsonl.gz (and its truth); publish nothing."
-        ),
-    ] = None,
-    key: Annotated[str, typer.Option(help="Zenoh key to publish under.")] = "tb/detections",
-    speed: Annotated[
-        float, typer.Option(help="Times as fast as the robot drives; 0: no waiting.", min=0.0)
-    ] = 10.0,
-    wait: Annotated[
-        float, typer.Option(metavar="SECONDS", help="How long to wait for a subscriber.", min=0.0)
-    ] = 30.0,
-    json_: JsonOption = False,
-    connect: ConnectOption = None,
-    listen: ListenOption = None,
-    zenoh_config: ConfigOption = None,
-) -> None:
-    """Simulate a run through a house, over Zenoh or into a file.
-
-    A robot drives through a house generated from a seed; its keyframes are published or written to
-    a file. The ground truth (room and instance) goes to a file beside --out, never into the
-    messages.
-    """
-    if not run.isprintable() or not 1 <= len(run) <= _MAX_NAME:
-        raise MisuseError(f"--run {run!r}: give a name of 1 to {_MAX_NAME} printable characters")
-    check_key(key, "--key")
-    simulated = simulate_run(seed, run)
-    document = _numbers(simulated)
-    if out is not None:
-        truth = write_run(simulated, out)
-        say(f"{_summary(document)}: wrote {out}, truth in {truth}")
-        document |= {"out": str(out), "truth": str(truth)}
-    else:
-        options = zenoh_options(connect, listen, zenoh_config)
-        document["published"] = _publish(simulated, options, key, speed, wait)
-        say(f"{_summary(document)}: published {document['published']} on {key}")
-    if json_:
-        emit(document)
-    finish(findings=document.get("published", document["keyframes"]) < document["keyframes"])
-
-
-def _publish(
-    simulated: SimulatedRun, options: ZenohOptions, key: str, speed: float, wait_s: float
-) -> int:
-    with stop_on_signals() as stop, open_session(options, mode=options.mode) as session:
-        return publish_run(session, simulated, key, speed=speed, wait_s=wait_s, stop=stop)
-
-
-def _numbers(simulated: SimulatedRun) -> dict[str, Any]:
-    return {
-        "run_id": simulated.run_id,
-        "keyframes": len(simulated.envelopes),
-        "detections": sum(len(envelope["detections"]) for envelope in simulated.envelopes),
-        "seconds": round(simulated.true_poses[-1].time_s, 1),
-    }
-
-
-def _summary(document: dict[str, Any]) -> str:
-    return (
-        f"{document['run_id']}: {counted(document['keyframes'], 'keyframe')}, "
-        f"{counted(document['detections'], 'detection')} in {document['seconds']} s of driving"
-    )
-
-
 def register(app: typer.Typer) -> None:
-    """Add `record`, `router` and `simulate` to the program."""
-    for command in (record, router, simulate):
+    """Add `record` and `router` to the program."""
+    for command in (record, router):
         app.command()(command)

@@ -14,12 +14,12 @@ from eventsrc.commands import (
 from eventsrc.envelope import MAX_POSITION_M, KeyframeId
 from eventsrc.errors import MisuseError
 from eventsrc.text import counted
+from eventsrc.trajectory import Trajectory
 
 from .conflicts import check_run_in_map
 from .current import CurrentMap
 from .make import Stamp, build, keyframes_of
 from .poses import Laid, RunKeyframe, lay
-from .trajectory import Trajectory
 
 _MOST_NAMED = 5
 

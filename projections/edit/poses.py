@@ -13,8 +13,7 @@ from typing import NamedTuple
 
 from eventsrc.commands import CorrectedPose
 from eventsrc.envelope import KeyframeId
-
-from .trajectory import Trajectory, TrajectoryPose
+from eventsrc.trajectory import Trajectory, TrajectoryPose
 
 DEFAULT_SLACK_S = 0.05
 

@@ -4,8 +4,8 @@ documents."""
 import re
 
 from eventsrc.commands import KINDS, MAX_COMMAND_BYTES, MAX_REASON
+from eventsrc.trajectory import MAX_POSES
 from projections.edit.poses import DEFAULT_SLACK_S
-from projections.edit.trajectory import MAX_POSES
 from tests.docs.console import ROOT
 
 PAGE = (ROOT / "docs" / "corrections.md").read_text("utf-8")

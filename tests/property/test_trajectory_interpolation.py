@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eventsrc.envelope import KeyframeId
+from eventsrc.trajectory import Trajectory, TrajectoryPose
 from projections.edit.poses import RunKeyframe, lay
-from projections.edit.trajectory import Trajectory, TrajectoryPose
 
 MILLISECONDS = st.integers(0, 60_000)
 METRES = st.floats(-100.0, 100.0)

@@ -28,10 +28,10 @@ from eventsrc.commands import (
     parse_command,
 )
 from eventsrc.errors import MisuseError
+from eventsrc.trajectory import Trajectory, TrajectoryPose, read_trajectory
 from projections.edit import make as by
 from projections.edit.correct_poses import Span, by_trajectory, by_transform
 from projections.edit.listing import what
-from projections.edit.trajectory import Trajectory, TrajectoryPose, read_trajectory
 from projections.settings import Camera, Settings
 from tests.corrected_logs import FAR, LEFT, MERGE, RIGHT, append, give, make, write_rooms
 

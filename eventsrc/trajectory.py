@@ -19,9 +19,9 @@ from itertools import chain, pairwise
 from pathlib import Path
 from typing import BinaryIO, Final, Literal, NamedTuple, TypeAlias
 
-from eventsrc.envelope import MAX_POSITION_M, MAX_TIMESTAMP_S
-from eventsrc.errors import MisuseError
-from eventsrc.text import visible
+from .envelope import MAX_POSITION_M, MAX_TIMESTAMP_S
+from .errors import MisuseError
+from .text import visible
 
 MAX_LINE: Final = 4_096
 """Characters of a line."""

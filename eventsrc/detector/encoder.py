@@ -1,0 +1,137 @@
+"""Encode crops: an ONNX image tower of CLIP, SigLIP or the like, and how it wants its pictures.
+
+A JSON file beside the model, of the same name, says how; docs/detector.md has it for common ones:
+
+    {"model": "ViT-B-32/laion2b_s34b_b79k", "size": 224, "resize": "crop",
+     "mean": [0.4815, 0.4578, 0.4082], "std": [0.2686, 0.2613, 0.2758]}
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from eventsrc.envelope import MAX_DIMENSION, Text
+from eventsrc.errors import MisuseError
+
+from .onnx_model import ModelError, OnnxModel
+from .picture import Pixels
+from .vision import Fit, fitted, planes
+
+BATCH: Final = 32
+"""Crops at once, of a model that takes any number."""
+_Side = Annotated[int, Field(ge=1, le=2048)]
+_Channel = Annotated[float, Field(ge=-10.0, le=10.0)]
+_Spread = Annotated[float, Field(ge=1e-3, le=1000.0)]
+
+
+class Preparation(BaseModel):
+    """What is in the JSON file beside a model.
+
+    ``size`` is width and height or the side of a square. Values from 0 to 1 have ``mean`` taken
+    off and are divided by ``std``, for red, green and blue. ``resize``: the middle of a crop
+    (``crop``), all of it stretched, or all of it with black around (``pad``).
+    """
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
+
+    model: Text
+    size: _Side | Annotated[list[_Side], Field(min_length=2, max_length=2)]
+    mean: Annotated[list[_Channel], Field(min_length=3, max_length=3)]
+    std: Annotated[list[_Spread], Field(min_length=3, max_length=3)]
+    resize: Fit = "crop"
+    interpolation: Literal["bicubic", "bilinear"] = "bicubic"
+    normalize: bool = True
+    output: str | None = None
+
+    @property
+    def wide_and_high(self) -> tuple[int, int]:
+        """Width and height."""
+        if isinstance(self.size, int):
+            return self.size, self.size
+        return self.size[0], self.size[1]
+
+
+def read_preparation(model: Path) -> Preparation:
+    """The preparation of a model. Raises MisuseError."""
+    path = model.with_suffix(".json")
+    try:
+        text = path.read_bytes()
+    except OSError as error:
+        raise MisuseError(
+            f"{path}: {error.strerror}; this file says how {model.name} wants its pictures,"
+            ' such as {"model": "NAME", "size": 224, "mean": [0.5, 0.5, 0.5], "std": [0.5, 0.5,'
+            " 0.5]}; see docs/detector.md"
+        ) from None
+    try:
+        return Preparation.model_validate_json(text)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"])) or "the file"
+        raise MisuseError(f"{path}: {place}: {first['msg']}; see docs/detector.md") from None
+
+
+class Encoder:
+    """An opened image tower. The constructor tries it on a grey crop and raises ModelError where it
+    does not answer one vector a crop."""
+
+    def __init__(self, model: OnnxModel, preparation: Preparation) -> None:
+        self._model, self._preparation = model, preparation
+        wanted = (preparation.output,) if preparation.output else ()
+        self._output = model.output(*wanted, "image_embeds", "image_features", "embedding")
+        self._size = preparation.wide_and_high
+        if model.size is not None and model.size != self._size:
+            raise ModelError(
+                f"{model.path}: its input is {model.input.text}, and the size in"
+                f" {model.path.with_suffix('.json').name} is {self._size[0]} × {self._size[1]}"
+            )
+        self._std = np.array(preparation.std, np.float32).reshape(1, 3, 1, 1)
+        self.dimension = len(self._run([np.full((8, 8, 3), 114, np.uint8)])[0])
+
+    @property
+    def name(self) -> str:
+        """The name of the embedding space."""
+        return self._preparation.model
+
+    def encode(self, crops: Sequence[Pixels]) -> list[NDArray[np.float32] | None]:
+        """A vector for each crop, in batches; None where the model's is not finite or zero.
+
+        Raises ModelError.
+        """
+        step = self._model.batch or BATCH
+        vectors: list[NDArray[np.float32] | None] = []
+        for start in range(0, len(crops), step):
+            rows = self._run(crops[start : start + step])
+            vectors += [self._usable(row) for row in rows]
+        return vectors
+
+    def _run(self, crops: Sequence[Pixels]) -> NDArray[np.float32]:
+        wanted = self._preparation
+        cubic = wanted.interpolation == "bicubic"
+        small = [fitted(crop, self._size, wanted.resize, cubic=cubic) for crop in crops]
+        if self._model.batch is not None:  # a fixed number: repeat the last one
+            small += small[-1:] * (self._model.batch - len(small))
+        mean = [255.0 * value for value in wanted.mean]
+        blob = planes(small, rgb=True, scale=1 / 255, mean=mean)
+        blob /= self._std
+        answer = self._model.run(blob, self._output)
+        if (
+            answer.ndim != 2
+            or len(answer) != len(small)
+            or not 0 < answer.shape[1] <= MAX_DIMENSION
+        ):
+            shape = " × ".join(map(str, answer.shape))
+            raise ModelError(
+                f"{self._model.path}: output {self._output} is {shape} for {len(small)} crops; one"
+                " vector for each is needed: export the pooled embedding"
+            )
+        return answer[: len(crops)].astype(np.float32, copy=False)
+
+    def _usable(self, row: NDArray[np.float32]) -> NDArray[np.float32] | None:
+        norm = float(np.linalg.norm(row.astype(np.float64)))
+        if not np.isfinite(norm) or norm < 1e-12:
+            return None
+        return (row / norm).astype(np.float32) if self._preparation.normalize else row

@@ -1,0 +1,162 @@
+"""Where keyframes go: over Zenoh through a robot's spool, or into a file of JSON lines."""
+
+import json
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Protocol
+from urllib.parse import quote
+
+from eventsrc.errors import MisuseError, SpoolFull, TransportError
+from eventsrc.robot.publisher import EnvelopePublisher
+from eventsrc.transport.session import Session
+
+from .keyframes import Crop, Keyframe
+
+CROPS_KEY: Final = "tb/crops"
+_SLICE_S: Final = 0.25
+_LAST_CHANCE_S: Final = 2.0
+
+
+@dataclass
+class Delivered:
+    """What became of the keyframes. ``waiting`` and ``refused`` are in the spool, ``no_room`` found
+    it full."""
+
+    published: int = 0
+    waiting: int = 0
+    refused: int = 0
+    no_room: int = 0
+    crops: int = 0
+    crops_lost: int = 0
+    """Crops that nobody was subscribed to."""
+
+
+class Output(Protocol):
+    """Takes keyframes."""
+
+    delivered: Delivered
+
+    def send(self, keyframe: Keyframe) -> None:
+        """Take one keyframe."""
+
+    def close(self, wait_s: float) -> None:
+        """Finish, with so many seconds for what is still on its way."""
+
+
+class FileOutput:
+    """Envelopes as JSON lines. Raises MisuseError when the file cannot be written."""
+
+    def __init__(self, path: Path) -> None:
+        self.delivered = Delivered()
+        self._path = path
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = path.open("wb")
+        except OSError as error:
+            raise self._unwritable(error) from None
+
+    def send(self, keyframe: Keyframe) -> None:
+        """Write its envelope."""
+        try:
+            self._file.write(_encode(keyframe.envelope) + b"\n")
+        except OSError as error:
+            raise self._unwritable(error) from None
+        self.delivered.published += 1
+
+    def close(self, wait_s: float) -> None:  # noqa: ARG002  as `Output` has it
+        """Close the file."""
+        try:
+            self._file.close()
+        except OSError as error:
+            raise self._unwritable(error) from None
+
+    def _unwritable(self, error: OSError) -> MisuseError:
+        return MisuseError(f"--out {self._path}: {error.strerror}; choose another file")
+
+
+class ZenohOutput:
+    """Envelopes through a spool, which keeps what no recorder has acknowledged; crops at once.
+
+    A spool without room makes files wait (``patient``), and costs a camera the keyframe.
+    """
+
+    def __init__(
+        self,
+        publisher: EnvelopePublisher,
+        crops: "CropSender | None",
+        stop: threading.Event,
+        *,
+        patient: bool,
+        note: Callable[[str], None],
+    ) -> None:
+        self.delivered = Delivered()
+        self._publisher, self._crops, self._stop = publisher, crops, stop
+        self._patient, self._note = patient, note
+
+    def send(self, keyframe: Keyframe) -> None:
+        """Spool its envelope and send its crops."""
+        payload = _encode(keyframe.envelope)
+        while True:
+            try:
+                self._publisher.publish(payload)
+            except SpoolFull as full:
+                if self._patient and not self._stop.is_set():
+                    self._publisher.flush(_SLICE_S)
+                    continue
+                if self.delivered.no_room == 0:
+                    self._note(f"keyframe lost: {full}")
+                self.delivered.no_room += 1
+                return
+            break
+        self.delivered.published += 1
+        if self._crops is not None:
+            for crop in keyframe.crops:
+                sent = self._crops.send(crop)
+                self.delivered.crops += sent
+                self.delivered.crops_lost += not sent
+
+    def close(self, wait_s: float) -> None:
+        """Wait for acknowledgements, less long when it was stopped, and close the spool."""
+        left_s = min(wait_s, _LAST_CHANCE_S) if self._stop.is_set() else wait_s
+        stopped = self._stop.is_set()
+        while left_s > 0 and self._publisher.unacknowledged:
+            self._publisher.flush(min(_SLICE_S, left_s))
+            left_s -= _SLICE_S
+            if self._stop.is_set() and not stopped:
+                break
+        self.delivered.refused = self._publisher.refused_count
+        self.delivered.waiting = self._publisher.close()
+
+
+class CropSender:
+    """Publishes crops under ``prefix/det_id``, percent-encoded where a key allows less."""
+
+    def __init__(self, session: Session, prefix: str, note: Callable[[str], None]) -> None:
+        self._session, self._prefix, self._note = session, prefix, note
+        self._heard = session.publisher(f"{prefix}/*")
+        self._told = False
+
+    def send(self, crop: Crop) -> bool:
+        """Send it; False if nobody is subscribed."""
+        if not self._heard.has_subscriber:
+            if not self._told:
+                self._note(
+                    f"crops are lost: nobody is subscribed to {self._prefix}/*;"
+                    f" record them with --key '{self._prefix}/*'"
+                )
+            self._told = True
+            return False
+        try:
+            self._session.put(f"{self._prefix}/{quote(crop.det_id, safe='')}", crop.jpeg)
+        except TransportError as error:
+            if not self._told:
+                self._note(str(error))
+            self._told = True
+            return False
+        return True
+
+
+def _encode(envelope: dict[str, Any]) -> bytes:
+    return json.dumps(envelope, ensure_ascii=False, separators=(",", ":")).encode()

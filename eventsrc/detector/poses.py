@@ -1,0 +1,159 @@
+"""The robot's poses by time, from a file or as they come in, and the pose that a picture was taken
+at.
+
+A picture has a pose when one is known within `NEAR_S` of its stamp. With such a pose on each side
+it is between them, in proportion to the time; otherwise it is the nearest one.
+"""
+
+import math
+import threading
+import time
+from bisect import bisect_left, bisect_right
+from collections import deque
+from pathlib import Path
+from typing import Final, Protocol
+
+from eventsrc.errors import MisuseError
+from eventsrc.trajectory import read_trajectory
+
+from .gate import Pose
+from .messages import MessageError, pose_of
+
+NEAR_S: Final = 0.1
+_KEPT: Final = 20_000
+"""Poses that are kept as they come in: 100 s of 200 a second."""
+_SLACK_S: Final = 1e-6
+"""A hundred milliseconds in floating point are a hundred milliseconds."""
+
+
+class Poses(Protocol):
+    """Where the robot was at a time."""
+
+    def at(self, stamp_s: float) -> Pose | None:
+        """The pose at a stamp; None if none is known near it."""
+
+
+class NoPoses:
+    """The robot has none."""
+
+    def at(self, stamp_s: float) -> Pose | None:  # noqa: ARG002  as `Poses` has it
+        """None."""
+        return None
+
+
+class PoseTrack:
+    """Poses in order of their stamps."""
+
+    def __init__(self) -> None:
+        self._stamps: list[float] = []
+        self._poses: list[Pose] = []
+
+    def add(self, stamp_s: float, pose: Pose) -> None:
+        """Add a pose; of equal stamps the last one counts."""
+        index = bisect_right(self._stamps, stamp_s)
+        if index and self._stamps[index - 1] == stamp_s:
+            self._poses[index - 1] = pose
+            return
+        self._stamps.insert(index, stamp_s)
+        self._poses.insert(index, pose)
+
+    def forget_before(self, kept: int) -> None:
+        """Keep only so many of the latest poses."""
+        del self._stamps[:-kept], self._poses[:-kept]
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    @property
+    def latest_s(self) -> float:
+        """The last stamp; minus infinity without any."""
+        return self._stamps[-1] if self._stamps else -math.inf
+
+    def at(self, stamp_s: float) -> Pose | None:
+        """The pose at a stamp, as the module says."""
+        after = bisect_left(self._stamps, stamp_s)
+        near = [
+            index
+            for index in (after - 1, after)
+            if 0 <= index < len(self._stamps)
+            and abs(self._stamps[index] - stamp_s) <= NEAR_S + _SLACK_S
+        ]
+        if len(near) == 2:
+            return self._between(near[0], near[1], stamp_s)
+        return self._poses[near[0]] if near else None
+
+    def _between(self, before: int, after: int, stamp_s: float) -> Pose:
+        start, end = self._poses[before], self._poses[after]
+        part = (stamp_s - self._stamps[before]) / (self._stamps[after] - self._stamps[before])
+        turned = math.remainder(end.yaw - start.yaw, math.tau)
+        return Pose(
+            start.x + part * (end.x - start.x),
+            start.y + part * (end.y - start.y),
+            math.remainder(start.yaw + part * turned, math.tau),
+        )
+
+
+def poses_of_file(path: Path) -> PoseTrack:
+    """The poses of a trajectory file. Raises MisuseError."""
+    trajectory = read_trajectory(path)
+    if trajectory.by != "stamp":
+        raise MisuseError(
+            f"--poses {path}: its poses are by keyframe_id; pictures need poses by stamp"
+        )
+    track = PoseTrack()
+    for pose in trajectory.poses:
+        track.add(pose.key, Pose(pose.x, pose.y, pose.yaw))
+    return track
+
+
+class LivePoses:
+    """Poses as they come in: Zenoh's thread puts messages, another asks and reads them."""
+
+    def __init__(self) -> None:
+        self._track = PoseTrack()
+        self._messages: deque[tuple[bytes, float]] = deque(maxlen=_KEPT)
+        self._came = threading.Condition()
+        self.count = 0
+        """Poses that were read."""
+        self.bad = 0
+        """Messages that are no pose."""
+        self.bad_reason: str | None = None
+        """What is wrong with the last of them."""
+
+    def put(self, payload: bytes, received_s: float) -> None:
+        """Note a message; it is read when somebody asks."""
+        with self._came:
+            self._messages.append((payload, received_s))
+            self._came.notify()
+
+    def refuse(self, reason: str) -> None:
+        """Count a message that cannot be taken."""
+        with self._came:
+            self.bad += 1
+            self.bad_reason = reason
+
+    def at(self, stamp_s: float) -> Pose | None:
+        """The pose at a stamp; waits up to `NEAR_S` for poses of that time to come in."""
+        deadline = time.monotonic() + NEAR_S
+        while True:
+            with self._came:
+                left = deadline - time.monotonic()
+                if not self._messages and self._track.latest_s < stamp_s and left > 0:
+                    self._came.wait(left)
+                messages = list(self._messages)
+                self._messages.clear()
+            for message in messages:
+                self._read(*message)
+            if self._track.latest_s >= stamp_s or time.monotonic() >= deadline:
+                return self._track.at(stamp_s)
+
+    def _read(self, payload: bytes, received_s: float) -> None:
+        try:
+            stamp_s, pose = pose_of(payload, received_s)
+        except MessageError as error:
+            self.refuse(str(error))
+            return
+        self.count += 1
+        self._track.add(stamp_s, pose)
+        if len(self._track) > 2 * _KEPT:
+            self._track.forget_before(_KEPT)

@@ -1,0 +1,70 @@
+"""The loop of `mapfold detect`: a source's pictures through the models to an output."""
+
+import threading
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from .keyframes import Counts, Keyframes
+from .live import LivePictures
+from .outputs import Delivered, Output
+from .picture import Picture
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What was done: about pictures, keyframes on their way, and what came in over Zenoh."""
+
+    counts: Counts
+    delivered: Delivered
+    dropped: int = 0
+    """Pictures dropped for newer ones."""
+    too_large: int = 0
+    """Pictures too large to be taken."""
+    poses: int | None = None
+    """Poses that came in; None where they do not."""
+    bad_poses: int = 0
+    stopped: bool = False
+
+    @property
+    def clean(self) -> bool:
+        """Whether nothing was lost, left out or kept waiting."""
+        sent = self.delivered
+        unsent = sent.waiting + sent.refused + sent.no_room + sent.crops_lost
+        return not (self.counts.lost + unsent + self.dropped + self.too_large + self.bad_poses)
+
+
+class Detection:
+    """One run of the detector; `report` may be called from any thread."""
+
+    def __init__(
+        self, keyframes: Keyframes, output: Output, live: LivePictures | None, stop: threading.Event
+    ) -> None:
+        self._keyframes, self._output, self._live, self._stop = keyframes, output, live, stop
+
+    def run(self, pictures: Iterable[Picture], watch: Callable[[Report], None]) -> None:
+        """Look at all pictures, or until ``stop`` is set; ``watch`` is called after each."""
+        for picture in pictures:
+            if self._stop.is_set():
+                return
+            keyframe = self._keyframes.look(picture)
+            if keyframe is not None:
+                self._output.send(keyframe)
+            watch(self.report())
+
+    def close(self, wait_s: float) -> None:
+        """Finish the output."""
+        self._output.close(wait_s)
+
+    def report(self) -> Report:
+        """The numbers now."""
+        counts, delivered = self._keyframes.counts, self._output.delivered
+        stopped = self._stop.is_set()
+        if self._live is None:
+            return Report(counts, delivered, stopped=stopped)
+        queue, poses = self._live.queue, self._live.poses
+        return Report(
+            *(counts, delivered, queue.dropped, queue.too_large),
+            poses=None if poses is None else poses.count,
+            bad_poses=0 if poses is None else poses.bad,
+            stopped=stopped,
+        )
