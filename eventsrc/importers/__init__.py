@@ -1,5 +1,7 @@
 """Import messages from files into a log."""
 
+from .bag_streams import BagOptions
+from .ros_bags import BagReport
 from .run import (
     DEFAULT_KEY,
     IMPORT_FSYNC,
@@ -13,6 +15,8 @@ from .topics import TopicChoice
 __all__ = [
     "DEFAULT_KEY",
     "IMPORT_FSYNC",
+    "BagOptions",
+    "BagReport",
     "ImportInterrupted",
     "ImportReport",
     "TopicChoice",

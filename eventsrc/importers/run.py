@@ -21,9 +21,12 @@ from eventsrc.occupancy_map import InvalidMap, OccupancyMap, decode_map
 from eventsrc.system_events import LOSS_KEY, MAP_KEY, REJECTED_KEY
 from eventsrc.upcast import UPCASTERS
 
+from .bag_files import START_BYTES, is_bag, is_file_of_a_bag
+from .bag_streams import BagOptions
 from .json_lines import JsonLines
 from .log_times import LogTimes
 from .mcap_files import MCAP_MAGIC, McapFile, OtherLog
+from .ros_bags import BagReport, RosBag
 from .source import ImportedMessage, Source
 from .topics import NO_ENVELOPES, NOT_CHOSEN, PassedOver, TopicChoice, means_envelope
 
@@ -34,6 +37,7 @@ IMPORT_FSYNC = FsyncPolicy(interval_ns=500_000_000, max_events=4096)
 
 ALL_TOPICS = TopicChoice()
 _PROGRESS_EVERY = 64
+_DEFAULT_BAGS = BagOptions()
 
 Progress = Callable[[Source], None]
 OnReject = Callable[[str, str], None]
@@ -65,6 +69,9 @@ class ImportReport:
         imported = self.accepted + self.system + self.maps + self.verbatim
         return not imported and bool(self.rejected or self.skipped)
 
+    bags: tuple[BagReport, ...] = ()
+    """What was in the bags of ROS 2, and what was used."""
+
 
 class ImportInterrupted(KeyboardInterrupt):
     """Ctrl-C. ``report`` counts what is in the log and synced; ``place`` is the place of its last
@@ -86,6 +93,7 @@ def import_files(
     step: AbstractContextManager[object] | None = None,
     given_map: OccupancyMap | None = None,
     topics: TopicChoice = ALL_TOPICS,
+    bags: BagOptions = _DEFAULT_BAGS,
 ) -> ImportReport:
     """Append ``given_map``, if there is one, then every message of ``names`` in order. Messages
     without a key get ``key``. An envelope that does not say when it was received gets its stamp as
@@ -93,7 +101,8 @@ def import_files(
 
     Messages of topics that are not among ``topics`` are passed over. So are the messages of an MCAP
     file that no importer reads and, unless ``topics`` chooses them, those that do not look like
-    envelopes. The map is appended when the first message was read.
+    envelopes. ``bags`` says what to use of bags of ROS 2. The map is appended when the first
+    message was read.
 
     ``step`` is entered for each message; one that defers Ctrl-C makes `ImportInterrupted` exact.
     Raises MisuseError and MapfoldError for files that cannot be read.
@@ -102,13 +111,20 @@ def import_files(
     try:
         with ExitStack() as files:
             for name in names:
-                source = open_source(name, files)
+                source = open_source(name, files, bags)
+                if topics and isinstance(source, RosBag):
+                    raise MisuseError(
+                        f"{name}: --topic does not choose what is used of a bag of ROS 2; "
+                        "--detections, --grid and so on do"
+                    )
                 for number, message in enumerate(source.messages()):
                     with step or nullcontext():
                         run.append(source, message)
                     if progress is not None and number % _PROGRESS_EVERY == 0:
                         progress(source)
                 run.skipped += source.skipped
+                if isinstance(source, RosBag) and source.report is not None:
+                    run.bags.append(source.report)
         run.append_given_map(None)
     except KeyboardInterrupt:
         raise ImportInterrupted(run.report(), run.place) from None
@@ -150,12 +166,15 @@ class _Import:
         self._last: tuple[Source, int | None] | None = None
         self.accepted = self.rejected = self.system = self.skipped = self.maps = 0
         self.verbatim = 0
+        self.bags: list[BagReport] = []
 
     def append(self, source: Source, message: ImportedMessage) -> None:
         """Append one message: a system event or a verbatim message unchanged, anything else after
         validation."""
         topic = message.key or self._key
-        if not self._topics.takes(topic):
+        if message.refused is not None:
+            self._append_refused(source, message, message.refused)
+        elif not self._topics.takes(topic):
             self._passed_over[topic, NOT_CHOSEN] += 1
         elif message.unread is not None:
             self._passed_over[topic, message.unread] += 1
@@ -205,6 +224,13 @@ class _Import:
         else:
             self._append_system_event(MAP_KEY, message)
             self.maps += 1
+
+    def _append_refused(self, source: Source, message: ImportedMessage, reason: str) -> None:
+        event = rejected_event(
+            message.key or self._key, message.payload, reason, self._time_of(message)
+        )
+        self._writer.append_all([event])
+        self._count_rejected(source, reason)
 
     def _count_rejected(self, source: Source, reason: str) -> None:
         self.rejected += 1
@@ -270,6 +296,7 @@ class _Import:
             self.maps,
             self.verbatim,
             tuple(PassedOver(*what, count) for what, count in self._passed_over.items()),
+            tuple(self.bags),
         )
 
 
@@ -286,16 +313,19 @@ def check_sources(names: Sequence[str]) -> None:
             raise MisuseError(f"{name}: {error.strerror or error}; check the path") from None
 
 
-def open_source(name: str, files: ExitStack) -> Source:
-    """Open ``name``: a folder is a log, ``-`` standard input, a file JSON lines or MCAP."""
+def open_source(name: str, files: ExitStack, bags: BagOptions = _DEFAULT_BAGS) -> Source:
+    """Open ``name``: a folder is a bag of ROS 2 or a log, ``-`` standard input, a file JSON lines,
+    MCAP or a file of a bag."""
     if name != STDIN and Path(name).is_dir():
-        return OtherLog(Path(name))
+        return RosBag(Path(name), files, bags) if is_bag(Path(name)) else OtherLog(Path(name))
     try:
         file, size = _open_file(name, files)
         start = _peek(file)
     except OSError as error:
         raise MisuseError(f"{name}: {error.strerror or error}; check the path") from None
     label = "standard input" if name == STDIN else name
+    if name != STDIN and is_file_of_a_bag(start):
+        return RosBag(Path(name), files, bags)
     if start.startswith(MCAP_MAGIC):
         return McapFile(label, file, size)
     return JsonLines(label, file, size, start)
@@ -309,5 +339,5 @@ def _open_file(name: str, files: ExitStack) -> tuple[BinaryIO, int | None]:
 
 
 def _peek(file: BinaryIO) -> bytes:
-    data: bytes = file.peek(8)  # type: ignore[attr-defined]
+    data: bytes = file.peek(START_BYTES)  # type: ignore[attr-defined]
     return data

@@ -19,7 +19,8 @@ class ImportedMessage:
     mapfold log, which is kept as it is, on topic ``key``. ``is_foreign`` says that another program
     may have meant it for something else: if it does not look like an envelope, it is passed over.
     ``unread`` is what a message is that no importer reads; it is passed over, and its payload
-    may be left out.
+    may be left out. ``refused`` is the reason if the source could not read the message: it is kept
+    as rejected.
     """
 
     payload: bytes
@@ -30,6 +31,7 @@ class ImportedMessage:
     form: MessageFormat | None = None
     is_foreign: bool = False
     unread: str | None = None
+    refused: str | None = None
 
 
 class Source(Protocol):

@@ -109,14 +109,15 @@ class ForeignRecord(NamedTuple):
 class ForeignMessage:
     """One message. ``key`` is its MCAP topic; times are int nanoseconds; ``schema`` is the name of
     its channel's schema, empty without one; ``version`` is the envelope version that a mapfold log
-    has it in, None in other files; ``verbatim`` is the format of a verbatim message of a mapfold
-    log."""
+    has it in, None in other files; ``form`` is what its channel and schema say, ``verbatim`` the
+    same for a verbatim message of a mapfold log."""
 
     key: str
     encoding: str
     schema: str
     version: int | None
     verbatim: MessageFormat | None
+    form: MessageFormat
     logged_ns: int
     published_ns: int
     payload: bytes
@@ -124,13 +125,14 @@ class ForeignMessage:
 
 class _ChannelName(NamedTuple):
     """The topic, message encoding and schema of a channel; if it has them, its envelope version
-    and the format of its verbatim messages."""
+    and the format of its verbatim messages; the format of its messages."""
 
     key: str
     encoding: str
     schema: str
     version: int | None
     verbatim: MessageFormat | None
+    form: MessageFormat
 
 
 def foreign_messages(file: BinaryIO) -> Iterator[ForeignMessage]:
@@ -263,12 +265,14 @@ class _Channels:
         _mcap.check_definitions(len(content))
         channel = _mcap.decode_as(Channel, content)
         schema = self._schemas.get(channel.schema_id)
+        form = message_format(channel, schema)
         name = _ChannelName(
             channel.topic,
             channel.message_encoding,
             "" if schema is None else schema.name,
             envelope_version(channel) if ENVELOPE_VERSION_KEY in channel.metadata else None,
-            message_format(channel, schema) if is_verbatim(channel) else None,
+            form if is_verbatim(channel) else None,
+            form,
         )
         if self._names.get(channel.id) != name:
             self._size += len(name.key) + len(name.encoding) + len(name.schema)

@@ -4,8 +4,9 @@ rosbags is of the extra ``[ros]`` and imported when it is needed. It decodes by 
 from definitions of messages, so a bag's own definitions are parsed, never run as they stand.
 """
 
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Callable, Collection, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from eventsrc.errors import MapfoldError
 
@@ -33,8 +34,19 @@ VISION_MSGS: Final[Mapping[str, str]] = {
 3 differ in the name of a nested type only: in CDR both are the same bytes."""
 
 
+_LINE: Final = "=" * 80 + "\n"
+_IDL_MARK: Final = f"{_LINE}IDL: "
+
+
 class NoRosbags(MapfoldError):
     """rosbags is not installed."""
+
+
+def _not_installed(error: ImportError) -> NoRosbags:
+    return NoRosbags(
+        f"rosbags is not installed ({error}), which reads messages of ROS 2: "
+        "pip install 'mapfold[ros]'"
+    )
 
 
 class Undecodable(ValueError):
@@ -47,23 +59,27 @@ class MessageTypes:
     def __init__(self) -> None:
         try:
             from rosbags.serde import SerdeError
-            from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+            from rosbags.typesys import (
+                Stores,
+                TypesysError,
+                get_types_from_idl,
+                get_types_from_msg,
+                get_typestore,
+            )
         except ImportError as error:
-            raise NoRosbags(
-                f"rosbags is not installed ({error}), which reads messages of ROS 2: "
-                "pip install 'mapfold[ros]'"
-            ) from None
+            raise _not_installed(error) from None
         self._parse: Callable[[str, str], Any] = get_types_from_msg
+        self._parse_idl: Callable[[str], Any] = get_types_from_idl
         self._faults = (SerdeError, TypesysError, KeyError)
         self._store: Typestore = get_typestore(Stores.ROS2_JAZZY)
         for name, text in VISION_MSGS.items():
             self.define(name, text)
 
-    def define(self, type_name: str, text: str) -> None:
+    def define(self, type_name: str, text: str, *, is_idl: bool = False) -> None:
         """Add a type, and those whose definitions follow in the same text, of which this one is
         used although there is another. Raises Undecodable for a text that defines nothing."""
         try:
-            types = self._parse(text, type_name)
+            types = self._types_of_idl(text) if is_idl else self._parse(text, type_name)
             for name in types:
                 if self._store.fielddefs.get(name) != types[name]:
                     self._store.fielddefs.pop(name, None)
@@ -73,6 +89,15 @@ class MessageTypes:
             raise Undecodable(
                 f"the definition of {type_name:.80} cannot be read: {error}"
             ) from None
+
+    def _types_of_idl(self, text: str) -> dict[str, Any]:
+        """The types of a text in IDL, or of several after lines as bags put them between."""
+        if not text.startswith(_IDL_MARK):
+            return dict(self._parse_idl(text))
+        types: dict[str, Any] = {}
+        for part in text.split(_LINE)[1:]:
+            types.update(self._parse_idl(part.partition("\n")[2]))
+        return types
 
     def definition(self, type_name: str) -> str:
         """The text of a type and all that it is made of, as bags keep it. Raises Undecodable."""
@@ -102,3 +127,90 @@ class MessageTypes:
     def make(self, type_name: str, **fields: Any) -> Any:
         """A message of a type."""
         return self._store.types[type_name](**fields)
+
+
+class BadBag(ValueError):
+    """A bag's database that cannot be read, from here on."""
+
+
+class BagTopic(NamedTuple):
+    """A topic of a bag, how many messages it has, and the text that defines their type: ``ros2msg``
+    or ``ros2idl``; empty if the bag has none."""
+
+    topic: str
+    type_name: str
+    encoding: str
+    message_count: int
+    definition: str
+    definition_encoding: str
+
+
+class SqliteBag:
+    """One ``.db3`` file of a bag. It is opened for reading and never changed."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            import apsw
+            from rosbags.interfaces import MessageDefinitionFormat
+            from rosbags.rosbag2 import Reader, ReaderError
+        except ImportError as error:
+            raise _not_installed(error) from None
+        self._faults = (ReaderError, apsw.Error, OSError, *_FAULTS)
+        self._idl = MessageDefinitionFormat.IDL
+        self._none = MessageDefinitionFormat.NONE
+        try:
+            self._reader = Reader(path)
+            self._reader.open()
+        except self._faults as error:
+            raise BadBag(f"it cannot be opened: {error}") from None
+
+    def topics(self) -> list[BagTopic]:
+        """The topics by name."""
+        return sorted(
+            BagTopic(
+                each.topic,
+                each.msgtype,
+                getattr(each.ext, "serialization_format", ""),
+                each.msgcount,
+                each.msgdef.data if each.msgdef.format != self._none else "",
+                "ros2idl" if each.msgdef.format == self._idl else "ros2msg",
+            )
+            for each in self._reader.connections
+        )
+
+    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, str, int, bytes]]:
+        """Topic, type, time of receipt and bytes of the messages, by that time. Raises BadBag
+        after the last good one."""
+        chosen = [each for each in self._reader.connections if each.topic in topics]
+        if not chosen:
+            return
+        try:
+            messages: Iterator[tuple[Any, Any, Any]] = self._reader.messages(chosen)
+            for connection, received_ns, payload in messages:
+                if not isinstance(received_ns, int) or not isinstance(payload, bytes):
+                    raise BadBag("a message has no bytes or no time")
+                yield connection.topic, connection.msgtype, received_ns, payload
+        except self._faults as error:
+            raise BadBag(str(error)) from None
+
+    def span(self) -> tuple[int, ...]:
+        """When its first and last messages were received; empty without messages."""
+        if not self._reader.message_count:
+            return ()
+        return self._reader.start_time, self._reader.end_time - 1
+
+    def close(self) -> None:
+        """Close the file."""
+        self._reader.close()
+
+
+_FAULTS: Final = (
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    LookupError,
+    MemoryError,
+    TypeError,
+    UnicodeError,
+)
+"""What rosbags raises for files that are not what they say."""

@@ -252,6 +252,8 @@ def _of_x_y_yaw(values: Sequence[float]) -> Covariance:
 
 
 def _integer(value: Any) -> int:
+    if type(value) is int:
+        return value
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise BadMessage(f"a stamp holds {value!r:.40}, not an integer")
     return int(value)

@@ -250,14 +250,9 @@ class TransformBuffer:
         """Whether links lead from the one to the other, whatever their times."""
         return target == source or self._path(target, source) is not None
 
-    def root_of(self, frame: str) -> str:
-        """The topmost frame that links lead to."""
-        for _ in range(_MAX_DEPTH):
-            link = self._links.get(frame)
-            if link is None:
-                return frame
-            frame = link.parent
-        return frame
+    def above(self, frame: str) -> list[str]:
+        """The frame, and those that links lead up to; empty for a circle."""
+        return [name for name, _ in self._upwards(frame)]
 
     def frames(self) -> set[str]:
         """All frames that a link names."""

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import typer
 
@@ -11,6 +11,7 @@ from eventsrc.errors import MisuseError
 from eventsrc.importers import (
     DEFAULT_KEY,
     IMPORT_FSYNC,
+    BagOptions,
     ImportInterrupted,
     ImportReport,
     TopicChoice,
@@ -21,9 +22,29 @@ from eventsrc.importers.map_yaml import read_map_yaml
 from eventsrc.importers.source import Source
 from eventsrc.importers.topics import NOT_CHOSEN
 from eventsrc.log import LogWriter
+from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS
 from eventsrc.text import counted, visible
 from eventsrc.transport.config import check_key
 
+from .bag_text import (
+    BaseFrameOption,
+    CameraOption,
+    CovarianceOption,
+    DetectionsOption,
+    EmbeddingsOption,
+    GridOption,
+    HeightsOption,
+    LabelsOption,
+    MapFrameOption,
+    MaxGapOption,
+    ModelOption,
+    PoseOption,
+    RunIdOption,
+    bag_lines,
+    check_run_id,
+    max_gap_ns,
+    read_labels,
+)
 from .options import JsonOption
 from .recorder_text import restart_as_json, say_restart
 from .signals import ctrl_c_between_steps
@@ -41,7 +62,8 @@ def import_(
         list[str] | None,
         typer.Argument(
             metavar="[FILE]...",
-            help="JSON lines (plain or gzip), logger records, MCAP files, other logs; - is stdin.",
+            help="JSON lines (plain or gzip), logger records, MCAP files, bags of ROS 2, other "
+            "logs; - is stdin.",
         ),
     ] = None,
     key: Annotated[str, typer.Option(help="Key for messages without one.")] = DEFAULT_KEY,
@@ -66,9 +88,26 @@ def import_(
             help="Only topics (keys) like this, such as 'tb/*'; may be given again.",
         ),
     ] = None,
+    detections: DetectionsOption = None,
+    pose: PoseOption = None,
+    covariance: CovarianceOption = None,
+    embeddings: EmbeddingsOption = None,
+    camera: CameraOption = None,
+    grid: GridOption = None,
+    map_frame: MapFrameOption = None,
+    base_frame: BaseFrameOption = None,
+    run_id: RunIdOption = None,
+    labels: LabelsOption = None,
+    embedding_model: ModelOption = None,
+    heights: HeightsOption = False,
+    max_gap: MaxGapOption = DEFAULT_MAX_GAP_NS / 1e9,
     json_: JsonOption = False,
 ) -> None:
     """Append recorded envelopes to a log, in the order of the files, after an occupancy map.
+
+    Of a bag of ROS 2 (a folder, or its .db3 or .mcap file) the detections become envelopes with
+    their poses, and an occupancy grid a map; needs the extra mapfold[ros]. What to use follows from
+    the topics' types and names where no option says it.
 
     A message that is neither a valid envelope nor an occupancy grid is kept with its bytes and the
     reason under mapfold/rejected, and the command exits with 3. Messages of an MCAP file that were
@@ -84,6 +123,21 @@ def import_(
         raise MisuseError(f"--floor {visible(floor)} is for a map; give one by --map, too")
     topics = TopicChoice.of(topic or ())
     given_map = None if map_ is None else read_map_yaml(map_, floor)
+    bags = BagOptions(
+        tuple(detections or ()),
+        pose,
+        covariance,
+        embeddings,
+        camera,
+        grid,
+        map_frame,
+        base_frame,
+        check_run_id(run_id),
+        embedding_model,
+        read_labels(labels),
+        heights,
+        max_gap_ns(max_gap),
+    )
     rejects = _RejectPrinter()
     try:
         with LogWriter(log, fsync=IMPORT_FSYNC, imported=True) as writer, FileBars() as bars:
@@ -98,6 +152,7 @@ def import_(
                     step=step,
                     given_map=given_map,
                     topics=topics,
+                    bags=bags,
                 )
     except ImportInterrupted as interrupted:
         rejects.say_rest()
@@ -105,11 +160,23 @@ def import_(
         raise
     rejects.say_rest()
     if json_:
-        emit({"log": str(log), **asdict(report), **restart_as_json(writer)})
+        emit({"log": str(log), **_without_bags(report), **restart_as_json(writer)})
+    for bag in report.bags:
+        for line in bag_lines(bag):
+            say(line)
     say(_summary(log, report))
     for line in _passed_over(report):
         say(line)
-    finish(findings=report.rejected > 0 or report.nothing_of_something)
+    useless = any(bag.is_useless for bag in report.bags)
+    finish(findings=report.rejected > 0 or report.nothing_of_something or useless)
+
+
+def _without_bags(report: ImportReport) -> dict[str, Any]:
+    """The report as JSON; ``bags`` only where there were some."""
+    document = asdict(report)
+    if not report.bags:
+        del document["bags"]
+    return document
 
 
 class _RejectPrinter:

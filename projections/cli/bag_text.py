@@ -1,0 +1,181 @@
+"""Bags of ROS 2 on the command line: options, the file of labels, and what was found in a bag."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from eventsrc.errors import MisuseError
+from eventsrc.importers import BagReport
+from eventsrc.ros.stream import Counts
+from eventsrc.text import counted, visible
+
+_PANEL: Final = "Bags of ROS 2"
+_MOST_LABELS_BYTES: Final = 1_000_000
+_MOST_UNUSED: Final = 10
+_MOST_RUN_ID: Final = 100
+"""So that run ids and default detection ids keep within their limits."""
+_NS: Final = 1_000_000_000
+MAX_GAP_S: Final = 3_600.0
+
+
+def _topic(name: str, text: str) -> typer.models.OptionInfo:
+    option: typer.models.OptionInfo = typer.Option(
+        name, metavar="TOPIC", help=text, rich_help_panel=_PANEL
+    )
+    return option
+
+
+def _named(name: str, metavar: str, text: str) -> typer.models.OptionInfo:
+    option: typer.models.OptionInfo = typer.Option(
+        name, metavar=metavar, help=text, rich_help_panel=_PANEL
+    )
+    return option
+
+
+DetectionsOption = Annotated[
+    list[str] | None,
+    _topic("--detections", "vision_msgs/Detection2DArray; may be repeated. Default: all."),
+]
+PoseOption = Annotated[
+    str | None,
+    _named(
+        "--pose",
+        "tf|TOPIC|none",
+        "Where poses come from: transforms, or a topic of nav_msgs/Odometry or "
+        "geometry_msgs/PoseWithCovarianceStamped.",
+    ),
+]
+CovarianceOption = Annotated[
+    str | None,
+    _topic("--covariance", "Whose latest covariance is the error of poses by transforms; or none."),
+]
+EmbeddingsOption = Annotated[
+    str | None,
+    _topic(
+        "--embeddings", "std_msgs/String or Float32MultiArray, as docs/ros.md describes; or none."
+    ),
+]
+CameraOption = Annotated[str | None, _topic("--camera", "sensor_msgs/CameraInfo; or none.")]
+GridOption = Annotated[
+    str | None, _topic("--grid", "nav_msgs/OccupancyGrid; or none. Default: topics called map.")
+]
+MapFrameOption = Annotated[
+    str | None, _named("--map-frame", "FRAME", "The frame of the map. Default: map, else the root.")
+]
+BaseFrameOption = Annotated[
+    str | None,
+    _named("--base-frame", "FRAME", "The robot's frame. Default: base_link or base_footprint."),
+]
+RunIdOption = Annotated[
+    str | None,
+    _named("--run-id", "ID", "The run of a bag's keyframes. Default: its name and when it began."),
+]
+LabelsOption = Annotated[
+    Path | None,
+    _named(
+        "--labels", "FILE", "Names of numbered classes, one a line; the first is that of class 0."
+    ),
+]
+ModelOption = Annotated[
+    str | None,
+    _named("--embedding-model", "NAME", "The model of embeddings that do not name theirs."),
+]
+HeightsOption = Annotated[
+    bool,
+    typer.Option(
+        "--heights", help="State the robot's height, which tells floors.", rich_help_panel=_PANEL
+    ),
+]
+MaxGapOption = Annotated[
+    float,
+    _named("--max-gap", "SECONDS", "Poses farther apart in time are not interpolated between."),
+]
+
+
+def check_run_id(run_id: str | None) -> str | None:
+    """``--run-id``, if a run can have it."""
+    if run_id is not None and not (run_id.isprintable() and 1 <= len(run_id) <= _MOST_RUN_ID):
+        raise MisuseError(
+            f"--run-id {visible(run_id)[:_MOST_RUN_ID]!r}: give 1 to {_MOST_RUN_ID} printable "
+            "characters"
+        )
+    return run_id
+
+
+def max_gap_ns(seconds: float) -> int:
+    """``--max-gap`` as nanoseconds."""
+    if not (math.isfinite(seconds) and 0.0 < seconds <= MAX_GAP_S):
+        raise MisuseError(f"--max-gap {seconds:g}: give seconds above 0, up to {MAX_GAP_S:g}")
+    return round(seconds * _NS)
+
+
+def read_labels(path: Path | None) -> dict[str, str]:
+    """Class names by number, from a file with one a line. Empty lines name nothing."""
+    if path is None:
+        return {}
+    try:
+        with path.open("rb") as file:
+            content = file.read(_MOST_LABELS_BYTES + 1)
+        text = content.decode()
+    except OSError as error:
+        raise MisuseError(f"--labels {path}: {error.strerror or error}; check the path") from None
+    except UnicodeDecodeError as error:
+        raise MisuseError(f"--labels {path}: is no UTF-8 text: {error}") from None
+    if len(content) > _MOST_LABELS_BYTES:
+        raise MisuseError(f"--labels {path}: larger than {_MOST_LABELS_BYTES:,} bytes")
+    lines = (line.strip() for line in text.splitlines())
+    labels = {str(number): line for number, line in enumerate(lines) if line}
+    if not labels:
+        raise MisuseError(f"--labels {path}: names no class; write one a line")
+    return labels
+
+
+def bag_lines(report: BagReport) -> Iterator[str]:
+    """What was in a bag, what was used, and what not and why."""
+    topics = counted(len(report.topics), "topic")
+    yield (
+        f"{report.name}: {counted(report.messages, 'message')} of {topics}, "
+        f"{report.duration_s:,.1f} s"
+    )
+    used = [topic for topic in report.topics if topic.used_for]
+    unused = [topic for topic in report.topics if not topic.used_for]
+    shown = [*used, *unused[:_MOST_UNUSED]]
+    name_width = max((len(visible(topic.topic)) for topic in shown), default=0)
+    count_width = max((len(f"{topic.messages:,}") for topic in shown), default=0)
+    for topic in shown:
+        yield (
+            f"  {visible(topic.topic):{name_width}}  {topic.messages:>{count_width},}  "
+            f"{visible(topic.type)}: {visible(topic.used_for or 'not used')}"
+        )
+    if len(unused) > _MOST_UNUSED:
+        yield f"  … and {len(unused) - _MOST_UNUSED:,} more topics that are not used"
+    for name, counts in report.streams.items():
+        yield f"  {visible(name)}: {_keyframes(counts)}"
+        for topic_name, count in counts.unused.items():
+            reason = visible(counts.reasons[topic_name][:200])
+            yield f"  {visible(topic_name)}: {count:,} could not be used; the first: {reason}"
+    if report.unchanged_grids:
+        same = counted(report.unchanged_grids, "occupancy grid")
+        yield f"  {same} had the cells of the one before"
+    for note in report.notes:
+        yield f"  note: {visible(note)}"
+
+
+def _keyframes(counts: Counts) -> str:
+    """The keyframes of a stream, and what they lack."""
+    lacks = (
+        (counts.without_pose, "without a pose"),
+        (counts.without_camera_frame, "with the pose of the base, not of the camera"),
+        (counts.without_base_frame, "with the heading of the camera, not of the base"),
+        (counts.without_camera, "without the camera's field of view"),
+        (counts.without_covariance, "with a pose, but without its error"),
+    )
+    parts = [f"{number:,} {what}" for number, what in lacks if number]
+    seen = counted(counts.detections, "detection")
+    parts.append(f"{seen}, {counts.with_embedding:,} with an embedding")
+    if counts.unclassified:
+        parts.append(f"{counts.unclassified:,} without a class")
+    return "; ".join([counted(counts.keyframes, "keyframe"), *parts])

@@ -1,0 +1,415 @@
+"""Bags of ROS 2, written by rosbags, become the log that their detections as JSON lines become."""
+
+import json
+import shutil
+import sqlite3
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from eventsrc.errors import MapfoldError, MisuseError
+from eventsrc.importers import BagOptions, ImportReport, import_files
+from eventsrc.log import LogReader, LogWriter
+from eventsrc.system_events import RejectedPayload
+from projections.model.digest import map_digest
+from projections.model.fold import fold_log
+from projections.settings import Settings
+from tests import ros_messages as ros
+from tests.fixtures_log import read_log
+from tests.ros_bags import RUN, Drive, Raw, write_bag
+from tests.ros_messages import SECOND, START, flat
+
+DRIVE = Drive(40)
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """One drive in every form, by storage and compression."""
+    folder = tmp_path_factory.mktemp("drives")
+    forms = [("mcap", "none"), ("sqlite", "none"), ("sqlite", "file"), ("sqlite", "message")]
+    messages = [*DRIVE.messages()]
+    return {
+        f"{storage} {compression}": write_bag(
+            folder / f"{storage}-{compression}" / "drive", messages, storage, compression
+        )
+        for storage, compression in forms
+    }
+
+
+def imported(log: Path, *names: Path, **options: Any) -> ImportReport:
+    with LogWriter(log) as writer:
+        return import_files(writer, [*map(str, names)], bags=BagOptions(**options))
+
+
+def digest(log: Path, *settings: str) -> str:
+    with LogReader(log) as reader:
+        _, view = fold_log(reader, Settings().with_assignments(settings))
+    return map_digest(view)
+
+
+def envelopes(log: Path) -> list[Any]:
+    return [json.loads(e.payload) for e in read_log(log) if not e.key.startswith("mapfold/")]
+
+
+def same_map_as_json_lines(drive: Drive, bag: Path, tmp_path: Path) -> None:
+    lines = tmp_path / "lines.jsonl"
+    lines.write_bytes(b"\n".join(drive.envelopes(RUN)))
+    assert imported(tmp_path / "lines", lines).rejected == 0
+    report = imported(tmp_path / "bag", bag)
+    assert (report.accepted, report.rejected) == (drive.pictures, 0)
+    assert envelopes(tmp_path / "bag") == envelopes(tmp_path / "lines")
+    for settings in ((), ("fusion=evidence", "places=rooms")):
+        assert digest(tmp_path / "bag", *settings) == digest(tmp_path / "lines", *settings)
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        "mcap none",
+        "sqlite none",
+        pytest.param("sqlite file", marks=pytest.mark.slow),
+        "sqlite message",
+    ],
+)
+def test_a_bag_gives_the_map_of_the_same_detections_as_json_lines(
+    form: str, drives: dict[str, Path], tmp_path: Path
+) -> None:
+    same_map_as_json_lines(DRIVE, drives[form], tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("storage", ["mcap", "sqlite"])
+def test_ten_thousand_messages_give_the_map_of_json_lines(storage: str, tmp_path: Path) -> None:
+    drive = Drive(10_000, dim=64)
+    bag = write_bag(tmp_path / "drive", drive.messages(), storage)
+    same_map_as_json_lines(drive, bag, tmp_path)
+
+
+def test_the_report_says_what_was_used_and_what_was_not(
+    drives: dict[str, Path], tmp_path: Path
+) -> None:
+    picture = Raw("sensor_msgs/msg/Image", b"\0\1\0\0")
+    bag = write_bag(tmp_path / "drive", [*DRIVE.messages(), ("/image", START, picture)])
+    report = imported(tmp_path / "log", bag)
+    (about,) = report.bags
+    assert {topic.topic: topic.used_for for topic in about.topics} == {
+        "/camera_info": "camera",
+        "/detections": f"keyframes of run {RUN}",
+        "/embeddings": "embeddings",
+        "/image": "",
+        "/tf": "poses of base_link in map",
+        "/tf_static": "where the camera is",
+    }
+    assert (report.skipped, about.messages) == (1, 40 * 2 + 42 + 3)
+    assert about.frames == {"/detections": "map"}
+    counts = about.streams["/detections"]
+    assert (counts.keyframes, counts.without_pose, counts.without_covariance) == (40, 0, 40)
+    assert (
+        counts.detections
+        == counts.with_embedding
+        == sum(len(each["detections"]) for each in envelopes(tmp_path / "log"))
+    )
+    assert (counts.unused, about.notes, about.is_useless) == ({}, [], False)
+
+
+def test_a_second_import_changes_no_map(drives: dict[str, Path], tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    imported(log, drives["mcap none"])
+    before = digest(log)
+    (file,) = drives["sqlite none"].glob("*.db3")
+    part = tmp_path / "drive_0.db3"  # as rosbag2 names the first file of the bag drive
+    shutil.copy(file, part)
+    assert imported(log, drives["mcap none"], part).accepted == 2 * DRIVE.pictures
+    assert digest(log) == before
+
+
+def test_events_are_logged_when_the_bag_received_them(
+    drives: dict[str, Path], tmp_path: Path
+) -> None:
+    imported(tmp_path / "log", drives["sqlite none"])
+    for number, event in enumerate(read_log(tmp_path / "log")):
+        assert event.logged_ns == event.stamp_ns == DRIVE.shown_at(number)
+        assert event.key == "tb/detections"
+
+
+def test_a_bag_of_two_robots_gives_a_run_of_each(tmp_path: Path) -> None:
+    robots = [Drive(10, seed=seed, prefix=f"/robot{seed}") for seed in (1, 2)]
+    order = count()
+    messages = sorted(
+        (received, next(order), topic, message)
+        for robot in robots
+        for topic, received, message in robot.messages()
+    )
+    bag = write_bag(tmp_path / "drive", [(t, r, m) for r, _, t, m in messages])
+    report = imported(tmp_path / "log", bag)
+    assert (report.accepted, report.bags[0].notes) == (20, [])
+    for seed, robot in enumerate(robots, 1):
+        run_id = f"{RUN}:robot{seed}"
+        found = [each for each in envelopes(tmp_path / "log") if each["run_id"] == run_id]
+        assert found == [json.loads(each) for each in robot.envelopes(run_id)]
+
+
+def test_files_of_a_split_bag_are_read_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    messages = [*DRIVE.messages()]
+    bag = tmp_path / "drive"
+    bag.mkdir()
+    for number, at in enumerate(range(0, len(messages), 11)):
+        part = write_bag(tmp_path / f"part{number}", messages[at : at + 11])
+        (file,) = part.glob("*.mcap")
+        file.rename(bag / f"drive_{number}.mcap")  # without a metadata.yaml
+    assert len([*bag.iterdir()]) > 10
+    imported(tmp_path / "log", bag)
+    assert envelopes(tmp_path / "log") == [json.loads(each) for each in DRIVE.envelopes(RUN)]
+
+
+def grid_and_detections(*grids: tuple[str, int, Any]) -> list[tuple[str, int, Any]]:
+    return sorted([*DRIVE.messages(), *grids], key=lambda each: each[1])
+
+
+def test_an_occupancy_grid_becomes_a_map_once_for_as_long_as_it_stays(tmp_path: Path) -> None:
+    cells = [0, 100, -1, 0, 0, 100]
+    at = [DRIVE.stamp(number) + 1 for number in (10, 20, 30)]
+    grids = [
+        ("/map", at[0], ros.grid(at[0], cells, 3, 2)),
+        ("/map", at[1], ros.grid(at[1], cells, 3, 2)),
+        ("/map", at[2], ros.grid(at[2], cells[::-1], 3, 2)),
+        ("/costmap/costmap", at[0], ros.grid(at[0], cells, 2, 3)),
+        ("/map", at[2], Raw("nav_msgs/msg/OccupancyGrid", b"\0\1\0\0short")),
+    ]
+    bag = write_bag(tmp_path / "drive", grid_and_detections(*grids))
+    report = imported(tmp_path / "log", bag)
+    assert (report.maps, report.accepted, report.rejected) == (2, DRIVE.pictures, 1)
+    assert report.bags[0].unchanged_grids == 1
+    keys = [event.key for event in read_log(tmp_path / "log")]
+    assert keys.index("mapfold/map") == 10, "between the keyframes that it was received between"
+    given = imported(tmp_path / "other", bag, grid="/costmap/costmap")
+    assert (given.maps, given.rejected) == (1, 0)
+    assert imported(tmp_path / "none", bag, grid="none").maps == 0
+
+
+def test_costmaps_are_not_taken_for_the_map(tmp_path: Path) -> None:
+    grid = ("/local_costmap/costmap", START + 1, ros.grid(START, [0], 1, 1))
+    bag = write_bag(tmp_path / "drive", grid_and_detections(grid))
+    report = imported(tmp_path / "log", bag)
+    assert report.maps == 0
+    assert "--grid" in report.bags[0].notes[0]
+
+
+def test_without_transforms_poses_come_from_the_localiser_else_from_odometry(
+    tmp_path: Path,
+) -> None:
+    covariance = ros.six_by_six(0.04, 0.0, 0.04, 0.01)
+    messages: list[tuple[str, int, Any]] = [
+        ("/detections", START + 50, ros.detections(START + 50, "camera"))
+    ]
+    for at in (START, START + 100):
+        odometry = ros.odometry(at, "odom", "base", flat(1.0, 0.0, 0.0))
+        messages.append(("/odom", at, odometry))
+        for topic, x in (("/amcl_pose", 2.0), ("/initialpose", 3.0)):
+            pose = ros.pose_with_covariance(at, "map", flat(x, 0.0, 0.0), covariance)
+            messages.append((topic, at, pose))
+    messages.sort(key=lambda each: each[1])
+    both = write_bag(tmp_path / "both", messages)
+    odometry_only = write_bag(
+        tmp_path / "odometry", [m for m in messages if m[0] in ("/odom", "/detections")]
+    )
+    imported(tmp_path / "a", both)
+    imported(tmp_path / "b", odometry_only)
+    imported(tmp_path / "c", both, pose="/odom", run_id="mine")
+    imported(tmp_path / "d", both, pose="none")
+    (a,), (b,), (c,), (d,) = (envelopes(tmp_path / name) for name in "abcd")
+    assert (a["map_x"], a["pose_covariance"][0]) == (2.0, 0.04)
+    assert (b["map_x"], "pose_covariance" in b) == (1.0, False)
+    assert (c["map_x"], c["run_id"]) == (1.0, "mine")
+    assert "map_x" not in d
+
+
+def test_frames_are_found_under_other_names(tmp_path: Path) -> None:
+    messages: list[tuple[str, int, Any]] = [
+        ("/detections", START + 50, ros.detections(START + 50, "r1/eye"))
+    ]
+    mount = ros.tf(ros.transform("r1/base_footprint", "r1/eye", 0, flat(0.5, 0.0, 0.0)))
+    messages.append(("/tf_static", START, mount))
+    for at in (START, START + 100):
+        link = ros.transform("r1/odom", "r1/base_footprint", at, flat(1.0, 0.0, 0.0))
+        messages.append(("/tf", at, ros.tf(link)))
+    messages.sort(key=lambda each: each[1])
+    report = imported(tmp_path / "log", write_bag(tmp_path / "drive", messages))
+    ((made,), (about,)) = envelopes(tmp_path / "log"), report.bags
+    assert made["map_x"] == 1.5
+    assert any("'r1/odom'" in note and "drifts" in note for note in about.notes)
+    assert about.streams["/detections"].without_base_frame == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"detections": ("/nothing",)}, "no messages of that topic"),
+        ({"detections": ("/tf",)}, "not vision_msgs/msg/Detection2DArray; of that type it has /d"),
+        ({"pose": "/odom"}, "it has none of that type"),
+        ({"embeddings": "/tf"}, "std_msgs/msg/String"),
+        ({"camera": "/x"}, "--camera /x"),
+        ({"grid": "/x"}, "--grid /x"),
+        ({"covariance": "/x"}, "--covariance /x"),
+    ],
+)
+def test_an_option_that_fits_nothing_says_what_there_is(
+    options: dict[str, Any], said: str, drives: dict[str, Path], tmp_path: Path
+) -> None:
+    with pytest.raises(MisuseError, match=said):
+        imported(tmp_path / "log", drives["mcap none"], **options)
+
+
+def test_a_bag_without_detections_says_so(tmp_path: Path) -> None:
+    only_tf = [each for each in DRIVE.messages() if each[0] == "/tf"]
+    for name, messages, said in (
+        ("drive", only_tf, "it has tf2_msgs/msg/TFMessage"),
+        ("empty", [], "it is empty"),
+    ):
+        for storage in ("mcap", "sqlite"):
+            bag = write_bag(tmp_path / storage / name, messages, storage)
+            report = imported(tmp_path / "log", bag)
+            assert (report.first_offset, report.bags[0].is_useless) == (report.next_offset, True)
+            assert said in report.bags[0].notes[-1]
+
+
+# Hostile bags
+
+
+def test_a_bag_cut_off_at_any_place_gives_what_was_before_it(
+    drives: dict[str, Path], tmp_path: Path
+) -> None:
+    (file,) = drives["mcap none"].glob("*.mcap")
+    whole = file.read_bytes()
+    for number, size in enumerate((len(whole) - 1, len(whole) // 2, 300, 40)):
+        bag = tmp_path / str(number) / "drive"
+        bag.mkdir(parents=True)
+        (bag / "drive_0.mcap").write_bytes(whole[:size])
+        log = tmp_path / str(number) / "log"
+        with pytest.raises(MapfoldError, match="what was made of the messages before it"):
+            imported(log, bag)
+        found = envelopes(log)
+        assert found == [json.loads(e) for e in DRIVE.envelopes(RUN)][: len(found)]
+        assert len(found) == DRIVE.pictures or number > 0
+
+
+def test_a_damaged_database_gives_what_was_before_the_damage(
+    drives: dict[str, Path], tmp_path: Path
+) -> None:
+    (file,) = drives["sqlite none"].glob("*.db3")
+    whole = file.read_bytes()
+    damaged = [
+        whole[: len(whole) // 2],
+        whole[:100],
+        whole[:4096] + b"\xff" * 4096 + whole[8192:],
+        whole[: len(whole) // 2] + b"\xff" * (len(whole) // 4) + whole[len(whole) * 3 // 4 :],
+    ]
+    for number, content in enumerate(damaged):
+        bag = tmp_path / str(number) / "drive"
+        bag.mkdir(parents=True)
+        (bag / "drive_0.db3").write_bytes(content)
+        log = tmp_path / str(number) / "log"
+        try:
+            report = imported(log, bag)
+        except MapfoldError as error:
+            said = [str(error)]
+        else:
+            said = report.bags[0].notes
+        assert any("drive_0.db3" in each for each in said)
+
+
+def test_what_is_no_bag_whatever_its_name_is_refused(tmp_path: Path) -> None:
+    bag = tmp_path / "drive"
+    bag.mkdir()
+    (bag / "metadata.yaml").write_text("rosbag2_bagfile_information: {}")
+    with pytest.raises(MisuseError, match=r"no \.db3 or \.mcap file"):
+        imported(tmp_path / "log", bag)
+    for content in (b"", b"hello", b"\x28\xb5\x2f\xfdrubbish"):
+        (bag / "drive_0.db3").write_bytes(content)
+        with pytest.raises(MisuseError, match="neither SQLite nor MCAP"):
+            imported(tmp_path / "log", bag)
+    (bag / "drive_0.db3").unlink()
+    with sqlite3.connect(bag / "drive_0.db3") as other:
+        other.execute("CREATE TABLE songs(title TEXT)")
+    other.close()
+    with pytest.raises(MapfoldError, match=r"drive_0\.db3"):
+        imported(tmp_path / "log", bag)
+
+
+def test_messages_that_were_not_written_into_the_database_are_not_passed_over(
+    drives: dict[str, Path], tmp_path: Path
+) -> None:
+    bag = tmp_path / "drive"
+    shutil.copytree(drives["sqlite none"], bag)
+    (bag / "drive.db3-wal").write_bytes(b"x")
+    with pytest.raises(MisuseError, match="wal_checkpoint"):
+        imported(tmp_path / "log", bag)
+
+
+def test_messages_that_are_none_of_their_type_are_kept_as_rejected(tmp_path: Path) -> None:
+    kind = "vision_msgs/msg/Detection2DArray"
+    good = ros.TYPES.encode(ros.detections(START, "camera"), kind)
+    lying = bytearray(good)
+    lying[-4:] = (2**31).to_bytes(4, "little")  # the number of detections
+    tf = Raw("tf2_msgs/msg/TFMessage", b"\0\1\0\0\xff\xff\xff\xff")
+    far = ros.detections(0, "camera")
+    far.header.stamp.sec = -1
+    bag = write_bag(
+        tmp_path / "drive",
+        [
+            ("/detections", START, Raw(kind, bytes(lying))),
+            ("/detections", START, Raw(kind, b"")),
+            ("/detections", START, Raw(kind, b"\0\7\0\0")),
+            ("/detections", START, Raw(kind, good[:-3])),
+            ("/detections", START, Raw(kind, good)),
+            ("/tf", START, tf),
+            ("/detections", START, far),
+        ],
+    )
+    report = imported(tmp_path / "log", bag)
+    assert (report.accepted, report.rejected) == (1, 6)
+    refused = [e for e in read_log(tmp_path / "log") if e.key == "mapfold/rejected"]
+    kept = [RejectedPayload.model_validate_json(event.payload) for event in refused]
+    assert kept[0].raw == bytes(lying)
+    assert "/detections: no vision_msgs/msg/Detection2DArray in CDR" in kept[0].reason
+
+
+def test_a_type_is_read_as_the_bag_defines_it_and_a_broken_definition_is_told(
+    drives: dict[str, Path], tmp_path: Path
+) -> None:
+    (file,) = drives["sqlite none"].glob("*.db3")
+    bag = tmp_path / "drive"
+    bag.mkdir()
+    shutil.copy(file, bag / "drive_0.db3")
+    with sqlite3.connect(bag / "drive_0.db3") as database:
+        database.execute(
+            "UPDATE message_definitions SET encoded_message_definition = 'import os; os.abort()' "
+            "WHERE topic_type = 'tf2_msgs/msg/TFMessage'"
+        )
+    database.close()
+    report = imported(tmp_path / "log", bag)
+    assert (report.accepted, report.rejected) == (DRIVE.pictures, 0)
+    assert "definition of tf2_msgs/msg/TFMessage cannot be read" in report.bags[0].notes[0]
+
+
+@pytest.mark.seconds
+def test_very_many_transforms_a_second_are_read_in_bounded_memory(tmp_path: Path) -> None:
+    messages: list[tuple[str, int, Any]] = []
+    kind = "tf2_msgs/msg/TFMessage"
+    for number in range(3_000):
+        at = START + number * SECOND // 100_000
+        if number < 50 or number % 1_000 == 0:
+            links = [ros.transform(f"f{i}", f"f{i + 1}", at, flat(0, 0, 0)) for i in range(20)]
+            payload = Raw(kind, ros.TYPES.encode(ros.tf(*links), kind))
+        messages.append(("/tf", at, payload))
+    messages.insert(1_500, ("/detections", START, ros.detections(START, "f20")))
+    report = imported(
+        tmp_path / "log",
+        write_bag(tmp_path / "drive", messages),
+        map_frame="f0",
+        base_frame="f19",
+    )
+    assert report.accepted == 1
+    assert report.bags[0].streams["/detections"].without_pose == 0
