@@ -3,6 +3,8 @@
 ``mapfold/rejected``  a payload that is no valid envelope, with its bytes and the reason
 ``mapfold/loss``      a detected gap: publisher, first and last missing, cause
 ``mapfold/command``   a command (`eventsrc.commands`), by `mapfold edit` or a recorder it asked
+``mapfold/ros``       how envelopes are made of the messages of ROS behind it
+                      (`eventsrc.ros.derivation`)
 ``mapfold/map``       an occupancy grid: where walls are (`eventsrc.occupancy_map`)
 
 The docstrings of the models are part of the JSON schema in every segment: do not change them.
@@ -21,6 +23,7 @@ REJECTED_KEY = "mapfold/rejected"
 LOSS_KEY = "mapfold/loss"
 COMMAND_KEY = "mapfold/command"
 MAP_KEY = "mapfold/map"
+ROS_KEY = "mapfold/ros"
 
 
 def is_system_key(key: str) -> bool:

@@ -12,13 +12,13 @@ from typing import Final, NamedTuple
 from eventsrc.append import NewMap, check_payloads, map_event, rejected_event
 from eventsrc.envelope import KeyframeId, RunId, has_keyframe_id
 from eventsrc.ingest import Rejected
-from eventsrc.log import LogWriter, NewEvent
+from eventsrc.log import LogWriter, MessageFormat, NewEvent
 from eventsrc.robot.acks import SENT_SUFFIX, Refusal, payload_sha256
 from eventsrc.system_events import MAP_KEY
 from eventsrc.transport.session import Received
 
 from .edit_requests import EditRequest
-from .queue import MAX_BATCH_BYTES, MessageQueue
+from .queue import MAX_BATCH_BYTES, BridgedMessage, MessageQueue
 
 _BATCH: Final = 256
 _CHECKED_TOGETHER: Final = 16
@@ -33,7 +33,8 @@ class CheckedMessage(NamedTuple):
 
     ``run_id``, ``keyframe_id`` and ``stamp_ns`` are None for a rejected payload and for a form
     older than the envelope. ``refusal`` is the reply to a rejected payload; ``sha256`` is that of
-    an envelope's payload, otherwise empty.
+    an envelope's payload, otherwise empty. ``form`` is the format of a message of a bridge, which
+    is kept verbatim.
     """
 
     key: str
@@ -44,16 +45,17 @@ class CheckedMessage(NamedTuple):
     keyframe_id: KeyframeId | None = None
     stamp_ns: int | None = None
     sha256: str = ""
+    form: MessageFormat | None = None
 
     def event(self, logged_ns: int) -> NewEvent:
         """The event to append."""
-        key, payload, version, refusal, _, _, stamp_ns, _ = self
+        key, payload, version, refusal, _, _, stamp_ns, _, form = self
         if refusal is not None:
             return rejected_event(key, payload, refusal.reason, logged_ns)
         if key == MAP_KEY:
             return map_event(payload, logged_ns)
         return NewEvent(
-            key, payload, logged_ns, logged_ns if stamp_ns is None else stamp_ns, version
+            key, payload, logged_ns, logged_ns if stamp_ns is None else stamp_ns, version, form
         )
 
 
@@ -62,6 +64,7 @@ class Batch:
 
     def __init__(self) -> None:
         self.messages: list[CheckedMessage] = []
+        self.bridged: list[BridgedMessage] = []
         self.announcements: list[Received] = []
         self.edits: list[EditRequest] = []
         self.size = 0
@@ -70,7 +73,12 @@ class Batch:
     @property
     def empty(self) -> bool:
         """Whether nothing is in it."""
-        return not (self.messages or self.announcements or self.edits)
+        return not (self.messages or self.bridged or self.announcements or self.edits)
+
+    @property
+    def count(self) -> int:
+        """Messages in it."""
+        return len(self.messages) + len(self.bridged)
 
 
 class Checker:
@@ -94,7 +102,7 @@ class Checker:
     @property
     def waiting(self) -> int:
         """Messages from the queue that are checked and in no batch yet."""
-        return len(self._ahead.messages)
+        return self._ahead.count
 
     def next_batch(self, timeout_s: float) -> Batch | None:
         """The next batch; an empty one if nothing came in time, None after the last one."""
@@ -110,7 +118,7 @@ class Checker:
     def _add(self, limit: int, timeout_s: float) -> bool:
         """Add up to ``limit`` messages from the queue; False if there is none or no room."""
         batch = self._ahead
-        limit = min(limit, _BATCH - len(batch.messages))
+        limit = min(limit, _BATCH - batch.count)
         if self._left is not None:
             limit = min(limit, self._left)
         if limit == 0 or batch.size >= MAX_BATCH_BYTES:
@@ -120,13 +128,17 @@ class Checker:
         for message in received:
             if isinstance(message, EditRequest):
                 batch.edits.append(message)
+            elif isinstance(message, BridgedMessage):
+                batch.bridged.append(message)
+                batch.size += len(message.payload)
             elif message.key.endswith(SENT_SUFFIX):
                 batch.announcements.append(message)
             else:
                 payloads.append(message)
                 batch.size += len(message.payload)
         if self._left is not None:
-            self._left -= len(payloads)
+            bridged = sum(isinstance(message, BridgedMessage) for message in received)
+            self._left -= len(payloads) + bridged
         for part in _parts(payloads):
             batch.messages.extend(self.check(part))
         return bool(received)

@@ -103,6 +103,12 @@ MAX_WAIT_S: Final = 1.0
 """How long a message may wait for room: longer than a sync takes, much less than five seconds."""
 
 
+class BridgedMessage(Received):
+    """A message of ROS that a bridge sent, in CDR."""
+
+    __slots__ = ()
+
+
 class MessageQueue:
     """Many threads `put`, one thread calls `get`.
 

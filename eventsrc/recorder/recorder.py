@@ -11,6 +11,7 @@ from eventsrc.gaps import GapLedger
 from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES
 from eventsrc.log import LogWriter
 from eventsrc.robot.acks import ACK_PREFIX, MAX_SENT_BYTES, sent_key
+from eventsrc.ros.bridge_keys import cache_selectors, token_selectors
 from eventsrc.transport.session import (
     Query,
     Received,
@@ -20,12 +21,16 @@ from eventsrc.transport.session import (
     check_keys,
 )
 
+from .bridged import Bridge
 from .edit_requests import EditRequest, Edits, fault_of, refuse_query
 from .edits import edit_key
-from .queue import DEFAULT_QUEUE_SIZE, MessageQueue
+from .queue import DEFAULT_QUEUE_SIZE, BridgedMessage, MessageQueue
 from .writer_thread import RecorderReport, WriterThread
 
 DEFAULT_KEYS: Final = ("tb/detections",)
+_CACHE_TIMEOUT_S: Final = 2.0
+_MOST_KEPT: Final = 1_000
+"""Messages taken from what a bridge keeps of one topic."""
 _MAX_REJECTED: Final = 2
 """A message of up to this many times the size limit (or the default limit, if larger) is rejected,
 kept and answered, so that its robot stops sending it. A larger one is counted as lost, because it
@@ -38,7 +43,8 @@ class Recorder:
     It is subscribed when the constructor returns. ``ledger`` is the log's gap history
     (`eventsrc.gap_history`); without it, a gap between an earlier recorder's last keyframe and this
     one's first is not found, and no ledger is saved. Turn ``report_gaps`` off for robots that do
-    not count their keyframes by one. With ``edits`` it takes commands too (`edits`).
+    not count their keyframes by one. With ``edits`` it takes commands too (`edits`), with
+    ``bridge`` the messages of a bridge from ROS (`bridged`).
     """
 
     def __init__(
@@ -53,8 +59,10 @@ class Recorder:
         report_gaps: bool = True,
         max_payload_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES,
         edits: Edits | None = None,
+        bridge: Bridge | None = None,
     ) -> None:
-        check_keys(keys)
+        bridged = () if bridge is None else bridge.keys
+        check_keys((*keys, *bridged))
         self._session = session
         self._queue = MessageQueue(queue_size)
         self._writer_thread = WriterThread(
@@ -66,6 +74,7 @@ class Recorder:
             report_gaps=report_gaps,
             max_payload_bytes=max_payload_bytes,
             edits=edits,
+            bridge=bridge,
         )
         limit = SizeLimit(
             _MAX_REJECTED * max(max_payload_bytes, DEFAULT_MAX_PAYLOAD_BYTES), self._count_too_large
@@ -84,7 +93,28 @@ class Recorder:
         if edits is not None:
             key = edit_key(writer.log_id)
             self._subscriptions.append(session.queryable(key, self._receive_edit))
+        if bridge is not None:
+            self._subscribe_bridge(session, bridge, limit)
         session.confirm()
+
+    def _subscribe_bridge(self, session: Session, bridge: Bridge, limit: SizeLimit) -> None:
+        """Subscribe to a bridge's tokens, then to its messages, and get those that it keeps for
+        who comes late."""
+        for key in bridge.keys:
+            for selector in token_selectors(key):
+                self._subscriptions.append(session.subscribe_tokens(selector, bridge.note_token))
+        for key in bridge.keys:
+            self._subscriptions += [
+                session.subscribe(key, self._receive_bridged, limit=limit),
+                session.subscribe_heartbeats(key, self._queue.put_heartbeat),
+            ]
+        session.confirm()
+        for key in bridge.latched_keys:
+            for selector in cache_selectors(key):
+                for message in session.kept(
+                    selector, timeout_s=_CACHE_TIMEOUT_S, limit=limit, most=_MOST_KEPT
+                ):
+                    self._receive_bridged(message)
 
     def run(
         self,
@@ -132,6 +162,9 @@ class Recorder:
         # A recorder of `**` receives acks and refusals too, also its own. They are not data.
         if not message.key.startswith(ACK_PREFIX):
             self._queue.put(message)
+
+    def _receive_bridged(self, message: Received) -> None:
+        self._queue.put(BridgedMessage(*message))
 
     def _receive_edit(self, query: Query) -> None:
         fault = fault_of(query)

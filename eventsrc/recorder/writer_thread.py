@@ -15,6 +15,7 @@
   as unwritten: in the commit group, in the batch at hand and the next, or in the queue.
 * Losses are recorded about once a second, not one by one, to spare an overloaded recorder.
 * `check_payloads` rejects messages under ``mapfold/``: they could forge a loss or a command.
+* A message of a bridge (`bridged`) is appended with what it completes right behind it.
 * A command that came as a query (`edit_requests`) is appended behind the messages of its batch and
   synced at once. It is not counted as a message.
 """
@@ -42,9 +43,11 @@ from eventsrc.robot.acks import (
     ack_key,
     refusal_key,
 )
-from eventsrc.system_events import LOSS_KEY, Loss
+from eventsrc.ros.derivation import RosRecording
+from eventsrc.system_events import LOSS_KEY, ROS_KEY, Loss
 from eventsrc.transport.session import Received
 
+from .bridged import Bridge
 from .checking import Batch, CheckedMessage, Checker
 from .edit_requests import EditRequest, Edits
 from .queue import MessageQueue
@@ -59,7 +62,7 @@ class Replies:
 
     def add(self, event: CheckedMessage) -> None:
         """Add a message whose event is synced."""
-        if event.run_id is not None:
+        if event.run_id is not None and event.sha256:
             self._synced[event.run_id, event.key].append(event.sha256)
         if event.refusal is not None:
             self._refusals[event.key].append(event.refusal)
@@ -106,6 +109,14 @@ class RecorderReport:
     lost_from_log: int = 0
     faults: tuple[str, ...] = ()
     commands: int = 0
+    messages: int = 0
+    """Messages of a bridge that are kept verbatim and synced."""
+    held: int = 0
+    """Messages of a bridge that wait for their type."""
+    untyped: int = 0
+    """Messages of a bridge that are kept without a schema: their type is not known."""
+    unread: tuple[tuple[str, int, str], ...] = ()
+    """Topics whose messages are kept but cannot be read, how many, and why the first cannot."""
 
     @property
     def lost(self) -> int:
@@ -115,8 +126,10 @@ class RecorderReport:
 
     @property
     def clean(self) -> bool:
-        """True when this recorder lost nothing, rejected nothing and left no new gap."""
-        return not (self.rejected or self.lost or self.missing > self.missing_before)
+        """True when this recorder lost nothing, rejected nothing, could read the messages of a
+        bridge, and left no new gap."""
+        unused = self.rejected or self.untyped or self.unread
+        return not (unused or self.lost or self.missing > self.missing_before)
 
 
 SendReply = Callable[[str, bytes], None]
@@ -153,8 +166,10 @@ class WriterThread:
         report_gaps: bool,
         max_payload_bytes: int,
         edits: Edits | None = None,
+        bridge: Bridge | None = None,
     ) -> None:
         self._queue = queue
+        self._bridge = bridge
         self._writer = writer
         self._edits = edits
         self._ledger: GapLedger[RunId] = GapLedger() if ledger is None else ledger
@@ -172,7 +187,7 @@ class WriterThread:
         self._in_progress = 0  # checked and not appended
         self._failed = False
         self._faults = 0
-        self._recorded = self._rejected = 0
+        self._recorded = self._rejected = self._messages = 0
         self._missing = self._missing_before = self._ledger.missing if report_gaps else 0
 
     def run(self) -> None:
@@ -180,9 +195,13 @@ class WriterThread:
         when the log cannot be written; everything synced is safe."""
         self._writer.work_while_syncing(self._checker.check_ahead)
         try:
+            if self._bridge is not None:
+                self._writer.append(ROS_KEY, self._bridge.recording.encode())
             while self._step():
                 pass
             self._writer.work_while_syncing(None)
+            if self._bridge is not None:
+                self._finish_bridge(self._bridge)
             self._sync()
             self._write_losses(self._ledger.flush(), self._queue.drain_missed(None))
             self._save()
@@ -217,12 +236,17 @@ class WriterThread:
             lost_from_log=sum(fault.lost_events for fault in writer.faults),
             faults=tuple(map(str, writer.faults)),
             commands=0 if self._edits is None else self._edits.recorded,
+            messages=self._messages,
+            held=0 if self._bridge is None else self._bridge.held,
+            untyped=0 if self._bridge is None else self._bridge.untyped,
+            unread=() if self._bridge is None else _unread(self._bridge),
         )
 
     def _unwritten(self) -> int:
         if not self._failed:
             return 0
-        checked = self._in_progress + self._checker.waiting
+        held = 0 if self._bridge is None else self._bridge.held
+        checked = self._in_progress + self._checker.waiting + held
         return len(self._unsynced) + checked + self._queue.depth()
 
     def _step(self) -> bool:
@@ -246,18 +270,28 @@ class WriterThread:
 
     def append(self, batch: Batch) -> None:
         """Append a batch; it commits in between."""
-        messages = batch.messages
-        self._in_progress = len(messages)
+        self._in_progress = batch.count
         logged_ns = self._writer.now_ns()
+        messages = batch.messages
+        if self._bridge is not None:
+            messages = messages + self._bridge.take(batch.bridged, logged_ns, self._checker.check)
+        self._append_messages(messages, logged_ns)
+        self._hold_announcements(batch.announcements)
+        if batch.edits:
+            self._append_edits(batch.edits)
+
+    def _append_messages(self, messages: list[CheckedMessage], logged_ns: int) -> None:
         events = [message.event(logged_ns) for message in messages]
         # Before appending: if that fails in the middle, what was synced by then still counts.
         offsets = map(Offset, itertools.count(self._writer.next_offset))
         self._unsynced.extend(zip(offsets, messages, strict=False))
         self._in_progress = 0
         self._writer.append_all(events)
-        self._hold_announcements(batch.announcements)
-        if batch.edits:
-            self._append_edits(batch.edits)
+
+    def _finish_bridge(self, bridge: Bridge) -> None:
+        logged_ns = self._writer.now_ns()
+        self._append_messages(bridge.finish(logged_ns, self._checker.check), logged_ns)
+        self._writer.append(ROS_KEY, RosRecording(key=bridge.recording.key).encode())
 
     def _append_edits(self, requests: list[EditRequest]) -> None:
         if self._edits is not None:
@@ -290,16 +324,18 @@ class WriterThread:
     def _acknowledge(self, durable: Offset, now_ns: int) -> None:
         """Count the events before ``durable``, enter them in the ledger and send the replies."""
         waiting, replies, ledger = self._unsynced, Replies(), self._ledger
-        rejected, before = 0, len(waiting)
+        rejected, messages, before = 0, 0, len(waiting)
         while waiting and waiting[0][0] < durable:
             _, message = waiting.popleft()
             rejected += message.refusal is not None
+            messages += message.form is not None
             run_id, keyframe_id = message.run_id, message.keyframe_id
             if run_id is not None and keyframe_id is not None:
                 ledger.record(run_id, keyframe_id, now_ns)
             replies.add(message)
         self._rejected += rejected
-        self._recorded += before - len(waiting) - rejected
+        self._messages += messages
+        self._recorded += before - len(waiting) - rejected - messages
         for key, payload in replies.messages(self._writer.log_id):
             self._send_reply(key, payload)
 
@@ -345,6 +381,11 @@ class WriterThread:
 
     def _append_loss(self, loss: Loss) -> None:
         self._writer.append(LOSS_KEY, loss.model_dump_json().encode())
+
+
+def _unread(bridge: Bridge) -> tuple[tuple[str, int, str], ...]:
+    counts = [*bridge.refused.items()]
+    return tuple((topic, count, bridge.reasons.get(topic, "")) for topic, count in counts)
 
 
 def _loss(cause: Literal["keyframe_gap", "transport_miss"], gap: Gap[Source]) -> Loss:

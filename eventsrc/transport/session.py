@@ -105,6 +105,39 @@ class Session:
         with transport_errors(f"key expression {expression!r} cannot be subscribed to"):
             return Subscription(self.raw.declare_subscriber(expression, receive))
 
+    def subscribe_tokens(self, key_expr: str, handler: Callable[[str], None]) -> Subscription:
+        """Call ``handler`` with the key of every liveliness token under ``key_expr``, those that
+        are there already included; like `subscribe` from a thread of Zenoh's."""
+
+        def receive(sample: zenoh.Sample) -> None:
+            if sample.kind == zenoh.SampleKind.PUT:
+                handler(str(sample.key_expr))
+
+        check_key_length(key_expr)
+        with transport_errors(f"key expression {key_expr!r} cannot be subscribed to"):
+            return Subscription(
+                self.raw.liveliness().declare_subscriber(key_expr, receive, history=True)
+            )
+
+    def kept(
+        self, selector: str, *, timeout_s: float, limit: SizeLimit, most: int
+    ) -> list[Received]:
+        """The messages that caches answer to ``selector`` with, under keys of their own; at most
+        ``most``, and those over ``limit`` are not copied out of Zenoh."""
+        check_key_length(selector)
+        found: list[Received] = []
+        with transport_errors(f"selector {selector!r} cannot be asked"):
+            for reply in self.raw.get(selector, timeout=timeout_s):
+                sample = reply.ok
+                if sample is None or len(found) >= most:
+                    continue
+                key, payload = str(sample.key_expr), sample.payload
+                if len(payload) > limit.size_bytes:
+                    limit.refuse(key, None)
+                else:
+                    found.append(Received(key, payload.to_bytes()))
+        return found
+
     def send(self, key: str, payload: bytes) -> None:
         """Send one message without blocking; it is dropped if the network is full."""
         check_key_length(key)

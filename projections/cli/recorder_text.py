@@ -14,7 +14,7 @@ from rich.text import Text
 from eventsrc.errors import LogError
 from eventsrc.log import LogWriter
 from eventsrc.recorder import Recorder, RecorderReport
-from eventsrc.text import counted
+from eventsrc.text import counted, visible
 
 from .terminal import emit, finish, people, say
 
@@ -37,10 +37,12 @@ class RecorderStatus:
     def line(self, report: RecorderReport, free_bytes: int) -> str:
         """The status line; the rate is since the previous call."""
         now_s = self._clock()
-        rate = (report.recorded - self._recorded) / max(now_s - self._at_s, 1e-9)
-        self._at_s, self._recorded = now_s, report.recorded
+        events = report.recorded + report.messages
+        rate = (events - self._recorded) / max(now_s - self._at_s, 1e-9)
+        self._at_s, self._recorded = now_s, events
         return (
-            f"{rate:,.0f}/s · {report.recorded:,} recorded · {report.rejected:,} rejected · "
+            f"{rate:,.0f}/s · {report.recorded:,} recorded · {_messages(report)}"
+            f"{report.rejected:,} rejected · "
             f"{report.lost:,} lost · {report.missing:,} missing · "
             f"queue {report.queue_depth:,} · "
             f"{free_bytes / 1e9:,.1f} GB free{_unsealed(report)}"
@@ -71,6 +73,11 @@ class RecorderStatus:
         self._faults = len(report.faults)
         self._sealing_error = report.sealing_error
         return lines
+
+
+def _messages(report: RecorderReport) -> str:
+    waiting = f" ({report.held:,} wait for their type)" if report.held else ""
+    return f"{report.messages:,} of ROS{waiting} · " if report.messages or report.held else ""
 
 
 def _unsealed(report: RecorderReport) -> str:
@@ -155,6 +162,8 @@ class RecorderSummary:
         report = recorder.report()
         if report.unwritten:
             say(unwritten_text(report))
+        for line in unused_text(report):
+            say(line)
         say(summary(self._log, report))
         if self._json:
             emit(as_json(report) | restart_as_json(writer))
@@ -172,12 +181,27 @@ def unwritten_text(report: RecorderReport) -> str:
     )
 
 
+def unused_text(report: RecorderReport) -> list[str]:
+    """Lines about messages of ROS that were kept and that nothing was made of."""
+    lines = [
+        visible(f"{topic}: {counted(count, 'message')} kept that cannot be read: {reason}")
+        for topic, count, reason in report.unread
+    ]
+    if report.untyped:
+        lines.append(
+            f"{counted(report.untyped, 'message')} kept without a schema, and nothing made of "
+            "them: no bridge told their type"
+        )
+    return lines
+
+
 def summary(log: Path, report: RecorderReport) -> str:
     """The last line of a recording."""
     commands = f"{counted(report.commands, 'command')} of mapfold edit, " if report.commands else ""
+    messages = f"{counted(report.messages, 'message')} of ROS, " if report.messages else ""
     return (
         f"{log}: {report.recorded:,} recorded, {report.rejected:,} rejected, {report.lost:,} lost, "
-        f"{counted(report.missing, 'keyframe')} missing; {commands}"
+        f"{counted(report.missing, 'keyframe')} missing; {messages}{commands}"
         f"{counted(report.next_offset, 'event')} in the log"
     )
 
@@ -191,6 +215,9 @@ def as_json(report: RecorderReport) -> dict[str, int | str | None]:
         "too_large": report.too_large,
         "transport_missed": report.transport_missed,
         "commands": report.commands,
+        "messages": report.messages,
+        "untyped": report.untyped,
+        "unread": sum(count for _, count, _ in report.unread),
         "unwritten": report.unwritten,
         "lost_from_log": report.lost_from_log,
         "missing": report.missing,

@@ -17,10 +17,33 @@ from eventsrc.log import LogReader, LogWriter, parse_fsync
 from eventsrc.recorder import DEFAULT_KEYS, DEFAULT_QUEUE_SIZE, Recorder
 from eventsrc.recorder.edit_requests import Edits, KnownCommands
 from eventsrc.recorder.edits import EDIT_PREFIX, edit_key
+from eventsrc.ros.library import MessageTypes
 from eventsrc.transport.config import parse_address
 from eventsrc.transport.session import Router, check_keys, open_session
 from projections.corrections import check_settings
 
+from .bridged import (
+    NOTHING,
+    TF_POSE,
+    BaseFrameOption,
+    BridgeChoice,
+    CameraOption,
+    CovarianceOption,
+    DetectionsOption,
+    EmbeddingsOption,
+    GridOption,
+    MapFrameOption,
+    NamespaceOption,
+    PoseOption,
+    Ros2ddsOption,
+    RunOption,
+    TopicOption,
+    check_unused,
+    open_bridge,
+    recording_of,
+    say_topics,
+    warn_of_silence,
+)
 from .options import ConfigOption, ConnectOption, JsonOption, ListenOption, zenoh_options
 from .recorder_text import EVERY_S, RecorderSummary, say_restart, show_status
 from .signals import stop_on_signals
@@ -80,19 +103,42 @@ def record(
             f"{EDIT_PREFIX}/ on this Zenoh network.",
         ),
     ] = False,
+    ros2dds: Ros2ddsOption = False,
+    namespace: NamespaceOption = "",
+    detections: DetectionsOption = None,
+    pose: PoseOption = TF_POSE,
+    covariance: CovarianceOption = None,
+    embeddings: EmbeddingsOption = None,
+    camera: CameraOption = None,
+    grid: GridOption = NOTHING.grid,
+    map_frame: MapFrameOption = NOTHING.map_frame,
+    base_frame: BaseFrameOption = NOTHING.base_frame,
+    run: RunOption = None,
+    topic: TopicOption = None,
     json: JsonOption = False,
 ) -> None:
     """Record what robots publish over Zenoh, until Ctrl-C.
 
-    Exit 3 when anything was rejected, lost or is missing.
+    With --ros2dds also the messages of a zenoh-bridge-ros2dds, and without --key only those.
+
+    Exit 3 when anything was rejected, lost or is missing, or could not be read.
     """
+    choice = BridgeChoice(
+        namespace, detections, pose, covariance, embeddings, camera, grid, map_frame, base_frame,
+        run, topic,
+    )  # fmt: skip
+    if not ros2dds:
+        check_unused(choice)
     policy = parse_fsync(fsync)
     options = dataclasses.replace(
         zenoh_options(connect, listen, zenoh_config),
         max_message_bytes=max(_LARGEST_BYTES, 4 * max_payload),
     )
-    keys = tuple(key or DEFAULT_KEYS)
+    keys = tuple(key or (() if ros2dds else DEFAULT_KEYS))
     check_keys(keys)
+    if ros2dds:
+        MessageTypes()
+        recording_of(choice, 0, None)
     address = None if metrics is None else parse_address(metrics, "--metrics")
     with (
         RecorderSummary(log, json=json) as summary,
@@ -101,20 +147,26 @@ def record(
         LogWriter(log, fsync=policy, sealing_process=True) as writer,
     ):
         say_restart(log, writer)
+        ledger = _gap_history(log)
+        bridge = open_bridge(choice, writer, ledger) if ros2dds else None
         recorder = Recorder(
             session,
             writer,
             keys,
             queue_size=queue,
             max_events=max_events,
-            ledger=_gap_history(log),
+            ledger=ledger,
             report_gaps=gaps,
             max_payload_bytes=max_payload,
             edits=_edits(log, writer) if accept_edits else None,
+            bridge=bridge,
         )
         summary.watch(writer, recorder)
         with _metrics(address, recorder, log), show_status(log) as watch:
-            named = ", ".join(keys)
+            if bridge is not None:
+                say_topics(log, bridge)
+                watch = warn_of_silence(bridge, watch, EVERY_S)
+            named = ", ".join(keys or (bridge.keys if bridge is not None else ()))
             say(f"recording {named} to {log} from offset {writer.next_offset}; Ctrl-C ends it")
             if accept_edits:
                 say(f"taking commands of `mapfold edit` on {edit_key(writer.log_id)}")

@@ -4,7 +4,6 @@ import itertools
 import json
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -38,35 +37,10 @@ from eventsrc.transport.session import Received, Router, Session, ZenohOptions, 
 from tests.envelopes import detection, envelope, payload
 from tests.fixtures_log import flip
 from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK, Program
+from tests.recorders import Running
 
 Sessions = Callable[[], Session]
 KEY = "tb/detections"
-
-
-class Running:
-    """A recorder at work in this process; `finish` stops it and returns its report."""
-
-    def __init__(self, recorder: Recorder) -> None:
-        self._recorder = recorder
-        self._seen = threading.Condition()
-        self._latest = recorder.report()
-        self._stop = threading.Event()
-        self._thread = ThreadPoolExecutor(1)
-        self._done = self._thread.submit(recorder.run, self._stop, every_s=0.01, watch=self._watch)
-
-    def _watch(self, report: RecorderReport) -> None:
-        with self._seen:
-            self._latest = report
-            self._seen.notify_all()
-
-    def wait_until(self, true: Callable[[RecorderReport], bool]) -> None:
-        with self._seen:
-            assert self._seen.wait_for(lambda: true(self._latest), DEADLINE_S), self._latest
-
-    def finish(self) -> RecorderReport:
-        self._stop.set()
-        self._thread.shutdown()
-        return self._done.result()
 
 
 @contextmanager

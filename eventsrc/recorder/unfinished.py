@@ -1,0 +1,77 @@
+"""What a recorder of ROS messages that was killed left out: messages without their envelopes.
+
+A killed recorder may have written a message and not yet what it completes; and detections that
+waited for a pose were not made into an envelope at all. Both follow from the messages in the log
+(`eventsrc.ros.derivation`), so the next recorder makes up for it before it records. It must read
+the last recording's messages once; after a regular end there is nothing to do.
+"""
+
+from collections import deque
+from collections.abc import Iterator
+
+from eventsrc.append import append_payload, map_event
+from eventsrc.envelope import Offset
+from eventsrc.log import Event, LogReader, LogWriter, VerbatimEvent
+from eventsrc.ros.derivation import (
+    CDR,
+    Derived,
+    RosRecording,
+    derive,
+    identity_of,
+    read_recording,
+)
+from eventsrc.ros.library import MessageTypes
+from eventsrc.system_events import MAP_KEY, ROS_KEY
+
+
+def append_missing(reader: LogReader, writer: LogWriter, types: MessageTypes) -> int:
+    """Append what the messages of the log's last recording of ROS make and the log lacks, and end
+    that recording; returns how many events. Raises LogDamaged."""
+    last = None
+    for event in reader.read(keys={ROS_KEY}):
+        last = event
+    if last is None:
+        return 0
+    recording = read_recording(last.payload)
+    if not recording.streams:
+        return 0
+    missing = _missing(reader, Offset(last.offset), types)
+    for derived in missing:
+        if derived.key == MAP_KEY:
+            writer.append_all([map_event(derived.payload, writer.now_ns())])
+        else:
+            append_payload(writer, derived.key, derived.payload)
+    writer.append(ROS_KEY, RosRecording(key=recording.key).encode())
+    writer.sync()
+    return len(missing)
+
+
+def message_of(event: Event) -> tuple[str, str] | None:
+    """Type and definition of an event that is a message of ROS in CDR, with its schema."""
+    if not isinstance(event, VerbatimEvent):
+        return None
+    form = event.format
+    if form.encoding != CDR or not form.schema_text:
+        return None
+    return form.schema, form.schema_text.decode(errors="replace")
+
+
+def _missing(reader: LogReader, start: Offset, types: MessageTypes) -> list[Derived]:
+    made: dict[tuple[str, int] | None, Derived] = {}
+    maps: deque[Derived] = deque()
+
+    def watched() -> Iterator[Event]:
+        """The events; what is found among them is taken out of what was made."""
+        for event in reader.read(start):
+            if event.key == MAP_KEY and maps:
+                maps.popleft()
+            elif event.is_envelope:
+                made.pop(identity_of(event.payload), None)
+            yield event
+
+    for _, derived in derive(watched(), types, message_of):
+        if derived.key == MAP_KEY:
+            maps.append(derived)
+        else:
+            made[identity_of(derived.payload)] = derived
+    return [*maps, *made.values()]

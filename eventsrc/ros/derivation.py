@@ -1,0 +1,201 @@
+"""Envelopes and maps made of the messages of ROS in a log: a pure function of its events.
+
+An event on ``mapfold/ros`` begins a recording: it says which topics are used for what, and which
+run their keyframes are of. Each verbatim message behind it is given to the `Derivation`, with the
+time when it was logged, and completes none, one or several envelopes. Another event on
+``mapfold/ros`` ends it: what still waited is then made without what it lacks.
+
+The recorder does this while it records, and appends each envelope right behind the message that
+completed it. So a log holds them, and nobody who reads one needs the types of ROS, or gets other
+numbers on another machine. `derive` makes them again of the events of a log: the next recorder
+after one that was killed, and the tests.
+"""
+
+import json
+from collections.abc import Iterable, Iterator
+from typing import Annotated, Any, Final, NamedTuple, Protocol
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from eventsrc.cdr_grids import GRID_SCHEMA
+from eventsrc.envelope import RunId
+from eventsrc.errors import LogDamaged
+from eventsrc.grid_messages import read_grid_message
+from eventsrc.occupancy_map import InvalidMap
+from eventsrc.system_events import MAP_KEY, ROS_KEY
+
+from .assembler import Assembled, Assembler, RosMessage
+from .library import MessageTypes, Undecodable
+from .messages import BadMessage
+from .stream import Stream
+
+CDR: Final = "cdr"
+ROS2MSG: Final = "ros2msg"
+_MOST_TOPICS: Final = 1_000
+_STREAMS: Final = TypeAdapter(tuple[Stream, ...])
+
+
+class RosRecording(BaseModel):
+    """The content of a ``mapfold/ros`` event: how envelopes are made of the messages behind it.
+
+    ``key`` is that of the envelopes. ``streams`` are the topics of detections, each with its run
+    and what goes with it; ``grids`` the topics of occupancy grids. Without any stream it ends the
+    recording before it.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    key: str
+    streams: Annotated[tuple[Stream, ...], Field(max_length=_MOST_TOPICS)] = ()
+    grids: Annotated[tuple[str, ...], Field(max_length=_MOST_TOPICS)] = ()
+
+    def encode(self) -> bytes:
+        """The event's JSON."""
+        streams = _STREAMS.dump_python(self.streams, mode="json")
+        document = {"key": self.key, "streams": streams, "grids": self.grids}
+        return json.dumps(document, ensure_ascii=False, separators=(",", ":")).encode()
+
+
+def read_recording(payload: bytes) -> RosRecording:
+    """The content of a ``mapfold/ros`` event. Raises ValidationError."""
+    return RosRecording.model_validate_json(payload)
+
+
+class Derived(NamedTuple):
+    """An event made of messages: the JSON of an envelope, or with ``key`` ``mapfold/map`` of a map.
+    ``stamp_ns`` is that of its picture; None for a map."""
+
+    key: str
+    stamp_ns: int | None
+    payload: bytes
+
+
+class Derivation:
+    """Makes the envelopes and maps of one recording, of its messages in the order of the log."""
+
+    def __init__(self, recording: RosRecording, types: MessageTypes) -> None:
+        self._key = recording.key
+        self._grids = frozenset(recording.grids)
+        self._assembler: Assembler[Derived] = Assembler(recording.streams)
+        self._types = types
+        self._defined: dict[str, str] = {}
+        self.refused: dict[str, int] = {}
+        """Messages that cannot be read, by topic."""
+        self.reasons: dict[str, str] = {}
+        """Why the first of each topic cannot."""
+
+    @property
+    def topics(self) -> frozenset[str]:
+        """The topics whose messages are used."""
+        return self._assembler.topics | self._grids
+
+    def add(
+        self, topic: str, type_name: str, definition: str, logged_ns: int, payload: bytes
+    ) -> list[Derived]:
+        """Take a message; returns what it completes. One that cannot be read completes nothing and
+        is counted."""
+        try:
+            if topic in self._grids and type_name == GRID_SCHEMA:
+                return self._finished(self._map(topic, logged_ns, payload))
+            if topic not in self._assembler.topics:
+                return []
+            self._define(type_name, definition)
+            content = self._types.decode(payload, type_name)
+            return self._finished(
+                self._assembler.add(RosMessage(topic, type_name, logged_ns, content))
+            )
+        except (Undecodable, BadMessage, InvalidMap) as error:
+            self.refused[topic] = self.refused.get(topic, 0) + 1
+            self.reasons.setdefault(topic, str(error))
+            return []
+
+    def finish(self) -> list[Derived]:
+        """What still waits: the recording ends here."""
+        return self._finished(self._assembler.finish())
+
+    def _map(self, topic: str, logged_ns: int, payload: bytes) -> list[Assembled | Derived]:
+        encoded = read_grid_message(payload, topic).encode()
+        return self._assembler.put(Derived(MAP_KEY, None, encoded), logged_ns)
+
+    def _define(self, type_name: str, definition: str) -> None:
+        """Use the definition that came with the messages."""
+        if definition and self._defined.get(type_name) != definition:
+            known = self._types.knows(type_name) and self._types.definition(type_name)
+            if known != definition:
+                self._types.define(type_name, definition)
+            self._defined[type_name] = definition
+
+    def _finished(self, ready: Iterable[Assembled | Derived]) -> list[Derived]:
+        return [
+            each if isinstance(each, Derived) else Derived(self._key, each.stamp_ns, each.payload)
+            for each in ready
+        ]
+
+
+class LoggedEvent(Protocol):
+    """What is needed of an event of a log."""
+
+    @property
+    def offset(self) -> int: ...
+    @property
+    def key(self) -> str: ...
+    @property
+    def logged_ns(self) -> int: ...
+    @property
+    def payload(self) -> bytes: ...
+
+
+class MessageOf(Protocol):
+    """Type and definition of an event that is a message of ROS in CDR; None for others."""
+
+    def __call__(self, event: Any, /) -> tuple[str, str] | None: ...
+
+
+class DerivedFrom(NamedTuple):
+    """``derived`` was completed by the message at ``offset``; None where its recording ended."""
+
+    offset: int | None
+    derived: Derived
+
+
+def derive(
+    events: Iterable[LoggedEvent], types: MessageTypes, message_of: MessageOf
+) -> Iterator[DerivedFrom]:
+    """Everything that the messages among ``events`` make, in their order. Raises LogDamaged for an
+    event on ``mapfold/ros`` that cannot be read."""
+    derivation: Derivation | None = None
+    for event in events:
+        if event.key == ROS_KEY:
+            if derivation is not None:
+                yield from (DerivedFrom(None, each) for each in derivation.finish())
+            recording = _recording_of(event)
+            derivation = Derivation(recording, types) if recording.streams else None
+        elif derivation is not None and (found := message_of(event)) is not None:
+            made = derivation.add(event.key, *found, event.logged_ns, event.payload)
+            yield from (DerivedFrom(event.offset, each) for each in made)
+    if derivation is not None:
+        yield from (DerivedFrom(None, each) for each in derivation.finish())
+
+
+def _recording_of(event: LoggedEvent) -> RosRecording:
+    try:
+        return read_recording(event.payload)
+    except ValidationError as error:
+        reason = error.errors()[0]["msg"]
+        raise LogDamaged(
+            f"the event on {ROS_KEY} at offset {event.offset} cannot be read: {reason}"
+        ) from None
+
+
+class _Identity(BaseModel):
+    run_id: RunId
+    keyframe_id: int
+
+
+def identity_of(payload: bytes) -> tuple[str, int] | None:
+    """Run and keyframe of an envelope's JSON; None if it has none."""
+    try:
+        found = _Identity.model_validate_json(payload)
+    except ValidationError:
+        return None
+    return found.run_id, found.keyframe_id

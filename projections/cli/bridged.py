@@ -1,0 +1,220 @@
+"""`mapfold record --ros2dds`: the options of a bridge from ROS, and what is said at the start."""
+
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Final, NamedTuple
+
+import typer
+
+from eventsrc.envelope import RunId
+from eventsrc.errors import LogDamaged, MisuseError
+from eventsrc.gaps import GapLedger
+from eventsrc.log import LogReader, LogWriter
+from eventsrc.recorder import DEFAULT_KEYS, RecorderReport
+from eventsrc.recorder.bridged import Bridge
+from eventsrc.recorder.unfinished import append_missing
+from eventsrc.ros.bridge_keys import topic_of
+from eventsrc.ros.derivation import RosRecording
+from eventsrc.ros.library import MessageTypes
+from eventsrc.ros.stream import Stream
+from eventsrc.text import counted, visible
+
+from .terminal import say
+
+TF_POSE: Final = "tf"
+NONE: Final = "none"
+_DETECTIONS: Final = "/detections"
+_GRID: Final = "/map"
+_QUIET_S: Final = 5.0
+_PANEL: Final = "Messages of ROS 2, with --ros2dds"
+
+
+def _option(name: str, metavar: str, help_: str) -> typer.models.OptionInfo:
+    option: typer.models.OptionInfo = typer.Option(
+        name, metavar=metavar, help=help_, rich_help_panel=_PANEL
+    )
+    return option
+
+
+Ros2ddsOption = Annotated[
+    bool,
+    typer.Option(
+        "--ros2dds",
+        help="Record what a zenoh-bridge-ros2dds sends, and make keyframes of it; needs "
+        "mapfold[ros].",
+        rich_help_panel=_PANEL,
+    ),
+]
+NamespaceOption = Annotated[
+    str, _option("--namespace", "NS", "The namespace in the bridge's configuration, as /bot1.")
+]
+DetectionsOption = Annotated[
+    list[str] | None,
+    _option(
+        "--detections",
+        "TOPIC",
+        f"Of vision_msgs/Detection2DArray; may be repeated. [default: {_DETECTIONS}]",
+    ),
+]
+PoseOption = Annotated[
+    str,
+    _option("--pose", "TOPIC", "Odometry or PoseWithCovarianceStamped; tf for transforms."),
+]
+CovarianceOption = Annotated[
+    str | None,
+    _option("--covariance", "TOPIC", "Whose errors go with poses of transforms, as /amcl_pose."),
+]
+EmbeddingsOption = Annotated[
+    str | None, _option("--embeddings", "TOPIC", "Embeddings of the detections; docs/ros.md.")
+]
+CameraOption = Annotated[str | None, _option("--camera", "TOPIC", "Of CameraInfo.")]
+GridOption = Annotated[
+    str, _option("--grid", "TOPIC", "Of OccupancyGrid, which becomes the map; none for no map.")
+]
+MapFrameOption = Annotated[str, _option("--map-frame", "FRAME", "The frame of poses by tf.")]
+BaseFrameOption = Annotated[str, _option("--base-frame", "FRAME", "The robot's frame.")]
+RunOption = Annotated[
+    str | None,
+    _option("--run", "ID", "The run of the keyframes. [default: namespace and time of the start]"),
+]
+TopicOption = Annotated[
+    list[str] | None,
+    _option("--topic", "TOPIC", "Another one to keep, of any type; may be repeated."),
+]
+
+
+class BridgeChoice(NamedTuple):
+    """What the options of `mapfold record` say about ROS."""
+
+    namespace: str
+    detections: list[str] | None
+    pose: str
+    covariance: str | None
+    embeddings: str | None
+    camera: str | None
+    grid: str
+    map_frame: str
+    base_frame: str
+    run: str | None
+    topics: list[str] | None
+
+
+NOTHING: Final = BridgeChoice(
+    "", None, TF_POSE, None, None, None, _GRID, "map", "base_link", None, None
+)
+"""What they say when none is given."""
+
+
+def check_unused(choice: BridgeChoice) -> None:
+    """Raise MisuseError if an option needs --ros2dds, which is not given."""
+    if choice != NOTHING:
+        raise MisuseError(
+            "--namespace, --detections, --pose and the other options for messages of ROS go with "
+            "--ros2dds"
+        )
+
+
+def open_bridge(choice: BridgeChoice, writer: LogWriter, ledger: GapLedger[RunId] | None) -> Bridge:
+    """What records the topics of ``choice``; first makes the envelopes that a recorder which was
+    killed left out. Raises MisuseError for what is no topic, MapfoldError without rosbags."""
+    types = MessageTypes()
+    recording, topics = recording_of(choice, writer.now_ns(), ledger)
+    try:
+        with LogReader(writer.path) as reader:
+            made = append_missing(reader, writer, types)
+    except LogDamaged as error:
+        say(f"what the last recording of ROS lacks is not looked for: {error}")
+    else:
+        if made:
+            say(
+                f"{writer.path}: the last recording of ROS did not finish; made "
+                f"{counted(made, 'event')} that its messages make"
+            )
+    return Bridge(recording, topics, types)
+
+
+def recording_of(
+    choice: BridgeChoice, now_ns: int, ledger: GapLedger[RunId] | None
+) -> tuple[RosRecording, tuple[str, ...]]:
+    """How envelopes are made, and all topics that are kept."""
+
+    def full(topic: str, option: str) -> str:
+        return topic_of(choice.namespace, topic, option)
+
+    def given(topic: str | None, option: str) -> str | None:
+        return None if topic in (None, NONE) else full(topic, option)
+
+    detections = list(
+        dict.fromkeys(full(t, "--detections") for t in choice.detections or [_DETECTIONS])
+    )
+    run = choice.run or _run_id(choice.namespace, now_ns)
+    streams = []
+    for topic in detections:
+        run_id = RunId(run if len(detections) == 1 else f"{run}:{topic.strip('/')}")
+        highest = None if ledger is None else ledger.highest(run_id)
+        streams.append(
+            Stream(
+                topic,
+                run_id,
+                full("/tf", "--namespace"),
+                full("/tf_static", "--namespace"),
+                None if choice.pose == TF_POSE else given(choice.pose, "--pose"),
+                given(choice.covariance, "--covariance"),
+                given(choice.embeddings, "--embeddings"),
+                given(choice.camera, "--camera"),
+                choice.map_frame,
+                choice.base_frame,
+                first_keyframe=0 if highest is None else highest + 1,
+            )
+        )
+    grid = given(choice.grid, "--grid")
+    recording = RosRecording(
+        key=DEFAULT_KEYS[0], streams=tuple(streams), grids=() if grid is None else (grid,)
+    )
+    others = (full(topic, "--topic") for topic in choice.topics or ())
+    return recording, tuple(dict.fromkeys([*used_topics(recording), *others]))
+
+
+def used_topics(recording: RosRecording) -> list[str]:
+    """The topics that envelopes and maps are made of."""
+    found: dict[str, None] = {}
+    for stream in recording.streams:
+        pose = [stream.pose, stream.covariance, stream.tf, stream.tf_static]
+        for topic in (stream.detections, *pose, stream.embeddings, stream.camera):
+            if topic is not None:
+                found[topic] = None
+    return [*found, *recording.grids]
+
+
+def _run_id(namespace: str, now_ns: int) -> str:
+    began = datetime.fromtimestamp(now_ns // 1_000_000_000, UTC)
+    return f"{namespace.strip('/').replace('/', '-') or 'ros'}-{began:%Y%m%dT%H%M%S}"
+
+
+def say_topics(log: Path, bridge: Bridge) -> None:
+    """Say what is recorded, and of which runs the keyframes are."""
+    runs = ", ".join(visible(stream.run_id) for stream in bridge.recording.streams)
+    keys = ", ".join(bridge.keys)
+    say(f"recording of a zenoh-bridge-ros2dds to {log}: {keys}; keyframes of {runs}")
+
+
+def warn_of_silence(
+    bridge: Bridge, watch: Callable[[RecorderReport], None], every_s: float
+) -> Callable[[RecorderReport], None]:
+    """``watch``, and once a line if no bridge has told of any topic some seconds after the
+    start."""
+    calls = 0
+
+    def watching(report: RecorderReport) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == round(_QUIET_S / every_s) and not (bridge.told or report.messages):
+            say(
+                f"no bridge has announced any of {', '.join(bridge.topics)} yet: check that "
+                "zenoh-bridge-ros2dds runs, is connected to the same router, and has the namespace "
+                "that --namespace says"
+            )
+        watch(report)
+
+    return watching
