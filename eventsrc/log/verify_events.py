@@ -31,11 +31,13 @@ from eventsrc.envelope import KeyframeId, Offset, RunId, has_keyframe_id
 from eventsrc.gaps import Gap, GapLedger, gap_of
 from eventsrc.ingest import Accepted
 from eventsrc.occupancy_map import InvalidMap, decode_map
+from eventsrc.ros.derivation import read_recording
 from eventsrc.system_events import (
     COMMAND_KEY,
     LOSS_KEY,
     MAP_KEY,
     REJECTED_KEY,
+    ROS_KEY,
     Loss,
     RejectedPayload,
 )
@@ -208,6 +210,8 @@ class EventFindings:
             self._check_command(event)
         elif event.key == MAP_KEY:
             self._check_map(event)
+        elif event.key == ROS_KEY:
+            self._check_recording(event)
         elif event.is_envelope:
             self._check_envelope(event)
 
@@ -233,6 +237,13 @@ class EventFindings:
             decode_map(event.payload)
         except InvalidMap as error:
             what = f"{event.key} event cannot be read: {error}"
+            self._add("schema", what, event.offset, what)
+
+    def _check_recording(self, event: Event) -> None:
+        try:
+            read_recording(event.payload)
+        except ValidationError as error:
+            what = f"{event.key} event cannot be read: {error.errors()[0]['msg']}"
             self._add("schema", what, event.offset, what)
 
     def _check_loss(self, event: Event) -> None:

@@ -17,6 +17,7 @@ import zenoh
 from eventsrc.envelope import FIRST_OFFSET
 from eventsrc.errors import MisuseError
 from eventsrc.gap_history import ledger_of
+from eventsrc.importers import import_files
 from eventsrc.log import (
     Event,
     LogReader,
@@ -375,6 +376,7 @@ def test_every_message_of_a_flood_is_recorded_or_counted(
     assert sum(each["count"] for each in lost) == report.queue_full
 
 
+@pytest.mark.seconds
 def test_a_killed_recording_is_completed_by_the_next(tmp_path: Path) -> None:
     """The log ends at any event, as after a kill: what the messages before it make is added."""
     ros_recording, _ = recording_of(choice(), 0, None)
@@ -494,6 +496,7 @@ def test_what_is_no_topic_is_refused(topic: str) -> None:
         topic_of("/**", "/tf", "--detections")
 
 
+@pytest.mark.seconds
 def test_the_command_records_says_so_and_ends_clean(
     tmp_path: Path, endpoint: str, start_code: Callable[..., Program]
 ) -> None:
@@ -527,6 +530,39 @@ def test_options_for_ros_need_ros2dds(tmp_path: Path) -> None:
     said = run("record", "L", "--ros2dds", "--topic", "/a b", code=2)
     assert "is no topic of ROS 2" in said.err
     assert not (tmp_path / "L").exists()
+
+
+def test_messages_that_find_the_queue_full_are_counted_by_key() -> None:
+    queue = MessageQueue(2, max_wait_s=0.0)
+    for number in range(5):
+        queue.put(BridgedMessage("bot1/tf", b"%d" % number))
+    assert [m.payload for m in queue.get(9, 0.0)] == [b"0", b"1"]
+    assert queue.drain_overflow() == {"bot1/tf": 3}
+
+
+def test_an_import_of_the_log_takes_all_over(
+    log_path: Path, tmp_path: Path, endpoint: str, connected: Sessions
+) -> None:
+    with (
+        ros2dds.bridge(endpoint) as bridge,
+        recording(connected(), log_path, new_bridge()) as running,
+    ):
+        announce_all(bridge)
+        send_all(bridge, drive(5))
+        running.wait_until(lambda r: r.messages >= 22)
+    with LogWriter(tmp_path / "copy") as writer:
+        report = import_files(writer, [str(log_path)])
+    assert (report.accepted, report.verbatim, report.rejected) == (5, 22, 0)
+    copied, events = read_log(tmp_path / "copy"), read_log(log_path)
+    assert [(type(e), e.key, e.payload) for e in copied] == [
+        (type(e), e.key, e.payload) for e in events
+    ]
+    check_derived(tmp_path / "copy")
+    with LogWriter(tmp_path / "copy") as writer:
+        writer.append(ROS_KEY, b'{"key": 3}')
+    (finding,) = verify_log(tmp_path / "copy").findings
+    assert finding.kind == "schema"
+    assert "mapfold/ros event cannot be read" in finding.message
 
 
 def test_a_recording_event_is_read_back() -> None:
