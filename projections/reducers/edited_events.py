@@ -81,6 +81,8 @@ def _with_pose(corrections: Corrections, offset: Offset, accepted: Accepted) -> 
             f"mapfold edit LOG undo {shlex.quote(command_id)} --reason …",
         )
     update: dict[str, object] = {"map_x": x, "map_y": y, "map_yaw": yaw}
+    if envelope.pose_covariance is not None:
+        update["pose_covariance"] = _turned_covariance(envelope, yaw)
     if any(detection.position is not None for detection in envelope.detections):
         update["detections"] = _with_positions(envelope, pose)
     moved = envelope.model_copy(update=update)
@@ -102,6 +104,23 @@ def _with_positions(envelope: Envelope, pose: tuple[float, float, float]) -> tup
             detection = detection.model_copy(update={"position": position})
         moved.append(detection)
     return tuple(moved)
+
+
+def _turned_covariance(envelope: Envelope, yaw: float) -> tuple[float, ...] | None:
+    """The covariance of the pose, turned as the pose is; None if there was no pose."""
+    nine = envelope.pose_covariance
+    if nine is None or envelope.map_yaw is None:
+        return None
+    cos, sin = cos_sin(small_angle(yaw) - small_angle(envelope.map_yaw))
+    xx, xy, xw, _, yy, yw, _, _, ww = nine
+    across = 2.0 * cos * sin * xy
+    xx, yy = (
+        max(cos * cos * xx - across + sin * sin * yy, 0.0),
+        max(sin * sin * xx + across + cos * cos * yy, 0.0),
+    )
+    xy = cos * sin * (nine[0] - nine[4]) + (cos * cos - sin * sin) * xy
+    xw, yw = cos * xw - sin * yw, sin * xw + cos * yw
+    return xx, xy, xw, xy, yy, yw, xw, yw, ww
 
 
 def is_in_bounds(pose: tuple[float, float, float]) -> bool:

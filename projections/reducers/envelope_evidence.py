@@ -14,7 +14,7 @@ from projections.exact import metres_to_um
 from projections.settings import Camera
 
 from .objects import FusibleObservation
-from .sights import Sighting
+from .sights import PoseError, Sighting
 
 _DEPTH_SIGMA_SHARE = 0.05
 _LEAST_DEPTH_SIGMA_M = 0.05
@@ -44,6 +44,12 @@ def pose_of(envelope: Envelope) -> Pose | None:
     if x is None or y is None or yaw is None:
         return None
     return Pose(metres_to_um(x), metres_to_um(y), yaw)
+
+
+def pose_error_of(envelope: Envelope) -> PoseError | None:
+    """The error of the pose that an envelope states."""
+    nine = envelope.pose_covariance
+    return None if nine is None else PoseError(nine[0], 0.5 * (nine[1] + nine[3]), nine[4], nine[8])
 
 
 def small_angle(angle: float) -> float:

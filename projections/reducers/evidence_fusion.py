@@ -20,7 +20,7 @@ from projections.settings import Camera
 from .evidence_objects import EvidenceObjects, ObjectDelta
 from .presence import Presence
 from .relocations import Relocations
-from .sights import Sighting
+from .sights import PoseError, Sighting
 
 FusionDelta: TypeAlias = ObjectDelta | ObjectMissing
 
@@ -43,9 +43,10 @@ class EvidenceFusion:
         pose: Pose,
         camera: Camera,
         sightings: Sequence[Sighting],
+        error: PoseError | None = None,
     ) -> list[FusionDelta]:
         """Fuse the observations of one picture; look for what it does not show."""
-        fused = self._objects.fold(offset, run, timestamp, pose, camera, sightings)
+        fused = self._objects.fold(offset, run, timestamp, pose, camera, sightings, error)
         missing = self._presence.fold(offset, run, pose, camera, fused)
         moved = self._relocations.fold(fused)
         if not moved:

@@ -54,7 +54,7 @@ from .label_counts import LabelCounts
 from .looks import LookRatios, LookScale, looks_of
 from .objects import object_id
 from .relocations import Moved
-from .sights import Sighting, Sights
+from .sights import PoseError, Sighting, Sights
 from .spots import Spots
 from .thing_index import ThingIndex
 from .things import Thing
@@ -99,13 +99,14 @@ class EvidenceObjects:
         pose: Pose,
         camera: Camera,
         sightings: Sequence[Sighting],
+        error: PoseError | None = None,
     ) -> list[ObjectDelta]:
-        """Fuse the observations of one picture."""
+        """Fuse the observations of one picture; ``error`` is that of its pose, if it is known."""
         if not sightings:
             return []
         labels = [sighting.class_name for sighting in sightings]
         looks, inverses = looks_of([sighting.vector for sighting in sightings])
-        sights = self._sights.of(pose, camera, sightings)
+        sights = self._sights.of(pose, camera, sightings, error)
         self._scale.learn(labels, looks)
         self._slopes.learn(sights)
         self._labels.learn(labels)

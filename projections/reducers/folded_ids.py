@@ -52,6 +52,8 @@ def content_digest(accepted: Accepted) -> bytes:
         )
     if has_floor(envelope):
         content += (envelope.floor, envelope.map_z)
+    if envelope.pose_covariance is not None:
+        content += (("pose_covariance", *envelope.pose_covariance),)
     # Format version 2 has no references, so equal values give equal bytes.
     return hashlib.blake2b(marshal.dumps(content, 2), digest_size=_DIGEST_BYTES).digest()
 

@@ -57,6 +57,7 @@ from .edited_events import edit_event, edits_events
 from .embedding_space import Space
 from .envelope_evidence import (
     camera_of,
+    pose_error_of,
     pose_of,
     sightings_of,
     with_small_yaw,
@@ -194,7 +195,8 @@ class SemanticMap:
                 camera = camera_of(envelope, self.settings.camera)
                 sights = self.floors.sightings(sightings_of(accepted, fusible), ground)
                 facing = with_small_yaw(pose)
-                fused = objects.fold(offset, run, timestamp, facing, camera, sights)
+                error = pose_error_of(envelope)
+                fused = objects.fold(offset, run, timestamp, facing, camera, sights, error)
                 self._locate(fused, keyframe, place)
                 deltas += fused
             else:

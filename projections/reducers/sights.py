@@ -5,6 +5,9 @@ f = width / 2 / tan(hfov / 2); a box that the picture's border cuts at a side ha
 error. The error of the mapped pose is in it too, so at the distance a the variance across the ray
 is (bearing error · a)² + (pose error)².
 
+An envelope may state its own pose's covariance. Then the variance across the ray is that of the
+position in the direction across it, and the bearing error is at least that of the heading.
+
 The box's height and its centre's height above the horizon, where the border cuts it neither at top
 nor at bottom, tell about the distance once they are compared (`spots`). A measured depth or
 position of the detection tells it directly.
@@ -28,6 +31,8 @@ _CUT_PX = 2.0
 _HALF_DEGREE = 0.008726646259971648
 _LEAST_M = 0.05
 _LEAST_ERROR_M = 0.001
+_MOST_BEARING_RAD2 = 10.0
+"""A heading of which nothing is known."""
 _FAR_PX = 1e6
 _LEAST_PX = 0.5
 _STEEPEST = 10.0
@@ -53,6 +58,20 @@ class Sighting(NamedTuple):
     bbox: tuple[float, float, float, float]
     depth: tuple[float, float] | None = None
     position: tuple[float, float, float] | None = None
+
+
+class PoseError(NamedTuple):
+    """Variances and covariance of a pose's x and y, m², and variance of its heading, rad²."""
+
+    xx: float
+    xy: float
+    yy: float
+    yaw: float
+
+    def along(self, cos: float, sin: float) -> float:
+        """The variance of the position in the direction of a unit vector."""
+        x, y = self.xx * cos + self.xy * sin, self.xy * cos + self.yy * sin
+        return max(x * cos + y * sin, _LEAST_ERROR_M * _LEAST_ERROR_M)
 
 
 class Sight(NamedTuple):
@@ -84,13 +103,19 @@ class Sights:
         self._cut_rad2 = constants.bearing_cut_rad * constants.bearing_cut_rad
         self._by_heading = constants.side_by == "heading"
 
-    def of(self, pose: Pose, camera: Camera, sightings: Sequence[Sighting]) -> list[Sight]:
-        """The sight of each detection."""
+    def of(
+        self,
+        pose: Pose,
+        camera: Camera,
+        sightings: Sequence[Sighting],
+        error: PoseError | None = None,
+    ) -> list[Sight]:
+        """The sight of each detection; ``error`` is that of the pose, if it is known."""
         x, y = pose.x_um / 1e6, pose.y_um / 1e6
         cos, sin = cos_sin(pose.yaw_rad + camera.yaw_rad)
         half_cos, half_sin = half_field(camera.hfov_deg)
         focal = camera.width_px * 0.5 * half_cos / half_sin
-        return [self._one(x, y, cos, sin, focal, camera, sighting) for sighting in sightings]
+        return [self._one(x, y, cos, sin, focal, camera, each, error) for each in sightings]
 
     def _one(
         self,
@@ -101,8 +126,8 @@ class Sights:
         focal: float,
         camera: Camera,
         sighting: Sighting,
+        pose_error: PoseError | None,
     ) -> Sight:
-        pose_m2 = self._pose_m2
         position = sighting.position
         there = None if position is None else _position_in_range(position, x, y)
         if there is not None:
@@ -128,10 +153,17 @@ class Sights:
         slant = math.sqrt(focal * focal + aside * aside)
         ahead, aside = focal / slant, aside / slant
         is_cut = left <= _CUT_PX or right >= camera.width_px - _CUT_PX
+        to_cos, to_sin = cos * ahead - sin * aside, sin * ahead + cos * aside
+        bearing_rad2 = self._cut_rad2 if is_cut else self._bearing_rad2
+        across_m2 = along_m2 = self._pose_m2
+        if pose_error is not None:
+            across_m2 = pose_error.along(-to_sin, to_cos)
+            along_m2 = pose_error.along(to_cos, to_sin)
+            bearing_rad2 = max(bearing_rad2, min(pose_error.yaw, _MOST_BEARING_RAD2))
         log_height, slope, known = None, 0.0, None
         if sighting.depth is not None:
             depth, error = sighting.depth
-            known = max(depth, _LEAST_M), error * error + pose_m2
+            known = max(depth, _LEAST_M), error * error + along_m2
         height = bottom - top
         if height > _LEAST_PX and top > _CUT_PX and bottom < camera.height_px - _CUT_PX:
             slope = (camera.height_px - top - bottom) * 0.5 * ahead / focal
@@ -139,14 +171,13 @@ class Sights:
                 log_height = log(height * ahead / focal)
             else:
                 slope = 0.0
-        to_cos, to_sin = cos * ahead - sin * aside, sin * ahead + cos * aside
         return Sight(
             x,
             y,
             to_cos,
             to_sin,
-            self._cut_rad2 if is_cut else self._bearing_rad2,
-            pose_m2,
+            bearing_rad2,
+            across_m2,
             log_height,
             slope,
             cos if self._by_heading else to_cos,
