@@ -59,10 +59,9 @@ class CdrFields:
             raise CdrFault(f"{rest:,} bytes follow its last field")
         return self._body[self._at : self._at + length]
 
-    @property
-    def left(self) -> int:
-        """How many bytes have not been read."""
-        return len(self._body) - self._at
+    def left(self, size: int) -> int:
+        """How many bytes follow, when the next field's numbers have ``size`` bytes each."""
+        return len(self._body) - -(-self._at // size) * size
 
     def _need(self, end: int, field: str) -> None:
         if end > len(self._body):

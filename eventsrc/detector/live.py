@@ -42,6 +42,12 @@ class NewestQueue:
             self._waiting.append((message, received_s))
             self._filled.notify()
 
+    def close(self) -> None:
+        """Drop what waits."""
+        with self._filled:
+            self.dropped += len(self._waiting)
+            self._waiting.clear()
+
     def get(self, timeout_s: float) -> tuple[Received, float] | None:
         """The oldest that waits; None if none came in time."""
         with self._filled:
@@ -87,6 +93,7 @@ class LivePictures:
                 yield picture_of(message.payload, name, received_s)
             except MessageError as error:
                 yield Picture(name, received_s, _Failing(str(error)))
+        self.queue.close()
 
     def _now_s(self) -> float:
         return self._clock() / 1e9

@@ -98,9 +98,9 @@ def pose_of(payload: bytes, received_s: float) -> tuple[float, Pose]:
 
 def _pose_of_cdr(fields: CdrFields, received_s: float) -> tuple[float, Pose]:
     stamp_s = _stamp(fields, received_s)
-    if not _is_length(fields.left, _POSE_BYTES, _POSE_BYTES + _COVARIANCE_BYTES):
+    if not _is_length(fields.left(8), _POSE_BYTES, _POSE_BYTES + _COVARIANCE_BYTES):
         fields.text("child_frame_id")
-        if not _is_length(fields.left, _POSE_BYTES + _COVARIANCE_BYTES + _TWIST_BYTES):
+        if not _is_length(fields.left(8), _POSE_BYTES + _COVARIANCE_BYTES + _TWIST_BYTES):
             raise MessageError(
                 "a message in CDR of another length than geometry_msgs/PoseStamped, "
                 "PoseWithCovarianceStamped and nav_msgs/Odometry have"
@@ -110,9 +110,8 @@ def _pose_of_cdr(fields: CdrFields, received_s: float) -> tuple[float, Pose]:
 
 
 def _is_length(left: int, *lengths: int) -> bool:
-    """Whether so many bytes are the numbers of a message, with those that align the first before
-    and those that pad the last behind them."""
-    return any(length <= left <= length + 7 + _MOST_PADDING for length in lengths)
+    """Whether so many bytes are the numbers of a message, with what pads the last."""
+    return any(length <= left <= length + _MOST_PADDING for length in lengths)
 
 
 def _stamp(fields: CdrFields, received_s: float) -> float:

@@ -30,6 +30,9 @@ _PADDING: Final = 114
 
 @functools.cache
 def _cv2() -> ModuleType:
+    # Read when it is imported: what it prints about files, as FFmpeg in it does, is said by us.
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     try:
         import cv2
     except ImportError:
@@ -234,8 +237,7 @@ class Video:
 
     def __init__(self, path: Path) -> None:
         cv2 = _cv2()
-        cv2.setLogLevel(0)  # what it prints about a file that is no video is said by us
-        self._capture: Any = cv2.VideoCapture(str(path))
+        self._capture: Any = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
         if not self._capture.isOpened():
             raise PictureError("it cannot be opened as a video")
         rate = float(self._capture.get(cv2.CAP_PROP_FPS))

@@ -21,10 +21,10 @@ mapfold detect needs two ONNX models, which mapfold does not ship: --detector fi
 pictures, --encoder turns each crop into an embedding. To have both in a few minutes:
 
   1. a detector, ready to use (YOLOX-S, Apache-2.0, 36 MB; it does not name its classes):
-       curl -LO https://github.com/Megvii-BaseDetection/YOLOX/releases/download/0.1.1rc0/yolox_s.onnx
+     curl -LO https://github.com/Megvii-BaseDetection/YOLOX/releases/download/0.1.1rc0/yolox_s.onnx
      then: --detector yolox_s.onnx --head yolox --labels coco
      An export of Ultralytics' YOLOv8 or v11 works without --head and --labels:
-       pip install ultralytics; yolo export model=yolo11n.pt format=onnx
+     pip install ultralytics; yolo export model=yolo11n.pt format=onnx
      Ultralytics and its weights are AGPL-3.0; what that asks of you: docs/detector.md.
 
   2. an encoder: the image tower of CLIP or SigLIP, exported once with PyTorch (docs/detector.md has

@@ -1,0 +1,300 @@
+"""`mapfold detect` on drawn pictures, as a user runs it: to a file, over Zenoh, on bad input."""
+
+import json
+import queue
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+import pytest
+
+from eventsrc.detector.vision import decode, encode_jpeg
+from eventsrc.ingest import Accepted, ingest
+from eventsrc.log import LogReader
+from eventsrc.sim import build_house
+from eventsrc.sim.pictures import camera_pictures, write_pictures
+from eventsrc.transport.session import Received, Session
+from projections.model.digest import map_digest
+from projections.model.fold import fold_log
+from projections.settings import Settings
+from tests.camera_truth import truth_of
+from tests.commands import Commands
+from tests.fixtures_zenoh import DEADLINE_S, Program
+from tests.tiny_models import MODEL_NAME, fixed_answer, models_for
+
+DRIVEN_S = 24.0
+
+
+class Stage:
+    """A folder of drawn pictures, the models that know their colours, and commands."""
+
+    def __init__(self, folder: Path) -> None:
+        import threading
+
+        self.folder = folder
+        self.pictures = folder / "camera"
+        self.count = write_pictures(
+            camera_pictures(until_s=DRIVEN_S), self.pictures, threading.Event()
+        )
+        self.detector, self.encoder = models_for(build_house(7), folder)
+        self.models = ("--detector", str(self.detector), "--encoder", str(self.encoder))
+        self.posed = ("--images", str(self.pictures), "--poses", str(self.pictures / "poses.csv"))
+        self.run = Commands.in_folder(folder)
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
+    return Stage(tmp_path_factory.mktemp("detect"))
+
+
+@pytest.fixture(scope="module")
+def made(stage: Stage) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """The numbers and envelopes of one detection into a file."""
+    out = stage.folder / "run.jsonl"
+    words = ("--threads", "1", "--hfov", "69.4", "--run-id", "cam", "--out", str(out), "--json")
+    said = stage.run("detect", *stage.posed, *stage.models, *words)
+    return said.json, [json.loads(line) for line in out.read_text().splitlines()]
+
+
+def test_every_picture_is_accounted_for(stage: Stage, made: Any) -> None:
+    numbers, envelopes = made
+    assert numbers["pictures"] == stage.count == numbers["between"] + numbers["keyframes"]
+    assert numbers["keyframes"] == numbers["published"] == len(envelopes) > 30
+    assert numbers["detections"] == sum(len(e["detections"]) for e in envelopes) > 60
+    assert numbers["space"] == MODEL_NAME
+
+
+def test_envelopes_are_valid_and_say_what_was_seen(stage: Stage, made: Any) -> None:
+    _, envelopes = made
+    rows = [r.split(",") for r in (stage.pictures / "poses.csv").read_text().splitlines()[1:]]
+    poses = {float(stamp): [float(value) for value in rest] for stamp, *rest in rows}
+    for number, envelope in enumerate(envelopes, start=1):
+        accepted = ingest(json.dumps(envelope).encode())
+        assert isinstance(accepted, Accepted)
+        assert all(vector is not None for vector in accepted.vectors)
+        assert envelope["keyframe_id"] == number
+        assert envelope["camera"] == {"hfov_deg": 69.4, "width_px": 640, "height_px": 400}
+        at = [envelope["map_x"], envelope["map_y"], envelope["map_yaw"]]
+        assert at == pytest.approx(poses[envelope["timestamp"]])
+    truth = truth_of(envelopes, stage.pictures / "truth.jsonl")
+    instances = [instance for one in truth for instance in one["instances"]]
+    assert sum(i is None for i in instances) <= 0.02 * len(instances)
+    assert len(set(instances)) > 10
+
+
+def _digest(log: Path) -> str:
+    with LogReader(log) as reader:
+        return map_digest(fold_log(reader, Settings())[1])
+
+
+def test_over_zenoh_into_a_map(
+    stage: Stage,
+    made: Any,
+    tmp_path: Path,
+    endpoint: str,
+    connected: Callable[[], Session],
+    start: Callable[..., Program],
+) -> None:
+    """The recorded map is that of the same envelopes from a file; every crop is its detection's."""
+    numbers, envelopes = made
+    crops: queue.Queue[Received] = queue.Queue()
+    session = connected()
+    session.subscribe("tb/crops/*", crops.put)
+    session.confirm()
+    recorder = start("record", str(tmp_path / "log"), "--connect", endpoint)
+    recorder.wait_for("recording tb/detections")
+    words = ("--threads", "1", "--hfov", "69.4", "--run-id", "cam", "--keep-crops")
+    spool = str(tmp_path / "spool.sqlite")
+    detect = start(
+        *("detect", *stage.posed, *stage.models, *words),
+        *("--connect", endpoint, "--spool", spool, "--json"),
+    )
+    assert detect.wait() == 0, detect.lines
+    assert recorder.end(signal.SIGINT) == 0, recorder.lines
+    said = json.loads(detect.output())
+    assert said["published"] == numbers["published"]
+    assert (said["waiting"], said["crops_lost"]) == (0, 0)
+    stage.run("import", tmp_path / "imported", stage.folder / "run.jsonl")
+    assert _digest(tmp_path / "log") == _digest(tmp_path / "imported")
+    detections = {d["det_id"]: d for e in envelopes for d in e["detections"]}
+    assert said["crops"] == len(detections)
+    for _ in range(said["crops"]):
+        crop = crops.get(timeout=DEADLINE_S)
+        x0, y0, x1, y1 = detections.pop(unquote(crop.key.removeprefix("tb/crops/")))["bbox"]
+        height, width = decode(crop.payload).shape[:2]
+        assert abs(width - (x1 - x0)) <= 1.1
+        assert abs(height - (y1 - y0)) <= 1.1
+    assert not detections
+
+
+def test_a_camera_over_zenoh(
+    stage: Stage, tmp_path: Path, endpoint: str, start: Callable[..., Program]
+) -> None:
+    """Each picture sent was looked at or counted as dropped; keyframes have their poses."""
+    out = tmp_path / "live.jsonl"
+    keys = ("--zenoh-image", "robot/image", "--zenoh-pose", "robot/pose")
+    detect = start(
+        *("detect", *keys, *stage.models, "--threads", "1", "--connect", endpoint),
+        *("--queue", "1000", "--out", str(out), "--json"),
+    )
+    detect.wait_for("detecting in robot/image")
+    robot = start(
+        "simulate", *keys, "--fps", "0.2", "--speed", "0", "--connect", endpoint, "--json"
+    )
+    assert robot.wait() == 0, robot.lines
+    sent = json.loads(robot.output())["pictures"]
+    code = detect.end(signal.SIGINT)
+    said = json.loads(detect.output())
+    assert said["pictures"] + said["dropped"] == sent
+    assert code == (3 if said["dropped"] else 0), detect.lines
+    envelopes = [json.loads(line) for line in out.read_text().splitlines()]
+    assert len(envelopes) == said["keyframes"] > 0
+    assert said["without_pose"] == said["bad_poses"] == 0
+    assert all("map_x" in envelope for envelope in envelopes)
+
+
+def test_a_stream_on_stdin(stage: Stage, tmp_path: Path) -> None:
+    pictures = sorted(stage.pictures.glob("*.jpg"))[:3]
+    stream = b"".join(p.read_bytes() for p in pictures)
+    words = ("--images", "-", "--fps", "2", "--start", "2026-05-04T09:00:00Z")
+    out = tmp_path / "run.jsonl"
+    stage.run("detect", *words, *stage.models, "--out", out, stdin=stream)
+    stamps = [json.loads(line)["timestamp"] for line in out.read_text().splitlines()]
+    assert stamps == [1777885200.0, 1777885200.5, 1777885201.0]
+
+
+def test_a_recorder_that_is_away_costs_nothing(
+    stage: Stage, tmp_path: Path, endpoint: str, start: Callable[..., Program]
+) -> None:
+    one = tmp_path / "one"
+    one.mkdir()
+    (one / "5.jpg").write_bytes(next(stage.pictures.glob("*.jpg")).read_bytes())
+    words = ("detect", *stage.models, "--spool", tmp_path / "spool", "--connect", endpoint)
+    said = stage.run(*words, "--images", one, "--wait", "0.2", code=3)
+    assert "1 envelope waiting" in said.err
+    assert "the next start with it sends them" in said.err
+    recorder = start("record", str(tmp_path / "log"), "--connect", endpoint)
+    recorder.wait_for("recording")
+    said = stage.run(*words, "--images", one, "--run-id", "again", code=0)
+    assert recorder.end(signal.SIGINT) == 0
+    with LogReader(tmp_path / "log") as reader:
+        assert reader.next_offset == 2
+
+
+def test_without_models_one_screen_says_what_to_fetch(stage: Stage) -> None:
+    said = stage.run("detect", code=2)
+    lines = said.err.splitlines()
+    assert len(lines) <= 24
+    assert max(map(len, lines)) <= 100
+    assert lines[-1] == "mapfold: no --detector and no --encoder given"
+    for word in ("yolox_s.onnx", "AGPL", "clip.json", "--poses", "docs/detector.md"):
+        assert word in said.err
+
+
+def test_bad_pictures_are_counted_and_said(stage: Stage, tmp_path: Path) -> None:
+    good = next(stage.pictures.glob("*.jpg")).read_bytes()
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    noise = np.random.default_rng(0).integers(0, 255, (90, 90, 3), np.uint8)
+    damaged = bytearray(encode_jpeg(noise))
+    damaged[len(damaged) // 2 : len(damaged) // 2 + 60] = b"\xff\xd0" * 30
+    bad = {
+        "1.jpg": b"",
+        "2.jpg": good[: len(good) // 2],
+        "3.jpg": b"<html>404</html>",
+        "4.jpg": bytes(damaged),
+        "5.png": b"\x89PNG\r\n\x1a\n" + bytes(40),
+    }
+    for name, data in ({"6.jpg": good, "7.jpg": good} | bad).items():
+        (folder / name).write_bytes(data)
+    out = tmp_path / "run.jsonl"
+    said = stage.run("detect", "--images", folder, *stage.models, "--out", out, "--json", code=3)
+    assert (said.json["pictures"], said.json["unreadable"], said.json["keyframes"]) == (7, 5, 2)
+    told = [line for line in said.err.splitlines() if "left out: " in line]
+    assert len(told) == 5
+    for name, line in zip(sorted(bad), told, strict=True):
+        assert f"/{name}: left out: " in line
+    assert "5 unreadable" in said.err.splitlines()[-1]
+
+
+@pytest.mark.seconds
+def test_a_picture_of_8k(stage: Stage, tmp_path: Path) -> None:
+    """33 million pixels are a picture like any other; 100 million are refused."""
+    folder = tmp_path / "large"
+    folder.mkdir()
+    truth = map(json.loads, (stage.pictures / "truth.jsonl").read_text().splitlines())
+    fullest = max(truth, key=lambda picture: len(picture["things"]))
+    drawn = decode((stage.pictures / f"{fullest['stamp']:.3f}.jpg").read_bytes())
+    large = np.repeat(np.repeat(drawn, 12, axis=0), 12, axis=1)[:4320]
+    (folder / "1.jpg").write_bytes(encode_jpeg(large))
+    (folder / "2.jpg").write_bytes(encode_jpeg(np.zeros((10_000, 10_000, 3), np.uint8)))
+    said = stage.run(
+        "detect", "--images", folder, *stage.models, "--out", tmp_path / "o.jsonl", "--json", code=3
+    )
+    assert (said.json["keyframes"], said.json["unreadable"]) == (1, 1)
+    assert "10,000 × 10,000 pixels, more than 64,000,000" in said.err
+    (envelope,) = (json.loads(line) for line in (tmp_path / "o.jsonl").read_text().splitlines())
+    assert max(max(d["bbox"]) for d in envelope["detections"]) > 1000
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (("--images", "none"), "no such folder or video"),
+        (("--images", "empty"), "no .jpg, .jpeg or .png in this folder"),
+        ((), "where are the pictures?"),
+        (("--images", "camera", "--zenoh-image", "k"), "give one of --images and --zenoh-image"),
+        (("--images", "camera", "--head", "resnet"), "choose one of yolov8"),
+        (("--images", "camera", "--device", "tpu"), "choose cpu or cuda"),
+        (("--images", "camera", "--device", "cuda"), "onnxruntime-gpu"),
+        (("--images", "camera", "--labels", "none.txt"), "give a file, or coco"),
+        (("--images", "camera", "--labels", "coco"), "yolov8 of 80 classes is 1 × 84 × N"),
+        (("--images", "camera", "--poses", "none.csv"), "none.csv: No such file"),
+        (("--images", "camera", "--start", "noon"), "neither seconds since 1970 nor an ISO time"),
+        (("--images", "camera", "--fps", "-1"), "a number above 0"),
+        (("--images", "camera", "--run-id", "a\nb"), "printable characters"),
+        (("--images", "camera", "--keep-crops"), "--out nothing"),
+        (("--images", "camera", "--detector", "text.onnx"), "no ONNX model that runs here"),
+        (("--images", "camera", "--detector", "gone.onnx"), "no such model"),
+        (("--images", "camera", "--encoder", "detector.onnx"), "detector.json: No such file"),
+        (("--zenoh-image", "a b//c"), "key expression"),
+    ],
+)
+def test_wrong_options_are_one_line(stage: Stage, words: tuple[str, ...], reason: str) -> None:
+    (stage.folder / "empty").mkdir(exist_ok=True)
+    (stage.folder / "text.onnx").write_text("no model")
+    said = stage.run("detect", *stage.models, "--out", "never.jsonl", *words, code=None)
+    assert said.code in (1, 2)
+    (line,) = said.err.strip().splitlines()
+    assert line.startswith("mapfold: ")
+    assert reason in line
+
+
+def test_an_answer_of_nan_is_said_and_counted(stage: Stage, tmp_path: Path) -> None:
+    answer = np.zeros((1, 5, 6), np.float32)
+    answer[0, :, :4] = np.array([[32, 32, 20, 20, 0.9]]).T
+    answer[0, 2, 1] = answer[0, 4, 2] = np.nan
+    model = fixed_answer(tmp_path / "nan.onnx", answer)
+    (tmp_path / "labels.txt").write_text("thing\n")
+    one = tmp_path / "one"
+    one.mkdir()
+    (one / "5.jpg").write_bytes(next(stage.pictures.glob("*.jpg")).read_bytes())
+    words = ("--detector", model, "--encoder", stage.encoder, "--labels", tmp_path / "labels.txt")
+    said = stage.run(
+        "detect", "--images", one, *words, "--out", tmp_path / "o.jsonl", "--json", code=3
+    )
+    assert (said.json["not_finite"], said.json["detections"]) == (2, 1)
+    assert "5.jpg: the detector answered NaN or infinity for 2 boxes" in said.err
+
+
+def test_ctrl_c_ends_it_with_its_numbers(
+    stage: Stage, tmp_path: Path, endpoint: str, start: Callable[..., Program]
+) -> None:
+    words = ("--zenoh-image", "k", "--out", str(tmp_path / "o.jsonl"), "--connect", endpoint)
+    program = start("detect", *words, *stage.models)
+    program.wait_for("Ctrl-C ends it")
+    assert program.end(signal.SIGINT) == 0
+    assert "0 pictures, 0 keyframes, 0 detections" in program.lines[-1]
