@@ -16,7 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from eventsrc.log import LogReader, LogWriter, verify_log
-from tests.chaos.log_writer import KEY, payload_at
+from tests.chaos.log_writer import event_at
+from tests.verbatim import recorded
 
 ROOT = Path(__file__).parents[2]
 LONGEST_LIFE_S = 0.9
@@ -36,25 +37,28 @@ class Life:
         return max(0, self.acknowledged - self.kept)
 
 
-def lives(log: Path, times: int, fsync: str, rng: random.Random) -> Iterator[Life]:
+def lives(
+    log: Path, times: int, fsync: str, rng: random.Random, *, mixed: bool = False
+) -> Iterator[Life]:
     """Start and kill ``times`` times, and recover after about half of them.
 
     Raises AssertionError when the log holds anything but a prefix of what was written.
     """
     checked = acknowledged = 0
     for _ in range(times):
-        acknowledged = max(acknowledged, _one_life(log, fsync, rng))
+        acknowledged = max(acknowledged, _one_life(log, fsync, rng, mixed))
         if rng.random() < 0.5:
             continue  # the next writer finds what this one left, and may be killed recovering it
         with LogWriter(log) as writer:
             kept = writer.next_offset
-        checked = _check(log, checked, kept)
+        checked = _check(log, checked, kept, mixed)
         yield Life(acknowledged, kept)
 
 
-def _one_life(log: Path, fsync: str, rng: random.Random) -> int:
+def _one_life(log: Path, fsync: str, rng: random.Random, mixed: bool) -> int:
     """The last offset a writer acknowledged before it was killed."""
     command = [sys.executable, "-m", "tests.chaos.log_writer", str(log), fsync]
+    command += ["mixed"] * mixed
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         if rng.random() < 0.7:
@@ -67,14 +71,14 @@ def _one_life(log: Path, fsync: str, rng: random.Random) -> int:
     return max((int(words[-1]) for words in told if len(words) == 1), default=0)
 
 
-def _check(log: Path, start: int, end: int) -> int:
+def _check(log: Path, start: int, end: int, mixed: bool) -> int:
     with LogReader(log) as reader:
         assert reader.next_offset == end
         expected = start
         for event in reader.read(start):
             assert event.offset == expected
-            assert event.key == KEY
-            assert event.payload == payload_at(event.offset), f"offset {event.offset} is not itself"
+            written = recorded(event_at(event.offset, mixed=mixed), event.offset)
+            assert event == written, f"offset {event.offset} is not itself"
             expected += 1
     assert expected == end
     return end

@@ -5,12 +5,25 @@
 """
 
 import random
+import shutil
+import threading
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
-from eventsrc.log import verify_log
+from eventsrc.envelope import FIRST_OFFSET
+from eventsrc.log import Event, LogReader, LogWriter, NewEvent, follow, recover_log, verify_log
+from eventsrc.log.format import list_segments
+from eventsrc.system_events import LOSS_KEY
+from projections.model.digest import map_digest
+from projections.model.fold import fold_event, fold_log
+from projections.model.view import MapView
+from projections.reducers.semantic_map import SemanticMap
+from projections.settings import Settings
 from tests.chaos.log_killer import lives
+from tests.fixtures_log import flip
+from tests.verbatim import mixed_events
 
 SEED = 20260324
 
@@ -26,8 +39,69 @@ def test_thirty_kills(log_path: Path, fsync: str) -> None:
     _kill(log_path, fsync, 30)
 
 
-def _kill(log: Path, fsync: str, times: int) -> None:
-    lived = list(lives(log, times, fsync, random.Random(SEED)))
+@pytest.mark.seconds
+def test_messages_pictures_and_envelopes_survive_kills(log_path: Path, tmp_path: Path) -> None:
+    _check_mixed(log_path, tmp_path / "alone", times=4)
+
+
+@pytest.mark.slow
+def test_messages_pictures_and_envelopes_survive_thirty_kills(
+    log_path: Path, tmp_path: Path
+) -> None:
+    _check_mixed(log_path, tmp_path / "alone", times=30)
+
+
+def _check_mixed(log: Path, alone: Path, times: int) -> None:
+    """Killed mid-write again and again, recovered, verified, replayed and tailed, the log gives the
+    map of its envelopes alone; also after a chunk of it has rotted."""
+    _kill(log, "5ms", times, mixed=True)
+    assert verify_log(log).findings == ()
+    with LogReader(log) as reader:
+        events = list(reader.read())
+    assert events == mixed_events(len(events))
+    assert recover_log(log).findings is False
+    assert _digests(log) == _digests_of_envelopes(events, alone)
+    segment = list_segments(log)[0]
+    with LogReader(log) as reader:
+        chunk = reader.open_segment(segment).chunks[0]
+    flip(segment.path, chunk.position + chunk.length // 2)
+    assert recover_log(log).findings
+    with LogReader(log) as reader:
+        kept = list(reader.read())
+    lost = range(chunk.first, chunk.following)
+    assert {event.offset for event in kept if event.key == LOSS_KEY} == set(lost)
+    assert [e for e in kept if e.key != LOSS_KEY] == [e for e in events if e.offset not in lost]
+    assert _digests(log) == _digests_of_envelopes(kept, alone)
+
+
+def _digests_of_envelopes(events: Sequence[Event], log: Path) -> set[str]:
+    shutil.rmtree(log, ignore_errors=True)
+    with LogWriter(log) as writer:
+        for event in events:
+            if event.is_envelope:
+                times = event.logged_ns, event.stamp_ns
+                writer.append_all([NewEvent(event.key, event.payload, *times)])
+    return _digests(log)
+
+
+def _digests(log: Path) -> set[str]:
+    """Of a replay, and of a tail."""
+    with LogReader(log) as reader:
+        replayed = map_digest(fold_log(reader, Settings())[1])
+        end = reader.next_offset
+    semantic_map, view = SemanticMap(Settings()), MapView(Settings())
+    stop = threading.Event()
+    for event in follow(log, FIRST_OFFSET, stop=stop):
+        if event is None and view.next_offset == end:
+            stop.set()
+        elif event is not None:
+            view.apply_event(event.offset, fold_event(event, semantic_map))
+    assert map_digest(view) == replayed
+    return {replayed}
+
+
+def _kill(log: Path, fsync: str, times: int, *, mixed: bool = False) -> None:
+    lived = list(lives(log, times, fsync, random.Random(SEED), mixed=mixed))
     assert lived
     assert sum(life.acknowledged for life in lived) > 0
     assert [life.lost for life in lived] == [0] * len(lived)
