@@ -22,7 +22,18 @@ from pydantic import (
 )
 from pydantic_core import from_json
 
-from .envelope import INT64, TEXT, DetId, KeyframeId, Offset, Position, RunId, Text, describe_error
+from .envelope import (
+    INT64,
+    MAX_DIMENSION,
+    TEXT,
+    DetId,
+    KeyframeId,
+    Offset,
+    Position,
+    RunId,
+    Text,
+    describe_error,
+)
 
 MAX_REASON = 2_000
 MAX_NAMED = 100_000
@@ -227,6 +238,20 @@ class UseSettings(_Command):
     settings: dict[str, object]
 
 
+class Reembed(_Command):
+    """The vectors of ``space`` in the events on ``mapfold/embeddings`` from offset ``first`` to
+    before ``end`` are those of their detections, where these have none of it. ``sha256`` is of
+    those events' payloads, in order."""
+
+    kind: Literal["reembed"] = "reembed"
+    space: Text
+    dim: Annotated[int, Field(ge=1, le=MAX_DIMENSION)]
+    first: Annotated[Offset, INT64]
+    end: Annotated[Offset, INT64]
+    detections: Annotated[int, Field(ge=1)]
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+
+
 class Undo(_Command):
     """As if the command ``undone`` had never been given. Undoing an undo restores it."""
 
@@ -247,6 +272,7 @@ Command: TypeAlias = (
     | ForgetKeyframes
     | CorrectPoses
     | UseSettings
+    | Reembed
     | Undo
 )
 KINDS: tuple[str, ...] = tuple(c.model_fields["kind"].default for c in Command.__args__)

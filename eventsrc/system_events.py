@@ -6,6 +6,7 @@
 ``mapfold/ros``       how envelopes are made of the messages of ROS behind it
                       (`eventsrc.ros.derivation`)
 ``mapfold/map``       an occupancy grid: where walls are (`eventsrc.occupancy_map`)
+``mapfold/embeddings``  vectors of another space for older detections (`eventsrc.embeddings`)
 
 The docstrings of the models are part of the JSON schema in every segment: do not change them.
 """
@@ -16,7 +17,7 @@ from typing import Annotated, Literal
 import pybase64
 from pydantic import BaseModel, ConfigDict, Field
 
-from .envelope import Floor, Position, Text
+from .envelope import MAX_DIMENSION, Floor, Position, Text
 
 RESERVED_PREFIX = "mapfold/"
 REJECTED_KEY = "mapfold/rejected"
@@ -24,6 +25,7 @@ LOSS_KEY = "mapfold/loss"
 COMMAND_KEY = "mapfold/command"
 MAP_KEY = "mapfold/map"
 ROS_KEY = "mapfold/ros"
+EMBEDDINGS_KEY = "mapfold/embeddings"
 
 
 def is_system_key(key: str) -> bool:
@@ -100,3 +102,24 @@ class OccupancyMapEvent(BaseModel):
     source: Text
     floor: Floor = None
     """The floor that it is of; without it the one that the log is of first."""
+
+
+MAX_REEMBEDDED = 4_096
+"""Bound of the detections in an event on ``mapfold/embeddings``."""
+
+
+class Embeddings(BaseModel):
+    """The content of a ``mapfold/embeddings`` event: vectors of the space ``space`` for detections
+    that were recorded without one of it.
+
+    ``vectors`` is base64 of float32, little endian, ``dim`` values for each of ``det_ids``.
+    ``encoder`` is the SHA-256 of the model that made them, in hex digits.
+    """
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="ignore", allow_inf_nan=False)
+
+    space: Text
+    encoder: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+    dim: Annotated[int, Field(ge=1, le=MAX_DIMENSION)]
+    det_ids: Annotated[tuple[Text, ...], Field(min_length=1, max_length=MAX_REEMBEDDED)]
+    vectors: str

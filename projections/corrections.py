@@ -34,6 +34,7 @@ from eventsrc.commands import (
     Join,
     KeepApart,
     NamePlace,
+    Reembed,
     RigidTransform,
     SameObject,
     Undo,
@@ -115,14 +116,25 @@ class Corrections(msgspec.Struct, frozen=True, eq=False):
     same: tuple[tuple[DetId, DetId], ...] = ()
     names: tuple[PlaceName, ...] = ()
     settings: Settings | None = None
+    reembedded: tuple[Reembed, ...] = ()
 
     def fingerprint(self) -> str:
         """16 hex digits that are equal for equal corrections; empty if there are none that change
-        the fold. The log's settings are not part of it: they have a fingerprint of their own."""
+        the fold. The log's settings are not part of it: they have a fingerprint of their own. Nor
+        are vectors, which only a map of their space has (`map_fingerprint`)."""
         rows = self._canonical()
         if not any(rows):
             return ""
         return hashlib.sha256(msgspec.json.encode(rows)).hexdigest()[:16]
+
+    def reembedded_for(self, settings: Settings) -> tuple[Reembed, ...]:
+        """The commands whose vectors a map of these settings has. It must name its space: the first
+        vectors of a log decide it otherwise, and no command changes what came first."""
+        return tuple(
+            each
+            for each in self.reembedded
+            if each.space == settings.embedding_model and settings.embedding_dim in (None, each.dim)
+        )
 
     def without_names(self) -> "Corrections":
         """The same without names of places, which change no place."""
@@ -193,7 +205,8 @@ NO_CORRECTIONS = Corrections()
 
 def map_fingerprint(settings: Settings, corrections: Corrections) -> str:
     """16 hex digits that are equal for maps of the same settings and corrections."""
-    own = corrections.fingerprint()
+    vectors = (each.sha256 for each in corrections.reembedded_for(settings))
+    own = " ".join((corrections.fingerprint(), *vectors)).strip()
     if not own:
         return settings.fingerprint()
     return hashlib.sha256(f"{settings.fingerprint()} {own}".encode()).hexdigest()[:16]
@@ -231,6 +244,7 @@ def compile_corrections(commands: Iterable[RecordedCommand]) -> Corrections:
     objects: list[tuple[tuple[DetId, DetId], bool]] = []
     names: list[PlaceName] = []
     settings: Settings | None = None
+    reembedded: list[Reembed] = []
     for offset, command in in_force:
         match command:
             case NamePlace():
@@ -252,6 +266,8 @@ def compile_corrections(commands: Iterable[RecordedCommand]) -> Corrections:
                 poses.setdefault(command.run_id, []).append(_pose_correction(command))
             case UseSettings():
                 settings = Settings.from_document(command.settings)
+            case Reembed():
+                reembedded.append(command)
             case Undo():
                 pass
     joined, apart = without_contradictions(places)
@@ -268,6 +284,7 @@ def compile_corrections(commands: Iterable[RecordedCommand]) -> Corrections:
         same=tuple(same),
         names=tuple(names),
         settings=settings,
+        reembedded=tuple(reembedded),
     )
 
 

@@ -30,9 +30,11 @@ from eventsrc.envelope import ENVELOPE_VERSION, Envelope, Offset
 from eventsrc.errors import LogDamaged, NotALog
 from eventsrc.system_events import (
     COMMAND_KEY,
+    EMBEDDINGS_KEY,
     LOSS_KEY,
     MAP_KEY,
     REJECTED_KEY,
+    Embeddings,
     Loss,
     OccupancyMapEvent,
     RejectedPayload,
@@ -185,6 +187,7 @@ _SYSTEM_MODELS: dict[str, type[BaseModel]] = {
     REJECTED_KEY: RejectedPayload,
     LOSS_KEY: Loss,
     MAP_KEY: OccupancyMapEvent,
+    EMBEDDINGS_KEY: Embeddings,
 }
 
 

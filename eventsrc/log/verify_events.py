@@ -27,6 +27,7 @@ from typing import Literal, NamedTuple, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from eventsrc.commands import InvalidCommand, encode_command, parse_command
+from eventsrc.embeddings import InvalidEmbeddings, decode_embeddings
 from eventsrc.envelope import KeyframeId, Offset, RunId, has_keyframe_id
 from eventsrc.gaps import Gap, GapLedger, gap_of
 from eventsrc.ingest import Accepted
@@ -34,6 +35,7 @@ from eventsrc.occupancy_map import InvalidMap, decode_map
 from eventsrc.ros.derivation import read_recording
 from eventsrc.system_events import (
     COMMAND_KEY,
+    EMBEDDINGS_KEY,
     LOSS_KEY,
     MAP_KEY,
     REJECTED_KEY,
@@ -212,6 +214,8 @@ class EventFindings:
             self._check_map(event)
         elif event.key == ROS_KEY:
             self._check_recording(event)
+        elif event.key == EMBEDDINGS_KEY:
+            self._check_embeddings(event)
         elif event.is_envelope:
             self._check_envelope(event)
 
@@ -244,6 +248,13 @@ class EventFindings:
             read_recording(event.payload)
         except ValidationError as error:
             what = f"{event.key} event cannot be read: {error.errors()[0]['msg']}"
+            self._add("schema", what, event.offset, what)
+
+    def _check_embeddings(self, event: Event) -> None:
+        try:
+            decode_embeddings(event.payload)
+        except InvalidEmbeddings as error:
+            what = f"{event.key} event cannot be read: {error}"
             self._add("schema", what, event.offset, what)
 
     def _check_loss(self, event: Event) -> None:

@@ -21,9 +21,9 @@ from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.deltas import Delta, KeyframeAdded, KeyframeOrdinal
 from projections.evidence import EvidenceConstants
 from projections.model.fold import READ_AHEAD, fold_parsed, gc_paused, parse_events
+from projections.model.space_vectors import new_map
 from projections.model.view import MapView
 from projections.reducers.envelope_evidence import camera_of
-from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Camera, LocalizerConstants, Settings
 
 from .geometry import camera_faults, errors, ranges, sizes
@@ -151,7 +151,7 @@ def calibrate(
 
     def fold(used: Settings) -> tuple[MapView, Cameras]:
         nonlocal before
-        semantic_map = SemanticMap(used, corrections=corrections)
+        semantic_map = new_map(reader, used, corrections)
         view, cameras = MapView(used, corrections=corrections), Cameras()
         coming = iter(reader.read(FIRST_OFFSET, end))
         with gc_paused():

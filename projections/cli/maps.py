@@ -15,8 +15,8 @@ from projections.model.digest import map_digest
 from projections.model.export import state_document, state_text
 from projections.model.fold import fold_events, fold_log_cached
 from projections.model.log_commands import read_corrections
+from projections.model.space_vectors import new_map
 from projections.model.view import MapView
-from projections.reducers.semantic_map import SemanticMap
 
 from .options import (
     JsonOption,
@@ -115,7 +115,7 @@ def draw(
         corrections = read_corrections(reader, known_point(reader, known_at, end))
         settings = settings_from(settings_file, set_, corrections)
         view = MapView(settings, keep_embeddings=False, corrections=corrections)
-        fold = SemanticMap(settings, corrections=corrections)
+        fold = new_map(reader, settings, corrections)
         merged = fold_with_merges(fold_events(reader.read(FIRST_OFFSET, end), fold), view)
     title = f"{log.resolve().name} after {counted(view.next_offset, 'event')}"
     if floor is not None:

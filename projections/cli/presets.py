@@ -1,6 +1,7 @@
-"""``--preset``: settings with a name, for every command that takes ``--set``.
+"""``--preset`` and ``--space``: settings with a name, for every command that takes ``--set``.
 
-A preset stands for assignments of ``--set`` and comes before them, so ``--set`` changes it.
+Both stand for assignments of ``--set``. A preset comes before them, so ``--set`` changes it;
+``--space NAME`` is ``--set embedding_model=NAME`` and comes behind them.
 """
 
 import functools
@@ -27,9 +28,19 @@ PresetOption = Annotated[
     ),
 ]
 
+SpaceOption = Annotated[
+    str | None,
+    typer.Option(
+        "--space",
+        metavar="NAME",
+        help="The embedding space of the map, by its model's name [default: that of the log's first"
+        " vector]; see `mapfold reembed`.",
+    ),
+]
+
 
 def add_presets(app: typer.Typer) -> None:
-    """Give ``--preset`` to each command of the program that has ``--set``."""
+    """Give ``--preset`` and ``--space`` to each command of the program that has ``--set``."""
     for command in app.registered_commands:
         if command.callback is not None:
             command.callback = _with_preset(command.callback)
@@ -46,16 +57,19 @@ def _with_preset(command: Callable[..., Any]) -> Callable[..., Any]:
     name = parameters[at].name
 
     @functools.wraps(command)
-    def with_preset(*, preset: str | None = None, **values: Any) -> Any:
+    def with_preset(*, preset: str | None = None, space: str | None = None, **values: Any) -> Any:
         if preset is not None:
             values[name] = [*PRESETS[preset], *(values[name] or ())]
+        if space is not None:
+            values[name] = [*(values[name] or ()), f"embedding_model={space}"]
         return command(**values)
 
-    added = inspect.Parameter(
-        "preset", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=PresetOption
-    )
+    added = [
+        inspect.Parameter(option, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=kind)
+        for option, kind in (("preset", PresetOption), ("space", SpaceOption))
+    ]
     keywords = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in parameters]
-    keywords.insert(at, added)
+    keywords[at:at] = added
     with_preset.__signature__ = inspect.Signature(keywords)  # type: ignore[attr-defined]
     with_preset.__annotations__ = {each.name: each.annotation for each in keywords}
     return with_preset

@@ -7,6 +7,7 @@ from typing import Final, Self, TypeAlias
 
 import msgspec
 
+from eventsrc.commands import Reembed
 from eventsrc.envelope import Offset
 from eventsrc.log import LogReader
 from eventsrc.system_events import COMMAND_KEY
@@ -70,9 +71,16 @@ class MapInputs:
 
     def differs_only_in_names(self, other: "MapInputs") -> bool:
         """True when the map of ``other`` is this one but for names of places, or is this one."""
-        return self.settings == other.settings and self.corrections.differs_in_names_only(
-            other.corrections
+        return (
+            self.settings == other.settings
+            and self.corrections.differs_in_names_only(other.corrections)
+            and self.vectors == other.vectors
         )
+
+    @property
+    def vectors(self) -> tuple[Reembed, ...]:
+        """The commands whose vectors the map has."""
+        return self.corrections.reembedded_for(self.settings)
 
 
 @dataclass(slots=True)

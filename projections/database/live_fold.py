@@ -3,11 +3,12 @@
 from collections.abc import Collection, Iterable, Iterator, Sequence
 
 from eventsrc.envelope import Offset
-from eventsrc.log import Event
+from eventsrc.log import Event, LogReader
 from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.errors import FoldError
 from projections.model.changes import ChangeTracker
 from projections.model.fold import READ_AHEAD, fold_events
+from projections.model.space_vectors import with_vectors
 from projections.model.view import MapView
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
@@ -18,16 +19,19 @@ class LiveFold:
 
     def __init__(
         self,
+        reader: LogReader,
         settings: Settings,
         start: tuple[SemanticMap, MapView] | None = None,
         *,
         corrections: Corrections = NO_CORRECTIONS,
     ) -> None:
-        """``start`` is a snapshot's, to go on from; by default nothing is folded yet."""
+        """``start`` is a snapshot's, to go on from; by default nothing is folded yet. ``reader``
+        reads the log that is folded. Raises FoldError, LogDamaged."""
         self.map, self.view = start or (
             SemanticMap(settings, corrections=corrections),
             MapView(settings, keep_embeddings=False, corrections=corrections),
         )
+        with_vectors(self.map, reader)
         self.tracker = ChangeTracker(self.view)
 
     def feed(self, events: Sequence[Event]) -> Iterator[FoldError | None]:

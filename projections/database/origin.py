@@ -117,7 +117,7 @@ def refuse_other_origin(
 
 def _is_of_another_version(found: Checkpoint, inputs: MapInputs) -> bool:
     """Neither the log nor the checkpoint has corrections, and yet the fingerprints differ."""
-    return found.known_at is None and not inputs.corrections.fingerprint()
+    return found.known_at is None and not (inputs.corrections.fingerprint() or inputs.vectors)
 
 
 def refuse_mismatch(

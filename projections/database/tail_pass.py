@@ -171,6 +171,7 @@ class TailPass:
             plan.log, reader.log_id, current.settings, plan.note, corrections=current.corrections
         )
         fold = folded or LiveFold(
+            reader,
             current.settings,
             cache.latest(self._snapshot_limit()),
             corrections=current.corrections,

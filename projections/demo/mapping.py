@@ -20,8 +20,8 @@ from projections.deltas import PlacesMerged
 from projections.model.digest import map_digest
 from projections.model.fold import fold_events, fold_log
 from projections.model.log_commands import read_corrections
+from projections.model.space_vectors import new_map
 from projections.model.view import MapView
-from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 
 from .folder import DemoFolder
@@ -82,7 +82,7 @@ def fold_with_rooms(folder: DemoFolder, settings: Settings, run: SimulatedRun) -
     with LogReader(folder.log) as reader:
         corrections = read_corrections(reader)
         view = MapView(settings, corrections=corrections)
-        for event in fold_events(reader.read(), SemanticMap(settings, corrections=corrections)):
+        for event in fold_events(reader.read(), new_map(reader, settings, corrections)):
             for delta in event.deltas:
                 if isinstance(delta, PlacesMerged):
                     deltas.append(delta)

@@ -19,9 +19,9 @@ from projections.history import NoSuchThing
 from projections.model.fold import READ_AHEAD, fold_events, fold_log_cached, gc_paused
 from projections.model.log_commands import read_commands
 from projections.model.records import KeyframeRecord, ObjectRecord, ObservationRecord
+from projections.model.space_vectors import new_map
 from projections.model.view import MapView
 from projections.reducers.objects import object_id
-from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 
 SettingsOf = Callable[[Corrections], Settings]
@@ -90,7 +90,7 @@ class CurrentMap:
     @cached_property
     def merges(self) -> list[PlacesMerged]:
         """Every merge of places, in order; from a fold of the whole log."""
-        semantic_map = SemanticMap(self.settings, corrections=self.corrections)
+        semantic_map = new_map(self.reader, self.settings, self.corrections)
         view = MapView(self.settings, keep_embeddings=False, corrections=self.corrections)
         merges: list[PlacesMerged] = []
         events = self.reader.read(FIRST_OFFSET, self.end)

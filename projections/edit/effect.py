@@ -88,7 +88,8 @@ class Change:
 
     def _same_fold(self, first: Corrections, second: Corrections) -> bool:
         same_settings = self.settings == self.current.settings
-        return same_settings and first.fingerprint() == second.fingerprint()
+        folds = [map_fingerprint(self.settings, each) for each in (first, second)]
+        return same_settings and folds[0] == folds[1]
 
     def effect(self) -> Effect:
         """How much changes."""

@@ -14,6 +14,7 @@ from eventsrc.commands import (
     Join,
     KeepApart,
     NamePlace,
+    Reembed,
     SameObject,
     Undo,
     UndoMerge,
@@ -57,6 +58,8 @@ def what(command: Command) -> str:
             plain, given = Settings().by_name(), settings_by_name(command.settings)
             changed = {name: value for name, value in given.items() if plain.get(name) != value}
             return ", ".join(assignment_texts(changed)) or "the defaults"
+        case Reembed():
+            return f"{counted(command.detections, 'detection')} in {command.space}"
         case Undo():
             return command.undone
 

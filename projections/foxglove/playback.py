@@ -33,8 +33,8 @@ from projections.model.change_lines import change_lines
 from projections.model.digest import map_digest
 from projections.model.fold import READ_AHEAD, fold_events, gc_paused
 from projections.model.moments import Moments
+from projections.model.space_vectors import new_map
 from projections.model.view import MapView
-from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 
 from .messages import MapTopics
@@ -64,7 +64,7 @@ class PastMaps:
         self._merges: list[PlacesMerged] = []
         self._history = History(settings, corrections)
         self._latest = MapView(settings, keep_embeddings=False, corrections=corrections)
-        semantic_map = SemanticMap(settings, corrections=corrections)
+        semantic_map = new_map(reader, settings, corrections)
         events = reader.read(FIRST_OFFSET, end)
         with gc_paused():
             for offset, deltas in fold_events(events, semantic_map, ahead=READ_AHEAD):

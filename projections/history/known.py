@@ -15,8 +15,8 @@ from projections.corrections import Corrections
 from projections.errors import LogPointError
 from projections.model.fold import READ_AHEAD, FoldedEvent, fold_events, fold_log_cached, gc_paused
 from projections.model.snapshot_cache import SnapshotCache
+from projections.model.space_vectors import new_map, with_vectors
 from projections.model.view import MapView
-from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 
 from .bisect import CountIndex, HistoryFacts, Search, Searcher
@@ -75,7 +75,7 @@ class KnownHistory:
         self._progress = progress
         self._note = note
         self._snapshot_tried = False
-        self._map = SemanticMap(settings, corrections=corrections)
+        self._map = new_map(reader, settings, corrections)
         self._latest = MapView(settings, keep_embeddings=False, corrections=corrections)
         self._history = History(settings, corrections)
         self._index: CountIndex | None = None
@@ -123,8 +123,10 @@ class KnownHistory:
         """The deltas of each event from ``start`` to before ``end``, by a separate fold from the
         nearest snapshot."""
         found = self._snapshots().latest(self._checked(start))
-        fresh = SemanticMap(self.settings, corrections=self.corrections)
-        semantic_map = fresh if found is None else found[0]
+        if found is None:
+            semantic_map = new_map(self.reader, self.settings, self.corrections)
+        else:
+            semantic_map = with_vectors(found[0], self.reader)
         events = self.reader.read(semantic_map.next_offset, self._checked(end))
         folded = fold_events(events, semantic_map, ahead=READ_AHEAD)
         return (event for event in folded if event.offset >= start)

@@ -41,8 +41,8 @@ from projections.evaluate.scores import object_scores, place_scores
 from projections.evaluate.truth import Truth
 from projections.model.digest import map_digest
 from projections.model.fold import READ_AHEAD, ParsedEvent, fold_parsed, gc_paused, parse_events
+from projections.model.space_vectors import new_map
 from projections.model.view import MapView
-from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 
 from .history import History
@@ -213,8 +213,8 @@ def fold_in_this_process(
     keep_views: bool = False,
 ) -> list[FoldResult]:
     """As `fold_all`, in this process: one pass over the log for all of ``rules``."""
-    folds = [_Fold(each) for each in rules]
     with LogReader(log) as reader:
+        folds = [_Fold(reader, each) for each in rules]
         events = reader.read(FIRST_OFFSET, end)
         with gc_paused():
             while chunk := list(islice(events, READ_AHEAD)):
@@ -227,9 +227,9 @@ def fold_in_this_process(
 class _Fold:
     """The fold under some rules, and the time it took."""
 
-    def __init__(self, rules: Rules) -> None:
+    def __init__(self, reader: LogReader, rules: Rules) -> None:
         settings, corrections = rules.settings, rules.corrections
-        self.map = SemanticMap(settings, corrections=corrections)
+        self.map = new_map(reader, settings, corrections)
         self.view = MapView(settings, keep_embeddings=False, corrections=corrections)
         self.history = History(settings, corrections)
         self.seconds = 0.0

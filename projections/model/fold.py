@@ -22,6 +22,7 @@ from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 
 from .snapshot_cache import SnapshotCache
+from .space_vectors import new_map, with_vectors
 from .view import MapView
 
 READ_AHEAD = 16
@@ -120,7 +121,7 @@ def fold_log(
     corrections: Corrections = NO_CORRECTIONS,
 ) -> tuple[SemanticMap, MapView]:
     """Fold the first ``until`` events of a log, all of them for None."""
-    semantic_map = SemanticMap(settings, corrections)
+    semantic_map = new_map(reader, settings, corrections)
     view = MapView(settings, keep_embeddings=keep_embeddings, corrections=corrections)
     _fold_into(reader, semantic_map, view, until)
     return semantic_map, view
@@ -145,6 +146,7 @@ def fold_log_cached(
         SemanticMap(settings, corrections),
         MapView(settings, keep_embeddings=False, corrections=corrections),
     )
+    with_vectors(semantic_map, reader)
     start = semantic_map.next_offset
     _fold_into(reader, semantic_map, view, end)
     if end - start >= SNAPSHOT_MIN_EVENTS:

@@ -7,11 +7,11 @@ from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.log import Event, LogReader
 from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.deltas import Delta, PlacesMerged
-from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 
 from .fold import fold_event
 from .moments import Moments
+from .space_vectors import new_map
 from .view import MapView
 
 SCENES: Final = 500
@@ -43,7 +43,7 @@ class RecordedFold:
         progress: Callable[[int, int], None] = lambda *_: None,
     ) -> None:
         self._reader, self._end, self._progress = reader, end, progress
-        self._map = SemanticMap(settings, corrections=corrections)
+        self._map = new_map(reader, settings, corrections)
         self._every = every or max(1, -(-end // SCENES))
         self.moments = Moments(reader.read(FIRST_OFFSET, end))
         self.view = MapView(settings, keep_embeddings=False, corrections=corrections)

@@ -70,6 +70,7 @@ from .objects import FusibleObservation, Objects
 from .place_members import PosedKeyframe
 from .place_names import PlaceNames
 from .places import Places
+from .reembedded import Reembedded
 from .rooms import Rooms
 from .rules import objects_by, places_by
 
@@ -88,7 +89,6 @@ Reducer: TypeAlias = (
 
 class SemanticMap:
     """The fold's state. `fold` changes it in place and is otherwise pure.
-
     ``next_offset`` is one past the last event folded or skipped.
     """
 
@@ -115,6 +115,8 @@ class SemanticMap:
         self.adjacency = Adjacency()
         self.current_map = CurrentMap(settings, self.floors)
         self.observation_count = 0
+        self.reembedded: Reembedded | None = None  # by `projections.model.space_vectors`
+        self._has_vectors = bool(corrections.reembedded_for(settings))
 
     def use_map(self, offset: Offset, given: OccupancyMap) -> list[Delta]:
         """Take over an occupancy map, which holds for the events after it; what changed."""
@@ -184,6 +186,9 @@ class SemanticMap:
         if dropped:
             run_id, keyframe_id = envelope.run_id, envelope.keyframe_id
             deltas += [EventSkipped(offset, "dropped", run_id, keyframe_id, d) for d in dropped]
+        if self._has_vectors:
+            assert self.reembedded is not None  # noqa: S101
+            accepted, units = self.reembedded.applied(accepted, units)
         fusible = self._observe(offset, keyframe, accepted, units, deltas)
         if pose is not None:
             pose = self.floors.laid_out(pose, ground)

@@ -20,6 +20,7 @@ from eventsrc.ingest import Rejected
 from eventsrc.log import Event
 from eventsrc.log.seek import resolve
 from eventsrc.upcast import read_envelopes
+from projections.corrections import map_fingerprint
 from projections.errors import QuestionError
 from projections.model.fold import fold_log
 from projections.model.log_commands import read_corrections
@@ -87,7 +88,7 @@ class Localizer:
             corrections = read_corrections(reader, end)
             settings = self._opened.settings(corrections)
             settings = settings.with_assignments(assignments_of(query), "set")
-            key = reader.log_id, end, settings.fingerprint(), corrections.fingerprint()
+            key = reader.log_id, end, map_fingerprint(settings, corrections)
             if self._kept is not None and self._kept[0] == key:
                 return end, self._kept[1]
             self._kept = None
