@@ -33,6 +33,7 @@ from eventsrc.system_events import MAP_KEY, OccupancyMapEvent
 from eventsrc.text import counted, visible
 
 from .options import JsonOption, LogArgument
+from .spaces import spaces
 from .terminal import display, emit, emit_lines, finish, say
 
 _SUMMARY_CHARS = 100
@@ -365,4 +366,5 @@ def _recovery_text(segment: SegmentRecovery) -> str:
 
 def register(app: typer.Typer) -> None:
     """Add the `log` group to ``app``."""
+    log_app.command()(spaces)
     app.add_typer(log_app, name="log")

@@ -202,7 +202,7 @@ def _check_sink(
                 raise rows_dropped(checkpoint, sink, describe_target(url), log, known.latest)
             inputs = known.at(checkpoint.known_to)
             refuse_mismatch(checkpoint, sink, describe_target(url), log, reader, inputs)
-            fold = LiveFold(reader, inputs.settings, corrections=inputs.corrections)
+            fold = LiveFold(inputs.settings, corrections=inputs.corrections, reader=reader)
             folding = _folded(fold, _events(connection, reader, checkpoint, sink))
             compare = _compare_graph if sink == "graph" else _compare_vectors
             compare(connection, fold, folding, comparison)

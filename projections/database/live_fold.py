@@ -19,19 +19,21 @@ class LiveFold:
 
     def __init__(
         self,
-        reader: LogReader,
         settings: Settings,
         start: tuple[SemanticMap, MapView] | None = None,
         *,
         corrections: Corrections = NO_CORRECTIONS,
+        reader: LogReader | None = None,
     ) -> None:
         """``start`` is a snapshot's, to go on from; by default nothing is folded yet. ``reader``
-        reads the log that is folded. Raises FoldError, LogDamaged."""
+        reads the log that is folded, which may have vectors of the map's space beside those in
+        envelopes. Raises FoldError, LogDamaged."""
         self.map, self.view = start or (
             SemanticMap(settings, corrections=corrections),
             MapView(settings, keep_embeddings=False, corrections=corrections),
         )
-        with_vectors(self.map, reader)
+        if reader is not None:
+            with_vectors(self.map, reader)
         self.tracker = ChangeTracker(self.view)
 
     def feed(self, events: Sequence[Event]) -> Iterator[FoldError | None]:

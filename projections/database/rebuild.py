@@ -79,7 +79,7 @@ def rebuild(
     with gc_paused(), LogReader(log) as reader:
         total = reader.next_offset if until is None else min(until, reader.next_offset)
         inputs = LogInputs.read(reader, settings).at(total if known_at is None else known_at)
-        fold = LiveFold(reader, inputs.settings, corrections=inputs.corrections)
+        fold = LiveFold(inputs.settings, corrections=inputs.corrections, reader=reader)
         folded_at = started
 
         def fold_into(writers: Sequence[ShadowWriter]) -> FoldedLog:

@@ -96,7 +96,7 @@ class Refold:
         return folded[0]
 
     def _fold(self, writers: Sequence[ShadowWriter], progress: RefoldProgress) -> FoldedLog:
-        fold = LiveFold(self.reader, self.base.settings, corrections=self.base.corrections)
+        fold = LiveFold(self.base.settings, corrections=self.base.corrections, reader=self.reader)
         last: Event | None = None
         at, end = FIRST_OFFSET, self.inputs.end
         with LogReader(self.reader.path) as events:

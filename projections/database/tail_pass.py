@@ -171,10 +171,10 @@ class TailPass:
             plan.log, reader.log_id, current.settings, plan.note, corrections=current.corrections
         )
         fold = folded or LiveFold(
-            reader,
             current.settings,
             cache.latest(self._snapshot_limit()),
             corrections=current.corrections,
+            reader=reader,
         )
         start = fold.map.next_offset
         writers = self._writers()

@@ -21,7 +21,11 @@ from eventsrc.ingest import Accepted, ingest
 from eventsrc.log import LogReader
 from projections import relocalize
 from projections.exact import quantise, to_float32
+from projections.model.log_commands import read_corrections
+from projections.model.space_vectors import vectors_of
+from projections.reducers.reembedded import Reembedded
 from projections.relocalize import Crop, View
+from projections.settings import Settings
 
 from .truth import Key, Truth
 
@@ -54,11 +58,16 @@ class Question:
         return self.asked.crops
 
 
-def read_keyframes(logs: Iterable[Path]) -> Iterator[Accepted]:
-    """Every valid keyframe of the logs with a pose, each (run, keyframe) once."""
+def read_keyframes(logs: Iterable[Path], settings: Settings | None = None) -> Iterator[Accepted]:
+    """Every valid keyframe of the logs with a pose, each (run, keyframe) once; where the settings
+    name a space, with the vectors of that space alone, also those given later."""
+    model = None if settings is None else settings.embedding_model
     seen: set[Key] = set()
     for log in logs:
         with LogReader(log) as reader:
+            later = None
+            if settings is not None and model is not None:
+                later = vectors_of(reader, settings, read_corrections(reader))
             for event in reader.read():
                 if not event.is_envelope:
                     continue
@@ -68,7 +77,19 @@ def read_keyframes(logs: Iterable[Path]) -> Iterator[Accepted]:
                 key = (found.envelope.run_id, found.envelope.keyframe_id)
                 if key not in seen:
                     seen.add(key)
-                    yield found
+                    yield found if model is None else _in_space(found, model, later)
+
+
+def _in_space(keyframe: Accepted, model: str, later: Reembedded | None) -> Accepted:
+    """A keyframe with the vectors of one model, and those of ``later``."""
+    if later is not None:
+        keyframe, _ = later.applied(keyframe, [None] * len(keyframe.vectors))
+    detections = keyframe.envelope.detections
+    vectors = tuple(
+        vector if detection.embedding_model == model else None
+        for detection, vector in zip(detections, keyframe.vectors, strict=True)
+    )
+    return Accepted(keyframe.envelope, keyframe.det_ids, vectors)
 
 
 def make_questions(

@@ -83,7 +83,7 @@ def evaluate(
         if not isinstance(settings, Settings):
             settings = settings(corrections)
         _, view = fold_log(reader, settings, end, corrections=corrections)
-    keyframes = list(read_keyframes(query_logs))
+    keyframes = list(read_keyframes(query_logs, settings))
     if query_logs:
         check_truth(keyframes, truth)
     rooms = RoomIndex(list(read_keyframes([map_log])), keyframes, truth)

@@ -29,9 +29,18 @@ def new_map(
 def with_vectors(semantic_map: SemanticMap, reader: LogReader) -> SemanticMap:
     """The map, with the vectors of its space that the log has beside those in envelopes. Raises
     FoldError, LogDamaged."""
-    commands = semantic_map.corrections.reembedded_for(semantic_map.settings)
-    semantic_map.reembedded = _read(reader.path, reader.log_id, commands) if commands else None
+    known = vectors_of(reader, semantic_map.settings, semantic_map.corrections)
+    semantic_map.reembedded = known
     return semantic_map
+
+
+def vectors_of(
+    reader: LogReader, settings: Settings, corrections: Corrections
+) -> Reembedded | None:
+    """The vectors of the settings' space that the log has beside those in envelopes; None if none
+    are in force. Raises FoldError, LogDamaged."""
+    commands = corrections.reembedded_for(settings)
+    return _read(reader.path, reader.log_id, commands) if commands else None
 
 
 @lru_cache(maxsize=2)

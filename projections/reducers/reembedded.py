@@ -18,8 +18,8 @@ class Reembedded:
         self.space = space
         self._vectors = vectors
 
-    def __len__(self) -> int:
-        return len(self._vectors)
+    def __contains__(self, det_id: DetId) -> bool:
+        return det_id in self._vectors
 
     def applied(
         self, accepted: Accepted, units: Sequence[Units | None]
