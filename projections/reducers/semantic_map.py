@@ -89,14 +89,11 @@ Reducer: TypeAlias = (
 
 class SemanticMap:
     """The fold's state. `fold` changes it in place and is otherwise pure.
+
     ``next_offset`` is one past the last event folded or skipped.
     """
 
-    def __init__(
-        self,
-        settings: Settings,
-        corrections: Corrections = NO_CORRECTIONS,
-    ) -> None:
+    def __init__(self, settings: Settings, corrections: Corrections = NO_CORRECTIONS) -> None:
         self.settings = settings
         self.corrections = corrections
         self._edits_events = edits_events(corrections)
