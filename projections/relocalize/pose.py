@@ -10,12 +10,8 @@ robots drive where robots have driven (`grid`).
 
 Several views: each pose at the last view gives a pose at every view before (`movements`).
 
-The answer is the cell with the least expected error, errors above 4 m counting as 4 m (like a
-median; a mean could lie between two look-alike spots), moved to the mean of the weights near it,
-which is then computed again on a grid of 0.12 m. In that expectation a fifth is the plain recipe,
-robots where they stood at the ten most similar observations of each crop: it decides where the
-weights are spread over half the building, as with one crop of things that the map has many of, and
-is too little to matter where they are not.
+The answer is the cell with the least expected error (`decision`), moved to the mean of the weights
+near it, which is then computed again on a grid of 0.12 m.
 """
 
 import itertools
@@ -30,6 +26,7 @@ from numpy.typing import NDArray
 from .appearance import usual_likeness
 from .camera import Floats
 from .candidates import Match
+from .decision import least_error, stood_at
 from .features import Features, confidence_of, features_of
 from .grid import cells_near, likely_spots, log_prior, square_to_nearest
 from .landmarks import CropGroup, Landmarks, Seen, crop_groups, likeness_of
@@ -60,12 +57,8 @@ _FINE: Final = np.arange(-3, 4) * _FINE_M
 _FINE_SQUARE: Final = np.array([(dx, dy) for dx in _FINE for dy in _FINE])
 _QUARTERS: Final = np.array([(x, y) for x in (-1, 1) for y in (-1, 1)]) * (CELL_M / 2)
 _FINE_YAW: Final = np.array([-0.16, -0.08, 0.0, 0.08, 0.16])
-_MAX_ERROR_M: Final = 4.0
-_PLAIN_SHARE: Final = 0.2
-_PLAIN_NEAREST: Final = 10
-"""The plain recipe: where robots stood at so many most similar observations of each crop."""
 _MAX_LOSS_M: Final = 2.5
-"""For the feature of the confidence."""
+"""Of the feature of the confidence."""
 _NEAR_M: Final = 1.0
 _MIN_YAW_AGREEMENT: Final = 0.8
 _SAME_SPOT_M: Final = 0.05
@@ -121,23 +114,10 @@ def locate(
     score = prior + _score_of_places(sighted, terms, scene)
     kept = _best(score, max(_KEPT, _IN_ALL // len(marks)))
     terms = [[each.take(kept) for each in of_view] for of_view in terms]
-    stood = _stood(views, matches)
+    stood = stood_at(views, matches)
     return _weigh(
         cells[kept], prior[kept], terms, sighted, behind, marks, been, stood, len(matches), scene
     )
-
-
-def _stood(views: Sequence[View], matches: Sequence[Sequence[Match]]) -> Floats:
-    """Positions (n, 2) of robots at the observations most similar to each crop that has a look."""
-    crops = [crop for view in views for crop in view.crops]
-    found = [
-        match.pose[:2]
-        for crop, row in zip(crops, matches, strict=True)
-        if crop.vector is not None
-        for match in row[:_PLAIN_NEAREST]
-        if match.pose is not None
-    ]
-    return np.array(found, dtype=np.float64).reshape(-1, 2)
 
 
 def _sighted(
@@ -299,13 +279,9 @@ def _choose(
     asked: int,
     scene: Scene,
 ) -> Posterior:
-    apart = _apart(cells, cells)
-    expected = (np.minimum(apart, _MAX_ERROR_M) * of_cell[None]).sum(1)
-    if len(stood):
-        plain = np.minimum(_apart(cells, stood), _MAX_ERROR_M).mean(1)
-        expected += _PLAIN_SHARE / (1.0 - _PLAIN_SHARE) * plain
-    best = int(np.argmin(expected))
-    near = np.maximum(of_cell, _LEAST_WEIGHT) * (apart[best] < _NEAR_M)
+    dx, dy = (cells - cells[least_error(cells, of_cell, stood)]).T
+    apart = np.sqrt(dx * dx + dy * dy)
+    near = np.maximum(of_cell, _LEAST_WEIGHT) * (apart < _NEAR_M)
     x, y = (float((cells[:, axis] * near).sum() / near.sum()) for axis in (0, 1))
     close = (np.maximum(weights, _LEAST_WEIGHT) * near.astype(np.bool_)).ravel()
     yaw = _mean_yaw(poses[:, 2], close / close.sum())
@@ -333,17 +309,6 @@ def _choose(
         found,
         confidence_of(found, scene.constants.localizer),
     )
-
-
-def _apart(one: Floats, other: Floats) -> Floats:
-    """The distance of each position (n, 2) to each other (m, 2), of shape (n, m)."""
-    dx = one[:, 0, None] - other[None, :, 0]
-    dy = one[:, 1, None] - other[None, :, 1]
-    dx *= dx
-    dy *= dy
-    dx += dy
-    found: Floats = np.sqrt(dx, out=dx)
-    return found
 
 
 def _refine(
