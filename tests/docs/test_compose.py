@@ -94,4 +94,4 @@ def test_the_image_holds_what_the_package_needs() -> None:
     for name in re.findall(r"^COPY (.*) \S+$", text, re.MULTILINE):
         assert {f"!{each}" for each in name.split()} <= set(ignored)
     assert 'ENTRYPOINT ["mapfold"]' in text
-    assert "USER mapfold" in text
+    assert "USER 10001" in text
