@@ -19,7 +19,7 @@ from eventsrc.errors import MisuseError
 
 from .onnx_model import ModelError, OnnxModel
 from .picture import Pixels
-from .vision import Fit, fitted, planes
+from .vision import Fit, Scaling, fitted, planes
 
 BATCH: Final = 32
 """Crops at once, of a model that takes any number."""
@@ -88,7 +88,9 @@ class Encoder:
                 f"{model.path}: its input is {model.input.text}, and the size in"
                 f" {model.path.with_suffix('.json').name} is {self._size[0]} × {self._size[1]}"
             )
-        self._std = np.array(preparation.std, np.float32).reshape(1, 3, 1, 1)
+        self._scaling = Scaling.of(
+            rgb=True, scale=1 / 255, mean=preparation.mean, std=preparation.std
+        )
         self.dimension = len(self._run([np.full((8, 8, 3), 114, np.uint8)])[0])
 
     @property
@@ -114,10 +116,7 @@ class Encoder:
         small = [fitted(crop, self._size, wanted.resize, cubic=cubic) for crop in crops]
         if self._model.batch is not None:  # a fixed number: repeat the last one
             small += small[-1:] * (self._model.batch - len(small))
-        mean = [255.0 * value for value in wanted.mean]
-        blob = planes(small, rgb=True, scale=1 / 255, mean=mean)
-        blob /= self._std
-        answer = self._model.run(blob, self._output)
+        answer = self._model.run(planes(small, self._scaling), self._output)
         if (
             answer.ndim != 2
             or len(answer) != len(small)

@@ -17,7 +17,7 @@ from .boxes import Boxes, suppress
 from .heads import HEADS, HeadError
 from .onnx_model import ModelError, OnnxModel
 from .picture import Pixels
-from .vision import Canvas, planes
+from .vision import Canvas, Scaling, planes
 
 CONFIDENCE: Final = 0.25
 OVERLAP: Final = 0.5
@@ -88,6 +88,9 @@ class Finder:
                 f"{model.path}: it takes {model.batch} pictures at once; export it for one"
             )
         self.labels = tuple(labels) if labels is not None else _labels_in(model)
+        head = self._head
+        self._scaling = Scaling.of(rgb=head.rgb, scale=head.scale, mean=head.mean, std=head.std)
+        self._input = np.empty((1, 3, self.size[1], self.size[0]), np.float32)
         self._canvas = Canvas(self.size, centred=self._head.centred)
         self.find(np.full((self.size[1], self.size[0], 3), 114, np.uint8))
 
@@ -95,10 +98,7 @@ class Finder:
         """The detections in a picture, in its pixels. Raises ModelError."""
         laid, letterbox = self._canvas.lay(pixels)
         head, options = self._head, self._options
-        blob = planes([laid], rgb=head.rgb, scale=head.scale, mean=head.mean)
-        if head.std != (1.0, 1.0, 1.0):
-            blob /= np.array(head.std, np.float32).reshape(1, 3, 1, 1)
-        answer = self._model.run(blob, self._output)
+        answer = self._model.run(planes([laid], self._scaling, self._input), self._output)
         try:
             read = head.decode(answer, self.size, len(self.labels), options.confidence)
         except HeadError as error:

@@ -36,7 +36,7 @@ Decode: TypeAlias = Callable[[Array, Size, int, float], Candidates]
 
 
 class Head(NamedTuple):
-    """A decoder, and how pictures are prepared: the order of colours, (value - mean) * scale / std,
+    """A decoder, and how pictures are prepared: the order of colours, (value * scale - mean) / std,
     and whether the picture lies in the middle of the input or at its top left. Boxes of the same
     thing are ``suppressed`` unless the model does that."""
 

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Final, Literal, TypeAlias
+from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -183,15 +183,35 @@ class Canvas:
         return self._pixels, box
 
 
-def planes(pictures: Sequence[Pixels], *, rgb: bool, scale: float, mean: Sequence[float]) -> Floats:
-    """Pictures of one size as (n, 3, height, width): (value - mean) * scale for each channel.
+class Scaling(NamedTuple):
+    """How values become a model's input: times ``gain`` plus ``shift``, for each channel of the
+    model, which takes red first if ``rgb``, else blue."""
 
-    ``mean`` is in the order of the output, which is red, green and blue if ``rgb``.
-    """
-    blob: Floats = _cv2().dnn.blobFromImages(
-        list(pictures), scale, mean=tuple(mean), swapRB=rgb, crop=False
-    )
-    return blob
+    rgb: bool
+    gain: tuple[float, ...]
+    shift: tuple[float, ...]
+
+    @classmethod
+    def of(
+        cls, *, rgb: bool, scale: float, mean: Sequence[float], std: Sequence[float]
+    ) -> "Scaling":
+        """(value * scale - mean) / std."""
+        gain = tuple(scale / spread for spread in std)
+        return cls(rgb, gain, tuple(-m / s for m, s in zip(mean, std, strict=True)))
+
+
+def planes(pictures: Sequence[Pixels], scaling: Scaling, out: Floats | None = None) -> Floats:
+    """Pictures of one size as (n, 3, height, width), in ``out`` if it is given."""
+    cv2 = _cv2()
+    if out is None:
+        out = np.empty((len(pictures), 3, *pictures[0].shape[:2]), np.float32)
+    for target, pixels in zip(out, pictures, strict=True):
+        channels = cv2.split(pixels)  # several times as fast as blobFromImages of OpenCV 5
+        for index, channel in enumerate(channels[::-1] if scaling.rgb else channels):
+            np.multiply(channel, np.float32(scaling.gain[index]), out=target[index])
+            if scaling.shift[index]:
+                target[index] += np.float32(scaling.shift[index])
+    return out
 
 
 def fitted(pixels: Pixels, size: tuple[int, int], fit: Fit, *, cubic: bool) -> Pixels:

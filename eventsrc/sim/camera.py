@@ -29,6 +29,7 @@ _WALLS: Final = (150, 172)
 """Greys of walls along y and along x."""
 _WALL_HEIGHT_M: Final = 2.5
 _NEAR_M: Final = 0.05
+_FAR_M: Final = 1e6
 _LEVELS: Final = (0, 64, 128, 192, 255)
 _LEAST_CHROMA: Final = 128
 
@@ -114,11 +115,13 @@ class Camera:
             self._empty,
         )
         sides = self._depths(self._edges, pose)
-        fronts = sides.reshape(len(self._things), 4, WIDTH_PX).min(axis=1)
+        sides = sides.reshape(len(self._things), 4, WIDTH_PX)
+        fronts = sides.min(axis=1)
+        backs = np.where(np.isfinite(sides), sides, 0.0).max(axis=1)
         fronts[fronts >= wall] = math.inf
         depth = np.full((HEIGHT_PX, WIDTH_PX), math.inf, np.float32)
         drawn = np.flatnonzero(np.isfinite(fronts).any(axis=1)).tolist()
-        parts = [self._draw_thing(index, fronts[index], shows, depth) for index in drawn]
+        parts = [self._draw_thing(i, fronts[i], backs[i], shows, depth) for i in drawn]
         shown = [
             self._shown(*each) for each in zip(drawn, parts, [shows] * len(drawn), strict=True)
         ]
@@ -128,13 +131,14 @@ class Camera:
         self,
         index: int,
         front: NDArray[np.float64],
+        back: NDArray[np.float64],
         shows: NDArray[np.uint8],
         depth: NDArray[np.float32],
     ) -> tuple[slice, slice]:
         """Draw one thing; returns the rows and columns that may show it."""
         hit = np.flatnonzero(np.isfinite(front))
         columns = slice(int(hit[0]), int(hit[-1]) + 1)
-        front = front[columns]
+        front, back = front[columns], np.minimum(back[columns], _FAR_M)
         model = self._things[index].model
         low, high = model.base_m, model.base_m + model.height_m
         scale = FOCAL_PX / float(front.min())
@@ -142,9 +146,17 @@ class Camera:
         bottom = math.ceil(HEIGHT_PX / 2 - scale * min(low - CAMERA_HEIGHT_M, 0.0))
         rows = slice(max(0, top), min(HEIGHT_PX, bottom))
         inside = self._between(front, low, high, rows)
-        inside &= front < depth[rows, columns]
+        near = np.broadcast_to(front, inside.shape)
+        if high < CAMERA_HEIGHT_M or low > CAMERA_HEIGHT_M:  # its upper or lower face shows
+            level = high if high < CAMERA_HEIGHT_M else low
+            with np.errstate(divide="ignore"):
+                plane = FOCAL_PX * (level - CAMERA_HEIGHT_M) / (HEIGHT_PX / 2 - self._rows[rows])
+            face = (plane > front) & (plane <= back)
+            inside |= face
+            near = np.where(face, plane, near)
+        inside &= near < depth[rows, columns]
         np.copyto(shows[rows, columns], index, where=inside)
-        np.copyto(depth[rows, columns], front, where=inside, casting="same_kind")
+        np.copyto(depth[rows, columns], near, where=inside, casting="same_kind")
         return rows, columns
 
     def _between(

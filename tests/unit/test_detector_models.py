@@ -12,6 +12,7 @@ from onnx import TensorProto
 from eventsrc.detector.encoder import Encoder, read_preparation
 from eventsrc.detector.finder import COCO, Finder, FinderOptions, read_labels
 from eventsrc.detector.onnx_model import ModelError, OnnxModel
+from eventsrc.detector.vision import Scaling, planes
 from eventsrc.errors import MisuseError
 from tests.tiny_models import DIMENSION, Graph, colour_detector, fixed_answer, mean_colour_encoder
 
@@ -295,3 +296,14 @@ def test_labels(tmp_path: Path, folder: Path) -> None:
     unnamed = fixed_answer(folder / "unnamed.onnx", np.zeros((1, 5, 1), np.float32))
     with pytest.raises(MisuseError, match="does not name its classes"):
         Finder(OnnxModel(unnamed), None, FinderOptions())
+
+
+@pytest.mark.parametrize("rgb", [False, True])
+def test_pixels_are_scaled_channel_by_channel(rgb: bool) -> None:
+    rng = np.random.default_rng(5)
+    pictures = [rng.integers(0, 255, (5, 7, 3), np.uint8) for _ in range(3)]
+    mean, std = (0.1, 0.2, 0.3), (0.5, 0.6, 0.7)
+    out = planes(pictures, Scaling.of(rgb=rgb, scale=1 / 255, mean=mean, std=std))
+    for n, c, y, x in np.ndindex(3, 3, 5, 7):
+        value = float(pictures[n][y, x, 2 - c if rgb else c]) / 255
+        assert out[n, c, y, x] == pytest.approx((value - mean[c]) / std[c], abs=1e-5)
