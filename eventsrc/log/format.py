@@ -25,6 +25,7 @@ from typing import Any
 
 from pydantic import BaseModel, TypeAdapter
 
+from eventsrc.advised import advised
 from eventsrc.commands import COMMAND
 from eventsrc.envelope import ENVELOPE_VERSION, Envelope, Offset
 from eventsrc.errors import LogDamaged, NotALog
@@ -125,7 +126,7 @@ def read_head(path: Path, data: bytes, base: Offset) -> tuple[dict[str, str], in
     if values["base"] != str(base):
         raise WrongPlace(
             f"{path} was written as the segment at offset {values['base']}, not {base}; "
-            f"run `mapfold log recover {path.parent}`, which gives files their right names"
+            f"run `{advised('log', 'recover', path.parent)}`, which gives files their right names"
         )
     return values, end
 
@@ -137,10 +138,13 @@ def _read_head(path: Path, data: bytes) -> tuple[dict[str, str], int]:
         head = _find_head(data)
     except BadRecord as error:
         raise LogDamaged(
-            f"{path}: damaged head: {error}; run `mapfold log recover {path.parent}`"
+            f"{path}: damaged head: {error}; run `{advised('log', 'recover', path.parent)}`"
         ) from None
     if head is None:
-        raise NotALog(f"{path} is an MCAP file but no segment of a log; `mapfold import` reads it")
+        raise NotALog(
+            f"{path} is an MCAP file but no segment of a log; "
+            f"`{advised('import', 'LOG', path)}` reads it"
+        )
     return head
 
 

@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from eventsrc.advised import advised
 from eventsrc.envelope import Offset
 from eventsrc.errors import LogDamaged, NotALog
 
@@ -57,7 +58,8 @@ def mixed_logs_message(one: Path, log_id: str, other: Path, other_id: str) -> st
     """The error text for two segments of different logs."""
     return (
         f"{one} belongs to log {log_id}, but {other.name} to log {other_id}; put the right file in "
-        f"place of the wrong one, or move that away and run `mapfold log recover {one.parent}`"
+        "place of the wrong one, or move that away and run "
+        f"`{advised('log', 'recover', one.parent)}`"
     )
 
 

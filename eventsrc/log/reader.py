@@ -12,6 +12,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Collection, Generator, Iterator
 from pathlib import Path
 
+from eventsrc.advised import advised
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.errors import LogDamaged, LogError, LogNotFound, NotALog
 
@@ -221,7 +222,7 @@ def _segments_of(path: Path) -> list[SegmentPath]:
         raise LogNotFound(f"no log at {path}; record or import one, or check the path")
     if not path.is_dir():
         raise NotALog(
-            f"{path} is a file; a log is a directory. `mapfold import LOG {path}` imports it"
+            f"{path} is a file; a log is a directory. `{advised('import', 'LOG', path)}` imports it"
         )
     segments = list_growing(path)
     if not segments:
@@ -245,7 +246,7 @@ def _raise_at_gap(log: Path) -> OnGap:
     def report(gap: Unreadable) -> None:
         raise LogDamaged(
             f"{log}: offsets {gap.first} to {gap.last} cannot be read: {gap.reason}; "
-            f"run `mapfold log verify {log}`"
+            f"run `{advised('log', 'verify', log)}`"
         )
 
     return report

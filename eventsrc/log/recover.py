@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
+from eventsrc.advised import advised
 from eventsrc.clock import Clock, system_clock
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.errors import LogDamaged, LogError, NotALog
@@ -196,8 +197,8 @@ class _Recovery:
             else "according to the offsets in the file"
         )
         way_out = (
-            f"If that is right, run `mapfold log recover {self._log} --yes`; else move the file "
-            "that is wrong out of the log"
+            f"If that is right, run `{advised('log', 'recover', self._log, '--yes')}`; else move "
+            "the file that is wrong out of the log"
             if losses <= _MOST_IN_A_SEGMENT
             else "No log is that long: move the file that is wrong out of the log"
         )

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+from eventsrc.advised import advised
 from eventsrc.envelope import Offset
 from eventsrc.errors import LogDamaged, NotALog
 
@@ -169,9 +170,9 @@ def _other_program_message(path: Path) -> str:
     log = path.parent
     return (
         f"{path} was written by another program and does not say which offsets it holds; nothing "
-        f"was changed. Put the original back, or move the file out of {log}, run `mapfold log "
-        f"recover {log}` if other segments are there, and append what it holds by `mapfold import "
-        f"{log} FILE`"
+        f"was changed. Put the original back, or move the file out of {log}, run "
+        f"`{advised('log', 'recover', log)}` if other segments are there, and append what it holds "
+        f"by `{advised('import', log, 'FILE')}`"
     )
 
 

@@ -20,6 +20,7 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from eventsrc.advised import advised
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.errors import LogDamaged, NotALog
 
@@ -89,7 +90,9 @@ def restart(log: Path) -> Restart:
     for path in leftovers(log):
         unlink_quietly(path)
     for path in half_renamed(log):
-        raise LogDamaged(f"{path}: a recovery was interrupted; run `mapfold log recover {log}`")
+        raise LogDamaged(
+            f"{path}: a recovery was interrupted; run `{advised('log', 'recover', log)}`"
+        )
     segments = list_segments(log)
     common_log_id(segments)
     for segment in [s for s in segments if s.sealed][-1:]:
@@ -146,7 +149,7 @@ def _scan_leftover(segment: SegmentPath, reach: Offset | None) -> _Leftover:
     if scan.rewritten:
         raise LogDamaged(
             f"{segment.path}: another program has rewritten it; "
-            f"run `mapfold log recover {segment.path.parent}`"
+            f"run `{advised('log', 'recover', segment.path.parent)}`"
         )
     if not scan.chunks:
         return _Leftover(segment, scan, 0, 0)
@@ -175,7 +178,7 @@ def _refuse_damage(path: Path, scan: Scan) -> None:
         first, last = scan.gaps[0]
         raise LogDamaged(
             f"{path}: offsets {first} to {last} were recorded and cannot be read any more; "
-            f"run `mapfold log recover {path.parent}` to keep the rest"
+            f"run `{advised('log', 'recover', path.parent)}` to keep the rest"
         )
 
 

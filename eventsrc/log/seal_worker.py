@@ -15,6 +15,7 @@ from collections import deque
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from eventsrc.advised import advised
 from eventsrc.envelope import Offset
 from eventsrc.errors import LogDamaged, LogError, MapfoldError
 
@@ -104,7 +105,7 @@ class Sealer:
                 return
             except MapfoldError as error:
                 self._damaged = True
-                self.error = LogError(f"{error}; run `mapfold log recover {self._log}`")
+                self.error = LogError(f"{error}; run `{advised('log', 'recover', self._log)}`")
             else:
                 self.error = None
                 self._sealed += 1

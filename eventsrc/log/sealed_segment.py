@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
+from eventsrc.advised import advised
 from eventsrc.envelope import Offset
 from eventsrc.errors import LogDamaged
 
@@ -53,7 +54,7 @@ class SealedFile(SegmentFile):
             self.close()
             raise LogDamaged(
                 f"{path}: the index at its end cannot be read, which leaves offsets from {base} "
-                f"unreadable: {error}; run `mapfold log recover {path.parent}`"
+                f"unreadable: {error}; run `{advised('log', 'recover', path.parent)}`"
             ) from None
         except BaseException:
             self.close()

@@ -24,6 +24,7 @@ from datetime import UTC, datetime
 
 from pydantic import BaseModel, ValidationError
 
+from eventsrc.advised import advised
 from eventsrc.envelope import KeyframeId, Offset, RunId
 from eventsrc.errors import MisuseError
 from eventsrc.text import counted
@@ -92,7 +93,7 @@ def _no_point_message(reader: LogReader, text: str, *, named: bool) -> str:
     )
     return (
         f"{text}: {reader.path} has no such keyframe{no_time}; "
-        f"`mapfold log cat {reader.path}` lists what it has"
+        f"`{advised('log', 'cat', reader.path)}` lists what it has"
     )
 
 

@@ -8,6 +8,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from eventsrc.advised import advised
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.errors import LogDamaged, LogError, NotALog
 from eventsrc.text import counted
@@ -144,7 +145,8 @@ class _Verifier:
         elif scan.index_fault is not None and not scan.rewritten:
             self._add("crc", scan.index_fault, name)
         if scan.rewritten:
-            text = "another program has rewritten it; `mapfold log recover` repairs it"
+            repair = advised("log", "recover", self._log)
+            text = f"another program has rewritten it; `{repair}` repairs it"
             self._add("crc", text, name)
         previous = head.get("previous_sha256", NO_PREVIOUS)
         if head and self._expected_hashes and previous not in self._expected_hashes:

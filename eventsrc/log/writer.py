@@ -17,6 +17,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
 
+from eventsrc.advised import advised
 from eventsrc.clock import Clock, system_clock
 from eventsrc.envelope import ENVELOPE_VERSION, Offset
 from eventsrc.errors import LogError, MapfoldError, NotALog
@@ -294,9 +295,9 @@ class LogWriter:
         more = f" (and {len(self._faults) - 1} more such files)" if len(self._faults) > 1 else ""
         return (
             f"{self._faults[0]}{more}; what was written from offset {self._faults[-1].following} "
-            f"on is recorded. Keep other programs away from {self.path}; `mapfold log verify "
-            f"{self.path}` names what cannot be read, `mapfold log recover {self.path}` marks it "
-            "as lost"
+            f"on is recorded. Keep other programs away from {self.path}; "
+            f"`{advised('log', 'verify', self.path)}` names what cannot be read, "
+            f"`{advised('log', 'recover', self.path)}` marks it as lost"
         )
 
     def _finish_active(self) -> None:

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from eventsrc.advised import advised
 from eventsrc.envelope import KeyframeId, RunId, default_det_id
 from eventsrc.errors import MisuseError, TransportError
 from eventsrc.transport.session import Session
@@ -131,7 +132,7 @@ def publish_run(
     publisher = session.publisher(key)
     if not publisher.wait_for_subscriber(wait_s):
         raise TransportError(
-            f"no one subscribed to {key!r} within {wait_s:g} s; start `mapfold record LOG` first "
+            f"no one subscribed to {key!r} within {wait_s:g} s; start `{advised('record')}` first "
             "or wait longer with --wait"
         )
     sent = 0

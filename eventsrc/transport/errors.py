@@ -7,6 +7,7 @@ from typing import Final
 
 import zenoh
 
+from eventsrc.advised import advised
 from eventsrc.errors import TransportError
 
 _SOURCE_PLACE: Final = re.compile(r"\s+at /\S+\.rs:\d+\.?")
@@ -38,7 +39,7 @@ def open_error(error: BaseException, connect: object, listen: object) -> Transpo
     if "Unable to connect" in message:
         return TransportError(
             f"no Zenoh router or peer answers at {_joined(connect)}; "
-            "start one with `mapfold router` or say where it is with --connect"
+            f"start one with `{advised('router')}` or say where it is with --connect"
         )
     return TransportError(f"no Zenoh session: {one_line(error)}; check --zenoh-config")
 

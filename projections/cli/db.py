@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
+from eventsrc.advised import advised
 from eventsrc.log_info import LogInfo, log_info
 from eventsrc.text import counted, visible
 from projections.database import rebuild
@@ -45,7 +46,7 @@ def url(as_json: JsonOption = False) -> None:
         return
     display(server.url)
     if not running:
-        say("the server is not running; start it with: mapfold db start")
+        say(f"the server is not running; start it with: {advised('db', 'start')}")
 
 
 @group.command()
@@ -58,7 +59,7 @@ def start(as_json: JsonOption = False) -> None:
         emit({"url": address, "data": str(server.data), "running": True, "kept": True})
         return
     display(address)
-    say(f"running, with its data in {server.data}; stop it with: mapfold db stop")
+    say(f"running, with its data in {server.data}; stop it with: {advised('db', 'stop')}")
 
 
 @group.command()
@@ -111,7 +112,7 @@ def check(
         for report in repaired:
             say(f"{report.sink}: rebuilt")
         if wrong and not repair:
-            say(f"to repair it run: mapfold db check --repair {log}")
+            say(f"to repair it run: {advised('db', 'check', '--repair', log)}")
         elif len(repaired) < len(wrong):
             say("graph: not rebuilt, as that would drop what is not ours; remove it first")
     finish(findings=not all(report.sound for report in reports))
@@ -233,7 +234,8 @@ def _unwanted_writers(roles: tuple[str, ...]) -> str:
     them = ", ".join(map(visible, roles))
     return (
         f"not read-only: {them} may only read the graph, but Apache AGE lets them change it through"
-        " cypher(); run mapfold replay with AGE 1.7 or later, or what mapfold db roles prints and"
+        f" cypher(); run `{advised('replay')}` with AGE 1.7 or later, or what"
+        f" `{advised('db', 'roles')}` prints and"
         f" REVOKE USAGE ON SCHEMA ag_catalog FROM {them}"
     )
 

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Final
 
 import typer
 
+from eventsrc.advised import advised
 from eventsrc.errors import MisuseError
 from eventsrc.importers import (
     DEFAULT_KEY,
@@ -219,7 +220,11 @@ def _summary(log: Path, report: ImportReport) -> str:
     if report.skipped:
         parts.append(f"{counted(report.skipped, 'message')} passed over")
     parts.append(f"{report.rejected} rejected")
-    hint = f"; `mapfold log cat {log} --key mapfold/rejected` shows them" if report.rejected else ""
+    hint = (
+        f"; `{advised('log', 'cat', log, '--key', 'mapfold/rejected')}` shows them"
+        if report.rejected
+        else ""
+    )
     return ", ".join(parts) + hint
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from eventsrc.advised import advised
 from eventsrc.envelope import Offset
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
@@ -124,7 +125,8 @@ def past_settings(
     if log is None and (file is not None or assignments):
         raise MisuseError(
             "--preset, --set and --settings are for folding a log, and the live map keeps the"
-            " settings it was made with; give --log LOG too, or run mapfold replay with them"
+            " settings it was made with; give --log LOG too, or run"
+            f" `{advised('replay')}`"
         )
     return settings_from(file, assignments, corrections)
 

@@ -34,6 +34,7 @@ from typer.core import TyperGroup
 
 from eventsrc.errors import MapfoldError
 
+from .in_force import remember_running
 from .presets import add_presets
 from .terminal import EXIT_FAILED, OutputLost, say
 
@@ -115,6 +116,7 @@ def compose(names: Iterable[str], modules: Mapping[str, str]) -> typer.Typer:
     for module in dict.fromkeys(modules[name] for name in names):
         importlib.import_module(module).register(app)
     add_presets(app)
+    remember_running(app)
     _list_whole_sentences(app)
     return app
 

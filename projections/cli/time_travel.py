@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from eventsrc.advised import advised
 from eventsrc.envelope import Offset
 from eventsrc.errors import MisuseError
 from projections.history import Explanation, Expression, ExpressionError, KnownHistory, Timeline
@@ -150,7 +151,7 @@ def _numbered(found: list[Merge], number: int) -> Merge:
         if merge.number == number:
             return merge
     there = f"there are 1 to {len(found)}" if found else "there are none"
-    raise MisuseError(f"no merge number {number}; {there} (see `mapfold merges LOG`)")
+    raise MisuseError(f"no merge number {number}; {there} (see `{advised('merges')}`)")
 
 
 def why(

@@ -8,6 +8,7 @@ from typing import Final
 
 import psycopg
 
+from eventsrc.advised import advised
 from eventsrc.envelope import FIRST_OFFSET, Offset, RunId
 from eventsrc.log import Event
 from projections.errors import CheckpointMoved, DatabaseError, ProjectionBusy
@@ -102,8 +103,8 @@ def _add_columns(connection: Connection) -> None:
     except psycopg.errors.InsufficientPrivilege:
         raise DatabaseError(
             f"{describe_connection(connection)}: mapfold.checkpoint was made by an older version,"
-            " and only its owner may change that; have the owner run mapfold replay, then start"
-            " again"
+            " and only its owner may change that; have the owner run"
+            f" `{advised('replay')}`, then start again"
         ) from None
 
 

@@ -27,6 +27,7 @@ from typing import Final
 import psycopg
 from psycopg import sql
 
+from eventsrc.advised import advised
 from projections.errors import ExtensionMissing
 
 from .connection import Connection, connect, describe_connection, extension_version
@@ -62,7 +63,7 @@ def _load_age(connection: Connection) -> None:
     except (psycopg.errors.InvalidSchemaName, psycopg.errors.UndefinedFunction):
         raise ExtensionMissing(
             f"{describe_connection(connection)}: the extension age is not created there; run"
-            " mapfold replay, or have a superuser run CREATE EXTENSION age"
+            f" `{advised('replay')}`, or have a superuser run CREATE EXTENSION age"
         ) from None
     except psycopg.errors.InsufficientPrivilege:
         raise ExtensionMissing(_age_forbidden(connection)) from None

@@ -23,6 +23,7 @@ from urllib.parse import quote
 import psycopg
 from psycopg.conninfo import conninfo_to_dict
 
+from eventsrc.advised import advised
 from projections.errors import EmbeddedServerError
 
 from .cluster import LOG_NAME, SUPERUSER, Cluster
@@ -102,7 +103,7 @@ class EmbeddedServer:
         if folder is None:
             raise EmbeddedServerError(
                 f"{self.data}: too long a path for a socket, which gets a folder when the server"
-                " starts; run mapfold db start"
+                f" starts; run `{advised('db', 'start')}`"
             )
         where = f"host={quote(str(folder), safe='')}&requirepeer={quote(server_user(), safe='')}"
         return f"postgresql://{SUPERUSER}@/{quote(database, safe='')}?{where}"

@@ -12,6 +12,7 @@ from typing import Final
 
 from psycopg import sql
 
+from eventsrc.advised import advised
 from projections.errors import DatabaseError, ProjectionMismatch
 
 from . import replaced_tables
@@ -79,7 +80,7 @@ def refuse_older(connection: Connection, graph: str) -> None:
     if missing:
         raise ProjectionMismatch(
             f"{describe_connection(connection)}: an older mapfold made the graph there: it has no"
-            f" {', '.join(missing)}; run mapfold replay, which makes it again"
+            f" {', '.join(missing)}; run `{advised('replay')}`, which makes it again"
         )
 
 

@@ -9,6 +9,7 @@ The checkpoint has a key of the rows: who knows the maps of a key does not read 
 
 from collections.abc import Sequence
 
+from eventsrc.advised import advised
 from eventsrc.grey_images import BadImage
 from eventsrc.occupancy_map import OccupancyMap
 from projections.errors import DatabaseError, ProjectionMismatch
@@ -25,8 +26,8 @@ def refuse_missing(connection: Connection) -> None:
     if not _exists(connection):
         raise ProjectionMismatch(
             f"{describe_connection(connection)}: the graph there has no table mapfold.{MAP_TABLE}:"
-            " an older mapfold made it, or somebody dropped the table; run mapfold replay, which"
-            " makes it again"
+            " an older mapfold made it, or somebody dropped the table; run"
+            f" `{advised('replay')}`, which makes it again"
         )
 
 
@@ -66,7 +67,7 @@ def _map_of(connection: Connection, row: MapRow) -> OccupancyMap:
     except BadImage as error:
         raise DatabaseError(
             f"{describe_connection(connection)}: mapfold.{MAP_TABLE} at log_offset"
-            f" {row.log_offset}: png: {error}; run mapfold replay, which writes it again"
+            f" {row.log_offset}: png: {error}; run `{advised('replay')}`, which writes it again"
         ) from None
 
 

@@ -9,6 +9,7 @@ from typing import Any, Final, Literal, TypeAlias
 
 from pydantic import ValidationError
 
+from eventsrc.advised import advised
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
 from projections.errors import ProjectionMismatch, ProjectionMissing
@@ -18,6 +19,7 @@ from .checkpoints import event_hash
 from .inputs import MapInputs
 from .sink import Checkpoint, SinkName
 
+_SETTINGS_OPTIONS: Final = ("--settings", "--preset", "--set")
 _WAS: Final[dict[SinkName, str]] = {"graph": "was", "vectors": "were"}
 
 Fault: TypeAlias = Literal["log", "settings", "corrections"]
@@ -30,8 +32,7 @@ def command_line(
     """``mapfold NAME LOG`` with ``options``, and ``--set`` for all that the command would not take
     by itself: from the log, whose settings are ``logged``, or the defaults."""
     changed = settings.changed_from(logged or Settings())
-    words = ["mapfold", name, shlex.quote(str(log)), *options, *_options(changed)]
-    return " ".join(words)
+    return advised(name, log, *options, *_words(changed), without=_SETTINGS_OPTIONS)
 
 
 def command_for(name: str, log: Path, inputs: MapInputs, *options: str) -> str:
@@ -60,7 +61,7 @@ def _options_to_match(before: str, settings: Settings) -> str | None:
     if old is None:
         return None
     changed = old.changed_from(settings)
-    return " ".join(_options(dict(sorted(changed.items())))) or None
+    return shlex.join(_words(dict(sorted(changed.items())))) or None
 
 
 def _settings_of(document: str) -> Settings | None:
@@ -71,10 +72,9 @@ def _settings_of(document: str) -> Settings | None:
         return None
 
 
-def _options(values: Mapping[str, Any]) -> list[str]:
-    return [
-        f"--set {shlex.quote(f'{name}={_option_value(value)}')}" for name, value in values.items()
-    ]
+def _words(values: Mapping[str, Any]) -> list[str]:
+    pairs = [("--set", f"{name}={_option_value(value)}") for name, value in values.items()]
+    return [word for pair in pairs for word in pair]
 
 
 def _option_value(value: object) -> str:

@@ -18,6 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
+from eventsrc.advised import advised
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.log import Event, LogReader
 from projections.errors import DatabaseError, ImpossibleCommand
@@ -207,8 +208,8 @@ class KeptVectors:
             if found != expected:
                 raise DatabaseError(
                     f"{describe_connection(connection)}: {TABLE} has {found:,} rows, the map"
-                    f" {expected:,} searchable detections; run mapfold replay, which makes both"
-                    " again"
+                    f" {expected:,} searchable detections; run `{advised('replay')}`, which makes"
+                    " both again"
                 )
             return {TABLE: found}
 

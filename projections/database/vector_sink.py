@@ -6,6 +6,7 @@ from typing import Final
 
 from psycopg import sql
 
+from eventsrc.advised import advised
 from projections.errors import DatabaseError
 from projections.model.changes import BatchChanges
 from projections.model.view import MapView
@@ -89,7 +90,7 @@ class VectorSink:
             raise DatabaseError(
                 f"{describe_connection(connection)}: the map's embeddings have {dimension}"
                 f" dimensions, {TABLE} is for {self._dimension}, and only its owner may change"
-                " that; have the owner run mapfold replay, then start again"
+                f" that; have the owner run `{advised('replay')}`, then start again"
             )
 
 

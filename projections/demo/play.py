@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from eventsrc.advised import command_line
 from eventsrc.log import LogWriter
 from eventsrc.sim import DEFAULT_SEED, occupancy_map, simulate_run
 from eventsrc.system_events import MAP_KEY
@@ -155,16 +156,17 @@ def _next_commands(
         yield f"   export MAPFOLD_HOME={_quoted(folder.path)}    # where the databases are"
     if db is not None or vector_db is not None:  # a URL may hold a password: not printed
         yield "   # and MAPFOLD_DB, MAPFOLD_VECTOR_DB set to what --db and --vector-db were given"
-    log, settings = _quoted(folder.log), f"--settings {_quoted(folder.settings)}"
-    yield f"   mapfold state {log} {settings}"
+    log, settings = folder.log, ("--settings", folder.settings)
+    yield f"   {command_line('state', log, *settings)}"
     if merge is not None:
-        yield f"   mapfold diff {log} {merge.offset} {merge.offset + 1} {settings}    # that merge"
-        yield f"   mapfold merges {log} {settings}"
-    yield f"   mapfold edits {log} {settings}"
-    yield f"   mapfold relocalize {_quoted(folder.question(1))}"
-    yield f"   mapfold status {log} {settings}"
-    shown = "" if merge is None else f" --at {merge.offset + 1} --select merge:{merge.offset}"
-    yield f"   mapfold ui {log} {settings}{shown}    # in a browser"
+        before_and_behind = merge.offset, merge.offset + 1
+        yield f"   {command_line('diff', log, *before_and_behind, *settings)}    # that merge"
+        yield f"   {command_line('merges', log, *settings)}"
+    yield f"   {command_line('edits', log, *settings)}"
+    yield f"   {command_line('relocalize', folder.question(1))}"
+    yield f"   {command_line('status', log, *settings)}"
+    shown = ("--at", merge.offset + 1, "--select", f"merge:{merge.offset}") if merge else ()
+    yield f"   {command_line('ui', log, *settings, *shown)}    # in a browser"
 
 
 def _relative(path: Path) -> Path:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Self
 
+from eventsrc.advised import advised
 from eventsrc.envelope import FIRST_OFFSET, Offset, RunId
 from eventsrc.errors import MapfoldError
 from eventsrc.log import LogReader
@@ -141,7 +142,7 @@ class BackgroundTail:
             if time.monotonic() > deadline:
                 raise MapfoldError(
                     f"{self._log}: the databases did not reach event {end} within "
-                    f"{_TAIL_TIMEOUT_S:g} s; run mapfold status {self._log}"
+                    f"{_TAIL_TIMEOUT_S:g} s; run `{advised('status', self._log)}`"
                 )
             pause.wait(_POLL_S)
         self._stop.set()

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Collection, Hashable, Iterable
 from typing import TypeVar
 
+from eventsrc.advised import advised
 from eventsrc.commands import (
     Command,
     DifferentObjects,
@@ -38,10 +39,10 @@ def describe(recorded: RecordedCommand) -> str:
 
 def refusal(what: str, recorded: RecordedCommand, log: object) -> EditRefused:
     """``what``, by which command, and how to undo that."""
-    command_id = visible(recorded.command.command_id)
+    command_id = recorded.command.command_id
     return EditRefused(
-        f"{what} by {describe(recorded)}; undo that first: `mapfold edit {visible(str(log))} undo "
-        f"{command_id} --reason …`"
+        f"{what} by {describe(recorded)}; undo that first: "
+        f"`{visible(advised('edit', log, 'undo', command_id, '--reason', 'WHY'))}`"
     )
 
 

@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 
+from eventsrc.advised import advised
 from eventsrc.envelope import FIRST_OFFSET, DetId, KeyframeId, Offset, RunId
 from eventsrc.errors import MisuseError
 from eventsrc.log import Event, LogReader
@@ -158,7 +159,7 @@ class CurrentMap:
             why = "has no pose" if self.keyframes[keyframe].pose is None else "is noise"
             raise MisuseError(
                 f"keyframe {text} is in no place, because it {why}; name a place or a keyframe in "
-                "one (`mapfold state LOG` lists the places)"
+                f"one (`{advised('state')}` lists the places)"
             )
         return keyframe
 

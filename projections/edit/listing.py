@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from eventsrc.advised import advised
 from eventsrc.commands import (
     Command,
     CorrectPoses,
@@ -82,7 +83,7 @@ def _poses(command: CorrectPoses) -> str:
 def edits_text(found: Found, times: Mapping[Offset, int]) -> str:
     """A table of the commands, two lines for each, and what to do next."""
     if not found:
-        return "no command in this log; `mapfold edit LOG` gives one\n"
+        return f"no command in this log; `{advised('edit')}` gives one\n"
     undone = undone_by([recorded for recorded, _ in found])
     first_of = _first_offsets(found)
     rows = []

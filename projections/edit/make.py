@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from pydantic import ValidationError
 
+from eventsrc.advised import advised
 from eventsrc.commands import (
     Anchor,
     Command,
@@ -132,7 +133,7 @@ def _two_places(current: CurrentMap, first: str, second: str) -> tuple[Keyframe,
     if pair[0] == pair[1]:
         raise EditRefused(
             f"{first} and {second} are the same place; name two, or two keyframes of it "
-            "(`mapfold merges LOG` lists what became one)"
+            f"(`{advised('merges')}` lists what became one)"
         )
     return pair
 
@@ -166,7 +167,7 @@ def different_objects(
     if one.det_id == other.det_id:
         raise EditRefused(
             f"{first} and {second} are the same observation; name two objects, or two of the "
-            "det_ids of one (`mapfold state LOG --json` has them)"
+            f"det_ids of one (`{advised('state', '--json')}` has them)"
         )
     if tuple(sorted((one.det_id, other.det_id))) in current.corrections.different:
         raise EditRefused(f"{first} and {second} are kept apart already")
@@ -291,7 +292,7 @@ def merged_at(current: CurrentMap, offset: int) -> tuple[Keyframe, ...]:
         parts = "; ".join(" with ".join(str(ids(p)) for p in places) for places in merged)
         raise EditRefused(
             f"{len(merged)} merges happened at offset {offset}: {parts}; say which with "
-            "`mapfold edit LOG keep-apart PLACE PLACE`"
+            f"`{advised('edit', current.reader.path, 'keep-apart', 'PLACE', 'PLACE')}`"
         )
     return tuple(current.founder(place) for place in merged[0])
 
@@ -312,5 +313,5 @@ def _nothing_merged(current: CurrentMap, offset: int) -> str:
     rest = f" (and {more:,} more)" if more > 0 else ""
     return (
         f"nothing merged at offset {offset}; {counted(len(offsets), 'event')} merged places, at "
-        f"{near}{rest}: see `mapfold merges {current.reader.path}`"
+        f"{near}{rest}: see `{advised('merges', current.reader.path)}`"
     )

@@ -9,6 +9,7 @@ from itertools import combinations
 from math import sqrt
 from typing import NamedTuple
 
+from eventsrc.advised import advised
 from eventsrc.commands import (
     Anchor,
     Command,
@@ -83,7 +84,8 @@ def _check_does(change: Change, command: Command, effect: Effect) -> None:
                         f"both would be in {change.after.place_id(place)}; keyframes in a cell of "
                         f"side ε/√2 = {side:.3g} m are never parted, nor those whose places were "
                         "one before the later of them came; name two places that were merged "
-                        f"(`mapfold merges {current.reader.path}`) or keyframes that founded two"
+                        f"(`{advised('merges', current.reader.path)}`) or keyframes that founded "
+                        "two"
                     )
         case DifferentObjects():
             located = Located.of(change.after)

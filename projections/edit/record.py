@@ -9,6 +9,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from eventsrc.advised import advised
 from eventsrc.commands import Command, encode_command
 from eventsrc.envelope import Offset
 from eventsrc.errors import LogBusy, MapfoldError, TransportError
@@ -67,7 +68,7 @@ def make_command(
     if known is not None and known.command != command:
         raise EditRefused(
             f"--command-id {visible(stamp.command_id)} is that of another command, at offset "
-            f"{known.offset} (see `mapfold edits`); give another or none"
+            f"{known.offset} (see `{advised('edits')}`); give another or none"
         )
     outcome = outcome_of(current, command, recorded=known is not None)
     offset = known.offset if known else None

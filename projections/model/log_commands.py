@@ -5,6 +5,7 @@ on ``mapfold/command`` that is no command is an error that names its offset: lea
 give another map than its author asked for.
 """
 
+from eventsrc.advised import advised
 from eventsrc.commands import InvalidCommand, UnknownKind, UseSettings, parse_command
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.log import Event, LogReader
@@ -35,7 +36,7 @@ def read_command(event: Event) -> RecordedCommand:
 
 
 def _before(offset: Offset) -> str:
-    return f"`mapfold state LOG --at {offset}`"
+    return f"`{advised('state', '--at', offset)}`"
 
 
 def read_commands(

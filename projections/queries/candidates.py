@@ -16,6 +16,7 @@ from typing import Any, Final, NamedTuple
 import psycopg
 from psycopg import sql
 
+from eventsrc.advised import advised
 from projections.database.connection import (
     Connection,
     Targets,
@@ -60,8 +61,8 @@ def refuse_mixed(
     )
     where = "" if vectors_place == graph_place else f" (the graph is in {graph_place})"
     raise ProjectionMismatch(
-        f"{vectors_place}: the vectors there were {reason}{where}; run mapfold replay LOG without"
-        " --only, so that one log and one set of settings make both"
+        f"{vectors_place}: the vectors there were {reason}{where}; run"
+        f" `{advised('replay')}` without --only, so that one log and one set of settings make both"
     )
 
 
@@ -330,7 +331,8 @@ def _query_errors(url: str) -> Iterator[None]:
             yield
         except (psycopg.errors.UndefinedTable, psycopg.errors.InvalidSchemaName):
             raise ProjectionMissing(
-                f"{describe_target(url)}: nothing has been projected there yet; run mapfold replay"
+                f"{describe_target(url)}: nothing has been projected there yet; run"
+                f" `{advised('replay')}`"
             ) from None
         except psycopg.errors.DataException as error:
             raise QuestionError(

@@ -9,6 +9,7 @@ from typing import Any
 
 import psycopg
 
+from eventsrc.advised import advised
 from projections.database.connection import Connection, database_errors, describe_connection
 from projections.database.graph_render import text
 from projections.database.statements import statements, tables
@@ -89,7 +90,7 @@ def _rows(connection: Connection, name: str, **values: Any) -> list[Any]:
         except (psycopg.errors.UndefinedTable, psycopg.errors.InvalidSchemaName):
             raise ProjectionMissing(
                 f"{describe_connection(connection)}: nothing has been projected there yet; run"
-                " mapfold replay"
+                f" `{advised('replay')}`"
             ) from None
 
 

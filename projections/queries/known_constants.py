@@ -12,6 +12,7 @@ from typing import Any, Final, Self
 
 from pydantic import ValidationError
 
+from eventsrc.advised import advised
 from eventsrc.occupancy_map import OccupancyMap
 from projections.errors import ProjectionMismatch
 from projections.relocalize import MapConstants, WallMap
@@ -63,7 +64,7 @@ class KnownConstants:
         except ValidationError:
             raise ProjectionMismatch(
                 f"{place}: the map there has settings that this version of mapfold does not know;"
-                " run mapfold replay LOG"
+                f" run `{advised('replay')}`"
             ) from None
         constants = MapConstants.of(settings, self.cosines)
         return replace(self, settings_key=sent[0], settings=settings, constants=constants)

@@ -6,6 +6,7 @@ A `MapSource` has the data they need: `LiveMap` in the graph's database, `Folded
 from collections.abc import Sequence
 from typing import Any, Protocol
 
+from eventsrc.advised import advised
 from projections.database.connection import Connection
 from projections.deltas import PlaceOrdinal
 from projections.errors import QuestionError
@@ -163,7 +164,7 @@ def where_is(source: MapSource, wanted: str) -> dict[str, Any] | list[dict[str, 
         known = f"; there are places of type {', '.join(types)}" if types else ""
         raise QuestionError(
             f"no object {wanted!r} in this map, and no place of that type or name{known}; "
-            "mapfold state --json lists objects and places"
+            f"`{advised('state', '--json')}` lists objects and places"
         )
     found.sort(key=lambda p: (p.name != wanted, -(p.type_probability or 0.0), p.ordinal))
     return [

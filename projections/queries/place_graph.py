@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
+from eventsrc.advised import advised
 from projections.errors import QuestionError
 from projections.model.view import MapView
 
@@ -54,7 +55,9 @@ class PlaceGraph:
     def find(self, place_id: str) -> int:
         """The ordinal of a Place. Raises QuestionError if there is none of that id."""
         if place_id not in self._ids:
-            raise QuestionError(f"no place {place_id!r} in this map; mapfold state lists them")
+            raise QuestionError(
+                f"no place {place_id!r} in this map; `{advised('state')}` lists them"
+            )
         return self._ids[place_id]
 
     def hops_from(self, start: int, most: int) -> dict[int, int]:

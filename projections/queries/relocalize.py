@@ -11,6 +11,7 @@ import psycopg
 from pgvector.psycopg import register_vector
 from psycopg import sql
 
+from eventsrc.advised import advised
 from projections.database.connection import (
     Connection,
     Targets,
@@ -71,7 +72,7 @@ def prepare_vectors(connection: Connection) -> None:
     except psycopg.ProgrammingError:
         raise ExtensionMissing(
             f"{describe_connection(connection)}: nothing has been projected there yet, not even"
-            " the extension vector is created; run mapfold replay"
+            f" the extension vector is created; run `{advised('replay')}`"
         ) from None
     connection.execute("SELECT '[1]'::vector")  # loads the library, whose settings come next
     connection.execute(sql.SQL("SET hnsw.ef_search = {}").format(sql.Literal(_EF_SEARCH)))

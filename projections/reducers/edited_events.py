@@ -7,10 +7,10 @@ a keyframe that had none it is left out.
 """
 
 import math
-import shlex
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from eventsrc.advised import command_line
 from eventsrc.envelope import MAX_POSITION_M, Detection, DetId, Envelope, Offset
 from eventsrc.ingest import Accepted
 from eventsrc.text import visible
@@ -78,7 +78,7 @@ def _with_pose(corrections: Corrections, offset: Offset, accepted: Accepted) -> 
             f"correct-poses {command_id} at offset {by.offset} moves keyframe "
             f"{envelope.keyframe_id} of run {envelope.run_id!r} to x={x!r}, y={y!r}, yaw={yaw!r}, "
             f"beyond ±{MAX_POSITION_M:,.0f} m; take it back: "
-            f"mapfold edit LOG undo {shlex.quote(command_id)} --reason …",
+            f"{command_line('edit', 'LOG', 'undo', command_id, '--reason', 'WHY')}",
         )
     update: dict[str, object] = {"map_x": x, "map_y": y, "map_yaw": yaw}
     if envelope.pose_covariance is not None:

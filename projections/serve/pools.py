@@ -13,6 +13,7 @@ from typing import Final, Self, TypeVar
 
 from psycopg_pool import ConnectionPool, PoolTimeout
 
+from eventsrc.advised import advised
 from projections.database import checkpoints
 from projections.database.connection import (
     Connection,
@@ -196,7 +197,7 @@ def _require_map(sink: SinkName, url: str) -> None:
         if checkpoints.load(connection, sink) is None:
             raise ProjectionMissing(
                 f"{describe_target(url)}: no {sink} there: nothing has been projected yet; run"
-                " mapfold replay LOG"
+                f" `{advised('replay')}`"
             )
 
 

@@ -197,6 +197,6 @@ def test_settings_of_another_version_are_refused(
         connection.execute("""UPDATE mapfold.checkpoint SET settings = '{"magic": 1}'""")
     with (
         CandidateReader(one_database) as reader,
-        pytest.raises(ProjectionMismatch, match="run mapfold replay LOG"),
+        pytest.raises(ProjectionMismatch, match="run `mapfold replay LOG"),
     ):
         reader.candidates(questions()[0])

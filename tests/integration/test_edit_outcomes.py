@@ -185,5 +185,5 @@ def test_a_command_of_an_unknown_kind_is_named_with_a_next_step(mapfold: Command
         writer.append(COMMAND_KEY, b'{"kind": "zz"}')
     said = mapfold("state", "log", code=1).err
     assert "it is a command of kind 'zz', which this version does not know; update mapfold" in said
-    assert f"`mapfold state LOG --at {EVENTS}`" in said
+    assert f"`mapfold state --at {EVENTS} log`" in said
     assert mapfold("state", "log", "--at", str(EVENTS), "--digest").out == digest

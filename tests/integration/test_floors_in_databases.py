@@ -89,7 +89,7 @@ def test_a_graph_of_an_older_version_is_refused_until_a_replay(
         for label in ("PART_OF", "Building", "Floor"):
             connection.execute("SELECT drop_label('semantic_map', %s)", [label])
     with pytest.raises(
-        ProjectionMismatch, match=r"no Floor, Building, PART_OF; run mapfold replay"
+        ProjectionMismatch, match=r"no Floor, Building, PART_OF; run `mapfold replay"
     ):
         tail(log, one_database, SETTINGS, once=True)
     rebuild(log, one_database, SETTINGS)

@@ -173,7 +173,7 @@ def test_check_finds_a_changed_map_and_repairs_it(
     assert kind in {d.kind for d in graph.differences}
     assert vectors.sound
     if "png" in change:
-        with pytest.raises(DatabaseError, match=r"log_offset 0: png: .* run mapfold replay"):
+        with pytest.raises(DatabaseError, match=r"log_offset 0: png: .* run `mapfold replay"):
             ask(one_database)
     rebuild(log, one_database, Settings())
     assert [r.differing for r in check(log, one_database, Settings())] == [0, 0]

@@ -465,7 +465,7 @@ def test_a_full_pool_is_not_reported_as_an_outage(
 
 
 def test_it_does_not_start_without_a_map(one_database: Targets) -> None:
-    with pytest.raises(ProjectionMissing, match="run mapfold replay"):
+    with pytest.raises(ProjectionMissing, match="run `mapfold replay"):
         Pools(one_database, 1)
 
 

@@ -157,7 +157,7 @@ def test_a_removed_folder_is_made_again_under_the_same_name(
 def test_before_the_first_start_there_is_no_url(home: Path) -> None:
     server = EmbeddedServer(home)
     assert not server.running
-    with pytest.raises(EmbeddedServerError, match="run mapfold db start"):
+    with pytest.raises(EmbeddedServerError, match="run `mapfold db start"):
         _ = server.url
 
 

@@ -217,7 +217,7 @@ def test_a_projection_of_an_older_version_is_answered_without_walls(
         assert reader.candidates(asked.crops).walls == {}
         with pytest.raises(ProjectionMismatch, match=r"no table mapfold\.occupancy_map") as told:
             tail(log, one_database, SETTINGS, once=True)
-        assert "run mapfold replay" in str(told.value)
+        assert "run `mapfold replay" in str(told.value)
         rebuild(log, one_database, SETTINGS)
         assert list(reader.candidates(asked.crops).walls) == [None]
     _append(log, payload(envelope(9_000, 1.0, 1.0, run_id="late")))

@@ -221,7 +221,7 @@ def test_a_command_that_stands_in_the_way_is_named(
     if "already" not in says or " by" in says:
         assert f"command first ({given.kind} at offset 30, by me@here: why)" in message
     if says.endswith(("kept apart by", "joined by", "made one by")):
-        assert f"`mapfold edit {log} undo first --reason …`" in message
+        assert f"`mapfold edit {log} undo first --reason WHY`" in message
         give(log, by.undo, "first", command_id="second")
         make(log, then[0], *then[1])
 

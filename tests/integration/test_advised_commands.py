@@ -1,0 +1,216 @@
+"""Every command line that a message advises can be pasted into a shell, and is the right one."""
+
+import ast
+import json
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import psycopg
+import pytest
+import typer
+
+from eventsrc.advised import advised, complete_by
+from eventsrc.log import LogWriter
+from projections.cli import COMMANDS, command_line
+from projections.database.connection import Targets
+from tests.commands import Commands, Said
+from tests.envelopes import envelope, payload
+from tests.fixtures_log import flip
+from tests.logs import bridge, walk, write_log
+
+ROOT = Path(__file__).resolve().parents[2]
+SOURCES = [p for top in ("eventsrc", "projections") for p in (ROOT / top).rglob("*.py")]
+LOG = "my logs/the log"
+SETTINGS = "my settings.json"
+ADVICE = re.compile(rf"(`|\brun:? |\bwith: )mapfold ({'|'.join(COMMANDS)})\b")
+
+
+def strings(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """The string constants that are no docstrings and no help texts, with their lines."""
+    skipped: set[int] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            skipped.add(id(node.value))
+        if isinstance(node, ast.keyword) and node.arg in ("help", "metavar"):
+            skipped |= {id(inner) for inner in ast.walk(node.value)}
+    for node in ast.walk(tree):
+        is_text = isinstance(node, ast.Constant) and isinstance(node.value, str)
+        if is_text and id(node) not in skipped:
+            yield node.lineno, node.value
+
+
+def test_no_message_has_a_command_line_of_its_own() -> None:
+    found = [
+        f"{path.relative_to(ROOT)}:{line}: {text}"
+        for path in SOURCES
+        for line, text in strings(ast.parse(path.read_text("utf-8")))
+        if ADVICE.search(text)
+    ]
+    named = {
+        "projections/cli/recording.py": 1,  # "taking commands of `mapfold edit`"
+        "projections/demo/report.py": 1,  # what the demo ran
+    }
+    others = [each for each in found if each.split(":")[0] not in named]
+    assert not others, "\n".join(others)
+    assert len(found) <= sum(named.values())
+
+
+def calls() -> list[tuple[str, ast.Call]]:
+    return [
+        (f"{path.relative_to(ROOT)}:{node.lineno}", node)
+        for path in SOURCES
+        for node in ast.walk(ast.parse(path.read_text("utf-8")))
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Name)
+        and node.func.id == "advised"
+    ]
+
+
+@pytest.mark.parametrize(("place", "call"), calls(), ids=lambda each: each if each is str else None)
+def test_each_advised_command_exists_and_takes_its_words(place: str, call: ast.Call) -> None:
+    """With a word for each value: ``db check --repair X`` is a command, and takes an argument."""
+    words = [
+        arg.value if isinstance(arg, ast.Constant) else "X"
+        for arg in call.args
+        if not isinstance(arg, ast.Starred)
+    ]
+    if words[0] == "X":  # a name that its caller gives
+        return
+    assert words[0] in COMMANDS, place
+    command: Any = typer.main.get_command(command_line([words[0]]))
+    names = list(words)
+    while hasattr(command, "commands") and names and names[0] in command.commands:
+        command = command.commands[names.pop(0)]
+        if hasattr(command, "commands") and names and names[0] == "X":  # mapfold edit LOG KIND …
+            return
+    options = {option for param in command.params for option in param.opts}
+    assert {name for name in names if str(name).startswith("-")} <= options, place
+    arguments = [param for param in command.params if param.param_type_name == "argument"]
+    assert len([n for n in names if not str(n).startswith("-")]) <= len(arguments) + 1, place
+
+
+def test_nothing_is_added_outside_the_program() -> None:
+    assert advised("log", "verify", "a b's") == """mapfold log verify 'a b'"'"'s'"""
+    complete_by(lambda words, without: ["--x", *words[:1], *without])
+    try:
+        assert advised("replay", without=["--set"]) == "mapfold replay --x replay --set"
+    finally:
+        complete_by(None)
+
+
+def told(said: Said) -> list[list[str]]:
+    """The words of the command lines in what was said, without ``mapfold``."""
+    found = re.findall(r"`(mapfold [^`]*)`|(?:run|with): (mapfold .*)", said.err + said.out)
+    return [shlex.split(quoted or rest)[1:] for quoted, rest in found]
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Commands:
+    """Beside a log and settings whose names have spaces."""
+    (tmp_path / "my logs").mkdir()
+    write_log(tmp_path / LOG, walk(40) + list(bridge()))
+    (tmp_path / SETTINGS).write_text(json.dumps({"eps_m": 0.9}))
+    (tmp_path / "question.json").write_text(json.dumps([{"class": "cup", "embedding": [1.0, 0.0]}]))
+    return Commands.in_folder(tmp_path)
+
+
+OWN = ("--settings", SETTINGS, "--set", "min_samples=4")
+
+
+@pytest.mark.parametrize(
+    ("args", "advice"),
+    [
+        (("merges", LOG, "--show", "99", *OWN), [["merges", LOG, *OWN]]),
+        (
+            ("merges", LOG, "--show", "99", "--preset", "rooms"),
+            [["merges", LOG, "--preset", "rooms"]],
+        ),
+        (("query", "contents", "nowhere", "--log", LOG, *OWN), [["state", LOG, *OWN]]),
+        (("edits", LOG), [["edit", LOG]]),
+        (("log", "cat", LOG, "--from", "run-a:4711"), [["log", "cat", LOG]]),
+        (("state", "my logs/a file", *OWN), [["import", "LOG", "my logs/a file"]]),
+        (
+            ("edit", LOG, "keep-apart", "run-a_p0", "run-a_p0", "--reason", "x", *OWN),
+            [["merges", LOG, *OWN]],
+        ),
+        (("db", "url"), [["db", "start"]]),
+    ],
+    ids=lambda each: " ".join(each[:3]) if isinstance(each, tuple) else None,
+)
+def test_advice_names_the_log_and_the_options_in_force_and_runs(
+    run: Commands, args: tuple[str, ...], advice: list[list[str]] | None
+) -> None:
+    (run.folder / "my logs/a file").write_bytes(payload(envelope(1)))
+    found = told(run(*args, code=None))
+    assert found
+    if advice is not None:
+        assert found == advice
+    for words in found:
+        assert run(*words, code=None).code == (2 if words[0] == "edit" else 0)  # shows its help
+    run("db", "stop")
+
+
+def test_advice_on_a_damaged_log_repairs_it(run: Commands) -> None:
+    log = run.folder / LOG
+    segment = next(log.glob("*.mcap"))
+    flip(segment, segment.stat().st_size - 30)
+    (words,) = told(run("state", LOG, *OWN, code=1))
+    assert words == ["log", "recover", LOG]
+    run(*words, code=None)
+    assert "all good" in run("log", "verify", LOG).err
+
+
+def test_advice_of_an_import_shows_what_was_rejected(run: Commands) -> None:
+    (words,) = told(run("import", LOG, "-", stdin=b"junk", code=3))
+    assert "not JSON" in run(*words).out
+
+
+def test_advice_on_a_command_of_a_later_version_shows_the_map_before_it(run: Commands) -> None:
+    with LogWriter(run.folder / LOG) as writer:
+        unknown = {"kind": "paint", "command_id": "c", "issued_by": "me"}
+        writer.append("mapfold/command", payload(unknown))
+    (words,) = told(run("merges", LOG, *OWN, code=1))
+    assert words[:3] == ["state", "--at", "60"]
+    assert words[3:] == [LOG, *OWN]
+    assert run(*words, "--digest").out
+
+
+def test_settings_without_a_log_are_advised_with_the_settings(run: Commands) -> None:
+    (words,) = told(run("relocalize", "question.json", *OWN, code=2))
+    assert words == ["replay", "LOG", *OWN]
+
+
+@pytest.mark.seconds
+def test_what_db_check_advises_repairs_under_the_same_settings_and_databases(
+    run: Commands, one_database: Targets
+) -> None:
+    url = one_database.graph_url
+    run("replay", LOG, *OWN, "--db", url)
+    with psycopg.connect(url) as connection:
+        connection.execute("DELETE FROM detection_embeddings WHERE det_pk = 1")
+    said = run("db", "check", LOG, *OWN, "--db", url, code=3)
+    (words,) = told(said)
+    assert words[:3] == ["db", "check", "--repair"]
+    assert words[3] == LOG
+    run(*words, code=3)
+    assert not told(run("db", "check", LOG, *OWN, "--db", url))
+    said = run("tail", LOG, "--once", "--set", "eps_m=2", "--db", url, code=1)
+    (words,) = told(said)
+    assert words == ["replay", LOG, "--set", "eps_m=2.0", "--db", url]
+    run(*words)
+    run("tail", LOG, "--once", "--set", "eps_m=2", "--db", url)
+
+
+def test_a_password_is_not_in_advice(run: Commands) -> None:
+    from projections.cli.in_force import _without_password
+
+    url = "postgresql://ann:s3cret@h:5433/maps?application_name=x"
+    assert "s3cret" not in _without_password(url)
+    assert "port=5433" in _without_password(url)
+    assert _without_password("postgresql://ann@h/maps") == "postgresql://ann@h/maps"
+    spaced = "host=h password='a b' dbname='my maps'"
+    assert "a b" not in _without_password(spaced)
+    assert "dbname='my maps'" in _without_password(spaced)
