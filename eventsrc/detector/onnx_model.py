@@ -10,6 +10,7 @@ from typing import Any, Final, Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from eventsrc.advised import command_line
 from eventsrc.errors import MapfoldError, MisuseError
 
 Device: TypeAlias = Literal["cpu", "cuda"]
@@ -52,7 +53,9 @@ class OnnxModel:
     def __init__(self, path: Path, device: Device = "cpu", threads: int | None = None) -> None:
         self.path = path
         if not path.is_file():
-            raise MisuseError(f"{path}: no such model; see `mapfold detect` without models")
+            raise MisuseError(
+                f"{path}: no such model; see `{command_line('detect')}` without models"
+            )
         ort, self._faults = _onnxruntime()
         options = ort.SessionOptions()
         options.log_severity_level = 4  # faults come as exceptions

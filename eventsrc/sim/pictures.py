@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from eventsrc.advised import advised
 from eventsrc.detector.vision import encode_jpeg
 from eventsrc.envelope import RunId
 from eventsrc.errors import MisuseError, TransportError
@@ -128,8 +129,8 @@ def publish_pictures(
     images, poses = session.publisher(image_key), session.publisher(pose_key)
     if not images.wait_for_subscriber(wait_s):
         raise TransportError(
-            f"no one subscribed to {image_key!r} within {wait_s:g} s; start `mapfold detect"
-            f" --zenoh-image {image_key}` first or wait longer with --wait"
+            f"no one subscribed to {image_key!r} within {wait_s:g} s; start"
+            f" `{advised('detect', '--zenoh-image', image_key)}` first or wait longer with --wait"
         )
     sent = 0
     started = time.monotonic()

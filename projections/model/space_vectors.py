@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from eventsrc.advised import advised
 from eventsrc.commands import Reembed
 from eventsrc.embeddings import InvalidEmbeddings, decode_embeddings
 from eventsrc.envelope import DetId
@@ -62,7 +63,7 @@ def _read(log: Path, _log_id: str, commands: tuple[Reembed, ...]) -> Reembedded:
                 raise FoldError(
                     command.first,
                     f"the vectors of {command.space!r} from here to offset {command.end} are not"
-                    f" those that command {command.command_id} was given for; run `mapfold log"
-                    " verify`, and undo the command to map without them",
+                    f" those that command {command.command_id} was given for; run"
+                    f" `{advised('log', 'verify')}`, and undo the command to map without them",
                 )
     return Reembedded(commands[0].space, vectors)
