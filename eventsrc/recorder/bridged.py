@@ -69,9 +69,10 @@ class Bridge:
         return self._derivation.reasons
 
     @property
-    def told(self) -> bool:
-        """Whether any type is known."""
-        return bool(self._formats or self._told)
+    def types_told(self) -> frozenset[str]:
+        """The keys whose types are known; may be called from any thread."""
+        with self._lock:
+            return frozenset(self._formats) | frozenset(self._told)
 
     @property
     def latched_keys(self) -> tuple[str, ...]:
@@ -125,8 +126,8 @@ class Bridge:
         """Take over the types that tokens have told."""
         with self._lock:
             told, self._told = self._told, {}
-        for key, type_name in told.items():
-            self._formats[key] = self._format(type_name)
+            for key, type_name in told.items():
+                self._formats[key] = self._format(type_name)
 
     def _format(self, type_name: str) -> MessageFormat:
         """With the definition of the type, if there is one."""

@@ -105,7 +105,7 @@ class Recorder:
                 self._subscriptions.append(session.subscribe_tokens(selector, bridge.note_token))
         for key in bridge.keys:
             self._subscriptions += [
-                session.subscribe(key, self._receive_bridged, limit=limit),
+                session.subscribe(key, self._receive_bridged, limit=limit, in_order=True),
                 session.subscribe_heartbeats(key, self._queue.put_heartbeat),
             ]
         session.confirm()

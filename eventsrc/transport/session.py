@@ -68,13 +68,19 @@ class Session:
         return Publisher(self.raw, key)
 
     def subscribe(
-        self, key_expr: str, handler: Callable[[Received], None], limit: SizeLimit | None = None
+        self,
+        key_expr: str,
+        handler: Callable[[Received], None],
+        limit: SizeLimit | None = None,
+        *,
+        in_order: bool = False,
     ) -> Subscription:
         """Call ``handler`` for every message under ``key_expr``, from a thread of Zenoh's.
 
         The handler must return quickly: nothing else is received meanwhile, and after five seconds
         Zenoh closes links and loses messages silently. Messages over ``limit`` are not copied out
-        of Zenoh.
+        of Zenoh. Each subscription has a thread of its own; those ``in_order`` share the one that
+        receives, so that messages of several keys come in the order in which they were sent.
         """
 
         def receive(sample: zenoh.Sample) -> None:
@@ -87,7 +93,8 @@ class Session:
 
         check_key_length(key_expr)
         with transport_errors(f"key expression {key_expr!r} cannot be subscribed to"):
-            return Subscription(self.raw.declare_subscriber(key_expr, receive))
+            called = zenoh.handlers.Callback(receive, indirect=not in_order)
+            return Subscription(self.raw.declare_subscriber(key_expr, called))
 
     def subscribe_heartbeats(
         self, key_expr: str, handler: Callable[[SequenceNumber], None]

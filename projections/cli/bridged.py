@@ -159,7 +159,7 @@ def recording_of(
                 run_id,
                 full("/tf", "--namespace"),
                 full("/tf_static", "--namespace"),
-                None if choice.pose == TF_POSE else given(choice.pose, "--pose"),
+                None if choice.pose == TF_POSE else full(choice.pose, "--pose"),
                 given(choice.covariance, "--covariance"),
                 given(choice.embeddings, "--embeddings"),
                 given(choice.camera, "--camera"),
@@ -209,7 +209,7 @@ def warn_of_silence(
     def watching(report: RecorderReport) -> None:
         nonlocal calls
         calls += 1
-        if calls == round(_QUIET_S / every_s) and not (bridge.told or report.messages):
+        if calls == round(_QUIET_S / every_s) and not (bridge.types_told or report.messages):
             say(
                 f"no bridge has announced any of {', '.join(bridge.topics)} yet: check that "
                 "zenoh-bridge-ros2dds runs, is connected to the same router, and has the namespace "

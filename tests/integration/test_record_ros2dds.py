@@ -158,9 +158,10 @@ def test_messages_are_verbatim_and_make_the_envelopes_of_a_bag(
     sent = drive(40)
     with (
         ros2dds.bridge(endpoint, namespace=namespace, old=old) as bridge,
-        recording(connected(), log_path, new_bridge(namespace)) as running,
+        recording(connected(), log_path, own := new_bridge(namespace)) as running,
     ):
         announce_all(bridge)
+        running.wait_until(lambda _: len(own.types_told) == len(KINDS))
         payloads = send_all(bridge, sent)
         running.wait_until(lambda r: r.messages >= len(sent))
     report = running.finish()
@@ -168,12 +169,12 @@ def test_messages_are_verbatim_and_make_the_envelopes_of_a_bag(
     assert report.clean
     events = read_log(log_path)
     kept = verbatim(events)
-    for name in KINDS:  # topics are not ordered among each other
-        topic = topic_of(namespace, name, "")
-        of_topic = [e for e in kept if e.key == topic]
-        assert [e.payload for e in of_topic] == [p for t, p in payloads if t == name]
+    assert [(e.key, e.payload) for e in kept] == [
+        (topic_of(namespace, name, ""), payload) for name, payload in payloads
+    ]
+    for event, (name, _) in zip(kept, payloads, strict=True):
         text = TYPES.definition(KINDS[name]).encode()
-        assert {e.format for e in of_topic} == {MessageFormat("cdr", KINDS[name], "ros2msg", text)}
+        assert event.format == MessageFormat("cdr", KINDS[name], "ros2msg", text)
     expected = expected_envelopes(sent, namespace)
     assert [e.payload for e in envelopes(events)] == expected
     assert all(b'"embedding"' in each and b'"map_x"' in each for each in expected)

@@ -466,7 +466,8 @@ def test_what_was_received_and_could_not_be_written_is_counted(
     """The clock is the gate, and what breaks the log: the first message stands before the log, ten
     in the queue, and then an impossible time comes."""
     entered, gate = threading.Event(), threading.Event()
-    times = itertools.chain([system_clock()], itertools.repeat(-1))
+    opening = [system_clock()] * 2  # the lock and the first segment
+    times = itertools.chain(opening, itertools.repeat(-1))
 
     def breaking_clock() -> int:
         now_ns = next(times)
