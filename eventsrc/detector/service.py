@@ -24,13 +24,15 @@ class Report:
     """Poses that came in; None where they do not."""
     bad_poses: int = 0
     stopped: bool = False
+    """Whether it ended before the last picture of a file, folder or stream."""
 
     @property
     def clean(self) -> bool:
         """Whether nothing was lost, left out or kept waiting."""
         sent = self.delivered
         unsent = sent.waiting + sent.refused + sent.no_room + sent.crops_lost
-        return not (self.counts.lost + unsent + self.dropped + self.too_large + self.bad_poses)
+        lost = self.counts.lost + unsent + self.dropped + self.too_large + self.bad_poses
+        return not lost and not self.stopped
 
 
 class Detection:
@@ -40,11 +42,13 @@ class Detection:
         self, keyframes: Keyframes, output: Output, live: LivePictures | None, stop: threading.Event
     ) -> None:
         self._keyframes, self._output, self._live, self._stop = keyframes, output, live, stop
+        self._stopped = False
 
     def run(self, pictures: Iterable[Picture], watch: Callable[[Report], None]) -> None:
         """Look at all pictures, or until ``stop`` is set; ``watch`` is called after each."""
         for picture in pictures:
             if self._stop.is_set():
+                self._stopped = True
                 return
             keyframe = self._keyframes.look(picture)
             if keyframe is not None:
@@ -58,7 +62,7 @@ class Detection:
     def report(self) -> Report:
         """The numbers now."""
         counts, delivered = self._keyframes.counts, self._output.delivered
-        stopped = self._stop.is_set()
+        stopped = self._stopped
         if self._live is None:
             return Report(counts, delivered, stopped=stopped)
         queue, poses = self._live.queue, self._live.poses

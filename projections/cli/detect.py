@@ -35,7 +35,15 @@ from eventsrc.text import visible
 from eventsrc.transport.config import check_key, parse_address
 from eventsrc.transport.session import Session, ZenohOptions, open_session
 
-from .detect_checks import check_sources, device_of, limits_of, run_id_of, stdin_until, timing_of
+from .detect_checks import (
+    check_sources,
+    device_of,
+    limits_of,
+    run_id_of,
+    spool_path,
+    stdin_until,
+    timing_of,
+)
 from .detect_text import WITHOUT_MODELS, advice, as_document, metrics_of, show_status, summary
 from .options import ConfigOption, ConnectOption, JsonOption, ListenOption, zenoh_options
 from .signals import stop_on_signals
@@ -47,7 +55,6 @@ if TYPE_CHECKING:
 _PICTURES: Final = "Pictures and poses"
 _MODELS: Final = "Models"
 _KEYFRAMES: Final = "Keyframes"
-_SPOOL: Final = Path(".mapfold/detect-spool.sqlite")
 _STATUS_EVERY_S: Final = 0.25
 
 
@@ -186,7 +193,7 @@ def detect(
         typer.Option(
             metavar="METRES",
             min=0.0,
-            help="A picture is a keyframe after so far,",
+            help="How far from the last keyframe a picture is the next one.",
             rich_help_panel=_KEYFRAMES,
         ),
     ] = MOVED_M,
@@ -195,7 +202,7 @@ def detect(
         typer.Option(
             metavar="DEGREES",
             min=0.0,
-            help="or after such a turn,",
+            help="After what turn it is one.",
             rich_help_panel=_KEYFRAMES,
         ),
     ] = TURNED_DEG,
@@ -204,7 +211,7 @@ def detect(
         typer.Option(
             metavar="SECONDS",
             min=0.0,
-            help=f"or after so long; 0: every picture. [default: {AFTER_S:g}; without any poses 0]",
+            help=f"After how long it is one; 0: at once. [default: {AFTER_S:g}; without poses 0]",
             rich_help_panel=_KEYFRAMES,
             show_default=False,
         ),
@@ -239,11 +246,13 @@ def detect(
         ),
     ] = False,
     spool: Annotated[
-        Path,
+        Path | None,
         typer.Option(
-            metavar="FILE", help="Keeps what no recorder has acknowledged, also for the next start."
+            metavar="FILE",
+            help="Keeps what no recorder has acknowledged, also for the next start [default:"
+            " detect-spool.sqlite in $MAPFOLD_HOME, else in .mapfold].",
         ),
-    ] = _SPOOL,
+    ] = None,
     wait: Annotated[
         float,
         typer.Option(
@@ -319,7 +328,7 @@ def detect(
             stack,
             out,
             zenoh,
-            spool,
+            spool or spool_path(),
             key,
             session if keep_crops else None,
             stop,

@@ -81,8 +81,16 @@ def device_of(text: str) -> Device:
 
 def limits_of(moved: float, turned: float, after: float | None, *, posed: bool) -> GateLimits:
     """What makes a keyframe: without poses and ``--after`` every picture."""
+    for name, value in (("--moved", moved), ("--turned", turned), ("--after", after or 0.0)):
+        if not math.isfinite(value):
+            raise MisuseError(f"{name} {value}: give a finite number")
     after_s = after if after is not None else (AFTER_S if posed else 0.0)
     return GateLimits(moved, math.radians(turned), after_s)
+
+
+def spool_path() -> Path:
+    """The spool without ``--spool``."""
+    return Path(os.environ.get("MAPFOLD_HOME") or ".mapfold") / "detect-spool.sqlite"
 
 
 def stdin_until(stop: threading.Event) -> Callable[[int], bytes]:

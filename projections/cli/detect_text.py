@@ -114,6 +114,8 @@ def summary(run_id: str, report: Report, where: str) -> str:
 
 def advice(report: Report, live: LivePictures | None, *, posed: bool) -> Iterator[str]:
     counts, sent = report.counts, report.delivered
+    if report.stopped:
+        yield "stopped before the last picture"
     if posed and counts.keyframes and counts.without_pose == counts.keyframes:
         yield (
             f"no keyframe has a pose: none was known within {NEAR_S * 1000:.0f} ms of its picture;"

@@ -290,6 +290,50 @@ def test_an_answer_of_nan_is_said_and_counted(stage: Stage, tmp_path: Path) -> N
     assert "5.jpg: the detector answered NaN or infinity for 2 boxes" in said.err
 
 
+def test_poses_that_are_none_are_counted(
+    stage: Stage,
+    tmp_path: Path,
+    endpoint: str,
+    connected: Callable[[], Session],
+    start: Callable[..., Program],
+) -> None:
+    words = ("--zenoh-image", "k", "--zenoh-pose", "p", "--out", str(tmp_path / "o.jsonl"))
+    detect = start("detect", *words, *stage.models, "--connect", endpoint, "--json")
+    detect.wait_for("Ctrl-C ends it")
+    session = connected()
+    poses, images = session.publisher("p"), session.publisher("k")
+    assert images.wait_for_subscriber(DEADLINE_S)
+    assert poses.wait_for_subscriber(DEADLINE_S)
+    for payload in (b"garbage", b'{"x": 1}', b'{"x": 1, "y": 2, "yaw": 0.5}'):
+        poses.put(payload)
+    images.put(b"no picture")
+    session.confirm()
+    detect.wait_for("left out: it is neither JPEG nor PNG")
+    assert detect.end(signal.SIGINT) == 3
+    said = json.loads(detect.output())
+    assert (said["bad_poses"], said["unreadable"], said["keyframes"]) == (2, 1, 0)
+    assert "2 messages that are no pose" in detect.lines[-2]
+    assert "without the numbers x, y and yaw" in detect.lines[-1]
+
+
+def test_ctrl_c_in_a_folder_says_so(
+    stage: Stage, tmp_path: Path, start: Callable[..., Program]
+) -> None:
+    """What was written by then is whole."""
+    out = tmp_path / "o.jsonl"
+    words = ("detect", *stage.posed, *stage.models, "--after", "0", "--out", str(out), "--json")
+    program = start(*words)
+    program.wait_for("Ctrl-C ends it")
+    exited = program.end(signal.SIGINT)
+    said = json.loads(program.output())
+    assert said["pictures"] <= stage.count
+    if said["pictures"] < stage.count:
+        assert exited == 3
+        assert program.lines[-1] == "stopped before the last picture"
+    written = out.read_text().splitlines()
+    assert len(written) == said["keyframes"] == said["published"]
+
+
 def test_ctrl_c_ends_it_with_its_numbers(
     stage: Stage, tmp_path: Path, endpoint: str, start: Callable[..., Program]
 ) -> None:
