@@ -86,6 +86,7 @@ def _serving_wsgi(host: str, port: int, application: Callable[..., Any]) -> Iter
 
 _COUNTERS: Final = (
     ("recorded", "Envelopes synced to the log."),
+    ("crops", "JPEGs of detections synced to the log."),
     ("messages", "Messages of ROS synced to the log."),
     ("rejected", "Payloads refused and kept under mapfold/rejected."),
     ("queue_full", "Messages lost because the queue was full."),

@@ -101,8 +101,11 @@ def reembed(
 
     ``progress`` gets the number of events looked at and of all; when ``stopped`` says so, it ends
     after the group at hand and gives no command. Raises LogBusy while another writes the log,
-    MisuseError if vectors of the space have another dimension or are of another encoder.
+    LogNotFound, MisuseError if vectors of the space have another dimension or are of another
+    encoder.
     """
+    with LogReader(log):
+        pass  # a writer would make the log
     with LogWriter(log) as writer:
         with LogReader(log) as reader:
             state = _State.read(reader, encoder)

@@ -10,7 +10,16 @@ from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
 from eventsrc.append import NewMap, check_payloads, map_event, rejected_event
-from eventsrc.envelope import KeyframeId, RunId, has_keyframe_id
+from eventsrc.crops import (
+    CROP_ENCODING,
+    CROP_SCHEMA,
+    CROP_SCHEMA_ENCODING,
+    CROP_SCHEMA_TEXT,
+    InvalidCrop,
+    encode_crop,
+    received_crop,
+)
+from eventsrc.envelope import ENVELOPE_VERSION, KeyframeId, RunId, has_keyframe_id
 from eventsrc.ingest import Rejected
 from eventsrc.log import LogWriter, MessageFormat, NewEvent
 from eventsrc.robot.acks import SENT_SUFFIX, Refusal, payload_sha256
@@ -18,8 +27,11 @@ from eventsrc.system_events import MAP_KEY
 from eventsrc.transport.session import Received
 
 from .edit_requests import EditRequest
-from .queue import MAX_BATCH_BYTES, BridgedMessage, MessageQueue
+from .queue import MAX_BATCH_BYTES, BridgedMessage, CropMessage, MessageQueue
 
+CROP_FORMAT: Final = MessageFormat(
+    CROP_ENCODING, CROP_SCHEMA, CROP_SCHEMA_ENCODING, CROP_SCHEMA_TEXT
+)
 _BATCH: Final = 256
 _CHECKED_TOGETHER: Final = 16
 """Messages checked at a time: enough to save time, few enough to fit the processor's cache."""
@@ -33,8 +45,8 @@ class CheckedMessage(NamedTuple):
 
     ``run_id``, ``keyframe_id`` and ``stamp_ns`` are None for a rejected payload and for a form
     older than the envelope. ``refusal`` is the reply to a rejected payload; ``sha256`` is that of
-    an envelope's payload, otherwise empty. ``form`` is the format of a message of a bridge, which
-    is kept verbatim.
+    an envelope's payload, otherwise empty. ``form`` is the format of a crop, or of a message of a
+    bridge, which are kept verbatim.
     """
 
     key: str
@@ -125,22 +137,25 @@ class Checker:
             return False
         received = self._queue.get(limit, timeout_s)
         payloads: list[Received] = []
+        before = batch.count
         for message in received:
             if isinstance(message, EditRequest):
                 batch.edits.append(message)
             elif isinstance(message, BridgedMessage):
                 batch.bridged.append(message)
                 batch.size += len(message.payload)
+            elif isinstance(message, CropMessage):
+                batch.messages.append(_checked_crop(message, self._writer.now_ns()))
+                batch.size += len(message.payload)
             elif message.key.endswith(SENT_SUFFIX):
                 batch.announcements.append(message)
             else:
                 payloads.append(message)
                 batch.size += len(message.payload)
-        if self._left is not None:
-            bridged = sum(isinstance(message, BridgedMessage) for message in received)
-            self._left -= len(payloads) + bridged
         for part in _parts(payloads):
             batch.messages.extend(self.check(part))
+        if self._left is not None:
+            self._left -= batch.count - before
         return bool(received)
 
     def check(self, messages: Sequence[Received]) -> Iterator[CheckedMessage]:
@@ -165,6 +180,16 @@ class Checker:
                 yield CheckedMessage(
                     key, payload, version, None, run_id, keyframe_id, stamp, sha256
                 )
+
+
+def _checked_crop(message: CropMessage, now_ns: int) -> CheckedMessage:
+    key, payload = message.key, message.payload
+    try:
+        topic, crop = received_crop(key, payload)
+    except InvalidCrop as error:
+        return CheckedMessage(key, payload, ENVELOPE_VERSION, Refusal.of(payload, str(error)))
+    kept = encode_crop(crop, now_ns)
+    return CheckedMessage(topic, kept, ENVELOPE_VERSION, None, form=CROP_FORMAT)
 
 
 def _parts(messages: Sequence[Received]) -> Iterator[list[Received]]:

@@ -109,6 +109,12 @@ class BridgedMessage(Received):
     __slots__ = ()
 
 
+class CropMessage(Received):
+    """The JPEG of a detection, under ``PREFIX/DET_ID`` (`eventsrc.crops`)."""
+
+    __slots__ = ()
+
+
 class MessageQueue:
     """Many threads `put`, one thread calls `get`.
 

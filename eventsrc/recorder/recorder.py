@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Final
 
+from eventsrc.crops import MAX_CROP_BYTES
 from eventsrc.envelope import RunId
 from eventsrc.errors import TransportError
 from eventsrc.gaps import GapLedger
@@ -24,10 +25,11 @@ from eventsrc.transport.session import (
 from .bridged import Bridge
 from .edit_requests import EditRequest, Edits, fault_of, refuse_query
 from .edits import edit_key
-from .queue import DEFAULT_QUEUE_SIZE, BridgedMessage, MessageQueue
+from .queue import DEFAULT_QUEUE_SIZE, BridgedMessage, CropMessage, MessageQueue
 from .writer_thread import RecorderReport, WriterThread
 
 DEFAULT_KEYS: Final = ("tb/detections",)
+DEFAULT_CROPS: Final = ("tb/crops/*",)
 _CACHE_TIMEOUT_S: Final = 2.0
 _MOST_KEPT: Final = 1_000
 """Messages taken from what a bridge keeps of one topic."""
@@ -44,7 +46,8 @@ class Recorder:
     (`eventsrc.gap_history`); without it, a gap between an earlier recorder's last keyframe and this
     one's first is not found, and no ledger is saved. Turn ``report_gaps`` off for robots that do
     not count their keyframes by one. With ``edits`` it takes commands too (`edits`), with
-    ``bridge`` the messages of a bridge from ROS (`bridged`).
+    ``bridge`` the messages of a bridge from ROS (`bridged`), under ``crops``, each
+    ``PREFIX/*``, the JPEGs of detections (`eventsrc.crops`), which then are nothing under ``keys``.
     """
 
     def __init__(
@@ -60,10 +63,13 @@ class Recorder:
         max_payload_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES,
         edits: Edits | None = None,
         bridge: Bridge | None = None,
+        crops: Sequence[str] = (),
     ) -> None:
         bridged = () if bridge is None else bridge.keys
         check_keys((*keys, *bridged))
+        check_keys(crops)
         self._session = session
+        self._crop_prefixes = tuple(key.removesuffix("*") for key in crops)
         self._queue = MessageQueue(queue_size)
         self._writer_thread = WriterThread(
             self._queue,
@@ -89,6 +95,10 @@ class Recorder:
                 session.subscribe(sent_key(key), self._queue.put, limit=sent_limit),
                 session.subscribe_heartbeats(key, self._queue.put_heartbeat),
             )
+        ]
+        crop_limit = SizeLimit(_MAX_REJECTED * MAX_CROP_BYTES, self._count_too_large)
+        self._subscriptions += [
+            session.subscribe(key, self._receive_crop, limit=crop_limit) for key in crops
         ]
         if edits is not None:
             key = edit_key(writer.log_id)
@@ -159,12 +169,16 @@ class Recorder:
         writing.result()
 
     def _receive(self, message: Received) -> None:
-        # A recorder of `**` receives acks and refusals too, also its own. They are not data.
-        if not message.key.startswith(ACK_PREFIX):
+        # A recorder of `**` receives acks and refusals too, also its own. They are not data. Crops
+        # it receives twice.
+        if not message.key.startswith((ACK_PREFIX, *self._crop_prefixes)):
             self._queue.put(message)
 
     def _receive_bridged(self, message: Received) -> None:
         self._queue.put(BridgedMessage(*message))
+
+    def _receive_crop(self, message: Received) -> None:
+        self._queue.put(CropMessage(*message))
 
     def _receive_edit(self, query: Query) -> None:
         fault = fault_of(query)

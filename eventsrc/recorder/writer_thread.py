@@ -48,7 +48,7 @@ from eventsrc.system_events import LOSS_KEY, ROS_KEY, Loss
 from eventsrc.transport.session import Received
 
 from .bridged import Bridge
-from .checking import Batch, CheckedMessage, Checker
+from .checking import CROP_FORMAT, Batch, CheckedMessage, Checker
 from .edit_requests import EditRequest, Edits
 from .queue import MessageQueue
 
@@ -109,6 +109,8 @@ class RecorderReport:
     lost_from_log: int = 0
     faults: tuple[str, ...] = ()
     commands: int = 0
+    crops: int = 0
+    """JPEGs of detections that are synced."""
     messages: int = 0
     """Messages of a bridge that are kept verbatim and synced."""
     held: int = 0
@@ -187,7 +189,7 @@ class WriterThread:
         self._in_progress = 0  # checked and not appended
         self._failed = False
         self._faults = 0
-        self._recorded = self._rejected = self._messages = 0
+        self._recorded = self._rejected = self._messages = self._crops = 0
         self._missing = self._missing_before = self._ledger.missing if report_gaps else 0
 
     def run(self) -> None:
@@ -236,6 +238,7 @@ class WriterThread:
             lost_from_log=sum(fault.lost_events for fault in writer.faults),
             faults=tuple(map(str, writer.faults)),
             commands=0 if self._edits is None else self._edits.recorded,
+            crops=self._crops,
             messages=self._messages,
             held=0 if self._bridge is None else self._bridge.held,
             untyped=0 if self._bridge is None else self._bridge.untyped,
@@ -324,18 +327,20 @@ class WriterThread:
     def _acknowledge(self, durable: Offset, now_ns: int) -> None:
         """Count the events before ``durable``, enter them in the ledger and send the replies."""
         waiting, replies, ledger = self._unsynced, Replies(), self._ledger
-        rejected, messages, before = 0, 0, len(waiting)
+        rejected, messages, crops, before = 0, 0, 0, len(waiting)
         while waiting and waiting[0][0] < durable:
             _, message = waiting.popleft()
             rejected += message.refusal is not None
-            messages += message.form is not None
+            crops += message.form is CROP_FORMAT
+            messages += message.form not in (None, CROP_FORMAT)
             run_id, keyframe_id = message.run_id, message.keyframe_id
             if run_id is not None and keyframe_id is not None:
                 ledger.record(run_id, keyframe_id, now_ns)
             replies.add(message)
         self._rejected += rejected
         self._messages += messages
-        self._recorded += before - len(waiting) - rejected - messages
+        self._crops += crops
+        self._recorded += before - len(waiting) - rejected - messages - crops
         for key, payload in replies.messages(self._writer.log_id):
             self._send_reply(key, payload)
 

@@ -29,6 +29,7 @@ COMMANDS: "Mapping[str, str]" = {
     "export": "projections.cli.export",
     "foxglove": "projections.cli.export",
     "relocalize": "projections.cli.relocalize",
+    "reembed": "projections.cli.reembed",
     "evaluate": "projections.cli.evaluate",
     "query": "projections.cli.query",
     "serve": "projections.cli.serve",

@@ -12,6 +12,8 @@ from typing import Annotated, Any
 
 import typer
 
+from eventsrc.crops import CROP_SCHEMA, InvalidCrop, decode_crop
+from eventsrc.embeddings import InvalidEmbeddings, decode_embeddings
 from eventsrc.envelope import ENVELOPE_VERSION, FIRST_OFFSET, Offset
 from eventsrc.errors import LogError, MisuseError
 from eventsrc.log import (
@@ -29,7 +31,7 @@ from eventsrc.log.recover import DEFAULT_MAX_LOSSES
 from eventsrc.log.seek import resolve, resolve_start, time_of
 from eventsrc.log_info import LogInfo, SegmentInfo, log_info
 from eventsrc.occupancy_map import InvalidMap, read_map_head
-from eventsrc.system_events import MAP_KEY, OccupancyMapEvent
+from eventsrc.system_events import EMBEDDINGS_KEY, MAP_KEY, OccupancyMapEvent
 from eventsrc.text import counted, visible
 
 from .options import JsonOption, LogArgument
@@ -90,10 +92,19 @@ def event_line(event: Event) -> str:
 def _summary(event: Event) -> str:
     if isinstance(event, VerbatimEvent):
         form = event.format
+        if form.schema == CROP_SCHEMA:
+            with contextlib.suppress(InvalidCrop):  # another picture
+                crop = decode_crop(event.payload)
+                return f"crop of {crop.det_id}, {len(crop.jpeg):,} bytes"
         return f"{form.encoding} {form.schema}".rstrip() + f", {len(event.payload):,} bytes"
     if event.key == MAP_KEY:
         with contextlib.suppress(InvalidMap):  # `log verify` names it
             return _map_text(read_map_head(event.payload))
+    if event.key == EMBEDDINGS_KEY:
+        with contextlib.suppress(InvalidEmbeddings):  # `log verify` names it
+            made = decode_embeddings(event.payload)
+            count, dim = made.vectors.shape
+            return f"{counted(count, 'vector')} of {made.space}, dimension {dim:,}"
     value = _value(event.payload.decode(errors="replace"))
     if isinstance(value, dict) and isinstance(value.get("detections"), list):
         classes = [str(d.get("class", "?")) for d in value["detections"] if isinstance(d, dict)]

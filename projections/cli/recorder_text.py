@@ -37,11 +37,11 @@ class RecorderStatus:
     def line(self, report: RecorderReport, free_bytes: int) -> str:
         """The status line; the rate is since the previous call."""
         now_s = self._clock()
-        events = report.recorded + report.messages
+        events = report.recorded + report.messages + report.crops
         rate = (events - self._recorded) / max(now_s - self._at_s, 1e-9)
         self._at_s, self._recorded = now_s, events
         return (
-            f"{rate:,.0f}/s · {report.recorded:,} recorded · {_messages(report)}"
+            f"{rate:,.0f}/s · {report.recorded:,} recorded · {_messages(report)}{_crops(report)}"
             f"{report.rejected:,} rejected · "
             f"{report.lost:,} lost · {report.missing:,} missing · "
             f"queue {report.queue_depth:,} · "
@@ -78,6 +78,10 @@ class RecorderStatus:
 def _messages(report: RecorderReport) -> str:
     waiting = f" ({report.held:,} wait for their type)" if report.held else ""
     return f"{report.messages:,} of ROS{waiting} · " if report.messages or report.held else ""
+
+
+def _crops(report: RecorderReport) -> str:
+    return f"{counted(report.crops, 'crop')} · " if report.crops else ""
 
 
 def _unsealed(report: RecorderReport) -> str:
@@ -199,9 +203,10 @@ def summary(log: Path, report: RecorderReport) -> str:
     """The last line of a recording."""
     commands = f"{counted(report.commands, 'command')} of mapfold edit, " if report.commands else ""
     messages = f"{counted(report.messages, 'message')} of ROS, " if report.messages else ""
+    crops = f"{counted(report.crops, 'crop')}, " if report.crops else ""
     return (
         f"{log}: {report.recorded:,} recorded, {report.rejected:,} rejected, {report.lost:,} lost, "
-        f"{counted(report.missing, 'keyframe')} missing; {messages}{commands}"
+        f"{counted(report.missing, 'keyframe')} missing; {crops}{messages}{commands}"
         f"{counted(report.next_offset, 'event')} in the log"
     )
 
@@ -215,6 +220,7 @@ def as_json(report: RecorderReport) -> dict[str, int | str | None]:
         "too_large": report.too_large,
         "transport_missed": report.transport_missed,
         "commands": report.commands,
+        "crops": report.crops,
         "messages": report.messages,
         "untyped": report.untyped,
         "unread": sum(count for _, count, _ in report.unread),

@@ -9,15 +9,16 @@ from typing import Annotated, Final
 import typer
 
 from eventsrc.envelope import RunId
-from eventsrc.errors import LogDamaged
+from eventsrc.errors import LogDamaged, MisuseError
 from eventsrc.gap_history import fold_and_save_ledger
 from eventsrc.gaps import GapLedger
 from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES, MAX_PAYLOAD_BYTES
 from eventsrc.log import LogReader, LogWriter, parse_fsync
-from eventsrc.recorder import DEFAULT_KEYS, DEFAULT_QUEUE_SIZE, Recorder
+from eventsrc.recorder import DEFAULT_CROPS, DEFAULT_KEYS, DEFAULT_QUEUE_SIZE, Recorder
 from eventsrc.recorder.edit_requests import Edits, KnownCommands
 from eventsrc.recorder.edits import EDIT_PREFIX, edit_key
 from eventsrc.ros.library import MessageTypes
+from eventsrc.text import visible
 from eventsrc.transport.config import parse_address
 from eventsrc.transport.session import Router, check_keys, open_session
 from projections.corrections import check_settings
@@ -66,6 +67,16 @@ def record(
             metavar="KEY",
             help="Key expression to record; wildcards * and ** work; may be repeated. "
             f"[default: {DEFAULT_KEYS[0]}]",
+        ),
+    ] = None,
+    crops: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--crops",
+            metavar="KEY",
+            help="Key expression PREFIX/* of the JPEGs of detections, which `mapfold detect"
+            " --keep-crops` publishes; may be repeated; '' keeps none. "
+            f"[default: {DEFAULT_CROPS[0]}]",
         ),
     ] = None,
     fsync: Annotated[
@@ -136,6 +147,7 @@ def record(
     )
     keys = tuple(key or (() if ros2dds else DEFAULT_KEYS))
     check_keys(keys)
+    crop_keys = _crop_keys(crops)
     if ros2dds:
         MessageTypes()
         recording_of(choice, 0, None)
@@ -160,6 +172,7 @@ def record(
             max_payload_bytes=max_payload,
             edits=_edits(log, writer) if accept_edits else None,
             bridge=bridge,
+            crops=crop_keys,
         )
         summary.watch(writer, recorder)
         with _metrics(address, recorder, log), show_status(log) as watch:
@@ -172,6 +185,16 @@ def record(
                 say(f"taking commands of `mapfold edit` on {edit_key(writer.log_id)}")
             recorder.run(stop, every_s=EVERY_S, watch=watch)
     summary.finish()
+
+
+def _crop_keys(given: list[str] | None) -> tuple[str, ...]:
+    """What ``--crops`` names. Raises MisuseError."""
+    keys = tuple(filter(None, DEFAULT_CROPS if given is None else given))
+    for key in keys:
+        if not key.endswith("/*") or "*" in key[:-1]:
+            raise MisuseError(f"--crops {visible(key)}: write it as PREFIX/*, such as tb/crops/*")
+    check_keys(keys)
+    return keys
 
 
 def _gap_history(log: Path) -> GapLedger[RunId] | None:

@@ -20,6 +20,7 @@ REPORT = RecorderReport(
     sealing_error="disk is on fire",
     lost_from_log=10,
     messages=13,
+    crops=14,
 )
 
 
@@ -35,6 +36,7 @@ def test_every_metric_is_scraped_with_its_current_value(tmp_path: Path) -> None:
         "mapfold_recorder_transport_missed_total": 5,
         "mapfold_recorder_lost_from_log_total": 10,
         "mapfold_recorder_messages_total": 13,
+        "mapfold_recorder_crops_total": 14,
         "mapfold_recorder_missing": 6,
         "mapfold_recorder_queue_depth": 7,
         "mapfold_recorder_queue_size": 100,

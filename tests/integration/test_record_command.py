@@ -63,6 +63,7 @@ def test_a_signal_drains_the_queue_and_exits_0(
         "unsealed": 0,
         "sealing_error": None,
         "commands": 0,
+        "crops": 0,
         "messages": 0,
         "untyped": 0,
         "unread": 0,
