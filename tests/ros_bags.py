@@ -15,7 +15,7 @@ from tests.ros_messages import OPTICAL, SECOND, START, TYPES, flat
 
 Recorded = tuple[str, int, Any]
 """Topic, time of receipt and message."""
-STORAGES = {"sqlite": StoragePlugin.SQLITE3, "mcap": StoragePlugin.MCAP}
+STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite": StoragePlugin.SQLITE3}
 COMPRESSIONS = {
     "none": CompressionMode.NONE,
     "file": CompressionMode.FILE,

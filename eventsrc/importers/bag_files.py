@@ -152,7 +152,10 @@ class Bag:
             self._at = at
             try:
                 for message in part.messages(topics):
-                    yield message._replace(payload=_decompressed(message.payload))
+                    if message.payload.startswith(ZSTD_MAGIC):
+                        yield message._replace(payload=_decompressed(message.payload))
+                    else:
+                        yield message
             except _DAMAGE as error:
                 raise MapfoldError(
                     f"{visible(str(part.path))}: {visible(str(error))}; what was made of the "

@@ -9,7 +9,6 @@ in pieces.
 import struct
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import BinaryIO, Final, NamedTuple
 
 import zstandard
@@ -105,8 +104,7 @@ class ForeignRecord(NamedTuple):
     at: int
 
 
-@dataclass(frozen=True, slots=True)
-class ForeignMessage:
+class ForeignMessage(NamedTuple):
     """One message. ``key`` is its MCAP topic; times are int nanoseconds; ``schema`` is the name of
     its channel's schema, empty without one; ``version`` is the envelope version that a mapfold log
     has it in, None in other files; ``form`` is what its channel and schema say, ``verbatim`` the

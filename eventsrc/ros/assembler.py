@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Final, Generic, NamedTuple, TypeVar
 
+import msgspec
+
 from .messages import (
     CAMERA_INFO,
     DETECTIONS,
@@ -67,6 +69,8 @@ class _Picture:
     detected: Detected
     keyframe_id: int
     pose: PicturePose | None = None
+    asked_at: int = -1
+    """How many messages the source of poses had taken when it was asked last."""
 
 
 @dataclass(slots=True)
@@ -91,7 +95,8 @@ class Assembler(Generic[Item]):
             key = stream.tf, stream.tf_static, stream.max_gap_ns
             is_first = key not in buffers
             buffer = buffers.setdefault(key, TransformBuffer(stream.max_gap_ns))
-            track = self._tracks[stream.detections] = _Track(stream, buffer)
+            track = _Track(stream, buffer, shares_transforms=not is_first)
+            self._tracks[stream.detections] = track
             for topic, taker in track.takers(with_transforms=is_first).items():
                 self._takers.setdefault(topic, []).append(taker)
 
@@ -165,8 +170,9 @@ _Taker = Callable[[str, str, Any], None]
 class _Track:
     """The state of one stream."""
 
-    def __init__(self, stream: Stream, buffer: TransformBuffer) -> None:
+    def __init__(self, stream: Stream, buffer: TransformBuffer, *, shares_transforms: bool) -> None:
         self.stream = stream
+        self._shares_transforms = shares_transforms
         self.counts = Counts()
         self.poses = PoseSource(stream, buffer, self.counts)
         self._lens: Lens | None = None
@@ -204,6 +210,9 @@ class _Track:
     def has_all(self, picture: _Picture) -> bool:
         """Whether it has everything that its stream has topics for."""
         if picture.pose is None:
+            if picture.asked_at == self.poses.received and not self._shares_transforms:
+                return False
+            picture.asked_at = self.poses.received
             detected = picture.detected
             picture.pose = self.poses.at(detected.stamp_ns, detected.frame, final=False)
             if picture.pose is None:
@@ -240,9 +249,8 @@ class _Track:
             }
         self._add_embeddings(detected)
         document["detections"] = detected.detections
-        payload = json.dumps(document, ensure_ascii=False, separators=(",", ":"))
-        encoded = payload.encode(errors="backslashreplace")
-        return Assembled(stream.detections, picture.received_ns, detected.stamp_ns, encoded)
+        payload = _encode(document)
+        return Assembled(stream.detections, picture.received_ns, detected.stamp_ns, payload)
 
     def _pose_fields(self, pose: PicturePose) -> dict[str, Any]:
         counts = self.counts
@@ -297,6 +305,18 @@ class _Track:
         for _ in self._embeddings:
             self.counts.refuse(self.stream.embeddings or "", _UNCLAIMED)
         self._embeddings.clear()
+
+
+def _encode(document: dict[str, Any]) -> bytes:
+    """JSON, with NaN and infinity as Python writes them: the door of the log names them then."""
+    try:
+        payload = msgspec.json.encode(document)
+    except (UnicodeError, ValueError):  # a lone surrogate
+        payload = b"null"
+    if b"null" not in payload:  # what msgspec makes of NaN and infinity
+        return payload
+    text = json.dumps(document, ensure_ascii=False, separators=(",", ":"))
+    return text.encode(errors="backslashreplace")
 
 
 def _dimension(text: str) -> int:

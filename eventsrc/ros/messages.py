@@ -5,13 +5,13 @@ What is missing or of another type raises BadMessage; NaN is passed on, for the 
 refuse with its reason.
 """
 
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 import pybase64
+from pydantic_core import from_json
 
 from eventsrc.envelope import covariance_fault
 
@@ -173,7 +173,7 @@ def detections_of(message: Any, labels: Mapping[str, str]) -> Detected:
 
 def embeddings_of_text(message: Any) -> Embeddings:
     """The embeddings of a std_msgs/String of JSON; docs/ros.md has the form."""
-    document = json.loads(message.data)
+    document = from_json(message.data, cache_strings="keys")
     if not isinstance(document, dict) or "stamp" not in document:
         raise BadMessage('the embeddings are no JSON object with a "stamp"')
     stamp, given = document["stamp"], document.get("embeddings")

@@ -54,9 +54,12 @@ class PoseSource:
         self._counts = counts
         self._given: History[StampedPose] = History()
         self._frame: str | None = None
+        self.received = 0
+        """Messages taken. Without another one, what is not known yet stays so."""
 
     def take_transforms(self, topic: str, type_name: str, message: Any) -> None:
         """Take a TFMessage, static if it is of the stream's topic of such."""
+        self.received += 1
         _expect(type_name, TF)
         static = topic == self._stream.tf_static
         for each in read(lambda m: [*m.transforms], message):
@@ -72,6 +75,7 @@ class PoseSource:
 
     def take_pose(self, topic: str, type_name: str, message: Any) -> None:
         """Take a pose of odometry or of a localiser."""
+        self.received += 1
         _expect(type_name, ODOMETRY, POSE)
         pose = read(pose_of, message)
         if pose.fault is not None:
@@ -94,7 +98,7 @@ class PoseSource:
         """The pose of a picture; None while it is not known. ``final`` takes what there is: the
         base's pose where no transform leads to the camera, or the other way round."""
         of = self._of_transforms if self._stream.pose is None else self._of_poses
-        base, there, covariance = of(stamp_ns, camera)
+        base, there, covariance = of(stamp_ns, camera, final=final)
         if base is None or there is None:
             if not final or (at := base or there) is None:
                 return None
@@ -113,14 +117,21 @@ class PoseSource:
             there is not None,
         )
 
-    def _of_transforms(self, stamp_ns: int, camera: str) -> _Found:
+    def _of_transforms(self, stamp_ns: int, camera: str, *, final: bool) -> _Found:
         stream, lookup = self._stream, self._buffer.lookup
         base = lookup(stream.map_frame, stream.base_frame, stamp_ns)
-        there = lookup(stream.map_frame, camera, stamp_ns) if camera else base
+        there = base
+        if base is None:
+            if not final:
+                return None, None, None
+            there = lookup(stream.map_frame, camera, stamp_ns) if camera else None
+        elif camera:
+            inside = lookup(stream.base_frame, camera, stamp_ns)
+            there = None if inside is None else compose(base, inside)
         known = self._given.latest(stamp_ns)
         return base, there, None if known is None else known.covariance
 
-    def _of_poses(self, stamp_ns: int, camera: str) -> _Found:
+    def _of_poses(self, stamp_ns: int, camera: str, *, final: bool) -> _Found:  # noqa: ARG002
         around = self._given.around(stamp_ns, self._stream.max_gap_ns)
         if around is None:
             return None, None, None

@@ -189,6 +189,18 @@ class _Link:
         return None if around is None else interpolate(*around)
 
 
+def _merged(links: list[_Link]) -> list[_Link]:
+    """The same way with one link for each row of static ones; the first is the lowest."""
+    merged: list[_Link] = []
+    for link in links:
+        below = merged[-1].static if merged else None
+        if link.static is None or below is None:
+            merged.append(link)
+        else:
+            merged[-1] = _Link(link.parent, compose(link.static, below))
+    return merged
+
+
 class TransformBuffer:
     """Links by child frame. A static link stands for all times and is not replaced by a moving
     one; a child that gets another parent forgets what it had under the first."""
@@ -289,7 +301,7 @@ class TransformBuffer:
         up: list[_Link] = []
         for frame, link in self._upwards(source):
             if frame in above:
-                return up, above[frame]
+                return _merged(up), _merged(above[frame])
             if link is not None:
                 up.append(link)
         return None
