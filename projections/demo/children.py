@@ -3,13 +3,14 @@
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
 from eventsrc.errors import MapfoldError
+
+from .progress import STALLED_S, Progress, cpu_steps, size_of
 
 _END_S: Final = 10.0
 _POLL_S: Final = 0.05
@@ -33,30 +34,53 @@ class Children:
             )
         self._stderr[name] = stderr
 
-    def wait(self, timeout_s: float) -> None:
-        """Wait until all have ended. Raises MapfoldError if one fails or takes too long."""
-        deadline = time.monotonic() + timeout_s
+    def wait(
+        self,
+        observe: Callable[[], Hashable],
+        *,
+        working: Sequence[str] = (),
+        stalled_s: float = STALLED_S,
+    ) -> None:
+        """Wait until all have ended, however long it takes while there is progress: what
+        ``observe`` returns changes, one of them ends or writes to stderr, or one that is named in
+        ``working`` uses its processor. Raises MapfoldError if one fails or there is none for
+        ``stalled_s`` seconds."""
+
+        def seen() -> Hashable:
+            written = tuple(map(size_of, self._stderr.values()))
+            return observe(), written, tuple(self._names_running()), self._cpu_steps(working)
+
+        progress = Progress(seen, stalled_s)
         pause = threading.Event()
-        while any(process.poll() is None for process in self._running.values()):
+        while names := self._names_running():
             self._check()
-            if time.monotonic() > deadline:
-                slow = [name for name, p in self._running.items() if p.poll() is None]
+            if progress.is_stalled():
                 raise MapfoldError(
-                    f"mapfold {' and '.join(slow)} did not end within {timeout_s:g} s; "
-                    f"see {self._stderr[slow[0]]}"
+                    f"mapfold {' and '.join(names)} made no progress for {stalled_s:g} s; "
+                    f"see {self._stderr[names[0]]}"
                 )
             pause.wait(_POLL_S)
         self._check()
 
-    def wait_for_output(self, name: str, text: str, timeout_s: float) -> None:
-        """Wait until ``name`` has written ``text`` to stderr; raises as `wait` does."""
-        deadline = time.monotonic() + timeout_s
+    def wait_for_output(self, name: str, text: str, stalled_s: float = STALLED_S) -> None:
+        """Wait until ``name`` has written ``text`` to stderr, while it writes or uses its
+        processor; raises as `wait` does."""
+        file = self._stderr[name]
+        progress = Progress(lambda: (size_of(file), self._cpu_steps([name])), stalled_s)
         pause = threading.Event()
-        while text not in self._stderr[name].read_text("utf-8", "replace"):
+        while text not in file.read_text("utf-8", "replace"):
             self._check()
-            if time.monotonic() > deadline:
-                raise MapfoldError(f"mapfold {name} did not start within {timeout_s:g} s")
+            if progress.is_stalled():
+                raise MapfoldError(
+                    f"mapfold {name} did not start: no progress for {stalled_s:g} s; see {file}"
+                )
             pause.wait(_POLL_S)
+
+    def _names_running(self) -> list[str]:
+        return [name for name, process in self._running.items() if process.poll() is None]
+
+    def _cpu_steps(self, names: Sequence[str]) -> tuple[int, ...]:
+        return tuple(cpu_steps(self._running[name].pid) for name in names)
 
     def _check(self) -> None:
         for name, process in self._running.items():

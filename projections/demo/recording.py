@@ -24,10 +24,11 @@ from projections.settings import Settings
 
 from .children import Children
 from .folder import DemoFolder
+from .progress import STALLED_S, Progress, size_of
 
 _ANY_PORT: Final = ZenohOptions(listen=("tcp/127.0.0.1:0",))
-_TIMEOUT_S: Final = 40.0
-_TAIL_TIMEOUT_S: Final = 30.0
+_WAIT_S: Final = 600
+"""How long the publisher waits for the recorder, which is there; it makes progress meanwhile."""
 _POLL_S: Final = 0.05
 
 
@@ -80,15 +81,19 @@ def record_run(
             ("record", str(folder.log), *connect, "--max-events", str(count)),
             folder.stderr_of("record"),
         )
-        children.wait_for_output("record", "recording", _TIMEOUT_S)
+        children.wait_for_output("record", "recording")
         with BackgroundTail(folder.log, targets, settings) as background_tail:
             seed = str(run.house.seed)
+            paced = ("--speed", str(speed), "--wait", str(_WAIT_S))
             children.start(
                 "simulate",
-                ("simulate", "--seed", seed, "--run", "a", "--speed", str(speed), *connect),
+                ("simulate", "--seed", seed, "--run", "a", *paced, *connect),
                 folder.stderr_of("simulate"),
             )
-            children.wait(_TIMEOUT_S + drive_s / speed)
+            children.wait(
+                lambda: (size_of(folder.log), background_tail.reached),
+                working=["simulate"],
+            )
             followed = background_tail.wait_for(Offset(before + count))
     seconds = time.monotonic() - started
     info = log_info(folder.log)
@@ -132,21 +137,26 @@ class BackgroundTail:
         self._stop.set()
         self._pool.shutdown()
 
+    @property
+    def reached(self) -> Offset:
+        """The offset before which all is in the databases."""
+        return self._commits[-1][0] if self._commits else FIRST_OFFSET
+
     def wait_for(self, end: Offset) -> Followed:
         """Wait until ``end`` events are in the databases; returns the delays."""
         assert self._running is not None  # noqa: S101 - inside the with block
-        deadline, pause = time.monotonic() + _TAIL_TIMEOUT_S, threading.Event()
-        while not self._commits or self._commits[-1][0] < end:
+        progress, pause = Progress(lambda: self.reached), threading.Event()
+        while self.reached < end:
             if self._running.done():
                 self._running.result()  # raises the tail's error
-            if time.monotonic() > deadline:
+            if progress.is_stalled():
                 raise MapfoldError(
-                    f"{self._log}: the databases did not reach event {end} within "
-                    f"{_TAIL_TIMEOUT_S:g} s; run `{advised('status', self._log)}`"
+                    f"{self._log}: the databases are at event {self.reached} of {end}, without "
+                    f"progress for {STALLED_S:g} s; run `{advised('status', self._log)}`"
                 )
             pause.wait(_POLL_S)
         self._stop.set()
-        report = self._running.result(_TAIL_TIMEOUT_S)
+        report = self._running.result()
         delays = self._delays()
         return Followed(len(delays), report.batches, statistics.median(delays), max(delays))
 

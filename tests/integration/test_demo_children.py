@@ -1,5 +1,6 @@
 """Processes that the demo starts end with it, also when it is killed outright."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -7,10 +8,13 @@ import threading
 import time
 from pathlib import Path
 
-from eventsrc.errors import LogBusy
+import pytest
+
+from eventsrc.errors import LogBusy, MapfoldError
 from eventsrc.log import LogWriter
 from eventsrc.transport.session import Router, ZenohOptions
 from projections.demo.children import Children
+from projections.demo.progress import LEAST_CPU_S, Progress, cpu_steps, size_of
 
 STARTER = """
 import sys
@@ -19,7 +23,7 @@ from projections.demo.children import Children
 log, endpoint, said = sys.argv[1:]
 with Children() as children:
     children.start("record", ("record", log, "--connect", endpoint), Path(said))
-    children.wait_for_output("record", "recording", 60)
+    children.wait_for_output("record", "recording")
     print("ready", flush=True)
     sys.stdin.read()
 """
@@ -62,6 +66,77 @@ def test_leaving_the_block_ends_them_too(tmp_path: Path) -> None:
     said = tmp_path / "said"
     with Children() as children:
         children.start("router", ("router", "--listen", "tcp/127.0.0.1:0"), said)
-        children.wait_for_output("router", "tcp/127.0.0.1", 60)
+        children.wait_for_output("router", "tcp/127.0.0.1")
         (process,) = children._running.values()
     assert process.returncode == 0
+
+
+def test_a_process_that_makes_no_progress_is_given_up(tmp_path: Path) -> None:
+    """One that waits for messages that nobody sends, and one that was stopped before it started."""
+    said = tmp_path / "said"
+    with Children() as children:
+        children.start("router", ("router", "--listen", "tcp/127.0.0.1:0"), said)
+        children.wait_for_output("router", "tcp/127.0.0.1")
+        with pytest.raises(MapfoldError, match=r"mapfold router made no progress for 0\.3 s; see"):
+            children.wait(lambda: None, stalled_s=0.3)
+        children.start("record", ("record", str(tmp_path / "log")), tmp_path / "other")
+        (*_, process) = children._running.values()
+        process.send_signal(signal.SIGSTOP)
+        try:
+            with pytest.raises(MapfoldError, match=r"record did not start: no progress for 0\.3 s"):
+                children.wait_for_output("record", "recording", stalled_s=0.3)
+        finally:
+            process.send_signal(signal.SIGCONT)
+
+
+def test_waiting_goes_on_as_long_as_there_is_progress(tmp_path: Path) -> None:
+    """The log's folder grows all the time, so ten times the bound is no reason to give up."""
+    seen = iter(range(10**9))
+    ended = threading.Event()
+    with Children() as children:
+        children.start("router", ("router", "--listen", "tcp/127.0.0.1:0"), tmp_path / "said")
+        children.wait_for_output("router", "tcp/127.0.0.1")
+        (process,) = children._running.values()
+        started = time.monotonic()
+
+        def observe() -> int:
+            if time.monotonic() - started > 3.0 and not ended.is_set():
+                ended.set()
+                process.terminate()
+            return next(seen)
+
+        children.wait(observe, stalled_s=0.3)
+    assert ended.is_set()
+
+
+@pytest.mark.parametrize("bound", [1.0, 60.0])
+def test_progress_is_any_change_within_the_bound(bound: float) -> None:
+    now = value = 0.0
+    progress = Progress(lambda: value, bound, lambda: now)
+    for _ in range(1000):
+        now += bound  # exactly the bound is still in time
+        assert not progress.is_stalled()
+        value += 1
+        assert not progress.is_stalled()
+    now += bound * 1.01
+    assert progress.is_stalled()
+    value += 1
+    assert not progress.is_stalled()
+
+
+def test_processor_time_is_counted_in_steps() -> None:
+    before = cpu_steps(os.getpid())
+    ends = time.process_time() + 1.5 * LEAST_CPU_S
+    while time.process_time() < ends:
+        sum(range(1000))
+    if sys.platform == "linux":
+        assert cpu_steps(os.getpid()) > before
+    assert cpu_steps(2**22 + 1) == 0
+
+
+def test_the_size_of_a_folder_that_changes_meanwhile_can_be_asked(tmp_path: Path) -> None:
+    assert size_of(tmp_path / "none") == 0
+    (tmp_path / "a").write_bytes(b"12")
+    (tmp_path / "b").symlink_to(tmp_path / "gone")
+    assert size_of(tmp_path) == 2
+    assert size_of(tmp_path / "a") == 2
