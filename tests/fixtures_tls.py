@@ -1,4 +1,4 @@
-"""A certificate for 127.0.0.1 that nobody has signed, made by the openssl program."""
+"""A certificate for 127.0.0.1 that no authority has signed, made by the openssl program."""
 
 import shutil
 import subprocess

@@ -16,7 +16,7 @@ import zenoh
 
 
 def open_session(endpoint: str) -> zenoh.Session:
-    """A client of the router at ``endpoint`` that looks for nobody else."""
+    """A client of the router at ``endpoint`` that connects to no other peer."""
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", json.dumps([endpoint]))

@@ -62,7 +62,7 @@ def _serve(listener: socket.socket) -> Mapping[str, Any]:
                 pid, answer = running.pop(pidfd)
                 os.close(pidfd)
                 code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-                with answer, contextlib.suppress(OSError):  # nobody may be left to be told
+                with answer, contextlib.suppress(OSError):  # the test may have gone
                     answer.send(str(code).encode())
         if sys.stdin.fileno() in ready:
             sys.exit(0)

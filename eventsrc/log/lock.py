@@ -2,7 +2,7 @@
 
 The file's text names the holder for error messages. Only the lock counts, so a file left behind by
 a killed writer blocks no other. The log's folder is locked as well where the file system allows it:
-if somebody deletes the lock file, a second writer would make a new one, lock that, and treat the
+if the lock file is deleted, a second writer would make a new one, lock that, and treat the
 first writer's growing segment as left over.
 """
 

@@ -15,7 +15,7 @@
   miss the last keyframes of a run.
 * Refused envelopes are quarantined: sending them again would block everything behind them.
 * Acks and refusals arrive on Zenoh's thread, which only queues them. They are applied whether or
-  not anybody subscribes: a recorder sends its last acks just after it has unsubscribed.
+  not there is a subscriber: a recorder sends its last acks just after it has unsubscribed.
 """
 
 import contextlib

@@ -1,7 +1,7 @@
 """AGE graphs: create, find, index, count, lock, swap and drop them.
 
 AGE keeps a graph as a schema, so a graph is *ours* when the schema carries our mark as its comment.
-Anything else under our names is somebody's and is refused, never touched.
+Anything else under these names belongs to another program: it is refused and never changed.
 
 The swap renames the old graph; it is dropped later, when every transaction that may still have
 looked up its name has ended (see `swap`).

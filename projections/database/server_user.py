@@ -4,7 +4,7 @@ PostgreSQL does not run as root. For root it runs as the system user ``pgserver`
 use. That user must be able to *enter* the folders above the data and the programs: those that
 forbid it get ``o+x``, which lets no one list or read them.
 
-The socket folder is in ``/tmp``, where everybody may make folders, so no name is trusted:
+The socket folder is in ``/tmp``, where every user may make folders, so no name is trusted:
 
 * It is made under a random name, 0700, so it cannot have been made before.
 * Its name is in the file ``pg.socket`` beside the data folder, with the data folder's inode: the
@@ -91,7 +91,7 @@ def give_to_server_user(folder: Path) -> None:
     owner = pwd.getpwnam(SYSTEM_USER)
     with open_folder(folder) as descriptor:
         if os.fstat(descriptor).st_uid != 0:
-            raise EmbeddedServerError(f"{folder}: somebody else has made it; remove it")
+            raise EmbeddedServerError(f"{folder}: another user has made it; remove it")
         os.fchown(descriptor, owner.pw_uid, owner.pw_gid)
 
 

@@ -8,7 +8,7 @@ is kept, it connects again (with growing pauses), and the checkpoint is read:
 * it is where the batch ends: it was committed, only the answer was lost; go on
 * it is before that: the server lost commits it had not yet flushed (``synchronous_commit = off``);
   the rows went with it, so fold again from there (`LostCommits`)
-* anything else: somebody else writes; stop (CheckpointMoved)
+* anything else: another program writes; stop (CheckpointMoved)
 
 A heartbeat that finds the connection lost is treated as an empty batch, for every sink of the
 store, so that a commit that was lost while no event came is noticed.

@@ -7,10 +7,12 @@ node types named here are accepted; nothing is compiled or evaluated as code. Ty
 when parsing: a comparison needs two numbers or two texts, texts have only == and !=, and the whole
 must be true or false. Each error names its column.
 
-The source is split into tokens first, for three reasons: ids may hold any character, so a text ends
-at its quote, with escapes for a quote and a backslash only; what Python allows and a condition does
-not (``0x10``, ``1.5``, ``# …``) is an error at its column; and `ast` parses the tokens joined by
-single spaces, so that a node's offset gives a token and with it a column.
+The source is split into tokens first, because `ast` alone refuses what is accepted here: a text
+with a line break, a NUL or a lone surrogate in it (ids may hold any character, so a text ends at
+its quote, with escapes for a quote and a backslash only), ``007``, digits of other scripts, and
+spaces that are not ASCII. What Python allows and a condition does not (``0x10``, ``1.5``, ``# …``)
+is an error at its column. `ast` parses the tokens joined by single spaces, so that a node's offset
+gives a token and with it a column.
 """
 
 import ast
@@ -30,6 +32,8 @@ from .condition_functions import FUNCTIONS, Direction, Facts, Function, Names, T
 
 MAX_DEPTH = 100
 """Greatest depth of parentheses and ``not``; it bounds every recursion over the tree."""
+MAX_DIGITS = 4300
+"""Of a number: as many as Python converts by default."""
 
 _TOKEN = re.compile(
     r"\s*(?:(?P<number>-?\d+)|(?P<name>[A-Za-z_]\w*)|(?P<sign><=|>=|==|!=|[<>(),])"
@@ -197,6 +201,9 @@ class _Parser:
                 raise ExpressionError(self._source, start + 1, reason)
             kind: Any = match.lastgroup
             text = match[kind]
+            if kind == "number" and len(text.removeprefix("-")) > MAX_DIGITS:
+                reason = f"a number of more than {MAX_DIGITS} digits"
+                raise ExpressionError(self._source, match.start(kind) + 1, reason)
             if kind == "text":
                 text = re.sub(r"\\(.)", r"\1", text[1:-1], flags=re.DOTALL)
             yield _Token(kind, text, match.start(kind) + 1)

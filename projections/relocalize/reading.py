@@ -292,7 +292,7 @@ def _floats(name: str, given: str | list[float] | None) -> Vector:
 
 def question_schema(options: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """A JSON schema of questions, for people and generators of clients; ``options`` are properties
-    that whoever answers reads beside those of the question."""
+    that the answering side reads beside those of the question."""
     crop = _CropModel.model_json_schema(by_alias=True)
     crop |= {"title": "Crop", "description": "It needs an embedding or a class."}
     crops = {"type": "array", "items": crop, "maxItems": MAX_CROPS}

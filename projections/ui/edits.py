@@ -152,7 +152,7 @@ class Editor:
             raise QuestionError(f"no edit {asked.kind[:40]!r}; there are {', '.join(KINDS)}")
         make_ = self._checked(KINDS[asked.kind].command(asked.kind, asked.arguments))
         if not asked.reason.strip() and not asked.dry_run:
-            raise MisuseError("the reason is missing: say why, for whoever reads the log later")
+            raise MisuseError("the reason is missing: say why, for later readers of the log")
         stamp = Stamp(asked.command_id or uuid.uuid4().hex, self._issued_by, asked.reason)
         notes: list[str] = []
         if asked.dry_run:

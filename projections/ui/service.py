@@ -2,7 +2,7 @@
 
 Answers are made on two threads: one for the log's own map, one for maps under other settings and
 for answers whose folds take long. The first fold begins at once on the first of them. A fold is
-given up when nobody waits for it any more.
+stopped when no client waits for it any more.
 """
 
 import threading
@@ -32,7 +32,7 @@ _PAGES: Final = "pages"
 _WATCH: Final = "watch"
 
 GoOn = Callable[[], None]
-"""Called while work goes on. Raises GivenUp when nobody waits for it any more."""
+"""Called while work goes on. Raises GivenUp when no client waits for it any more."""
 
 
 class GivenUp(TooMuchError):
@@ -84,7 +84,7 @@ class _Thread:
         if self._ending.is_set():
             raise GivenUp("mapfold ui ends; start it again and ask again")
         if not self._wanted():
-            raise GivenUp("nobody waits for the answer any more")
+            raise GivenUp("no client waits for the answer any more")
 
     def __enter__(self) -> Self:
         return self

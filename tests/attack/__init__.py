@@ -6,7 +6,7 @@
 seeded with seed, attack and round. Round 0 plays the cases that once did harm, later rounds random
 ones. Whatever the attack, these must hold:
 
-* no event that a recorder acknowledged is missing from the log, the log has no event that nobody
+* no event that a recorder acknowledged is missing from the log, the log has no event that was never
   sent, and none changes its offset (`oracle`);
 * no traceback and no panic on the stderr of any command, and none dies of a signal that the attack
   did not send;

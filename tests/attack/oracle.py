@@ -18,7 +18,7 @@ def digest(payload: bytes) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """Acknowledged events that the log lacks, and events in it that nobody sent or that have
+    """Acknowledged events that the log lacks, and events in it that were never sent or that have
     another offset than before."""
 
     acknowledged: int

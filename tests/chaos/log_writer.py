@@ -3,7 +3,7 @@
     python -m tests.chaos.log_writer LOG FSYNC [mixed]
 
 Prints ``next N`` once, then the durable offset after each commit, one a line. Event i always has
-the same payload, so whoever reads the log can tell what should stand there; if ``mixed``, messages
+the same payload, so a reader of the log can tell what should stand there; if ``mixed``, messages
 of ROS, pictures and envelopes stand side by side (`tests.verbatim`). Every other writer, by chance,
 has its segments sealed by a process.
 """

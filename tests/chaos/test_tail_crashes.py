@@ -227,7 +227,7 @@ def test_a_new_pass_waits_for_a_database_that_is_away(
     assert (report.next_offset, report.restarts, len(cuts)) == (40, 1, 2)
 
 
-def test_a_checkpoint_moved_by_somebody_else_stops_the_tail(
+def test_a_checkpoint_moved_by_another_writer_stops_the_tail(
     tmp_path: Path, one_database: Targets
 ) -> None:
     log = write_log(tmp_path / "log", walk(40))
@@ -261,7 +261,7 @@ def test_a_stopped_tail_gives_up_on_a_database_that_is_away(
     tmp_path: Path, own_server: EmbeddedServer
 ) -> None:
     log = write_log(tmp_path / "log", walk(20))
-    targets = Targets(own_server.url, own_server.url)  # nobody revives it
+    targets = Targets(own_server.url, own_server.url)  # it is not restarted
     stop = threading.Event()
 
     def kill_then_stop(_: TailReport) -> None:

@@ -1,4 +1,4 @@
-"""Segments that are huge, full of holes, or declare sizes that nobody should believe."""
+"""Segments that are huge, full of holes, or declare sizes that are not true."""
 
 import os
 import zlib

@@ -212,7 +212,7 @@ def test_a_live_tail_prints_when_it_has_caught_up(mapfold: Commands, log: Path) 
 def read_screen(screen: int) -> str:
     """All that a program shows on its terminal until it has ended."""
     shown = b""
-    # On Linux a terminal that nobody holds any more is an error to read from.
+    # On Linux a terminal that no process has open any more is an error to read from.
     with os.fdopen(screen, "rb", buffering=0) as stream, contextlib.suppress(OSError):
         while part := stream.read(4096):
             shown += part

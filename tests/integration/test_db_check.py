@@ -197,7 +197,7 @@ def test_a_rebuild_beside_a_check_makes_no_difference(
 
 
 def door(pg: psycopg.Connection) -> None:
-    """What somebody might do who takes the map for theirs to write to."""
+    """What a user might write into the tables of the map."""
     pg.execute(
         "SELECT * FROM cypher('semantic_map', $$ CREATE (:Door)-[:HINGE]->(:Door) RETURN 1 $$)"
         " AS (n agtype)"

@@ -30,7 +30,7 @@ with Children() as children:
 
 
 def _wait_until_free(log: Path, timeout_s: float) -> None:
-    """Take the writer's lock of the log as soon as nobody has it."""
+    """Take the writer's lock of the log as soon as it is free."""
     deadline = time.monotonic() + timeout_s
     while True:
         try:

@@ -1,4 +1,4 @@
-"""`mapfold edit` and `mapfold edits` on a log that nobody else holds."""
+"""`mapfold edit` and `mapfold edits` on a log that no other process has locked."""
 
 import getpass
 import json
@@ -164,7 +164,7 @@ def test_what_is_wrong_is_one_line_and_writes_nothing(mapfold: Commands) -> None
 
 
 def test_the_same_id_twice_is_recorded_once(mapfold: Commands) -> None:
-    """A retry, of which nobody knows whether the first try was recorded."""
+    """A retry after a try that may or may not have been recorded."""
     give = ("edit", "log", "name-place", LEFT, "hall", *WHY, "--command-id", "c1", "--json")
     first, again = mapfold(*give).json, mapfold(*give).json
     assert (first["offset"], again["offset"]) == (EVENTS, EVENTS)

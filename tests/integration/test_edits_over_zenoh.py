@@ -319,7 +319,7 @@ def test_only_so_many_wait_and_messages_still_fit() -> None:
     assert len(queue.get(1_000, 0)) == MAX_EDITS_WAITING + 1
     assert queue.put_edit(requests[-1])
     queue.close()
-    assert not queue.put_edit(requests[0]), "nobody would answer it"
+    assert not queue.put_edit(requests[0]), "it would not be answered"
 
 
 def test_nothing_is_answered_before_it_is_durable(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ FIRST_SEGMENT = f"{0:020d}"
 
 
 def killed_writer(path: Path, events: int = 5) -> SegmentPlan:
-    """The plan for the segment that a killed writer left, of a log that nobody holds."""
+    """The plan for the segment that a killed writer left, of a log that is not locked."""
     program = (
         "import os, sys; from pathlib import Path; from eventsrc.log import ALWAYS, LogWriter\n"
         "writer = LogWriter(Path(sys.argv[1]), fsync=ALWAYS)\n"
@@ -176,7 +176,7 @@ def test_errors_come_back_as_they_were_raised(tmp_path: Path) -> None:
 
 
 def test_the_process_of_a_dead_writer_changes_nothing_in_its_log(log_path: Path) -> None:
-    """It writes under a name of its own, finds nobody to answer, and deletes that file."""
+    """It writes under a name of its own, finds no process to answer, and deletes that file."""
     plan = killed_writer(log_path)
     process = SealingProcess()
     question = {

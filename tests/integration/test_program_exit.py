@@ -77,7 +77,7 @@ def test_ctrl_c_in_a_starting_worker_is_one_line(mapfold: Commands) -> None:
 
 
 def _into_closed_pipe(mapfold: Commands, *args: str, stream: str = "stdout") -> tuple[int, str]:
-    """Exit code and the other stream of a command whose ``stream`` nobody reads any more."""
+    """Exit code and the other stream of a command whose ``stream`` is closed at the reading end."""
     read_end, write_end = os.pipe()
     os.close(read_end)
     env = {k: v for k, v in mapfold.env.items() if k != "PYTHONUNBUFFERED"}

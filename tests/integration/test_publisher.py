@@ -202,7 +202,7 @@ def test_two_robots_get_their_own_acks(
 def test_a_run_id_used_by_two_robots_acknowledges_to_each_its_own(
     endpoint: str, connected: Sessions, start: Start, tmp_path: Path
 ) -> None:
-    """One publishes under a key that nobody records; the other's acks are heard by both."""
+    """One publishes under a key that is not recorded; the other's acks are heard by both."""
     program = start("record", str(tmp_path / "log"), "--connect", endpoint)
     program.wait_for("recording")
     arrived = threading.Semaphore(0)

@@ -36,7 +36,7 @@ def left_over(pg: psycopg.Connection) -> set[str]:
     return {name for (name,) in rows}
 
 
-def nobody_drops(connection: Connection, statement: sql.Composed) -> None:
+def skip_the_drop(connection: Connection, statement: sql.Composed) -> None:
     """Simulates a server that was stopped before it dropped anything."""
     connection.close()
 
@@ -55,7 +55,7 @@ def test_the_next_rebuild_drops_what_the_server_did_not(
 ) -> None:
     rebuild(log, one_database, SETTINGS, until=30)
     with monkeypatch.context() as patched:
-        patched.setattr("projections.database.replaced_tables.send_and_close", nobody_drops)
+        patched.setattr("projections.database.replaced_tables.send_and_close", skip_the_drop)
         rebuild(log, one_database, SETTINGS)
     rows = all_rows(one_database)
     assert left_over(pg) == {"semantic_map_old", "mapfold_old"}

@@ -24,7 +24,7 @@ START = Callable[..., int]
 
 async def application(scope: Scope, receive: Receive, send: Send) -> None:
     """Answers with the length of the body; at /long with more than a socket's buffers take; at
-    /begin it begins to answer, and goes on as long as somebody listens."""
+    /begin it begins to answer, and goes on as long as the client reads."""
     asked = Request(scope, receive)
     if scope["path"] == "/begin":
         await send({"type": "http.response.start", "status": 200, "headers": []})

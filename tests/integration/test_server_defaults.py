@@ -34,7 +34,7 @@ TIMEOUTS = (
     " '^(statement|lock|transaction|idle_session|idle_in_transaction_session)_timeout$'"
 )
 KEEPALIVES = {"keepalives_idle": "20", "keepalives_interval": "10", "keepalives_count": "3"}
-HOST = "127.0.0.77"  # nobody else's port 5432
+HOST = "127.0.0.77"  # where no other server has port 5432
 OWNER, WRITER = "an_owner", "a_tail"
 
 

@@ -115,7 +115,7 @@ def socket_folder(server: EmbeddedServer) -> Path:
 
 
 def data_served(server: EmbeddedServer) -> Path:
-    """The data folder of whoever answers."""
+    """The data folder of the server that answers."""
     with psycopg.connect(server.url, connect_timeout=WAIT_S) as connection:
         row = connection.execute("SHOW data_directory").fetchone()
     assert row is not None

@@ -132,7 +132,7 @@ class TestEdits:
         got = server.edit("undo-merge", offset, dry_run=False)
         assert got.error == (
             400, "bad_question",
-            "the reason is missing: say why, for whoever reads the log later",
+            "the reason is missing: say why, for later readers of the log",
         )  # fmt: skip
         done = server.edit("undo-merge", offset, dry_run=False, reason="two rooms").json
         assert (done["recorded"], done["offset"], done["through"]) == (True, 50, 51)

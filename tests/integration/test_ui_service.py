@@ -50,7 +50,7 @@ def folded(log: Path, rules: Settings) -> str:
         return map_digest(fold_log(reader, rules)[1])
 
 
-def test_a_fold_that_nobody_waits_for_is_given_up_and_continued_later(
+def test_a_fold_without_a_waiting_client_is_given_up_and_continued_later(
     log: Path, service: UiService
 ) -> None:
     calls = iter([True, True, False])
@@ -103,7 +103,7 @@ def test_long_answers_are_given_up_while_they_fold(
         asked.append(True)
         return len(asked) < 3
 
-    with pytest.raises(GivenUp, match="nobody"):
+    with pytest.raises(GivenUp, match="no client waits"):
         service.ask_apart(work, wanted).result(WAIT_S)
     assert len(asked) == 3
     assert service.ask_apart(work).result(WAIT_S)["through"] == 1300
@@ -138,7 +138,7 @@ def test_another_log_in_the_same_place_is_not_folded(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_an_error_that_nobody_expected_is_said_and_raised(tmp_path: Path) -> None:
+def test_an_unexpected_error_is_printed_and_raised(tmp_path: Path) -> None:
     """It ends the following of the log, not the answers."""
     log = write_log(tmp_path / "log", walk(5))
     failing: list[bool] = []

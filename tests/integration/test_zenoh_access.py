@@ -76,7 +76,7 @@ def endpoint(folder: Path, start: Start) -> str:
 
 @pytest.fixture
 def options(folder: Path, endpoint: str) -> Callable[[str], ZenohOptions]:
-    """How somebody with a certificate of that name connects."""
+    """How a client with a certificate of that name connects."""
     return lambda name: ZenohOptions(connect=(endpoint,), config_file=folder / f"{name}.json5")
 
 
@@ -159,7 +159,7 @@ def test_robots_do_not_hear_one_another_and_strangers_hear_nothing(
     assert heard == {"robot-2": [], "stranger": [], "recorder": [b"seen"]}
 
 
-def test_without_a_certificate_of_the_authority_nobody_connects(
+def test_without_a_certificate_of_the_authority_no_client_connects(
     folder: Path, endpoint: str
 ) -> None:
     _certificates(folder, "other-ca", ("impostor",))

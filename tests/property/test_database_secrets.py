@@ -83,7 +83,7 @@ def shown(url: str) -> str:
 
 
 def public(url: str) -> bool:
-    """Whether the secret stands where everybody sees that it is no password: in the host."""
+    """Whether the secret is in the host, where it is plainly no password."""
     try:
         said = conninfo_to_dict(url)
     except (psycopg.Error, ValueError):

@@ -131,7 +131,7 @@ def in_folder() -> tempfile.TemporaryDirectory[str]:
 @QUICK
 @given(data=st.data())
 def test_after_a_kill_at_any_byte_what_was_synced_is_there(data: st.DataObject) -> None:
-    """Not even somebody who knows the seed can forge anything."""
+    """Even with the seed known, nothing can be forged."""
     with in_folder() as name:
         log = Growing(Path(name), data, None)
         content = log.file.read_bytes()

@@ -73,7 +73,7 @@ def test_any_flip_in_an_active_segment_is_reported(quick_path: Path) -> None:
             shown, named = read_with_gaps(file.parent)
             assert all(event == events[event.offset] for event in shown)
             missing = everything - {e.offset for e in shown} - named
-            # Without its mark nobody but recovery may say that the last commit was synced.
+            # Without its mark only recovery may say that the last commit was synced.
             assert not missing or (missing == {len(events) - 1} and at >= len(data) - MARK_BYTES)
         else:
             with contextlib.suppress(LogError):

@@ -55,7 +55,7 @@ def test_every_flip_is_found_and_never_read(sealed: tuple[Path, list[Event]]) ->
         data[at] ^= 0x20
         file.write_bytes(data)
         findings = verify_log(file.parent).findings
-        assert findings, f"byte {at} of {len(data)} changed and nobody noticed"
+        assert findings, f"byte {at} of {len(data)} changed without a finding"
         named = {
             offset
             for f in findings

@@ -1,4 +1,4 @@
-"""A headless chromium that asks nobody but the server under test."""
+"""A headless chromium that sends requests to the server under test only."""
 
 import os
 import shutil

@@ -1,5 +1,5 @@
 """The page as a whole: hostile names, logs that show no map, a server that is gone, access by
-keyboard and by reading aloud, its size, and that its bundle asks nobody else."""
+keyboard and by reading aloud, its size, and that its bundle requests nothing from other hosts."""
 
 import gzip
 import shutil

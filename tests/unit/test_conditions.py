@@ -102,6 +102,7 @@ def test_expressions_hold(text: str, holds: bool) -> None:
         ("(1 < 2) == (2 < 3)", 9, "true and false cannot be compared"),
         ("__import__('os') == 'x'", 1, "no function '__import__'"),
         ("place_count < 3; 1", 16, "has no meaning here"),
+        ("1 < 2 or 3 < -" + "9" * 4301, 14, "a number of more than 4300 digits"),
     ],
 )
 def test_an_error_points_at_its_column(text: str, column: int, says: str) -> None:
@@ -130,6 +131,26 @@ def test_deep_nesting_is_an_error_and_no_overflow() -> None:
 def test_ids_may_hold_quotes_and_backslashes() -> None:
     facts = FakeFacts({r"it's:1": "p", 'b"\\s:1': "p"})
     assert Expression(r"""same_place('it\'s:1', "b\"\\s:1")""").holds(facts)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "place_of('a\nb:1') == none",
+        "place_of('a\rb:1') == none",
+        "place_of('a\0b:1') == none",
+        "place_of('a\udc80b:1') == none",
+        "place_count < 007",
+        "place_count < \u0663",  # three in Arabic-Indic digits
+        "place_count\u00a0< 3",
+        "place_count\n< 3",
+    ],
+    ids=ascii,
+)
+def test_what_python_refuses_in_a_text_or_between_tokens_is_accepted(text: str) -> None:
+    expression = Expression(text)
+    assert expression.holds(FakeFacts())
+    assert [mention.text for mention in expression.mentions()] == text.split("'")[1:2]
 
 
 def test_mentions_and_readings() -> None:

@@ -97,7 +97,7 @@ def test_announced_keyframes_are_missing_after_the_settle_time() -> None:
     ledger.expect("run-a", 5, 101)
     ledger.record("run-a", 4, 105)
     assert ledger.due(110) == []
-    assert ledger.missing == 1, "before, nobody knows whether it is still on its way"
+    assert ledger.missing == 1, "before, it may still be on its way"
     assert ledger.due(111) == [Gap("run-a", 5, 5)]
     assert ledger.due(115) == [Gap("run-a", 3, 3)]
     assert (ledger.missing, ledger.highest("run-a")) == (2, 5)
@@ -133,7 +133,7 @@ def test_closed_gaps_and_forgotten_runs_are_not_missing() -> None:
 
 
 def test_a_part_of_a_hole_can_have_been_reported() -> None:
-    """A recorder that said 2 to 4 were missing, when nobody knew of 5 to 8 yet."""
+    """A recorder that said 2 to 4 were missing, when 5 to 8 were not known yet."""
     ledger = _ledger(1, 9)
     ledger.mark_reported(Gap("run-a", 2, 4))
     assert ledger.missing_reported() == 3

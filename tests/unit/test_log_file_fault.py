@@ -277,7 +277,7 @@ def test_rotation_goes_on_after_a_file_was_given_up(log_path: Path) -> None:
 
 @pytest.mark.parametrize("back", [False, True])
 def test_a_folder_that_is_gone_ends_the_writer(log_path: Path, back: bool) -> None:
-    """Also where another one stands under its name by now: it is locked by nobody."""
+    """Also where another one stands under its name by now: it is not locked."""
     writer = LogWriter(log_path, fsync=BY_HAND)
     write(writer, range(BEFORE))
     log_path.rename(log_path.with_name("moved"))

@@ -16,7 +16,7 @@ TIMEOUT_S = 30
 
 
 def killed(path: Path, events: int, rotate_events: int) -> None:
-    """Leave finished segments that nobody has sealed, and a growing one."""
+    """Leave finished segments that are not sealed, and a growing one."""
     writer = LogWriter(path, fsync=ALWAYS, rotate_events=rotate_events)
     writer._sealer.submit = lambda *_, **__: None  # type: ignore[method-assign]
     for number in range(events):

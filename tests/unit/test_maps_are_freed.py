@@ -1,6 +1,6 @@
 """A map is freed with its last reference, not by the cyclic garbage collector.
 
-A rebuild leaves hundreds of megabytes behind, and whoever folds in one process again and again (a
+A rebuild leaves hundreds of megabytes behind, and a process that folds again and again (a
 tail that restarts, ``whatif``, ``serve``) would hold several of them.
 """
 

@@ -169,7 +169,7 @@ def test_a_short_fold_leaves_nothing_behind(log: Path) -> None:
 
 @pytest.mark.usefixtures("eager")
 def test_a_snapshot_of_events_that_the_log_has_lost_is_not_used(tmp_path: Path) -> None:
-    """Else the map would show what nobody can read any more."""
+    """Else the map would show what cannot be read any more."""
     log = tmp_path / "log"
     with LogWriter(log, fsync=ALWAYS, rotate_events=20) as writer:
         for document in _documents(60):

@@ -112,7 +112,7 @@ def test_unknown_fields_of_version_2_with_names_of_version_3_are_dropped() -> No
     fits = envelope(1, camera={"hfov_deg": 90.0, "width_px": 640.0, "height_px": 480.0})
     read = read_envelope(event(fits, 2))
     assert isinstance(read, Accepted)
-    assert read.envelope.camera is None, "whoever wrote it did not mean our field"
+    assert read.envelope.camera is None, "its writer did not mean our field"
     younger = read_envelope(event(fits, 3))
     assert isinstance(younger, Accepted)
     assert younger.envelope.camera is not None

@@ -97,7 +97,7 @@ def _import(arena: Arena, bomb: Path) -> None:
 
 
 def _log(arena: Arena, name: str) -> Path:
-    """A log of ten events that nobody closed."""
+    """A log of ten events that was not closed."""
     log = arena.folder / name
     writer = LogWriter(log, fsync=BY_HAND)
     for k in range(10):

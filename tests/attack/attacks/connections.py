@@ -32,7 +32,7 @@ BEGINNINGS = (
 
 
 CASES = (("127.0.0.1", HALF), (ELSEWHERE, AHEAD))
-"""Half requests use up the share of nobody, whole ones that of their address."""
+"""Half requests use up no share, whole ones that of their address."""
 
 
 def attack(arena: Arena) -> None:
@@ -64,7 +64,7 @@ def _hold_many(arena: Arena, address: tuple[str, int], source: str, begin: bytes
 
 
 def _open(address: tuple[str, int], source: str, begin: bytes) -> socket.socket | None:
-    """A connection that has said ``begin``, or had it refused; None when nobody takes it."""
+    """A connection that has said ``begin``, or had it refused; None when it is not accepted."""
     try:
         connection = socket.create_connection(address, timeout=5.0, source_address=(source, 0))
     except ConnectionError:

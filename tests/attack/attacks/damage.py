@@ -119,7 +119,7 @@ def _one(arena: Arena, damage: Damage) -> None:
 
 
 def _write(log: Path, run_id: str, oracle: Oracle, key: str = "tb/detections") -> None:
-    """Segments of 20 events and a growing one of 19 that nobody closed, as after a kill."""
+    """Segments of 20 events and a growing one of 19 that was not closed, as after a kill."""
     writer = LogWriter(log, fsync=BY_HAND, rotate_events=SEGMENT)
     for k in range(EVENTS):
         payload = json.dumps(envelope(k, run_id=run_id, note="x" * 50)).encode()

@@ -95,7 +95,7 @@ def _foreign_server_is_not_used(arena: Arena) -> None:
                 connection.settimeout(0.0)
                 with suppress(OSError):
                     if connection.recv(1):
-                        arena.complain("somebody else's server was taken for ours")
+                        arena.complain("another user's server was taken for ours")
 
 
 def _accepted(listener: socket.socket) -> Iterator[socket.socket]:
@@ -117,7 +117,7 @@ def _start_and_stop(arena: Arena, home: Path) -> str:
 @contextmanager
 def _taken(arena: Arena, home: Path) -> Iterator[Path]:
     """The folder for the socket of the server of ``home``, as a reboot leaves it: gone, its name
-    known to everybody. It is gone again in the end."""
+    known to every process. It is gone again in the end."""
     url = _start_and_stop(arena, home)
     (text,) = parse_qs(urlsplit(url).query)["host"]
     place = Path(text)

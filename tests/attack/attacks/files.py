@@ -35,7 +35,7 @@ def rename(active: Path, _: Arena) -> None:
 
 
 def replace(active: Path, _: Arena) -> None:
-    """Put a copy in its place, which nobody writes to."""
+    """Put a copy in its place, to which no process writes."""
     copy = active.with_name("copy")
     shutil.copyfile(active, copy)
     copy.replace(active)

@@ -68,7 +68,7 @@ PATHS = (
     "/docs/../secrets",
 )
 STRANGERS = ({"Host": "evil.example"}, {"Origin": "http://evil.example"})
-"""What a page of somebody else's says when a browser on this machine runs it."""
+"""What a page of another site says when a browser on this machine runs it."""
 
 
 def attack(arena: Arena) -> None:

@@ -47,7 +47,7 @@ def types_row(case: Case, settings: Settings) -> TypesRow:
 
 
 def typed_places(view: MapView, truth: Truth) -> tuple[TypedPlace, ...]:
-    """The places of a view in whose room anybody knows where it is."""
+    """The places of a view whose room is known."""
     found = []
     for place in view.places.values():
         members = [view.keyframes[k] for k in place.members]

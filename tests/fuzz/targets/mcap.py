@@ -1,4 +1,4 @@
-"""An MCAP file of somebody else's, imported: events in a log, or one clear error."""
+"""An imported MCAP file of another program: events in a log, or one clear error."""
 
 import random
 import shutil

@@ -1,4 +1,4 @@
-/** Light or dark: as the system says, until somebody chooses. */
+/** Light or dark: the system's choice until the user chooses. */
 
 import { effect } from "@preact/signals";
 import { storage } from "./kept";

@@ -48,7 +48,7 @@ export function applyAddress(hash: string) {
   });
 }
 
-/** Without a moment while the page follows the log, unless the link is for somebody else. */
+/** Without a moment while the page follows the log, unless the link is to be shared. */
 export function writtenAddress(still = false): string {
   const found = new URLSearchParams();
   if (still || !store.live.value) found.set("at", String(store.at.value));
