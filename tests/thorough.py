@@ -2,7 +2,9 @@
 
 import os
 from collections.abc import Iterable
-from typing import TypeVar
+from typing import Any, TypeVar
+
+import pytest
 
 _Case = TypeVar("_Case")
 
@@ -30,3 +32,13 @@ def every_other(cases: Iterable[_Case]) -> list[_Case]:
     In a `product` of two values and an odd number of others, each value stays.
     """
     return list(cases)[:: stride(2)]
+
+
+def mostly_slow(cases: Iterable[Any], quick: int = 1) -> list[Any]:
+    """Cases for `pytest.mark.parametrize`: all but the first ``quick`` are marked slow."""
+    found: list[Any] = []
+    for number, case in enumerate(cases):
+        given = case if isinstance(case, tuple) else (case,)
+        slow = [pytest.mark.slow] if number >= quick else []
+        found.append(pytest.param(*given, marks=slow))
+    return found

@@ -87,6 +87,7 @@ def test_a_bomb_ends_the_import_with_its_place_and_little_memory(name: str, tmp_
     assert [e.payload for e in read_log(log)] == [GOOD]
 
 
+@pytest.mark.slow
 def test_other_channels_are_skipped_whatever_their_size(tmp_path: Path) -> None:
     """An attachment of two gibibytes, most of it a hole."""
     file, log = tmp_path / "file.mcap", tmp_path / "log"

@@ -5,6 +5,8 @@ import os
 import subprocess
 from pathlib import Path
 
+import pytest
+
 from tests.commands import PROGRAM
 from tests.seen_rooms import write_room
 from tests.thorough import stride
@@ -19,6 +21,7 @@ CHOSEN = [
 ]
 
 
+@pytest.mark.slow
 def test_every_kernel_gives_the_same_constants(tmp_path: Path) -> None:
     log = write_room(tmp_path / "log", count=30)
     told = {

@@ -18,7 +18,7 @@ from tests.candidates import assert_equal, view_under_commands
 from tests.commands_in_logs import append_command, command, forget_keyframes
 from tests.flickering_house import flickering_house
 from tests.logs import WEIRD, walk, write_log
-from tests.thorough import rounds
+from tests.thorough import mostly_slow, rounds
 
 MANY = 500
 KNOWN = (Crop(None, None, "chair"), Crop(None, None, "oven"))
@@ -83,6 +83,7 @@ def test_an_open_reader_follows_tail_and_refold(
         agree(log, reader)
 
 
+@pytest.mark.slow
 def test_a_sample_of_a_large_map_is_the_same_in_both(
     tmp_path: Path,
     documents: list[dict[str, Any]],
@@ -118,7 +119,9 @@ class TestClasses:
     def log(self, tmp_path: Path, documents: list[dict[str, Any]]) -> Path:
         return write_log(tmp_path / "log", documents)
 
-    @pytest.mark.parametrize(("bound", "value"), [("OBJECTS_OF_A_CLASS", 2), ("MOST_OBJECTS", 5)])
+    @pytest.mark.parametrize(
+        ("bound", "value"), mostly_slow([("OBJECTS_OF_A_CLASS", 2), ("MOST_OBJECTS", 5)])
+    )
     def test_candidates_are_bounded_to_the_objects_seen_most(
         self,
         log: Path,
@@ -159,11 +162,13 @@ class TestClasses:
 
     @pytest.mark.parametrize(
         ("name", "said"),
-        [
-            ("lmap", "no object of class 'lmap'; the nearest are lamp"),
-            ('x" } --', r"there are .*chair, .*"),
-            ("☕", r"there are .*chair, .*"),
-        ],
+        mostly_slow(
+            [
+                ("lmap", "no object of class 'lmap'; the nearest are lamp"),
+                ('x" } --', r"there are .*chair, .*"),
+                ("☕", r"there are .*chair, .*"),
+            ]
+        ),
     )
     def test_an_unknown_class_is_named_with_the_nearest(
         self, log: Path, targets: Targets, name: str, said: str

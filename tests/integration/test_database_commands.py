@@ -87,6 +87,7 @@ def test_parked_events_are_findings(mapfold: Commands, log: Path) -> None:
     assert "still cannot be folded" in mapfold("db", "retry", log, code=3).out
 
 
+@pytest.mark.slow
 def test_what_a_replay_advises_for_an_event_that_cannot_be_folded_works(
     mapfold: Commands, log: Path
 ) -> None:
@@ -135,6 +136,7 @@ def test_a_refusal_names_the_settings_that_fit(mapfold: Commands, log: Path) -> 
     assert advised(said) == ["replay", str(log), "--set", "min_samples=4"]
 
 
+@pytest.mark.slow
 def test_a_refusal_names_settings_of_groups_that_fit(mapfold: Commands, log: Path) -> None:
     """Also from a map whose settings are older than the groups, and back to it."""
     own = ("--set", "camera.hfov_deg=90.0", "--set", "evidence.sizes_m.potted plant=0.4")
@@ -185,6 +187,7 @@ def test_a_replay_prints_what_it_left_out(mapfold: Commands) -> None:
     assert document["counts"]["foreign_embeddings"] == many + 1
 
 
+@pytest.mark.slow
 def test_a_complete_replay_prints_no_left_out_line(mapfold: Commands, log: Path) -> None:
     assert "left out" not in mapfold("replay", log).err
 
@@ -195,6 +198,7 @@ def test_db_stop_says_whether_anything_ran(mapfold: Commands) -> None:
     assert mapfold("db", "stop").err == "stopped\n"
 
 
+@pytest.mark.slow
 def test_a_live_tail_prints_when_it_has_caught_up(mapfold: Commands, log: Path) -> None:
     running = subprocess.Popen(
         [str(PROGRAM), "tail", str(log)], env=dict(mapfold.env), cwd=mapfold.folder,

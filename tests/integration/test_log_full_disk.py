@@ -13,6 +13,7 @@ import pytest
 from eventsrc.errors import LogError
 from eventsrc.log import LogWriter
 from tests.fixtures_log import read_log
+from tests.thorough import mostly_slow
 
 ROOT = Path(__file__).parents[2]
 
@@ -41,8 +42,20 @@ except LogError as error:
 """
 
 
-@pytest.mark.parametrize("fsync", ["always", "1ms", "50ms"])
-@pytest.mark.parametrize("limit", [20_000, 20_500, 1_000_000])
+@pytest.mark.parametrize(
+    ("limit", "fsync"),
+    mostly_slow(
+        [
+            (20_000, "always"),
+            (20_500, "50ms"),
+            (1_000_000, "1ms"),
+            *((limit, "1ms") for limit in (20_000, 20_500)),
+            *((limit, "50ms") for limit in (20_000, 1_000_000)),
+            *((limit, "always") for limit in (20_500, 1_000_000)),
+        ],
+        3,
+    ),
+)
 def test_synced_events_stay(log_path: Path, limit: int, fsync: str) -> None:
     program = FILL.format(limit=limit, fsync=fsync)
     done = subprocess.run(

@@ -27,6 +27,7 @@ from tests.fixtures_log import KEY
 from tests.live_rows import followed_and_rebuilt
 from tests.maps import drawn_map
 from tests.rows import all_rows, map_rows
+from tests.thorough import mostly_slow
 
 ROOMS = drawn_map("########## #...#....# #...#....# #........# ##########", 1.0, (-2.0, -2.0, 0.0))
 EAST = [envelope(k, 4.0 - 0.25 * (k % 4), 0.0) for k in range(8)]
@@ -41,7 +42,7 @@ def _log(path: Path, content: bytes) -> Path:
     return path
 
 
-@pytest.mark.parametrize("places", ["page", "rooms"])
+@pytest.mark.parametrize("places", mostly_slow(["rooms", "page"]))
 def test_tail_rebuild_and_check_agree(tmp_path: Path, one_database: Targets, places: str) -> None:
     log = _log(tmp_path / "log", ROOMS.encode())
     settings = Settings.model_validate({"places": places})
@@ -101,7 +102,7 @@ EVENTS = [
 ]
 
 
-@pytest.mark.parametrize("targets", ["one_database", "two_databases"])
+@pytest.mark.parametrize("targets", mostly_slow(["one_database", "two_databases"]))
 def test_the_table_has_the_maps_in_force_after_every_step(
     request: pytest.FixtureRequest, tmp_path: Path, targets: str
 ) -> None:
@@ -152,14 +153,17 @@ def test_a_command_that_refolds_keeps_the_maps(tmp_path: Path, one_database: Tar
 
 @pytest.mark.parametrize(
     ("change", "kind"),
-    [
-        ("UPDATE mapfold.occupancy_map SET resolution = 2.0", "different"),
-        ("UPDATE mapfold.occupancy_map SET png = 'junk'", "different"),
-        ("UPDATE mapfold.occupancy_map SET digest = 'junk'", "different"),
-        ("UPDATE mapfold.occupancy_map SET floor = 'cellar'", "different"),
-        ("DELETE FROM mapfold.occupancy_map", "missing"),
-        ("UPDATE mapfold.occupancy_map SET log_offset = 9", "extra"),
-    ],
+    mostly_slow(
+        [
+            ("UPDATE mapfold.occupancy_map SET png = 'junk'", "different"),
+            ("DELETE FROM mapfold.occupancy_map", "missing"),
+            ("UPDATE mapfold.occupancy_map SET log_offset = 9", "extra"),
+            ("UPDATE mapfold.occupancy_map SET resolution = 2.0", "different"),
+            ("UPDATE mapfold.occupancy_map SET digest = 'junk'", "different"),
+            ("UPDATE mapfold.occupancy_map SET floor = 'cellar'", "different"),
+        ],
+        3,
+    ),
 )
 def test_check_finds_a_changed_map_and_repairs_it(
     tmp_path: Path, one_database: Targets, change: LiteralString, kind: str
@@ -207,6 +211,7 @@ def test_a_map_that_killed_its_tail_is_written_by_the_next(
     assert _in_database(one_database) == _as_folded(log)
 
 
+@pytest.mark.slow
 def test_the_largest_map_is_written_and_read(tmp_path: Path, one_database: Targets) -> None:
     cells = np.random.default_rng(1).choice(np.array([0, 100, 255], np.uint8), (4000, 4000))
     log = tmp_path / "log"

@@ -23,6 +23,7 @@ from tests.commands import Commands
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import KEY
 from tests.maps import drawn_map
+from tests.thorough import mostly_slow
 
 HALL = drawn_map("########## #........# #........# #........# ##########", 1.0, (-2.0, -2.0, 0.0))
 ROOMS = drawn_map("########## #...#....# #...#....# #........# ##########", 1.0, (-2.0, -2.0, 0.0))
@@ -203,7 +204,7 @@ def test_state_names_the_map_only_where_there_is_one(tmp_path: Path) -> None:
     assert f"{named}\n" in run("state", "mapped", "--preset", "rooms").out
 
 
-@pytest.mark.parametrize("suffix", ["svg", "png", "pdf"])
+@pytest.mark.parametrize("suffix", mostly_slow(["svg", "png", "pdf"]))
 def test_a_picture_shows_the_walls_and_stays_the_same(tmp_path: Path, suffix: str) -> None:
     run = Commands.in_folder(tmp_path)
     _write(tmp_path / "plain", *DRIVE)

@@ -46,11 +46,12 @@ def mapfold(tmp_path: Path) -> Commands:
     ("module", "args"),
     [
         ("contextlib", ("log", "info", "log")),  # the first thing that is imported
-        ("projections.cli.program", ("log", "info", "log")),
-        ("typer", ("state", "log")),
         ("projections.cli.maps", ("state", "log")),
-        ("numpy", ("state", "log")),
-        ("projections.demo", ("demo",)),  # imported when the command runs already
+        pytest.param("projections.cli.program", ("log", "info", "log"), marks=pytest.mark.slow),
+        pytest.param("typer", ("state", "log"), marks=pytest.mark.slow),
+        pytest.param("numpy", ("state", "log"), marks=pytest.mark.slow),
+        # imported when the command runs already
+        pytest.param("projections.demo", ("demo",), marks=pytest.mark.slow),
     ],
 )
 def test_ctrl_c_is_one_line_and_130(tmp_path: Path, module: str, args: tuple[str, ...]) -> None:
@@ -124,9 +125,9 @@ def test_an_import_completes_when_stderr_is_closed(mapfold: Commands) -> None:
     [
         ("state", "log"),  # little: found out at the end
         ("log", "cat", "log", "--json"),  # much: found out on the way
-        ("log", "info", "log", "--json"),
-        ("--help",),
-        ("--version",),
+        pytest.param(("log", "info", "log", "--json"), marks=pytest.mark.slow),
+        pytest.param(("--help",), marks=pytest.mark.slow),
+        pytest.param(("--version",), marks=pytest.mark.slow),
     ],
     ids=lambda args: args[0],
 )

@@ -18,7 +18,7 @@ from projections.settings import Settings
 from tests.drops import wait_for_drops
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows
-from tests.thorough import THOROUGH, every_other, rounds
+from tests.thorough import THOROUGH, mostly_slow, rounds
 
 SETTINGS = Settings()
 WAIT_S = 60.0
@@ -71,7 +71,7 @@ def single_answer(connection: psycopg.Connection, query: str) -> str:
     return str(row[0])
 
 
-@pytest.mark.parametrize("prepare", [False, True], ids=["plain", "prepared"])
+@pytest.mark.parametrize("prepare", mostly_slow([False, True]), ids=["plain", "prepared"])
 def test_readers_see_one_map_or_the_other_and_never_an_error(
     tmp_path: Path, one_database: Targets, pg: psycopg.Connection, prepare: bool
 ) -> None:
@@ -135,11 +135,14 @@ class Interrupted(Exception):
 
 @pytest.mark.parametrize(
     ("kind", "stage"),
-    every_other(
-        product(
-            ["one_database", "two_databases"],
-            ["folding", "writing", "swapping", "tidying", "indexing"],
-        )
+    mostly_slow(
+        [
+            ("one_database", "writing"),
+            ("two_databases", "tidying"),
+            *product(["one_database"], ["folding", "swapping", "tidying", "indexing"]),
+            *product(["two_databases"], ["folding", "writing", "swapping", "indexing"]),
+        ],
+        2,
     ),
 )
 def test_interrupted_at_each_stage_one_whole_map_is_served(
@@ -203,7 +206,7 @@ def test_the_two_sinks_may_be_written_at_the_same_time(
     assert all_rows(one_database) == apart
 
 
-@pytest.mark.parametrize("query", [COUNT_PATHS, COUNT_LABELS, COUNT_VECTORS])
+@pytest.mark.parametrize("query", mostly_slow([COUNT_PATHS, COUNT_LABELS, COUNT_VECTORS]))
 def test_between_swap_and_commit_a_reader_waits_at_its_first_table(
     tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch, query: str
 ) -> None:
@@ -244,7 +247,8 @@ def test_a_reader_that_keeps_its_lock_stops_the_swap_with_a_message(
 
 
 @pytest.mark.parametrize(
-    ("first", "second"), [(COUNT_VECTORS, COUNT_PATHS), (COUNT_PATHS, COUNT_VECTORS)]
+    ("first", "second"),
+    mostly_slow([(COUNT_VECTORS, COUNT_PATHS), (COUNT_PATHS, COUNT_VECTORS)]),
 )
 def test_a_transaction_that_reads_both_is_never_ended_by_a_deadlock(
     tmp_path: Path, one_database: Targets, first: str, second: str
@@ -275,6 +279,7 @@ def test_a_transaction_that_reads_both_is_never_ended_by_a_deadlock(
         assert single_answer(reader, first) != expected[0]
 
 
+@pytest.mark.slow
 def test_readers_of_one_database_do_not_wait_for_those_of_the_other(
     tmp_path: Path, two_databases: Targets
 ) -> None:

@@ -114,9 +114,9 @@ def tailing(
 @pytest.mark.parametrize(
     "commands",
     [
-        pytest.param([forget_run("run-b")], id="forget-run"),
-        pytest.param([forget_keyframes(5, 40)], id="forget-keyframes"),
-        pytest.param([name_place(3, "kitchen")], id="name"),
+        pytest.param([forget_run("run-b")], id="forget-run", marks=pytest.mark.slow),
+        pytest.param([forget_keyframes(5, 40)], id="forget-keyframes", marks=pytest.mark.slow),
+        pytest.param([name_place(3, "kitchen")], id="name", marks=pytest.mark.slow),
         pytest.param([keep_apart(0, 1), name_place(0, "hall")], id="keep-apart"),
     ],
 )
@@ -140,6 +140,7 @@ def test_commands_come_to_the_rows_of_a_fresh_replay(
     assert all_rows(targets) == before
 
 
+@pytest.mark.slow
 def test_an_undone_command_gives_the_digest_of_before(log: Path, one_database: Targets) -> None:
     rebuild(log, one_database, SETTINGS)
     (digest,) = digests(one_database)
@@ -173,6 +174,7 @@ def test_a_live_tail_names_places_and_refolds(
     assert all_rows(targets) == fresh_rows(log, third_database)
 
 
+@pytest.mark.slow
 def test_a_fresh_tail_folds_under_the_commands_of_the_whole_log(
     log: Path, targets: Targets, third_database: Targets
 ) -> None:
@@ -186,7 +188,7 @@ def test_a_fresh_tail_folds_under_the_commands_of_the_whole_log(
 @pytest.mark.parametrize(
     ("second", "refolds"),
     [
-        pytest.param(name_place(3, "kitchen"), 1, id="a name joins"),
+        pytest.param(name_place(3, "kitchen"), 1, id="a name joins", marks=pytest.mark.slow),
         pytest.param(forget_keyframes(5, 40), 1, id="another one restarts it"),
     ],
 )
@@ -213,6 +215,7 @@ def test_a_command_during_a_refold_is_not_lost(
     assert all_rows(targets) == fresh_rows(log, third_database)
 
 
+@pytest.mark.slow
 def test_commands_that_keep_coming_do_not_keep_the_map_from_changing(
     log: Path, one_database: Targets, third_database: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -239,6 +242,7 @@ def oid(targets: Targets) -> Any:
         return connection.execute("SELECT 'detection_embeddings'::regclass::oid").fetchone()
 
 
+@pytest.mark.slow
 def test_corrections_of_places_keep_the_vectors(
     log: Path, targets: Targets, third_database: Targets
 ) -> None:
@@ -272,6 +276,7 @@ def test_settings_of_the_log_are_used_and_changed(
         tail(log, one_database, SETTINGS, once=True)
 
 
+@pytest.mark.slow
 def test_settings_of_fusion_by_evidence_keep_the_vectors(
     log: Path, targets: Targets, third_database: Targets
 ) -> None:
@@ -360,6 +365,7 @@ def test_a_projection_under_other_corrections_is_reported_and_refolded(
     assert all_rows(one_database) == fresh_rows(log, third_database)
 
 
+@pytest.mark.slow
 def test_a_refold_parks_what_it_cannot_fold(
     log: Path, targets: Targets, third_database: Targets
 ) -> None:
@@ -415,6 +421,7 @@ def test_a_command_that_no_fold_can_obey_leaves_the_old_map(log: Path, targets: 
     assert all_rows(targets) == before
 
 
+@pytest.mark.slow
 def test_a_live_tail_tries_an_impossible_command_again_when_another_comes(
     log: Path, targets: Targets, third_database: Targets
 ) -> None:

@@ -25,7 +25,7 @@ from tests.integration.test_rebuild_under_readers import (
     single_answer,
 )
 from tests.logs import bridge, walk, write_log
-from tests.thorough import rounds
+from tests.thorough import mostly_slow, rounds
 
 SETTINGS = Settings()
 WAIT_S = 60.0
@@ -55,7 +55,7 @@ class Asker(threading.Thread):
             self.stop.wait(PAUSE_S)
 
 
-@pytest.mark.parametrize("what", ["places", "keyframes"])
+@pytest.mark.parametrize("what", mostly_slow(["places", "keyframes"]))
 def test_readers_see_one_map_or_the_other_and_never_an_error(
     tmp_path: Path, one_database: Targets, what: str
 ) -> None:

@@ -20,7 +20,7 @@ from tests.candidates import assert_equal, found
 from tests.commands import Commands
 from tests.envelopes import detection
 from tests.logs import WEIRD, walk, write_log
-from tests.thorough import rounds
+from tests.thorough import mostly_slow, rounds
 
 SETTINGS = Settings()
 
@@ -32,7 +32,7 @@ def log(tmp_path: Path) -> Path:
     return write_log(tmp_path / "log", [*walk(60, seed=3), *other])
 
 
-@pytest.fixture(params=["page", "evidence"])
+@pytest.fixture(params=mostly_slow(["evidence", "page"]))
 def rule(request: pytest.FixtureRequest) -> Settings:
     return Settings(fusion=request.param)
 
@@ -138,7 +138,7 @@ def test_another_embedding_space_is_refused(targets: Targets) -> None:
 
 
 @pytest.mark.parametrize("targets", ["two_databases", "one_database"][: rounds(2, 1)])
-@pytest.mark.parametrize("other", ["log", "settings"])
+@pytest.mark.parametrize("other", mostly_slow(["log", "settings"]))
 def test_graph_and_vectors_of_different_origin_are_refused(
     request: pytest.FixtureRequest, targets: str, other: str, log: Path, tmp_path: Path
 ) -> None:

@@ -20,6 +20,7 @@ from tests.drops import wait_for_drops
 from tests.logs import bridge, walk, write_log
 from tests.maps import drawn_map
 from tests.rows import all_rows, map_rows
+from tests.thorough import mostly_slow
 
 pytestmark = pytest.mark.usefixtures("server_roles")
 
@@ -166,7 +167,7 @@ def attempt(url: str, session: str, statement: str) -> str:
     return "done"
 
 
-@pytest.mark.parametrize("session", SESSIONS)
+@pytest.mark.parametrize("session", mostly_slow(SESSIONS))
 def test_no_form_of_writing_works_for_a_reader(projected: Targets, session: str) -> None:
     url = as_role(projected, "a_reader").graph_url
     before = all_rows(projected)
@@ -236,6 +237,7 @@ def test_a_writer_tails_many_events_at_once(log: Path, projected: Targets) -> No
     assert [r.differing for r in check(log, projected, SETTINGS)] == [0, 0]
 
 
+@pytest.mark.slow
 def test_roles_reach_the_maps_also_after_an_older_version(log: Path, projected: Targets) -> None:
     """The table of maps gets the grants of the checkpoints where an older version made none."""
     given = drawn_map("####.###", 0.5)

@@ -37,10 +37,11 @@ DEADLINE_S = 30.0
 OTHER_SPACE = json.dumps([detection("x", [1.0, 2.0])]).encode()
 
 
-@pytest.fixture
-def targets(tmp_path: Path, one_database: Targets) -> Targets:
-    rebuild(write_log(tmp_path / "log", walk(60, seed=3)), one_database, Settings())
-    return one_database
+@pytest.fixture(scope="module")
+def targets(tmp_path_factory: pytest.TempPathFactory, module_database: Targets) -> Targets:
+    log = write_log(tmp_path_factory.mktemp("map") / "log", walk(60, seed=3))
+    rebuild(log, module_database, Settings())
+    return module_database
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ import struct
 import threading
 from base64 import b64encode
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -29,10 +28,11 @@ HALF_OPEN = 400
 MEBIBYTE = 1024 * 1024
 
 
-@pytest.fixture
-def targets(tmp_path: Path, one_database: Targets) -> Targets:
-    rebuild(write_log(tmp_path / "log", walk(60, seed=3)), one_database, Settings())
-    return one_database
+@pytest.fixture(scope="module")
+def targets(tmp_path_factory: pytest.TempPathFactory, module_database: Targets) -> Targets:
+    log = write_log(tmp_path_factory.mktemp("map") / "log", walk(60, seed=3))
+    rebuild(log, module_database, Settings())
+    return module_database
 
 
 @pytest.fixture

@@ -20,10 +20,11 @@ TOKEN = "0123456789abcdef-not-a-secret"
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
 
 
-@pytest.fixture
-def base(tmp_path: Path, one_database: Targets) -> tuple[str, ...]:
-    rebuild(write_log(tmp_path / "log", walk(10, seed=3)), one_database, Settings())
-    return "--no-zenoh", "--db", one_database.graph_url
+@pytest.fixture(scope="module")
+def base(tmp_path_factory: pytest.TempPathFactory, module_database: Targets) -> tuple[str, ...]:
+    log = write_log(tmp_path_factory.mktemp("map") / "log", walk(10, seed=3))
+    rebuild(log, module_database, Settings())
+    return "--no-zenoh", "--db", module_database.graph_url
 
 
 @pytest.fixture

@@ -46,6 +46,7 @@ def test_errors_that_were_taken_for_too_small_do() -> None:
     assert _inflation(rows) == pytest.approx(4.0, rel=0.25)
 
 
+@pytest.mark.slow
 def test_a_run_that_is_off_as_a_whole_does() -> None:
     """Residuals about one position hardly show it: the two runs differ by 0.4 m."""
     rows = rows_of(KNOWN)

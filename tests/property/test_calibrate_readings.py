@@ -12,6 +12,7 @@ from projections.calibrate.sightings import sightings_of
 from projections.evidence import EvidenceConstants
 from projections.settings import Camera
 from tests.known_worlds import CAMERA, Known, rows_of
+from tests.thorough import mostly_slow
 
 PRIOR = EvidenceConstants()
 WORLDS = {
@@ -45,7 +46,7 @@ def _by_name(found: Round) -> dict[str, Reading]:
     return {each.name: each for each in (*found.readings, *found.sizes)}
 
 
-@pytest.fixture(scope="module", params=WORLDS)
+@pytest.fixture(scope="module", params=mostly_slow(sorted(WORLDS, key="far, heading".__ne__)))
 def world(request: pytest.FixtureRequest) -> tuple[Known, Round]:
     known = WORLDS[request.param]
     return known, _calibrated(known)
@@ -200,6 +201,7 @@ def test_a_wrong_field_of_view_is_noticed() -> None:
         assert math.copysign(1.0, fault.value) == sign
 
 
+@pytest.mark.slow
 def test_a_turned_camera_is_noticed() -> None:
     found = _calibrated(Known(turned_rad=0.1, looks=20))
     assert [fault.name for fault in found.camera] == ["yaw_rad"]

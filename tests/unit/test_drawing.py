@@ -127,6 +127,7 @@ def test_the_house_the_lost_robot_and_the_bridge_are_on_it() -> None:
     assert any("lost robot" in text for text in texts)
 
 
+@pytest.mark.slow
 def test_labels_that_find_no_room_are_counted_on_the_picture() -> None:
     view = _two_places()
     for number in range(3, 300):
