@@ -12,8 +12,8 @@ THOROUGH = os.environ.get("MAPFOLD_TEST_THOROUGH") == "1"
 
 
 def examples(number: int) -> int:
-    """Hypothesis examples of a test: ``number`` when thorough, else a fifth of it."""
-    return number if THOROUGH else -(-number // 5)
+    """Hypothesis examples of a test: ``number`` when thorough, else a tenth of it."""
+    return number if THOROUGH else -(-number // 10)
 
 
 def stride(quick: int) -> int:

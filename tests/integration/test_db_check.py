@@ -16,7 +16,7 @@ from projections.errors import DatabaseError, ProjectionMismatch, ProjectionMiss
 from projections.settings import Settings
 from tests.commands import Commands
 from tests.logs import append_raw, bridge, walk, write_log
-from tests.thorough import every_other
+from tests.thorough import every_other, mostly_slow
 
 SETTINGS = Settings()
 
@@ -176,7 +176,7 @@ def test_dropped_tables_are_reported_and_not_written_to(
     assert [r.differing for r in check(log, one_database, SETTINGS)] == [0, 0]
 
 
-@pytest.mark.parametrize("sink", DROPS)
+@pytest.mark.parametrize("sink", mostly_slow(DROPS))
 def test_a_rebuild_beside_a_check_makes_no_difference(
     log: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch, sink: SinkName
 ) -> None:

@@ -15,7 +15,7 @@ import pytest
 
 from tests.envelopes import detection, envelope, payload
 from tests.shared_data import shared_run
-from tests.thorough import every_other, stride
+from tests.thorough import mostly_slow, stride
 
 KERNELS = ("Prescott", "Nehalem", "Haswell", "SkylakeX", "Zen")
 PLACES = [(kernel, "1", "0") for kernel in KERNELS] + [
@@ -90,11 +90,12 @@ def _fold_in(kernel: str, threads: str, seed: str, lines: Path, *rules: str) -> 
 
 @pytest.mark.parametrize(
     ("run", "rules"),
-    every_other(
+    mostly_slow(
         product(
             ["synthetic", "house-a", "home-1"],
             [("page", "page"), ("evidence", "page"), ("page", "rooms")],
-        )
+        ),
+        2,
     ),
 )
 def test_one_digest_on_every_kernel_thread_count_and_hash_seed(

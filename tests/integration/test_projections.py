@@ -20,6 +20,7 @@ from tests.drops import wait_for_drops
 from tests.envelopes import detection, envelope
 from tests.logs import WEIRD, append_raw, bridge, walk, write_log
 from tests.rows import all_rows, expected_graph, graph_rows, vector_rows
+from tests.thorough import mostly_slow
 
 SETTINGS = Settings()
 LOADERS: list[LoaderName] = ["copy", "insert"]
@@ -61,8 +62,18 @@ def test_replay_writes_what_the_fold_says(
     assert report.events == view.next_offset
 
 
-@pytest.mark.parametrize("loader", LOADERS)
-@pytest.mark.parametrize("kind", ["one_database", "two_databases"])
+@pytest.mark.parametrize(
+    ("kind", "loader"),
+    mostly_slow(
+        [
+            ("one_database", "insert"),
+            ("two_databases", "copy"),
+            ("one_database", "copy"),
+            ("two_databases", "insert"),
+        ],
+        2,
+    ),
+)
 def test_tail_writes_the_rows_of_replay(
     log: Path, kind: str, loader: LoaderName, request: pytest.FixtureRequest
 ) -> None:
@@ -75,6 +86,7 @@ def test_tail_writes_the_rows_of_replay(
     assert parsed(dict(tailed[0])) == expected_graph(view_of(log))
 
 
+@pytest.mark.slow
 def test_tail_in_small_steps_through_merges(tmp_path: Path, one_database: Targets) -> None:
     path = tmp_path / "log"
     for documents in (walk(50), list(bridge())[:7], list(bridge())[7:], walk(30, first=50)):
@@ -196,6 +208,7 @@ def test_wide_embeddings(tmp_path: Path, one_database: Targets) -> None:
     ]
 
 
+@pytest.mark.slow
 def test_a_box_beyond_float32(tmp_path: Path, one_database: Targets) -> None:
     boxes = ([1e300, -1e300, 1e-60, 0.1], [0.1, 0.2, 0.3, 16777217.0])
     seen = [detection("cup", [1.0, float(i)], bbox=box) for i, box in enumerate(boxes)]
@@ -309,7 +322,7 @@ def test_an_event_that_cannot_be_folded(log: Path, one_database: Targets) -> Non
     assert "keyframe_id" in kept[0][2]
 
 
-@pytest.mark.parametrize("batch_events", [1, 200], ids=["pipelined", "plain"])
+@pytest.mark.parametrize("batch_events", mostly_slow([1, 200]), ids=["pipelined", "plain"])
 def test_a_row_the_database_refuses_ends_the_tail_with_a_message(
     tmp_path: Path, one_database: Targets, pg: psycopg.Connection, batch_events: int
 ) -> None:

@@ -170,6 +170,7 @@ class TestOverZenoh:
         assert "has 10000000 bytes" in json.loads(got)["error"]["message"]
 
 
+@pytest.mark.slow
 def test_zenoh_drops_a_far_too_long_question(
     targets: Targets, endpoint: str, connected: Callable[[], Session]
 ) -> None:

@@ -24,6 +24,7 @@ from tests.drops import wait_for_drops
 from tests.logs import walk, write_log
 from tests.rows import all_rows
 from tests.servers import server_to_kill
+from tests.thorough import mostly_slow
 
 pytestmark = pytest.mark.usefixtures("server_roles")
 
@@ -56,7 +57,7 @@ def as_user(url: str, user: str) -> Targets:
     return Targets(theirs, theirs)
 
 
-@pytest.mark.parametrize("loader", ["copy", "insert"])
+@pytest.mark.parametrize("loader", mostly_slow(["copy", "insert"]))
 def test_pgvector_in_a_schema_of_its_own(
     log: Path, bare: psycopg.Connection, bare_pg_url: str, loader: LoaderName
 ) -> None:
@@ -85,19 +86,22 @@ def test_short_default_timeouts(log: Path, one_database: Targets, pg: psycopg.Co
     assert [r.differing for r in check(log, one_database, SETTINGS)] == [0, 0]
 
 
-@pytest.mark.parametrize("loader", ["copy", "insert"])
+@pytest.mark.parametrize("loader", mostly_slow(["copy", "insert"]))
 @pytest.mark.parametrize(
     "setting",
-    [
-        "client_encoding = 'LATIN1'",
-        "extra_float_digits = 0",
-        "datestyle = 'German'",
-        "array_nulls = off",
-        "search_path = ''",
-        "timezone = 'Asia/Kathmandu'",
-        "standard_conforming_strings = off",
-        "default_transaction_isolation = 'serializable'",
-    ],
+    mostly_slow(
+        [
+            "client_encoding = 'LATIN1'",
+            "extra_float_digits = 0",
+            "search_path = ''",
+            "default_transaction_isolation = 'serializable'",
+            "datestyle = 'German'",
+            "array_nulls = off",
+            "timezone = 'Asia/Kathmandu'",
+            "standard_conforming_strings = off",
+        ],
+        4,
+    ),
 )
 def test_output_formats_of_the_server_change_no_value(
     log: Path, one_database: Targets, pg: psycopg.Connection, setting: str, loader: LoaderName

@@ -49,7 +49,7 @@ def run(mapfold: Commands, command: str, *more: str) -> str:
 
 def moments(end: int) -> list[int]:
     chosen = random.Random(19)
-    return sorted({0, 1, end, *(chosen.randrange(end) for _ in range(rounds(200, 12)))})
+    return sorted({0, 1, end, *(chosen.randrange(end) for _ in range(rounds(200, 4)))})
 
 
 def check_digests_and_arrays(mapfold: Commands, server: UiServer, log: Path, *sets: str) -> None:
@@ -85,6 +85,7 @@ def test_digests_and_arrays_are_those_of_state(
     check_digests_and_arrays(mapfold, server, sample)
 
 
+@pytest.mark.slow
 def test_under_other_settings_too(mapfold: Commands, server: UiServer, sample: Path) -> None:
     check_digests_and_arrays(mapfold, server, sample, *WIDE)
 

@@ -36,6 +36,7 @@ from projections.settings import Settings
 from tests.candidates import assert_equal
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import KEY
+from tests.thorough import mostly_slow
 
 WAIT_S = 60.0
 SEED = 7
@@ -96,7 +97,7 @@ class _Services:
         return [over_http, json.loads(over_zenoh)]
 
 
-@pytest.fixture(params=["one_database", "two_databases"])
+@pytest.fixture(params=mostly_slow(["two_databases", "one_database"]))
 def targets(request: pytest.FixtureRequest) -> Targets:
     found: Targets = request.getfixturevalue(request.param)
     return found

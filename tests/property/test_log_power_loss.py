@@ -12,6 +12,7 @@ from eventsrc.log import LogReader, LogWriter, recover_log
 from eventsrc.log.durable_files import ALWAYS, FsyncPolicy
 from tests.fixtures_log import BY_HAND, KEY, read_log
 from tests.power_loss import Call, Tracer, power_cuts
+from tests.thorough import mostly_slow
 
 THREE = FsyncPolicy(interval_ns=10**18, max_events=3)
 
@@ -71,7 +72,7 @@ LIVES: dict[str, Callable[[Tracer], None]] = {
 }
 
 
-@pytest.mark.parametrize("name", LIVES)
+@pytest.mark.parametrize("name", mostly_slow(sorted(LIVES, key="always".__eq__), 3))
 def test_recorded_events_survive_any_power_cut(name: str, tracer: Tracer, quick_path: Path) -> None:
     LIVES[name](tracer)
     assert survive(tracer.end(), quick_path / "log") > 40

@@ -20,6 +20,7 @@ from projections.relocalize.walls import WallMap
 from projections.settings import Settings
 from tests.envelopes import envelope
 from tests.folds import Folded
+from tests.thorough import examples
 
 ROOMS = Settings(places="rooms")
 Item = dict[str, Any] | OccupancyMap
@@ -88,7 +89,7 @@ def _partition(folded: Folded, floor: str) -> set[frozenset[int]]:
     return set(map(frozenset, groups.values()))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 @given(st.integers(0, 10**6))
 def test_each_floor_is_folded_as_if_it_were_alone(seed: int) -> None:
     items = _items(seed)
@@ -97,7 +98,7 @@ def test_each_floor_is_folded_as_if_it_were_alone(seed: int) -> None:
         assert _partition(whole, floor) == _partition(_fold(_of_floor(items, floor)), floor)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=examples(10), deadline=None)
 @given(st.integers(0, 10**6))
 def test_snapshots_have_the_maps_of_all_floors(seed: int) -> None:
     items = _items(seed)
@@ -153,7 +154,7 @@ def test_a_map_of_a_floor_that_no_pose_is_on_is_kept_and_waits() -> None:
     assert list(folded.view.maps_in_force()) == ["1"]
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 @given(st.integers(0, 10**6))
 def test_walls_in_an_answer_are_those_of_the_floor(seed: int) -> None:
     rng, numbers = random.Random(seed), np.random.default_rng(seed)

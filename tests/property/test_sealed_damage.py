@@ -74,7 +74,7 @@ def test_recovery_keeps_every_good_chunk_at_its_offsets(sealed: tuple[Path, list
     file, events = sealed
     log = file.parent
     original = file.read_bytes()
-    for at in range(0, len(original), 3 * stride(11)):
+    for at in range(0, len(original), 3 * stride(33)):
         damaged = bytearray(original)
         damaged[at] ^= 0x20
         file.write_bytes(damaged)

@@ -12,11 +12,12 @@ from projections.reducers.looks import LookRatios, LookScale, looks_of
 from projections.reducers.spots import Spots
 from projections.reducers.things import Thing
 from projections.reducers.turned_looks import turned_looks
+from tests.thorough import examples
 
 DIM = 48
 RATIOS = LookRatios(EvidenceConstants())
 SCALE = LookScale(0.5)
-CASES = settings(max_examples=40, deadline=None)
+CASES = settings(max_examples=examples(40), deadline=None)
 SEEDS = st.integers(0, 10_000)
 Picture = tuple[np.ndarray, float, int]
 """An embedding, the side that it shows, radians, and the run."""

@@ -16,6 +16,7 @@ from eventsrc.grid_messages import is_grid_message, read_grid_message
 from eventsrc.occupancy_map import InvalidMap, OccupancyMap, decode_map
 from tests.envelopes import payload
 from tests.maps import cdr_message, drawn_map, grid_message
+from tests.thorough import examples
 
 # Made by rosbags 0.11.9, `serialize_cdr` of ROS 2 Humble's types: 3 × 2 cells of 0.05 m from
 # (1.5, -2.25) turned by -0.7 rad, in the frame "map"; one cell of 0.1 m in a frame without name; a
@@ -75,7 +76,7 @@ def test_the_encoder_of_the_tests_makes_the_bytes_of_rosbags() -> None:
         assert read_grid_message(again, "k").digest() == made.digest()
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=examples(100), deadline=None)
 @given(
     st.integers(1, 20),
     st.integers(1, 20),
@@ -109,7 +110,7 @@ def test_a_message_that_ends_too_soon_is_refused_with_the_field(message: bytes) 
     assert not is_grid_message(message[:1])
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=examples(300), deadline=None)
 @given(st.data())
 def test_changed_bytes_give_a_map_or_a_reason(data: st.DataObject) -> None:
     changed = bytearray(data.draw(st.sampled_from([LITTLE, BIG])))

@@ -24,6 +24,7 @@ from pathlib import Path
 from eventsrc.append import append_payload
 from eventsrc.log import LogWriter
 from eventsrc.ingest import MAX_JSON_VALUES
+from tests.thorough import mostly_slow
 
 resource.setrlimit(resource.RLIMIT_CPU, (int(sys.argv[2]), int(sys.argv[2])))
 SIZE = int(sys.argv[3]) << 20
@@ -82,7 +83,7 @@ with LogWriter(Path(sys.argv[1])) as log:
 """
 
 
-@pytest.mark.parametrize("mib", [1, pytest.param(16, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("mib", mostly_slow([1, 16]))
 @pytest.mark.seconds
 def test_a_large_message_of_any_content_costs_little(tmp_path: Path, mib: int) -> None:
     done = subprocess.run(

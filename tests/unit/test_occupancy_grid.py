@@ -128,6 +128,7 @@ def test_origin_and_yaw_say_where_the_grid_lies() -> None:
 
 
 @pytest.mark.seconds
+@pytest.mark.slow
 def test_the_largest_map_takes_bounded_time() -> None:
     rng = np.random.default_rng(1)
     cells = np.where(rng.random((4000, 4000)) < 0.1, 100, 0)

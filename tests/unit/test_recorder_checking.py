@@ -21,6 +21,7 @@ from eventsrc.robot.acks import Ack, payload_sha256
 from eventsrc.transport.session import Received
 from tests.envelopes import detection, envelope, payload
 from tests.fixtures_log import KEY, MEMORY_DISK, read_log
+from tests.thorough import examples
 
 DEADLINE_S = 30.0
 GROUP = 256
@@ -68,7 +69,7 @@ class Recorded:
         return [sha256 for ack in acks for sha256 in ack.sha256]
 
 
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(st.lists(st.tuples(KEYS, PAYLOADS), max_size=40))
 def test_the_log_is_that_of_appending_one_by_one(messages: list[tuple[str, bytes]]) -> None:
     with tempfile.TemporaryDirectory(dir=MEMORY_DISK if MEMORY_DISK.is_dir() else None) as name:

@@ -43,6 +43,7 @@ def test_last_bits_of_a_sine_change_no_byte(
     assert list(simulate_run(seed, run).payloads) == here
 
 
+@pytest.mark.slow
 def test_without_slack_at_the_thresholds_they_do(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tour, "_SLACK", 0.0)
     here = list(simulate_run(2, "a").payloads)
