@@ -13,6 +13,7 @@ from eventsrc.envelope import MAX_DETECTIONS
 from eventsrc.ingest import MAX_JSON_VALUES, Accepted, Rejected, ingest
 from eventsrc.upcast import PendingEvent, read_envelope
 from tests.envelopes import detection, envelope, payload
+from tests.thorough import mostly_slow
 
 CPU_S = 60
 """For all shapes together; they take about five. The slowest alone took longer before."""
@@ -24,7 +25,6 @@ from pathlib import Path
 from eventsrc.append import append_payload
 from eventsrc.log import LogWriter
 from eventsrc.ingest import MAX_JSON_VALUES
-from tests.thorough import mostly_slow
 
 resource.setrlimit(resource.RLIMIT_CPU, (int(sys.argv[2]), int(sys.argv[2])))
 SIZE = int(sys.argv[3]) << 20
