@@ -215,6 +215,7 @@ def test_a_folder_that_no_demo_made_is_refused(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
+@pytest.mark.slow
 def test_ended_early_it_leaves_no_process_behind(tmp_path: Path) -> None:
     out = tmp_path / "demo"
     slow = [*_COMMAND[:-1], "1", "--out", str(out)]

@@ -11,6 +11,7 @@ from projections.database.connection import Targets
 from .edit_killer import Ordeal
 
 
+@pytest.mark.slow
 def test_a_few_kills(tmp_path: Path, third_database: Targets) -> None:
     _kill(tmp_path, third_database, 6, 20260324)
 

@@ -6,14 +6,14 @@ from pathlib import Path
 import pytest
 
 from tests.docs.console import ROOT, Command, File, matches, read, run
-from tests.thorough import THOROUGH
+from tests.thorough import THOROUGH, mostly_slow
 
 DOCUMENTS = (
     "README.md",
+    "docs/simulator.md",
     "docs/corrections.md",
     "docs/export.md",
     "docs/fusion.md",
-    "docs/simulator.md",
     "docs/python.md",
     "docs/time-travel.md",
     "docs/tour.md",
@@ -24,7 +24,7 @@ LONG = ("scripts/demo", "mapfold calibrate logs/mine")
 with ``--write`` too."""
 
 
-@pytest.mark.parametrize("name", DOCUMENTS)
+@pytest.mark.parametrize("name", mostly_slow(DOCUMENTS, 3))
 def test_commands_print_what_the_document_says(name: str) -> None:
     parts = read(ROOT / name)
     if not THOROUGH:

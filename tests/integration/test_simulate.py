@@ -65,6 +65,7 @@ def test_an_unprintable_empty_or_long_run_name_is_misuse(name: str) -> None:
     assert not Path("never.jsonl").exists()
 
 
+@pytest.mark.slow
 def test_an_unwritable_place_is_one_clear_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     done = _mapfold("simulate", "--out", str(tmp_path / "file" / "x.jsonl"))

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from tests.commands import Commands
+from tests.thorough import mostly_slow
 
 _SPEAKING = (("record", "log"), ("router",), ("simulate",))
 
@@ -12,11 +13,13 @@ _SPEAKING = (("record", "log"), ("router",), ("simulate",))
 @pytest.mark.parametrize("command", _SPEAKING, ids=lambda command: command[0])
 @pytest.mark.parametrize(
     ("option", "value", "complaint"),
-    [
-        ("--connect", "foo", "endpoint 'foo' has no protocol"),
-        ("--listen", "tcp/here", "endpoint 'tcp/here' has no port"),
-        ("--zenoh-config", "no-file", "no-file: no such Zenoh configuration file"),
-    ],
+    mostly_slow(
+        [
+            ("--connect", "foo", "endpoint 'foo' has no protocol"),
+            ("--listen", "tcp/here", "endpoint 'tcp/here' has no port"),
+            ("--zenoh-config", "no-file", "no-file: no such Zenoh configuration file"),
+        ]
+    ),
 )
 def test_a_bad_zenoh_option_is_misuse(
     tmp_path: Path, command: tuple[str, ...], option: str, value: str, complaint: str

@@ -17,7 +17,7 @@ from projections.relocalize.track import PARTICLES, _resampled
 from tests.relocalization.buildings import Building, Keyframe
 from tests.relocalization.drives import drive
 from tests.relocalization.rooms import RoomMap, crops_of
-from tests.thorough import examples
+from tests.thorough import examples, mostly_slow
 
 STILL = (0.0, 0.0, 0.0)
 SEEDS = (3, 5)
@@ -279,7 +279,7 @@ def error(found: PoseHypothesis | None, pose: Movement) -> float:
     return 9.0 if found is None else min(math.hypot(found.x - pose[0], found.y - pose[1]), 9.0)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", mostly_slow(SEEDS))
 def test_a_drive_is_followed_better_than_single_questions_are_answered(seed: int) -> None:
     run = drive(Building(seed), f"q{seed}", seed + 100, 60)
     single, tracked = follow(seed, [run])
@@ -288,7 +288,7 @@ def test_a_drive_is_followed_better_than_single_questions_are_answered(seed: int
     assert np.mean(np.array(tracked[5:]) < 1.5) > 0.95
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", mostly_slow(SEEDS))
 def test_a_kidnapped_robot_is_found_again(seed: int) -> None:
     before = drive(Building(seed), f"q{seed}", seed + 100, 30)
     after = drive(Building(seed), f"k{seed}", seed + 300, 120)

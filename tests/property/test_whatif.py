@@ -15,7 +15,7 @@ from projections.model.view import MapView
 from projections.settings import Settings
 from tests.envelopes import envelope
 from tests.fixtures_timetravel import walks, write_log
-from tests.thorough import examples
+from tests.thorough import examples, rounds
 
 BASE = Settings(eps_m=0.7, min_samples=3, fusion_radius_m=2.0)
 OTHERS = st.lists(
@@ -89,7 +89,7 @@ def test_equal_settings_change_nothing(documents: list[dict[str, Any]]) -> None:
 def test_a_long_chain_of_merges_can_be_pickled(tmp_path: Path) -> None:
     """Each place is absorbed by the one founded before it, the last one first: a pickle that went
     from survivor to survivor would go too deep."""
-    far, count = Settings(eps_m=1.0, min_samples=2), 3_000
+    far, count = Settings(eps_m=1.0, min_samples=2), rounds(3_000, 1_200)
     first = [envelope(n, 1.5 * n) for n in range(count)]
     second = [envelope(count + n, 1.5 * n + 0.1) for n in reversed(range(count))]
     between = [envelope(2 * count + n, 1.5 * n + 0.8) for n in range(count - 1)]
