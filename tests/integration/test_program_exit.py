@@ -46,12 +46,11 @@ def mapfold(tmp_path: Path) -> Commands:
     ("module", "args"),
     [
         ("contextlib", ("log", "info", "log")),  # the first thing that is imported
-        ("projections.cli.maps", ("state", "log")),
+        ("projections.demo", ("demo",)),  # imported when the command runs already
+        pytest.param("projections.cli.maps", ("state", "log"), marks=pytest.mark.slow),
         pytest.param("projections.cli.program", ("log", "info", "log"), marks=pytest.mark.slow),
         pytest.param("typer", ("state", "log"), marks=pytest.mark.slow),
         pytest.param("numpy", ("state", "log"), marks=pytest.mark.slow),
-        # imported when the command runs already
-        pytest.param("projections.demo", ("demo",), marks=pytest.mark.slow),
     ],
 )
 def test_ctrl_c_is_one_line_and_130(tmp_path: Path, module: str, args: tuple[str, ...]) -> None:
