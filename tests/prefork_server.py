@@ -49,6 +49,10 @@ MODULES = (
     "importlib.metadata",
     "email.parser",
     "email.policy",
+    "matplotlib.figure",
+    "matplotlib.patheffects",
+    "fastapi.responses",
+    "uvicorn.protocols.http.h11_impl",
 )
 
 

@@ -35,7 +35,10 @@ def every_other(cases: Iterable[_Case]) -> list[_Case]:
 
 
 def mostly_slow(cases: Iterable[Any], quick: int = 1) -> list[Any]:
-    """Cases for `pytest.mark.parametrize`: all but the first ``quick`` are marked slow."""
+    """Cases for `pytest.mark.parametrize`: all but the first ``quick`` are marked slow.
+
+    A tuple is the values of several parameters; wrap one that is the value of a single parameter.
+    """
     found: list[Any] = []
     for number, case in enumerate(cases):
         given = case if isinstance(case, tuple) else (case,)

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import psycopg
+import pytest
 from psycopg import sql
 
 from tests.acceptance.awkward_run import awkward_payloads
@@ -86,6 +87,7 @@ def test_a_past_state_is_the_state_of_a_shorter_log(mapfold: Commands, awkward_l
         assert past["offset"] == count
 
 
+@pytest.mark.slow
 def test_importing_a_file_twice_folds_it_once(mapfold: Commands) -> None:
     lines = b"".join(p + b"\n" for p in awkward_payloads())
     once, twice = mapfold.folder / "once", mapfold.folder / "twice"

@@ -24,6 +24,7 @@ def _row(name: str, before: ObjectScores, after: ObjectScores | None) -> Row:
     return Row(name, 100, before, before, 1.0, 2.0, calibrated=after, calibrated_s=0.5)
 
 
+@pytest.mark.slow
 def test_envelopes_are_calibrated_as_their_log_is(tmp_path: Path) -> None:
     documents = drive(4, "run-a", 60)
     events = [each for each in ingest_all([*map(payload, documents)]) if isinstance(each, Accepted)]

@@ -129,6 +129,7 @@ def test_the_other_building_is_one_of_the_same_half() -> None:
     assert stranger_of(HALVES, "develop", "v1") == "w1"
 
 
+@pytest.mark.slow
 def test_a_building_is_mapped_by_both_rules_and_asked_with_known_and_unknown_things(tmp_path):
     generator = trial_generator()
     case, other = (

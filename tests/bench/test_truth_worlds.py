@@ -53,6 +53,7 @@ def test_a_case_is_read_from_the_cache_as_it_was_made(generator, tmp_path):
     assert seconds > 0
 
 
+@pytest.mark.slow
 def test_moved_things_have_both_positions_and_looks_at_the_old_one(generator, tmp_path):
     case = make_case(generator, "rover", "aws_house", moved=0.5, limit=120, cache=tmp_path)
     moved = {name: thing for name, thing in case.things.items() if thing.moved_to is not None}

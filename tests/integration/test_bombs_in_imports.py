@@ -18,6 +18,7 @@ from eventsrc.log.mcap_records import MAGIC
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import read_log
 from tests.memory import MOST_MIB, run_measured
+from tests.thorough import mostly_slow
 
 GIB = 2**30
 HEADER = b"\x01" + struct.pack("<QII", 8, 0, 0)
@@ -73,7 +74,7 @@ BOMBS: dict[str, Callable[[], bytes]] = {
 }
 
 
-@pytest.mark.parametrize("name", BOMBS)
+@pytest.mark.parametrize("name", mostly_slow(BOMBS, 3))
 def test_a_bomb_ends_the_import_with_its_place_and_little_memory(name: str, tmp_path: Path) -> None:
     file, log = tmp_path / "bomb.mcap", tmp_path / "log"
     before = MAGIC + HEADER + CHANNEL + message(GOOD)

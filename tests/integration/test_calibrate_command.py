@@ -248,6 +248,7 @@ def test_a_recorder_that_takes_commands_records_it(
     assert set(_settings(log).evidence.sizes_m) == set(SIZES)
 
 
+@pytest.mark.slow
 def test_a_log_that_another_writer_holds_is_named(tmp_path: Path) -> None:
     write_room(tmp_path / "log", count=20)
     mapfold = Commands.in_folder(tmp_path)

@@ -20,6 +20,7 @@ from tests.commands import PROGRAM, Commands
 from tests.envelopes import MODEL, detection, envelope
 from tests.logs import append_raw, walk, write_log
 from tests.servers import furnish
+from tests.thorough import mostly_slow
 
 WAIT_S = 60
 REPLAYS = "SELECT count(*) FROM pg_stat_activity WHERE application_name = 'mapfold replay'"
@@ -79,6 +80,7 @@ def test_check_and_repair(mapfold: Commands, log: Path) -> None:
     assert not server(mapfold).running
 
 
+@pytest.mark.slow
 def test_parked_events_are_findings(mapfold: Commands, log: Path) -> None:
     append_raw(log, b"neither fish nor fowl")
     assert "cannot be folded" in mapfold("replay", log, code=1).err
@@ -117,6 +119,7 @@ def advised(said: str) -> list[str]:
     return shlex.split(said[said.rindex("run: mapfold ") :].splitlines()[0])[2:]
 
 
+@pytest.mark.slow
 def test_what_status_advises_works(mapfold: Commands, log: Path) -> None:
     own = ("--set", "eps_m=0.75", "--set", "min_samples=4")
     assert advised(mapfold("status", log, *own, code=3).err)[2:] == list(own)
@@ -156,6 +159,7 @@ def test_a_refusal_names_settings_of_groups_that_fit(mapfold: Commands, log: Pat
     mapfold("tail", log, "--once", *own)
 
 
+@pytest.mark.slow
 def test_another_log_has_no_lag(mapfold: Commands, log: Path) -> None:
     mapfold("replay", log)
     other = write_log(mapfold.folder / "other", walk(5))
@@ -241,7 +245,7 @@ def test_roles_are_sql(mapfold: Commands) -> None:
     assert "semantic_map" not in mapfold("db", "roles", "--only", "vectors").out
 
 
-@pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("signum", mostly_slow([signal.SIGTERM, signal.SIGINT]))
 def test_a_signal_ends_a_live_tail_after_its_batch_and_leaves_no_server(
     mapfold: Commands, log: Path, signum: signal.Signals
 ) -> None:

@@ -155,7 +155,7 @@ DROPS = {
 }
 
 
-@pytest.mark.parametrize("sink", DROPS)
+@pytest.mark.parametrize("sink", mostly_slow(DROPS))
 def test_dropped_tables_are_reported_and_not_written_to(
     log: Path, one_database: Targets, pg: psycopg.Connection, sink: str
 ) -> None:
@@ -236,6 +236,7 @@ def test_foreign_tables_are_found_and_copied_and_removed_by_the_sql_given(
         assert pg.execute(count).fetchone() == (FOREIGN[table][1],)
 
 
+@pytest.mark.slow
 def test_the_command_names_foreign_tables_and_repair_does_not_drop_them(
     log: Path, one_database: Targets, pg: psycopg.Connection
 ) -> None:

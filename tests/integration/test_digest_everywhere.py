@@ -95,7 +95,6 @@ def _fold_in(kernel: str, threads: str, seed: str, lines: Path, *rules: str) -> 
             ["synthetic", "house-a", "home-1"],
             [("page", "page"), ("evidence", "page"), ("page", "rooms")],
         ),
-        2,
     ),
 )
 def test_one_digest_on_every_kernel_thread_count_and_hash_seed(

@@ -9,6 +9,7 @@ from eventsrc.append import append_payload
 from eventsrc.log import LogWriter
 from eventsrc.sim import simulate_run
 from tests.commands import Commands, Said
+from tests.thorough import mostly_slow
 
 
 @pytest.fixture(scope="module")
@@ -24,6 +25,7 @@ def _draw(*arguments: str) -> Said:
     return Commands(Path.cwd(), os.environ)("draw", *arguments, code=None)
 
 
+@pytest.mark.slow
 def test_a_picture_of_any_point_with_other_settings(log: Path, tmp_path: Path) -> None:
     whole, part = tmp_path / "whole.svg", tmp_path / "part.svg"
     done = _draw(str(log), "--house", "7", "--merges", "--out", str(whole))
@@ -46,6 +48,7 @@ def test_a_picture_by_evidence_shows_where_objects_stand(log: Path, tmp_path: Pa
     assert "drawn where the robot saw it from" not in text
 
 
+@pytest.mark.slow
 def test_the_title_of_the_log_one_is_in(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -57,11 +60,13 @@ def test_the_title_of_the_log_one_is_in(
 
 @pytest.mark.parametrize(
     ("arguments", "says"),
-    [
-        (("--out", "map.bmp"), "a picture is .png, .svg or .pdf"),
-        (("--set", "epsilon=1"), "no setting 'epsilon'"),
-        (("--at", "nowhere"), "nowhere"),
-    ],
+    mostly_slow(
+        [
+            (("--out", "map.bmp"), "a picture is .png, .svg or .pdf"),
+            (("--set", "epsilon=1"), "no setting 'epsilon'"),
+            (("--at", "nowhere"), "nowhere"),
+        ]
+    ),
 )
 def test_misuse_is_one_line_and_exit_2(log: Path, arguments: tuple[str, ...], says: str) -> None:
     done = _draw(str(log), *arguments)

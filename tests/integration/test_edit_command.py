@@ -29,7 +29,7 @@ from tests.corrected_logs import EVENTS, FAR, LEFT, MERGE, RIGHT, write_rooms
 from tests.fixtures_log import flip, read_log
 from tests.fixtures_timetravel import write_damaged_log
 from tests.logs import walk
-from tests.thorough import every_other, stride
+from tests.thorough import every_other, mostly_slow, stride
 
 WHY = ("--reason", "why")
 
@@ -298,7 +298,7 @@ def test_a_command_recorded_meanwhile_is_seen(
     assert [c.kind for c in _commands(log)] == ["keep-apart"]
 
 
-@pytest.mark.parametrize("seed", range(0, 4, stride(2)))
+@pytest.mark.parametrize("seed", mostly_slow(range(0, 4, stride(2))))
 def test_killed_at_any_moment_it_is_recorded_once_or_not_at_all(
     mapfold: Commands, seed: int
 ) -> None:

@@ -16,7 +16,7 @@ from tests.commands import Commands
 from tests.corrected_logs import EVENTS, FAR, LEFT, RIGHT, write_rooms
 from tests.envelopes import envelope, payload
 from tests.fixtures_zenoh import Program
-from tests.thorough import stride
+from tests.thorough import mostly_slow, stride
 
 Start = Callable[..., Program]
 WHY = ("--reason", "why")
@@ -117,7 +117,7 @@ def test_a_log_with_an_event_that_is_no_command_is_recorded_without_edits(
     assert running.end(signal.SIGTERM) == 0
 
 
-@pytest.mark.parametrize("seed", range(0, 3, stride(2)))
+@pytest.mark.parametrize("seed", mostly_slow(range(0, 3, stride(2))))
 def test_a_command_is_recorded_once_whichever_process_is_killed(
     mapfold: Commands, recorder: Start, endpoint: str, seed: int
 ) -> None:

@@ -113,6 +113,7 @@ def test_it_is_deterministic_but_for_latencies(
     assert one == other
 
 
+@pytest.mark.slow
 def test_the_table_and_the_plain_method(mapfold: Commands, runs: list[str]) -> None:
     said = mapfold("evaluate", *runs, "--method", "plain")
     assert "re-localisation (plain)" in said.out
@@ -198,6 +199,7 @@ def test_truth_that_fits_nothing_is_misuse(mapfold: Commands, runs: list[str]) -
     assert "--truth" in said.err
 
 
+@pytest.mark.slow
 def test_the_trial_house_is_found_again(mapfold: Commands) -> None:
     arguments: list[str] = []
     for flag, run in (("--map", "house-a"), ("--query", "house-c"), ("--query", "home-2")):

@@ -29,7 +29,7 @@ from tests.integration.test_projections import parsed
 from tests.live_rows import followed_and_rebuilt
 from tests.logs import write_log
 from tests.rows import all_rows, expected_graph, graph_rows
-from tests.thorough import rounds
+from tests.thorough import mostly_slow, rounds
 
 EVIDENCE = Settings(fusion="evidence")
 
@@ -68,7 +68,7 @@ def test_the_log_has_what_these_tests_are_about(log: Path) -> None:
     assert merged_later > 2
 
 
-@pytest.mark.parametrize("size", [1, 17])
+@pytest.mark.parametrize("size", mostly_slow([1, 17]))
 def test_batches_of_any_size_give_the_rows_of_the_fold(log: Path, size: int) -> None:
     live, fresh = followed_and_rebuilt(log, EVIDENCE, size)
     assert live.graph == fresh.graph
@@ -131,6 +131,7 @@ def test_a_tail_starts_from_a_snapshot(log: Path, one_database: Targets) -> None
     assert parsed(graph_rows(one_database.graph_url)) == expected_graph(view_of(log))
 
 
+@pytest.mark.slow
 def test_commands_about_objects_are_obeyed_by_tails(
     tmp_path: Path,
     documents: list[dict[str, Any]],
@@ -179,6 +180,7 @@ def founder_of(log: Path, ordinal: int, view: MapView) -> str:
     raise AssertionError(ordinal)
 
 
+@pytest.mark.slow
 def test_what_was_carried_away_is_missing_in_the_graph(
     tmp_path: Path, one_database: Targets, third_database: Targets
 ) -> None:

@@ -26,6 +26,7 @@ from projections.queries.relocalize import prepare_graph
 from projections.settings import Settings
 from tests.integration.test_projections import parsed
 from tests.rows import all_rows, expected_graph
+from tests.thorough import mostly_slow
 from tests.told_objects import Story, random_steps, told_rows, without_sigma
 
 EVIDENCE = Settings(fusion="evidence")
@@ -87,7 +88,8 @@ def rebuild(
 
 
 @pytest.mark.parametrize(
-    ("seed", "size", "loader"), [(1, 1, "copy"), (2, 7, "insert"), (3, 7, "copy"), (4, 99, "copy")]
+    ("seed", "size", "loader"),
+    mostly_slow([(1, 1, "copy"), (2, 7, "insert"), (3, 7, "copy"), (4, 99, "copy")]),
 )
 def test_live_batches_and_a_rebuild_give_what_the_deltas_say(
     seed: int, size: int, loader: LoaderName, one_database: Targets

@@ -15,7 +15,7 @@ from projections.settings import Settings
 from tests.commands import PROGRAM
 from tests.logs import write_log
 from tests.property.test_hostile_evidence import hostile_drive
-from tests.thorough import rounds
+from tests.thorough import mostly_slow, rounds
 
 EVIDENCE = Settings(fusion="evidence")
 WAIT_S = 60
@@ -71,7 +71,9 @@ def test_a_killed_tail_goes_on_without_a_row_that_differs(
     assert reached[0] > 0
 
 
-@pytest.mark.parametrize("name", ["size_spread", "range_spread", "range_m", "bearing_rad"])
+@pytest.mark.parametrize(
+    "name", mostly_slow(["size_spread", "range_spread", "range_m", "bearing_rad"])
+)
 def test_constants_that_would_divide_by_nothing_are_refused(tmp_path: Path, name: str) -> None:
     log = _log(tmp_path)
     done = subprocess.run(

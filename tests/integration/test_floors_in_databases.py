@@ -79,6 +79,7 @@ def test_check_names_a_wrong_floor(log: Path, one_database: Targets) -> None:
     assert (difference.table, difference.kind) == ("PART_OF", "missing")
 
 
+@pytest.mark.slow
 def test_a_graph_of_an_older_version_is_refused_until_a_replay(
     log: Path, one_database: Targets
 ) -> None:

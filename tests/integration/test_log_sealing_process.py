@@ -141,6 +141,7 @@ def test_a_process_that_dies_while_sealing_leaves_no_half_written_file(tmp_path:
     assert not half_written.exists()
 
 
+@pytest.mark.slow
 def test_it_imports_nothing_from_the_current_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -137,6 +137,7 @@ def test_memory_has_the_rows_of_the_database(tmp_path: Path, one_database: Targe
     assert [tuple(row) for row in live.maps] == map_rows(one_database.graph_url)[:-1]
 
 
+@pytest.mark.slow
 def test_a_command_that_refolds_keeps_the_maps(tmp_path: Path, one_database: Targets) -> None:
     log = tmp_path / "log"
     _append(log, *EVENTS)

@@ -99,6 +99,7 @@ def test_tail_in_small_steps_through_merges(tmp_path: Path, one_database: Target
     assert all_rows(one_database) == stepped
 
 
+@pytest.mark.slow
 def test_a_second_replay_and_tail_change_nothing(log: Path, one_database: Targets) -> None:
     first = rebuild(log, one_database, SETTINGS)
     rows = all_rows(one_database)
@@ -188,6 +189,7 @@ def test_both_queries_of_the_design_work_verbatim(
         assert [tuple(json.loads(value) for value in r) for r in found] == expected
 
 
+@pytest.mark.slow
 def test_the_dimension_follows_the_map(tmp_path: Path, one_database: Targets) -> None:
     empty = write_log(tmp_path / "log", [envelope(0)])
     tail(empty, one_database, SETTINGS, once=True)
@@ -268,12 +270,14 @@ def test_a_users_own_tables_and_graphs_stay(
 
 @pytest.mark.parametrize(
     ("statement", "told"),
-    [
-        ("SELECT create_graph('semantic_map')", "graph semantic_map that mapfold did not make"),
-        ("CREATE SCHEMA semantic_map", "schema semantic_map that mapfold did not make"),
-        ("CREATE TABLE public.detection_embeddings (n int)", "table detection_embeddings that"),
-        ("CREATE SCHEMA mapfold", "schema mapfold that mapfold did not make"),
-    ],
+    mostly_slow(
+        [
+            ("SELECT create_graph('semantic_map')", "graph semantic_map that mapfold did not make"),
+            ("CREATE SCHEMA semantic_map", "schema semantic_map that mapfold did not make"),
+            ("CREATE TABLE public.detection_embeddings (n int)", "table detection_embeddings that"),
+            ("CREATE SCHEMA mapfold", "schema mapfold that mapfold did not make"),
+        ]
+    ),
 )
 def test_foreign_objects_under_our_names_are_refused(
     log: Path, one_database: Targets, pg: psycopg.Connection, statement: str, told: str
@@ -287,6 +291,7 @@ def test_foreign_objects_under_our_names_are_refused(
             act()
 
 
+@pytest.mark.slow
 def test_a_view_on_the_table_stops_the_swap(
     log: Path, one_database: Targets, pg: psycopg.Connection
 ) -> None:

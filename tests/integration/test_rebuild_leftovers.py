@@ -50,6 +50,7 @@ def test_nothing_is_left_after_the_drop(
     assert left_over(pg) == set()
 
 
+@pytest.mark.slow
 def test_the_next_rebuild_drops_what_the_server_did_not(
     log: Path, one_database: Targets, pg: psycopg.Connection, monkeypatch: pytest.MonkeyPatch
 ) -> None:

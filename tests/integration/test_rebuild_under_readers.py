@@ -192,6 +192,7 @@ def test_a_rebuild_refuses_to_run_beside_a_tail_and_the_other_way_round(
     assert refused == [True, True]
 
 
+@pytest.mark.slow
 def test_the_two_sinks_may_be_written_at_the_same_time(
     tmp_path: Path, one_database: Targets
 ) -> None:
@@ -313,6 +314,7 @@ def test_readers_of_one_database_do_not_wait_for_those_of_the_other(
     assert tail(log, two_databases, SETTINGS, once=True).events == 0
 
 
+@pytest.mark.slow
 def test_readers_that_end_one_by_one_never_end_a_waiting_one_by_a_deadlock(
     tmp_path: Path, one_database: Targets
 ) -> None:

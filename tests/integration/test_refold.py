@@ -317,6 +317,7 @@ def test_settings_of_fusion_by_evidence_keep_the_vectors(
     assert all_rows(targets) == all_rows(third_database)
 
 
+@pytest.mark.slow
 def test_status_tells_how_far_a_refold_is(
     log: Path, targets: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:

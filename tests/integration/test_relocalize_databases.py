@@ -112,6 +112,7 @@ def test_the_library_call_answers(targets: Targets, view: MapView) -> None:
         assert live.confidence == pytest.approx(exact.confidence, abs=0.02)
 
 
+@pytest.mark.slow
 def test_a_graph_by_evidence_goes_with_vectors_of_the_other_rule(
     log: Path, two_databases: Targets
 ) -> None:
@@ -160,6 +161,7 @@ def test_an_empty_database_says_what_to_do(one_database: Targets) -> None:
         relocalize(one_database, read_crops([detection("cup", [1.0] * 8)]))
 
 
+@pytest.mark.slow
 def test_two_round_trips_at_most(targets: Targets, monkeypatch: pytest.MonkeyPatch) -> None:
     sent = 0
     execute = psycopg.Connection.execute

@@ -221,6 +221,7 @@ def test_without_row_security_readers_may_not_use_cypher_and_status_names_who_ca
 
 
 @pytest.mark.usefixtures("_readers_use_cypher")
+@pytest.mark.slow
 def test_a_rebuild_puts_row_security_on_a_graph_that_lacks_it(
     log: Path, projected: Targets, pg: psycopg.Connection
 ) -> None:
@@ -229,6 +230,7 @@ def test_a_rebuild_puts_row_security_on_a_graph_that_lacks_it(
     assert projection_status(log, projected, SETTINGS).healthy
 
 
+@pytest.mark.slow
 def test_a_writer_tails_many_events_at_once(log: Path, projected: Targets) -> None:
     """COPY, which a tail prefers then, cannot write tables under row-level security."""
     write_log(log, walk(300, first=40))

@@ -470,6 +470,7 @@ def test_it_does_not_start_without_a_map(one_database: Targets) -> None:
         Pools(one_database, 1)
 
 
+@pytest.mark.slow
 def test_a_cut_connection_is_reported_in_one_line_of_ours(targets: Targets) -> None:
     program = subprocess.Popen(
         [

@@ -118,6 +118,7 @@ def test_wrong_questions_are_400_and_name_no_path(service: Served, pg_server_fol
         assert "database" not in error["message"]
 
 
+@pytest.mark.slow
 def test_errors_of_the_database_name_no_path_either(
     service: Served, targets: Targets, pg_server_folder: str
 ) -> None:

@@ -34,6 +34,7 @@ def test_every_keyframe_arrives_byte_for_byte_and_in_order(
     assert f"published {len(payloads)} on tb/detections" in program.lines[-1]
 
 
+@pytest.mark.slow
 def test_simulate_without_a_subscriber_is_one_line(
     endpoint: str, start: Callable[..., Program]
 ) -> None:

@@ -145,6 +145,7 @@ def test_it_is_made_for_the_server_alone_and_found_again(home: Path, folders: li
         assert socket_folder(server) == folder
 
 
+@pytest.mark.slow
 def test_a_removed_folder_is_made_again_under_the_same_name(
     home: Path, folders: list[Path]
 ) -> None:
@@ -200,6 +201,7 @@ def test_a_folder_that_others_may_enter_is_not_used(home: Path, folders: list[Pa
         assert socket_folder(server) != folder
 
 
+@pytest.mark.slow
 def test_the_copy_of_a_home_is_a_server_of_its_own(home: Path, folders: list[Path]) -> None:
     with EmbeddedServer(home):
         pass

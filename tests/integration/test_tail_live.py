@@ -110,6 +110,7 @@ def test_a_tail_is_following_from_its_start(tmp_path: Path, one_database: Target
         assert found.healthy
 
 
+@pytest.mark.slow
 def test_status_of_a_running_replay_is_rebuilding(tmp_path: Path, one_database: Targets) -> None:
     log = write_log(tmp_path / "log", walk(20))
     rebuild(log, one_database, SETTINGS, until=10)
@@ -122,6 +123,7 @@ def test_status_of_a_running_replay_is_rebuilding(tmp_path: Path, one_database: 
     assert seen[0] == {"rebuilding"}
 
 
+@pytest.mark.slow
 def test_a_first_replay_is_not_missing(tmp_path: Path, one_database: Targets) -> None:
     log = write_log(tmp_path / "log", walk(20))
     seen = []

@@ -12,6 +12,7 @@ from projections.reducers.semantic_map import SemanticMap
 from tests.commands import Commands, Said
 from tests.envelopes import detection, envelope
 from tests.fixtures_timetravel import write_damaged_log, write_log
+from tests.thorough import mostly_slow
 
 RULES = ("--set", "eps_m=1.0", "--set", "min_samples=3")
 XS = (0.0, 1.0, 2.0, 6.0, 5.0, 4.0, 9.0, 3.0)
@@ -196,7 +197,7 @@ def test_truth_of_another_log_scores_nothing(mapfold: InProcess, args: tuple[str
     assert mapfold(*args, "--truth", truth).err == ""
 
 
-@pytest.mark.parametrize("processes", ["1", "2"])
+@pytest.mark.parametrize("processes", mostly_slow(["1", "2"]))
 def test_whatif_draws_what_it_has_folded(
     mapfold: InProcess, monkeypatch: pytest.MonkeyPatch, processes: str
 ) -> None:
@@ -268,11 +269,14 @@ def test_misuse_is_one_line(mapfold: InProcess, args: tuple[str, ...], says: str
 
 @pytest.mark.parametrize(
     "args",
-    [
-        ("merges",),
-        ("whatif", "--try", "eps_m=1"),
-        ("whatif", "--try", "eps_m=1", "--processes", "2"),
-    ],
+    mostly_slow(
+        [
+            (("merges",),),
+            (("whatif", "--try", "eps_m=1"),),
+            (("whatif", "--try", "eps_m=1", "--processes", "2"),),
+        ],
+        2,
+    ),
 )
 def test_an_event_that_cannot_be_folded_is_named(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], args: tuple[str, ...]

@@ -15,6 +15,7 @@ from tests.envelopes import detection, envelope
 from tests.integration.test_projections import parsed
 from tests.logs import write_log
 from tests.rows import expected_graph, graph_rows
+from tests.thorough import mostly_slow
 
 LOOKS = {
     "refrigerator": [1, 0, 0, 0],
@@ -104,6 +105,7 @@ def test_query_where_finds_places_by_type_and_by_name(mapfold: Commands, log: Pa
     assert "there are places of type bathroom, kitchen" in said
 
 
+@pytest.mark.slow
 def test_the_picture_shows_types(mapfold: Commands, log: Path, tmp_path: Path) -> None:
     out = tmp_path / "map.svg"
     mapfold("draw", log, "--out", out)
@@ -115,7 +117,7 @@ def test_the_picture_shows_types(mapfold: Commands, log: Path, tmp_path: Path) -
     assert "bathroom?" not in out.read_text("utf-8")
 
 
-@pytest.mark.parametrize("places", ["page", "rooms"])
+@pytest.mark.parametrize("places", mostly_slow(["page", "rooms"]))
 def test_a_live_tail_keeps_types_up_to_date(
     tmp_path: Path, one_database: Targets, places: Any
 ) -> None:

@@ -18,6 +18,7 @@ from tests.fixtures_log import BY_HAND, KEY, flip
 from tests.http_attacks import connect, request
 from tests.logs import append_raw, bridge, walk, write_log
 from tests.shared_data import ROOT
+from tests.thorough import mostly_slow
 from tests.ui_client import read_arrays, replay
 from tests.ui_server import UiServer, showing
 
@@ -196,18 +197,24 @@ class TestEdits:
 
     @pytest.mark.parametrize(
         ("document", "said"),
-        [
-            ([], "the edit"),
-            ({}, "kind"),
-            ({"kind": "nothing"}, "no edit 'nothing'"),
-            ({"kind": "undo"}, "undo has 0 arguments; give COMMAND_ID"),
-            ({"kind": "undo", "arguments": ["a", "b"]}, "undo has 2 arguments"),
-            ({"kind": "undo", "arguments": [1]}, "arguments.0"),
-            ({"kind": "undo", "arguments": "a"}, "arguments"),
-            ({"kind": "undo-merge", "arguments": ["x"]}, "undo-merge is of offset 'x'"),
-            ({"kind": "correct-poses", "arguments": ["run-a", "x", "0", "0"]}, "'x' is no number"),
-            ({"kind": "undo", "more": 1}, "more"),
-        ],
+        mostly_slow(
+            [
+                ([], "the edit"),
+                ({}, "kind"),
+                ({"kind": "nothing"}, "no edit 'nothing'"),
+                ({"kind": "undo"}, "undo has 0 arguments; give COMMAND_ID"),
+                ({"kind": "undo", "arguments": ["a", "b"]}, "undo has 2 arguments"),
+                ({"kind": "undo", "arguments": [1]}, "arguments.0"),
+                ({"kind": "undo", "arguments": "a"}, "arguments"),
+                ({"kind": "undo-merge", "arguments": ["x"]}, "undo-merge is of offset 'x'"),
+                (
+                    {"kind": "correct-poses", "arguments": ["run-a", "x", "0", "0"]},
+                    "'x' is no number",
+                ),
+                ({"kind": "undo", "more": 1}, "more"),
+            ],
+            3,
+        ),
     )
     def test_nonsense(self, server: UiServer, document: Any, said: str) -> None:
         bearer = {"Authorization": f"Bearer {server.token}"}
@@ -297,11 +304,13 @@ class TestProblems:
 
     @pytest.mark.parametrize(
         "command",
-        [
-            {"kind": "teleport"},
-            {"kind": "use-settings", "settings": {"gravity": 9.81}},
-            {"kind": "use-settings", "settings": {"eps_m": -1}},
-        ],
+        mostly_slow(
+            [
+                {"kind": "teleport"},
+                {"kind": "use-settings", "settings": {"gravity": 9.81}},
+                {"kind": "use-settings", "settings": {"eps_m": -1}},
+            ]
+        ),
     )
     def test_settings_and_commands_of_another_version(
         self, mapfold: Commands, tmp_path: Path, command: dict[str, Any]
@@ -330,7 +339,7 @@ class TestProblems:
             got = server.ask("/api/whatif", set="eps_m=1")
             assert got.error[1] == "log"
 
-    @pytest.mark.parametrize("events", [3, 20, 40])
+    @pytest.mark.parametrize("events", mostly_slow([3, 20, 40]))
     def test_another_log_in_its_place(self, mapfold: Commands, tmp_path: Path, events: int) -> None:
         log = write_log(tmp_path / "log", walk(20))
         before = digest(mapfold, log)

@@ -109,6 +109,7 @@ def test_long_answers_are_given_up_while_they_fold(
     assert service.ask_apart(work).result(WAIT_S)["through"] == 1300
 
 
+@pytest.mark.slow
 def test_processes_of_a_what_if_stop_when_it_is_given_up(log: Path) -> None:
     def progress(_folded: int, _events: int) -> None:
         raise GivenUp

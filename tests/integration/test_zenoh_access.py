@@ -21,6 +21,7 @@ from tests.docs.console import ROOT
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import read_log
 from tests.fixtures_zenoh import DEADLINE_S, Program
+from tests.thorough import mostly_slow
 
 PAGE = (ROOT / "docs" / "security.md").read_text()
 NAMES = ("router", "recorder", "robot-1", "robot-2", "stranger")
@@ -138,7 +139,7 @@ def test_only_the_recorder_can_acknowledge(
     assert heard.empty()
 
 
-@pytest.mark.parametrize("key", [KEY, sent_key(KEY), f"{KEY}/@adv/pub/1/2/_"])
+@pytest.mark.parametrize("key", mostly_slow([KEY, sent_key(KEY), f"{KEY}/@adv/pub/1/2/_"]))
 def test_robots_do_not_hear_one_another_and_strangers_hear_nothing(
     session: Callable[[str], Session], key: str
 ) -> None:

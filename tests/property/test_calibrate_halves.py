@@ -41,6 +41,7 @@ def test_independent_errors_need_no_inflation(seed: int) -> None:
     assert _inflation(rows_of(Known(seed=seed))) == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_errors_that_were_taken_for_too_small_do() -> None:
     rows = rows_of(Known(bearing_rad=2 * KNOWN.bearing_rad, pose_m=2 * KNOWN.pose_m))
     assert _inflation(rows) == pytest.approx(4.0, rel=0.25)

@@ -6,7 +6,6 @@ import math
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from sklearn import metrics
 
 from projections.evaluate.scores import (
     agreement,
@@ -24,6 +23,8 @@ SCORES = st.lists(st.sampled_from([0.0, 0.1, 0.25, 0.5, 0.75, 1.0]), max_size=15
 def test_agreement_is_sklearns(pairs: list[tuple[int, int]]) -> None:
     classes, clusters = [a for a, _ in pairs], [b for _, b in pairs]
     ours = agreement(classes, clusters)
+    from sklearn import metrics  # takes a second to import
+
     h, c, v = metrics.homogeneity_completeness_v_measure(classes, clusters)
     assert (ours.homogeneity, ours.completeness) == pytest.approx((h, c), abs=1e-9)
     assert ours.v_measure == pytest.approx(v, abs=1e-9)

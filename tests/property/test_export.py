@@ -15,7 +15,6 @@ import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial import ConvexHull, QhullError
 
 from projections.export import Origin, dot, geojson, graphml, nav2_waypoints, tables
 from projections.export.waypoints import NEAR_M
@@ -152,6 +151,8 @@ def test_tables_read_back_are_the_map(view: MapView) -> None:
 
 @given(maps())
 def test_geojson_outlines_are_convex_hulls(view: MapView) -> None:
+    from scipy.spatial import ConvexHull, QhullError  # takes a second to import
+
     features = json.loads(geojson(view))["features"]
     by_kind: dict[str, list[Any]] = {"place": [], "object": [], "adjacency": [], "run": []}
     for feature in features:

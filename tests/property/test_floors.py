@@ -137,6 +137,7 @@ def test_snapshots_with_floors_go_on_as_the_fold_does(
 
 
 @given(documents=drives(), seed=st.integers(0, 2**32), places=st.sampled_from(["page", "rooms"]))
+@pytest.mark.slow
 def test_fusion_by_evidence_and_rooms_keep_floors_apart_too(
     documents: list[dict[str, Any]], seed: int, places: Any
 ) -> None:

@@ -6,7 +6,6 @@ from itertools import combinations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from sklearn.metrics import adjusted_rand_score
 
 from projections.model.partitions import compare_partitions
 
@@ -21,6 +20,8 @@ def _noise_alone(labelling: list[str | None]) -> list[str]:
 @given(labellings)
 def test_the_index_is_scikit_learns(pairs: list[tuple[str | None, str | None]]) -> None:
     first, second = [a for a, _ in pairs], [b for _, b in pairs]
+    from sklearn.metrics import adjusted_rand_score  # takes a second to import
+
     expected = adjusted_rand_score(_noise_alone(first), _noise_alone(second)) if pairs else 1.0
     assert float(compare_partitions(first, second).adjusted_rand) == pytest.approx(expected)
 

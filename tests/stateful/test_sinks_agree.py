@@ -52,8 +52,9 @@ from tests.drops import wait_for_drops
 from tests.envelopes import envelope
 from tests.logs import append_raw, bridge, walk, write_log
 from tests.rows import ORDER, graph_rows, vector_rows
+from tests.thorough import THOROUGH
 
-EXAMPLES = int(os.environ.get("MAPFOLD_STATEFUL_EXAMPLES", "8"))
+EXAMPLES = int(os.environ.get("MAPFOLD_STATEFUL_EXAMPLES", "8" if THOROUGH else "4"))
 PLACES = st.sampled_from(["one", "two"])
 
 

@@ -112,6 +112,7 @@ def test_a_message_that_ends_too_soon_is_refused_with_the_field(message: bytes) 
 
 @settings(max_examples=examples(300), deadline=None)
 @given(st.data())
+@pytest.mark.seconds
 def test_changed_bytes_give_a_map_or_a_reason(data: st.DataObject) -> None:
     changed = bytearray(data.draw(st.sampled_from([LITTLE, BIG])))
     for _ in range(data.draw(st.integers(1, 4))):

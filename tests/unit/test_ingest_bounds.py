@@ -85,6 +85,7 @@ with LogWriter(Path(sys.argv[1])) as log:
 
 @pytest.mark.parametrize("mib", mostly_slow([1, 16]))
 @pytest.mark.seconds
+@pytest.mark.slow
 def test_a_large_message_of_any_content_costs_little(tmp_path: Path, mib: int) -> None:
     done = subprocess.run(
         [sys.executable, "-c", HOSTILE, str(tmp_path / "log"), str(CPU_S), str(mib)],

@@ -136,6 +136,7 @@ def test_an_event_is_never_made_that_could_not_be_read() -> None:
 
 
 @pytest.mark.seconds
+@pytest.mark.slow
 def test_a_map_of_the_largest_size_goes_through() -> None:
     noise = np.random.default_rng(0).integers(0, 101, (4000, 4000), np.uint8)
     assert noise.size == MAX_MAP_CELLS

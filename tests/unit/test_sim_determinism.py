@@ -32,6 +32,7 @@ def _another_library(seed: int) -> SimpleNamespace:
 
 
 @pytest.mark.parametrize(("seed", "run"), [(7, "a"), (2, "a"), (1, "b")][:: stride(3)])
+@pytest.mark.seconds
 def test_last_bits_of_a_sine_change_no_byte(
     seed: int, run: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

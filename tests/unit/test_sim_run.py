@@ -92,6 +92,7 @@ def test_cosines_come_out_as_on_real_crops(which: str, low: float, high: float) 
 
 
 @pytest.mark.seconds
+@pytest.mark.slow
 def test_another_house_has_other_things_of_the_same_models() -> None:
     there = simulate_run(8, "a")
     assert not {t.instance for t in there.house.things} & {

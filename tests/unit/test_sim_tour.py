@@ -9,6 +9,7 @@ from eventsrc.sim.grid import ROBOT_RADIUS_M
 from eventsrc.sim.house import House, build_house
 from eventsrc.sim.shapes import Segment, wrap
 from eventsrc.sim.tour import KEYFRAME_M, KEYFRAME_RAD, TruePose, drive, keyframes, plan_tour
+from tests.thorough import mostly_slow
 
 pytestmark = pytest.mark.seconds
 
@@ -16,7 +17,7 @@ SEEDS_AND_RUNS = [(7, "a"), (7, "b"), (3, "a"), (12, "c")]
 Drive = tuple[House, str, list[TruePose]]
 
 
-@pytest.fixture(params=SEEDS_AND_RUNS, ids=str, scope="module")
+@pytest.fixture(params=mostly_slow((each,) for each in SEEDS_AND_RUNS), ids=str, scope="module")
 def driven(request: pytest.FixtureRequest) -> Drive:
     seed, run = request.param
     house = build_house(seed)

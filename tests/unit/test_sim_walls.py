@@ -22,6 +22,7 @@ def test_walls_are_occupied_and_doors_are_not(seed: int) -> None:
     assert 0.01 < float(np.mean(given.cells == OCCUPIED)) < 0.1
 
 
+@pytest.mark.seconds
 def test_the_robot_drove_through_no_wall() -> None:
     run = simulate_run(7, "a")
     grid = OccupancyGrid(occupancy_map(run.house))
