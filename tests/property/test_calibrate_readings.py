@@ -122,6 +122,7 @@ def test_few_observations_leave_the_priors_nearly_as_they_are() -> None:
     assert few.constants.side_by == PRIOR.side_by
 
 
+@pytest.mark.slow
 def test_cut_boxes_have_an_error_of_their_own() -> None:
     """Every third box is cut at a side and its middle displaced by 0.15 rad."""
     known, focal = Known(), CAMERA.width_px / 2.0 / math.tan(math.radians(CAMERA.hfov_deg / 2.0))

@@ -9,6 +9,7 @@ from projections.relocalize import Answer, rank
 from tests.relocalization.buildings import Building, Keyframe
 from tests.relocalization.drives import drive
 from tests.relocalization.rooms import RoomMap, crops_of
+from tests.thorough import mostly_slow
 
 SEEDS = (20, 21, 22)
 
@@ -38,7 +39,7 @@ def ask(mapped: list[Keyframe], asked: list[Keyframe]) -> list[tuple[float, Answ
     return found
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", mostly_slow(SEEDS))
 def test_half_of_the_own_run_beside_another_does_no_harm(seed: int) -> None:
     explored, own = runs(seed)
     found = ask(explored + own[::2], own[1::2])
@@ -46,7 +47,7 @@ def test_half_of_the_own_run_beside_another_does_no_harm(seed: int) -> None:
     assert sum(answer.unknown for _, answer in found) <= 0.05 * len(found)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", mostly_slow(SEEDS))
 def test_the_very_crops_in_the_map_lead_to_where_they_were_seen(seed: int) -> None:
     """A confident answer to a crop that is in the map must be right."""
     explored, own = runs(seed)
