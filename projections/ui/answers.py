@@ -56,7 +56,7 @@ def digest_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
 
 
 def _types(view: MapView) -> list[dict[str, Any]]:
-    """Of each place that anything tells about: its type, None where unsure, how probable that is,
+    """For each place whose type there is evidence of: the type, None where unsure, its probability,
     and the likeliest types."""
     found = ((place.place_id, view.type_of(place.ordinal)) for place in view.places.values())
     return [

@@ -170,7 +170,7 @@ async def _answer(
 async def _awaited(
     request: Request, submit: Callable[[Callable[[], bool]], Future[bytes]]
 ) -> bytes:
-    """The result. When the page leaves, the work is not wanted any more, and not begun."""
+    """The result. When the client disconnects, work that has not begun is dropped."""
     here = True
     answered = asyncio.ensure_future(asyncio.wrap_future(submit(lambda: here)))
     leaving = asyncio.ensure_future(_disconnect(request))

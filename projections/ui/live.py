@@ -1,4 +1,4 @@
-"""What a page hears while a log grows: server-sent events, one whenever something changed.
+"""Server-sent events of a log that grows, one whenever something changed.
 
 A thread looks for new events; each page has a stream, which ends with the service. The lag of the
 databases' tails is asked for only where a database is named.
@@ -54,11 +54,11 @@ class LiveWatch:
 
     @property
     def is_full(self) -> bool:
-        """Whether `MOST_STREAMS` pages listen."""
+        """Whether `MOST_STREAMS` streams are open."""
         return self._streams >= MOST_STREAMS
 
     def document(self) -> dict[str, Any]:
-        """What a page hears now."""
+        """The event that is sent now."""
         log = self._service.log_document()
         heard = ("through", "state", "events", "problems", "losses", "rejected", "loading")
         found = {name: log[name] for name in heard}

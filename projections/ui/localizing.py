@@ -1,5 +1,5 @@
-"""Where a robot is that sees some crops, by the map at W; and a mapped keyframe's crops as such a
-question.
+"""Re-localisation in the map at W: the pose from which some crops are seen; and the crops of a
+mapped keyframe as such a question.
 
 The search needs the map with its embeddings, which histories do not keep: a question about another
 W folds the log once more. The last such map is kept where it is small.

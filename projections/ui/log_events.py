@@ -1,4 +1,4 @@
-"""What a timeline marks: keyframes, places founded and merged, commands, rejected payloads, losses.
+"""Marks of the timeline: keyframes, places founded and merged, commands, rejected payloads, losses.
 
 Places and objects are marked by their history. Commands, rejected payloads and losses are mapfold's
 own events in the log, which change nothing in a fold; they are read from the log by their keys.

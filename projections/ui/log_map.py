@@ -81,7 +81,7 @@ class LogMap:
 
     @property
     def problems(self) -> list[str]:
-        """Why the map may not be what a person expects: sentences."""
+        """Warnings about the map, as sentences."""
         found = [problem for problem in (self._lost, self._stopped) if problem is not None]
         if left_out := self.log_events.left_out:
             found.append(
@@ -104,7 +104,7 @@ class LogMap:
 
     @property
     def key(self) -> str:
-        """Equal while the map only grows: another one means that the past is another too."""
+        """Equal while the map only grows; another one where maps of the past have changed too."""
         known = self.timeline.corrections()
         offsets = ",".join(str(command.offset) for command in known.in_force)
         map_ = map_fingerprint(self.timeline.settings, known)

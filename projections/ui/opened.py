@@ -1,4 +1,4 @@
-"""What a page was started with."""
+"""The log and the options that the server was started with."""
 
 from dataclasses import dataclass
 from pathlib import Path

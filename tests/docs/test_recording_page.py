@@ -1,4 +1,4 @@
-"""docs/recording.md is run, not trusted."""
+"""The commands of docs/recording.md do what it says."""
 
 import json
 import re

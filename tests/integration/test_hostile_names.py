@@ -1,4 +1,4 @@
-"""Names and keys from a stranger, printed by every command that prints what a log holds."""
+"""Hostile names and keys, printed by every command that prints what a log holds."""
 
 import json
 from pathlib import Path

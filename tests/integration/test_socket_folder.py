@@ -43,7 +43,7 @@ with socket.socket(socket.AF_UNIX) as door:
         with caller:
             print(len(caller.recv(100)), flush=True)
 """
-"""Listens where the server would, and says how much it hears from each caller: 0 for nothing."""
+"""Listens on the server's socket, and prints how many bytes each client sends: 0 for none."""
 LAST = b"x"
 """Shorter than anything a client of PostgreSQL begins with."""
 
@@ -69,7 +69,7 @@ def rogue(folder: Path) -> Iterator[subprocess.Popen[str]]:
 
 
 def heard(process: subprocess.Popen[str], door: Path) -> list[str]:
-    """How much it has heard from each caller until now."""
+    """How many bytes each client has sent until now."""
     with socket.socket(socket.AF_UNIX) as last:
         last.connect(str(door))
         last.sendall(LAST)

@@ -19,8 +19,8 @@ LOOKS += [[-1, 0, 0], [1, 2]]
 
 @st.composite
 def worlds(draw: st.DrawFn) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Settings, and keyframes of three runs whose numbers, det_ids and times get in each other's
-    way: repeats, conflicts, borrowed det_ids, late arrivals, lost robots, foreign vectors."""
+    """Settings, and keyframes of three runs whose numbers, det_ids and times conflict: repeats,
+    det_ids used twice, late arrivals, keyframes without a pose, vectors of another space."""
     rng = random.Random(draw(st.integers(0, 2**32)))
     settings = {
         "eps_m": rng.choice([0.5, 0.75, 1.0]),

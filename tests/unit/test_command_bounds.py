@@ -1,4 +1,4 @@
-"""What a command may cost that came from a stranger: bounded, whatever is in its 16 MiB."""
+"""The cost of a command from outside is bounded, whatever is in its 16 MiB."""
 
 import time
 
