@@ -1,4 +1,4 @@
-"""Headers of every answer, refusals too: nothing from other hosts, no inline code, no sniffing of types."""
+"""Headers of every answer, refusals too: only own hosts, no inline code, no sniffing of types."""
 
 from typing import Final
 
