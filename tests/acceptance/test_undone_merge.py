@@ -38,6 +38,7 @@ def places_in_age(mapfold: Commands) -> set[str]:
 
 
 @pytest.mark.parametrize("name", ["sample", pytest.param("house-a", marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_an_undone_merge_is_two_places_after_every_rebuild_and_one_again_after_undo(
     tmp_path: Path, name: str
 ) -> None:

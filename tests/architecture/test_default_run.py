@@ -7,6 +7,7 @@ from pathlib import Path
 TESTS = Path(__file__).parents[1]
 COMMANDS = TESTS.parent / "docs" / "commands.md"
 SLOW_AS_A_WHOLE = {
+    "acceptance/test_undone_merge.py",
     "chaos/test_edit_kills.py",
     "integration/test_calibrate_kernels.py",
 }

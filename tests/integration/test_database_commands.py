@@ -274,6 +274,7 @@ def test_a_signal_ends_a_live_tail_after_its_batch_and_leaves_no_server(
     assert not server(mapfold).running
 
 
+@pytest.mark.slow
 def test_sigterm_in_the_middle_of_a_replay_leaves_no_server_and_the_old_map(
     mapfold: Commands, log: Path
 ) -> None:

@@ -34,6 +34,7 @@ def _log(folder: Path) -> Path:
     return write_log(folder / "log", documents)
 
 
+@pytest.mark.slow
 def test_a_killed_tail_goes_on_without_a_row_that_differs(
     tmp_path: Path, one_database: Targets
 ) -> None:

@@ -157,6 +157,7 @@ def test_it_imports_nothing_from_the_current_folder(
     assert not (tmp_path / "executed").exists()
 
 
+@pytest.mark.slow
 def test_errors_come_back_as_they_were_raised(tmp_path: Path) -> None:
     plan = killed_writer(tmp_path / "log")
     process = SealingProcess()

@@ -66,6 +66,7 @@ def test_ctrl_c_is_one_line_and_130(tmp_path: Path, module: str, args: tuple[str
     assert (done.returncode, done.stderr) == (EXIT_INTERRUPTED, "mapfold: interrupted\n")
 
 
+@pytest.mark.slow
 def test_ctrl_c_in_a_starting_worker_is_one_line(mapfold: Commands) -> None:
     (mapfold.folder / "sitecustomize.py").write_text(_CTRL_C_IN_A_WORKER)
     env = {**mapfold.env, "PYTHONPATH": str(mapfold.folder)}

@@ -222,6 +222,7 @@ def test_a_box_beyond_float32(tmp_path: Path, one_database: Targets) -> None:
     assert copied[1][0][6][:3] == [float("inf"), float("-inf"), 0.0]
 
 
+@pytest.mark.slow
 def test_other_settings_are_refused_with_the_difference(log: Path, one_database: Targets) -> None:
     rebuild(log, one_database, SETTINGS)
     rows = all_rows(one_database)

@@ -413,6 +413,7 @@ class TestKilledServer:
             rebuild(write_log(tmp_path / "log", walk(60, seed=3)), targets, Settings())
             yield server
 
+    @pytest.mark.slow
     def test_the_embedded_server_is_restarted(self, server: EmbeddedServer) -> None:
         told: list[str] = []
         with Pools(Targets(server.url, server.url, server), 4, told.append) as pools:

@@ -81,6 +81,7 @@ JUNK = [
 ]
 
 
+@pytest.mark.slow
 def test_invalid_questions_delay_others_little(service: Served) -> None:
     over, wrong = threading.Event(), []
 

@@ -100,7 +100,7 @@ def test_short_default_timeouts(log: Path, one_database: Targets, pg: psycopg.Co
             "timezone = 'Asia/Kathmandu'",
             "standard_conforming_strings = off",
         ],
-        4,
+        2,
     ),
 )
 def test_output_formats_of_the_server_change_no_value(
