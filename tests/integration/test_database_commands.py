@@ -80,7 +80,6 @@ def test_check_and_repair(mapfold: Commands, log: Path) -> None:
     assert not server(mapfold).running
 
 
-@pytest.mark.slow
 def test_parked_events_are_findings(mapfold: Commands, log: Path) -> None:
     append_raw(log, b"neither fish nor fowl")
     assert "cannot be folded" in mapfold("replay", log, code=1).err
