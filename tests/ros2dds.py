@@ -19,8 +19,8 @@ LATCHED_QOS = ":1:1:0,1"
 
 
 class Bridge:
-    """A bridge's session. ``old`` is one from before version 1.0, with its older tokens and
-    caches; from 1.5 on it publishes with sequence numbers and heartbeats."""
+    """A bridge's session. ``old`` is one with older tokens and caches; a newer one publishes with
+    sequence numbers and heartbeats."""
 
     def __init__(self, session: Any, namespace: str = "", *, old: bool = False) -> None:
         self.session = session

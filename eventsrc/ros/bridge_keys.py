@@ -8,13 +8,13 @@ The type is in a liveliness token that the bridge declares for each topic that i
 ``§`` for each slash of the key and of the type::
 
     @/<zenoh id>/@ros2_lv/MP/bot1§tf/tf2_msgs§msg§TFMessage/<quality of service>
-    @ros2_lv/<zenoh id>/MP/…                                     (bridges before 1.0)
+    @ros2_lv/<zenoh id>/MP/…                                     (older bridges)
 
 What a topic has that keeps its last message for those who come late (``/tf_static``), the bridge
 keeps in a cache, which is asked by a query::
 
-    bot1/tf_static/@adv/pub/**                   (bridges from 1.5 on)
-    @/<zenoh id>/@ros2_pub_cache/bot1/tf_static
+    bot1/tf_static/@adv/pub/**
+    @/<zenoh id>/@ros2_pub_cache/bot1/tf_static  (older bridges)
 """
 
 import re

@@ -17,9 +17,10 @@ from eventsrc.recorder.unfinished import append_missing
 from eventsrc.ros.bridge_keys import topic_of
 from eventsrc.ros.derivation import RosRecording
 from eventsrc.ros.library import MessageTypes
-from eventsrc.ros.stream import Stream
+from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS, Stream
 from eventsrc.text import counted, visible
 
+from .bag_text import check_run_id, max_gap_ns, read_labels
 from .terminal import say
 
 TF_POSE: Final = "tf"
@@ -74,9 +75,29 @@ GridOption = Annotated[
 ]
 MapFrameOption = Annotated[str, _option("--map-frame", "FRAME", "The frame of poses by tf.")]
 BaseFrameOption = Annotated[str, _option("--base-frame", "FRAME", "The robot's frame.")]
-RunOption = Annotated[
+RunIdOption = Annotated[
     str | None,
-    _option("--run", "ID", "The run of the keyframes. [default: namespace and time of the start]"),
+    _option(
+        "--run-id", "ID", "The run of the keyframes. [default: namespace and time of the start]"
+    ),
+]
+LabelsOption = Annotated[
+    Path | None,
+    _option("--labels", "FILE", "Names of numbered classes, one a line; the first is of class 0."),
+]
+ModelOption = Annotated[
+    str | None,
+    _option("--embedding-model", "NAME", "The model of embeddings that do not name theirs."),
+]
+HeightsOption = Annotated[
+    bool,
+    typer.Option(
+        "--heights", help="State the robot's height, which tells floors.", rich_help_panel=_PANEL
+    ),
+]
+MaxGapOption = Annotated[
+    float,
+    _option("--max-gap", "SECONDS", "Poses farther apart in time are not interpolated between."),
 ]
 TopicOption = Annotated[
     list[str] | None,
@@ -96,12 +117,30 @@ class BridgeChoice(NamedTuple):
     grid: str
     map_frame: str
     base_frame: str
-    run: str | None
+    run_id: str | None
+    labels: Path | None
+    embedding_model: str | None
+    heights: bool
+    max_gap_s: float
     topics: list[str] | None
 
 
 NOTHING: Final = BridgeChoice(
-    "", None, TF_POSE, None, None, None, _GRID, "map", "base_link", None, None
+    "",
+    None,
+    TF_POSE,
+    None,
+    None,
+    None,
+    _GRID,
+    "map",
+    "base_link",
+    None,
+    None,
+    None,
+    False,
+    DEFAULT_MAX_GAP_NS / 1e9,
+    None,
 )
 """What they say when none is given."""
 
@@ -148,10 +187,11 @@ def recording_of(
     detections = list(
         dict.fromkeys(full(t, "--detections") for t in choice.detections or [_DETECTIONS])
     )
-    run = choice.run or _run_id(choice.namespace, now_ns)
+    run = check_run_id(choice.run_id) or _run_id(choice.namespace, now_ns)
+    labels, gap_ns = read_labels(choice.labels), max_gap_ns(choice.max_gap_s)
     streams = []
     for topic in detections:
-        run_id = RunId(run if len(detections) == 1 else f"{run}:{topic.strip('/')}")
+        run_id = RunId(run if len(detections) == 1 else f"{run}:{_camera(topic)}")
         highest = None if ledger is None else ledger.highest(run_id)
         streams.append(
             Stream(
@@ -165,6 +205,10 @@ def recording_of(
                 given(choice.camera, "--camera"),
                 choice.map_frame,
                 choice.base_frame,
+                labels,
+                choice.embedding_model,
+                choice.heights,
+                max_gap_ns=gap_ns,
                 first_keyframe=0 if highest is None else highest + 1,
             )
         )
@@ -185,6 +229,11 @@ def used_topics(recording: RosRecording) -> list[str]:
             if topic is not None:
                 found[topic] = None
     return [*found, *recording.grids]
+
+
+def _camera(topic: str) -> str:
+    """What tells a run of one of several topics of detections from those of the others."""
+    return topic.strip("/").removesuffix("/detections")
 
 
 def _run_id(namespace: str, now_ns: int) -> str:

@@ -33,11 +33,15 @@ from .bridged import (
     DetectionsOption,
     EmbeddingsOption,
     GridOption,
+    HeightsOption,
+    LabelsOption,
     MapFrameOption,
+    MaxGapOption,
+    ModelOption,
     NamespaceOption,
     PoseOption,
     Ros2ddsOption,
-    RunOption,
+    RunIdOption,
     TopicOption,
     check_unused,
     open_bridge,
@@ -124,7 +128,11 @@ def record(
     grid: GridOption = NOTHING.grid,
     map_frame: MapFrameOption = NOTHING.map_frame,
     base_frame: BaseFrameOption = NOTHING.base_frame,
-    run: RunOption = None,
+    run_id: RunIdOption = None,
+    labels: LabelsOption = None,
+    embedding_model: ModelOption = None,
+    heights: HeightsOption = False,
+    max_gap: MaxGapOption = NOTHING.max_gap_s,
     topic: TopicOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -136,7 +144,7 @@ def record(
     """
     choice = BridgeChoice(
         namespace, detections, pose, covariance, embeddings, camera, grid, map_frame, base_frame,
-        run, topic,
+        run_id, labels, embedding_model, heights, max_gap, topic,
     )  # fmt: skip
     if not ros2dds:
         check_unused(choice)

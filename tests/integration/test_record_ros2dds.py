@@ -61,7 +61,7 @@ Sessions = Callable[[], Session]
 
 
 def choice(namespace: str = "", **more: Any) -> Any:
-    return NOTHING._replace(namespace=namespace, embeddings="/embeddings", run="drive", **more)
+    return NOTHING._replace(namespace=namespace, embeddings="/embeddings", run_id="drive", **more)
 
 
 def new_bridge(namespace: str = "", **more: Any) -> Bridge:
@@ -470,7 +470,7 @@ def test_the_command_records_says_so_and_ends_clean(
         announce_all(bridge)
         program = start_code(
             MAPFOLD, "record", str(log), "--connect", endpoint, "--ros2dds", "--namespace",
-            "/bot1", "--embeddings", "embeddings", "--run", "r", "--json",
+            "/bot1", "--embeddings", "embeddings", "--run-id", "r", "--json",
         )  # fmt: skip
         program.wait_for("keyframes of r")
         program.wait_for("Ctrl-C ends it")
@@ -494,7 +494,17 @@ def test_options_for_ros_need_ros2dds(tmp_path: Path) -> None:
     assert "go with --ros2dds" in said.err
     said = run("record", "L", "--ros2dds", "--topic", "/a b", code=2)
     assert "is no topic of ROS 2" in said.err
+    (tmp_path / "labels").write_text("cup\n\nchair\n")
+    for wrong in (["--run-id", "a\nb"], ["--max-gap", "nan"], ["--labels", "no"], ["--pose", "*"]):
+        assert run("record", "L", "--ros2dds", *wrong, code=2).err.count("\n") == 1
     assert not (tmp_path / "L").exists()
+    labels, several = tmp_path / "labels", ["/left/detections", "/right/detections"]
+    how, topics = recording_of(
+        choice("bot1", labels=labels, heights=True, detections=several), 0, None
+    )
+    assert [s.run_id for s in how.streams] == ["drive:bot1/left", "drive:bot1/right"]
+    assert how.streams[0].labels == {"0": "cup", "2": "chair"}
+    assert {"/bot1/left/detections", "/bot1/tf", "/bot1/map", "/bot1/embeddings"} < {*topics}
 
 
 def test_messages_that_find_the_queue_full_are_counted_by_key() -> None:
