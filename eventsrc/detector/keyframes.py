@@ -16,9 +16,12 @@ from .finder import Finder, Found
 from .gate import KeyframeGate, Pose
 from .picture import Picture, PictureError, Pixels
 from .poses import Poses
-from .vision import encode_jpeg
+from .vision import encode_jpeg, shrunk
 
 FIRST_KEYFRAME: Final = 1
+CROP_SIDE: Final = 640
+"""Crops that are kept are no wider or higher: more than encoders take, and less than the 1 MiB that
+a log keeps, whatever is in them."""
 _TOLD: Final = 5
 """How often something is said of one kind of fault; after that it is only counted."""
 
@@ -160,7 +163,8 @@ class Keyframes:
         }
         crops = []
         if self._keep_crops:
-            crops = [Crop(*each) for each in zip(ids, map(encode_jpeg, cut_out), strict=True)]
+            jpegs = [encode_jpeg(shrunk(pixels, CROP_SIDE)) for pixels in cut_out]
+            crops = [Crop(*each) for each in zip(ids, jpegs, strict=True)]
         return Keyframe(envelope, crops)
 
     def _detection(

@@ -121,6 +121,18 @@ def encode_jpeg(pixels: Pixels, quality: int = JPEG_QUALITY) -> bytes:
     return bytes(data)
 
 
+def shrunk(pixels: Pixels, side: int) -> Pixels:
+    """``pixels``, made smaller where they are wider or higher than ``side``."""
+    height, width = pixels.shape[:2]
+    ratio = side / max(height, width)
+    if ratio >= 1.0:
+        return pixels
+    size = max(1, round(width * ratio)), max(1, round(height * ratio))
+    cv2 = _cv2()
+    smaller: Pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    return smaller
+
+
 @dataclass(frozen=True, slots=True)
 class Letterbox:
     """How a picture lies in a model's input: scaled by ``scale`` along x and y, then moved."""

@@ -11,7 +11,9 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 
-from eventsrc.detector.vision import decode, encode_jpeg
+from eventsrc.crops import MAX_CROP_BYTES, decode_crop
+from eventsrc.detector.keyframes import CROP_SIDE
+from eventsrc.detector.vision import decode, encode_jpeg, shrunk
 from eventsrc.ingest import Accepted, ingest
 from eventsrc.log import LogReader
 from eventsrc.sim import build_house
@@ -117,9 +119,12 @@ def test_over_zenoh_into_a_map(
     said = json.loads(detect.output())
     assert said["published"] == numbers["published"]
     assert (said["waiting"], said["crops_lost"]) == (0, 0)
+    with LogReader(tmp_path / "log") as reader:
+        kept = [decode_crop(event.payload) for event in reader.read(keys=["tb/crops"])]
+    detections = {d["det_id"]: d for e in envelopes for d in e["detections"]}
+    assert sorted(crop.det_id for crop in kept) == sorted(detections)
     stage.run("import", tmp_path / "imported", stage.folder / "run.jsonl")
     assert _digest(tmp_path / "log") == _digest(tmp_path / "imported")
-    detections = {d["det_id"]: d for e in envelopes for d in e["detections"]}
     assert said["crops"] == len(detections)
     for _ in range(said["crops"]):
         crop = crops.get(timeout=DEADLINE_S)
@@ -218,6 +223,15 @@ def test_bad_pictures_are_counted_and_said(stage: Stage, tmp_path: Path) -> None
     for name, line in zip(sorted(bad), told, strict=True):
         assert f"/{name}: left out: " in line
     assert "5 unreadable" in said.err.splitlines()[-1]
+
+
+def test_a_crop_is_kept_in_a_size_that_a_log_takes() -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (2000, 3000, 3), np.uint8)
+    smaller = shrunk(noise, CROP_SIDE)
+    assert smaller.shape == (427, 640, 3)
+    worst = np.random.default_rng(0).integers(0, 255, (CROP_SIDE, CROP_SIDE, 3), np.uint8)
+    assert shrunk(worst, CROP_SIDE) is worst
+    assert len(encode_jpeg(worst)) < MAX_CROP_BYTES
 
 
 @pytest.mark.seconds
