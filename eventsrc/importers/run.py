@@ -18,7 +18,13 @@ from eventsrc.errors import MisuseError
 from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES, Rejected
 from eventsrc.log import FsyncPolicy, LogWriter, MessageFormat
 from eventsrc.occupancy_map import InvalidMap, OccupancyMap, decode_map
-from eventsrc.system_events import LOSS_KEY, MAP_KEY, REJECTED_KEY, ROS_KEY
+from eventsrc.system_events import (
+    EMBEDDINGS_KEY,
+    LOSS_KEY,
+    MAP_KEY,
+    REJECTED_KEY,
+    ROS_KEY,
+)
 from eventsrc.upcast import UPCASTERS
 
 from .bag_files import START_BYTES, is_bag, is_file_of_a_bag
@@ -180,7 +186,7 @@ class _Import:
             self._passed_over[topic, message.unread] += 1
         elif message.form is not None:
             self._append_verbatim(message, message.form)
-        elif message.key in (REJECTED_KEY, LOSS_KEY, ROS_KEY):
+        elif message.key in (REJECTED_KEY, LOSS_KEY, ROS_KEY, EMBEDDINGS_KEY):
             self._append_system_event(message.key or "", message)
         elif message.key == MAP_KEY:
             self._append_map_event(source, message)

@@ -10,7 +10,7 @@ from eventsrc.envelope import FIRST_OFFSET
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 from eventsrc.text import counted, visible
-from projections.model.advice import places_advice
+from projections.model.advice import places_advice, space_advice
 from projections.model.digest import map_digest
 from projections.model.export import state_document, state_text
 from projections.model.fold import fold_events, fold_log_cached
@@ -64,9 +64,9 @@ def state(
         display(f"{hexdigits}\n")
     else:
         display(state_text(view, hexdigits, known))
-    advice = None if digest else places_advice(view.counts(), settings)
-    if advice is not None:
-        say(advice)
+    for advice in () if digest else (places_advice(view.counts(), settings), space_advice(view)):
+        if advice is not None:
+            say(advice)
 
 
 def draw(

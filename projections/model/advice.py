@@ -1,14 +1,30 @@
-"""Advice on settings from a map's counts: all poses are in one place, or hardly any is in one."""
+"""Advice on settings: all poses are in one place, or hardly any is in one; nothing is in the space
+that they name."""
 
 from collections.abc import Mapping
 from typing import Final
 
-from eventsrc.text import counted
+from eventsrc.text import counted, visible
 from projections.settings import Settings
+
+from .view import MapView
 
 LEAST_POSES: Final = 20
 """With fewer there is nothing to say yet."""
 _MOSTLY: Final = 0.8
+
+
+def space_advice(view: MapView) -> str | None:
+    """One line where the settings name a space of which the map has no vector."""
+    model = view.settings.embedding_model
+    if model is None or not view.observations:
+        return None
+    if any(o.embedding_crc is not None and not o.foreign_space for o in view.observations):
+        return None
+    return (
+        f"no detection has a vector of space {visible(model)}, so there are no Objects; `mapfold"
+        " log spaces` lists the spaces of a log"
+    )
 
 
 def places_advice(counts: Mapping[str, int], settings: Settings) -> str | None:

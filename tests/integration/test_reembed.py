@@ -291,6 +291,21 @@ def test_a_command_lists_the_spaces_of_a_log(tmp_path: Path) -> None:
     in_c = mapfold("state", log, "--space", "C", "--json").json
     assert in_c["digest"] == digest(log, Settings(embedding_model="C"))
     assert mapfold("state", log, "--space", "C", "--set", "eps_m=2", "--json").json
+    assert "no detection has a vector of space D" in mapfold("state", log, "--space", "D").err
+    assert "no detection" not in mapfold("state", log, "--space", "C").err
+
+
+def test_vectors_are_imported_and_put_into_force_there(tmp_path: Path) -> None:
+    log, mapfold = write(tmp_path / "log", drive(14), A), Commands.in_folder(tmp_path)
+    length, expected = end_of(log), run(log).added
+    mapfold("import", "copy", *sorted(log.glob("*.mcap")), code=3)
+    copy = tmp_path / "copy"
+    assert digest(copy, until=length) != digest(log, until=length)
+    encoder = Encoder("B", 9)
+    done = run(copy, encoder)
+    assert (done.known, done.added, encoder.calls) == (expected, 0, 0)
+    assert done.command is not None
+    assert digest(copy, until=length) == digest(log, until=length)
 
 
 def test_questions_of_an_evaluation_are_in_the_space_of_the_map(tmp_path: Path) -> None:
