@@ -12,7 +12,7 @@ from eventsrc.grid_messages import read_grid_message
 from eventsrc.occupancy_map import InvalidMap
 from eventsrc.ros.assembler import Assembled, Assembler, RosMessage
 from eventsrc.ros.library import MessageTypes, Undecodable
-from eventsrc.ros.messages import DETECTIONS, BadMessage
+from eventsrc.ros.messages import DETECTIONS, FLOATS, TEXT, BadMessage
 from eventsrc.ros.stream import Counts
 
 from .bag_files import Bag, BagContents, bag_name
@@ -163,7 +163,7 @@ class RosBag:
 
 
 def _may_be_used(type_name: str) -> bool:
-    return type_name == DETECTIONS or sampled(type_name, 0) or type_name.startswith("std_msgs/")
+    return type_name in (TEXT, FLOATS) or sampled(type_name, 0)
 
 
 def _report(name: str, contents: BagContents, choice: Choice) -> BagReport:

@@ -4,6 +4,7 @@ rosbags is of the extra ``[ros]`` and imported when it is needed. It decodes by 
 from definitions of messages, so a bag's own definitions are parsed, never run as they stand.
 """
 
+import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -40,6 +41,35 @@ _IDL_MARK: Final = f"{_LINE}IDL: "
 
 class NoRosbags(MapfoldError):
     """rosbags is not installed."""
+
+
+_MOST_SHOWN: Final = 160
+_TYPE_NAME: Final = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*)+", re.ASCII)
+_FIELD_NAME: Final = re.compile(r"[A-Za-z]\w*", re.ASCII)
+
+
+def _checked(type_name: str, fields: list[tuple[str, Any]]) -> tuple[list[Any], list[Any]]:
+    """A type without its constants, of which all names can stand in the code that rosbags makes
+    and runs; it does not check all of them itself. Raises ValueError."""
+    for name in (type_name, *(name for _, kind in fields for name in _names_in(kind))):
+        if not _TYPE_NAME.fullmatch(name):
+            raise ValueError(f"{name[:80]!r} is no name of a type")
+    for name, _ in fields:
+        if not _FIELD_NAME.fullmatch(name):
+            raise ValueError(f"{name[:80]!r} is no name of a field")
+    return [], fields
+
+
+def _names_in(kind: Any) -> Iterator[str]:
+    """The names of types in rosbags' description of a field: a pair of the kind of its node, and
+    a name, or a basic type and its length, or another description and its length."""
+    node, inner = kind
+    if isinstance(inner, str):
+        yield inner
+    elif isinstance(inner[0], tuple):
+        yield from _names_in(inner[0])
+    elif node.name != "BASE" or not inner[0].isalnum():
+        raise ValueError(f"{kind!r:.80} is no field")
 
 
 def _not_installed(error: ImportError) -> NoRosbags:
@@ -79,16 +109,16 @@ class MessageTypes:
         """Add a type, and those whose definitions follow in the same text, of which this one is
         used although there is another. Raises Undecodable for a text that defines nothing."""
         try:
-            types = self._types_of_idl(text) if is_idl else self._parse(text, type_name)
+            parsed = self._types_of_idl(text) if is_idl else self._parse(text, type_name)
+            types = {name: _checked(name, fields) for name, (_, fields) in parsed.items()}
             for name in types:
                 if self._store.fielddefs.get(name) != types[name]:
                     self._store.fielddefs.pop(name, None)
                     self._store.cache.clear()
             self._store.register(types)
-        except (*self._faults, ValueError, RecursionError) as error:
-            raise Undecodable(
-                f"the definition of {type_name:.80} cannot be read: {error}"
-            ) from None
+        except (*self._faults, *_FAULTS, RecursionError, SyntaxError, ValueError) as error:
+            reason = " ".join(str(error).split())[:_MOST_SHOWN]
+            raise Undecodable(f"the definition of {type_name} cannot be read: {reason}") from None
 
     def _types_of_idl(self, text: str) -> dict[str, Any]:
         """The types of a text in IDL, or of several after lines as bags put them between."""
