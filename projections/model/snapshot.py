@@ -301,7 +301,7 @@ def _load_places(view: MapView, rows: list[list[Any]]) -> None:
             view.survivors.merge(survivor, (place.ordinal,))
 
 
-FOLD_VERSION = 4
+FOLD_VERSION = 5
 """Raise it with every change of the reducers after which the same log gives another map."""
 
 

@@ -9,21 +9,18 @@ from projections.exact_functions import exp
 from projections.pair_groups import PairGroups
 
 from .agreement import Agreement, Slopes
+from .assignment import Match, assign
 from .label_counts import LABEL_WEIGHT, LabelCounts
 from .looks import LookRatios, Looks, LookScale
 from .sights import Sight, Sighting
 from .thing_index import ThingIndex
 from .things import Thing
 
-_MOST_EXPONENT = 50.0
+_LEAST_EXPONENT = -50.0
 Choice: TypeAlias = tuple[ObjectOrdinal | None, float, float]
 """An Object, None for a new one; the cosine of the best pair of looks; the probability that it is
 that Object and no other."""
 _NEW: Choice = (None, 1.0, 1.0)
-
-
-_Match: TypeAlias = tuple[float, ObjectOrdinal, float]
-"""How much speaks for an Object, which one, and the cosine of the best pair of looks."""
 
 
 class Matching:
@@ -59,24 +56,28 @@ class Matching:
         object_of: Mapping[int, ObjectOrdinal],
     ) -> list[Choice]:
         """The choice of each observation."""
-        chosen: list[Choice] = [_NEW] * len(sights)
-        matches, order = self._matches(
-            run, pose, labels, looks, inverses, sights, sightings, object_of
-        )
-        best_first = [(match, column) for match, column in order if match[0] > 0.0]
-        best_first.sort(key=_value, reverse=True)  # of equal ones the first
-        used: set[ObjectOrdinal] = set()
-        for match, column in best_first:
-            value, ordinal, cosine = match
-            if ordinal in used or chosen[column][0] is not None:
+        matches = self._matches(run, pose, labels, looks, inverses, sights, sightings, object_of)
+        taken = assign([[match for match in own if match[0] > 0.0] for own in matches])
+        holders = {match[1]: column for column, match in enumerate(taken) if match is not None}
+        chosen: list[Choice] = []
+        seconds: dict[int, _Second] = {}
+        for own, match in zip(matches, taken, strict=True):
+            if match is None:
+                chosen.append(_NEW)
                 continue
-            rivals = 1.0
-            for other in matches[column]:
-                if other is not match and other[1] not in used:
-                    rivals += exp(min(other[0], _MOST_EXPONENT))
-            mine = exp(min(value, _MOST_EXPONENT))
-            chosen[column] = ordinal, cosine, mine / (mine + rivals)
-            used.add(ordinal)
+            value, ordinal, cosine = match
+            rivals = exp(max(-value, _LEAST_EXPONENT))
+            for other in own:
+                if other is match:
+                    continue
+                more = other[0] - value
+                holder = holders.get(other[1])
+                if holder is not None:
+                    if holder not in seconds:
+                        seconds[holder] = _Second(matches[holder], taken[holder], holders)
+                    more -= seconds[holder].lost(ordinal)
+                rivals += exp(max(min(more, 0.0), _LEAST_EXPONENT))
+            chosen.append((ordinal, cosine, 1.0 / (1.0 + rivals)))
         return chosen
 
     def _matches(
@@ -89,14 +90,13 @@ class Matching:
         sights: list[Sight],
         sightings: Sequence[Sighting],
         object_of: Mapping[int, ObjectOrdinal],
-    ) -> tuple[list[list[_Match]], list[tuple[_Match, int]]]:
-        """What each observation may be of, and all of it with the observation, by ordinal."""
-        matches: list[list[_Match]] = [[] for _ in sights]
-        order: list[tuple[_Match, int]] = []
+    ) -> list[list[Match]]:
+        """What each observation may be of, by ordinal."""
+        matches: list[list[Match]] = [[] for _ in sights]
         index = self._index
         listed = index.listed(pose.x_um / 1e6, pose.y_um / 1e6)
         if not len(listed):
-            return matches, order
+            return matches
         estimates = index.estimates.take(listed, axis=0)
         pairs = self._agreement.pairs(estimates, sights, self._slopes.mean_square)
         ordinals: list[ObjectOrdinal] = listed.take(pairs.rows).tolist()
@@ -126,10 +126,8 @@ class Matching:
                 agree,
                 different,
             )
-            match = value + ratio, ordinal, cosine
-            matches[column].append(match)
-            order.append((match, column))
-        return matches, order
+            matches[column].append((value + ratio, ordinal, cosine))
+        return matches
 
     def _is_apart(
         self,
@@ -147,5 +145,17 @@ class Matching:
         return thing.groups is not inside and bool(groups.conflicts(inside, thing.groups))
 
 
-def _value(item: tuple[_Match, int]) -> float:
-    return item[0][0]
+class _Second:
+    """What is left to an observation that has to leave the Object it takes: the best of those that
+    no observation takes, one that is freed, or none."""
+
+    def __init__(
+        self, own: list[Match], taken: Match | None, holders: Mapping[ObjectOrdinal, int]
+    ) -> None:
+        self._value = 0.0 if taken is None else taken[0]
+        self._values = {ordinal: value for value, ordinal, _ in own}
+        self._best = max([value for value, ordinal, _ in own if ordinal not in holders] + [0.0])
+
+    def lost(self, freed: ObjectOrdinal) -> float:
+        """The evidence that is lost if ``freed`` is free."""
+        return self._value - max(self._best, self._values.get(freed, 0.0))

@@ -8,10 +8,11 @@ The rules, for the observations of one picture:
     the estimate (`agreement`), of its look and the exemplars (the mean of the best four; each that
     is missing costs an eighth), and half of that of its label and the labels seen so far
     (`label_counts`). Below −5 the sight alone rules a candidate out.
-3.  Pairs are taken best first while the evidence is above 0. Each observation goes to one Object,
-    and each Object gets one observation of a picture: two things in one picture are not one. What
-    is left founds Objects. Where other Objects, or a new one, were nearly as probable, the sight
-    weighs only its probability in the estimate, and below 0.85 the look is no exemplar.
+3.  Each observation goes to one Object, and each Object gets one observation of a picture: two
+    things in one picture are not one. Of all such choices that with the largest sum of evidence is
+    taken, a pair's being above 0 (`assignment`). What is left founds Objects. Where other Objects,
+    or a new one, or two observations exchanged were nearly as probable, the sight weighs only its
+    probability in the estimate, and below 0.85 the look is no exemplar.
 4.  The Object's estimate is solved again from its spots (`spots`), its class is that of most of its
     observations.
 5.  Two Objects are merged when better views show that they are one (`evidence_merging`).
