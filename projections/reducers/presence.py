@@ -57,7 +57,7 @@ _PRIOR = 8.0
 _WEIGHTS = 2, 1, 0
 """Of the first, the second and each other look from one cell in one run, in halves of a look."""
 _SEEN, _SURE, _FLOOR = 8.0, 512.0, 1.0 / 1024.0
-_MISSING = 0.2
+_MISSING = 0.1
 _LEAST_MISSES, _LEAST_HITS = 2, 2
 _Cell = tuple[int, int]
 

@@ -42,7 +42,7 @@ _LEAST_NEW, _LEAST_RIVAL = 3, 2
 _APART_M2, _APART_CHI2 = 1.0, 16.0
 _ONE_FLOOR_M2 = 5e7 * 5e7
 """Farther apart are only Objects on two floors, which are laid out beside each other."""
-_LEAST_LOOK, _ENOUGH, _GONE = 2.0, 1.0, 0.5
+_LEAST_LOOK, _ENOUGH, _GONE = 2.0, 2.0, 0.5
 _STILL = 8.0
 _MOST = 128
 

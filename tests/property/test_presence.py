@@ -97,7 +97,7 @@ class Oracle:
             if run != known.home:
                 known.enter(run)
                 known.odds2 = min(known.odds2 * 64, Fraction(512) ** 2)
-                known.is_missing = known.is_missing and known.odds2 <= Fraction(1, 25)
+                known.is_missing = known.is_missing and known.odds2 <= Fraction(1, 100)
         return [
             ObjectMissing(offset, ObjectOrdinal(o), RunOrdinal(run), k.run_misses, k.is_missing)
             for o, k in sorted(self.known.items())
@@ -153,7 +153,7 @@ class Oracle:
             known.misses += weight
             self.misses += weight
             enough = known.run_misses >= 2 and known.hits >= 1
-            known.is_missing = enough and known.odds2 < Fraction(1, 25)
+            known.is_missing = enough and known.odds2 < Fraction(1, 100)
 
 
 class Step(NamedTuple):

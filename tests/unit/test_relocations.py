@@ -104,12 +104,12 @@ def test_the_best_candidate_is_the_newcomer_at_its_third_observation(story):
 @pytest.mark.parametrize(
     ("first", "second", "told"),
     [
-        (2.0, 0.9, [0]),
-        (2.0, 1.0, [0]),
-        (2.0, 1.1, []),  # what looks like two tells little
+        (2.0, -0.1, [0]),
+        (2.0, 0.0, [0]),
+        (2.0, 0.1, []),  # what looks like two tells little
         (1.9, -3.0, []),
-        (5.0, 4.1, []),
-        (3.0, 4.1, [1]),
+        (6.0, 4.1, []),
+        (3.0, 5.1, [1]),
         (None, 2.3, [1]),  # kept apart by a command
         (2.3, None, [0]),
     ],
@@ -130,7 +130,7 @@ def test_an_older_one_that_looks_like_another_seen_now_tells_little(story):
     story.table.looks |= {(0, 3): 4.0, (0, 1): 3.5, (1, 3): 0.0}
     story.see(1, 1)
     assert story.see(3, 1, 3) == []
-    story.table.looks |= {(0, 1): 3.0}
+    story.table.looks |= {(0, 1): 2.0}
     assert [pair.old for pair in story.see(3, 1, 3)] == [0]
 
 
@@ -159,12 +159,12 @@ def test_misses_of_the_older_one_add_to_evidence_of_looks(story, look, is_told):
 
 def test_what_was_seen_in_the_run_needs_more_evidence(story):
     """A sighting is eight times likelier where the thing still stands: log 8 is 2.08."""
-    story.table.looks |= {(0, 3): 3.0}
+    story.table.looks |= {(0, 3): 4.0}
     story.see(0, 1)
     assert story.see(3, 1, 30) == []
     story.miss(0, 2, 8)  # run 2 no longer sees it, but the newcomer is of run 1
     assert story.see(3, 2, 60) == []
-    for look, told in ((3.0, []), (3.1, [0])):
+    for look, told in ((4.0, []), (4.1, [0])):
         again = Story()
         again.see(0, 0, 5)
         again.see(0, 1)
