@@ -1,13 +1,16 @@
 """AGE graphs: create, find, index, count, lock, swap and drop them.
 
 AGE keeps a graph as a schema, so a graph is *ours* when the schema carries our mark as its comment.
-Anything else under these names belongs to another program: it is refused and never changed.
+Anything else under these names belongs to another program: it is refused and never changed; but a
+graph that was made and left empty, as scripts that set up a database do, becomes ours
+(`adopt_if_empty`).
 
 The swap renames the old graph; it is dropped later, when every transaction that may still have
 looked up its name has ended (see `swap`).
 """
 
 from collections.abc import Collection
+from itertools import count
 from typing import Final
 
 from psycopg import sql
@@ -41,19 +44,74 @@ def exists(connection: Connection, graph: str) -> bool:
     if row is None:
         return False
     if not row[0] or not str(row[1]).startswith(_MARK):
+        renaming = _renaming(connection, graph, is_graph=row[0])
         raise DatabaseError(
             f"{describe_connection(connection)}: has a {'graph' if row[0] else 'schema'} {graph}"
-            " that mapfold did not make; rename or drop it, or use another database"
+            f" that mapfold did not make; rename it by `{renaming}`, or use another database"
         )
     return True
 
 
+def _renaming(connection: Connection, graph: str, *, is_graph: bool) -> str:
+    """The statement that gives a graph or a schema a name that is free."""
+    rows = connection.execute(statements("graph")["taken_names"], {"pattern": f"{graph}%"})
+    taken = {name for (name,) in rows}
+    names = (f"{graph}_{number}" for number in count(1))
+    free = next(name for name in names if name not in taken)
+    if is_graph:
+        return f"SELECT ag_catalog.alter_graph('{graph}', 'RENAME', '{free}');"
+    return f"ALTER SCHEMA {graph} RENAME TO {free};"
+
+
+def adopt_if_empty(connection: Connection, graph: str) -> None:
+    """Make a graph ours that somebody else made and that has no vertex, edge or other table. Inside
+    a transaction. The rights on its schema stay, unless it has labels: then another one takes its
+    place, because labels get their numbers in the order in which they are made. It is renamed and
+    dropped with the next replay: AGE 1.5 may end a session that drops a graph."""
+    run = statements("graph")
+    row = connection.execute(run["state"], {"graph": graph}).fetchone()
+    if row is None or not row[0] or row[1] or not _is_empty(connection, graph):
+        return
+    if not is_bare(connection, graph) and exists(connection, OLD_GRAPH):
+        return  # its place is taken until the next replay
+    parents = sql.SQL(", ").join(sql.Identifier(graph, parent) for parent in PARENTS)
+    connection.execute(run["lock"].format(tables=parents))
+    if not _is_empty(connection, graph):  # somebody has written to it meanwhile
+        return
+    _use_age(connection)
+    connection.execute(run["mark"].format(graph=sql.Identifier(graph)))
+    if not is_bare(connection, graph):
+        drop_later = {"graph": graph, "new_name": OLD_GRAPH}
+        connection.execute(run["rename_graph"], drop_later)
+        connection.execute(run["create_graph"], {"graph": graph})
+        connection.execute(run["mark"].format(graph=sql.Identifier(graph)))
+
+
+def _is_empty(connection: Connection, graph: str) -> bool:
+    vertices, edges = (sql.Identifier(graph, parent) for parent in PARENTS)
+    query = statements("graph")["is_empty"].format(vertices=vertices, edges=edges)
+    row = connection.execute(query, {"graph": graph}).fetchone()
+    return row is not None and bool(row[0])
+
+
+def is_bare(connection: Connection, graph: str) -> bool:
+    """Whether a graph has no labels but those that every graph has."""
+    return set(_label_ids(connection, graph)) <= set(PARENTS)
+
+
 def create(connection: Connection, graph: str) -> None:
-    """An empty graph with all labels, in the order that gives them their constant ids."""
+    """An empty graph with all labels."""
     _use_age(connection)
     run = statements("graph")
     connection.execute(run["create_graph"], {"graph": graph})
     connection.execute(run["mark"].format(graph=sql.Identifier(graph)))
+    add_labels(connection, graph)
+
+
+def add_labels(connection: Connection, graph: str) -> None:
+    """All labels of a graph that has none, in the order that gives them their constant ids."""
+    _use_age(connection)
+    run = statements("graph")
     for label in LABELS:
         kind = "create_vlabel" if label in VERTEX_LABELS else "create_elabel"
         connection.execute(run[kind], {"graph": graph, "label": label})

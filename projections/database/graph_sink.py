@@ -49,14 +49,18 @@ class GraphSink:
         self._loader: Loader = loader_of(loader)
 
     def ensure(self, connection: Connection) -> bool:
-        """Create an empty graph if there is none. Raises ProjectionMismatch for that of an older
-        version."""
+        """Create an empty graph if there is none, or one without labels. Raises ProjectionMismatch
+        for that of an older version."""
         ensure_extension(connection, "age")
-        if graph_schema.exists(connection, GRAPH):
+        graph_schema.adopt_if_empty(connection, GRAPH)
+        if not graph_schema.exists(connection, GRAPH):
+            graph_schema.create(connection, GRAPH)
+        elif graph_schema.is_bare(connection, GRAPH):
+            graph_schema.add_labels(connection, GRAPH)
+        else:
             graph_schema.refuse_older(connection, GRAPH)
             map_table.refuse_missing(connection)
             return False
-        graph_schema.create(connection, GRAPH)
         graph_schema.index(connection, GRAPH)
         map_table.ensure(connection)
         map_table.replace(connection, [])
@@ -92,13 +96,16 @@ class GraphSink:
             map_table.replace(connection, maps)
 
     def drop_leftovers(self, connection: Connection) -> None:
-        """Drop a replaced graph that a reader held on to; refuse a graph that is not ours.
+        """Drop a replaced graph that a reader held on to; refuse a graph that is not ours, unless
+        it is empty.
 
         Not inside the rebuild's transaction: AGE 1.5 crashes the session that drops a graph after
         it has made another one in the same transaction.
         """
         ensure_extension(connection, "age")
-        graph_schema.exists(connection, GRAPH)
+        with connection.transaction():
+            graph_schema.adopt_if_empty(connection, GRAPH)
+            graph_schema.exists(connection, GRAPH)
         if try_drop_lock(connection, self.name):
             for graph in (OLD_GRAPH, NEXT_GRAPH):
                 with connection.transaction():

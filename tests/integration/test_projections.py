@@ -273,7 +273,6 @@ def test_a_users_own_tables_and_graphs_stay(
     ("statement", "told"),
     mostly_slow(
         [
-            ("SELECT create_graph('semantic_map')", "graph semantic_map that mapfold did not make"),
             ("CREATE SCHEMA semantic_map", "schema semantic_map that mapfold did not make"),
             ("CREATE TABLE public.detection_embeddings (n int)", "table detection_embeddings that"),
             ("CREATE SCHEMA mapfold", "schema mapfold that mapfold did not make"),

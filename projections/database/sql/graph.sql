@@ -47,6 +47,17 @@ SELECT g.name IS NOT NULL, coalesce(obj_description(n.oid, 'pg_namespace'), '')
 FROM pg_namespace n LEFT JOIN ag_catalog.ag_graph g ON g.namespace = n.oid::regnamespace
 WHERE n.nspname = %(graph)s
 
+-- name: is_empty
+-- No vertex and no edge, and nothing in the schema besides the labels' tables.
+SELECT NOT EXISTS (SELECT FROM {vertices}) AND NOT EXISTS (SELECT FROM {edges})
+   AND NOT EXISTS (
+       SELECT FROM pg_class c JOIN pg_namespace n ON n.oid = c.relnamespace
+       WHERE n.nspname = %(graph)s AND c.relkind IN ('r', 'p', 'v', 'm', 'f')
+         AND NOT EXISTS (SELECT FROM ag_catalog.ag_label l WHERE l.relation::oid = c.oid))
+
+-- name: taken_names
+SELECT nspname::text FROM pg_namespace WHERE nspname LIKE %(pattern)s
+
 -- name: create_graph
 SELECT ag_catalog.create_graph(%(graph)s::name)
 

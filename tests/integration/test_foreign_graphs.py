@@ -1,0 +1,119 @@
+"""A graph under our name that somebody else made: adopted if it is empty, else refused with the
+statement that renames it."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import psycopg
+import pytest
+
+from projections.database import rebuild, tail
+from projections.database.check import check
+from projections.database.connection import Targets
+from projections.errors import DatabaseError
+from projections.settings import Settings
+from tests.logs import bridge, walk, write_log
+from tests.rows import all_rows
+
+SETTINGS = Settings()
+LABELS = "SELECT create_vlabel('semantic_map', 'Robot'), create_elabel('semantic_map', 'SAW')"
+VERTEX = """SELECT * FROM cypher('semantic_map', $$ CREATE (:Robot {n: 1}) $$) AS (v agtype)"""
+
+Act = Callable[[Path, Targets], object]
+
+
+def by_replay(log: Path, targets: Targets) -> object:
+    return rebuild(log, targets, SETTINGS)
+
+
+def by_tail(log: Path, targets: Targets) -> object:
+    return tail(log, targets, SETTINGS, once=True)
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    return write_log(tmp_path / "log", walk(30) + list(bridge()))
+
+
+@pytest.fixture
+def rows(log: Path, two_databases: Targets) -> object:
+    """What the databases hold where there was no graph before."""
+    rebuild(log, two_databases, SETTINGS)
+    return all_rows(two_databases)
+
+
+def make(pg: psycopg.Connection, *statements: str) -> None:
+    for statement in ("SELECT create_graph('semantic_map')", *statements):
+        pg.execute(statement)  # type: ignore[arg-type]
+    pg.commit()
+
+
+@pytest.mark.seconds
+@pytest.mark.parametrize("act", [by_replay, by_tail])
+@pytest.mark.parametrize("labels", [(), (LABELS,)], ids=["bare", "with labels"])
+def test_an_empty_graph_is_adopted(
+    log: Path,
+    rows: object,
+    third_database: Targets,
+    labels: tuple[str, ...],
+    act: Act,
+) -> None:
+    with psycopg.connect(third_database.graph_url) as pg:
+        pg.execute("SET search_path = ag_catalog, public")
+        make(pg, *labels)
+    act(log, third_database)
+    assert all_rows(third_database) == rows
+    assert [report.sound for report in check(log, third_database, SETTINGS)] == [True, True]
+    act(log, third_database)
+    assert all_rows(third_database) == rows
+
+
+def test_rights_on_an_empty_graph_are_kept(log: Path, third_database: Targets) -> None:
+    with psycopg.connect(third_database.graph_url) as pg:
+        pg.execute("SET search_path = ag_catalog, public")
+        make(pg, "GRANT USAGE ON SCHEMA semantic_map TO PUBLIC")
+    rebuild(log, third_database, SETTINGS)
+    tail(log, third_database, SETTINGS, once=True)
+    with psycopg.connect(third_database.graph_url) as pg:
+        row = pg.execute("SELECT nspacl::text FROM pg_namespace WHERE nspname = 'semantic_map'")
+        assert "=U/" in str(row.fetchone())
+
+
+@pytest.mark.parametrize("act", [by_replay, by_tail])
+@pytest.mark.parametrize(
+    "statements",
+    [
+        ("SELECT create_graph('semantic_map')", LABELS, VERTEX),
+        ("SELECT create_graph('semantic_map')", "CREATE TABLE semantic_map.mine AS SELECT 1 AS n"),
+        ("SELECT create_graph('semantic_map')", "COMMENT ON SCHEMA semantic_map IS 'of Ann'"),
+        ("CREATE SCHEMA semantic_map", "CREATE SCHEMA semantic_map_1"),
+    ],
+    ids=["vertex", "table", "comment", "schema"],
+)
+def test_what_is_not_empty_is_refused_and_the_statement_renames_it(
+    log: Path, third_database: Targets, statements: tuple[str, ...], act: Act
+) -> None:
+    with psycopg.connect(third_database.graph_url) as pg:
+        pg.execute("LOAD 'age'")
+        pg.execute("SET search_path = ag_catalog, public")
+        for statement in statements:
+            pg.execute(statement)  # type: ignore[arg-type]
+    with pytest.raises(DatabaseError, match="that mapfold did not make; rename it by `") as told:
+        act(log, third_database)
+    (sql,) = re.findall(r"`([^`]*)`", str(told.value))
+    with psycopg.connect(third_database.graph_url) as pg:  # a session that knows nothing of AGE
+        pg.execute(sql)
+    act(log, third_database)
+    assert [report.sound for report in check(log, third_database, SETTINGS)] == [True, True]
+    with psycopg.connect(third_database.graph_url) as pg:
+        names = pg.execute("SELECT nspname::text FROM pg_namespace WHERE nspname ~ '^semantic_'")
+        new_name = re.findall(r"semantic_map_\d", sql)[0]
+        assert {new_name, "semantic_map"} <= {name for (name,) in names}
+        if "cypher" in statements[-1]:
+            pg.execute("LOAD 'age'")
+            found = pg.execute(
+                f"SELECT * FROM ag_catalog.cypher('{new_name}', $$ MATCH (r:Robot) RETURN r.n $$)"  # type: ignore[arg-type]
+                " AS (n ag_catalog.agtype)"
+            )
+            assert found.fetchall() == [("1",)]
