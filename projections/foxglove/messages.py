@@ -99,7 +99,7 @@ class MapTopics:
         return Channel(
             f"{_RECORDED}{key}" if key in _OWN_TOPICS else key,
             message_encoding=form.encoding,
-            schema=schema if form.schema else None,
+            schema=schema,
             context=self._context,
         )
 

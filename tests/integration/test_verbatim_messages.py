@@ -268,6 +268,28 @@ def test_log_cat_and_info_show_what_they_are(mixed: Path) -> None:
     assert "/tf: 60 (cdr tf2_msgs/msg/TFMessage)" in run("log", "info", "log").out
 
 
+def test_a_recording_for_foxglove_has_the_messages_on_their_topics(log_path: Path) -> None:
+    write_mixed(log_path, 40)
+    target = log_path.parent / "out.mcap"
+    run = Commands.in_folder(log_path.parent)
+    run("export", "log", "--foxglove", "out.mcap")
+    topics = {"/tf": "/recorded/tf"}  # that of the mapped robot is there
+    expected = [
+        (topics.get(e.key, e.key), e.format.encoding, e.format.schema, e.payload)
+        for e in mixed_events(40)
+        if isinstance(e, VerbatimEvent)
+    ]
+    with target.open("rb") as file:
+        seen = [
+            (channel.topic, channel.message_encoding, "" if schema is None else schema.name, data)
+            for schema, channel, message in make_reader(file).iter_messages(log_time_order=False)
+            if channel.message_encoding in ("cdr", "jpeg") and (data := message.data) is not None
+        ]
+    assert sorted(seen) == sorted(expected)
+    run("export", "log", "--foxglove", "again.mcap")
+    assert (log_path.parent / "again.mcap").read_bytes() == target.read_bytes()
+
+
 @pytest.mark.parametrize(
     ("topic", "form", "said"),
     [
