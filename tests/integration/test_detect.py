@@ -27,7 +27,7 @@ from tests.commands import Commands
 from tests.fixtures_zenoh import DEADLINE_S, Program
 from tests.tiny_models import MODEL_NAME, fixed_answer, models_for
 
-DRIVEN_S = 24.0
+DRIVEN_S = 14.0
 
 
 class Stage:
@@ -64,8 +64,8 @@ def made(stage: Stage) -> tuple[dict[str, Any], list[dict[str, Any]]]:
 def test_every_picture_is_accounted_for(stage: Stage, made: Any) -> None:
     numbers, envelopes = made
     assert numbers["pictures"] == stage.count == numbers["between"] + numbers["keyframes"]
-    assert numbers["keyframes"] == numbers["published"] == len(envelopes) > 30
-    assert numbers["detections"] == sum(len(e["detections"]) for e in envelopes) > 60
+    assert numbers["keyframes"] == numbers["published"] == len(envelopes) > 20
+    assert numbers["detections"] == sum(len(e["detections"]) for e in envelopes) > 40
     assert numbers["space"] == MODEL_NAME
 
 
@@ -84,7 +84,7 @@ def test_envelopes_are_valid_and_say_what_was_seen(stage: Stage, made: Any) -> N
     truth = truth_of(envelopes, stage.pictures / "truth.jsonl")
     instances = [instance for one in truth for instance in one["instances"]]
     assert sum(i is None for i in instances) <= 0.02 * len(instances)
-    assert len(set(instances)) > 10
+    assert len(set(instances)) > 5
 
 
 def _digest(log: Path) -> str:

@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from onnx import TensorProto
 
+from eventsrc.detector import vision
 from eventsrc.detector.encoder import Encoder, read_preparation
 from eventsrc.detector.finder import COCO, Finder, FinderOptions, read_labels
 from eventsrc.detector.onnx_model import ModelError, OnnxModel
@@ -307,3 +309,16 @@ def test_pixels_are_scaled_channel_by_channel(rgb: bool) -> None:
     for n, c, y, x in np.ndindex(3, 3, 5, 7):
         value = float(pictures[n][y, x, 2 - c if rgb else c]) / 255
         assert out[n, c, y, x] == pytest.approx((value - mean[c]) / std[c], abs=1e-5)
+
+
+def test_a_missing_library_names_the_extra(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = mean_colour_encoder(folder / "extra.onnx")
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(MisuseError, match=r"pip install 'mapfold\[detector\]'"):
+        OnnxModel(model)
+    vision._cv2.cache_clear()
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(MisuseError, match=r"pip install 'mapfold\[detector\]'"):
+        vision.check_installed()
+    monkeypatch.undo()
+    vision.check_installed()
