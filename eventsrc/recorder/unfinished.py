@@ -3,11 +3,14 @@
 A killed recorder may have written a message and not yet what it completes; and detections that
 waited for a pose were not made into an envelope at all. Both follow from the messages in the log
 (`eventsrc.ros.derivation`), so the next recorder makes up for it before it records. It must read
-the last recording's messages once; after a regular end there is nothing to do.
+the last recording's messages once; after a regular end there is nothing to do. A recording that has
+lost events to damage is left as it is.
 """
 
 from collections import deque
 from collections.abc import Iterator
+
+from pydantic import ValidationError
 
 from eventsrc.append import append_payload, map_event
 from eventsrc.envelope import Offset
@@ -18,10 +21,10 @@ from eventsrc.ros.derivation import (
     RosRecording,
     derive,
     identity_of,
-    read_recording,
+    recording_of,
 )
 from eventsrc.ros.library import MessageTypes
-from eventsrc.system_events import MAP_KEY, ROS_KEY
+from eventsrc.system_events import LOSS_KEY, MAP_KEY, ROS_KEY, Loss
 
 
 def append_missing(reader: LogReader, writer: LogWriter, types: MessageTypes) -> int:
@@ -32,7 +35,7 @@ def append_missing(reader: LogReader, writer: LogWriter, types: MessageTypes) ->
         last = event
     if last is None:
         return 0
-    recording = read_recording(last.payload)
+    recording = recording_of(last)
     if not recording.streams:
         return 0
     missing = _missing(reader, Offset(last.offset), types)
@@ -59,10 +62,13 @@ def message_of(event: Event) -> tuple[str, str] | None:
 def _missing(reader: LogReader, start: Offset, types: MessageTypes) -> list[Derived]:
     made: dict[tuple[str, int] | None, Derived] = {}
     maps: deque[Derived] = deque()
+    has_losses = False
 
     def watched() -> Iterator[Event]:
         """The events; what is found among them is taken out of what was made."""
+        nonlocal has_losses
         for event in reader.read(start):
+            has_losses = has_losses or _is_rot(event)
             if event.key == MAP_KEY and maps:
                 maps.popleft()
             elif event.is_envelope:
@@ -74,4 +80,15 @@ def _missing(reader: LogReader, start: Offset, types: MessageTypes) -> list[Deri
             maps.append(derived)
         else:
             made[identity_of(derived.payload)] = derived
-    return [*maps, *made.values()]
+    return [] if has_losses else [*maps, *made.values()]
+
+
+def _is_rot(event: Event) -> bool:
+    """Whether it stands for a lost event; if that was a message, keyframes behind it would be
+    numbered anew."""
+    if event.key != LOSS_KEY:
+        return False
+    try:
+        return Loss.model_validate_json(event.payload).cause == "rot"
+    except ValidationError:
+        return False

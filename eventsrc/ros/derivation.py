@@ -168,7 +168,7 @@ def derive(
         if event.key == ROS_KEY:
             if derivation is not None:
                 yield from (DerivedFrom(None, each) for each in derivation.finish())
-            recording = _recording_of(event)
+            recording = recording_of(event)
             derivation = Derivation(recording, types) if recording.streams else None
         elif derivation is not None and (found := message_of(event)) is not None:
             made = derivation.add(event.key, *found, event.logged_ns, event.payload)
@@ -177,7 +177,8 @@ def derive(
         yield from (DerivedFrom(None, each) for each in derivation.finish())
 
 
-def _recording_of(event: LoggedEvent) -> RosRecording:
+def recording_of(event: LoggedEvent) -> RosRecording:
+    """The content of an event on ``mapfold/ros``. Raises LogDamaged."""
     try:
         return read_recording(event.payload)
     except ValidationError as error:

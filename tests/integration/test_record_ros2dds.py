@@ -15,7 +15,7 @@ import pytest
 import zenoh
 
 from eventsrc.envelope import FIRST_OFFSET
-from eventsrc.errors import MisuseError
+from eventsrc.errors import LogDamaged, MisuseError
 from eventsrc.gap_history import ledger_of
 from eventsrc.importers import import_files
 from eventsrc.log import (
@@ -36,7 +36,7 @@ from eventsrc.recorder.unfinished import append_missing, message_of
 from eventsrc.ros.assembler import Assembled, Assembler, RosMessage
 from eventsrc.ros.bridge_keys import token_selectors, topic_of, type_of_token
 from eventsrc.ros.derivation import RosRecording, derive, read_recording
-from eventsrc.system_events import MAP_KEY, REJECTED_KEY, ROS_KEY
+from eventsrc.system_events import LOSS_KEY, MAP_KEY, REJECTED_KEY, ROS_KEY, Loss
 from eventsrc.transport.session import Session, ZenohOptions, open_session
 from projections.cli.bridged import NOTHING, recording_of
 from projections.model.digest import map_digest
@@ -381,6 +381,27 @@ def test_a_killed_recording_is_completed_by_the_next(tmp_path: Path) -> None:
         assert sorted(ready) == sorted(
             e.payload for e in after if e.is_envelope or e.key == MAP_KEY
         )
+
+
+def test_a_damaged_recording_is_not_completed(tmp_path: Path) -> None:
+    how, _ = recording_of(choice(), 0, None)
+    form = MessageFormat("cdr", BOXES, "ros2msg", TYPES.definition(BOXES).encode())
+    picture = TYPES.encode(drive(1)[3][1], BOXES)
+    loss = Loss(publisher="log", first=1, last=1, count=1, cause="rot").model_dump_json().encode()
+    for lost, made in ((False, 1), (True, 0)):
+        with LogWriter(tmp_path / f"log-{lost}") as writer:
+            writer.append(ROS_KEY, how.encode())
+            if lost:
+                writer.append(LOSS_KEY, loss)
+            writer.append("/detections", picture, form=form)
+            writer.sync()
+            with LogReader(writer.path) as reader:
+                assert append_missing(reader, writer, TYPES) == made
+                writer.append(ROS_KEY, b"{}")
+                writer.sync()
+                reader.refresh()
+                with pytest.raises(LogDamaged, match="cannot be read"):
+                    append_missing(reader, writer, TYPES)
 
 
 def test_a_run_that_goes_on_counts_on(log_path: Path, endpoint: str, connected: Sessions) -> None:
