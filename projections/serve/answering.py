@@ -100,6 +100,8 @@ class RepeatFilter:
 
 MAX_TOP: Final = 100
 DEFAULT_RADIUS_M: Final = 3.0
+STATES: Final = {"places": places_near, "objects": objects_near}
+"""What can be asked for near a pose, and the function that finds it."""
 MAX_METRES: Final = 1e8
 """Ten times as far as a pose may be from the origin."""
 DEFAULT_MAX_BYTES: Final = 1_000_000
@@ -161,10 +163,10 @@ class Answerer:
 
     def state(self, what: str, options: Mapping[str, str]) -> dict[str, Any]:
         """``places`` or ``objects`` near a pose: x, y and radius in metres."""
-        near = {"places": places_near, "objects": objects_near}.get(what)
+        near = STATES.get(what)
         if near is None:
             raise QuestionError(
-                f"no state called {describe_value(what)}; there are places and objects"
+                f"no state called {describe_value(what)}; there are {' and '.join(STATES)}"
             )
         x, y = _number(options, "x"), _number(options, "y")
         radius = _number(options, "radius", DEFAULT_RADIUS_M)

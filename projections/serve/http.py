@@ -5,25 +5,34 @@ threads of the `FairQueue` answer them, because database access is synchronous.
 """
 
 import asyncio
+import base64
+import struct
 from collections.abc import Callable
 from typing import Any, get_args
 
-from fastapi import FastAPI, Query, Request
+from fastapi import FastAPI, Path, Query, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from eventsrc.errors import MapfoldError
 from projections.errors import QuestionError
 from projections.relocalize import Method, describe_value, question_schema
 
-from .answering import DEFAULT_RADIUS_M, MAX_TOP, Answerer, TooMuchError, encode, refusal
+from .answering import DEFAULT_RADIUS_M, MAX_TOP, STATES, Answerer, TooMuchError, encode, refusal
 from .connections import peer_of
 from .fair_queue import FairQueue
 from .sessions import MAX_NAME
 
-_CROP = {"class": "cup", "bbox": [120, 80, 250, 310], "embedding": "<base64>"}
+_EMBEDDING = base64.b64encode(struct.pack("<512f", 1.0, *[0.0] * 511)).decode()
+_CROP = {
+    "class": "cup",
+    "bbox": [120, 80, 250, 310],
+    "embedding": _EMBEDDING,
+    "embedding_dim": 512,
+}
 _EXAMPLES = {
     "one picture": {"value": {"crops": [_CROP]}},
     "a robot that turned a quarter to the left between two pictures": {
@@ -80,6 +89,7 @@ def create_app(answerer: Answerer, queue: FairQueue) -> FastAPI:
         redirect_slashes=False,
     )
     _add_error_handlers(app)
+    app.add_middleware(HeadLikeGet)
 
     async def answered(request: Request, work: Callable[[], dict[str, Any]]) -> Response:
         peer = "" if request.client is None else peer_of(request.client.host)
@@ -92,7 +102,7 @@ def create_app(answerer: Answerer, queue: FairQueue) -> FastAPI:
     async def relocalize(
         request: Request,
         top: int | None = Query(None, ge=1, le=MAX_TOP),
-        method: str | None = None,
+        method: str | None = Query(None, json_schema_extra={"enum": list(get_args(Method))}),
         session: str | None = Query(None, description="Track the questions of this name."),
     ) -> Response:
         payload = await read_body(request, answerer.max_bytes)
@@ -102,7 +112,11 @@ def create_app(answerer: Answerer, queue: FairQueue) -> FastAPI:
 
     @app.get("/state/{what}", summary="places or objects near a pose, nearest first")
     async def state(
-        request: Request, what: str, x: float, y: float, radius: float = DEFAULT_RADIUS_M
+        request: Request,
+        x: float,
+        y: float,
+        what: str = Path(json_schema_extra={"enum": [*STATES]}),
+        radius: float = DEFAULT_RADIUS_M,
     ) -> Response:
         options = {"x": str(x), "y": str(y), "radius": str(radius)}
         return await answered(request, lambda: answerer.state(what, options))
@@ -112,6 +126,26 @@ def create_app(answerer: Answerer, queue: FairQueue) -> FastAPI:
         return await answered(request, answerer.health)
 
     return app
+
+
+class HeadLikeGet:
+    """ASGI middleware that answers HEAD as GET is answered, without the body."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request."""
+        if scope["type"] != "http" or scope["method"] != "HEAD":
+            await self._app(scope, receive, send)
+            return
+
+        async def send_without_body(message: Message) -> None:
+            if message["type"] == "http.response.body":
+                message = {**message, "body": b""}
+            await send(message)
+
+        await self._app({**scope, "method": "GET"}, receive, send_without_body)
 
 
 def _add_error_handlers(app: FastAPI) -> None:

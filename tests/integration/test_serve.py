@@ -7,9 +7,11 @@ import sys
 import threading
 import time
 import urllib.error
+import urllib.parse
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
 
@@ -352,6 +354,36 @@ class TestHttp:
         assert (status, document["error"]["kind"]) == (404, "bad_question")
         status, document = fetch(f"{http}/relocalize")
         assert (status, document["error"]["kind"]) == (405, "bad_question")
+
+    def test_its_description_names_what_a_path_and_an_option_may_be(self, http: str) -> None:
+        _, document = fetch(f"{http}/openapi.json")
+        (what, *_) = (
+            parameter
+            for parameter in document["paths"]["/state/{what}"]["get"]["parameters"]
+            if parameter["name"] == "what"
+        )
+        assert what["schema"]["enum"] == ["places", "objects"]
+        for name in what["schema"]["enum"]:
+            assert list(fetch(f"{http}/state/{name}?x=0&y=0")[1]) == [name]
+        status, refused = fetch(f"{http}/state/rooms?x=0&y=0")
+        assert (status, refused["error"]["kind"]) == (400, "bad_question")
+
+    @pytest.mark.parametrize(
+        "path", ["/health", "/state/places?x=0&y=0", "/openapi.json", "/state/rooms?x=0&y=0"]
+    )
+    def test_head_is_answered_like_get_without_the_body(self, http: str, path: str) -> None:
+        address = urllib.parse.urlsplit(http).netloc
+        said = []
+        for method in ("GET", "HEAD"):
+            connection = HTTPConnection(address, timeout=DEADLINE_S)
+            with closing(connection):
+                connection.request(method, path)
+                answer = connection.getresponse()
+                headers = {k: v for k, v in answer.getheaders() if k.lower() != "date"}
+                said.append((answer.status, headers, len(answer.read())))
+        get, head = said
+        assert head[:2] == get[:2]
+        assert (head[2], get[2] > 0) == (0, True)
 
     def test_it_describes_no_refusal_that_it_never_gives(self, http: str) -> None:
         _, document = fetch(f"{http}/openapi.json")

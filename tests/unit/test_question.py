@@ -109,8 +109,7 @@ def test_the_schema_holds_what_is_read() -> None:
         "det_id",
     }
     for form in http._EXAMPLES.values():
-        document = json.loads(json.dumps(form["value"]).replace("<base64>", BASE64))
-        assert read_question(document).crops
+        assert read_question(json.loads(json.dumps(form["value"]))).crops
 
 
 def test_the_service_says_what_else_it_reads() -> None:
