@@ -27,6 +27,7 @@ MAX_MESSAGE_BYTES: Final = 64 * 1024 * 1024
 _ROS2_PROFILE: Final = b"\x04\0\0\0ros2"
 _PROFILE_AT: Final = len(MCAP_MAGIC) + 9
 _METADATA: Final = "metadata.yaml"
+_SQLITE_SUFFIX: Final = ".db3"
 _FILE_OF_A_BAG: Final = re.compile(r".*\.(db3|mcap)(\.zstd)?", re.DOTALL)
 _SEGMENT_OF_A_LOG: Final = re.compile(r"\d{20}\.mcap")
 
@@ -261,11 +262,16 @@ class _SqlitePart:
             path = self.path
             if self._compressed:
                 folder = self._files.enter_context(tempfile.TemporaryDirectory())
-                path = Path(folder, path.name.removesuffix(".zstd"))
+                path = Path(folder, f"bag{_SQLITE_SUFFIX}")
                 with self.path.open("rb") as packed, path.open("wb") as plain:
                     zstandard.ZstdDecompressor().copy_stream(packed, plain)
             else:
                 _refuse_unwritten(path)
+                if path.suffix != _SQLITE_SUFFIX or any(mark in str(path) for mark in "?#%"):
+                    # rosbags goes by the suffix, and makes a URI of the path as it stands
+                    folder = self._files.enter_context(tempfile.TemporaryDirectory())
+                    path = Path(folder, f"bag{_SQLITE_SUFFIX}")
+                    path.symlink_to(self.path.resolve())
             self._bag = SqliteBag(path)
             self._files.callback(self._bag.close)
         return self._bag

@@ -17,6 +17,7 @@ from projections.model.digest import map_digest
 from projections.model.fold import fold_log
 from projections.settings import Settings
 from tests import ros_messages as ros
+from tests.commands import Commands
 from tests.fixtures_log import read_log
 from tests.ros_bags import RUN, Drive, Raw, write_bag
 from tests.ros_messages import SECOND, START, flat
@@ -53,14 +54,22 @@ def envelopes(log: Path) -> list[Any]:
     return [json.loads(e.payload) for e in read_log(log) if not e.key.startswith("mapfold/")]
 
 
-def same_map_as_json_lines(drive: Drive, bag: Path, tmp_path: Path) -> None:
+BOTH_RULES: tuple[tuple[str, ...], ...] = ((), ("fusion=evidence", "places=rooms"))
+
+
+def same_map_as_json_lines(
+    drive: Drive,
+    bag: Path,
+    tmp_path: Path,
+    rules: tuple[tuple[str, ...], ...] = BOTH_RULES,
+) -> None:
     lines = tmp_path / "lines.jsonl"
     lines.write_bytes(b"\n".join(drive.envelopes(RUN)))
     assert imported(tmp_path / "lines", lines).rejected == 0
     report = imported(tmp_path / "bag", bag)
     assert (report.accepted, report.rejected) == (drive.pictures, 0)
     assert envelopes(tmp_path / "bag") == envelopes(tmp_path / "lines")
-    for settings in ((), ("fusion=evidence", "places=rooms")):
+    for settings in rules:
         assert digest(tmp_path / "bag", *settings) == digest(tmp_path / "lines", *settings)
 
 
@@ -82,9 +91,9 @@ def test_a_bag_gives_the_map_of_the_same_detections_as_json_lines(
 @pytest.mark.slow
 @pytest.mark.parametrize("storage", ["mcap", "sqlite"])
 def test_ten_thousand_messages_give_the_map_of_json_lines(storage: str, tmp_path: Path) -> None:
-    drive = Drive(10_000, dim=64)
+    drive = Drive(10_000)
     bag = write_bag(tmp_path / "drive", drive.messages(), storage)
-    same_map_as_json_lines(drive, bag, tmp_path)
+    same_map_as_json_lines(drive, bag, tmp_path, ((),))
 
 
 def test_the_report_says_what_was_used_and_what_was_not(
@@ -338,6 +347,19 @@ def test_what_is_no_bag_whatever_its_name_is_refused(tmp_path: Path) -> None:
         imported(tmp_path / "log", bag)
 
 
+def test_a_database_is_known_by_its_content_whatever_its_path(
+    drives: dict[str, Path], tmp_path: Path
+) -> None:
+    (file,) = drives["sqlite none"].glob("*.db3")
+    odd = tmp_path / "100%41? #1"
+    odd.mkdir()
+    for number, name in enumerate(("drive_0.sqlite", "drive_0.db3", "drive")):
+        shutil.copy(file, odd / name)
+        log = tmp_path / f"log{number}"
+        assert imported(log, odd / name).accepted == DRIVE.pictures
+        assert envelopes(log)[0]["run_id"] == RUN
+
+
 def test_messages_that_were_not_written_into_the_database_are_not_passed_over(
     drives: dict[str, Path], tmp_path: Path
 ) -> None:
@@ -413,3 +435,56 @@ def test_very_many_transforms_a_second_are_read_in_bounded_memory(tmp_path: Path
     )
     assert report.accepted == 1
     assert report.bags[0].streams["/detections"].without_pose == 0
+
+
+# The command
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Commands:
+    """Commands in an empty folder."""
+    return Commands.in_folder(tmp_path)
+
+
+def test_the_command_says_what_it_took_for_what(run: Commands) -> None:
+    messages = [*Drive(3).messages()]
+    other = [(f"/other{n:02}", START, ros.text("x")) for n in range(12)]
+    write_bag(run.folder / "drive", [*messages, *other], "sqlite")
+    said = run("import", "log", "drive")
+    lines = said.err.splitlines()
+    assert lines[0] == "drive: 25 messages of 17 topics, 0.4 s"
+    assert [line.split() for line in lines[1:3]] == [
+        ["/camera_info", "1", "sensor_msgs/msg/CameraInfo:", "camera"],
+        ["/detections", "3", "vision_msgs/msg/Detection2DArray:", "keyframes", "of", "run", RUN],
+    ]
+    assert "  … and 2 more topics that are not used" in lines
+    assert lines[-1].startswith("imported 3 envelopes into log, offsets 0 to 2, 12 messages")
+    document = run("import", "other", "drive", "--json").json
+    assert document["bags"][0]["streams"]["/detections"]["keyframes"] == 3
+    assert document["accepted"] == 3
+
+
+def test_the_command_exits_with_3_for_nothing_and_2_for_a_wrong_option(run: Commands) -> None:
+    write_bag(run.folder / "empty", [])
+    said = run("import", "log", "empty", code=3)
+    assert "note: nothing to import: no topic is of type" in said.err
+    write_bag(run.folder / "drive", Drive(2).messages())
+    for options, told in (
+        (["--detections", "/x"], "--detections /x"),
+        (["--topic", "/detections"], "--topic does not choose what is used of a bag"),
+        (["--max-gap", "0"], "--max-gap 0"),
+        (["--max-gap", "nan"], "--max-gap nan"),
+        (["--run-id", ""], "--run-id"),
+        (["--labels", "none.txt"], "--labels none.txt: No such file"),
+    ):
+        assert told in run("import", "log", "drive", *options, code=2).err
+
+
+def test_numbered_classes_get_the_names_of_a_file(run: Commands) -> None:
+    seen = [ros.detection([(name, 0.9)], ros.box(9, 9, 2, 2)) for name in ("0", "2", "7")]
+    shown = ("/detections", START, ros.detections(START, "camera", *seen))
+    write_bag(run.folder / "drive", [shown])
+    (run.folder / "names.txt").write_text("person\n\nbicycle \n")
+    run("import", "log", "drive", "--labels", "names.txt")
+    (made,) = envelopes(run.folder / "log")
+    assert [each["class"] for each in made["detections"]] == ["person", "bicycle", "7"]
