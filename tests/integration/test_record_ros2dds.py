@@ -18,6 +18,7 @@ from eventsrc.envelope import FIRST_OFFSET
 from eventsrc.errors import LogDamaged, MisuseError
 from eventsrc.gap_history import ledger_of
 from eventsrc.importers import import_files
+from eventsrc.importers.bag_streams import BagOptions
 from eventsrc.log import (
     Event,
     LogReader,
@@ -48,6 +49,7 @@ from tests.fixtures_log import KEY, read_log
 from tests.fixtures_zenoh import DEADLINE_S, LONG_LEASE, MAPFOLD, Program
 from tests.recorders import Running
 from tests.ros2dds_drive import BOXES, KINDS, LATCHED, TF, Sent, drive
+from tests.ros_bags import write_bag
 from tests.ros_messages import (
     SECOND,
     START,
@@ -207,6 +209,28 @@ def test_the_map_is_that_of_the_envelopes_alone(
     with LogReader(log_path) as reader:
         view = fold_log(reader, Settings())[1]
     assert len(view.places) >= 2
+
+
+def test_a_bag_of_the_same_messages_makes_the_same_envelopes_and_map(
+    log_path: Path, tmp_path: Path, endpoint: str, connected: Sessions
+) -> None:
+    sent = drive(25)
+    with (
+        ros2dds.bridge(endpoint) as bridge,
+        recording(connected(), log_path, new_bridge()) as running,
+    ):
+        announce_all(bridge)
+        send_all(bridge, sent)
+        running.wait_until(lambda r: r.messages >= len(sent))
+    times = range(START, START + len(sent))
+    bag = write_bag(tmp_path / "bag", [(t, n, m) for n, (t, m) in zip(times, sent, strict=True)])
+    with LogWriter(tmp_path / "of-bag") as writer:
+        import_files(writer, [str(bag)], bags=BagOptions(run_id="drive"))
+    imported = read_log(tmp_path / "of-bag")
+    assert [e.payload for e in envelopes(imported)] == [
+        e.payload for e in envelopes(read_log(log_path))
+    ]
+    assert digest(tmp_path / "of-bag") == digest(log_path)
 
 
 @pytest.mark.parametrize("old", [False, True])
