@@ -149,18 +149,24 @@ class Bag:
     def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
         """The messages of these topics, file by file. Raises MapfoldError where a file is
         damaged."""
+        has_any = False
         for at, part in enumerate(self._parts):
             self._at = at
             try:
                 for message in part.messages(topics):
+                    has_any = True
                     if message.payload.startswith(ZSTD_MAGIC):
                         yield message._replace(payload=_decompressed(message.payload))
                     else:
                         yield message
             except _DAMAGE as error:
+                before = (
+                    "what was made of the messages before it is in the log"
+                    if has_any
+                    else "no message before it could be read"
+                )
                 raise MapfoldError(
-                    f"{visible(str(part.path))}: {visible(str(error))}; what was made of the "
-                    "messages before it is in the log"
+                    f"{visible(str(part.path))}: {visible(str(error))}; {before}{part.advice}"
                 ) from None
         self._at = len(self._parts)
 
@@ -172,6 +178,8 @@ class _Part(Protocol):
     """One file of a bag."""
 
     path: Path
+    advice: str
+    """How more of a damaged file may be saved."""
 
     def look(self, contents: BagContents, sampled: Sampled) -> None: ...
 
@@ -182,6 +190,8 @@ class _Part(Protocol):
 
 class _McapPart:
     """An MCAP file, also a compressed one; checked as `eventsrc.log.foreign_mcap` does."""
+
+    advice = ""
 
     def __init__(self, path: Path, *, compressed: bool) -> None:
         self.path = path
@@ -222,6 +232,8 @@ class _McapPart:
 
 class _SqlitePart:
     """An SQLite file, opened at the first use."""
+
+    advice = "; `sqlite3 OLD .recover | sqlite3 NEW.db3` may save more"
 
     def __init__(self, path: Path, files: ExitStack, *, compressed: bool) -> None:
         self.path = path

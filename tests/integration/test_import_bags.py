@@ -297,9 +297,11 @@ def test_a_bag_cut_off_at_any_place_gives_what_was_before_it(
         bag.mkdir(parents=True)
         (bag / "drive_0.mcap").write_bytes(whole[:size])
         log = tmp_path / str(number) / "log"
-        with pytest.raises(MapfoldError, match="what was made of the messages before it"):
+        with pytest.raises(MapfoldError) as damage:
             imported(log, bag)
         found = envelopes(log)
+        before = "what was made of the messages before it is in the log"
+        assert (before if found else "no message before it could be read") in str(damage.value)
         assert found == [json.loads(e) for e in DRIVE.envelopes(RUN)][: len(found)]
         assert len(found) == DRIVE.pictures or number > 0
 
