@@ -143,7 +143,11 @@ def _command(words: tuple[str, ...]) -> tuple[Any, tuple[str, ...]]:
     from . import command_line  # it imports this module
 
     command: Any = typer.main.get_command(command_line([words[0]]))
-    at = 0
-    while at < len(words) and hasattr(command, "commands"):
-        command, at = command.commands[words[at]], at + 1
-    return command, words[at:]
+    rest = words
+    while rest and hasattr(command, "commands"):
+        at = 0 if rest[0] in command.commands else 1  # `edit` takes the log first
+        if rest[at : at + 1] and rest[at] in command.commands:
+            command, rest = command.commands[rest[at]], (*rest[:at], *rest[at + 1 :])
+        else:
+            break
+    return command, rest

@@ -9,6 +9,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from eventsrc.advised import advised
 from eventsrc.detector.encoder import Encoder, read_preparation
 from eventsrc.detector.onnx_model import Device, OnnxModel
 from eventsrc.detector.picture import PictureError, Pixels
@@ -125,10 +126,8 @@ def _report(log: Path, encoder: Path, done: Reembedding) -> None:
         parts += [f"{count:,} {what}"] if count else []
     say(f"{log}: {counted(done.detections, 'detection')}: {', '.join(parts)}")
     if done.stopped:
-        say(
-            f"{log}: interrupted, and no map has these yet; go on with: mapfold reembed {log}"
-            f" --encoder {encoder}"
-        )
+        again = advised("reembed", log, "--encoder", encoder)
+        say(f"{log}: interrupted, and no map has these yet; go on with: {visible(again)}")
     elif done.command is not None:
         say(f"{log}: in force by the command at offset {done.command}")
 

@@ -4,6 +4,7 @@ that they name."""
 from collections.abc import Mapping
 from typing import Final
 
+from eventsrc.advised import advised
 from eventsrc.text import counted, visible
 from projections.settings import Settings
 
@@ -22,8 +23,8 @@ def space_advice(view: MapView) -> str | None:
     if any(o.embedding_crc is not None and not o.foreign_space for o in view.observations):
         return None
     return (
-        f"no detection has a vector of space {visible(model)}, so there are no Objects; `mapfold"
-        " log spaces` lists the spaces of a log"
+        f"no detection has a vector of space {visible(model)}, so there are no Objects; the log's"
+        f" spaces: `{visible(advised('log', 'spaces'))}`"
     )
 
 
