@@ -29,7 +29,7 @@ int32 sec
 uint32 nanosec
 """
 MAX_CROP_BYTES: Final = 1024 * 1024
-"""Bound of a crop's JPEG; one of 640 × 400 pixels takes 60 kB."""
+"""Bound of a crop's JPEG."""
 _HEAD: Final = b"\0\1\0\0"
 _JPEG_START: Final = b"\xff\xd8\xff"
 _JPEG_END: Final = b"\xff\xd9"
