@@ -56,6 +56,7 @@ def test_constants_are_printed_with_their_priors_and_what_they_rest_on(mapfold: 
     assert mapfold("edits", "log", "--json").json == []
 
 
+@pytest.mark.slow
 def test_json_names_constants_as_set_takes_them(mapfold: Commands) -> None:
     found = mapfold("calibrate", "log", "--json", *BY_EVIDENCE).json
     assert (found["keyframes"], found["things"], found["runs"]) == (2 * COUNT, 6, 2)

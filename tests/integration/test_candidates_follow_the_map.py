@@ -51,6 +51,7 @@ def agree(log: Path, reader: CandidateReader) -> MapConstants:
     return index.constants
 
 
+@pytest.mark.slow
 def test_an_open_reader_follows_tail_and_refold(
     tmp_path: Path, documents: list[dict[str, Any]], targets: Targets
 ) -> None:
@@ -203,6 +204,6 @@ def test_settings_of_another_version_are_refused(
         connection.execute("""UPDATE mapfold.checkpoint SET settings = '{"magic": 1}'""")
     with (
         CandidateReader(one_database) as reader,
-        pytest.raises(ProjectionMismatch, match="run `mapfold replay LOG"),
+        pytest.raises(ProjectionMismatch, match="run `mapfold replay`"),
     ):
         reader.candidates(questions()[0])

@@ -180,7 +180,9 @@ def test_cypher_without_the_extension(bare_pg_url: str) -> None:
 
 
 def test_a_question_to_a_database_without_a_projection(bare_pg_url: str) -> None:
-    with pytest.raises(ExtensionMissing, match=r"nothing has been projected .*; run mapfold"):
+    with pytest.raises(
+        ExtensionMissing, match=r"nothing has been projected .*; run `mapfold replay`"
+    ):
         CandidateReader(Targets(bare_pg_url, bare_pg_url))
 
 

@@ -92,6 +92,7 @@ def test_the_scores_have_their_shape_and_sense(scores: Any) -> None:
         assert 0.0 < column["known_ece_floor"] < 0.2
 
 
+@pytest.mark.slow
 def test_a_pose_may_lie_in_a_room_the_map_never_entered(
     mapfold: Commands, runs: list[str], scores: Any
 ) -> None:

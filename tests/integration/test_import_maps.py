@@ -161,7 +161,7 @@ def test_grids_in_cdr_of_an_mcap_file_become_maps(run: Commands) -> None:
         in said.err
     )
     assert "2 maps" in said.err
-    assert "1 message of other encodings passed over" in said.err
+    assert "passed over: /t1: 1 message, cdr sensor_msgs/msg/LaserScan" in said.err
     events = read_log(run.folder / "L")
     assert [event.key for event in events] == [MAP_KEY, REJECTED_KEY, MAP_KEY]
     assert {decode_map(events[n].payload).digest() for n in (0, 2)} == {given.digest()}

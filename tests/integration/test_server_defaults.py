@@ -203,7 +203,7 @@ def test_a_writer_cannot_change_the_dimension_and_names_who_can(
     create = sql.SQL("CREATE ROLE {} LOGIN IN ROLE mapfold_writer")
     superuser.execute(create.format(sql.Identifier(WRITER)))
     write_log(log, walk(10))
-    with pytest.raises(DatabaseError, match=r"8 dimensions, .* for 512, .* mapfold replay"):
+    with pytest.raises(DatabaseError, match=r"8 dimensions, .* for 512, .* `mapfold replay`"):
         tail(log, writer, SETTINGS, once=True)
     rebuild(log, owner, SETTINGS)
     rows = all_rows(owner)
