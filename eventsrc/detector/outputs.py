@@ -144,7 +144,7 @@ class CropSender:
             if not self._told:
                 self._note(
                     f"crops are lost: nobody is subscribed to {self._prefix}/*;"
-                    f" a recorder keeps them, unless its --crops says otherwise"
+                    " a recorder keeps them, unless its --crops says otherwise"
                 )
             self._told = True
             return False

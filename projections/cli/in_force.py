@@ -139,15 +139,16 @@ def _without_password(url: str) -> str:
 
 @lru_cache(maxsize=64)
 def _command(words: tuple[str, ...]) -> tuple[Any, tuple[str, ...]]:
-    """The click command that ``words`` begin with, and the words after its name."""
+    """The click command that ``words`` begin with, and the other words: after its name, and the
+    arguments of the group that it is in, as in ``edit LOG undo``."""
     from . import command_line  # it imports this module
 
     command: Any = typer.main.get_command(command_line([words[0]]))
-    rest = words
-    while rest and hasattr(command, "commands"):
-        at = 0 if rest[0] in command.commands else 1  # `edit` takes the log first
-        if rest[at : at + 1] and rest[at] in command.commands:
-            command, rest = command.commands[rest[at]], (*rest[:at], *rest[at + 1 :])
-        else:
+    before: tuple[str, ...] = ()
+    while hasattr(command, "commands"):
+        arguments = sum(param.param_type_name == "argument" for param in command.params)
+        before, words = before + words[:arguments], words[arguments:]
+        if not words or words[0] not in command.commands:
             break
-    return command, rest
+        command, words = command.commands[words[0]], words[1:]
+    return command, before + words

@@ -15,6 +15,7 @@ import typer
 from eventsrc.advised import advised, complete_by
 from eventsrc.log import LogWriter
 from projections.cli import COMMANDS, command_line
+from projections.cli.in_force import _command, _without_password
 from projections.database.connection import Targets
 from tests.commands import Commands, Said
 from tests.envelopes import envelope, payload
@@ -80,6 +81,7 @@ def test_each_advised_command_exists_and_takes_its_words(place: str, call: ast.C
     if words[0] == "X":  # a name that its caller gives
         return
     assert words[0] in COMMANDS, place
+    _command(tuple(map(str, words)))  # what it is completed by
     command: Any = typer.main.get_command(command_line([words[0]]))
     names = list(words)
     while hasattr(command, "commands") and names and names[0] in command.commands:
@@ -178,6 +180,15 @@ def test_advice_on_a_command_of_a_later_version_shows_the_map_before_it(run: Com
     assert run(*words, "--digest").out
 
 
+def test_advice_on_a_conflict_takes_the_other_command_back(run: Commands) -> None:
+    places = ("run-a_p0", "run-a:39", "--reason", "two rooms", *OWN)
+    run("edit", LOG, "keep-apart", *places, "--command-id", "c c")
+    (words,) = told(run("edit", LOG, "join", *places, code=2))
+    assert words == ["edit", LOG, "undo", "c c", "--reason", "WHY", *OWN]
+    run(*words)
+    run("edit", LOG, "join", *places)
+
+
 def test_settings_without_a_log_are_advised_with_the_settings(run: Commands) -> None:
     (words,) = told(run("relocalize", "question.json", *OWN, code=2))
     assert words == ["replay", "LOG", *OWN]
@@ -205,8 +216,6 @@ def test_what_db_check_advises_repairs_under_the_same_settings_and_databases(
 
 
 def test_a_password_is_not_in_advice(run: Commands) -> None:
-    from projections.cli.in_force import _without_password
-
     url = "postgresql://ann:s3cret@h:5433/maps?application_name=x"
     assert "s3cret" not in _without_password(url)
     assert "port=5433" in _without_password(url)
