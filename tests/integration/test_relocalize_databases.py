@@ -149,7 +149,9 @@ def test_graph_and_vectors_of_different_origin_are_refused(
     rebuild(log, found, SETTINGS, only="graph")
     rebuild(second, found, settings, only="vectors")
     said = {"log": "the graph from log", "settings": "with other settings than the graph"}[other]
-    with pytest.raises(ProjectionMismatch, match=rf"{said}.* run `mapfold replay LOG") as told:
+    with pytest.raises(
+        ProjectionMismatch, match=rf"{said}.* run `mapfold replay` without --only"
+    ) as told:
         relocalize(found, next(questions()))
     assert len(str(told.value).splitlines()) == 1
     rebuild(second, found, settings, only="graph")
