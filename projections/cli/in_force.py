@@ -24,6 +24,8 @@ _CARRIED: Final = (
 )
 """In the order in which they are added."""
 _DATABASES: Final = frozenset({"--db", "--vector-db"})
+_ANSWERS_OTHERS: Final = frozenset({"serve", "ui"})
+"""Commands whose messages go to other machines too, which are not told where the databases are."""
 _LOG: Final = "log"
 _CONTEXT: Final = "running_context"
 
@@ -79,8 +81,11 @@ def _complete(words: Sequence[str], without: Collection[str]) -> list[str]:
         added.append(str(_log_of(context) or "LOG"))
     known = {option for param in command.params for option in param.opts}
     given = {param.opts[-1]: param.name for param in context.command.params}
+    left_out = {*words, *without}
+    if context.info_name in _ANSWERS_OTHERS:
+        left_out |= _DATABASES
     for option in _CARRIED:
-        wanted = option in known & given.keys() and option not in {*words, *without}
+        wanted = option in known & given.keys() and option not in left_out
         if wanted and _is_given(context, given[option]):
             added += _as_words(option, context.params[given[option]])
     return added
