@@ -167,7 +167,7 @@ def base64_of(vector_: Sequence[float]) -> str:
 def embeddings(ns: int, vectors: Any, model: str | None = "m") -> Any:
     """As JSON; ``vectors`` are a list, or a dict by Detection2D.id."""
     given = (
-        {name: base64_of(each) for name, each in vectors.items()}
+        {name: None if each is None else base64_of(each) for name, each in vectors.items()}
         if isinstance(vectors, dict)
         else [None if each is None else base64_of(each) for each in vectors]
     )

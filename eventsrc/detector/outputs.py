@@ -3,7 +3,7 @@
 import json
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Protocol
 from urllib.parse import quote
@@ -36,7 +36,9 @@ class Delivered:
 class Output(Protocol):
     """Takes keyframes."""
 
-    delivered: Delivered
+    @property
+    def delivered(self) -> Delivered:
+        """What became of them so far."""
 
     def send(self, keyframe: Keyframe) -> None:
         """Take one keyframe."""
@@ -91,9 +93,15 @@ class ZenohOutput:
         patient: bool,
         note: Callable[[str], None],
     ) -> None:
-        self.delivered = Delivered()
+        self._counts = Delivered()
         self._publisher, self._crops, self._stop = publisher, crops, stop
         self._patient, self._note = patient, note
+
+    @property
+    def delivered(self) -> Delivered:
+        """What became of the keyframes so far, and what the spool holds now."""
+        spooled = self._publisher
+        return replace(self._counts, waiting=spooled.unacknowledged, refused=spooled.refused_count)
 
     def send(self, keyframe: Keyframe) -> None:
         """Spool its envelope and send its crops."""
@@ -105,17 +113,17 @@ class ZenohOutput:
                 if self._patient and not self._stop.is_set():
                     self._publisher.flush(_SLICE_S)
                     continue
-                if self.delivered.no_room == 0:
+                if self._counts.no_room == 0:
                     self._note(f"keyframe lost: {full}")
-                self.delivered.no_room += 1
+                self._counts.no_room += 1
                 return
             break
-        self.delivered.published += 1
+        self._counts.published += 1
         if self._crops is not None:
             for crop in keyframe.crops:
                 sent = self._crops.send(crop)
-                self.delivered.crops += sent
-                self.delivered.crops_lost += not sent
+                self._counts.crops += sent
+                self._counts.crops_lost += not sent
 
     def close(self, wait_s: float) -> None:
         """Wait for acknowledgements, less long when it was stopped, and close the spool."""
@@ -126,8 +134,7 @@ class ZenohOutput:
             left_s -= _SLICE_S
             if self._stop.is_set() and not stopped:
                 break
-        self.delivered.refused = self._publisher.refused_count
-        self.delivered.waiting = self._publisher.close()
+        self._publisher.close()
 
 
 class CropSender:

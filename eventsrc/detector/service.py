@@ -45,9 +45,12 @@ class Detection:
         self._stopped = False
 
     def run(self, pictures: Iterable[Picture], watch: Callable[[Report], None]) -> None:
-        """Look at all pictures, or until ``stop`` is set; ``watch`` is called after each."""
+        """Look at all pictures, or until ``stop`` is set; ``watch`` is called after each.
+
+        Pictures that come in over Zenoh have no last one: they end by themselves with ``stop``.
+        """
         for picture in pictures:
-            if self._stop.is_set():
+            if self._stop.is_set() and pictures is not self._live:
                 self._stopped = True
                 return
             keyframe = self._keyframes.look(picture)

@@ -19,6 +19,7 @@ from eventsrc.log import MessageFormat
 from eventsrc.ros.bridge_keys import key_of, type_of_token
 from eventsrc.ros.derivation import CDR, ROS2MSG, Derivation, Derived, RosRecording
 from eventsrc.ros.library import MessageTypes, Undecodable
+from eventsrc.ros.stream import Counts
 from eventsrc.system_events import MAP_KEY
 from eventsrc.transport.session import Received
 
@@ -67,6 +68,11 @@ class Bridge:
     def reasons(self) -> dict[str, str]:
         """Why the first of each topic cannot be read."""
         return self._derivation.reasons
+
+    @property
+    def counts(self) -> dict[str, Counts]:
+        """What the envelopes have and what they lack, by topic of detections."""
+        return self._derivation.counts
 
     @property
     def types_told(self) -> frozenset[str]:
@@ -167,7 +173,7 @@ class Bridge:
     ) -> Iterator[CheckedMessage]:
         topic, form = self._topics[key], self._formats.get(key, _UNKNOWN)
         yield CheckedMessage(topic, payload, ENVELOPE_VERSION, None, form=form)
-        if form.schema_text:
+        if form.schema:  # of a type without a known definition nothing is made, which is counted
             definition = form.schema_text.decode()
             made = self._derivation.add(topic, form.schema, definition, logged_ns, payload)
             for derived in made:

@@ -269,7 +269,13 @@ class _Track:
         given = self._embeddings.pop(detected.stamp_ns, None)
         if given is None:
             return
-        texts = [given.by_id.get(name) for name in detected.ids] if given.by_id else given.by_index
+        texts = given.by_index
+        if given.by_id is not None:
+            texts = [given.by_id.get(name) for name in detected.ids]
+            for name, text in given.by_id.items():
+                if text is not None and name not in detected.ids:
+                    reason = f"an embedding of {name!r:.80}, which is the id of no detection"
+                    self.counts.refuse(self.stream.embeddings or "", reason)
         if len(texts) != len(detected.detections):
             reason = f"{len(texts)} embeddings for {len(detected.detections)} detections"
             self.counts.refuse(self.stream.embeddings or "", reason)

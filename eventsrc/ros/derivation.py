@@ -27,7 +27,7 @@ from eventsrc.system_events import MAP_KEY, ROS_KEY
 from .assembler import Assembled, Assembler, RosMessage
 from .library import MessageTypes, Undecodable
 from .messages import BadMessage
-from .stream import Stream
+from .stream import Counts, Stream
 
 CDR: Final = "cdr"
 ROS2MSG: Final = "ros2msg"
@@ -89,14 +89,19 @@ class Derivation:
         """The topics whose messages are used."""
         return self._assembler.topics | self._grids
 
+    @property
+    def counts(self) -> dict[str, Counts]:
+        """What the envelopes have and what they lack, by topic of detections."""
+        return self._assembler.counts
+
     def add(
         self, topic: str, type_name: str, definition: str, logged_ns: int, payload: bytes
     ) -> list[Derived]:
         """Take a message; returns what it completes. One that cannot be read completes nothing and
         is counted."""
         try:
-            if topic in self._grids and type_name == GRID_SCHEMA:
-                return self._finished(self._map(topic, logged_ns, payload))
+            if topic in self._grids:
+                return self._finished(self._map(topic, type_name, logged_ns, payload))
             if topic not in self._assembler.topics:
                 return []
             self._define(type_name, definition)
@@ -113,7 +118,11 @@ class Derivation:
         """What still waits: the recording ends here."""
         return self._finished(self._assembler.finish())
 
-    def _map(self, topic: str, logged_ns: int, payload: bytes) -> list[Assembled | Derived]:
+    def _map(
+        self, topic: str, type_name: str, logged_ns: int, payload: bytes
+    ) -> list[Assembled | Derived]:
+        if type_name != GRID_SCHEMA:
+            raise BadMessage(f"it is {type_name:.80}, not {GRID_SCHEMA}")
         encoded = read_grid_message(payload, topic).encode()
         return self._assembler.put(Derived(MAP_KEY, None, encoded), logged_ns)
 

@@ -80,7 +80,8 @@ class Embeddings(NamedTuple):
     model: str | None
     dim: int | None
     by_index: Sequence[str | None]
-    by_id: Mapping[str, str]
+    by_id: Mapping[str, str | None] | None
+    """None where they are by index."""
 
 
 class Detected(NamedTuple):
@@ -181,11 +182,10 @@ def embeddings_of_text(message: Any) -> Embeddings:
     model, dim = document.get("model"), document.get("dim")
     if isinstance(given, list):
         by_index = [_base64(each) for each in given]
-        return Embeddings(stamp_ns, model, dim, by_index, {})
+        return Embeddings(stamp_ns, model, dim, by_index, None)
     if isinstance(given, dict):
         by_id = {name: _base64(each) for name, each in given.items()}
-        kept = {name: each for name, each in by_id.items() if each is not None}
-        return Embeddings(stamp_ns, model, dim, (), kept)
+        return Embeddings(stamp_ns, model, dim, (), by_id)
     raise BadMessage('"embeddings" is neither a list nor an object')
 
 
@@ -207,7 +207,9 @@ def embeddings_of_floats(message: Any) -> Embeddings:
     by_index = [
         pybase64.b64encode(raw[at * size : (at + 1) * size]).decode() for at in range(count)
     ]
-    return Embeddings(int(seconds) * _NS + int(fraction), columns.label or None, dim, by_index, {})
+    return Embeddings(
+        int(seconds) * _NS + int(fraction), columns.label or None, dim, by_index, None
+    )
 
 
 def _best(results: Sequence[Any], labels: Mapping[str, str]) -> tuple[str, float]:

@@ -1,7 +1,7 @@
 """Bags of ROS 2 on the command line: options, the file of labels, and what was found in a bag."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -152,16 +152,21 @@ def bag_lines(report: BagReport) -> Iterator[str]:
         )
     if len(unused) > _MOST_UNUSED:
         yield f"  … and {len(unused) - _MOST_UNUSED:,} more topics that are not used"
-    for name, counts in report.streams.items():
-        yield f"  {visible(name)}: {_keyframes(counts)}"
-        for topic_name, count in counts.unused.items():
-            reason = visible(counts.reasons[topic_name][:200])
-            yield f"  {visible(topic_name)}: {count:,} could not be used; the first: {reason}"
+    yield from (f"  {line}" for line in stream_lines(report.streams))
     if report.unchanged_grids:
         same = counted(report.unchanged_grids, "occupancy grid")
         yield f"  {same} had the cells of the one before"
     for note in report.notes:
         yield f"  note: {visible(note)}"
+
+
+def stream_lines(streams: Mapping[str, Counts]) -> Iterator[str]:
+    """What was made of each topic of detections, what that lacks, and what could not be used."""
+    for name, counts in streams.items():
+        yield f"{visible(name)}: {_keyframes(counts)}"
+        for topic_name, count in counts.unused.items():
+            reason = visible(counts.reasons[topic_name][:200])
+            yield f"{visible(topic_name)}: {count:,} could not be used; the first: {reason}"
 
 
 def _keyframes(counts: Counts) -> str:

@@ -4,7 +4,7 @@ import threading
 from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Final
 
 import typer
 
@@ -49,13 +49,9 @@ from .options import ConfigOption, ConnectOption, JsonOption, ListenOption, zeno
 from .signals import stop_on_signals
 from .terminal import emit, finish, say
 
-if TYPE_CHECKING:
-    pass
-
 _PICTURES: Final = "Pictures and poses"
 _MODELS: Final = "Models"
 _KEYFRAMES: Final = "Keyframes"
-_STATUS_EVERY_S: Final = 0.25
 
 
 def detect(

@@ -49,7 +49,7 @@ def metrics_of(address: tuple[str, int], detection: Detection) -> Iterator[None]
         found = [
             MetricValue(f"mapfold_detect_{name}", f"As `detect --json` has {name}.", number, True)
             for name, number in counters.items()
-            if isinstance(number, int)
+            if type(number) is int
         ]
         text = "Envelopes that no recorder has acknowledged yet."
         return [*found, MetricValue("mapfold_detect_waiting", text, waiting)]
@@ -137,5 +137,6 @@ def as_document(report: Report) -> dict[str, Any]:
         "dropped": report.dropped,
         "too_large": report.too_large,
         "bad_poses": report.bad_poses,
+        "stopped": report.stopped,
         **vars(sent),
     }

@@ -23,6 +23,7 @@ from eventsrc.transport.config import parse_address
 from eventsrc.transport.session import Router, check_keys, open_session
 from projections.corrections import check_settings
 
+from .bag_text import stream_lines
 from .bridged import (
     NOTHING,
     TF_POSE,
@@ -192,6 +193,8 @@ def record(
             if accept_edits:
                 say(f"taking commands of `mapfold edit` on {edit_key(writer.log_id)}")
             recorder.run(stop, every_s=EVERY_S, watch=watch)
+            for line in stream_lines({} if bridge is None else bridge.counts):
+                say(line)
     summary.finish()
 
 

@@ -3,6 +3,7 @@
 import json
 import queue
 import signal
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,17 @@ import numpy as np
 import pytest
 
 from eventsrc.crops import MAX_CROP_BYTES, decode_crop
-from eventsrc.detector.keyframes import CROP_SIDE
+from eventsrc.detector.encoder import Encoder, read_preparation
+from eventsrc.detector.finder import Finder, FinderOptions
+from eventsrc.detector.gate import GateLimits, KeyframeGate
+from eventsrc.detector.keyframes import CROP_SIDE, Keyframes
+from eventsrc.detector.live import LivePictures
+from eventsrc.detector.onnx_model import OnnxModel
+from eventsrc.detector.outputs import FileOutput
+from eventsrc.detector.poses import NoPoses
+from eventsrc.detector.service import Detection
 from eventsrc.detector.vision import decode, encode_jpeg, shrunk
+from eventsrc.envelope import RunId
 from eventsrc.ingest import Accepted, ingest
 from eventsrc.log import LogReader
 from eventsrc.sim import build_house
@@ -34,8 +44,6 @@ class Stage:
     """A folder of drawn pictures, the models that know their colours, and commands."""
 
     def __init__(self, folder: Path) -> None:
-        import threading
-
         self.folder = folder
         self.pictures = folder / "camera"
         self.count = write_pictures(
@@ -159,6 +167,33 @@ def test_a_camera_over_zenoh(
     assert len(envelopes) == said["keyframes"] > 0
     assert said["without_pose"] == said["bad_poses"] == 0
     assert all("map_x" in envelope for envelope in envelopes)
+
+
+def test_a_camera_has_no_last_picture(
+    stage: Stage, tmp_path: Path, connected: Callable[[], Session]
+) -> None:
+    """One that comes in as it is stopped is looked at or counted, and nothing is said of it."""
+    stop, looked = threading.Event(), threading.Event()
+    live = LivePictures(connected(), "robot/image", None, stop)
+    finder = Finder(OnnxModel(stage.detector), None, FinderOptions())
+    encoder = Encoder(OnnxModel(stage.encoder), read_preparation(stage.encoder))
+    gate = KeyframeGate(GateLimits())
+    keyframes = Keyframes(finder, encoder, gate, NoPoses(), RunId("r"), note=lambda _line: None)
+    detection = Detection(keyframes, FileOutput(tmp_path / "out"), live, stop)
+    running = threading.Thread(target=detection.run, args=(live, lambda _report: looked.set()))
+    running.start()
+    message = Received("robot/image", b"no picture")
+    live.queue.put(message, 0.0)
+    assert looked.wait(DEADLINE_S)
+    threading.Event().wait(0.1)  # it waits for the next one by now
+    with live.queue._filled:
+        stop.set()
+        live.queue.put(message, 0.0)
+    running.join(DEADLINE_S)
+    detection.close(0.0)
+    report = detection.report()
+    assert report.counts.pictures + report.dropped == 2
+    assert not report.stopped
 
 
 def test_a_stream_on_stdin(stage: Stage, tmp_path: Path) -> None:

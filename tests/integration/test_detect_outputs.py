@@ -37,6 +37,16 @@ def test_a_full_spool_costs_a_camera_the_newest_keyframes(tmp_path: Path) -> Non
     assert "keyframe lost: " in said[0]
 
 
+def test_what_waits_is_counted_while_it_waits(tmp_path: Path) -> None:
+    publisher = EnvelopePublisher(NOBODY, tmp_path / "spool")
+    output = ZenohOutput(publisher, None, threading.Event(), patient=False, note=lambda _line: None)
+    for number in range(3):
+        output.send(_keyframe(number))
+        assert output.delivered.waiting == output.delivered.published == number + 1
+    output.close(0.0)
+    assert output.delivered.waiting == 3
+
+
 def test_a_full_spool_makes_files_wait_until_they_are_stopped(tmp_path: Path) -> None:
     stop = threading.Event()
     publisher = EnvelopePublisher(NOBODY, tmp_path / "spool", max_spool_bytes=70)

@@ -310,6 +310,21 @@ def test_messages_of_no_known_type_are_kept_and_make_nothing(
     assert formats == {"/odd": MessageFormat("cdr"), "/own": own}
 
 
+def test_topics_of_other_types_make_nothing_and_are_counted() -> None:
+    """Also of a type without a definition, such as a detector's own messages."""
+    bridge = new_bridge()
+    told = {"detections": "yolo_msgs§msg§DetectionArray", "map": "std_msgs§msg§String"}
+    for key, type_name in told.items():
+        bridge.note_token(f"@/1/@ros2_lv/MP/{key}/{type_name}/:::")
+    text = TYPES.encode(TYPES.make("std_msgs/msg/String", data="x"), "std_msgs/msg/String")
+    batch = [BridgedMessage(key, text) for key in (*told, *told)]
+    taken = bridge.take(batch, START, lambda _: iter(()))
+    assert [each.key for each in taken] == ["/detections", "/map"] * 2
+    assert bridge.refused == {"/detections": 2, "/map": 2}
+    assert bridge.reasons["/detections"] == "yolo_msgs/msg/DetectionArray: no such type is known"
+    assert bridge.reasons["/map"] == "it is std_msgs/msg/String, not nav_msgs/msg/OccupancyGrid"
+
+
 def test_broken_messages_are_kept_counted_and_harm_no_other(
     log_path: Path, endpoint: str, connected: Sessions
 ) -> None:
@@ -531,6 +546,8 @@ def test_the_command_records_says_so_and_ends_clean(
     document = json.loads(program.output())
     assert (document["recorded"], document["messages"]) == (11, len(sent))
     assert any(f"{len(sent)} messages of ROS" in line for line in program.lines)
+    counted = "/bot1/detections: 10 keyframes; 10 without the camera's field of view"
+    assert any(line.startswith(counted) for line in program.lines), program.lines
 
 
 def test_options_for_ros_need_ros2dds(tmp_path: Path) -> None:

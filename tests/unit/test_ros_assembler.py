@@ -310,6 +310,22 @@ def test_embeddings_that_fit_nothing_are_counted_not_guessed() -> None:
     assert assembler.counts["/detections"].unused == {"/floats": 1}
 
 
+def test_embeddings_by_ids_that_no_detection_has_are_counted() -> None:
+    cup = ros.detection([("cup", 0.9)], ros.box(1, 1, 2, 2), "a")
+    given: dict[str, list[float] | None] = {"b": [1.0], "a": [3.0], "none": None, "c": [2.0]}
+    cases: tuple[tuple[dict[str, list[float] | None], int], ...]
+    cases = (given, 2), ({"a": None}, 0), ({}, 0)
+    for by_id, refused in cases:
+        embeddings = message("/embeddings", 0, ros.embeddings(START, by_id))
+        (made,), assembler = run([embeddings, picture(0, cup)], stream(embeddings="/embeddings"))
+        counts = assembler.counts["/detections"]
+        assert counts.unused == ({"/embeddings": refused} if refused else {})
+        assert counts.with_embedding == (by_id is given)
+        assert ("embedding" in made["detections"][0]) is (by_id is given)
+        if refused:
+            assert "'b'" in counts.reasons["/embeddings"]
+
+
 def test_what_the_log_cannot_take_is_left_for_its_door_to_refuse() -> None:
     nan = math.nan
     for bad in (
