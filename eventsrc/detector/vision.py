@@ -5,6 +5,7 @@ docs/decisions/opencv.md says why OpenCV. It is imported when the first picture 
 
 import functools
 import os
+import re
 import tempfile
 import threading
 from collections.abc import Iterator, Sequence
@@ -63,6 +64,10 @@ def decode(data: bytes) -> Pixels:
 
 
 _stderr = threading.Lock()
+_PADDED: Final = re.compile(
+    r"Corrupt JPEG data: (\d|1[0-6]) extraneous bytes before marker 0xd9", re.ASCII
+)
+"""Many cameras that compress in hardware fill a picture up between its last pixel and its end."""
 
 
 @contextmanager
@@ -84,6 +89,8 @@ def _decoder_messages() -> Iterator[list[str]]:
             if printed:
                 for line in os.pread(scratch, printed, 0).splitlines(keepends=True):
                     text = line.decode("utf-8", "replace").strip()
+                    if _PADDED.fullmatch(text):
+                        continue
                     if text.startswith(("Corrupt JPEG", "Premature end", "libpng", "Invalid ")):
                         messages.append(text)
                     else:

@@ -26,7 +26,7 @@ ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 MAX_MESSAGE_BYTES: Final = 64 * 1024 * 1024
 _ROS2_PROFILE: Final = b"\x04\0\0\0ros2"
 _PROFILE_AT: Final = len(MCAP_MAGIC) + 9
-_METADATA: Final = "metadata.yaml"
+METADATA: Final = "metadata.yaml"
 _SQLITE_SUFFIX: Final = ".db3"
 _FILE_OF_A_BAG: Final = re.compile(r".*\.(db3|mcap)(\.zstd)?", re.DOTALL)
 _SEGMENT_OF_A_LOG: Final = re.compile(r"\d{20}\.mcap")
@@ -93,7 +93,7 @@ def is_bag(path: Path) -> bool:
         names = [each.name for each in path.iterdir()]
     except OSError:
         return False
-    return _METADATA in names or any(
+    return METADATA in names or any(
         _FILE_OF_A_BAG.fullmatch(name) and not _SEGMENT_OF_A_LOG.fullmatch(name) for name in names
     )
 
@@ -122,7 +122,7 @@ class Bag:
     def __init__(self, path: Path, files: ExitStack) -> None:
         parts = _files_of(path) if path.is_dir() else [path]
         if not parts:
-            raise MisuseError(f"{path}: it has a {_METADATA}, but no .db3 or .mcap file")
+            raise MisuseError(f"{path}: it has a {METADATA}, but no .db3 or .mcap file")
         self._parts = [_open_part(each, files) for each in parts]
         self._sizes = [each.stat().st_size for each in parts]
         self.size_bytes = sum(self._sizes)

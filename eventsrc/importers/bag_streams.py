@@ -133,6 +133,8 @@ class _Chooser:
         pose = self._pose(topic, has_transforms=found)
         if pose == TF_POSE and tf is None and tf_static is None:
             raise MisuseError(f"--pose {TF_POSE}: the bag has no topic of {ros.TF}")
+        if pose is None:  # without a topic of poses a stream takes those of its transforms
+            tf = tf_static = None
         by_transforms = pose == TF_POSE
         covariance = self._covariance(topic, map_frame) if by_transforms else None
         embeddings = self._embeddings(topic)
@@ -174,12 +176,12 @@ class _Chooser:
             made.use(pose, "poses")
             made.use(tf, "where the camera is")
             made.use(tf_static, "where the camera is")
-            if pose is None:
+            if pose is None and options.pose != NONE:
                 made.notes.append(f"{topic}: no topic has poses; its keyframes are kept without")
         made.use(covariance, "errors of poses")
         made.use(embeddings, "embeddings")
         made.use(camera, "camera")
-        if embeddings is None:
+        if embeddings is None and options.embeddings != NONE:
             made.notes.append(
                 f"{topic}: no topic has embeddings, so there will be no Objects; "
                 "docs/ros.md says how to publish them"

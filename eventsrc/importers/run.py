@@ -27,7 +27,7 @@ from eventsrc.system_events import (
 )
 from eventsrc.upcast import UPCASTERS
 
-from .bag_files import START_BYTES, is_bag, is_file_of_a_bag
+from .bag_files import METADATA, START_BYTES, is_bag, is_file_of_a_bag
 from .bag_streams import BagOptions
 from .json_lines import JsonLines
 from .log_times import LogTimes
@@ -324,6 +324,8 @@ def open_source(name: str, files: ExitStack, bags: BagOptions = _DEFAULT_BAGS) -
     MCAP or a file of a bag."""
     if name != STDIN and Path(name).is_dir():
         return RosBag(Path(name), files, bags) if is_bag(Path(name)) else OtherLog(Path(name))
+    if Path(name).name == METADATA:
+        raise MisuseError(f"{name}: it describes a bag of ROS 2; give its folder")
     try:
         file, size = _open_file(name, files)
         start = _peek(file)

@@ -271,6 +271,16 @@ def test_an_option_that_fits_nothing_says_what_there_is(
         imported(tmp_path / "log", drives["mcap none"], **options)
 
 
+def test_what_is_switched_off_is_not_said_to_be_missing(
+    drives: dict[str, Path], tmp_path: Path
+) -> None:
+    report = imported(tmp_path / "log", drives["mcap none"], pose="none", embeddings="none")
+    about = report.bags[0]
+    counts = about.streams["/detections"]
+    assert (counts.without_pose, counts.with_embedding) == (counts.keyframes, 0)
+    assert about.notes == []
+
+
 def test_a_bag_without_detections_says_so(tmp_path: Path) -> None:
     only_tf = [each for each in DRIVE.messages() if each[0] == "/tf"]
     for name, messages, said in (
@@ -337,6 +347,8 @@ def test_what_is_no_bag_whatever_its_name_is_refused(tmp_path: Path) -> None:
     (bag / "metadata.yaml").write_text("rosbag2_bagfile_information: {}")
     with pytest.raises(MisuseError, match=r"no \.db3 or \.mcap file"):
         imported(tmp_path / "log", bag)
+    with pytest.raises(MisuseError, match="give its folder"):
+        imported(tmp_path / "log", bag / "metadata.yaml")
     for content in (b"", b"hello", b"\x28\xb5\x2f\xfdrubbish"):
         (bag / "drive_0.db3").write_bytes(content)
         with pytest.raises(MisuseError, match="neither SQLite nor MCAP"):

@@ -60,6 +60,18 @@ def test_damage_inside_is_found_and_nothing_is_printed(capfd: pytest.CaptureFixt
     assert capfd.readouterr().err == ""
 
 
+def test_what_cameras_put_behind_the_last_pixel_is_no_damage(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """As webcams do that compress in hardware; of more bytes than that, pixels may be missing."""
+    for count in range(16):
+        padded = JPEG[:-2] + b"\x55" * count + JPEG[-2:]
+        assert np.array_equal(decode(padded), decode(JPEG)), count
+    with pytest.raises(PictureError, match="extraneous bytes"):
+        decode(JPEG[:-2] + b"\x55" * 100 + JPEG[-2:])
+    assert capfd.readouterr().err == ""
+
+
 def test_a_damaged_png_is_found_by_its_crc() -> None:
     for at in range(8, len(PNG) - 12):
         damaged = bytearray(PNG)
