@@ -31,7 +31,8 @@ from .picture import (
 from .vision import Video, decode
 
 SUFFIXES: Final = frozenset({".jpg", ".jpeg", ".png"})
-_NUMBER: Final = re.compile(r"[0-9]{1,10}(?:\.[0-9]{1,9})?|[0-9]{16,19}", re.ASCII)
+_TIME: Final = re.compile(r"[0-9]{1,10}\.[0-9]{1,9}|[0-9]{10}|[0-9]{16,19}", re.ASCII)
+"""``000017`` is the number of a picture, not a time."""
 _NANOSECOND_DIGITS: Final = 16
 _PARTS: Final = re.compile(r"([0-9]+)", re.ASCII)
 _MAX_PATH: Final = 8_192
@@ -61,6 +62,8 @@ def open_images(text: str, stdin: Read, timing: Timing) -> Iterator[Picture]:
         found = sorted((p for p in path.iterdir() if p.suffix.lower() in SUFFIXES), key=_in_order)
         if not found:
             raise MisuseError(f"--images {text}: no .jpg, .jpeg or .png in this folder")
+        if timing.per_s is None:
+            found.sort(key=_stamp_in)  # 5.25 before 5.5
         return _from_paths(found, timing)
     if not path.is_file():
         raise MisuseError(f"--images {text}: no such folder or video; - reads stdin")
@@ -93,14 +96,15 @@ def _from_paths(paths: Iterable[Path], timing: Timing) -> Iterator[Picture]:
 
 def _stamp_in(path: Path) -> float:
     text = path.stem
-    if _NUMBER.fullmatch(text):
+    if _TIME.fullmatch(text):
         nanoseconds = len(text) >= _NANOSECOND_DIGITS and "." not in text
         stamp_s = int(text) / 1e9 if nanoseconds else float(text)
         if stamp_s <= MAX_TIMESTAMP_S:
             return stamp_s
     raise MisuseError(
         f"{visible(str(path))}: its name is no time; name pictures by the time they were taken, in"
-        " seconds or nanoseconds, or give --fps N for N pictures a second from --start on"
+        " seconds with a point or nanoseconds, or give --fps N for N pictures a second from --start"
+        " on"
     )
 
 

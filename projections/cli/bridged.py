@@ -60,7 +60,7 @@ DetectionsOption = Annotated[
 ]
 PoseOption = Annotated[
     str,
-    _option("--pose", "TOPIC", "Odometry or PoseWithCovarianceStamped; tf for transforms."),
+    _option("--pose", "TOPIC", "Odometry or PoseWithCovarianceStamped; tf for transforms; none."),
 ]
 CovarianceOption = Annotated[
     str | None,
@@ -188,6 +188,7 @@ def recording_of(
         dict.fromkeys(full(t, "--detections") for t in choice.detections or [_DETECTIONS])
     )
     run = check_run_id(choice.run_id) or _run_id(choice.namespace, now_ns)
+    by_transforms = choice.pose == TF_POSE
     labels, gap_ns = read_labels(choice.labels), max_gap_ns(choice.max_gap_s)
     streams = []
     for topic in detections:
@@ -197,9 +198,9 @@ def recording_of(
             Stream(
                 topic,
                 run_id,
-                full("/tf", "--namespace"),
-                full("/tf_static", "--namespace"),
-                None if choice.pose == TF_POSE else full(choice.pose, "--pose"),
+                None if choice.pose == NONE else full("/tf", "--namespace"),
+                None if choice.pose == NONE else full("/tf_static", "--namespace"),
+                None if by_transforms else given(choice.pose, "--pose"),
                 given(choice.covariance, "--covariance"),
                 given(choice.embeddings, "--embeddings"),
                 given(choice.camera, "--camera"),

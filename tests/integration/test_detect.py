@@ -211,7 +211,7 @@ def test_a_recorder_that_is_away_costs_nothing(
 ) -> None:
     one = tmp_path / "one"
     one.mkdir()
-    (one / "5.jpg").write_bytes(next(stage.pictures.glob("*.jpg")).read_bytes())
+    (one / "5.0.jpg").write_bytes(next(stage.pictures.glob("*.jpg")).read_bytes())
     words = ("detect", *stage.models, "--spool", tmp_path / "spool", "--connect", endpoint)
     said = stage.run(*words, "--images", one, "--wait", "0.2", code=3)
     assert "1 envelope waiting" in said.err
@@ -242,13 +242,13 @@ def test_bad_pictures_are_counted_and_said(stage: Stage, tmp_path: Path) -> None
     damaged = bytearray(encode_jpeg(noise))
     damaged[len(damaged) // 2 : len(damaged) // 2 + 60] = b"\xff\xd0" * 30
     bad = {
-        "1.jpg": b"",
-        "2.jpg": good[: len(good) // 2],
-        "3.jpg": b"<html>404</html>",
-        "4.jpg": bytes(damaged),
-        "5.png": b"\x89PNG\r\n\x1a\n" + bytes(40),
+        "1.0.jpg": b"",
+        "2.0.jpg": good[: len(good) // 2],
+        "3.0.jpg": b"<html>404</html>",
+        "4.0.jpg": bytes(damaged),
+        "5.0.png": b"\x89PNG\r\n\x1a\n" + bytes(40),
     }
-    for name, data in ({"6.jpg": good, "7.jpg": good} | bad).items():
+    for name, data in ({"6.0.jpg": good, "7.0.jpg": good} | bad).items():
         (folder / name).write_bytes(data)
     out = tmp_path / "run.jsonl"
     said = stage.run("detect", "--images", folder, *stage.models, "--out", out, "--json", code=3)
@@ -278,8 +278,8 @@ def test_a_picture_of_8k(stage: Stage, tmp_path: Path) -> None:
     fullest = max(truth, key=lambda picture: len(picture["things"]))
     drawn = decode((stage.pictures / f"{fullest['stamp']:.3f}.jpg").read_bytes())
     large = np.repeat(np.repeat(drawn, 12, axis=0), 12, axis=1)[:4320]
-    (folder / "1.jpg").write_bytes(encode_jpeg(large))
-    (folder / "2.jpg").write_bytes(encode_jpeg(np.zeros((10_000, 10_000, 3), np.uint8)))
+    (folder / "1.0.jpg").write_bytes(encode_jpeg(large))
+    (folder / "2.0.jpg").write_bytes(encode_jpeg(np.zeros((10_000, 10_000, 3), np.uint8)))
     said = stage.run(
         "detect", "--images", folder, *stage.models, "--out", tmp_path / "o.jsonl", "--json", code=3
     )
@@ -330,13 +330,13 @@ def test_an_answer_of_nan_is_said_and_counted(stage: Stage, tmp_path: Path) -> N
     (tmp_path / "labels.txt").write_text("thing\n")
     one = tmp_path / "one"
     one.mkdir()
-    (one / "5.jpg").write_bytes(next(stage.pictures.glob("*.jpg")).read_bytes())
+    (one / "5.0.jpg").write_bytes(next(stage.pictures.glob("*.jpg")).read_bytes())
     words = ("--detector", model, "--encoder", stage.encoder, "--labels", tmp_path / "labels.txt")
     said = stage.run(
         "detect", "--images", one, *words, "--out", tmp_path / "o.jsonl", "--json", code=3
     )
     assert (said.json["not_finite"], said.json["detections"]) == (2, 1)
-    assert "5.jpg: the detector answered NaN or infinity for 2 boxes" in said.err
+    assert "5.0.jpg: the detector answered NaN or infinity for 2 boxes" in said.err
 
 
 def test_poses_that_are_none_are_counted(

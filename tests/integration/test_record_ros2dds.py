@@ -567,6 +567,9 @@ def test_options_for_ros_need_ros2dds(tmp_path: Path) -> None:
     assert [s.run_id for s in how.streams] == ["drive:bot1/left", "drive:bot1/right"]
     assert how.streams[0].labels == {"0": "cup", "2": "chair"}
     assert {"/bot1/left/detections", "/bot1/tf", "/bot1/map", "/bot1/embeddings"} < {*topics}
+    how, topics = recording_of(choice(pose="none", grid="none"), 0, None)
+    assert topics == ("/detections", "/embeddings")
+    assert [(s.pose, s.tf, s.tf_static) for s in how.streams] == [(None, None, None)]
 
 
 def test_messages_that_find_the_queue_full_are_counted_by_key() -> None:

@@ -4,6 +4,7 @@ import io
 import itertools
 import json
 import math
+import re
 import struct
 from pathlib import Path
 from typing import Any
@@ -35,13 +36,16 @@ def _stamps(pictures: Any) -> list[tuple[str, float]]:
 
 
 def test_a_folder_is_in_the_order_of_its_numbers(tmp_path: Path) -> None:
-    for name in ("10.5.jpg", "9.25.JPG", "1403636579763555584.png", "notes.txt", "100.jpeg"):
+    names = ("10.5.jpg", "10.25.jpg", "10.05.jpg", "9.25.JPG", "1403636579.jpeg", "notes.txt")
+    for name in (*names, "1403636579763555584.png"):
         (tmp_path / name).write_bytes(JPEG)
     found = list(open_images(str(tmp_path), _never, Timing()))
     assert _stamps(found) == [
         ("9.25.JPG", 9.25),
+        ("10.05.jpg", 10.05),
+        ("10.25.jpg", 10.25),
         ("10.5.jpg", 10.5),
-        ("100.jpeg", 100.0),
+        ("1403636579.jpeg", 1403636579.0),
         ("1403636579763555584.png", 1403636579.7635555),
     ]
     assert found[0].pixels().shape == (24, 32, 3)
@@ -52,8 +56,11 @@ def test_a_folder_at_a_rate(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(JPEG)
     found = _stamps(open_images(str(tmp_path), _never, Timing(100.0, 4.0)))
     assert found == [("frame1.jpg", 100.0), ("frame2.jpg", 100.25), ("frame10.jpg", 100.5)]
-    with pytest.raises(MisuseError, match=r"frame1\.jpg: its name is no time; .* give --fps N"):
-        list(open_images(str(tmp_path), _never, Timing()))
+    for name in ("frame1.jpg", "000017.jpg", "1.jpg", "12345678901.jpg", "1.jpg.jpg"):
+        (tmp_path / name).write_bytes(JPEG)
+        expected = rf"{re.escape(name)}: its name is no time; .* give --fps N"
+        with pytest.raises(MisuseError, match=expected):
+            list(open_images(str(tmp_path / name), _never, Timing()))
 
 
 def test_where_there_are_no_pictures(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -98,9 +105,9 @@ def test_stdin_with_a_stream(step: int) -> None:
 
 @pytest.mark.parametrize("step", [1, 5, 1000])
 def test_stdin_with_paths(tmp_path: Path, step: int) -> None:
-    text = "".join(f"{tmp_path}/{n}.jpg\n" for n in (1.5, 2.5)) + f"\n{tmp_path}/3.jpg"
+    text = "".join(f"{tmp_path}/{n}.jpg\n" for n in (1.5, 2.5)) + f"\n{tmp_path}/3.0.jpg"
     found = list(open_images("-", _reader(text.encode(), step), Timing()))
-    assert _stamps(found) == [("1.5.jpg", 1.5), ("2.5.jpg", 2.5), ("3.jpg", 3.0)]
+    assert _stamps(found) == [("1.5.jpg", 1.5), ("2.5.jpg", 2.5), ("3.0.jpg", 3.0)]
     with pytest.raises(PictureError, match="No such file"):
         found[0].pixels()
 
