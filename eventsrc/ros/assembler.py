@@ -209,7 +209,7 @@ class _Track:
 
     def has_all(self, picture: _Picture) -> bool:
         """Whether it has everything that its stream has topics for."""
-        if picture.pose is None:
+        if picture.pose is None and self.stream.has_poses:
             if picture.asked_at == self.poses.received and not self._shares_transforms:
                 return False
             picture.asked_at = self.poses.received

@@ -40,6 +40,11 @@ class Stream:
     max_gap_ns: int = DEFAULT_MAX_GAP_NS
     max_waiting: int = MAX_WAITING
 
+    @property
+    def has_poses(self) -> bool:
+        """Whether there is a topic that poses may come from."""
+        return any((self.pose, self.tf, self.tf_static))
+
 
 @dataclass
 class Counts:

@@ -310,6 +310,13 @@ def test_embeddings_that_fit_nothing_are_counted_not_guessed() -> None:
     assert assembler.counts["/detections"].unused == {"/floats": 1}
 
 
+def test_without_topics_of_poses_nothing_waits_for_one() -> None:
+    assembler: Assembler[Any] = Assembler([stream(tf=None, tf_static=None)])
+    (made,) = assembler.add(picture(0, CUP))
+    assert "map_x" not in json.loads(made.payload)
+    assert assembler.counts["/detections"].without_pose == 1
+
+
 def test_embeddings_by_ids_that_no_detection_has_are_counted() -> None:
     cup = ros.detection([("cup", 0.9)], ros.box(1, 1, 2, 2), "a")
     given: dict[str, list[float] | None] = {"b": [1.0], "a": [3.0], "none": None, "c": [2.0]}
