@@ -1,6 +1,7 @@
 """`mapfold reembed`: vectors of another encoder for the detections of a log, of their crops."""
 
 import hashlib
+import re
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -33,8 +34,12 @@ class CropModel:
         check_installed()
         self._encoder = Encoder(OnnxModel(path, device, threads), preparation)
         self.space, self.dimension = self._encoder.name, self._encoder.dimension
-        content = path.read_bytes() + b"\0" + preparation.model_dump_json().encode()
-        self.sha256 = hashlib.sha256(content).hexdigest()
+        model = path.read_bytes()
+        digest = hashlib.sha256(model + b"\0" + preparation.model_dump_json().encode())
+        for name in weight_files(model):
+            with (path.parent / name).open("rb") as weights:
+                digest.update(hashlib.file_digest(weights, "sha256").digest())
+        self.sha256 = digest.hexdigest()
 
     def encode(self, jpegs: Sequence[bytes]) -> list[Vector | str]:
         """A vector for each JPEG, of NaN where the model has none; or why it cannot be decoded."""
@@ -46,6 +51,22 @@ class CropModel:
             crop if isinstance(crop, str) else none if (vector := next(vectors)) is None else vector
             for crop in decoded
         ]
+
+
+def weight_files(model: bytes) -> list[str]:
+    """The files beside an ONNX model that hold its weights, as newer exporters write them.
+
+    Found as the values of the keys ``location`` of the model's external data (onnx.proto,
+    ``StringStringEntryProto``).
+    """
+    names = set()
+    for found in _LOCATION.finditer(model):
+        length = found[1][0]  # below 128, the whole of protobuf's variable-length integer
+        names.add(model[found.end() : found.end() + length].decode("utf-8", "surrogateescape"))
+    return sorted(names)
+
+
+_LOCATION = re.compile(rb"\x0a\x08location\x12([\x01-\x7f])")
 
 
 def _decoded(jpeg: bytes) -> Pixels | str:

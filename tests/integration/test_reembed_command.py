@@ -8,6 +8,7 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
+import onnx
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -25,6 +26,7 @@ from eventsrc.envelope import DetId
 from eventsrc.log import LogReader, VerbatimEvent
 from eventsrc.ros.library import MessageTypes
 from eventsrc.transport.session import Session
+from projections.cli.reembed import CropModel, weight_files
 from tests.commands import Commands
 from tests.crops import FORMAT
 from tests.envelopes import detection, envelope
@@ -32,6 +34,7 @@ from tests.fixtures_zenoh import Program
 from tests.thorough import examples
 from tests.tiny_models import fixed_answer, mean_colour_encoder
 
+WEIGHTS = "clip.onnx.data"
 NAMES = st.characters(codec="utf-8", exclude_characters="\0")
 IDS = ("run 1/kf#2?d0", "cup-1", "☕")
 
@@ -51,6 +54,21 @@ def test_a_crop_is_a_compressed_image_of_ros(det_id: str, size: int) -> None:
     for end in range(0, len(message), 3):
         with pytest.raises(InvalidCrop):
             decode_crop(message[:end])
+
+
+def test_weights_in_a_file_beside_the_model_are_a_part_of_it(tmp_path: Path) -> None:
+    path = mean_colour_encoder(tmp_path / "clip.onnx")
+    assert weight_files(path.read_bytes()) == []
+    whole = CropModel(path, "cpu", None).sha256
+    onnx.save_model(
+        onnx.load(path), path, save_as_external_data=True, location=WEIGHTS, size_threshold=0
+    )
+    assert weight_files(path.read_bytes()) == [WEIGHTS]
+    apart = CropModel(path, "cpu", None).sha256
+    weights = bytearray((tmp_path / WEIGHTS).read_bytes())
+    weights[40] ^= 1
+    (tmp_path / WEIGHTS).write_bytes(weights)
+    assert len({whole, apart, CropModel(path, "cpu", None).sha256}) == 3
 
 
 def test_it_is_read_by_the_types_of_ros() -> None:
