@@ -111,8 +111,9 @@ def test_crops_are_recorded_and_re_embedded(
         session.put(f"tb/crops/{quote(det_id, safe='')}", jpeg)
     session.put("tb/crops/broken", crops["cup-1"][:-9] + b"\xff\xd9")
     session.put("tb/crops/none", b"text")
-    session.put("tb/crops/huge", bytes(3 * MAX_CROP_BYTES))
-    session.confirm()
+    blocking = session.publisher("tb/crops/huge")  # a plain put drops where the link is full
+    blocking.put(bytes(3 * MAX_CROP_BYTES))
+    recorder.wait_for("1 too large")
     assert recorder.end(signal.SIGINT) == 3, recorder.lines
     said = json.loads(recorder.output())
     assert (said["recorded"], said["crops"], said["rejected"], said["too_large"]) == (1, 4, 1, 1)
