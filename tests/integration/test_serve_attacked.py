@@ -5,6 +5,7 @@ import struct
 import threading
 from base64 import b64encode
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -121,17 +122,20 @@ def test_wrong_questions_are_400_and_name_no_path(service: Served, pg_server_fol
 
 @pytest.mark.slow
 def test_errors_of_the_database_name_no_path_either(
-    service: Served, targets: Targets, pg_server_folder: str
+    one_database: Targets, tmp_path: Path, pg_server_folder: str
 ) -> None:
-    with connect_database(targets.graph_url, autocommit=True) as owner:
-        owner.execute("LOAD 'age'")
-        owner.execute("SELECT ag_catalog.drop_graph('semantic_map', true)")
-    for path in ("/state/objects?x=0&y=0", "/state/places?x=0&y=0"):
-        got = ask(service.port, request("GET", path))
-        error = json.loads(got.partition(b"\r\n\r\n")[2])["error"]
-        assert (status(got), error["kind"]) == (503, "database")
-        assert pg_server_folder not in error["message"]
-    assert pg_server_folder in service.text
+    rebuild(write_log(tmp_path / "log", walk(60, seed=3)), one_database, Settings())
+    args = ("--no-zenoh", "--http", "127.0.0.1:0", "--db", one_database.graph_url)
+    with served(*args) as service:
+        with connect_database(one_database.graph_url, autocommit=True) as owner:
+            owner.execute("LOAD 'age'")
+            owner.execute("SELECT ag_catalog.drop_graph('semantic_map', true)")
+        for path in ("/state/objects?x=0&y=0", "/state/places?x=0&y=0"):
+            got = ask(service.port, request("GET", path))
+            error = json.loads(got.partition(b"\r\n\r\n")[2])["error"]
+            assert (status(got), error["kind"]) == (503, "database")
+            assert pg_server_folder not in error["message"]
+        assert pg_server_folder in service.text
 
 
 class TestOverZenoh:
