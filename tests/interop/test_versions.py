@@ -57,7 +57,7 @@ def check(programs: Path, folder: Path) -> None:
     assert mapfold("relocalize", "question.json").startswith("sim-7-a_p0 (confidence")
     mapfold("import", "mine", "b.jsonl")
     mapfold("tail", SAMPLE, "--once", *ROOMS)
-    mapfold("db", "check", SAMPLE)
+    mapfold("db", "check", SAMPLE, *ROOMS)
     mapfold("draw", SAMPLE, "--out", "map.png")
     for kind in ("graphml", "dot", "geojson", "nav2", "foxglove"):
         mapfold("export", SAMPLE, f"--{kind}", f"map.{kind}")
