@@ -2,6 +2,7 @@
 
 import asyncio
 import subprocess
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import asyncpg
@@ -64,7 +65,8 @@ def test_asyncpg(filled: Targets, view: MapView) -> None:
             await connection.close()
         return places, vectors
 
-    places, vectors = asyncio.run(read())
+    with ThreadPoolExecutor(1) as thread:  # the browser of other tests leaves a loop in this one
+        places, vectors = thread.submit(lambda: asyncio.run(read())).result()
     found = [(row["place_id"].strip('"'), float(row["x"])) for row in places]
     assert sorted(found) == places_of(view)
     seen = {o.det_id: o.embedding for o in view.observations if o.class_name == "toilet"}
