@@ -30,7 +30,7 @@ class Delivered:
     no_room: int = 0
     crops: int = 0
     crops_lost: int = 0
-    """Crops that nobody was subscribed to."""
+    """Crops without a subscriber."""
 
 
 class Output(Protocol):
@@ -146,11 +146,11 @@ class CropSender:
         self._told = False
 
     def send(self, crop: Crop) -> bool:
-        """Send it; False if nobody is subscribed."""
+        """Send it; False without a subscriber."""
         if not self._heard.has_subscriber:
             if not self._told:
                 self._note(
-                    f"crops are lost: nobody is subscribed to {self._prefix}/*;"
+                    f"crops are lost: there is no subscriber to {self._prefix}/*;"
                     " a recorder keeps them, unless its --crops says otherwise"
                 )
             self._told = True

@@ -185,4 +185,4 @@ def _checked(derived: Derived, check: CheckEnvelope) -> Iterator[CheckedMessage]
         yield CheckedMessage(MAP_KEY, derived.payload, ENVELOPE_VERSION, None)
     else:
         for message in check([Received(derived.key, derived.payload)]):
-            yield message._replace(sha256="")  # nobody sent it, nobody is answered
+            yield message._replace(sha256="")  # no robot sent it, so none is answered

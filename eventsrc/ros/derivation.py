@@ -6,7 +6,7 @@ time when it was logged, and completes none, one or several envelopes. Another e
 ``mapfold/ros`` ends it: what still waited is then made without what it lacks.
 
 The recorder does this while it records, and appends each envelope right behind the message that
-completed it. So a log holds them, and nobody who reads one needs the types of ROS, or gets other
+completed it. So a log holds them, and its readers need no types of ROS, and get no other
 numbers on another machine. `derive` makes them again of the events of a log: the next recorder
 after one that was killed, and the tests.
 """

@@ -125,7 +125,7 @@ def publish_pictures(
     stop: threading.Event,
 ) -> int:
     """Publish pictures and poses, ``speed`` times as fast as the robot drove, until ``stop`` is
-    set; 0 is unpaced. Returns how many pictures. TransportError if nobody subscribes in time."""
+    set; 0 is unpaced. Returns how many pictures. TransportError without a subscriber in time."""
     images, poses = session.publisher(image_key), session.publisher(pose_key)
     if not images.wait_for_subscriber(wait_s):
         raise TransportError(

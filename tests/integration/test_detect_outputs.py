@@ -1,4 +1,4 @@
-"""Keyframes on their way out: a spool without room, crops that nobody takes."""
+"""Keyframes on their way out: a spool without room, crops without a subscriber."""
 
 import threading
 from collections.abc import Callable
@@ -71,7 +71,7 @@ def test_crops_are_lost_or_taken(connected: Callable[[], Session]) -> None:
     assert not sender.send(crop)
     assert not sender.send(crop)
     assert len(said) == 1
-    assert "nobody is subscribed to tb/crops/*" in said[0]
+    assert "there is no subscriber to tb/crops/*" in said[0]
     came = threading.Event()
     got: list[Received] = []
 
