@@ -1,9 +1,10 @@
 """Messages of ROS over DDS, by Cyclone DDS: types made from definitions, a writer that is a program
 of its own, a reader of the raw CDR.
 
-    python -m tests.dds DOMAIN         writes what `messages` says, until every reader has it
+    python -m tests.dds DOMAIN KEYFRAMES        writes a drive, and keeps it until it is killed
 """
 
+import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -117,22 +118,23 @@ def topic(on: DomainParticipant, name: str, type_name: str) -> Topic:
 
 
 def raw_samples(reader: DataReader) -> list[bytes]:
-    """The CDR of what a reader has received, as it came."""
+    """The CDR of what a reader has received, as it came; without notices that a writer has left."""
     any_state = SampleState.Any | ViewState.Any | InstanceState.Any
     taken = ddspy_take(reader._ref, any_state, 10_000)
-    return [] if isinstance(taken, int) else [bytes(each[0]) for each in taken]
+    return (
+        [] if isinstance(taken, int) else [bytes(cdr) for cdr, about in taken if about.valid_data]
+    )
 
 
 def main() -> None:
-    """Write a drive, and end when the readers have it."""
+    """Write a drive, and keep it for readers until the process is killed."""
     from tests.ros2dds_drive import KINDS, drive
 
     with participant(int(sys.argv[1])) as own:
         writers = {name: DataWriter(own, topic(own, name, KINDS[name]), qos=QOS) for name in KINDS}
         for name, message in drive(int(sys.argv[2])):
             writers[name].write(to_idl(message))
-        print("written", flush=True)
-        sys.stdin.read()
+        signal.pause()  # a writer that leaves early may leave before a reader has found it
 
 
 if __name__ == "__main__":
