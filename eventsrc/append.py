@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 from eventsrc.transport.config import key_fault
 
-from .envelope import Envelope, Offset, has_keyframe_id
+from .envelope import Offset, has_keyframe_id
 from .grid_messages import is_grid_message, read_grid_message
-from .ingest import DEFAULT_MAX_PAYLOAD_BYTES, Rejected, abbreviate
+from .ingest import DEFAULT_MAX_PAYLOAD_BYTES, CheckedEnvelope, Rejected, abbreviate
 from .log import LogWriter, NewEvent
 from .occupancy_map import InvalidMap
 from .system_events import MAP_KEY, REJECTED_KEY, RejectedPayload
@@ -28,16 +28,19 @@ class NewMap(NamedTuple):
     event: bytes
 
 
+Result = CheckedEnvelope | NewMap | Rejected
+
+
 class Checked(NamedTuple):
     """The version of a payload, and the result of its validation."""
 
     version: int
-    result: Envelope | NewMap | Rejected
+    result: Result
 
     @property
     def stamp_ns(self) -> int | None:
         """The robot's time; None if the payload has none."""
-        if not isinstance(self.result, Envelope) or not has_keyframe_id(self.version):
+        if not isinstance(self.result, CheckedEnvelope) or not has_keyframe_id(self.version):
             return None
         return self.result.stamp_ns
 
@@ -50,7 +53,7 @@ def append_payload(
     logged_ns: int | None = None,
     max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES,
     version: int | None = None,
-) -> Envelope | NewMap | Rejected:
+) -> Result:
     """Append ``payload``, which came under ``key``; returns the result of its validation.
 
     ``logged_ns`` is when it was received, now by default; ``version`` the envelope version that it
@@ -98,7 +101,9 @@ def check_payloads(
         PendingEvent(Offset(offset), key, logged_ns, payload, version or detect_version(payload))
         for offset, (key, payload) in enumerate(messages, first)
     ]
-    results: list[Envelope | NewMap | Rejected] = [*check_envelopes(pending, max_bytes=max_bytes)]
+    results: list[CheckedEnvelope | NewMap | Rejected] = [
+        *check_envelopes(pending, max_bytes=max_bytes)
+    ]
     keys = {event.key for event in pending}  # usually one
     faults = {key: fault for key in keys if (fault := key_fault(key)) is not None}
     for index, event in enumerate(pending if faults else ()):

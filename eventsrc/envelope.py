@@ -258,12 +258,17 @@ class Envelope(_Model):
 
     @property
     def stamp_ns(self) -> int:
-        """``timestamp`` as int nanoseconds, exact to the shortest decimal that names the float."""
-        text = repr(self.timestamp)
-        whole, _, part = text.partition(".")
-        if 0 < len(part) <= 9 and "e" not in part:
-            return int(whole + part.ljust(9, "0"))  # the same, faster
-        return int(Decimal(text).scaleb(9).to_integral_value())
+        """``timestamp`` as int nanoseconds."""
+        return stamp_ns(self.timestamp)
+
+
+def stamp_ns(timestamp: float) -> int:
+    """Seconds as int nanoseconds, exact to the shortest decimal that names the float."""
+    text = repr(timestamp)
+    whole, _, part = text.partition(".")
+    if 0 < len(part) <= 9 and "e" not in part:
+        return int(whole + part.ljust(9, "0"))  # the same, faster
+    return int(Decimal(text).scaleb(9).to_integral_value())
 
 
 def has_evidence(envelope: Envelope) -> bool:

@@ -9,7 +9,7 @@ import binascii
 import math
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain, islice
-from typing import Any, Final
+from typing import Any, Final, NamedTuple, Protocol
 
 import msgspec
 import numpy as np
@@ -22,11 +22,14 @@ from .envelope import (
     Detection,
     DetId,
     Envelope,
+    KeyframeId,
     NonFinite,
+    RunId,
     contains_non_finite,
     default_det_id,
     describe_error,
 )
+from .plain_envelopes import read_plain
 from .text import visible
 
 DEFAULT_MAX_PAYLOAD_BYTES = 16 * 1024 * 1024
@@ -69,6 +72,28 @@ class Rejected(msgspec.Struct, frozen=True, gc=False):
     reason: str
 
 
+class CheckedEnvelope(NamedTuple):
+    """What stays of a valid envelope whose bytes are kept."""
+
+    run_id: RunId
+    keyframe_id: KeyframeId
+    stamp_ns: int
+
+    @classmethod
+    def of(cls, envelope: Envelope) -> "CheckedEnvelope":
+        """That of an envelope."""
+        return cls(envelope.run_id, envelope.keyframe_id, envelope.stamp_ns)
+
+
+class _Embedded(Protocol):
+    """A detection, as far as its vector is concerned."""
+
+    @property
+    def embedding(self) -> str | None: ...
+    @property
+    def embedding_dim(self) -> int | None: ...
+
+
 class _RejectionError(Exception):
     """Carries a reason up to `ingest`, within this module."""
 
@@ -92,13 +117,24 @@ def ingest_all(
 
 def check_all(
     payloads: Sequence[bytes], *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES
-) -> list[Envelope | Rejected]:
-    """Like `ingest_all`, without the vectors and ids: for callers that only keep the bytes."""
-    read = [_read(payload, max_bytes) for payload in payloads]
-    if _decode_uniform(_detections(read)) is not None:
-        return [_check_det_ids(result) for result in read]
-    accepted = [_accept(result, None) for result in read]
-    return [result if isinstance(result, Rejected) else result.envelope for result in accepted]
+) -> list[CheckedEnvelope | Rejected]:
+    """Whether `ingest` accepts each, and the reason if not; faster, for callers that only keep the
+    bytes."""
+    plain = [read_plain(p) if check_cost(p, max_bytes) is None else None for p in payloads]
+    embedded = [d for e in plain if e is not None for d in e.detections if d.embedding is not None]
+    if embedded and _decode_uniform(embedded) is None:
+        plain = [None] * len(payloads)
+    return [
+        _check(payload, max_bytes)
+        if known is None
+        else CheckedEnvelope(RunId(known.run_id), KeyframeId(known.keyframe_id), known.stamp_ns)
+        for payload, known in zip(payloads, plain, strict=True)
+    ]
+
+
+def _check(payload: bytes, max_bytes: int) -> CheckedEnvelope | Rejected:
+    result = ingest(payload, max_bytes=max_bytes)
+    return result if isinstance(result, Rejected) else CheckedEnvelope.of(result.envelope)
 
 
 def _detections(read: Sequence[Envelope | Rejected]) -> list[Detection]:
@@ -214,19 +250,6 @@ def _repr_start(value: Any, room: int) -> str:
     return f"{{{text}}}" if isinstance(value, dict) else f"[{text}]"
 
 
-def _check_det_ids(result: Envelope | Rejected) -> Envelope | Rejected:
-    if isinstance(result, Rejected):
-        return result
-    for detection in result.detections:
-        if detection.det_id is not None:  # default ids are distinct
-            try:
-                _det_ids(result)
-            except _RejectionError as rejection:
-                return Rejected(str(rejection))
-            break
-    return result
-
-
 def _det_ids(envelope: Envelope) -> tuple[DetId, ...]:
     ids = [
         default_det_id(envelope.run_id, envelope.keyframe_id, index)
@@ -257,7 +280,7 @@ def _decode_vectors(envelope: Envelope) -> tuple[Vector | None, ...]:
     )
 
 
-def _decode_uniform(detections: Sequence[Detection]) -> Vector | None:
+def _decode_uniform(detections: Sequence[_Embedded]) -> Vector | None:
     """All vectors at once, shape (len(detections), dim), if they are valid and of one dimension, as
     is usual; None if each must be looked at."""
     try:

@@ -29,7 +29,6 @@ from .envelope import (
     ENVELOPE_VERSION,
     MAX_DETECTIONS,
     Detection,
-    Envelope,
     Offset,
     contains_non_finite,
     has_evidence,
@@ -38,6 +37,7 @@ from .envelope import (
 from .ingest import (
     DEFAULT_MAX_PAYLOAD_BYTES,
     Accepted,
+    CheckedEnvelope,
     Rejected,
     check_all,
     check_cost,
@@ -119,11 +119,11 @@ def read_envelopes(
 
 def check_envelopes(
     events: Sequence[VersionedEvent], *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES
-) -> list[Envelope | Rejected]:
-    """Like `read_envelopes`, without the vectors and ids."""
+) -> list[CheckedEnvelope | Rejected]:
+    """Like `read_envelopes`, for callers that only keep the bytes."""
     if any(event.version != ENVELOPE_VERSION for event in events):
         read = read_envelopes(events, max_bytes=max_bytes)
-        return [result if isinstance(result, Rejected) else result.envelope for result in read]
+        return [r if isinstance(r, Rejected) else CheckedEnvelope.of(r.envelope) for r in read]
     return check_all([event.payload for event in events], max_bytes=max_bytes)
 
 

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 from eventsrc.append import Checked, NewMap, check_payloads, checked_event, rejected_event
-from eventsrc.envelope import Envelope, Offset, RunId
+from eventsrc.envelope import Offset, RunId
 from eventsrc.errors import MisuseError
-from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES, Rejected
+from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES, CheckedEnvelope, Rejected
 from eventsrc.log import FsyncPolicy, LogWriter, MessageFormat
 from eventsrc.occupancy_map import InvalidMap, OccupancyMap, decode_map
 from eventsrc.system_events import (
@@ -145,7 +145,7 @@ class _Keyframe(NamedTuple):
 def _keyframe(checked: Checked) -> _Keyframe | None:
     """Run and stamp of a payload; None if it is no envelope, or one of a form without them."""
     stamp_ns, envelope = checked.stamp_ns, checked.result
-    if stamp_ns is None or not isinstance(envelope, Envelope):
+    if stamp_ns is None or not isinstance(envelope, CheckedEnvelope):
         return None
     return _Keyframe(envelope.run_id, stamp_ns)
 

@@ -6,7 +6,7 @@ from typing import Any
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from eventsrc.ingest import Accepted, Rejected, ingest
+from eventsrc.ingest import Accepted, CheckedEnvelope, Rejected, ingest
 from eventsrc.log import Event
 from eventsrc.upcast import check_envelopes, read_envelope, read_envelopes
 from tests.envelopes import detection, envelope
@@ -81,4 +81,4 @@ def test_an_older_envelope_is_read_as_if_it_had_no_field_of_later_names(
                 assert [v.tobytes() for v in result.vectors if v is not None] == [
                     v.tobytes() for v in want.vectors if v is not None
                 ]
-                assert found[1] == want.envelope
+                assert found[1] == CheckedEnvelope.of(want.envelope)

@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 
 from eventsrc.append import append_payload
-from eventsrc.envelope import ENVELOPE_VERSION, Envelope
+from eventsrc.envelope import ENVELOPE_VERSION
 from eventsrc.gap_history import fold_and_save_ledger
 from eventsrc.importers.run import import_files
-from eventsrc.ingest import Accepted, Rejected, ingest
+from eventsrc.ingest import Accepted, CheckedEnvelope, Rejected, ingest
 from eventsrc.log import Event, LogReader, LogWriter
 from eventsrc.log.format import ENVELOPE_VERSION_KEY, envelope_version, key_channel
 from eventsrc.log.verify import verify_log
@@ -68,8 +68,8 @@ def test_the_version_is_detected_from_the_payload(payload: bytes, version: int) 
 
 def test_a_log_of_both_forms_keeps_the_bytes_and_folds(log_path: Path) -> None:
     with LogWriter(log_path) as writer:
-        assert isinstance(append_payload(writer, KEY, envelope(1)), Envelope)
-        assert isinstance(append_payload(writer, KEY, BARE, logged_ns=10**9), Envelope)
+        assert isinstance(append_payload(writer, KEY, envelope(1)), CheckedEnvelope)
+        assert isinstance(append_payload(writer, KEY, BARE, logged_ns=10**9), CheckedEnvelope)
         assert isinstance(append_payload(writer, KEY, b'[{"class": "cup"}]'), Rejected)
     events = read_log(log_path)
     assert [e.version for e in events[:2]] == [ENVELOPE_VERSION, 1]

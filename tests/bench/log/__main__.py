@@ -5,6 +5,7 @@ names: record read latency
 """
 
 import argparse
+import os
 import shutil
 import tempfile
 import time
@@ -58,10 +59,14 @@ def bench_record(folder: Path, seconds: float, rate: float) -> None:
 
 
 def say_recording(what: str, done: Recording, wanted: str) -> None:
-    """The three lines of a recording."""
+    """The lines of a recording."""
     say(what, f"{done.per_s:,.0f}/s", wanted)
     say("  published and not recorded", f"{done.lost} of {done.published:,}", "0")
     say("  segments left to seal, and how long that took", sealing(done), "")
+    each = done.cpu_us
+    parts = ", ".join(f"{name} {each[name]:.1f}" for name in each)
+    say(f"  processor µs for each event: {parts}", f"{sum(each.values()):.1f} µs", "")
+    say("  one-minute load of the machine", f"{os.getloadavg()[0]:.1f}", "")
 
 
 def sealing(done: Recording) -> str:

@@ -1,10 +1,12 @@
 """Recording through a loopback router: publisher, router and recorder in processes of their own."""
 
+import os
+import resource
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +16,7 @@ from eventsrc.log.durable_files import FsyncPolicy
 from eventsrc.log_info import log_info
 from eventsrc.recorder import Recorder
 from eventsrc.transport.session import ZenohOptions, open_session
+from tests.cpu_time import cpu_seconds
 
 from .payloads import KEY
 from .plain import PlainFile
@@ -74,13 +77,16 @@ def said(process: "subprocess.Popen[str]") -> str:
 @dataclass(frozen=True)
 class Recording:
     """``per_s`` is events a second from the logging of the first to that of the last. ``unsealed``
-    segments were left at the end, and sealing them took ``sealing_s`` seconds more."""
+    segments were left at the end, and sealing them took ``sealing_s`` seconds more. ``cpu_us`` is
+    processor time for each event, by process: unlike the rate it hardly depends on what else the
+    machine does."""
 
     published: int
     recorded: int
     per_s: float
     unsealed: int
     sealing_s: float
+    cpu_us: Mapping[str, float]
 
     @property
     def lost(self) -> int:
@@ -123,17 +129,30 @@ def record(log: Path, fsync: FsyncPolicy, rate: float, seconds: float) -> Record
             open_session(ZenohOptions(connect=(endpoint,)), mode="client") as session,
         ):
             recorder = Recorder(session, writer, [KEY])
+            before = {"recorder": cpu_seconds(os.getpid()), "router": cpu_seconds(router.pid)}
             with program(PUBLISHER, endpoint, str(rate), str(seconds)) as publisher:
                 until = _Until(publisher, seconds)
                 report = recorder.run(
                     until.stop, every_s=0.05, watch=lambda now: until.check(now.recorded)
                 )
                 until.end()
+                used = {
+                    "recorder": cpu_seconds(os.getpid()) - before["recorder"],
+                    "router": cpu_seconds(router.pid) - before["router"],
+                    "publisher": cpu_seconds(publisher.pid),
+                }
             unsealed = len(list(log.glob("*.active"))) - 1
-            begun = time.perf_counter()
+            begun, ended = time.perf_counter(), _ended_cpu_s()
+        used["sealing"] = _ended_cpu_s() - ended  # all ended processes: only the sealer is new
     sealing_s = time.perf_counter() - begun
     per_s = _logged_per_s(log)
-    return Recording(until.published, report.recorded, per_s, unsealed, sealing_s)
+    cpu_us = {name: s * 1e6 / max(1, report.recorded) for name, s in used.items()}
+    return Recording(until.published, report.recorded, per_s, unsealed, sealing_s, cpu_us)
+
+
+def _ended_cpu_s() -> float:
+    ended = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return ended.ru_utime + ended.ru_stime
 
 
 def subscribe_plain(path: Path, seconds: float) -> float:

@@ -3,7 +3,7 @@
 import random
 from collections.abc import Sequence
 
-from eventsrc.ingest import Accepted, Rejected, check_all, ingest
+from eventsrc.ingest import Accepted, CheckedEnvelope, Rejected, check_all, ingest
 from tests.attack.corruption import corrupt_json
 from tests.envelopes import detection, envelope, payload
 from tests.fuzz.target import Target
@@ -35,6 +35,6 @@ class EnvelopeTarget(Target):
             assert said == kept
         else:
             assert isinstance(said, Accepted)
-            assert said.envelope == kept
+            assert CheckedEnvelope.of(said.envelope) == kept
             assert len(said.det_ids) == len(said.vectors) == len(said.envelope.detections)
             assert 0 <= said.envelope.stamp_ns < 2**63

@@ -1,0 +1,151 @@
+"""The quick check of envelopes accepts nothing that the models refuse, and reads the same of it."""
+
+import json
+import re
+from typing import Any
+
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from eventsrc.envelope import Detection, Envelope, EnvelopeCamera
+from eventsrc.ingest import CheckedEnvelope, Rejected, check_all, ingest
+from eventsrc.plain_envelopes import PlainCamera, PlainDetection, PlainEnvelope, read_plain
+from tests.envelopes import detection, envelope, payload
+from tests.thorough import examples
+
+EDGE_TEXTS = r"""
+0 -0 0.0 -0.0 1 1.0 1e0 1e2 01 1. .5 +1 0x1 1_0 1E+2 1e-400 5e-324 1e308 1e309 1e400 -1e400 1e23
+0.001 0.0009999999999999999 1000.0 1000 1000.0000000000001 170 170.00000000000003 1e6
+1000000.0000000001 7 7.0 7.000000000000001 -7.000000000000001 1e7 10000000.000000002 -1e7 9e9
+9000000000.000002 9000000001 16000 16001 9223372036854775807 9223372036854775808
+-9223372036854775808 -9223372036854775809 18446744073709551615 18446744073709551616
+123456789012345678901234567890 1774357200.123456789 0.1234567891234567 1e-7 123456789.123456784
+NaN Infinity -Infinity nan null true false "" "a" "1" "\u0000" "\u0009" "\n" "a\n" "\u007f" "\u0080"
+"\u0085" "\u009f" "\u00a0" "\u200b" "\u2028" "\ud800" "\udc00\ud800" "\ud83e\ude91" "🪑" "é" "\/"
+"\x" "\u00g0"
+[] {} [1] [1,2] [1,2,3] [1,2,3,4] [1,2,3,4,5] [1,2,3,"4"] [1,2,3,null] [1,2,3,1e400] [1,2,3,4,]
+{"a":NaN} [0.01,0,0,0,0.01,0,0,0,0.0004] [0.01,0.02,0,0.02,0.01,0,0,0,0.0004] [1,0,0,0,1,0,0,0,-1]
+{"hfov_deg":69.4,"width_px":640,"height_px":400} {"hfov_deg":0.5,"width_px":640,"height_px":400}
+{"hfov_deg":69.4,"width_px":640,"height_px":400,"yaw_rad":null} {"hfov_deg":69.4,"width_px":640}
+"AACAPwAAAAA=" "AACAPwAAAAA" "AAAAAAAAAAA=" "AADAfwAAgD8=" "AACAPwAAgD8="
+"""
+EDGES = [*EDGE_TEXTS.split(), '"a\x7fb"', '"a\x85b"', '"a\xa0b"', '"a b"', '"AACA PwAAgD8="']
+"""Values as JSON texts, at and beyond every bound, and some that are no JSON."""
+LONG = [json.dumps("x" * length) for length in (255, 256, 257)] + [json.dumps("é" * 256)]
+VALUES = st.sampled_from([*EDGES, *LONG]) | st.floats().map(json.dumps) | st.text().map(json.dumps)
+PLAIN = {
+    "run_id": '"run-a"',
+    "keyframe_id": "7",
+    "timestamp": "1774357207.25",
+    "map_x": "1.5",
+    "map_y": "-2",
+    "map_yaw": "0.5",
+}
+OF_ENVELOPE = [*PLAIN, "camera", "floor", "map_z", "pose_covariance", "detections", "note"]
+OF_DETECTION = [*(f.alias or name for name, f in Detection.model_fields.items()), "class_name", "x"]
+Members = list[tuple[str, str]]
+
+
+def written(members: Members) -> str:
+    """A JSON object, with names that may stand twice."""
+    return "{" + ",".join(f'"{name}":{value}' for name, value in members) + "}"
+
+
+DETECTIONS = st.lists(
+    st.lists(st.tuples(st.sampled_from(OF_DETECTION), VALUES), max_size=1).map(
+        lambda odd: written(
+            [("class", '"cup"'), ("confidence", "0.5"), ("bbox", "[0,0,1,1]"), *odd]
+        )
+    ),
+    max_size=3,
+).map(lambda found: f"[{','.join(found)}]")
+ODD = st.lists(st.tuples(st.sampled_from(OF_ENVELOPE), VALUES), max_size=2)
+PAYLOADS = st.builds(
+    lambda odd, found, left_out, first: written(
+        ([*odd] if first else [])
+        + [m for m in PLAIN.items() if m[0] != left_out]
+        + [("detections", found)]
+        + ([] if first else [*odd])
+    ).encode(errors="surrogatepass"),
+    ODD,
+    DETECTIONS,
+    st.sampled_from([*PLAIN] + 20 * [""]),
+    st.booleans(),
+)
+
+
+def checked(raw: bytes) -> CheckedEnvelope | Rejected:
+    """What the models say: pydantic decides."""
+    result = ingest(raw)
+    return result if isinstance(result, Rejected) else CheckedEnvelope.of(result.envelope)
+
+
+@settings(max_examples=examples(300), suppress_health_check=[HealthCheck.too_slow])
+@given(st.lists(PAYLOADS, min_size=1, max_size=3))
+@example([b'{"run_id":"a","run_id":"b","keyframe_id":1,"timestamp":0,"detections":[]}'])
+@example([b'\xef\xbb\xbf{"run_id":"a","keyframe_id":1,"timestamp":0,"detections":[]}'])
+@example([b'{"run_id":"a\xff","keyframe_id":1,"timestamp":0,"detections":[]}'])
+@example([b'{"run_id":"a\xed\xa0\x80","keyframe_id":1,"timestamp":0,"detections":[]}'])
+@example([b' {"run_id":"a","keyframe_id":1,"timestamp":0,"detections":[]}\n\t ', b"", b"{}", b"[]"])
+@example([b'{"run_id":"a","keyframe_id":1,"timestamp":0,"detections":[]}x'])
+@example([b'{"run_id":"a","keyframe_id":1,"timestamp":0,"detections":[]}\x00'])
+@example([b'{"run_\\u0069d":"a","keyframe_id":1,"timestamp":0,"detections":[]}'])
+def test_checked_together_each_is_answered_as_pydantic_does(payloads: list[bytes]) -> None:
+    assert check_all(payloads) == [checked(raw) for raw in payloads]
+
+
+@settings(max_examples=examples(300), suppress_health_check=[HealthCheck.too_slow])
+@given(PAYLOADS)
+def test_what_is_read_quickly_is_what_the_models_read(raw: bytes) -> None:
+    plain = read_plain(raw)
+    if plain is None:
+        return
+    whole = Envelope.model_validate_json(raw)
+    assert (plain.run_id, plain.keyframe_id) == (whole.run_id, whole.keyframe_id)
+    assert plain.timestamp.hex() == whole.timestamp.hex()
+    assert [d.embedding for d in plain.detections] == [d.embedding for d in whole.detections]
+    assert [d.embedding_dim for d in plain.detections] == [
+        d.embedding_dim for d in whole.detections
+    ]
+
+
+@given(st.floats(0.0, 9e9))
+def test_times_are_read_to_the_last_bit(timestamp: float) -> None:
+    raw = payload(envelope(timestamp=timestamp))
+    assert read_plain(raw) is not None
+    assert check_all([raw]) == [checked(raw)]
+
+
+def test_usual_envelopes_are_read_quickly() -> None:
+    evidence: dict[str, Any] = {"depth_m": 2.4, "depth_sigma_m": 0.1, "position": [2.2, 3.2]}
+    camera = {"hfov_deg": 69.4, "width_px": 640, "height_px": 400}
+    covariance = [0.01, 0, 0, 0, 0.01, 0, 0, 0, 0.0004]
+    for document in (
+        envelope(),
+        envelope(x=None),
+        envelope(run_id="r🪑", detections=[detection("tasse à café", [1.0, 2.0]), detection()]),
+        envelope(camera=camera, floor=1, map_z=2.9, pose_covariance=covariance),
+        envelope(floor="attic", detections=[detection("cup", [1.0, 2.0], **evidence)]),
+        envelope(detections=[detection(det_id="a"), detection(det_id="b")]),
+    ):
+        assert read_plain(payload(document)) is not None, document
+    for document in (
+        envelope(detections=[detection(det_id="a"), detection(det_id="a")]),
+        envelope(detections=[detection(det_id="run-a_kf1_d1"), detection()]),
+    ):
+        assert read_plain(payload(document)) is None, document
+
+
+def test_the_fields_are_those_of_the_models() -> None:
+    for model, plain in (
+        (Envelope, PlainEnvelope),
+        (Detection, PlainDetection),
+        (EnvelopeCamera, PlainCamera),
+    ):
+        known = {field.alias or name for name, field in model.model_fields.items()}
+        assert known == {*plain.__struct_encode_fields__}
+
+
+def test_no_control_character_is_printable() -> None:
+    control = re.compile(r"[\x00-\x1f\x7f-\x9f]")
+    assert not any(control.search(chr(i)) for i in range(0x110000) if chr(i).isprintable())
