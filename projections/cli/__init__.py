@@ -24,6 +24,7 @@ COMMANDS: "Mapping[str, str]" = {
     "tail": "projections.cli.databases",
     "status": "projections.cli.db",
     "db": "projections.cli.db",
+    "fleet": "projections.cli.fleet",
     "state": "projections.cli.maps",
     "draw": "projections.cli.maps",
     "export": "projections.cli.export",

@@ -190,20 +190,23 @@ def status(
     with databases(db, vector_db) as targets:
         found = projection_status(log, targets, settings)
     if as_json:
-        emit(
-            {
-                "log": {
-                    "id": info.log_id,
-                    "next_offset": info.events,
-                    "rejected": info.rejected,
-                    "lost": info.lost,
-                },
-                "sinks": {s.sink: _sink_document(s) for s in found.sinks},
-            }
-        )
+        emit(status_document(info, found))
     else:
         _print_status(info, found)
     finish(findings=not found.healthy or bool(info.rejected) or bool(info.lost))
+
+
+def status_document(info: LogInfo, found: Status) -> dict[str, Any]:
+    """The state of a log and its databases as JSON."""
+    return {
+        "log": {
+            "id": info.log_id,
+            "next_offset": info.events,
+            "rejected": info.rejected,
+            "lost": info.lost,
+        },
+        "sinks": {s.sink: _sink_document(s) for s in found.sinks},
+    }
 
 
 def _sink_document(sink: SinkStatus) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from eventsrc.log import (
     SegmentRecovery,
     Unreadable,
     VerbatimEvent,
+    Verification,
     recover_log,
     verify_log,
 )
@@ -191,12 +192,13 @@ def info(log: LogArgument, json_: JsonOption = False) -> None:
     """Show what a log holds: id, segments, offsets, counts by key, rejected, losses, times."""
     report = log_info(log, note=say)
     if json_:
-        emit(_info_document(report))
+        emit(info_document(report))
     else:
         display(_info_text(report))
 
 
-def _info_document(report: LogInfo) -> dict[str, Any]:
+def info_document(report: LogInfo) -> dict[str, Any]:
+    """What `log info --json` prints."""
     return {
         **asdict(report),
         "path": str(report.path),
@@ -315,17 +317,23 @@ def verify(log: LogArgument, json_: JsonOption = False) -> None:
     """
     result = verify_log(log)
     if json_:
-        emit({**asdict(result), "path": str(log)})
+        emit(verification_document(result))
     else:
         for finding in result.findings:
-            display(_finding_text(finding))
+            display(finding_text(finding))
     size = f"{counted(result.events, 'event')} in {counted(result.segments, 'segment')}"
     found = counted(len(result.findings), "finding") if result.findings else "all good"
     say(f"{log}: {size}, {result.size_bytes:,} bytes: {found}")
     finish(findings=bool(result.findings))
 
 
-def _finding_text(finding: Finding) -> str:
+def verification_document(result: Verification) -> dict[str, Any]:
+    """What `log verify --json` prints."""
+    return {**asdict(result), "path": str(result.path)}
+
+
+def finding_text(finding: Finding) -> str:
+    """A finding in one line."""
     where = [finding.segment] if finding.segment else []
     if finding.first_offset is not None:
         where.append(f"offsets {finding.first_offset} to {finding.last_offset}")

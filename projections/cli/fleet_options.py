@@ -1,0 +1,92 @@
+"""Options of the commands of ``mapfold fleet``, and the bar over all sites."""
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from eventsrc.errors import LogError
+from eventsrc.log import LogReader
+from projections.fleet.engine import Ended, Task
+from projections.fleet.engines import open_engine
+from projections.fleet.sites import Site, find_sites
+
+from .signals import sigterm_unwinds
+from .terminal import Bar, people, say
+
+SitesArgument = Annotated[
+    Path,
+    typer.Argument(
+        metavar="DIR|LIST",
+        help="Folder with a log in each subfolder, or a file with a line NAME PATH for each log.",
+    ),
+]
+TemplateOption = Annotated[
+    str | None,
+    typer.Option(
+        "--db",
+        metavar="TEMPLATE",
+        help="A database for each site, as postgresql://host/{site} [env MAPFOLD_DB; default:"
+        " databases of the embedded server, named as the sites].",
+    ),
+]
+VectorTemplateOption = Annotated[
+    str | None,
+    typer.Option(
+        "--vector-db",
+        metavar="TEMPLATE",
+        help="Another one for the embeddings [env MAPFOLD_VECTOR_DB; default: --db].",
+    ),
+]
+EngineOption = Annotated[
+    str,
+    typer.Option(
+        "--engine",
+        metavar="ENGINE",
+        help="local: processes on this machine; dask://HOST:PORT: the workers of that scheduler.",
+    ),
+]
+JobsOption = Annotated[
+    int | None,
+    typer.Option("--jobs", min=1, max=1024, help="Sites at once [default: the number of cores]."),
+]
+
+
+def sites_of(place: Path) -> list[Site]:
+    """The sites of DIR or LIST; says which subfolders are left out."""
+    return find_sites(place, say)
+
+
+@contextlib.contextmanager
+def ended_sites(
+    task: Task, requests: Sequence[Any], sites: Sequence[Site], engine: str, jobs: int | None
+) -> Iterator[Iterator[Ended]]:
+    """The results of a task for each site as they come, under a bar; SIGTERM ends the workers as
+    Ctrl-C does."""
+    with sigterm_unwinds(), open_engine(engine, jobs, len(requests)) as running, Bar() as bar:
+        yield _shown(running.run, task, requests, sites, bar)
+
+
+def _shown(
+    run: Any, task: Task, requests: Sequence[Any], sites: Sequence[Site], bar: Bar
+) -> Iterator[Ended]:
+    sizes = [_events(site) for site in sites] if people.is_terminal else [0] * len(sites)
+    total, ended = sum(sizes), set[int]()
+
+    def show(events: int) -> None:
+        done = max(events, sum(sizes[index] for index in ended))
+        bar.show(f"{len(ended):,} of {len(sites):,} sites", min(done, total), total)
+
+    for each in run(task, requests, show):
+        ended.add(each.index)
+        yield each
+
+
+def _events(site: Site) -> int:
+    try:
+        with LogReader(site.log) as reader:
+            return int(reader.next_offset)
+    except (LogError, OSError):  # its task reports it
+        return 0

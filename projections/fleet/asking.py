@@ -1,0 +1,58 @@
+"""Ask the databases of several sites one question, several at once."""
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+from eventsrc.errors import MapfoldError
+from projections.queries.relocalize import CandidateReader
+from projections.relocalize import Answer, Camera, Question, rank
+
+from .site_databases import SiteDatabases, exists
+from .sites import Site
+from .which_site import WhichSite, which_site
+
+
+@dataclass(frozen=True, slots=True)
+class FleetAnswer:
+    """What the sites that could be asked say together; the others with the reason."""
+
+    which: WhichSite
+    not_asked: Mapping[str, str]
+
+
+def ask_sites(
+    sites: Sequence[Site],
+    databases: Mapping[str, SiteDatabases],
+    question: Question,
+    *,
+    top: int,
+    camera: Camera | None,
+    jobs: int,
+) -> FleetAnswer:
+    """Ask each site; one that cannot be asked counts neither for nor against the others."""
+    names = [site.name for site in sites]
+    with ThreadPoolExecutor(jobs, "ask") as threads:  # it mostly waits for the databases
+        answers = threads.map(
+            lambda name: _ask(databases[name], question, top=top, camera=camera), names
+        )
+        found = dict(zip(names, answers, strict=True))
+    return FleetAnswer(
+        which_site({name: a for name, a in found.items() if isinstance(a, Answer)}),
+        {name: a for name, a in found.items() if isinstance(a, str)},
+    )
+
+
+def _ask(
+    databases: SiteDatabases, question: Question, *, top: int, camera: Camera | None
+) -> Answer | str:
+    """The answer of one site's map, or why there is none."""
+    for url in databases.urls:
+        if exists(url) is False:
+            return "there is no such database yet; `mapfold fleet replay` makes it"
+    try:
+        with CandidateReader(databases.targets) as reader:
+            candidates = reader.candidates(question.crops)
+        return rank(question, candidates, top=top, camera=camera)
+    except MapfoldError as error:
+        return str(error)

@@ -1,0 +1,121 @@
+"""Tasks on a Dask cluster: scheduler and workers that are there already (``--engine dask://…``).
+
+The only importer of ``distributed``. One task a site. When a worker is killed the scheduler gives
+its tasks to others; a task that fails for a reason of the machine's is begun again `RETRIES` times.
+"""
+
+import logging
+import queue
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any, Final, Self
+from uuid import uuid4
+
+from eventsrc.errors import MapfoldError, MisuseError
+from eventsrc.text import counted
+
+from .engine import RETRIES, Ended, Progress, Task
+
+_CONNECT_S: Final = 10.0
+_POLL_S: Final = 0.25
+_GONE_S: Final = 20.0
+"""So long the scheduler may be away: it is not told what is done meanwhile."""
+
+
+class ClusterError(MapfoldError):
+    """The cluster cannot be used, or has gone."""
+
+
+class DaskCluster:
+    """A client of the scheduler at ``address``, HOST:PORT. Raises MisuseError without the package
+    ``distributed``, and ClusterError when nothing answers."""
+
+    def __init__(self, address: str) -> None:
+        try:
+            import distributed
+        except ModuleNotFoundError:
+            raise MisuseError(
+                "--engine dask:// needs the package distributed: pip install 'mapfold[cluster]'"
+            ) from None
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # we say it ourselves
+        self.address = address
+        client: Any = distributed.Client
+        try:
+            self._client: Any = client(
+                f"tcp://{address}", timeout=_CONNECT_S, set_as_default=False, name="mapfold"
+            )
+        except (OSError, ValueError) as error:
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise ClusterError(
+                f"--engine dask://{address}: no scheduler answers there: {reason}; start one with"
+                " `dask scheduler`, and workers with `dask worker tcp://HOST:PORT --nthreads 1`"
+            ) from None
+
+    def run(
+        self, task: Task, requests: Sequence[Any], progress: Progress | None = None
+    ) -> Iterator[Ended]:
+        """See `projections.fleet.engine.Engine`; ``progress`` is not told of events."""
+        ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        name = f"mapfold-{uuid4().hex[:8]}"
+        futures = {}
+        for index, request in enumerate(requests):
+            future = self._client.submit(
+                _call, task, request, key=f"{name}-{index}", pure=False, retries=RETRIES
+            )
+            futures[future.key] = index, future
+            future.add_done_callback(ended.put)
+        away_since: float | None = None
+        while futures:
+            try:
+                future = ended.get(timeout=_POLL_S)
+            except queue.Empty:
+                away_since = self._watch(away_since, len(futures), len(requests))
+                if progress is not None:
+                    progress(0)
+                continue
+            index, _ = futures.pop(future.key)
+            if future.status in ("cancelled", "lost"):
+                self._raise_gone(len(futures) + 1, len(requests))
+            error = future.exception() if future.status == "error" else None
+            result = None if error is not None else future.result()
+            yield Ended(index, result, None if error is None else _error_text(error), 1)
+
+    def _watch(self, away_since: float | None, left: int, total: int) -> float | None:
+        """Since when the scheduler is away; raises ClusterError when that is too long."""
+        if self._client.status == "running":
+            return None
+        away_since = time.monotonic() if away_since is None else away_since
+        if self._client.status == "closed" or time.monotonic() - away_since > _GONE_S:
+            self._raise_gone(left, total)
+        return away_since
+
+    def _raise_gone(self, left: int, total: int) -> None:
+        raise ClusterError(
+            f"--engine dask://{self.address}: the scheduler has gone; of {left:,} of"
+            f" {counted(total, 'site')} it is not known whether they are done. Run the command"
+            " again: it skips those that are"
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        """Let the scheduler forget tasks that have not begun; those at work end by themselves."""
+        self._client.close(timeout=2.0 if kind is None else 0.5)
+
+
+def _call(task: Task, request: Any) -> Any:
+    return task(request, _unreported)
+
+
+def _unreported(_events: int) -> None:
+    """A cluster's tasks report at their end."""
+
+
+def _error_text(error: BaseException) -> str:
+    if type(error).__name__ == "KilledWorker":
+        return (
+            "the workers that had it were killed, one after the other; for want of memory? Look in"
+            " their logs"
+        )
+    return f"{type(error).__name__}: {str(error)[:400]}"

@@ -1,0 +1,48 @@
+"""What runs a task for each site, and what comes back."""
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Protocol, Self, TypeAlias
+
+RETRIES: Final = 2
+"""So often a site is begun again whose worker process was killed."""
+
+Progress: TypeAlias = Callable[[int], None]
+"""Receives how many events of its site a task has done."""
+Task: TypeAlias = Callable[[Any, Progress], Any]
+"""A function of a module, which a worker imports; the request and the result are pickled. It raises
+nothing that the site's log or database can cause: such errors are in its result."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """What came of the request with this index: a result, or ``error`` when its worker was killed
+    again and again, or met a fault in mapfold. ``attempts`` counts how often it was begun, as far
+    as the engine knows."""
+
+    index: int
+    result: Any
+    error: str | None
+    attempts: int
+
+
+class Engine(Protocol):
+    """Runs tasks. A context manager; leaving it ends or cancels what still runs."""
+
+    def run(
+        self, task: Task, requests: Sequence[Any], progress: Progress | None = None
+    ) -> Iterator[Ended]:
+        """Run the task for each request; yields each as soon as it has ended. ``progress`` receives
+        the sum of the events that tasks have reported, several times a second."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, kind: object, error: object, at: object, /) -> None: ...
+
+
+def usable_cores() -> int:
+    """The cores this process may run on, which may be fewer than the machine has."""
+    if hasattr(os, "sched_getaffinity"):
+        return max(1, len(os.sched_getaffinity(0)))
+    return os.cpu_count() or 1

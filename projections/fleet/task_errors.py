@@ -1,0 +1,48 @@
+"""Messages of the errors that a task meets at its site."""
+
+import contextlib
+from collections.abc import Collection, Iterator, Sequence
+
+from psycopg.conninfo import conninfo_to_dict, make_conninfo
+
+from eventsrc.advised import complete_by
+
+from .site_databases import SiteDatabases
+from .sites import Site
+
+
+@contextlib.contextmanager
+def advice_for(databases: SiteDatabases) -> Iterator[None]:
+    """Command lines that are advised meanwhile are for one site: they name its databases, without
+    passwords, which libpq reads from ~/.pgpass or PGPASSWORD."""
+
+    def complete(words: Sequence[str], without: Collection[str]) -> list[str]:
+        given = [("--db", databases.graph_url)]
+        if databases.vector_url != databases.graph_url:
+            given.append(("--vector-db", databases.vector_url))
+        if words[:1] == ["log"]:
+            return []
+        left_out = {*words, *without}
+        return [
+            word
+            for option, url in given
+            if option not in left_out
+            for word in (option, without_password(url))
+        ]
+
+    complete_by(complete)
+    try:
+        yield
+    finally:
+        complete_by(None)
+
+
+def without_password(url: str) -> str:
+    """A URL without its password."""
+    parts = conninfo_to_dict(url)
+    return url if parts.pop("password", None) is None else make_conninfo("", **parts)
+
+
+def os_error_text(error: OSError, site: Site) -> str:
+    """An error of the disk, with the file it is about."""
+    return f"{error.filename or site.log}: {error.strerror or error}"
