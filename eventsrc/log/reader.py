@@ -15,6 +15,7 @@ from pathlib import Path
 from eventsrc.advised import advised
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.errors import LogDamaged, LogError, LogNotFound, NotALog
+from eventsrc.progress import report_progress
 
 from .active_file import ActiveFile
 from .event import Event
@@ -25,6 +26,7 @@ from .segment import Unreadable, chunk_events
 
 _OPEN_SEGMENTS = 8
 _NO_END = Offset(sys.maxsize)
+_READING = "reading the log"
 
 OpenSegment = SealedFile | ActiveFile
 OnGap = Callable[[Unreadable], None]
@@ -116,18 +118,22 @@ class LogReader:
         stop = known if end is None else min(end, known)
         report = on_gap or _raise_at_gap(self.path)
         at = max(start, FIRST_OFFSET)
-        for entry, following in self._entries_from(at):
-            if at < min(entry.base, stop):  # the log's first segment is gone
-                last = Offset(min(entry.base, stop) - 1)
-                report(Unreadable(at, last, f"missing before {entry.path.name}"))
-                at = entry.base
-            if at >= stop:
-                break
-            segment_end = min(stop, following)
-            at = yield from self._read_segment(entry, at, segment_end, keys, report)
-            if at < segment_end:
-                report(Unreadable(at, Offset(segment_end - 1), f"missing after {entry.path.name}"))
-                at = segment_end
+        try:
+            for entry, following in self._entries_from(at):
+                if at < min(entry.base, stop):  # the log's first segment is gone
+                    last = Offset(min(entry.base, stop) - 1)
+                    report(Unreadable(at, last, f"missing before {entry.path.name}"))
+                    at = entry.base
+                if at >= stop:
+                    break
+                segment_end = min(stop, following)
+                at = yield from self._read_segment(entry, at, segment_end, keys, report)
+                if at < segment_end:
+                    gap_end = Offset(segment_end - 1)
+                    report(Unreadable(at, gap_end, f"missing after {entry.path.name}"))
+                    at = segment_end
+        finally:
+            report_progress(_READING, max(stop, 1), max(stop, 1))
         if end is None or end > known:
             self._report_damaged_end(start, report)
 
@@ -165,6 +171,7 @@ class LogReader:
                 continue
             if chunk.first >= end:
                 break
+            report_progress(_READING, chunk.first, self.next_offset)
             if wanted is None or chunk.channels is None or not wanted.isdisjoint(chunk.channels):
                 try:
                     yield from chunk_events(segment, chunk, at, end, keys)

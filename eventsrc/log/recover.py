@@ -16,6 +16,7 @@ from eventsrc.advised import advised
 from eventsrc.clock import Clock, system_clock
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.errors import LogDamaged, LogError, NotALog
+from eventsrc.progress import reported
 
 from .active_segment import ActiveSegment
 from .durable_files import GROUP_COMMIT, delete_durably, keep_copy, sync_directory, unlink_quietly
@@ -127,7 +128,8 @@ class _Recovery:
             delete_durably(self._log / LEDGER)
         self._log_id = log_id or uuid.uuid4().hex
         segments = list_segments(self._log)
-        for index, segment in enumerate(segments):
+        watched = reported(segments, "recovering", len(segments), "segments")
+        for index, segment in enumerate(watched):
             following = segments[index + 1] if index + 1 < len(segments) else None
             if segment.base > self._next_offset:
                 self._fill_from_overlapping(segment)

@@ -11,6 +11,7 @@ from pathlib import Path
 from eventsrc.advised import advised
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.errors import LogDamaged, LogError, NotALog
+from eventsrc.progress import report_progress
 from eventsrc.text import counted
 
 from .format import IMPORTED, SEALED, SegmentPath, WrongPlace, claims_of, head_of, segment_path
@@ -62,6 +63,9 @@ class _Verifier:
         self._log_id = _majority_log_id(segments)
         self._next_offset = FIRST_OFFSET
         self._count = 0
+        self._bytes_done = 0
+        self._bytes = 2 * sum(_size_of(segment) for segment in segments)
+        """Each segment is read twice: its chunks, then its events."""
         self._expected_hashes: set[str] = {NO_PREVIOUS}
         """Hashes that the next segment may name for the one before it; empty if any."""
 
@@ -72,6 +76,7 @@ class _Verifier:
             size += self._verify_segment(
                 segment, None if is_last else self._segments[index + 1].base
             )
+        report_progress("verifying", 1, 1, "MB")
         return Verification(
             self._log,
             self._log_id,
@@ -83,6 +88,7 @@ class _Verifier:
 
     def _verify_segment(self, segment: SegmentPath, reach: Offset | None) -> int:
         """Verify one segment, which ends at ``reach`` if that is known; its size in bytes."""
+        self._report(self._bytes_done)
         if not segment.sealed and not segment.path.exists():  # sealed since the folder was listed
             segment = SegmentPath(segment_path(self._log, segment.base, SEALED), segment.base, True)
         name = segment.path.name
@@ -107,9 +113,16 @@ class _Verifier:
         for first, last in scan.gaps:
             self._add("gap", "recorded events cannot be read", name, first, last)
         self._events.begin_segment(imported=IMPORTED in head)
+        size = segment.path.stat().st_size
+        self._bytes_done += size
         self._verify_events(segment, scan)
+        self._bytes_done += size
         self._next_offset = scan.next_offset
-        return segment.path.stat().st_size
+        return size
+
+    def _report(self, done: int) -> None:
+        total = max(self._bytes // 1_000_000, 1)
+        report_progress("verifying", min(done // 1_000_000, total), total, "MB")
 
     def _skip_segment(self, segment: SegmentPath, reach: Offset | None) -> None:
         """Report the offsets of a segment that does not belong here as missing."""
@@ -162,6 +175,7 @@ class _Verifier:
         fd = os.open(segment.path, os.O_RDONLY)
         try:
             for chunk in scan.chunks:
+                self._report(self._bytes_done + chunk.position)
                 for event in scanned_events(fd, scan, chunk):
                     self._events.check(event)
                     self._count += 1
@@ -181,6 +195,13 @@ class _Verifier:
         if count is None:
             count = 1 if first is None or last is None else last - first + 1
         self._found.append(Finding(kind, message, segment, first, last, count))
+
+
+def _size_of(segment: SegmentPath) -> int:
+    try:
+        return segment.path.stat().st_size
+    except OSError:  # sealed meanwhile, or unreadable, which is reported when it is read
+        return 0
 
 
 def _majority_log_id(segments: list[SegmentPath]) -> str | None:

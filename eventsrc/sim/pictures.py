@@ -20,6 +20,7 @@ from eventsrc.advised import advised
 from eventsrc.detector.vision import encode_jpeg
 from eventsrc.envelope import RunId
 from eventsrc.errors import MisuseError, TransportError
+from eventsrc.progress import reported
 from eventsrc.transport.session import Session
 
 from .camera import Camera
@@ -59,8 +60,8 @@ def camera_pictures(
     driven = itertools.takewhile(
         lambda pose: pose.time_s <= until_s, drive(house.grid, plan_tour(house, run))
     )
-    poses = _at_rate(driven, per_s) if per_s > 0 else keyframes(driven)
-    for number, pose in enumerate(poses):
+    poses = list(_at_rate(driven, per_s) if per_s > 0 else keyframes(driven))
+    for number, pose in enumerate(reported(poses, "drawing", len(poses), "pictures")):
         rng = stream("picture", run_id, number)
         view = camera.draw(pose)
         stamp_s = round(start_s + pose.time_s, 3)

@@ -19,6 +19,7 @@ import numpy as np
 from eventsrc.advised import advised
 from eventsrc.envelope import KeyframeId, RunId, default_det_id
 from eventsrc.errors import MisuseError, TransportError
+from eventsrc.progress import reported
 from eventsrc.transport.session import Session
 
 from .detector import detect, visible_objects
@@ -61,9 +62,10 @@ def simulate_run(seed: int = DEFAULT_SEED, run: str = EXPLORER) -> SimulatedRun:
     house, run_id = build_house(seed), RunId(f"sim-{seed}-{run}")
     poses = tuple(keyframes(drive(house.grid, plan_tour(house, run))))
     start_s = start_of(run)
+    watched = reported(poses, "simulating", len(poses), "keyframes")
     made = [
         _keyframe(house, run_id, number, pose, start_s)
-        for number, pose in enumerate(poses, start=1)
+        for number, pose in enumerate(watched, start=1)
     ]
     return SimulatedRun(
         run_id, house, tuple(envelope for envelope, _ in made), tuple(t for _, t in made), poses
@@ -137,7 +139,9 @@ def publish_run(
         )
     sent = 0
     started = time.monotonic()
-    for payload, pose in zip(run.payloads, run.true_poses, strict=True):
+    count = len(run.envelopes)
+    watched = reported(run.payloads, "publishing", count, "keyframes")
+    for payload, pose in zip(watched, run.true_poses, strict=True):
         due = started + pose.time_s / speed if speed > 0 else started
         if stop.wait(max(0.0, due - time.monotonic())):
             break

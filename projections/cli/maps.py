@@ -9,6 +9,7 @@ import typer
 from eventsrc.envelope import FIRST_OFFSET
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
+from eventsrc.progress import working
 from eventsrc.text import counted, visible
 from projections.model.advice import places_advice, space_advice
 from projections.model.digest import map_digest
@@ -57,7 +58,8 @@ def state(
         corrections = read_corrections(reader, known)
         settings = settings_from(settings_file, set_, corrections)
         _, view = fold_log_cached(reader, settings, end, note=say, corrections=corrections)
-    hexdigits = map_digest(view)
+    with working("computing the digest"):
+        hexdigits = map_digest(view)
     if json_:
         emit(state_document(view, hexdigits, known))
     elif digest:
@@ -122,14 +124,15 @@ def draw(
         view, title = view_of_floor(view, floor), f"{title}, floor {visible(floor)}"
     elif len(floors := {k.floor for k in view.keyframes if k.pose is not None}) > 1:
         say(f"{out} shows {len(floors)} floors, one above the other; --floor NAME draws one")
-    draw_map(
-        view,
-        out,
-        title=title,
-        floor=None if house is None else floor_of(build_house(house)),
-        bridges=bridges_of(view, merged) if merges else (),
-        min_observations=min_observations,
-    )
+    with working("drawing"):
+        draw_map(
+            view,
+            out,
+            title=title,
+            floor=None if house is None else floor_of(build_house(house)),
+            bridges=bridges_of(view, merged) if merges else (),
+            min_observations=min_observations,
+        )
     places, objects = counted(len(view.places), "place"), counted(len(view.objects), "object")
     say(f"wrote {out}: {places}, {objects}")
 

@@ -36,7 +36,8 @@ from eventsrc.errors import MapfoldError
 
 from .in_force import remember_running
 from .presets import add_presets
-from .terminal import EXIT_FAILED, OutputLost, say
+from .reading_bar import ReadingBar
+from .terminal import EXIT_FAILED, OutputLost, output_begins, say
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
@@ -157,6 +158,7 @@ def _main_options(
 
 class _Stdout(io.FileIO):
     def write(self, data: "ReadableBuffer", /) -> int:
+        output_begins()
         try:
             return super().write(data)
         except BrokenPipeError:
@@ -277,7 +279,8 @@ def _report_lost_output(lost: OutputLost) -> int:
 
 def _exit_code(app: Callable[..., Any]) -> int:
     try:
-        app()
+        with ReadingBar():
+            app()
     except SystemExit as ended:  # typer raises it after every command
         return ended.code if isinstance(ended.code, int) else 0
     except MapfoldError as error:

@@ -7,7 +7,7 @@ reasons come from the network.
 import contextlib
 import json
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import typer
@@ -78,12 +78,42 @@ def finish(*, findings: bool) -> None:
         raise typer.Exit(EXIT_FINDINGS)
 
 
-class Bar:
-    """A progress bar with rate and time left; prints nothing when stderr is not a terminal."""
+class _Listeners:
+    """What `reading_bar` wants to know."""
 
-    def __init__(self) -> None:
+    output: Callable[[], None] | None = None
+    own_bar: Callable[[int], None] | None = None
+
+
+def on_output(told: Callable[[], None] | None) -> None:
+    """Have this called before data goes to stdout."""
+    _Listeners.output = told
+
+
+def on_own_bar(told: Callable[[int], None] | None) -> None:
+    """Have this called with 1 before a command shows a bar of its own, and with -1 after it."""
+    _Listeners.own_bar = told
+
+
+def output_begins() -> None:
+    """To be called before data goes to stdout."""
+    if _Listeners.output is not None:
+        _Listeners.output()
+
+
+def _own_bar(opened: int) -> None:
+    if _Listeners.own_bar is not None:
+        _Listeners.own_bar(opened)
+
+
+class Bar:
+    """A progress bar with rate and time left; prints nothing when stderr is not a terminal. Unless
+    it is ``announced``, it is that of `reading_bar`, which all others take the place of."""
+
+    def __init__(self, *, announced: bool = True) -> None:
         from rich import progress  # here: importing it takes a tenth of a short command
 
+        self._announced = announced
         self._progress = progress.Progress(
             progress.TextColumn("{task.description}", markup=False),
             progress.BarColumn(),
@@ -94,20 +124,31 @@ class Bar:
             transient=True,
             disable=not people.is_terminal,
         )
-        self._task = self._progress.add_task("folding", total=None, rate="")
+        self._stage = ""
+        self._task = self._progress.add_task("", total=None, rate="")
 
     def __enter__(self) -> "Bar":
+        if self._announced:
+            _own_bar(1)
         self._progress.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self.stop()
+        if self._announced:
+            _own_bar(-1)
 
-    def show(self, stage: str, done: int, total: int) -> None:
-        """Show the name of the current stage, and that ``done`` of ``total`` events are through."""
+    def show(self, stage: str, done: int, total: int, unit: str = "events") -> None:
+        """Show the name of the current stage, and that ``done`` of ``total`` events, or what the
+        ``unit`` is, are through. With a total of 0, which nobody knows, only that it goes on."""
+        if stage != self._stage:
+            self._stage = stage
+            self._progress.reset(self._task)
         speed = self._progress.tasks[0].speed
-        rate = f"{speed:,.0f} events/s" if speed else ""
-        self._progress.update(self._task, description=stage, completed=done, total=total, rate=rate)
+        rate = f"{speed:,.0f} {unit}/s" if speed else ""
+        self._progress.update(
+            self._task, description=stage, completed=done, total=total or None, rate=rate
+        )
 
     def show_fold(self, done: int, total: int) -> None:
         """Progress of a command that only folds: the bar is removed when all events are folded."""
@@ -139,11 +180,13 @@ class FileBars:
         self._tasks: dict[int, progress.TaskID] = {}
 
     def __enter__(self) -> "FileBars":
+        _own_bar(1)
         self._progress.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._progress.stop()
+        _own_bar(-1)
 
     def show(self, file: int, name: str, done: int, size: int | None) -> None:
         """Show that ``done`` bytes of a file are read; ``file`` is a number of its own."""

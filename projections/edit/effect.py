@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from eventsrc.commands import Command
 from eventsrc.envelope import Offset
+from eventsrc.progress import working
 from eventsrc.text import counted
 from projections.corrections import (
     Corrections,
@@ -22,6 +23,7 @@ from projections.model.view import MapView
 from .current import CurrentMap
 
 _CACHE = "effects.json"
+_COMPARING = "comparing the maps"
 _VERSION = 1
 """Of the effects in it; a fold that gives another map of the same log needs another."""
 _MAX_CACHE_BYTES = 16 * 1024 * 1024
@@ -101,17 +103,20 @@ class Change:
 
     def difference(self) -> Difference:
         """All that changes."""
-        return difference_of(self.current.view, self.after, {}, ())
+        before, after = self.current.view, self.after
+        with working(_COMPARING):
+            return difference_of(before, after, {}, ())
 
 
 def effect_of(before: MapView, after: MapView) -> Effect:
     """How much differs between two maps of the same events."""
-    first, second = rows_of(before), rows_of(after)
-    return Effect(
-        len(_differing(first.places, second.places)),
-        len(_differing(first.objects, second.objects)),
-        len(_differing(first.keyframes, second.keyframes)),
-    )
+    with working(_COMPARING):
+        first, second = rows_of(before), rows_of(after)
+        return Effect(
+            len(_differing(first.places, second.places)),
+            len(_differing(first.objects, second.objects)),
+            len(_differing(first.keyframes, second.keyframes)),
+        )
 
 
 def _names(current: CurrentMap, corrections: Corrections) -> dict[PlaceOrdinal, str]:

@@ -16,6 +16,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from eventsrc.envelope import RunId
+from eventsrc.progress import reported
+from eventsrc.text import counted
 from projections.deltas import ObservationOrdinal
 from projections.exact import to_float32
 from projections.model.records import KeyframeRecord, ObjectRecord, ObservationRecord
@@ -72,7 +74,9 @@ def ask_own_questions(
         for keyframe in view.keyframes
         if keyframe.pose is not None and len(seen := _drawn(view, keyframe, crops, seed)) == crops
     ]
-    for keyframe, seen in spread(askable, most):
+    chosen = spread(askable, most)
+    stage = f"asking about itself, {counted(crops, 'crop')}"
+    for keyframe, seen in reported(chosen, stage, len(chosen), "keyframes"):
         asked = [_crop(view.observations[ordinal]) for ordinal in seen]
         visit = _visit(runs, keyframe)
         shown = _observations_of_things(view, by_class, seen)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from eventsrc.ingest import Accepted
+from eventsrc.progress import reported
 from projections.model.view import MapView
 from projections.relocalize import Answer, Camera, ExactIndex, Method, rank
 
@@ -124,7 +125,10 @@ class TrialRunner:
 
     def run(self, questions: Iterable[Question]) -> list[Trial]:
         """One trial for each question, three places asked for."""
-        return [self._run(question) for question in questions]
+        asked = list(questions)
+        return [
+            self._run(question) for question in reported(asked, "asking", len(asked), "questions")
+        ]
 
     def _run(self, question: Question) -> Trial:
         began = time.perf_counter()

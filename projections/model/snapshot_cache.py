@@ -14,6 +14,7 @@ from pathlib import Path
 
 from eventsrc.envelope import Offset
 from eventsrc.log import segment_signatures
+from eventsrc.progress import working
 from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
@@ -62,14 +63,14 @@ class SnapshotCache:
         for offset in reversed([offset for offset in self.offsets() if offset <= until]):
             path = self._path(offset)
             try:
-                data = path.read_bytes()
-                found = restore(
-                    data,
-                    self._settings,
-                    self._log_id,
-                    self._signatures,
-                    corrections=self._corrections,
-                )
+                with working("reading a snapshot of the map"):
+                    found = restore(
+                        path.read_bytes(),
+                        self._settings,
+                        self._log_id,
+                        self._signatures,
+                        corrections=self._corrections,
+                    )
             except (OSError, SnapshotRefused) as error:
                 self._note(f"{path}: this snapshot is not used: {error}; it is safe to delete")
                 self._unusable.add(path)
@@ -88,7 +89,8 @@ class SnapshotCache:
             self.folder.mkdir(exist_ok=True)
             if not path.exists() or path in self._unusable:
                 segments = self._signatures(semantic_map.next_offset)
-                beside.write_bytes(snapshot(semantic_map, view, self._log_id, segments))
+                with working("keeping a snapshot of the map"):
+                    beside.write_bytes(snapshot(semantic_map, view, self._log_id, segments))
                 beside.replace(path)
                 self._thin_out()
         except OSError as error:

@@ -22,6 +22,7 @@ Data goes to stdout (`--json` gives one JSON document or JSON lines), what is fo
 Exit codes: 0 done · 1 failed · 2 misuse · 3 done, with loss or findings · 130 interrupted (Ctrl-C)
 · 141 the reader of stdout left before everything was printed (`… | head`) · 143 terminated
 (SIGTERM). What runs until it is stopped, such as `record`, exits with 0 or 3 when it is stopped.
+What takes longer than a second shows a progress bar where stderr is a terminal.
 
 `W` is a point in a log: a number of events, an ISO time, `RUN:KEYFRAME`, or `end`. `--at N` means
 after the first N events; a time or a keyframe means including it. Where stamps run backwards in a

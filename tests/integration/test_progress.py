@@ -1,0 +1,269 @@
+"""Every command that may take long says how far it is, and a person at a terminal sees it.
+
+`PROVOKED` and `WITHOUT` together name every command: a new one fails here until it is in one.
+"""
+
+import io
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from rich.console import Console
+
+from eventsrc.errors import MapfoldError
+from eventsrc.log import verify_log
+from eventsrc.progress import report_progress, reported, tell_progress, working
+from projections.cli import COMMANDS, command_line, reading_bar, terminal
+from projections.cli.reading_bar import ReadingBar
+from projections.cli.terminal import Bar, FileBars, output_begins
+from tests.commands_in_logs import append_command, name_place
+from tests.docs.commands_page import commands
+from tests.logs import walk, write_log
+
+USAGE_ERROR: Any = typer.BadParameter.__base__
+Report = tuple[str, int, int, str]
+
+WITHOUT = {
+    "demo": "says each step, a few seconds each",
+    "record": "shows a status line",
+    "router": "runs until Ctrl-C, reads nothing",
+    "detect": "shows a status line",
+    "import": "has a bar for each file",
+    "foxglove": "has a bar of its own, then runs until Ctrl-C",
+    "reembed": "has a bar of its own",
+    "ui": "shows its progress in the page",
+    "serve": "asks the databases, until Ctrl-C",
+    "status": "reads indexes only",
+    "replay": "has a bar of its own",
+    "tail": "has a bar of its own",
+    "db check": "tests/integration/test_db_check.py",
+    "db retry": "folds as db check and replay do",
+    "db url": "reads no log",
+    "db start": "reads no log",
+    "db stop": "reads no log",
+    "db roles": "reads no log",
+    "query similar": "asks the databases",
+    "log info": "reads indexes only",
+    "completion": "reads no log",
+    "help": "reads no log",
+}
+"""The commands that need no progress bar, or have one of their own, and why."""
+
+EDITS = {
+    "name-place": ["run-a:3", "hall"],
+    "keep-apart": ["run-a:3", "run-a:9"],
+    "undo-merge": ["7"],
+    "join": ["run-a:3", "run-a:9"],
+    "same-object": ["run-a_kf3_d0", "run-a_kf9_d0"],
+    "different-objects": ["run-a_kf3_d0", "run-a_kf9_d0"],
+    "drop-object": ["run-a_kf3_d0"],
+    "drop-detection": ["run-a_kf3_d0"],
+    "forget-run": ["run-a"],
+    "forget-keyframes": ["run-a", "2..4"],
+    "correct-poses": ["run-a", "--dx", "1"],
+    "use-settings": ["--set", "eps_m=1"],
+    "undo": ["0"],
+}
+"""Arguments of the corrections. Some are refused: the log is read before."""
+
+PROVOKED = {
+    "simulate": ["--out", "drive.jsonl"],
+    "state": ["L"],
+    "draw": ["L", "--out", "map.png"],
+    "export": ["L", "--dot", "map.dot"],
+    "relocalize": ["--class", "cup", "--log", "L"],
+    "evaluate": ["--map", "L", "--self"],
+    "merges": ["L"],
+    "why": ["L", "run-a:3", "run-a:9"],
+    "diff": ["L", "3"],
+    "bisect": ["L", "place_count > 0"],
+    "whatif": ["L", "--set", "eps_m=1"],
+    "calibrate": ["L"],
+    "edits": ["L", "--effects"],
+    "log cat": ["L"],
+    "log verify": ["L"],
+    "log recover": ["L"],
+    "log spaces": ["L"],
+    "query where": ["hall", "--log", "L"],
+    "query contents": ["run-a_p0", "--log", "L"],
+    "query holding": ["cup", "--from", "run-a_p0", "--log", "L"],
+    "query path": ["run-a_p0", "run-a_p0", "--log", "L"],
+} | {f"edit {kind}": ["L", kind, *given, "--dry-run"] for kind, given in EDITS.items()}
+
+SLOW = {"simulate", "draw"}
+
+
+def names() -> list[str]:
+    """Every command, without the arguments of groups: ``edit undo``."""
+    return [" ".join(w for w in name.split()[1:] if w != "LOG") for name, _ in commands()]
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log L with a command in it."""
+    log = write_log(tmp_path_factory.mktemp("progress") / "L", walk(60, detections=3))
+    append_command(log, name_place(3, "hall"))
+    return log
+
+
+def reports_of(what: Callable[[], object]) -> list[Report]:
+    """What is reported while something runs."""
+    reports: list[Report] = []
+    tell_progress(lambda *report: reports.append(report))
+    try:
+        what()
+    finally:
+        tell_progress(None)
+    return reports
+
+
+def run(arguments: list[str]) -> None:
+    """Run a command in this process, whatever it exits with."""
+    program: Any = typer.main.get_command(command_line([arguments[0]]))
+    try:
+        program(arguments, standalone_mode=False)
+    except (MapfoldError, USAGE_ERROR):
+        return
+
+
+def test_each_command_is_looked_at() -> None:
+    assert sorted([*PROVOKED, *WITHOUT]) == sorted(names())
+    assert {name.split()[0] for name in names()} == set(COMMANDS)
+
+
+@pytest.mark.seconds
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in PROVOKED]
+)
+def test_a_command_says_how_far_it_is(
+    name: str, log: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(log.parent)
+    first = name.split()[0]
+    words = [first] if first == "edit" else name.split()
+    reports = reports_of(lambda: run([*words, *PROVOKED[name]]))
+    begun = [each for each in reports if not 0 < each[2] <= each[1]]
+    assert begun, capsys.readouterr().err
+    assert reports[-1][1] >= reports[-1][2] > 0  # the last stage has ended
+
+
+def test_verification_counts_up_to_the_end(log: Path) -> None:
+    reports = reports_of(lambda: verify_log(log))
+    done = [at / total for _, at, total, _ in reports]
+    assert done == sorted(done)
+    assert done[-1] == 1.0
+
+
+def test_a_stage_ends_however_it_is_left() -> None:
+    def stop_early() -> None:
+        watched = reported(range(5), "counting", 5, "numbers")
+        next(watched)
+        watched.close()
+
+    assert reports_of(stop_early) == [
+        ("counting", 0, 5, "numbers"),
+        ("counting", 5, 5, "numbers"),
+    ]
+
+    def fail() -> None:
+        with pytest.raises(OSError, match="no"), working("trying"):
+            raise OSError("no")
+
+    assert reports_of(fail) == [("trying", 0, 0, ""), ("trying", 1, 1, "")]
+    assert reports_of(lambda: list(reported([], "counting", 0, "numbers"))) == [
+        ("counting", 1, 1, "numbers")
+    ]
+
+
+@pytest.fixture
+def screen(monkeypatch: pytest.MonkeyPatch) -> Iterator[io.StringIO]:
+    """What a terminal gets, with a bar that does not wait."""
+    text = io.StringIO()
+    console = Console(file=text, force_terminal=True, width=100, markup=False)
+    monkeypatch.setattr(terminal, "people", console)
+    monkeypatch.setattr(reading_bar, "people", console)
+    yield text
+    tell_progress(None)
+
+
+def begin(bar: ReadingBar) -> None:
+    """Report the begin of a stage and wait until its bar is there, if it is to come."""
+    report_progress("reading the log", 10, 100)
+    if bar._timer is not None:
+        bar._timer.join()
+    report_progress("reading the log", 20, 100)
+
+
+def test_a_stage_that_takes_long_gets_a_bar(screen: io.StringIO) -> None:
+    with ReadingBar(0.0) as bar:
+        begin(bar)
+        assert bar._bar is not None
+        report_progress("reading the log", 100, 100)
+        assert bar._bar is None
+    assert "reading the log" in screen.getvalue()
+    assert "/100" in screen.getvalue()
+    report_progress("reading the log", 10, 100)  # nobody listens any more
+    assert bar._timer is None
+
+
+def test_a_short_stage_gets_none(screen: io.StringIO) -> None:
+    with ReadingBar(60.0):
+        report_progress("reading the log", 10, 100)
+        report_progress("reading the log", 100, 100)
+    assert screen.getvalue() == ""
+
+
+def test_an_end_that_nobody_knows_is_shown_too(screen: io.StringIO) -> None:
+    with ReadingBar(0.0) as bar, working("drawing"):
+        assert bar._timer is not None
+        bar._timer.join()
+    assert "drawing" in screen.getvalue()
+
+
+@pytest.mark.parametrize("own", [Bar, FileBars])
+def test_a_bar_of_the_command_takes_its_place(
+    own: Callable[[], Bar | FileBars], screen: io.StringIO
+) -> None:
+    with ReadingBar(0.0) as bar:
+        begin(bar)
+        with own():
+            assert bar._bar is None
+            begin(bar)
+            assert bar._timer is bar._bar is None
+        begin(bar)
+        assert bar._bar is not None
+
+
+def test_data_on_stdout_removes_it_for_good(
+    screen: io.StringIO, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ReadingBar(0.0) as bar:
+        monkeypatch.setattr(reading_bar, "_is_file", lambda _: True)
+        begin(bar)
+        output_begins()
+        assert bar._bar is not None
+        monkeypatch.setattr(reading_bar, "_is_file", lambda _: False)
+        output_begins()
+        begin(bar)
+        assert bar._timer is bar._bar is None
+
+
+def test_what_a_server_reads_is_not_shown(screen: io.StringIO) -> None:
+    with ReadingBar(0.0) as bar:
+        thread = threading.Thread(target=lambda: report_progress("reading the log", 10, 100))
+        thread.start()
+        thread.join()
+        assert bar._timer is None
+
+
+def test_nothing_is_told_without_a_terminal(
+    screen: io.StringIO, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reading_bar, "people", Console(file=screen))
+    with ReadingBar(0.0) as bar:
+        begin(bar)
+        assert bar._timer is bar._bar is None
+    assert screen.getvalue() == ""
