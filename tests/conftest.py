@@ -1,5 +1,7 @@
 """Fixtures every test may use; those of one subsystem live in ``tests/fixtures_*.py``."""
 
+import gc
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
@@ -19,13 +21,29 @@ pytest_plugins = [
 ]
 
 UNIT = Path(__file__).parent / "unit"
+INTEROP = Path(__file__).parent / "interop"
 NETWORK = {"pg_server", "endpoint", "connected", "start", "start_code"}
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """With ``-m unit`` do not even import the other tests; None leaves it to pytest."""
+    """Do not even import what is left out: with ``-m unit`` the tests elsewhere, with ``-m "not
+    slow"`` those of tests/interop, which are all slow; None leaves it to pytest."""
     other = collection_path.parent == UNIT.parent and collection_path != UNIT
-    return True if other and config.option.markexpr == "unit" else None
+    only = config.option.markexpr
+    ignored = (only == "unit" and other) or (only == "not slow" and collection_path == INTEROP)
+    return True if ignored else None
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Without the cyclic garbage collector, which would look through all modules and tests again
+    and again while they are made and, if they were not frozen, while they run."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

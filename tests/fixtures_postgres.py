@@ -12,7 +12,7 @@ from psycopg import sql
 
 from projections.database.connection import Targets, connect, ensure_extension
 from projections.database.embedded import EmbeddedServer
-from tests.servers import RUN_HOME
+from tests.servers import CARELESS, RUN_HOME
 
 _TEMPLATE = "mapfold_test_template"
 _numbers = count()
@@ -43,8 +43,10 @@ def pg_server() -> Iterator[EmbeddedServer]:
         return
     with EmbeddedServer(RUN_HOME) as server:
         with connect(server.url, autocommit=True) as connection:
-            # These tests kill the server, never the machine; without it a database is dropped fast.
-            connection.execute("ALTER SYSTEM SET fsync = off")
+            for each, value in CARELESS.items():
+                connection.execute(
+                    sql.SQL("ALTER SYSTEM SET {} = {}").format(sql.Identifier(each), value)
+                )
             connection.execute("SELECT pg_reload_conf()")
         yield server
 

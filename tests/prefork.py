@@ -195,6 +195,7 @@ def _must_be_new(env: Mapping[str, str]) -> bool:
         name
         for name in {**os.environ, **env}
         if name.startswith(("PYTHON", "LC_", "LANG", "OPENBLAS", "OMP_", "NPY_", "LD_"))
+        and name != "PYTHONUNBUFFERED"  # which `tests.prefork_server` obeys
     ]
     return THOROUGH or any(env.get(name) != os.environ.get(name) for name in names)
 

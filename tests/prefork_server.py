@@ -11,6 +11,7 @@ import atexit
 import contextlib
 import gc
 import importlib
+import io
 import json
 import os
 import select
@@ -103,9 +104,11 @@ def _become(request: Mapping[str, Any], fds: list[int]) -> None:
         os.dup2(fd, number)
     for fd in fds:
         os.close(fd)
-    text = {"encoding": sys.stdout.encoding, "errors": sys.stdout.errors, "closefd": False}
-    sys.stdin = os.fdopen(0, **text)
-    sys.stdout = os.fdopen(1, "w", **text)
+    text = {"encoding": sys.stdout.encoding, "errors": sys.stdout.errors}
+    through = bool(request["env"].get("PYTHONUNBUFFERED"))
+    sys.stdin = os.fdopen(0, closefd=False, **text)
+    raw = os.fdopen(1, "wb", 0 if through else -1, closefd=False)
+    sys.stdout = io.TextIOWrapper(raw, write_through=through, line_buffering=os.isatty(1), **text)
     sys.stderr = os.fdopen(2, "w", 1, errors="backslashreplace", closefd=False)
     os.chdir(request["cwd"])
     os.environ.clear()

@@ -8,7 +8,6 @@ from typing import Any
 
 from eventsrc.envelope import Offset
 from eventsrc.text import counted, visible
-from projections.drawing import draw_map, map_png
 from projections.model.digest import map_digest
 from projections.model.export import state_document, state_text
 from projections.model.view import MapView
@@ -58,6 +57,8 @@ class Map:
 
     def draw(self, out: str | Path, title: str = "") -> None:
         """Draw the map to a file .png, .svg or .pdf. Raises MisuseError if it cannot be written."""
+        from projections.drawing import draw_map  # here: matplotlib takes half a second to import
+
         draw_map(self.view, Path(out), title=title or self._title)
 
     @property
@@ -74,6 +75,8 @@ class Map:
         return f"<Map after {events}: {places}, {objects}, digest {self.digest[:16]}>"
 
     def _repr_html_(self) -> str:
+        from projections.drawing import map_png  # see `draw`
+
         picture = b64encode(map_png(self.view, self._title)).decode("ascii")
         names = ("place_id", "name", "type", "keyframe_count", "centroid_x", "centroid_y")
         head = "".join(f"<th>{name}</th>" for name in names)

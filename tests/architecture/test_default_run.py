@@ -51,6 +51,18 @@ def test_every_test_module_has_a_test_that_is_not_slow() -> None:
     assert slow == SLOW_AS_A_WHOLE, "keep one test quick, or name the module above"
 
 
+def test_what_is_not_even_imported_is_slow() -> None:
+    modules = [name for name in _test_modules() if name.startswith("interop/")]
+    assert len(modules) > 3
+    for name in modules:
+        text = (TESTS / name).read_text()
+        assert re.search(
+            r"^pytestmark = (\[\s+)?pytest\.mark\.slow$|^    pytest\.mark\.slow,$",
+            text,
+            re.MULTILINE,
+        )
+
+
 def test_every_command_is_run_by_a_test_that_is_not_slow() -> None:
     quick = "\n".join(
         lines

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rerun.chunk import RrdReader
 
 from eventsrc.envelope import Offset
 from eventsrc.errors import MisuseError
@@ -36,6 +35,8 @@ class Recording:
     def __init__(self, path: Path) -> None:
         self.entities: dict[str, list[Row]] = {}
         self.static: dict[str, list[Row]] = {}
+        from rerun.chunk import RrdReader  # here: no other test needs what takes half a second
+
         reader = RrdReader(str(path))
         assert [store.application_id for store in reader.recordings()] == ["mapfold"]
         for chunk in reader.stream():

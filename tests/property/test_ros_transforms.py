@@ -5,7 +5,6 @@ from itertools import pairwise
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation, Slerp
 
 from eventsrc.ros.transforms import (
     MAX_FRAMES,
@@ -32,6 +31,8 @@ def transforms(draw: st.DrawFn) -> Transform:
 
 
 def matrix(t: Transform) -> np.ndarray:
+    from scipy.spatial.transform import Rotation  # takes half a second to import
+
     whole = np.eye(4)
     whole[:3, :3] = Rotation.from_quat(t[3:]).as_matrix()
     whole[:3, 3] = t[:3]
@@ -49,6 +50,8 @@ def test_compose_and_invert_are_those_of_matrices(a: Transform, b: Transform) ->
 
 
 def slow_interpolation(a: Transform, b: Transform, share: float) -> np.ndarray:
+    from scipy.spatial.transform import Rotation, Slerp
+
     turns = Rotation.from_quat([a[3:], b[3:]])
     whole = np.eye(4)
     whole[:3, :3] = Slerp([0.0, 1.0], turns)(share).as_matrix()
