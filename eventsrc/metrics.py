@@ -1,4 +1,5 @@
-"""Metrics for Prometheus over HTTP: the recorder's, and any other values (`--metrics`).
+"""Metrics for Prometheus over HTTP: the recorder's, and any other values (`--metrics`); and as text
+for a server of another kind (`Instruments`).
 
 Only this module imports prometheus_client. Values are read when they are scraped, so metrics cost
 the recording nothing. Each request has a thread, which a silent connection would keep, with its
@@ -11,20 +12,29 @@ import shutil
 import socket
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from socketserver import ThreadingMixIn
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
-from prometheus_client import CollectorRegistry, make_wsgi_app
+from prometheus_client import (
+    CollectorRegistry,
+    Counter,
+    Histogram,
+    disable_created_metrics,
+    generate_latest,
+    make_wsgi_app,
+)
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from .errors import TransportError
-from .recorder import RecorderReport
+
+if TYPE_CHECKING:
+    from .recorder import RecorderReport
 
 SILENT_S: Final = 5.0
 MAX_CONNECTIONS: Final = 16
@@ -104,7 +114,7 @@ _GAUGES: Final = (
 
 
 class _RecorderCollector(Collector):
-    def __init__(self, report: Callable[[], RecorderReport], log: Path) -> None:
+    def __init__(self, report: "Callable[[], RecorderReport]", log: Path) -> None:
         self._report = report
         self._log = log
 
@@ -122,7 +132,7 @@ class _RecorderCollector(Collector):
 
 @contextmanager
 def serving_metrics(
-    address: tuple[str, int], report: Callable[[], RecorderReport], log: Path
+    address: tuple[str, int], report: "Callable[[], RecorderReport]", log: Path
 ) -> Iterator[int]:
     """Serve ``/metrics`` within a ``with`` block; yields the port, also for port 0.
 
@@ -153,6 +163,35 @@ class _ValuesCollector(Collector):
             metric = family(value.name, value.text, labels=[name for name, _ in value.labels])
             metric.add_metric([text for _, text in value.labels], value.value)
             yield metric
+
+
+class Instruments:
+    """What a program counts itself, beside values that are read at a scrape. For any thread."""
+
+    def __init__(self, values: Callable[[], Iterable[MetricValue]]) -> None:
+        disable_created_metrics()  # type: ignore[no-untyped-call]  # a time of birth for every label: as many lines again
+        self._registry = CollectorRegistry()
+        self._registry.register(_ValuesCollector(values))
+
+    def counter(self, name: str, text: str, labels: Sequence[str]) -> Callable[..., None]:
+        """A counter; returns the function that counts one up, called with the labels' values."""
+        counter = Counter(name, text, labels, registry=self._registry)
+        return lambda *of: counter.labels(*of).inc()
+
+    def histogram(
+        self, name: str, text: str, labels: Sequence[str], buckets: Sequence[float]
+    ) -> Callable[..., None]:
+        """A histogram; returns the function that takes a value and the labels' values."""
+        histogram = Histogram(name, text, labels, buckets=buckets, registry=self._registry)
+        return lambda value, *of: histogram.labels(*of).observe(value)
+
+    def text(self) -> bytes:
+        """All of it in Prometheus' text format."""
+        return generate_latest(self._registry)
+
+
+METRICS_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
+"""The content type of `Instruments.text`."""
 
 
 @contextmanager

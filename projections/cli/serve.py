@@ -38,6 +38,8 @@ if TYPE_CHECKING:  # modules that need the extra [serve] are imported when they 
     import socket
     import ssl
 
+    from projections.serve.metrics import ServiceMetrics
+
 
 @dataclass(frozen=True, slots=True)
 class HttpOptions:
@@ -47,6 +49,7 @@ class HttpOptions:
     tls_cert: Path | None
     tls_key: Path | None
     hosts: tuple[str, ...]
+    origins: tuple[str, ...]
 
     def refuse_without_http(self) -> None:
         """Raise MisuseError when one of them is given."""
@@ -55,6 +58,7 @@ class HttpOptions:
             ("--tls-cert", self.tls_cert),
             ("--tls-key", self.tls_key),
             ("--allow-host", self.hosts),
+            ("--cors", self.origins),
         ):
             if value:
                 raise MisuseError(f"{name} is for HTTP; give --http HOST:PORT too")
@@ -69,6 +73,7 @@ class HttpEndpoint:
     token: str | None
     tls: "ssl.SSLContext | None"
     hosts: tuple[str, ...]
+    origins: tuple[str, ...]
 
     @classmethod
     @contextmanager
@@ -79,7 +84,7 @@ class HttpEndpoint:
             raise MisuseError(f"--http {http}: write it as HOST:PORT, such as 127.0.0.1:8080")
         host = host.strip("[]") or "127.0.0.1"
         try:
-            from projections.serve.guard import TOKEN_VARIABLE, read_token
+            from projections.serve.guard import TOKEN_VARIABLE, read_origin, read_token
             from projections.serve.listening import bind, is_loopback, tls_context
         except ModuleNotFoundError as error:
             raise MisuseError(
@@ -87,6 +92,7 @@ class HttpEndpoint:
             ) from None
         if (options.tls_cert is None) != (options.tls_key is None):
             raise MisuseError("--tls-cert and --tls-key need each other; give both")
+        origins = tuple(read_origin(origin) for origin in options.origins)
         token, tls = read_token(options.token_file, os.environ, say), None
         if options.tls_cert is not None and options.tls_key is not None:
             tls = tls_context(options.tls_cert, options.tls_key)
@@ -103,17 +109,22 @@ class HttpEndpoint:
                     f"warning: --http {http} without TLS: others on the way can read the token and"
                     " all answers; give --tls-cert and --tls-key"
                 )
-            yield cls(host, listener, token, tls, options.hosts)
+            yield cls(host, listener, token, tls, options.hosts, origins)
 
     @contextmanager
-    def serving(self, answerer: Answerer, queue: FairQueue) -> Iterator[str]:
+    def serving(
+        self, answerer: Answerer, queue: FairQueue, metrics: "ServiceMetrics"
+    ) -> Iterator[str]:
         """Serve until the end of the block; yields the URL."""
-        from projections.serve.guard import Guard
+        from projections.serve.guard import Guard, SafeHeaders
         from projections.serve.http import create_app
         from projections.serve.listening import serving
+        from projections.serve.metrics import CountedResponses
 
-        guarded = Guard(create_app(answerer, queue), self.token, (self.host, *self.hosts))
-        with serving(guarded, self.listener, self.tls, say) as port:
+        app = create_app(answerer, queue, metrics, secured=self.token is not None)
+        guarded = Guard(app, self.token, (self.host, *self.hosts), self.origins)
+        counted = CountedResponses(SafeHeaders(guarded), metrics)
+        with serving(counted, self.listener, self.tls, say) as port:
             shown = f"[{self.host}]" if ":" in self.host else self.host
             yield f"{'http' if self.tls is None else 'https'}://{shown}:{port}"
 
@@ -152,6 +163,15 @@ def serve(
             " repeated.",
         ),
     ] = None,
+    cors: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--cors",
+            metavar="ORIGIN",
+            help="Site whose pages may ask from a browser, such as https://map.example; may be"
+            " repeated.",
+        ),
+    ] = None,
     zenoh: Annotated[bool, typer.Option(help="Serve mapfold/relocalize over Zenoh.")] = True,
     connect: ConnectOption = None,
     listen: ListenOption = None,
@@ -182,7 +202,7 @@ def serve(
         zenoh_options(connect, listen, zenoh_config),
         max_message_bytes=max(_LARGEST_BYTES, 4 * max_bytes),
     )
-    given = HttpOptions(token_file, tls_cert, tls_key, tuple(allow_host or ()))
+    given = HttpOptions(token_file, tls_cert, tls_key, tuple(allow_host or ()), tuple(cors or ()))
     with ExitStack() as stack:
         endpoint = None if http is None else stack.enter_context(HttpEndpoint.bound(http, given))
         if http is None:
@@ -196,15 +216,23 @@ def serve(
             session = stack.enter_context(open_session(options, mode=options.mode))
         # Closed before the session, which sends its last answers.
         queue = stack.enter_context(FairQueue(workers))
+        metrics = None if endpoint is None else _metrics(answerer, queue)
         if session is not None:
-            stack.enter_context(ZenohService(session, answerer, queue))
+            watch = (lambda *_: None) if metrics is None else metrics.watch
+            stack.enter_context(ZenohService(session, answerer, queue, watch))
             say("answering mapfold/relocalize and mapfold/state/** over Zenoh")
-        if endpoint is not None:
-            url = stack.enter_context(endpoint.serving(answerer, queue))
+        if endpoint is not None and metrics is not None:
+            url = stack.enter_context(endpoint.serving(answerer, queue, metrics))
             say(f"answering {url}, described at /docs")
         say("Ctrl-C ends it")
         stop.wait()
     say("service ended")
+
+
+def _metrics(answerer: Answerer, queue: FairQueue) -> "ServiceMetrics":
+    from projections.serve.metrics import ServiceMetrics
+
+    return ServiceMetrics(answerer, queue)
 
 
 def register(app: typer.Typer) -> None:

@@ -5,13 +5,14 @@ Ids and class names are bind parameters, encoded as agtype strings; they may hol
 
 import json
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import psycopg
 
 from eventsrc.advised import advised
 from projections.database.connection import Connection, database_errors, describe_connection
 from projections.database.graph_render import text
+from projections.database.labels import graphid_base
 from projections.database.statements import statements, tables
 from projections.errors import ProjectionMissing
 
@@ -107,6 +108,35 @@ def objects_near(connection: Connection, x: float, y: float, radius: float) -> l
     """
     found = _read_square(connection, "objects", x, y, radius)
     return _nearest(found, ("est_x", "mean_x"), ("est_y", "mean_y"), "object_id", (x, y), radius)
+
+
+class Page(NamedTuple):
+    """A part of a list. ``after`` is the number of the last one here, None if no more come."""
+
+    things: list[dict[str, Any]]
+    after: int | None
+
+
+def places_after(connection: Connection, after: int, most: int) -> Page:
+    """At most ``most`` Places with numbers greater than ``after``, in founding order."""
+    values = {"after": str(graphid_base("Place") + after), "most": most + 1}
+    rows = _rows(connection, "page_of_places", **values)
+    return _page([(row[0], json.loads(row[1])) for row in rows], most)
+
+
+def objects_after(connection: Connection, after: int, most: int) -> Page:
+    """At most ``most`` Objects with numbers greater than ``after``, in founding order, each with
+    its ``place_id``."""
+    values = {"after": str(graphid_base("Object") + after), "most": most + 1}
+    rows = _rows(connection, "page_of_objects", **values)
+    return _page([(row[0], _object_document(row[1:])) for row in rows], most)
+
+
+def _page(found: list[tuple[str, dict[str, Any]]], most: int) -> Page:
+    """``found`` has one more than the page when more come."""
+    page = found[:most]
+    after = int(page[-1][0]) & _NUMBER_MASK if len(found) > most else None
+    return Page([thing for _, thing in page], after)
 
 
 def _nearest(

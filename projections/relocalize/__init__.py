@@ -28,11 +28,11 @@ from .ranking import (
 from .reading import (
     parse_json,
     parse_question,
-    question_schema,
     read_crops,
     read_moved,
     read_question,
 )
+from .schema import question_schema
 from .track import Track, Tracked, movement_of
 from .walls import WallMap
 

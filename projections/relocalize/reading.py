@@ -13,7 +13,7 @@ in an envelope is *not* read: it is what is being asked.
 
 import binascii
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated, Any, Final
 
@@ -40,7 +40,9 @@ _Numbers = Annotated[list[float], Field(max_length=MAX_DIMENSION, fail_fast=True
 _Pixels = Annotated[list[float], Field(min_length=4, max_length=4, fail_fast=True)]
 
 
-class _CropModel(BaseModel):
+class CropModel(BaseModel):
+    """A crop as it is sent."""
+
     model_config = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False)
 
     embedding: str | _Numbers | None = None
@@ -52,12 +54,12 @@ class _CropModel(BaseModel):
     det_id: Text | None = None
 
 
-_CROPS: TypeAdapter[list[_CropModel]] = TypeAdapter(
-    Annotated[list[_CropModel], Field(fail_fast=True)]
+_CROPS: TypeAdapter[list[CropModel]] = TypeAdapter(
+    Annotated[list[CropModel], Field(fail_fast=True)]
 )
 
 
-class _Movement(BaseModel):
+class MovementModel(BaseModel):
     """How the robot moved since the view before."""
 
     model_config = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False)
@@ -168,7 +170,7 @@ def read_moved(document: Any) -> Movement:
 def _movement(document: dict[str, Any], name: str, since: str) -> Movement:
     """``since`` is what it is since the one before, a view or a question."""
     try:
-        moved = _Movement.model_validate(document)
+        moved = MovementModel.model_validate(document)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         key = ".".join(str(part) for part in (name, *first["loc"]) if part)
@@ -228,7 +230,7 @@ def _crop_list(document: Any) -> list[Any]:
     return document
 
 
-def _validated(items: list[Any], name: str) -> list[_CropModel]:
+def _validated(items: list[Any], name: str) -> list[CropModel]:
     try:
         return _CROPS.validate_python(items)
     except ValidationError as error:
@@ -244,7 +246,7 @@ def _validated(items: list[Any], name: str) -> list[_CropModel]:
         raise QuestionError(f"{name}.{place}: {what}") from None
 
 
-def _crop(name: str, model: _CropModel) -> Crop:
+def _crop(name: str, model: CropModel) -> Crop:
     box = None if model.bbox is None else (model.bbox[0], model.bbox[1], *model.bbox[2:])
     vector = None if model.embedding is None else _unit_vector(name, model)
     return Crop(
@@ -257,7 +259,7 @@ def _crop(name: str, model: _CropModel) -> Crop:
     )
 
 
-def _unit_vector(name: str, model: _CropModel) -> Vector:
+def _unit_vector(name: str, model: CropModel) -> Vector:
     raw = _floats(name, model.embedding)
     if len(raw) > MAX_DIMENSION:
         raise QuestionError(
@@ -288,41 +290,3 @@ def _floats(name: str, given: str | list[float] | None) -> Vector:
         raise QuestionError(f"{name}.embedding: is empty")
     with np.errstate(over="ignore"):  # an overflow becomes infinity and is refused as such
         return np.asarray(given, dtype=np.float64).astype(np.float32)
-
-
-def question_schema(options: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """A JSON schema of questions, for people and generators of clients; ``options`` are properties
-    that the answering side reads beside those of the question."""
-    crop = _CropModel.model_json_schema(by_alias=True)
-    crop |= {"title": "Crop", "description": "It needs an embedding or a class."}
-    crops = {"type": "array", "items": crop, "maxItems": MAX_CROPS}
-    movement = _Movement.model_json_schema()
-    view = {
-        "title": "View",
-        "type": "object",
-        "description": movement["description"] + " The first view's is that since the question"
-        " before, and is read only where questions are tracked.",
-        "properties": {**movement["properties"], "crops": crops},
-        "required": ["crops"],
-    }
-    views = {"type": "array", "items": view, "minItems": 1, "maxItems": MAX_VIEWS}
-    common = {"camera": EnvelopeCamera.model_json_schema(), **(options or {})}
-    moved = {
-        key: {**value, "description": "Since the question before; read where they are tracked."}
-        for key, value in movement["properties"].items()
-    }
-    forms: tuple[tuple[str, Any, dict[str, Any]], ...] = (
-        ("crops", crops, moved),
-        ("detections", crops, moved),
-        ("views", views, {}),
-    )
-    return {
-        "title": "Question",
-        "anyOf": [
-            *(
-                {"type": "object", "properties": {key: of, **more, **common}, "required": [key]}
-                for key, of, more in forms
-            ),
-            crops,
-        ],
-    }

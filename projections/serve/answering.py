@@ -7,7 +7,7 @@ A question is what ``mapfold relocalize`` takes; an object may also have ``top``
 
 import contextlib
 import json
-import math
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -21,7 +21,6 @@ from projections.errors import (
     ProjectionMissing,
     QuestionError,
 )
-from projections.queries.graph_reads import objects_near, places_near
 from projections.relocalize import (
     Camera,
     Method,
@@ -33,10 +32,11 @@ from projections.relocalize import (
     read_moved,
     read_question,
 )
-from projections.relocalize.question import STILL, Movement
+from projections.relocalize.question import Movement
 
 from .pools import Pools
 from .sessions import Sessions, session_name
+from .states import state_read
 
 
 class TooMuchError(MapfoldError):
@@ -99,11 +99,7 @@ class RepeatFilter:
 
 
 MAX_TOP: Final = 100
-DEFAULT_RADIUS_M: Final = 3.0
-STATES: Final = {"places": places_near, "objects": objects_near}
-"""What can be asked for near a pose, and the function that finds it."""
-MAX_METRES: Final = 1e8
-"""Ten times as far as a pose may be from the origin."""
+_DIGITS: Final = re.compile(r"[0-9]{1,9}", re.ASCII)
 DEFAULT_MAX_BYTES: Final = 1_000_000
 _KINDS: Final[tuple[tuple[type[MapfoldError], str, int, str | None], ...]] = (
     (BusyError, "too_much", 503, None),
@@ -141,6 +137,8 @@ class Answerer:
         self._parsing = threading.Lock()
         self._sessions = Sessions()
         self.max_bytes = max_bytes
+        self.database_up = True
+        """Whether the database could be asked when it was last tried."""
 
     def relocalize(self, payload: bytes, options: Mapping[str, str]) -> dict[str, Any]:
         """The answer to a question, as ``relocalize --json`` gives it."""
@@ -162,17 +160,17 @@ class Answerer:
         return answer.document() | {"track": tracked}
 
     def state(self, what: str, options: Mapping[str, str]) -> dict[str, Any]:
-        """``places`` or ``objects`` near a pose: x, y and radius in metres."""
-        near = STATES.get(what)
-        if near is None:
-            raise QuestionError(
-                f"no state called {describe_value(what)}; there are {' and '.join(STATES)}"
-            )
-        x, y = _number(options, "x"), _number(options, "y")
-        radius = _number(options, "radius", DEFAULT_RADIUS_M)
+        """``places`` or ``objects``: near a position (x, y and radius in metres), or a page of all
+        of them (limit, cursor)."""
+        read = state_read(what, options)
         with self._reporting_errors():
             self._bucket.take_token()
-            return {what: self._pools.on_graph(lambda c: near(c, x, y, radius))}
+            return self._pools.on_graph(read)
+
+    @property
+    def session_count(self) -> int:
+        """How many sessions are tracked."""
+        return len(self._sessions)
 
     def health(self) -> dict[str, str]:
         """``{"status": "ok"}``. Raises DatabaseError when questions cannot be answered now."""
@@ -185,8 +183,12 @@ class Answerer:
         try:
             yield
         except DatabaseError as error:
+            self.database_up = False
             self._complaints(f"mapfold: {error}")
             raise
+        except MapfoldError:
+            raise  # it says nothing of the database
+        self.database_up = True
 
 
 def refusal(error: MapfoldError) -> tuple[int, dict[str, Any]]:
@@ -213,17 +215,21 @@ class _Asked(NamedTuple):
 def _read(payload: bytes, options: Mapping[str, str]) -> _Asked:
     document = parse_json(payload)
     fields = document if isinstance(document, dict) else {}
-    top = _top(options.get("top", fields.get("top", 3)))
-    method = _method(options.get("method", fields.get("method", "joint")))
-    session = session_name(options.get("session", fields.get("session")))
+    # What the question says is checked also where an option takes its place.
+    top = _top(fields.get("top", 3))
+    method = _method(fields.get("method", "joint"))
+    session = session_name(fields.get("session"))
+    if "top" in options:
+        top = _top(int(options["top"]) if _DIGITS.fullmatch(options["top"]) else options["top"])
+    method = _method(options.get("method", method))
+    session = session_name(options.get("session", session))
     if session is not None and method != "joint":
         raise QuestionError("a session follows the poses of the method joint; ask without plain")
-    moved = STILL if session is None else read_moved(document)
-    return _Asked(read_question(document), top, method, session, moved)
+    return _Asked(read_question(document), top, method, session, read_moved(document))
 
 
 def _top(value: Any) -> int:
-    if isinstance(value, str) and value.isascii() and value.isdecimal() and len(value) <= 9:
+    if isinstance(value, float) and value.is_integer():  # 3.0 is an integer in JSON schemas
         value = int(value)
     if type(value) is not int or not 1 <= value <= MAX_TOP:
         raise QuestionError(f"top is {describe_value(value)}; give a number from 1 to {MAX_TOP}")
@@ -234,15 +240,3 @@ def _method(value: Any) -> Method:
     if isinstance(value, str) and value in get_args(Method):
         return cast("Method", value)
     raise QuestionError(f"method is {describe_value(value)}; there are joint and plain")
-
-
-def _number(options: Mapping[str, str], name: str, default: float | None = None) -> float:
-    try:
-        value = float(options[name]) if name in options or default is None else default
-    except (KeyError, ValueError):
-        value = math.nan
-    if not abs(value) <= MAX_METRES:  # nor NaN
-        raise QuestionError(
-            f"{name} is {describe_value(options.get(name))}; give a number of metres"
-        )
-    return value

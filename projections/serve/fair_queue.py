@@ -53,7 +53,7 @@ class FairQueue:
     def __init__(
         self, workers: int, *, capacity: int = CAPACITY, max_wait_s: float = MAX_WAIT_S
     ) -> None:
-        self._capacity, self._max_wait_s = capacity, max_wait_s
+        self.capacity, self._max_wait_s = capacity, max_wait_s
         self._queued: dict[str, deque[_Job]] = {}  # by peer, in the order of their turns
         self._refused: list[_Job] = []
         self._closing = False
@@ -72,12 +72,17 @@ class FairQueue:
                 job.refuse()
                 return job.future
             self._queued.setdefault(peer, deque()).append(job)
-            if sum(map(len, self._queued.values())) > self._capacity:
+            if sum(map(len, self._queued.values())) > self.capacity:
                 heaviest = max(self._queued, key=lambda name: len(self._queued[name]))
                 self._refused.append(self._queued[heaviest].pop())
                 self._drop_empty()
             self._changed.notify_all()
         return job.future
+
+    def __len__(self) -> int:
+        """How many wait."""
+        with self._changed:
+            return sum(map(len, self._queued.values()))
 
     def close(self) -> None:
         """Refuse new work and finish what is queued. May be called twice."""

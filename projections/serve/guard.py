@@ -2,12 +2,15 @@
 
 * ``Host`` must be an address of this machine, localhost or a name of ``--allow-host``. Otherwise a
   web page could point its own name at this address and read the answers (DNS rebinding).
-* ``Origin``, which browsers send with requests of other sites, must equal ``Host``.
+* ``Origin``, which browsers send with requests of other sites, must equal ``Host`` or be one of
+  ``--cors``. Pages of those may read the answers: they get the headers of CORS, and their preflight
+  requests, which browsers send without a token, are answered.
 * With a token, every path requires it: ``Authorization: Bearer TOKEN``.
 """
 
 import hmac
 import os
+import re
 import stat
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -15,8 +18,9 @@ from typing import Final
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers
-from starlette.responses import JSONResponse
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.middleware.cors import CORSMiddleware
+from starlette.responses import JSONResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from eventsrc.errors import MisuseError
 
@@ -24,6 +28,12 @@ TOKEN_VARIABLE: Final = "MAPFOLD_TOKEN"  # noqa: S105  the name of a variable
 MIN_TOKEN: Final = 16
 _MAX_FILE: Final = 4096
 _LOOPBACK: Final = frozenset({"localhost", "127.0.0.1", "::1"})
+_PORTS: Final = {"http": 80, "https": 443}
+_HOST: Final = re.compile(r"[a-z0-9._-]+|[0-9a-f:]+")
+_SAFE: Final = (
+    (b"content-security-policy", b"default-src 'none'; frame-ancestors 'none'"),
+    (b"x-content-type-options", b"nosniff"),
+)
 _ADVICE: Final = "make one with: openssl rand -hex 32"
 
 
@@ -61,20 +71,57 @@ def _checked(text: str, where: str) -> str:
     return token
 
 
-class Guard:
-    """ASGI middleware that passes on what is allowed and refuses the rest."""
+def read_origin(text: str) -> str:
+    """An origin of ``--cors`` as browsers send it. Raises MisuseError."""
+    wrong = MisuseError(
+        f"--cors {text}: write an origin as a browser sends it, such as https://map.example or"
+        " http://localhost:5173; each site is named, * is not taken"
+    )
+    try:
+        parts = urlsplit(text)
+        port = parts.port
+    except ValueError:
+        raise wrong from None
+    host = parts.hostname
+    if parts.scheme not in _PORTS or not host or not _HOST.fullmatch(host):
+        raise wrong
+    shown = f"[{host}]" if ":" in host else host
+    named = f"{parts.scheme}://{shown}" + (f":{port}" if port is not None else "")
+    if named != text.lower().removesuffix("/"):
+        raise wrong
+    return named.removesuffix(f":{_PORTS[parts.scheme]}")
 
-    def __init__(self, app: ASGIApp, token: str | None = None, hosts: Iterable[str] = ()) -> None:
+
+class Guard:
+    """ASGI middleware that passes on what is allowed and refuses the rest.
+
+    ``origins`` are of `read_origin`.
+    """
+
+    def __init__(
+        self,
+        app: ASGIApp,
+        token: str | None = None,
+        hosts: Iterable[str] = (),
+        origins: Iterable[str] = (),
+    ) -> None:
         self._app = app
         self._token = None if token is None else token.encode()
         self._hosts = _LOOPBACK | {host.lower().strip("[]") for host in hosts}
+        self._origins = frozenset(origins)
+        self._shared = _Cors(
+            self._with_token,
+            allow_origins=[*self._origins],
+            allow_methods=["GET", "HEAD", "POST"],
+            allow_headers=["Authorization", "Content-Type"],
+            expose_headers=["Retry-After", "WWW-Authenticate"],
+        )
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on, or refuse it."""
-        refused = self._refusal(scope)
-        await (self._app if refused is None else refused)(scope, receive, send)
+        await self._chosen(scope)(scope, receive, send)
 
-    def _refusal(self, scope: Scope) -> JSONResponse | None:
+    def _chosen(self, scope: Scope) -> ASGIApp:
         headers = Headers(scope=scope)
         authority = headers.get("host", "")
         name = _name(authority)
@@ -85,20 +132,60 @@ class Guard:
                 " with --allow-host NAME",
             )
         origin = headers.get("origin")
-        if origin is not None and _site(origin) != authority.lower():
-            return _refuse(403, "the Origin header names another site")
-        if self._token is not None and not self._has_token(headers.get("authorization", "")):
-            return _refuse(
-                401,
-                "send the service's token: Authorization: Bearer TOKEN",
-                {"WWW-Authenticate": 'Bearer realm="mapfold"'},
-            )
-        return None
+        if origin is None or _site(origin) == authority.lower():
+            return self._with_token
+        if origin in self._origins and len(headers.getlist("origin")) == 1:
+            return self._shared
+        return _refuse(403, "the Origin header names another site")
+
+    async def _with_token(self, scope: Scope, receive: Receive, send: Send) -> None:
+        authorization = Headers(scope=scope).get("authorization", "")
+        if self._token is None or self._has_token(authorization):
+            await self._app(scope, receive, send)
+            return
+        refused = _refuse(
+            401,
+            "send the service's token: Authorization: Bearer TOKEN",
+            {"WWW-Authenticate": 'Bearer realm="mapfold"'},
+        )
+        await refused(scope, receive, send)
 
     def _has_token(self, authorization: str) -> bool:
         scheme, _, given = authorization.partition(" ")
         ours = self._token or b""
         return hmac.compare_digest(given.strip().encode(), ours) and scheme.lower() == "bearer"
+
+
+class _Cors(CORSMiddleware):
+    """Starlette's, with refusals in the form of all others."""
+
+    def preflight_response(self, request_headers: Headers) -> Response:
+        """The answer to a browser that asks what a page of an allowed origin may send."""
+        response = super().preflight_response(request_headers)
+        if response.status_code < 400:
+            return response
+        return _refuse(
+            403, "a page of another site may GET and POST, with Authorization and Content-Type"
+        )
+
+
+class SafeHeaders:
+    """ASGI middleware: what browsers are told of every response that does not say it itself."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request."""
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                present = {name for name, _ in message["headers"]}
+                more = [header for header in _SAFE if header[0] not in present]
+                message = {**message, "headers": [*message["headers"], *more]}
+            await send(message)
+
+        await self._app(scope, receive, send_with_headers)
 
 
 def _own_address(scope: Scope) -> str:

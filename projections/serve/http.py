@@ -1,131 +1,174 @@
 """The service over HTTP: an ASGI app with its description at ``/openapi.json`` and ``/docs``.
 
+Answers are described by the models in `models` and sent as they are, without a pass through these.
+
 Needs the extra ``mapfold[serve]`` (fastapi, uvicorn). The event loop only reads requests; the
 threads of the `FairQueue` answer them, because database access is synchronous.
 """
 
 import asyncio
-import base64
-import struct
-from collections.abc import Callable
-from typing import Any, get_args
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, Final
 
-from fastapi import FastAPI, Path, Query, Request
+from fastapi import FastAPI, Path, Query, Request, Security
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
+from fastapi.security import HTTPBearer
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from eventsrc.errors import MapfoldError
+from eventsrc.metrics import METRICS_TYPE
 from projections.errors import QuestionError
-from projections.relocalize import Method, describe_value, question_schema
+from projections.relocalize import Method, describe_value
 
-from .answering import DEFAULT_RADIUS_M, MAX_TOP, STATES, Answerer, TooMuchError, encode, refusal
+from .answering import MAX_TOP, Answerer, TooMuchError, encode, refusal
 from .connections import peer_of
+from .description import EXAMPLES, METRICS, QUESTION, refusals
+from .docs_page import add_docs
 from .fair_queue import FairQueue
+from .metrics import ServiceMetrics
+from .models import Answer, Health, Objects, Places, StateQuery
 from .sessions import MAX_NAME
+from .states import State
 
-_EMBEDDING = base64.b64encode(struct.pack("<512f", 1.0, *[0.0] * 511)).decode()
-_CROP = {
-    "class": "cup",
-    "bbox": [120, 80, 250, 310],
-    "embedding": _EMBEDDING,
-    "embedding_dim": 512,
-}
-_EXAMPLES = {
-    "one picture": {"value": {"crops": [_CROP]}},
-    "a robot that turned a quarter to the left between two pictures": {
-        "value": {
-            "views": [{"crops": [_CROP]}, {"dx": 0.0, "dy": 0.0, "dyaw": 1.57, "crops": [_CROP]}]
-        }
-    },
-    "near a toilet and a mirror": {"value": {"crops": [{"class": "toilet"}, {"class": "mirror"}]}},
-}
-_OPTIONS = {
-    "top": {"type": "integer", "minimum": 1, "maximum": MAX_TOP, "default": 3},
-    "method": {"type": "string", "enum": list(get_args(Method)), "default": "joint"},
-    "session": {
-        "type": "string",
-        "minLength": 1,
-        "maxLength": MAX_NAME,
-        "description": "Track the questions of this name.",
-    },
-}
-"""What the service reads of a question beside what every question has."""
-_QUESTION = {
-    "requestBody": {
-        "required": True,
-        "description": "An envelope, a list of detections, or an object with crops or views.",
-        "content": {
-            "application/json": {"schema": question_schema(_OPTIONS), "examples": _EXAMPLES}
-        },
-    }
-}
+_DRAIN_FACTOR: Final = 8
+_RETRY_AFTER: Final = {"Retry-After": "1"}
+_ABOUT: Final = """Answers come from the map as it is in the databases when they are asked.
+
+Every refusal is `{"error": {"kind", "message"}}`. HEAD is answered like GET, without the body.
+"""
 
 
-_REFUSALS: dict[int | str, dict[str, Any]] = {
-    status: {
-        "description": text,
-        "content": {
-            "application/json": {"example": {"error": {"kind": kind, "message": "what and why"}}}
-        },
-    }
-    for status, text, kind in (
-        ("4XX", "A question that cannot be answered, or may not be asked", "bad_question"),
-        ("5XX", "No answer just now: the database is away, or too many ask", "database"),
-    )
-}
-_DRAIN_FACTOR = 8
-_RETRY_AFTER = {"Retry-After": "1"}
-
-
-def create_app(answerer: Answerer, queue: FairQueue) -> FastAPI:
-    """The ASGI application. The caller closes the pools and the queue."""
+def create_app(
+    answerer: Answerer,
+    queue: FairQueue,
+    metrics: ServiceMetrics | None = None,
+    *,
+    secured: bool = False,
+) -> FastAPI:
+    """The ASGI application. The caller closes the pools and the queue. ``secured`` describes that
+    a token is required, which `Guard` checks."""
+    counted = metrics or ServiceMetrics(answerer, queue)
     app = FastAPI(
         title="mapfold",
         summary="Where is the robot, and what stands near a pose?",
-        responses=_REFUSALS,
+        description=_ABOUT,
+        docs_url=None,  # FastAPI's pages load scripts from other servers
+        redoc_url=None,
         redirect_slashes=False,
+        generate_unique_id_function=lambda route: route.name,
+        dependencies=_security(secured),
     )
     _add_error_handlers(app)
     app.add_middleware(HeadLikeGet)
+    add_docs(app)
 
-    async def answered(request: Request, work: Callable[[], dict[str, Any]]) -> Response:
+    async def answered(request: Request, what: str, work: Callable[[], Any]) -> Response:
         peer = "" if request.client is None else peer_of(request.client.host)
         future = queue.submit(peer, lambda: encode(work()))
+        counted.watch("http", what, future)
         return Response(await asyncio.wrap_future(future), media_type="application/json")
 
+    # Each returns a Response, which is sent as it is: response_model only describes it.
+
     @app.post(
-        "/relocalize", summary="Ranked Places, a pose and a confidence", openapi_extra=_QUESTION
+        "/relocalize",
+        summary="Ranked Places, a pose and a confidence",
+        openapi_extra=QUESTION,
+        response_model=Answer,
+        responses=refusals(asking=True, sending=True),
     )
     async def relocalize(
         request: Request,
-        top: int | None = Query(None, ge=1, le=MAX_TOP),
-        method: str | None = Query(None, json_schema_extra={"enum": list(get_args(Method))}),
-        session: str | None = Query(None, description="Track the questions of this name."),
+        top: Annotated[int | None, Query(ge=1, le=MAX_TOP)] = None,
+        method: Annotated[Method | None, Query()] = None,
+        session: Annotated[
+            str | None,
+            Query(
+                min_length=1,
+                max_length=MAX_NAME,
+                description="Track the questions of this name; with the method joint only.",
+            ),
+        ] = None,
     ) -> Response:
         payload = await read_body(request, answerer.max_bytes)
         given = {"top": top, "method": method, "session": session}
         options = {name: str(value) for name, value in given.items() if value is not None}
-        return await answered(request, lambda: answerer.relocalize(payload, options))
+        return await answered(request, "relocalize", lambda: answerer.relocalize(payload, options))
 
-    @app.get("/state/{what}", summary="places or objects near a pose, nearest first")
+    @app.get(
+        "/state/{what}",
+        summary="Places or objects near a position, nearest first, or all of them",
+        description="With `x` and `y` those near that position. Without, all of them by pages: ask"
+        " again with `next` of the answer as `cursor` until it is null.",
+        response_model=Places | Objects,
+        responses=refusals(asking=True),
+    )
     async def state(
         request: Request,
-        x: float,
-        y: float,
-        what: str = Path(json_schema_extra={"enum": [*STATES]}),
-        radius: float = DEFAULT_RADIUS_M,
+        what: Annotated[State, Path()],
+        asked: Annotated[StateQuery, Query()],
     ) -> Response:
-        options = {"x": str(x), "y": str(y), "radius": str(radius)}
-        return await answered(request, lambda: answerer.state(what, options))
+        given = asked.model_dump(exclude_none=True)
+        options = {name: str(value) for name, value in given.items()}
+        return await answered(request, what, lambda: answerer.state(what, options))
 
-    @app.get("/health", summary="200 while questions can be answered, else 503")
+    @app.get(
+        "/health",
+        summary="200 while questions can be answered, else 503",
+        response_model=Health,
+        responses=refusals(asking=True),
+    )
     async def health(request: Request) -> Response:
-        return await answered(request, answerer.health)
+        return await answered(request, "health", answerer.health)
 
+    @app.get(
+        "/metrics",
+        summary="Numbers for Prometheus",
+        response_class=Response,
+        responses=METRICS | refusals(),
+    )
+    async def metrics_text() -> Response:
+        return Response(counted.text(), media_type=METRICS_TYPE)
+
+    _complete_description(app)
     return app
+
+
+def _complete_description(app: FastAPI) -> None:
+    """Correct what FastAPI describes otherwise than it is: refusals with 422, which are 400 here,
+    parameters of a query that are null, and examples, out of which it leaves what is null."""
+    described = app.openapi
+
+    def openapi() -> dict[str, Any]:
+        document = described()
+        for path in document["paths"].values():
+            for operation in path.values():
+                operation["responses"].pop("422", None)
+                for parameter in operation.get("parameters", ()):
+                    _drop_null(parameter["schema"])
+        for name in ("HTTPValidationError", "ValidationError"):
+            document["components"]["schemas"].pop(name, None)
+        for path, method, shown in EXAMPLES:
+            content = document["paths"][path][method]["responses"]["200"]["content"]
+            content["application/json"]["example"] = shown
+        return document
+
+    app.openapi = openapi  # type: ignore[method-assign]
+
+
+def _drop_null(schema: dict[str, Any]) -> None:
+    others = [form for form in schema.get("anyOf", ()) if form != {"type": "null"}]
+    if len(others) == 1:
+        del schema["anyOf"]
+        schema.update(others[0])
+
+
+def _security(secured: bool) -> Sequence[Any]:
+    scheme = HTTPBearer(scheme_name="token", auto_error=False, description="--token-file")
+    return [Security(scheme)] if secured else []
 
 
 class HeadLikeGet:
@@ -170,7 +213,10 @@ def _add_error_handlers(app: FastAPI) -> None:
         asked = f"{request.method} {describe_value(request.scope['path'])}"
         message = f"{asked}: {error.detail}; see /docs"
         _, document = refusal(QuestionError(message))
-        return JSONResponse(document, error.status_code, headers=error.headers)
+        headers = dict(error.headers or {})
+        if headers.get("Allow") == "GET":
+            headers["Allow"] = "GET, HEAD"
+        return JSONResponse(document, error.status_code, headers=headers)
 
     @app.exception_handler(ClientDisconnect)
     async def disconnected(_: Request, __: ClientDisconnect) -> Response:

@@ -6,6 +6,7 @@ error: without one a robot would wait for its timeout.
 """
 
 import logging
+from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any, Final, Self
 
@@ -25,10 +26,19 @@ _log = logging.getLogger(__name__)
 
 
 class ZenohService:
-    """Answers on a session until closed; the queue still answers what it has by then."""
+    """Answers on a session until closed; the queue still answers what it has by then.
 
-    def __init__(self, session: Session, answerer: Answerer, queue: FairQueue) -> None:
-        self._answerer, self._queue = answerer, queue
+    ``watch`` gets ``zenoh``, what is asked and the future answer of each question, to count it.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        answerer: Answerer,
+        queue: FairQueue,
+        watch: Callable[[str, str, "Future[Any]"], None] = lambda *_: None,
+    ) -> None:
+        self._answerer, self._queue, self._watch = answerer, queue, watch
         self._declared = [
             session.queryable(RELOCALIZE, self._receive),
             session.queryable(f"{STATE}/**", self._receive),
@@ -51,6 +61,7 @@ class ZenohService:
             query.reply_error(encode(refusal(error)[1]))
             return
         answered = self._queue.submit(_PEER, lambda: self._document(query))
+        self._watch(_PEER, query.key.rpartition("/")[2], answered)
         answered.add_done_callback(lambda future: _reply(query, future))
 
     def _document(self, query: Query) -> tuple[str, dict[str, Any]]:

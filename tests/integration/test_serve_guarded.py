@@ -10,6 +10,7 @@ import pytest
 
 from projections.database import rebuild
 from projections.database.connection import Targets
+from projections.serve.guard import read_origin
 from projections.settings import Settings
 from tests.commands import Commands
 from tests.fixtures_tls import Certificate
@@ -178,6 +179,7 @@ class TestMisuse:
             ("--tls-cert", certificate.cert),
             ("--tls-key", certificate.key),
             ("--allow-host", "robot"),
+            ("--cors", "https://map.example"),
         ):
             said = mapfold("serve", option, value, code=2).err
             assert said == f"mapfold: {option} is for HTTP; give --http HOST:PORT too\n"
@@ -201,3 +203,43 @@ class TestMisuse:
             "--token-file"
             in mapfold("serve", "--http", "127.0.0.1:0", "--token-file", missing, code=2).err
         )
+
+    @pytest.mark.parametrize(
+        "origin",
+        [
+            "*",
+            "null",
+            "",
+            "map.example",
+            "ftp://map.example",
+            "https://",
+            "https://map.example/page",
+            "https://map.example?x",
+            "https://ann@map.example",
+            "https://map.example:x",
+            "https://*.example",
+            "https://map.example:99999",
+            "https://[::1",
+            "https://map example",
+        ],
+    )
+    def test_what_is_no_origin_is_refused(self, mapfold: Commands, origin: str) -> None:
+        args = ("serve", "--no-zenoh", "--http", "127.0.0.1:0", "--cors", origin)
+        said = mapfold(*args, code=2).err
+        assert said.startswith(f"mapfold: --cors {origin}: write an origin as a browser sends it")
+        assert "* is not taken" in said
+
+
+@pytest.mark.parametrize(
+    ("given", "sent"),
+    [
+        ("https://map.example", "https://map.example"),
+        ("HTTPS://Map.Example:443/", "https://map.example"),
+        ("http://localhost:5173", "http://localhost:5173"),
+        ("http://localhost:80", "http://localhost"),
+        ("https://localhost:80", "https://localhost:80"),
+        ("http://[::1]:8000", "http://[::1]:8000"),
+    ],
+)
+def test_an_origin_is_written_as_browsers_send_it(given: str, sent: str) -> None:
+    assert read_origin(given) == sent

@@ -18,7 +18,7 @@ from projections.relocalize import (
     read_question,
 )
 from projections.relocalize.question import MAX_CROPS, MAX_VIEWS
-from projections.serve import answering, http
+from projections.serve import answering, description
 from tests.envelopes import MODEL, detection, embedding, envelope
 
 VECTOR = [3.0, 4.0, 0.0]
@@ -96,7 +96,7 @@ def test_the_schema_holds_what_is_read() -> None:
     ]
     view = schema["anyOf"][2]["properties"]["views"]["items"]
     assert set(view["properties"]) == {"dx", "dy", "dyaw", "crops"}
-    camera = schema["anyOf"][0]["properties"]["camera"]
+    camera = schema["anyOf"][0]["properties"]["camera"]["anyOf"][0]
     assert set(camera["properties"]) == set(EnvelopeCamera.model_fields)
     crop = view["properties"]["crops"]["items"]
     assert set(crop["properties"]) == {
@@ -108,13 +108,13 @@ def test_the_schema_holds_what_is_read() -> None:
         "bbox",
         "det_id",
     }
-    for form in http._EXAMPLES.values():
+    for form in description._EXAMPLES.values():
         assert read_question(json.loads(json.dumps(form["value"]))).crops
 
 
 def test_the_service_says_what_else_it_reads() -> None:
     """Its options, at their limits, are read; beyond them they are refused."""
-    body: Any = http._QUESTION["requestBody"]
+    body: Any = description.QUESTION["requestBody"]
     *forms, _ = body["content"]["application/json"]["schema"]["anyOf"]
     for form in forms:
         given = form["properties"]
@@ -122,7 +122,7 @@ def test_the_service_says_what_else_it_reads() -> None:
         asked = {
             **ONE,
             "top": given["top"]["maximum"],
-            "session": "x" * given["session"]["maxLength"],
+            "session": "x" * given["session"]["anyOf"][0]["maxLength"],
         }
         read = answering._read(json.dumps(asked).encode(), {})
         assert (read.top, read.session) == (asked["top"], asked["session"])

@@ -58,3 +58,17 @@ WHERE coalesce(
         ag_catalog.agtype_access_operator(VARIADIC ARRAY[properties, '"est_y"'::ag_catalog.agtype]),
         ag_catalog.agtype_access_operator(VARIADIC ARRAY[properties, '"mean_y"'::ag_catalog.agtype])
     )::float8 BETWEEN %(y0)s AND %(y1)s
+
+-- name: page_of_places
+-- The next ones by id, which is the order of their founding.
+SELECT id::text, properties FROM {place}
+WHERE id OPERATOR(ag_catalog.>) %(after)s::text::ag_catalog.graphid ORDER BY id LIMIT %(most)s
+
+-- name: page_of_objects
+-- The next ones by id, with the Place that each is located in, if any.
+SELECT thing.id::text, thing.properties, its.properties
+FROM {object} AS thing
+LEFT JOIN {located_in} AS located ON located.start_id = thing.id
+LEFT JOIN {place} AS its ON its.id = located.end_id
+WHERE thing.id OPERATOR(ag_catalog.>) %(after)s::text::ag_catalog.graphid
+ORDER BY thing.id LIMIT %(most)s

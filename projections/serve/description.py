@@ -1,0 +1,141 @@
+"""The description at ``/openapi.json``: questions with examples, and every refusal."""
+
+import base64
+import struct
+from typing import Any, Final, get_args
+
+from projections.relocalize import Method, question_schema
+
+from .answering import MAX_TOP
+from .models import Refusal
+from .sessions import MAX_NAME
+
+_EMBEDDING: Final = base64.b64encode(struct.pack("<512f", 1.0, *[0.0] * 511)).decode()
+_CROP: Final = {
+    "class": "mirror",
+    "bbox": [120, 80, 250, 310],
+    "embedding": _EMBEDDING,
+    "embedding_dim": 512,
+}
+_EXAMPLES: Final = {
+    "one picture": {
+        "summary": "one picture, by the embeddings of its crops",
+        "value": {"crops": [_CROP]},
+    },
+    "two pictures": {
+        "summary": "a robot that turned a quarter to the left between two pictures",
+        "value": {
+            "views": [{"crops": [_CROP]}, {"dx": 0.0, "dy": 0.0, "dyaw": 1.57, "crops": [_CROP]}]
+        },
+    },
+    "classes": {
+        "summary": "near a toilet and a mirror",
+        "value": {"crops": [{"class": "toilet"}, {"class": "mirror"}]},
+    },
+    "tracked": {
+        "summary": "a robot that drove half a metre since its question before",
+        "value": {"session": "robot-7", "dx": 0.5, "dy": 0.0, "dyaw": 0.0, "crops": [_CROP]},
+    },
+}
+_OPTIONS: Final = {
+    "top": {"type": "integer", "minimum": 1, "maximum": MAX_TOP, "default": 3},
+    "method": {"type": "string", "enum": list(get_args(Method)), "default": "joint"},
+    "session": {
+        "anyOf": [{"type": "string", "minLength": 1, "maxLength": MAX_NAME}, {"type": "null"}],
+        "description": "Track the questions of this name.",
+    },
+}
+"""What the service reads of a question beside what every question has."""
+QUESTION: Final = {
+    "requestBody": {
+        "required": True,
+        "description": "An envelope, a list of detections, or an object with crops or views.",
+        "content": {
+            "application/json": {"schema": question_schema(_OPTIONS), "examples": _EXAMPLES}
+        },
+    }
+}
+"""The body of a question, for ``openapi_extra``."""
+
+_PLACE: Final = {
+    "place_id": "sim-7-a_p0",
+    "centroid_x": 6.77,
+    "centroid_y": 5.03,
+    "keyframe_count": 445,
+}
+_POSE: Final = {"x": 3.43, "y": 5.21, "yaw": 0.27, "spread_m": 0.41}
+_ANSWER: Final = {
+    "places": [
+        {
+            "place_id": "sim-7-a_p0",
+            "score": 1.0,
+            "centroid_x": 6.77,
+            "centroid_y": 5.03,
+            "evidence": [
+                {
+                    "det_id": "sim-7-a_kf2_d0",
+                    "object_id": "obj-5bf2dc3f14b8a1f0",
+                    "class_name": "toilet",
+                    "similarity": 1.0,
+                }
+            ],
+        }
+    ],
+    "pose": _POSE,
+    "confidence": 0.62,
+    "known": 0.97,
+    "unknown": False,
+    "thin": None,
+}
+_PLACES: Final = {"places": [_PLACE], "next": None}
+
+METRICS: Final[dict[int | str, dict[str, Any]]] = {
+    200: {
+        "description": "Questions, their times and results, and the database's state",
+        "content": {"text/plain": {"schema": {"type": "string"}}},
+    }
+}
+
+
+EXAMPLES: Final = (
+    ("/relocalize", "post", _ANSWER),
+    ("/state/{what}", "get", _PLACES),
+    ("/health", "get", {"status": "ok"}),
+)
+"""Path, method and an example of the answer."""
+
+_RETRY_AFTER: Final = {
+    "Retry-After": {
+        "description": "Seconds until it is worth asking again; where too much was asked.",
+        "schema": {"type": "string"},
+    }
+}
+_TOKEN: Final = {"WWW-Authenticate": {"description": "What to send.", "schema": {"type": "string"}}}
+_ALLOW: Final = {"Allow": {"description": "What can be sent.", "schema": {"type": "string"}}}
+_EVERYWHERE: Final[tuple[tuple[int, str, dict[str, Any]], ...]] = (
+    (400, "The request is wrong, or it does not fit the map", {}),
+    (401, "The token is missing or wrong", _TOKEN),
+    (403, "The Origin header names another site, which --cors does not allow", {}),
+    (404, "No such path", {}),
+    (405, "The path has another method", _ALLOW),
+    (408, "The request did not end within 10 seconds", {}),
+    (421, "The Host header does not name this service", {}),
+    (431, "The head of the request is too long", {}),
+    (500, "A fault of the service, which it logs", {}),
+)
+_ASKING: Final[tuple[tuple[int, str, dict[str, Any]], ...]] = (
+    (429, "More questions a second than --rate", _RETRY_AFTER),
+    (503, "The database cannot be asked now, or too many questions wait", _RETRY_AFTER),
+)
+_SENDING: Final[tuple[tuple[int, str, dict[str, Any]], ...]] = (
+    (411, "The body came in chunks; send a Content-Length", {}),
+)
+
+
+def refusals(*, asking: bool = False, sending: bool = False) -> dict[int | str, dict[str, Any]]:
+    """The refusals of a path; ``asking`` one that asks the database, ``sending`` a body."""
+    known = _EVERYWHERE + (_ASKING if asking else ()) + (_SENDING if sending else ())
+    return {
+        status: {"model": Refusal, "description": text} | ({"headers": headers} if headers else {})
+        for status, text, headers in sorted(known)
+    }

@@ -1,0 +1,200 @@
+"""The shapes of answers, for the description at ``/openapi.json``.
+
+Answers are written as they are, not through these: tests check that every answer sent has the shape
+that is described. A key that is not required is absent where there is nothing to say, never null.
+Later versions may add keys.
+"""
+
+from typing import Annotated, Literal, NotRequired
+
+from pydantic import BaseModel, ConfigDict, Field
+from typing_extensions import TypedDict  # pydantic needs it before Python 3.12
+
+from .states import CURSOR, DEFAULT_PAGE, DEFAULT_RADIUS_M, MAX_METRES, MAX_PAGE
+
+Probability = Annotated[float, Field(ge=0, le=1)]
+Metres = Annotated[float, Field(description="Metres in the map's frame.")]
+
+
+class Evidence(TypedDict):
+    """An observation in the map that supports a Place."""
+
+    det_id: str
+    object_id: Annotated[str | None, Field(description="Null where it is of no Object.")]
+    class_name: str
+    similarity: Annotated[
+        float, Field(description="Of the embeddings; 1 where the crop was a class alone.")
+    ]
+
+
+class RankedPlace(TypedDict):
+    """A Place where the robot may be."""
+
+    place_id: str
+    score: Annotated[
+        float,
+        Field(
+            description="The share of the poses' weight that lies in it; with the method plain the"
+            " sum of similarities."
+        ),
+    ]
+    centroid_x: Metres
+    centroid_y: Metres
+    evidence: list[Evidence]
+    name: NotRequired[str]
+    floor: NotRequired[str]
+
+
+class Pose(TypedDict):
+    """Where the robot is, in the map's frame."""
+
+    x: Metres
+    y: Metres
+    yaw: Annotated[
+        float | None, Field(description="Radians; null where the evidence leaves it open.")
+    ]
+    spread_m: Annotated[
+        float, Field(ge=0, description="Root mean square distance of all weighed poses from it.")
+    ]
+    floor: NotRequired[str]
+
+
+class Track(TypedDict):
+    """What all questions of a session together say of where the robot is."""
+
+    pose: Pose | None
+    confidence: Probability
+    questions: Annotated[int, Field(ge=1, description="How many the session has had.")]
+
+
+class Answer(TypedDict):
+    """Where a robot is that sees these things."""
+
+    places: Annotated[list[RankedPlace], Field(description="The likeliest first.")]
+    pose: Pose | None
+    confidence: Annotated[
+        float, Field(ge=0, le=1, description="Probability that the pose is right within 1.5 m.")
+    ]
+    known: Annotated[
+        float, Field(ge=0, le=1, description="Probability that the map has one of the things.")
+    ]
+    unknown: Annotated[bool, Field(description="Whether it more likely has none of them.")]
+    thin: Annotated[
+        str | None, Field(description="What the map has too little of; null where it has enough.")
+    ]
+    track: Annotated[NotRequired[Track], Field(description="There if a session was given.")]
+
+
+class Place(TypedDict):
+    """A region of the building."""
+
+    place_id: str
+    centroid_x: Metres
+    centroid_y: Metres
+    keyframe_count: Annotated[int, Field(ge=0)]
+    name: NotRequired[str]
+    floor: NotRequired[str]
+    type: Annotated[NotRequired[str], Field(description="What room it is, where that is sure.")]
+    type_probability: NotRequired[Probability]
+    distance_m: Annotated[
+        NotRequired[float], Field(ge=0, description="From the position, where one was given.")
+    ]
+
+
+class MapObject(TypedDict):
+    """A thing in the building."""
+
+    object_id: str
+    class_name: str
+    mean_x: Annotated[float, Field(description="Mean position of the robots that saw it.")]
+    mean_y: float
+    obs_count: Annotated[int, Field(ge=0)]
+    first_seen: Annotated[float, Field(description="Seconds since 1970.")]
+    last_seen: float
+    est_x: Annotated[
+        NotRequired[float], Field(description="Where it stands, under fusion by evidence.")
+    ]
+    est_y: NotRequired[float]
+    est_sigma_m: NotRequired[float]
+    est_xx: NotRequired[float]
+    est_xy: NotRequired[float]
+    est_yy: NotRequired[float]
+    est_spots: NotRequired[int]
+    missing: Annotated[
+        NotRequired[bool], Field(description="Whether it was not seen where it should have been.")
+    ]
+    place_id: Annotated[
+        NotRequired[str | None],
+        Field(description="The Place it is in, null for none; in lists without a position."),
+    ]
+    place_name: NotRequired[str]
+    distance_m: Annotated[
+        NotRequired[float], Field(ge=0, description="From the position, where one was given.")
+    ]
+
+
+Next = Annotated[
+    str | None,
+    Field(description="The cursor of the next page, null on the last; in lists without a position"),
+]
+
+
+class Places(TypedDict):
+    """Places: nearest first, or in the order of their founding where no position was given."""
+
+    places: list[Place]
+    next: NotRequired[Next]
+
+
+class Objects(TypedDict):
+    """Objects: nearest first, or in the order of their founding where no position was given."""
+
+    objects: list[MapObject]
+    next: NotRequired[Next]
+
+
+class Health(TypedDict):
+    """Questions can be answered."""
+
+    status: Literal["ok"]
+
+
+class Error(TypedDict):
+    """Why a request was refused."""
+
+    kind: Annotated[
+        Literal["bad_question", "refused", "too_much", "database", "failed"],
+        Field(
+            description="bad_question: the request is wrong; refused: it may not ask; too_much: ask"
+            " again later; database: it cannot be asked now; failed: a fault of the service."
+        ),
+    ]
+    message: Annotated[str, Field(description="For people: what is wrong, and what to send.")]
+
+
+class Refusal(TypedDict):
+    """Every response with a status of 400 or more."""
+
+    error: Error
+
+
+class StateQuery(BaseModel):
+    """What is asked of a state; other parameters are kept, to be refused where they mislead."""
+
+    model_config = ConfigDict(extra="allow")
+
+    x: Annotated[float, Field(ge=-MAX_METRES, le=MAX_METRES)] | None = Field(
+        None, description="Metres in the map's frame; only with y."
+    )
+    y: Annotated[float, Field(ge=-MAX_METRES, le=MAX_METRES)] | None = Field(
+        None, description="Metres in the map's frame; only with x."
+    )
+    radius: Annotated[float, Field(ge=0, le=MAX_METRES)] | None = Field(
+        None, description=f"Only with x and y; {DEFAULT_RADIUS_M:g} metres if not given."
+    )
+    limit: Annotated[int, Field(ge=1, le=MAX_PAGE)] | None = Field(
+        None, description=f"At most so many; without a position {DEFAULT_PAGE} if not given."
+    )
+    cursor: Annotated[str, Field(pattern=CURSOR)] | None = Field(
+        None, description="`next` of the page before; not with x and y."
+    )

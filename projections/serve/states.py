@@ -1,0 +1,117 @@
+"""What can be asked of the map's state: Places or Objects, near a position or all of them by pages.
+
+Near a position they come nearest first. Without one they come in the order in which they were
+founded, at most `MAX_PAGE` at a time. A page's ``next`` is the number of its last one: the next
+page has those with greater numbers. So while the map changes, one that is there all the time comes
+exactly once; what is founded meanwhile comes last.
+"""
+
+import math
+import re
+from collections.abc import Callable, Mapping
+from typing import Any, Final, Literal, NamedTuple
+
+from projections.database.connection import Connection
+from projections.errors import QuestionError
+from projections.queries.graph_reads import (
+    Page,
+    objects_after,
+    objects_near,
+    places_after,
+    places_near,
+)
+from projections.relocalize import describe_value
+
+State = Literal["places", "objects"]
+
+DEFAULT_RADIUS_M: Final = 3.0
+MAX_METRES: Final = 1e8
+"""Ten times as far as a pose may be from the origin."""
+DEFAULT_PAGE: Final = 100
+MAX_PAGE: Final = 1000
+CURSOR: Final = r"^[0-9]{1,14}$"
+"""Any such number is a cursor: fewer than the 48 bits of a number in a graphid."""
+_NAMES: Final = ("x", "y", "radius", "limit", "cursor")
+
+
+class _Reads(NamedTuple):
+    near: Callable[[Connection, float, float, float], list[dict[str, Any]]]
+    after: Callable[[Connection, int, int], Page]
+
+
+_STATES: Final = {
+    "places": _Reads(places_near, places_after),
+    "objects": _Reads(objects_near, objects_after),
+}
+
+
+def state_read(what: str, options: Mapping[str, str]) -> Callable[[Connection], dict[str, Any]]:
+    """The read that answers a question. Raises QuestionError for what is none.
+
+    Names other than those of `_NAMES` are left alone beside a position. Without one they are
+    refused: a misspelt ``x`` must not list everything.
+    """
+    reads = _STATES.get(what)
+    if reads is None:
+        raise QuestionError(
+            f"no state called {describe_value(what)}; there are {' and '.join(_STATES)}"
+        )
+    if "x" in options or "y" in options:
+        return _near(what, reads, options)
+    for name in options:
+        if name == "radius":
+            raise QuestionError("radius is given without x and y; give all three, or none for all")
+        if name not in _NAMES:
+            raise QuestionError(
+                f"no parameter called {describe_value(name)}; there are {', '.join(_NAMES)}"
+            )
+    most, after = _limit(options) or DEFAULT_PAGE, _cursor(options)
+
+    def read(connection: Connection) -> dict[str, Any]:
+        page = reads.after(connection, after, most)
+        return {what: page.things, "next": None if page.after is None else str(page.after)}
+
+    return read
+
+
+def _near(
+    what: str, reads: _Reads, options: Mapping[str, str]
+) -> Callable[[Connection], dict[str, Any]]:
+    if "cursor" in options:
+        raise QuestionError("cursor is given with x and y; it is for lists without a position")
+    x, y = _number(options, "x"), _number(options, "y")
+    radius = _number(options, "radius", DEFAULT_RADIUS_M)
+    if radius < 0:
+        raise QuestionError(f"radius is {describe_value(options['radius'])}; give 0 or more metres")
+    most = _limit(options)
+    return lambda connection: {what: reads.near(connection, x, y, radius)[:most]}
+
+
+def _number(options: Mapping[str, str], name: str, default: float | None = None) -> float:
+    if name not in options and default is None:
+        raise QuestionError(f"{name} is missing; give x and y, or neither to list all")
+    try:
+        value = float(options[name]) if name in options or default is None else default
+    except ValueError:
+        value = math.nan
+    if not abs(value) <= MAX_METRES:  # nor NaN
+        raise QuestionError(
+            f"{name} is {describe_value(options.get(name))}; give a number of metres"
+        )
+    return value
+
+
+def _limit(options: Mapping[str, str]) -> int | None:
+    given = options.get("limit")
+    if given is None:
+        return None
+    if not re.fullmatch(r"[0-9]{1,9}", given) or not 1 <= int(given) <= MAX_PAGE:
+        raise QuestionError(f"limit is {describe_value(given)}; give a number from 1 to {MAX_PAGE}")
+    return int(given)
+
+
+def _cursor(options: Mapping[str, str]) -> int:
+    given = options.get("cursor", "0")
+    if not re.fullmatch(CURSOR, given, re.ASCII):
+        raise QuestionError(f"cursor is {describe_value(given)}; give the next of the page before")
+    return int(given)
