@@ -3,8 +3,10 @@
 import json
 import socket
 import ssl
+import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
+from http.client import HTTPConnection
 from typing import Any
 
 import pytest
@@ -239,3 +241,17 @@ def test_pending_connections_are_accepted_a_few_at_a_time() -> None:
         for most, accepted in ((3, 3), (10, 2), (10, 0)):
             taken = [clients.enter_context(one) for one in accept_pending(listener, most)]
             assert len(taken) == accepted
+
+
+def test_answers_on_a_used_connection_are_sent_at_once() -> None:
+    """With Nagle's algorithm each would wait 40 ms for the peer's delayed acknowledgement."""
+    times = []
+    with serving(application, bind("127.0.0.1", 0)) as port:
+        connection = HTTPConnection("127.0.0.1", port, timeout=DEADLINE_S)
+        with closing(connection):
+            for _ in range(60):
+                began = time.perf_counter()
+                connection.request("GET", "/")
+                assert connection.getresponse().read() == b"0"
+                times.append(time.perf_counter() - began)
+    assert min(times[-20:]) < 0.03
