@@ -177,7 +177,8 @@ print(json.dumps(sorted(set(named))))
 ASK = """
 asked = sys.stdin.buffer.read()
 with opened(sys.argv[1]) as session:
-    for selector, payload in (("mapfold/relocalize", asked), ("mapfold/state/places?x=0;y=0", None)):
+    places = "mapfold/state/places?x=0;y=0"
+    for selector, payload in (("mapfold/relocalize", asked), (places, None)):
         (reply,) = session.get(selector, payload=payload, timeout=30.0)
         if reply.ok is None:
             sys.exit(reply.err.payload.to_string())
