@@ -7,6 +7,7 @@ Content-Security-Policy; its own script is a file too, because inline ones are n
 
 from functools import cache
 from importlib.resources import files
+from importlib.util import find_spec
 from typing import Final
 
 from fastapi import FastAPI
@@ -33,6 +34,10 @@ _PAGE: Final = """<!doctype html>
 </body>
 </html>
 """
+_MISSING: Final = (
+    "Swagger UI is not installed here; pip install 'mapfold[serve]'. The description is at"
+    " /openapi.json.\n"
+)
 _START: Final = (
     "SwaggerUIBundle({url: '/openapi.json', dom_id: '#swagger-ui', deepLinking: true,"
     " validatorUrl: null, presets: [SwaggerUIBundle.presets.apis]});\n"
@@ -44,6 +49,8 @@ def add_docs(app: FastAPI) -> None:
 
     @app.get("/docs", include_in_schema=False)
     async def docs() -> Response:
+        if find_spec("fastapi_offline") is None:
+            return Response(_MISSING, media_type="text/plain")
         return Response(_PAGE, media_type="text/html", headers={"Content-Security-Policy": _POLICY})
 
     @app.get("/docs/start.js", include_in_schema=False)

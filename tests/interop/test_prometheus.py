@@ -1,4 +1,4 @@
-"""The metrics of a recorder, checked by Prometheus' own `promtool`."""
+"""The metrics of a recorder and of a service, checked by Prometheus' own `promtool`."""
 
 import shutil
 import subprocess
@@ -8,6 +8,11 @@ from pathlib import Path
 import pytest
 
 from eventsrc.metrics import serving_metrics
+from projections.database.connection import Targets
+from projections.serve import Answerer, FairQueue, Pools
+from projections.serve.http import create_app
+from projections.serve.listening import bind, serving
+from tests.described_maps import build
 from tests.integration.test_metrics import REPORT
 
 pytestmark = pytest.mark.slow
@@ -35,6 +40,26 @@ def test_metrics_of_a_recorder(promtool: str, tmp_path: Path) -> None:
     ):
         scraped = response.read()
     assert b"mapfold_recorder_recorded_total 12" in scraped
+    check(promtool, scraped)
+
+
+def test_metrics_of_a_service(promtool: str, one_database: Targets, tmp_path: Path) -> None:
+    build(tmp_path, one_database)
+    with Pools(one_database, 1) as pools, FairQueue(1, max_wait_s=30.0) as queue:
+        answerer = Answerer(pools, per_second=1000.0)
+        app = create_app(answerer, queue)
+        with serving(app, bind("127.0.0.1", 0)) as port:
+            for path in ("state/objects", "state/places?x=0&y=0", "health"):
+                with urllib.request.urlopen(f"http://127.0.0.1:{port}/{path}") as response:
+                    assert response.read()
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics") as response:
+                scraped = response.read()
+    assert scraped.count(b'result="answered"') == 3
+    check(promtool, scraped)
+
+
+def check(promtool: str, scraped: bytes) -> None:
+    """Fail unless promtool has nothing to say of the metrics."""
     done = subprocess.run(
         [promtool, "check", "metrics"], input=scraped, capture_output=True, check=False
     )

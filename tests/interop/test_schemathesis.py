@@ -1,0 +1,71 @@
+"""`schemathesis` finds nothing in the HTTP interface of `mapfold serve`.
+
+It reads /openapi.json, sends what that allows and what it forbids, and checks every response with
+all the checks it has."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from projections.database.connection import Targets
+from tests.described_maps import MODEL, build
+from tests.http_attacks import served
+
+pytestmark = pytest.mark.slow
+
+TOKEN = "0123456789abcdef-not-a-secret"
+PROGRAM = Path(sys.executable).with_name("schemathesis")
+OPERATIONS = 4
+
+
+@pytest.fixture(scope="module")
+def targets(tmp_path_factory: pytest.TempPathFactory, module_database: Targets) -> Targets:
+    build(tmp_path_factory.mktemp("described"), module_database)
+    return module_database
+
+
+def found(port: int, folder: Path, *options: str) -> str:
+    """The report of a run with all checks that found nothing."""
+    if not PROGRAM.exists():
+        pytest.skip("schemathesis is not installed; pip install --group interop")
+    done = subprocess.run(
+        [
+            *(PROGRAM, "run", f"http://127.0.0.1:{port}/openapi.json", "--checks", "all"),
+            *("--no-color", "--continue-on-failure", "--generation-database", "none", *options),
+        ],
+        cwd=folder,
+        env={
+            **os.environ,
+            "PYTHONPATH": str(Path(__file__).parent),
+            "SCHEMATHESIS_HOOKS": "schemathesis_hooks",
+            "MAPFOLD_EMBEDDING_MODEL": MODEL,
+        },
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert f"Selected: {OPERATIONS}/{OPERATIONS}" in done.stdout
+    assert f"Tested: {OPERATIONS}" in done.stdout
+    assert "No issues found" in done.stdout
+    return done.stdout
+
+
+@pytest.mark.timeout(900)
+def test_all_checks_of_all_phases(targets: Targets, tmp_path: Path) -> None:
+    args = ("--no-zenoh", "--http", "127.0.0.1:0", "--db", targets.graph_url, "--rate", "100000")
+    with served(*args) as service:
+        said = found(service.port, tmp_path, "--seed", "1", "-n", "150")
+    for phase in ("Examples", "Coverage", "Fuzzing"):
+        assert f"✅ {phase}" in said
+
+
+@pytest.mark.timeout(900)
+def test_with_a_token(targets: Targets, tmp_path: Path) -> None:
+    args = ("--no-zenoh", "--http", "127.0.0.1:0", "--db", targets.graph_url, "--rate", "100000")
+    with served(*args, MAPFOLD_TOKEN=TOKEN) as service:
+        bearer = f"Authorization: Bearer {TOKEN}"
+        found(service.port, tmp_path, "--seed", "3", "-n", "20", "-H", bearer)
