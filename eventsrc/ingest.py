@@ -58,12 +58,13 @@ class Accepted(msgspec.Struct, frozen=True, gc=False):
 
     ``det_ids`` and ``vectors`` run parallel to ``envelope.detections``. A vector is float32 of
     shape (embedding_dim,), finite, not zero and *not* normalised; None where the detection
-    has none.
+    has none. ``digest`` is the fold's digest of the content, where another process has made it.
     """
 
     envelope: Envelope
     det_ids: tuple[DetId, ...]
     vectors: tuple[Vector | None, ...]
+    digest: bytes | None = None
 
 
 class Rejected(msgspec.Struct, frozen=True, gc=False):

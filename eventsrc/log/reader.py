@@ -150,6 +150,36 @@ class LogReader:
             is_last = index + 1 == len(self._segments)
             yield self._segments[index], _NO_END if is_last else self._segments[index + 1].base
 
+    def stretches(self, start: Offset, end: Offset, size: int) -> Iterator[tuple[Offset, Offset]]:
+        """Ranges that make up ``start`` to ``end``, in order, for several readers to share: each is
+        of whole chunks of one segment, in the file about ``size`` bytes or one chunk, or of events
+        that cannot be read. None is of more than ``size`` / 1024 events, but for one chunk."""
+        at = start
+        for entry, following in self._entries_from(start):
+            segment_end = min(end, following)
+            for edge in self._edges(entry, at, size):
+                if at < edge < segment_end:
+                    yield at, edge
+                    at = edge
+            if at < segment_end:
+                yield at, segment_end
+                at = segment_end
+
+    def _edges(self, entry: SegmentPath, start: Offset, size: int) -> Iterator[Offset]:
+        """Where to divide a segment; nowhere if it cannot be opened."""
+        try:
+            segment = self.open_segment(entry)
+        except LogDamaged:
+            return
+        first, length = start, 0
+        for chunk in segment.chunks:
+            if chunk.following <= start:
+                continue
+            if length and (length + chunk.length > size or chunk.following - first > size // 1024):
+                yield chunk.first
+                first, length = chunk.first, 0
+            length += chunk.length
+
     def _read_segment(
         self,
         entry: SegmentPath,

@@ -33,6 +33,7 @@ from projections.database.origin import command_line
 from projections.database.sink import SinkName
 from projections.model.advice import places_advice
 from projections.model.log_commands import read_corrections
+from projections.model.parsed_log import DEFAULT_WORKERS, MAX_WORKERS
 from projections.settings import Settings
 
 from .options import (
@@ -138,6 +139,19 @@ LoaderOption = Annotated[
 ]
 
 
+WorkersOption = Annotated[
+    int | None,
+    typer.Option(
+        "--workers",
+        metavar="N",
+        min=0,
+        max=MAX_WORKERS,
+        help="Processes that read and parse a large LOG ahead of this one. Default: as many as"
+        f" there are further processors, at most {DEFAULT_WORKERS}.",
+    ),
+]
+
+
 def only_of(only: Sinks | None) -> SinkName | None:
     """The sink's name, None for both."""
     return None if only is None else only.value
@@ -160,6 +174,7 @@ def replay(
     no_hnsw: Annotated[
         bool, typer.Option("--no-hnsw", help="Do not index a large table for vector search.")
     ] = False,
+    workers: WorkersOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Rebuild the databases from LOG. Readers see the old map until the new one is whole."""
@@ -176,6 +191,7 @@ def replay(
             only=only_of(only),
             loader=loader_of(loader),
             hnsw=not no_hnsw,
+            workers=workers,
             progress=lambda at: bar.show(at.stage, at.done, at.total),
         )
     if as_json:
@@ -196,6 +212,11 @@ def _print_rebuilt(
     counts = report.counts
     words = ("run", "keyframe", "observation", "object", "place")
     say(", ".join(counted(counts[f"{word}s"], word) for word in words))
+    if report.lost_workers:
+        say(
+            f"{report.lost_workers} of the {report.workers} processes that parsed the log died,"
+            " perhaps for lack of memory; their part was parsed again"
+        )
     if report.hnsw is not None:
         say(f"vector search: {report.hnsw.reason}")
     for line in (left_out(log, settings, report, logged), places_advice(counts, settings)):

@@ -7,7 +7,8 @@ from eventsrc.log import Event, LogReader
 from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.errors import FoldError
 from projections.model.changes import ChangeTracker
-from projections.model.fold import READ_AHEAD, fold_events
+from projections.model.fold import fold_events, fold_parsed
+from projections.model.parsing import READ_AHEAD, ParsedEvent
 from projections.model.space_vectors import with_vectors
 from projections.model.view import MapView
 from projections.reducers.semantic_map import SemanticMap
@@ -55,6 +56,11 @@ class LiveFold:
                 yield error
                 self.skip(events[start].offset)
                 start += 1
+
+    def fold_parsed(self, events: Sequence[ParsedEvent]) -> None:
+        """Fold events that are parsed. Raises FoldError at the first one that fails."""
+        for event in events:
+            self.tracker.apply_event(event.offset, fold_parsed(event, self.map), event.logged_ns)
 
     def use_names(self, offset: Offset, corrections: Corrections) -> None:
         """Take over the names of ``corrections``, which the event at ``offset`` changed in nothing

@@ -1,4 +1,8 @@
-"""Rebuild: fold the whole log into shadows, and swap them in for the map that readers see."""
+"""Rebuild: fold the whole log into shadows, and swap them in for the map that readers see.
+
+Other processes read and parse a large log (`projections.model.parsed_log`), this one folds it and
+makes the rows, and a thread for each database sends them.
+"""
 
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -8,15 +12,17 @@ from pathlib import Path
 from typing import Final, TypeAlias
 
 from eventsrc.envelope import FIRST_OFFSET, Offset
-from eventsrc.log import Event, LogReader
+from eventsrc.log import LogReader
 from projections.errors import FoldError
 from projections.model.fold import gc_paused
+from projections.model.parsed_log import ParsedLog, default_workers
+from projections.model.parsing import ParsedEvent
 from projections.settings import Settings
 
 from .connection import Targets
 from .foreign_embedding import ForeignEmbedding, first_foreign_embedding
 from .inputs import LogInputs, MapInputs, SettingsOf
-from .live_fold import LiveFold, batches
+from .live_fold import LiveFold
 from .loader import LoaderName
 from .origin import command_for
 from .shadows import FoldedLog, ShadowWriter, drop_replaced, stream, swap_in_new_map
@@ -44,6 +50,8 @@ class RebuildReport:
     """What a rebuild did. ``rows`` is by graph label and table; times are seconds.
 
     ``foreign`` is the first embedding that was left out because it is outside the map's space.
+    ``workers`` is how many processes were started to parse the log, ``lost_workers`` how many of
+    them died: their part was parsed here.
     """
 
     events: int
@@ -54,6 +62,8 @@ class RebuildReport:
     total_s: float
     hnsw: HnswReport | None
     foreign: ForeignEmbedding | None = None
+    workers: int = 0
+    lost_workers: int = 0
 
 
 def rebuild(
@@ -66,16 +76,21 @@ def rebuild(
     only: Only = None,
     loader: LoaderName = "copy",
     hnsw: bool = True,
+    workers: int | None = None,
     progress: OnProgress | None = None,
 ) -> RebuildReport:
     """Fold the first ``until`` events (all for None) and replace the map in the databases.
 
     The corrections are those of the commands before ``known_at``, by default before ``until``.
+    ``workers`` is how many processes may parse a large log beside this one, 0 for none, by default
+    `default_workers`; the map does not depend on it.
     Raises FoldError at an event that cannot be folded, ProjectionBusy beside a tail or another
     rebuild, and DatabaseError; the old map stays then.
     """
     started = time.monotonic()
     notify = progress or (lambda _: None)
+    if workers is None:
+        workers = default_workers()
     with gc_paused(), LogReader(log) as reader:
         total = reader.next_offset if until is None else min(until, reader.next_offset)
         inputs = LogInputs.read(reader, settings).at(total if known_at is None else known_at)
@@ -84,9 +99,11 @@ def rebuild(
 
         def fold_into(writers: Sequence[ShadowWriter]) -> FoldedLog:
             nonlocal folded_at
-            events, advice = reader.read(FIRST_OFFSET, total), partial(_advice, log, inputs)
-            last = _fold_into(fold, events, writers, total, notify, advice)
+            _fold_into(
+                fold, parsed.stretches(), writers, total, notify, partial(_advice, log, inputs)
+            )
             folded_at = time.monotonic()
+            last = next(reader.read(Offset(total - 1), total), None)
             return FoldedLog(fold, last, inputs)
 
         def tell(stage: str) -> None:
@@ -95,7 +112,7 @@ def rebuild(
         opened = open_stores(
             targets, inputs.settings, only=only, application="mapfold replay", loader=loader
         )
-        with opened as stores:
+        with opened as stores, ParsedLog(reader, total, workers) as parsed:
             swap = swap_in_new_map(stores, reader.log_id, fold_into, tell)
             index = drop_replaced(stores, tell, hnsw=hnsw)
             ended = time.monotonic()
@@ -108,26 +125,31 @@ def rebuild(
                 ended - started,
                 index,
                 first_foreign_embedding(fold, reader),
+                parsed.started,
+                parsed.lost,
             )
 
 
 def _fold_into(
     fold: LiveFold,
-    events: Iterable[Event],
+    stretches: Iterable[Sequence[ParsedEvent]],
     writers: Sequence[ShadowWriter],
     total: int,
     notify: OnProgress,
     advice: Callable[[int], str],
-) -> Event | None:
-    last: Event | None = None
-    for batch in batches(events, TICK_EVENTS):
-        for failed in fold.feed(batch):
-            if failed is not None:
-                raise FoldError(failed.offset, f"{failed.reason}; {advice(failed.offset)}")
-        last = batch[-1]
-        notify(RebuildProgress("folding", last.offset + 1, total))
-        stream(fold, writers)
-    return last
+) -> None:
+    told = FIRST_OFFSET
+    for stretch in stretches:
+        try:
+            fold.fold_parsed(stretch)
+        except FoldError as failed:
+            reason = f"{failed.reason}; {advice(failed.offset)}"
+            raise FoldError(failed.offset, reason) from failed
+        done = fold.map.next_offset
+        if done - told >= TICK_EVENTS or done == total:
+            told = done
+            notify(RebuildProgress("folding", done, total))
+            stream(fold, writers)
 
 
 def _advice(log: Path, inputs: MapInputs, offset: Offset) -> str:

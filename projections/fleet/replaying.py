@@ -100,6 +100,7 @@ def _replay(request: ReplayRequest, progress: Progress) -> SiteReplay:
                 request.settings.of,
                 loader=request.loader,
                 hnsw=request.hnsw,
+                workers=0,  # the other sites keep the other processors busy
                 progress=lambda at: progress(at.done),
             )
         except ProjectionBusy:

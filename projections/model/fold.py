@@ -1,32 +1,28 @@
 """Folding a log: reads and validates events, and passes them to the pure fold."""
 
 import gc
-import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from functools import lru_cache
 from itertools import islice
 from typing import NamedTuple
 
 from eventsrc.envelope import Offset
-from eventsrc.ingest import Accepted, Rejected
+from eventsrc.ingest import Rejected
 from eventsrc.log import Event, LogReader
-from eventsrc.occupancy_map import InvalidMap, OccupancyMap, decode_map
-from eventsrc.system_events import MAP_KEY
-from eventsrc.upcast import read_envelopes
+from eventsrc.occupancy_map import OccupancyMap
 from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.deltas import Delta
 from projections.errors import FoldError
-from projections.exact import Units, unit_vectors
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 
+from .parsing import READ_AHEAD as READ_AHEAD
+from .parsing import ParsedEvent as ParsedEvent
+from .parsing import parse_events as parse_events
 from .snapshot_cache import SnapshotCache
 from .space_vectors import new_map, with_vectors
 from .view import MapView
 
-READ_AHEAD = 16
-"""Events validated together in a bulk fold: their 50 vectors or so fit a core's cache."""
 SNAPSHOT_MIN_EVENTS = 5_000
 """Events; folding fewer takes about as long as reading a snapshot of them."""
 
@@ -36,17 +32,6 @@ class FoldedEvent(NamedTuple):
 
     offset: Offset
     deltas: list[Delta]
-
-
-class ParsedEvent(NamedTuple):
-    """A validated event: ``parsed`` is None for mapfold's own events other than maps.
-
-    ``units`` are the unit vectors of the envelope's detections, in order; empty if it was rejected.
-    """
-
-    offset: Offset
-    parsed: Accepted | OccupancyMap | Rejected | None
-    units: list[Units | None]
 
 
 def fold_events(
@@ -70,34 +55,6 @@ def fold_events(
 def fold_event(event: Event, semantic_map: SemanticMap) -> list[Delta]:
     """Fold one event; see `fold_events`."""
     return next(fold_events([event], semantic_map)).deltas
-
-
-def parse_events(events: Sequence[Event]) -> list[ParsedEvent]:
-    """Validate events; for sixteen or so together this is quicker than one by one."""
-    enveloped = [event for event in events if event.is_envelope]
-    # No size limit: it applied when the event was recorded.
-    outcomes = read_envelopes(enveloped, max_bytes=sys.maxsize)
-    units = iter(unit_vectors([v for a in outcomes if isinstance(a, Accepted) for v in a.vectors]))
-    coming, parsed_events = iter(outcomes), []
-    for event in events:
-        parsed = next(coming) if event.is_envelope else _parse_own(event)
-        count = len(parsed.vectors) if isinstance(parsed, Accepted) else 0
-        parsed_events.append(ParsedEvent(event.offset, parsed, list(islice(units, count))))
-    return parsed_events
-
-
-def _parse_own(event: Event) -> OccupancyMap | Rejected | None:
-    """An event that is no envelope: a map, or None for one that a fold passes over."""
-    if event.key != MAP_KEY:
-        return None
-    try:
-        return _decoded(event.payload)
-    except InvalidMap as error:
-        return Rejected(f"it is on {MAP_KEY} and no map: {error}")
-
-
-_decoded = lru_cache(maxsize=1)(decode_map)
-"""Map servers publish the same map again and again: its image is then decoded once."""
 
 
 def fold_parsed(event: ParsedEvent, semantic_map: SemanticMap) -> list[Delta]:

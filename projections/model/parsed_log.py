@@ -1,0 +1,130 @@
+"""A log's events, parsed, for one fold: in this process, or by others that read ahead of it.
+
+Reading, checking sums, decompressing and parsing are half of the work of a rebuild and need nothing
+but the event. The fold needs the one before, so it stays in this process, which gets the parsed
+events in the order of the log. Nothing depends on how many processes read: an event is the same
+whoever parses it, and what another process could not read, or was asked for when it died, is read
+again here. So damage is found at the same event, with the same message, as without processes.
+
+While the processes start, this one reads the first ranges itself.
+"""
+
+import os
+from collections import deque
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
+from itertools import islice
+from typing import Final
+
+from eventsrc.envelope import FIRST_OFFSET, Offset
+from eventsrc.log import LogReader
+
+from .parsing import ParsedEvent, parsed_stretches
+from .parsing_process import ParsingProcess, ProcessGone
+
+MAX_WORKERS: Final = 64
+DEFAULT_WORKERS: Final = 4
+"""At most, by default: one is enough for a fold that takes longer than parsing."""
+MIN_EVENTS: Final = 10_000
+"""Of a log that is worth a process, which takes half a second of another processor to start."""
+EVENTS_PER_WORKER: Final = 5_000
+"""For each process that is started."""
+_RANGE_BYTES: Final = 768 * 1024
+
+
+def default_workers() -> int:
+    """One process for each further processor that this one may use, at most `DEFAULT_WORKERS`."""
+    if hasattr(os, "sched_getaffinity"):
+        processors = len(os.sched_getaffinity(0))
+    else:
+        processors = os.cpu_count() or 1
+    return min(processors - 1, DEFAULT_WORKERS)
+
+
+class ParsedLog:
+    """The first ``end`` events of a log. A context manager, which ends the processes.
+
+    ``workers`` is how many processes may be started, 0 for none. ``started`` are those that were,
+    ``lost`` those of them that died or did not answer.
+    """
+
+    def __init__(self, reader: LogReader, end: Offset, workers: int) -> None:
+        self._reader = reader
+        self._end = end
+        self._most = min(workers, end // EVENTS_PER_WORKER) if end >= MIN_EVENTS else 0
+        self._processes = ExitStack()
+        self._alive: list[ParsingProcess] = []
+        self.started = 0
+        self.lost = 0
+
+    def __enter__(self) -> "ParsedLog":
+        with suppress(ProcessGone):  # without it, this process reads
+            while self.started < self._most:
+                process = ParsingProcess(self._reader.path, self._reader.log_id)
+                self._alive.append(self._processes.enter_context(process))
+                self.started += 1
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._alive.clear()
+        self._processes.close()
+
+    def stretches(self) -> Iterator[list[ParsedEvent]]:
+        """The events, a few at a time. Raises LogDamaged after those before the damage."""
+        if not self._alive:
+            yield from self._here(FIRST_OFFSET, self._end)
+            return
+        ranges = self._reader.stretches(FIRST_OFFSET, self._end, _RANGE_BYTES)
+        asked: deque[tuple[Offset, Offset, ParsingProcess]] = deque()
+        while True:
+            self._ask(ranges, asked)
+            if asked:
+                start, end, process = asked.popleft()
+                yield from self._taken(process) or self._here(start, end)
+            elif (following := next(ranges, None)) is not None:
+                yield from self._here(*following)
+            else:
+                return
+
+    def _ask(
+        self,
+        ranges: Iterator[tuple[Offset, Offset]],
+        asked: deque[tuple[Offset, Offset, ParsingProcess]],
+    ) -> None:
+        """Have the processes parse further ranges, those first that have least to do."""
+        while free := [process for process in self._alive if self._can_take_more(process)]:
+            following = next(ranges, None)
+            if following is None:
+                return
+            process = min(free, key=lambda each: each.waiting)
+            asked.append((*following, process))
+            try:
+                process.ask(*following)
+            except ProcessGone:
+                self._give_up(process)
+
+    def _can_take_more(self, process: ParsingProcess) -> bool:
+        try:
+            return process.can_take_more()
+        except ProcessGone:
+            self._give_up(process)
+            return False
+
+    def _taken(self, process: ParsingProcess) -> Iterator[list[ParsedEvent]] | None:
+        """What a process has parsed; None if it could not, or is gone."""
+        if process not in self._alive:
+            return None
+        try:
+            return process.take()
+        except ProcessGone:
+            self._give_up(process)
+            return None
+
+    def _give_up(self, process: ParsingProcess) -> None:
+        self._alive.remove(process)
+        self.lost += 1
+
+    def _here(self, start: Offset, end: Offset) -> Iterator[list[ParsedEvent]]:
+        """Read and parse in this process. As if to the end of all, which messages of damage say."""
+        events = self._reader.read(start, self._end)
+        yield from parsed_stretches(islice(events, end - start))
