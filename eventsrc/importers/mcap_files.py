@@ -8,6 +8,7 @@ from eventsrc.cdr_grids import GRID_SCHEMA
 from eventsrc.errors import MapfoldError
 from eventsrc.log import LogReader, VerbatimEvent
 from eventsrc.log.foreign_mcap import ForeignDamage, foreign_messages
+from eventsrc.log.format import IMPORTED
 
 from .source import ImportedMessage
 
@@ -84,9 +85,21 @@ class OtherLog:
     def messages(self) -> Iterator[ImportedMessage]:
         """The log's events, system events included."""
         with self._reader as reader:
+            begun = {
+                entry.base
+                for entry in reader.segments
+                if IMPORTED in reader.open_segment(entry).head
+            }
             for event in reader.read():
                 self.at = event.offset
                 self._read += len(event.payload)
                 form = event.format if isinstance(event, VerbatimEvent) else None
                 times = event.logged_ns, event.stamp_ns
-                yield ImportedMessage(event.payload, event.key, *times, event.version, form)
+                yield ImportedMessage(
+                    event.payload,
+                    event.key,
+                    *times,
+                    event.version,
+                    form,
+                    begins=event.offset in begun,
+                )

@@ -123,6 +123,7 @@ def import_files(
                         f"{name}: --topic does not choose what is used of a bag of ROS 2; "
                         "--detections, --grid and so on do"
                     )
+                run.begins = True
                 for number, message in enumerate(source.messages()):
                     with step or nullcontext():
                         run.append(source, message)
@@ -168,6 +169,10 @@ class _Import:
         self._topics = topics
         self._passed_over: Counter[tuple[str, str]] = Counter()
         self._times = LogTimes()
+        self.begins = False
+        """Whether the next message is the first of a file: log times may go back there, and the
+        segment that then begins says why."""
+        self._logged_ns: int | None = None
         self._first = writer.next_offset
         self._last: tuple[Source, int | None] | None = None
         self.accepted = self.rejected = self.system = self.skipped = self.maps = 0
@@ -178,6 +183,7 @@ class _Import:
         """Append one message: a system event or a verbatim message unchanged, anything else after
         validation."""
         topic = message.key or self._key
+        self.begins |= message.begins
         if message.refused is not None:
             self._append_refused(source, message, message.refused)
         elif not self._topics.takes(topic):
@@ -215,6 +221,9 @@ class _Import:
             logged_ns = self._times.last_ns
         else:
             logged_ns = self._writer.now_ns()
+        if self.begins and self._logged_ns is not None and logged_ns < self._logged_ns:
+            self._writer.begin_segment()
+        self.begins, self._logged_ns = False, logged_ns
         self.append_given_map(logged_ns)
         return logged_ns
 

@@ -20,7 +20,8 @@ class ImportedMessage:
     may have meant it for something else: if it does not look like an envelope, it is passed over.
     ``unread`` is what a message is that no importer reads; it is passed over, and its payload
     may be left out. ``refused`` is the reason if the source could not read the message: it is kept
-    as rejected.
+    as rejected. ``begins`` says that an import begins here in another mapfold log, so that log
+    times may be older than before.
     """
 
     payload: bytes
@@ -32,6 +33,7 @@ class ImportedMessage:
     is_foreign: bool = False
     unread: str | None = None
     refused: str | None = None
+    begins: bool = False
 
 
 class Source(Protocol):

@@ -167,7 +167,9 @@ class Finding:
 
 Model = TypeVar("Model", bound=BaseModel)
 
-_BACKWARDS = "logged_ns runs backwards: the clock was set back, or older recordings were imported"
+_BACKWARDS = (
+    "logged_ns runs backwards: the clock was set back, or a file was imported that is not in order"
+)
 
 
 @dataclass(slots=True)

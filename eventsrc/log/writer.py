@@ -240,6 +240,13 @@ class LogWriter:
         self._active.commit()
         return self.durable_offset
 
+    def begin_segment(self) -> None:
+        """Commit, and begin the next segment unless this one is empty. Of an import: what comes is
+        older than what is before, so that no clock is taken to have been set back."""
+        self.sync()
+        if self._active.committed > self._active.base:
+            self._rotate()
+
     def _full(self) -> bool:
         active = self._active
         events = active.committed - active.base
