@@ -18,6 +18,10 @@ _CROP: Final = {
     "embedding_dim": 512,
 }
 _EXAMPLES: Final = {
+    "classes": {
+        "summary": "near a toilet and a mirror",
+        "value": {"crops": [{"class": "toilet"}, {"class": "mirror"}]},
+    },
     "one picture": {
         "summary": "one picture, by the embeddings of its crops",
         "value": {"crops": [_CROP]},
@@ -27,10 +31,6 @@ _EXAMPLES: Final = {
         "value": {
             "views": [{"crops": [_CROP]}, {"dx": 0.0, "dy": 0.0, "dyaw": 1.57, "crops": [_CROP]}]
         },
-    },
-    "classes": {
-        "summary": "near a toilet and a mirror",
-        "value": {"crops": [{"class": "toilet"}, {"class": "mirror"}]},
     },
     "tracked": {
         "summary": "a robot that drove half a metre since its question before",

@@ -82,8 +82,10 @@ def create_app(
     )
     async def relocalize(
         request: Request,
-        top: Annotated[int | None, Query(ge=1, le=MAX_TOP)] = None,
-        method: Annotated[Method | None, Query()] = None,
+        top: Annotated[
+            int | None, Query(ge=1, le=MAX_TOP, description="How many Places; 3 if not given.")
+        ] = None,
+        method: Annotated[Method | None, Query(description="joint if not given.")] = None,
         session: Annotated[
             str | None,
             Query(
