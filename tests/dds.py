@@ -1,7 +1,7 @@
 """Messages of ROS over DDS, by Cyclone DDS: types made from definitions, a writer that is a program
 of its own, a reader of the raw CDR.
 
-    python -m tests.dds DOMAIN KEYFRAMES        writes a drive, and keeps it until it is killed
+    python -m tests.dds TAG KEYFRAMES        writes a drive, and keeps it until it is killed
 """
 
 import signal
@@ -37,10 +37,11 @@ from cyclonedds.util import duration
 
 from tests.ros_messages import TYPES
 
-LOOPBACK = """<CycloneDDS><Domain Id="any">
+_DOMAIN = 91
+_LOOPBACK = """<CycloneDDS><Domain Id="any">
 <General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>
 <AllowMulticast>false</AllowMulticast></General>
-<Discovery><Peers><Peer address="127.0.0.1"/></Peers>
+<Discovery><Tag>{tag}</Tag><Peers><Peer address="127.0.0.1"/></Peers>
 <ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>50</MaxAutoParticipantIndex>
 </Discovery></Domain></CycloneDDS>"""
 QOS = Qos(
@@ -105,10 +106,11 @@ def _value(value: Any) -> Any:
 
 
 @contextmanager
-def participant(domain: int) -> Iterator[DomainParticipant]:
-    """A participant that speaks over loopback only."""
-    owner = Domain(domain, LOOPBACK)
-    yield DomainParticipant(domain)
+def participant(tag: str) -> Iterator[DomainParticipant]:
+    """A participant that speaks over loopback only, and only with participants of its own tag:
+    another run of the tests on this machine has the same domain."""
+    owner = Domain(_DOMAIN, _LOOPBACK.format(tag=tag))
+    yield DomainParticipant(_DOMAIN)
     del owner
 
 
@@ -130,7 +132,7 @@ def main() -> None:
     """Write a drive, and keep it for readers until the process is killed."""
     from tests.ros2dds_drive import KINDS, drive
 
-    with participant(int(sys.argv[1])) as own:
+    with participant(sys.argv[1]) as own:
         writers = {name: DataWriter(own, topic(own, name, KINDS[name]), qos=QOS) for name in KINDS}
         for name, message in drive(int(sys.argv[2])):
             writers[name].write(to_idl(message))

@@ -64,19 +64,30 @@ def start(
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when numpy is imported
     gc.disable()
-    name = sys.argv[1] if len(sys.argv) > 1 else ""
     if COMPLETION_VARIABLE in os.environ:
         from typer._completion_classes import completion_init
 
         completion_init()
     with _exit_on_ctrl_c():
-        program = command_line({name: commands[name]} if name in commands else commands)
+        program = command_line(_needed(commands))
     gc.freeze()
     gc.enable()
     try:
         run_app(program)
     finally:
         gc.freeze()  # else the interpreter would search all objects for cycles as it exits
+
+
+def _needed(commands: Mapping[str, str]) -> Mapping[str, str]:
+    """The command that was asked for, or that a shell wants to be completed; all if it is none."""
+    name = sys.argv[1] if len(sys.argv) > 1 else ""
+    if COMPLETION_VARIABLE in os.environ:
+        typed = os.environ.get("COMP_WORDS") or os.environ.get("_TYPER_COMPLETE_ARGS", "")
+        found = re.match(r"\s*\S+\s+(\S+)\s", typed)  # the program, and a command and its end
+        name = found[1] if found else ""
+    if sys.argv[1:] in (["--version"], ["-V"]):
+        return {}
+    return {name: commands[name]} if name in commands else commands
 
 
 @contextlib.contextmanager

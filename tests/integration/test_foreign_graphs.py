@@ -31,16 +31,16 @@ def by_tail(log: Path, targets: Targets) -> object:
     return tail(log, targets, SETTINGS, once=True)
 
 
-@pytest.fixture
-def log(tmp_path: Path) -> Path:
-    return write_log(tmp_path / "log", walk(30) + list(bridge()))
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_log(tmp_path_factory.mktemp("foreign") / "log", walk(30) + list(bridge()))
 
 
-@pytest.fixture
-def rows(log: Path, two_databases: Targets) -> object:
-    """What the databases hold where there was no graph before."""
-    rebuild(log, two_databases, SETTINGS)
-    return all_rows(two_databases)
+@pytest.fixture(scope="module")
+def rows(log: Path, module_database: Targets) -> object:
+    """What a database holds where there was no graph before."""
+    rebuild(log, module_database, SETTINGS)
+    return all_rows(module_database)
 
 
 def make(pg: psycopg.Connection, *statements: str) -> None:
@@ -55,27 +55,27 @@ def make(pg: psycopg.Connection, *statements: str) -> None:
 def test_an_empty_graph_is_adopted(
     log: Path,
     rows: object,
-    third_database: Targets,
+    one_database: Targets,
     labels: tuple[str, ...],
     act: Act,
 ) -> None:
-    with psycopg.connect(third_database.graph_url) as pg:
+    with psycopg.connect(one_database.graph_url) as pg:
         pg.execute("SET search_path = ag_catalog, public")
         make(pg, *labels)
-    act(log, third_database)
-    assert all_rows(third_database) == rows
-    assert [report.sound for report in check(log, third_database, SETTINGS)] == [True, True]
-    act(log, third_database)
-    assert all_rows(third_database) == rows
+    act(log, one_database)
+    assert all_rows(one_database) == rows
+    assert [report.sound for report in check(log, one_database, SETTINGS)] == [True, True]
+    act(log, one_database)
+    assert all_rows(one_database) == rows
 
 
-def test_rights_on_an_empty_graph_are_kept(log: Path, third_database: Targets) -> None:
-    with psycopg.connect(third_database.graph_url) as pg:
+def test_rights_on_an_empty_graph_are_kept(log: Path, one_database: Targets) -> None:
+    with psycopg.connect(one_database.graph_url) as pg:
         pg.execute("SET search_path = ag_catalog, public")
         make(pg, "GRANT USAGE ON SCHEMA semantic_map TO PUBLIC")
-    rebuild(log, third_database, SETTINGS)
-    tail(log, third_database, SETTINGS, once=True)
-    with psycopg.connect(third_database.graph_url) as pg:
+    rebuild(log, one_database, SETTINGS)
+    tail(log, one_database, SETTINGS, once=True)
+    with psycopg.connect(one_database.graph_url) as pg:
         row = pg.execute("SELECT nspacl::text FROM pg_namespace WHERE nspname = 'semantic_map'")
         assert "=U/" in str(row.fetchone())
 
@@ -92,21 +92,21 @@ def test_rights_on_an_empty_graph_are_kept(log: Path, third_database: Targets) -
     ids=["vertex", "table", "comment", "schema"],
 )
 def test_what_is_not_empty_is_refused_and_the_statement_renames_it(
-    log: Path, third_database: Targets, statements: tuple[str, ...], act: Act
+    log: Path, one_database: Targets, statements: tuple[str, ...], act: Act
 ) -> None:
-    with psycopg.connect(third_database.graph_url) as pg:
+    with psycopg.connect(one_database.graph_url) as pg:
         pg.execute("LOAD 'age'")
         pg.execute("SET search_path = ag_catalog, public")
         for statement in statements:
             pg.execute(statement)  # type: ignore[arg-type]
     with pytest.raises(DatabaseError, match="that mapfold did not make; rename it by `") as told:
-        act(log, third_database)
+        act(log, one_database)
     (sql,) = re.findall(r"`([^`]*)`", str(told.value))
-    with psycopg.connect(third_database.graph_url) as pg:  # a session that knows nothing of AGE
+    with psycopg.connect(one_database.graph_url) as pg:  # a session that knows nothing of AGE
         pg.execute(sql)
-    act(log, third_database)
-    assert [report.sound for report in check(log, third_database, SETTINGS)] == [True, True]
-    with psycopg.connect(third_database.graph_url) as pg:
+    act(log, one_database)
+    assert [report.sound for report in check(log, one_database, SETTINGS)] == [True, True]
+    with psycopg.connect(one_database.graph_url) as pg:
         names = pg.execute("SELECT nspname::text FROM pg_namespace WHERE nspname ~ '^semantic_'")
         new_name = re.findall(r"semantic_map_\d", sql)[0]
         assert {new_name, "semantic_map"} <= {name for (name,) in names}

@@ -1,5 +1,6 @@
 """A peer in DDS: Cyclone makes the CDR and sends it over loopback; a small bridge passes it on."""
 
+import uuid
 from collections.abc import Callable
 from pathlib import Path
 
@@ -27,7 +28,6 @@ from tests.ros2dds_drive import KINDS, drive
 from tests.ros_messages import TYPES
 
 KEYFRAMES = 12
-DOMAIN = 91
 WRITER = "from tests.dds import main; main()"
 
 
@@ -47,12 +47,13 @@ def test_a_drive_over_dds_and_a_bridge(
     start_code: Callable[..., Program],
 ) -> None:
     sent = drive(KEYFRAMES)
-    with dds.participant(DOMAIN) as own:
+    tag = uuid.uuid4().hex
+    with dds.participant(tag) as own:
         readers = {
             name: DataReader(own, dds.topic(own, name, kind), qos=dds.QOS)
             for name, kind in KINDS.items()
         }
-        start_code(WRITER, str(DOMAIN), str(KEYFRAMES))
+        start_code(WRITER, tag, str(KEYFRAMES))
         waits = WaitSet(own)
         for reader in readers.values():
             waits.attach(ReadCondition(reader, SampleState.Any | ViewState.Any | State.Any))

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands import PROGRAM, Commands
+from projections.cli.program import _needed
+from tests.commands import Commands
+from tests.prefork import folder_with_mapfold
 
 
 @pytest.fixture
@@ -41,7 +43,7 @@ OFFERED = {
 def test_bash_completes(tmp_path: Path) -> None:
     (tmp_path / "log").mkdir()
     script = f"""
-PATH={PROGRAM.parent}:$PATH
+PATH={folder_with_mapfold()}:$PATH
 eval "$(mapfold completion bash)"
 for typed in "$@"; do
     IFS=' ' read -ra COMP_WORDS <<< "$typed"
@@ -78,3 +80,27 @@ def test_another_shell_is_refused_with_the_ones_there_are(mapfold: Commands) -> 
 
 def test_the_man_page_is_installed() -> None:
     assert (Path(sys.prefix) / "share" / "man" / "man1" / "mapfold.1").is_file()
+
+
+@pytest.mark.parametrize(
+    ("typed", "modules"),
+    [
+        ("mapfold log ", 1),  # completes the words of a command: only its module is needed
+        ("mapfold lo", 2),
+        ("mapfold ", 2),
+    ],
+)
+@pytest.mark.parametrize("variable", ["COMP_WORDS", "_TYPER_COMPLETE_ARGS"])
+def test_completing_imports_only_the_command_that_is_typed(
+    typed: str, modules: int, variable: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    commands = {"log": "its module", "state": "another"}
+    monkeypatch.setattr(sys, "argv", ["mapfold"])
+    monkeypatch.setenv("_MAPFOLD_COMPLETE", "complete_bash")
+    monkeypatch.setenv(variable, typed)
+    assert len(_needed(commands)) == modules
+
+
+def test_the_version_needs_no_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["mapfold", "--version"])
+    assert _needed({"log": "its module"}) == {}
