@@ -82,7 +82,7 @@ class Answer(TypedDict):
     thin: Annotated[
         str | None, Field(description="What the map has too little of; null where it has enough.")
     ]
-    track: Annotated[NotRequired[Track], Field(description="There if a session was given.")]
+    track: NotRequired[Annotated[Track, Field(description="There if a session was given.")]]
 
 
 class Place(TypedDict):
@@ -94,10 +94,10 @@ class Place(TypedDict):
     keyframe_count: Annotated[int, Field(ge=0)]
     name: NotRequired[str]
     floor: NotRequired[str]
-    type: Annotated[NotRequired[str], Field(description="What room it is, where that is sure.")]
+    type: NotRequired[Annotated[str, Field(description="What room it is, where that is sure.")]]
     type_probability: NotRequired[Probability]
-    distance_m: Annotated[
-        NotRequired[float], Field(ge=0, description="From the position, where one was given.")
+    distance_m: NotRequired[
+        Annotated[float, Field(ge=0, description="From the position, where one was given.")]
     ]
 
 
@@ -111,8 +111,8 @@ class MapObject(TypedDict):
     obs_count: Annotated[int, Field(ge=0)]
     first_seen: Annotated[float, Field(description="Seconds since 1970.")]
     last_seen: float
-    est_x: Annotated[
-        NotRequired[float], Field(description="Where it stands, under fusion by evidence.")
+    est_x: NotRequired[
+        Annotated[float, Field(description="Where it stands, under fusion by evidence.")]
     ]
     est_y: NotRequired[float]
     est_sigma_m: NotRequired[float]
@@ -120,16 +120,18 @@ class MapObject(TypedDict):
     est_xy: NotRequired[float]
     est_yy: NotRequired[float]
     est_spots: NotRequired[int]
-    missing: Annotated[
-        NotRequired[bool], Field(description="Whether it was not seen where it should have been.")
+    missing: NotRequired[
+        Annotated[bool, Field(description="Whether it was not seen where it should have been.")]
     ]
-    place_id: Annotated[
-        NotRequired[str | None],
-        Field(description="The Place it is in, null for none; in lists without a position."),
+    place_id: NotRequired[
+        Annotated[
+            str | None,
+            Field(description="The Place it is in, null for none; in lists without a position."),
+        ]
     ]
     place_name: NotRequired[str]
-    distance_m: Annotated[
-        NotRequired[float], Field(ge=0, description="From the position, where one was given.")
+    distance_m: NotRequired[
+        Annotated[float, Field(ge=0, description="From the position, where one was given.")]
     ]
 
 

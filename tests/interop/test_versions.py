@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SAMPLE = ROOT / "logs" / "sample"
 ROOMS = ("--set", "eps_m=0.75", "--set", "min_samples=8")
 DIGEST = "83caf24df6303ddf85522676f0ae726b671725573c6044e0743eb7af2691aab1"
-EXTRAS = "ui,foxglove,detector,ros,cluster"
+EXTRAS = "serve,ui,foxglove,detector,ros,cluster"
 UV = Path(sys.executable).with_name("uv")
 
 pytestmark = pytest.mark.slow
@@ -46,10 +46,11 @@ def check(programs: Path, folder: Path) -> None:
         assert done.returncode == 0, f"{arguments}: {done.stderr}"
         return done.stdout
 
-    helped = subprocess.run(
-        [programs / "python", "-c", HELP_OF_ALL], capture_output=True, text=True, check=False
-    )
-    assert helped.returncode == 0, helped.stderr
+    for code in (HELP_OF_ALL, DESCRIBED):
+        done = subprocess.run(
+            [programs / "python", "-c", code], capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
     assert mapfold("state", SAMPLE, *ROOMS, "--digest").strip() == DIGEST
     mapfold("replay", SAMPLE, *ROOMS)
     mapfold("simulate", "--run", "b", "--out", "b.jsonl")
@@ -71,6 +72,12 @@ program = command_line()
 for name in ["", *COMMANDS, "log cat", "db check", "query path", "edit join"]:
     done = CliRunner().invoke(program, [*name.split(), "--help"])
     assert done.exit_code == 0, (name, done.output, done.exception)
+"""
+
+DESCRIBED = """
+from projections.serve.http import create_app
+shapes = create_app(None, None).openapi()["components"]["schemas"]
+assert "place_id" in shapes["Place"]["properties"], shapes
 """
 
 
