@@ -48,14 +48,20 @@ class Output(Protocol):
 
 
 class FileOutput:
-    """Envelopes as JSON lines. Raises MisuseError when the file cannot be written."""
+    """Envelopes as JSON lines in a new file. Raises MisuseError when it is there already, or cannot
+    be written."""
 
     def __init__(self, path: Path) -> None:
         self.delivered = Delivered()
         self._path = path
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = path.open("wb")
+            # A FIFO or a device, such as /dev/stdout, holds nothing to be lost.
+            self._file = path.open("xb" if path.is_file() or not path.exists() else "wb")
+        except FileExistsError:
+            raise MisuseError(
+                f"--out {path}: there is such a file; remove it, or choose another"
+            ) from None
         except OSError as error:
             raise self._unwritable(error) from None
 

@@ -22,6 +22,8 @@ from .messages import MessageError, pose_of
 NEAR_S: Final = 0.1
 _KEPT: Final = 20_000
 """Poses that are kept as they come in: 100 s of 200 a second."""
+_KEPT_BYTES: Final = 16 * 1024 * 1024
+"""Of messages that were not read yet: 20,000 of Odometry with covariances take 14 MB."""
 _SLACK_S: Final = 1e-6
 """A hundred milliseconds in floating point are a hundred milliseconds."""
 
@@ -64,10 +66,10 @@ class PoseTrack:
     def __len__(self) -> int:
         return len(self._stamps)
 
-    @property
-    def latest_s(self) -> float:
-        """The last stamp; minus infinity without any."""
-        return self._stamps[-1] if self._stamps else -math.inf
+    def has_soon_after(self, stamp_s: float) -> bool:
+        """Whether there is a pose of this stamp or up to `NEAR_S` later."""
+        after = bisect_left(self._stamps, stamp_s)
+        return after < len(self._stamps) and self._stamps[after] <= stamp_s + NEAR_S + _SLACK_S
 
     def at(self, stamp_s: float) -> Pose | None:
         """The pose at a stamp, as the module says."""
@@ -107,14 +109,23 @@ def poses_of_file(path: Path) -> PoseTrack:
 
 
 class LivePoses:
-    """Poses as they come in: Zenoh's thread puts messages, another asks and reads them."""
+    """Poses as they come in: Zenoh's thread puts messages, another asks and reads them.
+
+    Of messages that nobody has asked for yet the newest are kept, at most `_KEPT` of them and
+    `_KEPT_BYTES`.
+    """
 
     def __init__(self) -> None:
         self._track = PoseTrack()
-        self._messages: deque[tuple[bytes, float]] = deque(maxlen=_KEPT)
+        self._last_two_s = (-math.inf, -math.inf)
+        """The stamps of the poses that came last."""
+        self._messages: deque[tuple[bytes, float]] = deque()
+        self._bytes = 0
         self._came = threading.Condition()
         self.count = 0
         """Poses that were read."""
+        self.dropped = 0
+        """Messages that were dropped for newer ones, since nobody asked."""
         self.bad = 0
         """Messages that are no pose."""
         self.bad_reason: str | None = None
@@ -124,6 +135,10 @@ class LivePoses:
         """Note a message; it is read when somebody asks."""
         with self._came:
             self._messages.append((payload, received_s))
+            self._bytes += len(payload)
+            while len(self._messages) > _KEPT or self._bytes > _KEPT_BYTES:
+                self._bytes -= len(self._messages.popleft()[0])
+                self.dropped += 1
             self._came.notify()
 
     def refuse(self, reason: str) -> None:
@@ -138,14 +153,20 @@ class LivePoses:
         while True:
             with self._came:
                 left = deadline - time.monotonic()
-                if not self._messages and self._track.latest_s < stamp_s and left > 0:
+                if not self._messages and not self._reaches(stamp_s) and left > 0:
                     self._came.wait(left)
                 messages = list(self._messages)
                 self._messages.clear()
+                self._bytes = 0
             for message in messages:
                 self._read(*message)
-            if self._track.latest_s >= stamp_s or time.monotonic() >= deadline:
+            if self._reaches(stamp_s) or time.monotonic() >= deadline:
                 return self._track.at(stamp_s)
+
+    def _reaches(self, stamp_s: float) -> bool:
+        """Whether the poses of that time have come: one soon after it, or the last two are both of
+        later. A single one far in the future, of a clock that was wrong, says nothing."""
+        return self._track.has_soon_after(stamp_s) or min(self._last_two_s) >= stamp_s
 
     def _read(self, payload: bytes, received_s: float) -> None:
         try:
@@ -154,6 +175,7 @@ class LivePoses:
             self.refuse(str(error))
             return
         self.count += 1
+        self._last_two_s = (self._last_two_s[1], stamp_s)
         self._track.add(stamp_s, pose)
         if len(self._track) > 2 * _KEPT:
             self._track.forget_before(_KEPT)

@@ -18,6 +18,7 @@ COMMANDS: "Mapping[str, str]" = {
     "router": "projections.cli.recording",
     "simulate": "projections.cli.simulate",
     "detect": "projections.cli.detect",
+    "spool": "projections.cli.spool",
     "import": "projections.cli.import_",
     "log": "projections.cli.log",
     "replay": "projections.cli.databases",

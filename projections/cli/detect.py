@@ -233,7 +233,9 @@ def detect(
     key: Annotated[str, typer.Option(help="Zenoh key to publish under.")] = "tb/detections",
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Write JSON lines for `import`; publish nothing."),
+        typer.Option(
+            metavar="FILE", help="Write JSON lines for `import` into a new file; publish nothing."
+        ),
     ] = None,
     keep_crops: Annotated[
         bool,
@@ -341,7 +343,8 @@ def detect(
         detection.close(wait)
     report = detection.report()
     say(summary(name, report, where))
-    for line in advice(report, live, posed=bool(poses or zenoh_pose)):
+    kept_in = spool or spool_path()
+    for line in advice(report, live, posed=bool(poses or zenoh_pose), spool=kept_in):
         say(line)
     if json_:
         emit({"run_id": name, "space": opened.name, **as_document(report)})

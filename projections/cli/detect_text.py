@@ -3,8 +3,10 @@
 import contextlib
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from eventsrc.advised import advised
 from eventsrc.detector.live import LivePictures
 from eventsrc.detector.poses import NEAR_S
 from eventsrc.detector.service import Detection, Report
@@ -112,7 +114,7 @@ def summary(run_id: str, report: Report, where: str) -> str:
     return ", ".join(part for part in parts if part)
 
 
-def advice(report: Report, live: LivePictures | None, *, posed: bool) -> Iterator[str]:
+def advice(report: Report, live: LivePictures | None, *, posed: bool, spool: Path) -> Iterator[str]:
     counts, sent = report.counts, report.delivered
     if report.stopped:
         yield "stopped before the last picture"
@@ -127,6 +129,12 @@ def advice(report: Report, live: LivePictures | None, *, posed: bool) -> Iterato
         yield (
             f"{counted(sent.waiting, 'envelope')} not acknowledged by a recorder; they wait in the"
             " spool, and the next start with it sends them"
+        )
+    if sent.refused:
+        listed = advised("spool", spool)
+        yield visible(
+            f"{counted(sent.refused, 'envelope')} in the spool that a recorder has refused; why,"
+            f" and how to send or drop them: {listed}"
         )
 
 

@@ -391,3 +391,11 @@ def test_ctrl_c_ends_it_with_its_numbers(
     program.wait_for("Ctrl-C ends it")
     assert program.end(signal.SIGINT) == 0
     assert "0 pictures, 0 keyframes, 0 detections" in program.lines[-1]
+
+
+def test_a_file_that_is_there_is_not_written_over(stage: Stage, tmp_path: Path) -> None:
+    out = tmp_path / "run.jsonl"
+    out.write_text("a drive\n")
+    said = stage.run("detect", *stage.posed, *stage.models, "--out", str(out), code=2).err
+    assert f"--out {out}: there is such a file; remove it, or choose another" in said
+    assert out.read_text() == "a drive\n"

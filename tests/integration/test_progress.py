@@ -31,6 +31,7 @@ WITHOUT = {
     "record": "shows a status line",
     "router": "runs until Ctrl-C, reads nothing",
     "detect": "shows a status line",
+    "spool": "reads no log",
     "import": "has a bar for each file",
     "foxglove": "has a bar of its own, then runs until Ctrl-C",
     "reembed": "has a bar of its own",

@@ -6,6 +6,8 @@ import json
 import math
 import re
 import struct
+import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -283,6 +285,49 @@ def test_live_poses_are_read_when_asked() -> None:
     assert (poses.count, poses.bad) == (3, 1)
     assert poses.bad_reason is not None
     assert poses.at(50.0) is None  # after a tenth of a second
+
+
+def _pose(stamp: float, size: int = 0) -> bytes:
+    document = {"x": stamp, "y": 0, "yaw": 0, "stamp": stamp, "frame": "f" * size}
+    return json.dumps(document).encode()
+
+
+def test_live_poses_that_nobody_reads_stay_within_bounds_of_number_and_bytes() -> None:
+    for size in (0, 60_000):
+        poses = LivePoses()
+        for number in range(30_000 if not size else 1_000):
+            poses.put(_pose(float(number), size), 0.0)
+        kept = [payload for payload, _ in poses._messages]
+        assert len(kept) <= 20_000
+        assert sum(map(len, kept)) == poses._bytes <= 16 * 1024 * 1024
+        assert poses.dropped == (30_000 if not size else 1_000) - len(kept) > 0
+        last = 29_999.0 if not size else 999.0
+        assert poses.at(last) == Pose(last, 0, 0)  # the newest are kept
+        assert poses._bytes == 0
+
+
+def test_one_pose_far_in_the_future_does_not_end_the_wait() -> None:
+    """The pose of the picture comes after it, as the robot's next one always does."""
+    poses = LivePoses()
+    for stamp in (1.0, 99_999.0):
+        poses.put(_pose(stamp), 0.0)
+    assert poses.at(1.0) == Pose(1.0, 0, 0)
+    came = threading.Timer(0.03, lambda: poses.put(_pose(1.05), 0.0))
+    came.start()
+    found = poses.at(1.02)
+    came.join()
+    assert found == pytest.approx(Pose(1.02, 0, 0))
+
+
+def test_poses_that_are_all_later_are_not_waited_for() -> None:
+    """Those of a slow localiser, when pictures of a moment ago are looked at."""
+    poses = LivePoses()
+    for stamp in (1.0, 2.0, 3.0):
+        poses.put(_pose(stamp), 0.0)
+    began = time.monotonic()
+    for number in range(50):
+        assert poses.at(1.2 + 0.01 * number) is None
+    assert time.monotonic() - began < 2.0  # it would take five seconds
 
 
 def test_a_picture_is_a_value() -> None:
