@@ -51,6 +51,15 @@ class DaskCluster:
                 " `dask scheduler`, and workers with `dask worker tcp://HOST:PORT --nthreads 1`"
             ) from None
 
+    def wait_for_workers(self, number: int, seconds: float) -> None:
+        """Wait until the cluster has so many workers. Raises ClusterError."""
+        try:
+            self._client.wait_for_workers(number, timeout=seconds)
+        except TimeoutError:
+            raise ClusterError(
+                f"--engine dask://{self.address}: fewer than {counted(number, 'worker')}"
+            ) from None
+
     def run(
         self, task: Task, requests: Sequence[Any], progress: Progress | None = None
     ) -> Iterator[Ended]:

@@ -1,0 +1,1 @@
+"""Benchmarks of `mapfold fleet`; run by scripts/bench_fleet."""

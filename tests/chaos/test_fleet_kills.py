@@ -1,0 +1,59 @@
+"""Workers of a fleet's engines killed in the middle: every site right, none rebuilt twice."""
+
+from pathlib import Path
+
+import pytest
+
+from projections.database.embedded import EmbeddedServer
+from projections.fleet.cluster import ClusterError, DaskCluster
+from projections.fleet.replaying import ReplayRequest, replay_site
+from projections.fleet.site_databases import SiteDatabases
+from projections.fleet.sites import Site
+from scripts.fleet_bench.killing import killed
+from scripts.fleet_bench.speed import dask_cluster, make_sites
+from tests.envelopes import envelope
+from tests.fleet_tasks import wait
+from tests.fleets import fleet_databases
+from tests.logs import write_log
+
+
+def test_a_request_that_is_begun_again_finds_its_site_done(pg_url: str, tmp_path: Path) -> None:
+    """What a second worker does with a site whose first one was killed after it committed."""
+    log = write_log(tmp_path / "log", [envelope(0, 0.0, 0.0)])
+    request = ReplayRequest(Site("a", log), SiteDatabases(pg_url, pg_url))
+    assert [replay_site(request, print).outcome for _ in range(2)] == ["rebuilt", "up_to_date"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["pool", "dask"])
+def test_every_site_is_right_and_none_done_twice(
+    engine: str, pg_server: EmbeddedServer, tmp_path: Path
+) -> None:
+    with fleet_databases(pg_server) as template:
+        sites = make_sites(tmp_path / "sites", 6, 300)
+        found = killed(template, sites, engine, kills=3)
+    assert found.workers == 3
+    assert found.twice == 0
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_goes_is_an_error_after_a_while(tmp_path: Path) -> None:
+    gone: list[str] = []
+    requests = [tmp_path / "a", tmp_path / "b"]
+    for path in requests:
+        path.mkdir()
+    with dask_cluster(1) as cluster, DaskCluster(cluster.address) as engine:
+
+        def kill_scheduler(_events: int) -> None:
+            if not gone and any((path / "pid").exists() for path in requests):
+                cluster.kill_scheduler()
+                gone.append("scheduler")
+
+        with pytest.raises(ClusterError, match="the scheduler has gone; of 2 of 2 sites"):
+            list(engine.run(wait, requests, kill_scheduler))
+
+
+@pytest.mark.slow
+def test_no_scheduler_is_an_error_that_says_how_to_start_one() -> None:
+    with pytest.raises(ClusterError, match="no scheduler answers there"):
+        DaskCluster("127.0.0.1:1")
