@@ -21,6 +21,7 @@ from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any, Final, Self
 
+from eventsrc.errors import MapfoldError
 from eventsrc.text import counted
 
 from .engine import RETRIES, Ended, Progress, Task
@@ -28,6 +29,10 @@ from .engine import RETRIES, Ended, Progress, Task
 _POLL_S: Final = 0.25
 _ERROR_CHARS: Final = 400
 """Of an unexpected error's text so much is kept."""
+
+
+class WorkersError(MapfoldError):
+    """Worker processes cannot be started."""
 
 
 class LocalPool:
@@ -91,6 +96,11 @@ class LocalPool:
                 with contextlib.suppress(BrokenProcessPool):  # killed while it had nothing to do
                     return worker.submit(_call, task, request, index)
                 self._discard(slot)
+        except OSError as error:
+            raise WorkersError(
+                f"--jobs {self._jobs}: no more worker processes can be started: {error.strerror};"
+                " run with fewer --jobs"
+            ) from error
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 

@@ -1,4 +1,4 @@
-"""The same sites by one worker after another, by a pool of processes, and by a Dask cluster."""
+"""The same sites by `mapfold replay` in turn, by pools of processes, and by a Dask cluster."""
 
 import contextlib
 import os
@@ -23,6 +23,7 @@ from projections.fleet.sites import Site
 from scripts.projections_bench.world import make_log
 
 WORKERS = 2
+REPLAYS, ONE = "replays", "pool of 1"
 
 
 def make_sites(folder: Path, sites: int, keyframes: int) -> list[Site]:
@@ -61,21 +62,22 @@ def compare(template: str, sites: Sequence[Site], rounds: int) -> None:
         requests = requests_for(template, sites)
         with DaskCluster(address) as cluster:  # makes the databases, and the workers' imports
             replayed(cluster, requests)
-        times: dict[str, list[float]] = {"one after another": [], "pool": [], "dask": []}
+        times: dict[str, list[float]] = {name: [] for name in (REPLAYS, ONE, "pool", "dask")}
         starts = []
         for number in range(rounds):
             order = list(times)
-            for name in order[number % 3 :] + order[: number % 3]:
+            for name in order[number % 4 :] + order[: number % 4]:
                 times[name].append(_seconds(name, address, requests))
             starts.append(_start_seconds())
             row = ", ".join(f"{name} {times[name][-1]:.1f} s" for name in times)
             print(f"  round {number + 1}: {row}, load {os.getloadavg()[0]:.1f}", flush=True)
-    one, pool, dask = times.values()
+    replays, one, pool, dask = times.values()
     started = [whole - start for whole, start in zip(pool, starts, strict=True)]
     print(
-        f"pool of {WORKERS}: {_median(one, pool):.2f} × as fast as one after another (goal 1.6);"
-        f" dask takes {_median(dask, started):.2f} × the pool's time, start-up apart (goal at most"
-        f" 1.3; the pool's is {statistics.median(starts):.1f} s)"
+        f"pool of {WORKERS}: {_median(replays, pool):.2f} × as fast as `mapfold replay` of one site"
+        f" after another (goal 1.6), {_median(one, pool):.2f} × as fast as a pool of 1; dask takes"
+        f" {_median(dask, started):.2f} × the pool's time, start-up apart (goal at most 1.3; the"
+        f" pool's is {statistics.median(starts):.1f} s)"
     )
 
 
@@ -86,12 +88,18 @@ def _median(over: Sequence[float], under: Sequence[float]) -> float:
 def _seconds(name: str, address: str, requests: Sequence[ReplayRequest]) -> float:
     """Wall seconds; of the pool with the start of its processes, of the cluster without."""
     started = time.perf_counter()
+    if name == REPLAYS:
+        for request in requests:
+            command = [sys.executable, "-m", "projections.cli", "replay", str(request.site.log)]
+            command += ["--db", request.databases.graph_url]
+            subprocess.run(command, check=True, capture_output=True)
+        return time.perf_counter() - started
     if name == "dask":
         with DaskCluster(address) as engine:
             started = time.perf_counter()
             replayed(engine, requests)
             return time.perf_counter() - started
-    with LocalPool(1 if name == "one after another" else WORKERS) as pool:
+    with LocalPool(1 if name == ONE else WORKERS) as pool:
         replayed(pool, requests)
     return time.perf_counter() - started
 
