@@ -17,7 +17,6 @@ from typing import Any
 import pytest
 
 from eventsrc.log import LogReader
-from eventsrc.sim import simulate_run
 from eventsrc.system_events import COMMAND_KEY, MAP_KEY
 from projections.cli.options import settings_from
 from projections.model.digest import map_digest
@@ -26,6 +25,7 @@ from projections.model.log_commands import read_corrections
 from tests.commands import Commands
 from tests.docs.console import ROOT, Command, matches, read
 from tests.prefork import folder_with_mapfold
+from tests.simulated import simulated
 from tests.ui_server import showing
 
 _COMMAND = [sys.executable, "-m", "projections.cli", "demo", "--speed", "300"]
@@ -72,7 +72,7 @@ def test_the_tour_shows_what_it_prints(played: Played) -> None:
 
 
 def test_every_keyframe_went_through_the_router_into_the_log(played: Played) -> None:
-    run = simulate_run()
+    run = simulated()
     with LogReader(played.out / "log") as reader:
         walls, *events = [event for event in reader.read() if event.key != COMMAND_KEY]
     assert walls.key == MAP_KEY
@@ -144,7 +144,7 @@ def test_one_merge_is_undone_and_one_place_has_a_name(played: Played) -> None:
 
 def test_the_error_is_the_distance_to_where_the_robot_truly_was(played: Played) -> None:
     lost = played.numbers["relocalize"]
-    run = simulate_run(run="b")
+    run = simulated(run="b")
     pose = run.true_poses[lost["keyframe_id"] - 1]
     assert lost["room"] == run.truth[lost["keyframe_id"] - 1]["room"]
     assert 1 <= len(lost["questions"]) <= 3

@@ -28,6 +28,7 @@ from eventsrc.log.recover import TooManyLosses
 from tests.fixtures_log import BY_HAND, KEY, envelope, flip, read_log, write_log
 from tests.memory import MOST_MIB, run_measured
 from tests.rewriting import rewrite
+from tests.thorough import mostly_slow
 
 HUGE = 20 * 2**30
 EVENTS = 6
@@ -219,15 +220,18 @@ def forge(field: str, value: Any) -> Callable[..., ChunkIndex]:
 
 @pytest.mark.parametrize(
     "what",
-    [
-        {"ChunkIndex": forge("chunk_length", 2**40)},
-        {"ChunkIndex": forge("chunk_length", 2**64 - 1)},
-        {"ChunkIndex": forge("chunk_start_offset", 2**63)},
-        {"MetadataIndex": lambda at, size, name: _mcap.MetadataIndex(2**63, size, name)},
-        {"MetadataIndex": lambda at, size, name: _mcap.MetadataIndex(at, 2**62, name)},
-        {"MetadataIndex": lambda at, size, name: _mcap.MetadataIndex(at, size, "other")},
-        {"Statistics": lambda **f: Statistics(**{**f, "channel_message_counts": {9: 1}})},
-    ],
+    mostly_slow(
+        [
+            {"ChunkIndex": forge("chunk_start_offset", 2**63)},
+            {"MetadataIndex": lambda at, size, name: _mcap.MetadataIndex(at, 2**62, name)},
+            {"Statistics": lambda **f: Statistics(**{**f, "channel_message_counts": {9: 1}})},
+            {"ChunkIndex": forge("chunk_length", 2**40)},
+            {"ChunkIndex": forge("chunk_length", 2**64 - 1)},
+            {"MetadataIndex": lambda at, size, name: _mcap.MetadataIndex(2**63, size, name)},
+            {"MetadataIndex": lambda at, size, name: _mcap.MetadataIndex(at, size, "other")},
+        ],
+        quick=3,
+    ),
 )
 def test_places_beyond_the_file_are_damage_and_recovered(
     log_path: Path, what: dict[str, Any], monkeypatch: pytest.MonkeyPatch

@@ -7,8 +7,8 @@ import pytest
 
 from eventsrc.append import append_payload
 from eventsrc.log import LogWriter
-from eventsrc.sim import simulate_run
 from tests.commands import Commands, Said
+from tests.simulated import simulated
 from tests.thorough import mostly_slow
 
 
@@ -16,7 +16,7 @@ from tests.thorough import mostly_slow
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("logs") / "drive"
     with LogWriter(path) as writer:
-        for payload in list(simulate_run(7, "b").payloads)[:120]:
+        for payload in list(simulated(7, "b").payloads)[:120]:
             append_payload(writer, "tb/detections", payload)
     return path
 

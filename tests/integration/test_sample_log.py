@@ -4,7 +4,7 @@ from pathlib import Path
 
 from eventsrc.log import LogReader
 from eventsrc.log_info import log_info
-from eventsrc.sim import simulate_run
+from tests.simulated import simulated
 
 SAMPLE = Path(__file__).resolve().parents[2] / "logs" / "sample"
 
@@ -20,6 +20,6 @@ def test_it_is_one_sealed_segment_of_at_most_two_megabytes() -> None:
 def test_its_payloads_are_those_of_the_simulated_run_byte_for_byte() -> None:
     with LogReader(SAMPLE) as reader:
         events = list(reader.read())
-    assert [event.payload for event in events] == list(simulate_run(7, "a").payloads)
+    assert [event.payload for event in events] == list(simulated(7, "a").payloads)
     assert [event.offset for event in events] == list(range(len(events)))
     assert {event.key for event in events} == {"tb/detections"}

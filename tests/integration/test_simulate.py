@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.sim import simulate_run
 from eventsrc.transport.session import Received, Session
 from tests.commands import Commands, Said
 from tests.fixtures_zenoh import DEADLINE_S, Program
+from tests.simulated import simulated
 
 
 def _mapfold(*arguments: str) -> Said:
@@ -27,7 +27,7 @@ def test_every_keyframe_arrives_byte_for_byte_and_in_order(
     session.confirm()
     program = start("simulate", "--run", "b", "--speed", "0", "--connect", endpoint)
     assert program.wait() == 0, program.lines
-    payloads = list(simulate_run(run="b").payloads)
+    payloads = list(simulated(run="b").payloads)
     arrived = [received.get(timeout=DEADLINE_S) for _ in payloads]
     assert [message.payload for message in arrived] == payloads
     assert {message.key for message in arrived} == {"tb/detections"}
@@ -49,7 +49,7 @@ def test_a_file_is_written_with_its_numbers(tmp_path: Path) -> None:
     out = tmp_path / "run.jsonl.gz"
     done = _mapfold("simulate", "--run", "c", "--out", str(out), "--json")
     numbers = json.loads(done.out)
-    run = simulate_run(run="c")
+    run = simulated(run="c")
     assert numbers["run_id"] == run.run_id
     assert numbers["keyframes"] == len(run.envelopes)
     assert Path(numbers["out"]).exists()

@@ -17,7 +17,7 @@ import pytest
 
 from eventsrc.log import ALWAYS, LogReader, LogWriter
 from eventsrc.occupancy_map import OccupancyMap
-from eventsrc.sim import build_house, simulate_run
+from eventsrc.sim import build_house
 from eventsrc.sim.house import occupancy_map
 from eventsrc.system_events import MAP_KEY
 from eventsrc.transport.session import Session
@@ -36,6 +36,7 @@ from projections.settings import Settings
 from tests.candidates import assert_equal
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import KEY
+from tests.simulated import simulated
 from tests.thorough import mostly_slow, rounds
 
 WAIT_S = 60.0
@@ -45,7 +46,7 @@ SETTINGS = Settings()
 
 @cache
 def _drive(run: str) -> list[bytes]:
-    return list(simulate_run(SEED, run).payloads)
+    return list(simulated(SEED, run).payloads)
 
 
 def _questions() -> list[bytes]:

@@ -8,6 +8,7 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from eventsrc.sim import detector, simulate_run, tour
+from tests.simulated import simulated
 from tests.thorough import stride
 
 Function = Callable[..., float]
@@ -36,7 +37,7 @@ def _another_library(seed: int) -> SimpleNamespace:
 def test_last_bits_of_a_sine_change_no_byte(
     seed: int, run: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    here = list(simulate_run(seed, run).payloads)
+    here = list(simulated(seed, run).payloads)
     elsewhere = _another_library(seed)
     modules: tuple[ModuleType, ...] = (tour, detector)
     for module in modules:

@@ -14,15 +14,15 @@ from eventsrc.ingest import Accepted, ingest
 from eventsrc.sim import SimulatedRun, simulate_run
 from eventsrc.sim.detector import DIM
 from eventsrc.sim.run import truth_path, write_run
+from tests.simulated import simulated
 from tests.thorough import stride
 
 WITNESS_SHA256 = "f82a71e2193354310bd068bc8511907b6972614add60546300a3515dc79960f6"
 """Of run a of house 7, its payloads joined by line ends. It moves only when the simulator does."""
 
 
-@cache
 def _run(name: str) -> SimulatedRun:
-    return simulate_run(7, name)
+    return simulated(7, name)
 
 
 def _vectors(payload: bytes) -> tuple[NDArray[np.float32] | None, ...]:

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from eventsrc.occupancy_map import OCCUPIED, decode_map
-from eventsrc.sim import build_house, occupancy_map, simulate_run
+from eventsrc.sim import build_house, occupancy_map
 from projections.occupancy import OccupancyGrid
+from tests.simulated import simulated
 
 
 @pytest.mark.parametrize("seed", [1, 7, 12])
@@ -24,7 +25,7 @@ def test_walls_are_occupied_and_doors_are_not(seed: int) -> None:
 
 @pytest.mark.seconds
 def test_the_robot_drove_through_no_wall() -> None:
-    run = simulate_run(7, "a")
+    run = simulated(7, "a")
     grid = OccupancyGrid(occupancy_map(run.house))
     for pose in run.true_poses:
         assert not grid.is_wall((round(pose.x * 1e6), round(pose.y * 1e6)))
