@@ -104,6 +104,22 @@ _COUNTERS: Final = (
     ("transport_missed", "Messages that advanced publishers sent and that never came."),
     ("lost_from_log", "Recorded events lost with a segment file that was taken away or cut short."),
 )
+_OF_ROS: Final = (
+    ("untyped", "Messages of ROS kept without a schema: no bridge told their type."),
+    ("unknown_keys", "Messages left out under keys of no topic of ROS."),
+)
+_STREAM_COUNTERS: Final = (
+    ("keyframes", "Keyframes made."),
+    ("detections", "Detections in them."),
+    ("with_embedding", "Detections with an embedding."),
+    ("unclassified", "Detections without a class."),
+    ("without_pose", "Keyframes without a pose."),
+    ("without_camera_frame", "Keyframes with the pose of the base, not of the camera."),
+    ("without_base_frame", "Keyframes with the heading of the camera, not of the base."),
+    ("without_camera", "Keyframes without the camera's field of view."),
+    ("without_covariance", "Keyframes with a pose, but without its error."),
+)
+"""Of each topic of detections of ROS."""
 _GAUGES: Final = (
     ("missing", "Keyframes the log's runs lack now."),
     ("queue_depth", "Messages that wait for the log's writer."),
@@ -124,10 +140,28 @@ class _RecorderCollector(Collector):
             yield CounterMetricFamily(f"mapfold_recorder_{name}", text, getattr(report, name))
         for name, text in _GAUGES:
             yield GaugeMetricFamily(f"mapfold_recorder_{name}", text, getattr(report, name))
+        if report.streams:
+            yield from _ros_metrics(report)
         failing = report.sealing_error is not None
         yield GaugeMetricFamily("mapfold_recorder_sealing_failing", "1 while it fails.", failing)
         free = shutil.disk_usage(self._log).free
         yield GaugeMetricFamily("mapfold_recorder_disk_free_bytes", "Room where the log is.", free)
+
+
+def _ros_metrics(report: "RecorderReport") -> Iterator[Metric]:
+    for name, text in _OF_ROS:
+        yield CounterMetricFamily(f"mapfold_recorder_ros_{name}", text, getattr(report, name))
+    unread = CounterMetricFamily(
+        "mapfold_recorder_ros_unread", "Messages kept that cannot be read.", labels=["topic"]
+    )
+    for topic, count, _ in report.unread:
+        unread.add_metric([topic], count)
+    yield unread
+    for name, text in _STREAM_COUNTERS:
+        family = CounterMetricFamily(f"mapfold_recorder_ros_{name}", text, labels=["topic"])
+        for topic, counts in report.streams:
+            family.add_metric([topic], getattr(counts, name))
+        yield family
 
 
 @contextmanager

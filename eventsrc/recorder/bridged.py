@@ -6,12 +6,14 @@ message with its schema, and right behind it the envelopes that it completes (`e
 
 A message whose type no token has told yet is held back, for at most `HOLD_NS` and within
 `HOLD_MESSAGES` and `HOLD_BYTES`; then it is kept without a schema and makes nothing. Messages of
-one topic keep their order. Nothing is lost here.
+one topic keep their order. Nothing is lost here but messages under keys of no topic, which are
+counted.
 """
 
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 from eventsrc.envelope import ENVELOPE_VERSION
@@ -58,6 +60,8 @@ class Bridge:
         self._held_bytes = 0
         self.untyped = 0
         """Messages kept without a schema, since their type is not known."""
+        self.unknown_keys = 0
+        """Messages left out, since their keys are those of no topic of ours."""
 
     @property
     def refused(self) -> dict[str, int]:
@@ -73,6 +77,20 @@ class Bridge:
     def counts(self) -> dict[str, Counts]:
         """What the envelopes have and what they lack, by topic of detections."""
         return self._derivation.counts
+
+    @property
+    def unread(self) -> tuple[tuple[str, int, str], ...]:
+        """Topics whose messages are kept but cannot be read, how many, and why the first cannot."""
+        counts = [*self.refused.items()]
+        return tuple((topic, count, self.reasons.get(topic, "")) for topic, count in counts)
+
+    @property
+    def streams(self) -> tuple[tuple[str, Counts], ...]:
+        """Copies of `counts`, for other threads: the writer thread goes on counting."""
+        return tuple(
+            (topic, replace(counts, unused=dict(counts.unused), reasons=dict(counts.reasons)))
+            for topic, counts in self.counts.items()
+        )
 
     @property
     def types_told(self) -> frozenset[str]:
@@ -108,8 +126,9 @@ class Bridge:
         taken = [*self._release(logged_ns, check)] if self._held else []
         waiting = {held.key for held in self._held}
         for key, payload, _ in messages:
-            if key not in self._topics:
-                continue  # a key expression that a publisher made up; no topic of ours
+            if key not in self._topics:  # a key expression that a publisher made up
+                self.unknown_keys += 1
+                continue
             if key in self._formats and key not in waiting:
                 taken += self._appended(key, payload, logged_ns, check)
             else:

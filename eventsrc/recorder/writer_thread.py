@@ -44,6 +44,7 @@ from eventsrc.robot.acks import (
     refusal_key,
 )
 from eventsrc.ros.derivation import RosRecording
+from eventsrc.ros.stream import Counts
 from eventsrc.system_events import LOSS_KEY, ROS_KEY, Loss
 from eventsrc.transport.session import Received
 
@@ -119,6 +120,10 @@ class RecorderReport:
     """Messages of a bridge that are kept without a schema: their type is not known."""
     unread: tuple[tuple[str, int, str], ...] = ()
     """Topics whose messages are kept but cannot be read, how many, and why the first cannot."""
+    unknown_keys: int = 0
+    """Messages that came for a bridge's topics under keys of none, and were left out."""
+    streams: tuple[tuple[str, Counts], ...] = ()
+    """What was made of each topic of detections of a bridge, and what that lacks."""
 
     @property
     def lost(self) -> int:
@@ -130,7 +135,7 @@ class RecorderReport:
     def clean(self) -> bool:
         """True when this recorder lost nothing, rejected nothing, could read the messages of a
         bridge, and left no new gap."""
-        unused = self.rejected or self.untyped or self.unread
+        unused = self.rejected or self.untyped or self.unread or self.unknown_keys
         return not (unused or self.lost or self.missing > self.missing_before)
 
 
@@ -242,7 +247,9 @@ class WriterThread:
             messages=self._messages,
             held=0 if self._bridge is None else self._bridge.held,
             untyped=0 if self._bridge is None else self._bridge.untyped,
-            unread=() if self._bridge is None else _unread(self._bridge),
+            unread=() if self._bridge is None else self._bridge.unread,
+            unknown_keys=0 if self._bridge is None else self._bridge.unknown_keys,
+            streams=() if self._bridge is None else self._bridge.streams,
         )
 
     def _unwritten(self) -> int:
@@ -386,11 +393,6 @@ class WriterThread:
 
     def _append_loss(self, loss: Loss) -> None:
         self._writer.append(LOSS_KEY, loss.model_dump_json().encode())
-
-
-def _unread(bridge: Bridge) -> tuple[tuple[str, int, str], ...]:
-    counts = [*bridge.refused.items()]
-    return tuple((topic, count, bridge.reasons.get(topic, "")) for topic, count in counts)
 
 
 def _loss(cause: Literal["keyframe_gap", "transport_miss"], gap: Gap[Source]) -> Loss:

@@ -4,9 +4,10 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from rich.live import Live
 from rich.text import Text
@@ -196,6 +197,11 @@ def unused_text(report: RecorderReport) -> list[str]:
             f"{counted(report.untyped, 'message')} kept without a schema, and nothing made of "
             "them: no bridge told their type"
         )
+    if report.unknown_keys:
+        lines.append(
+            f"{counted(report.unknown_keys, 'message')} left out: a publisher sent them under keys"
+            " that match topics of ROS recorded here and are none"
+        )
     return lines
 
 
@@ -211,8 +217,12 @@ def summary(log: Path, report: RecorderReport) -> str:
     )
 
 
-def as_json(report: RecorderReport) -> dict[str, int | str | None]:
-    """The final numbers, for ``--json``."""
+def as_json(report: RecorderReport) -> dict[str, Any]:
+    """The final numbers, for ``--json``; ``streams`` and ``unknown_keys`` with --ros2dds only."""
+    of_ros = {
+        "unknown_keys": report.unknown_keys,
+        "streams": {topic: asdict(counts) for topic, counts in report.streams},
+    }
     return {
         "recorded": report.recorded,
         "rejected": report.rejected,
@@ -230,4 +240,5 @@ def as_json(report: RecorderReport) -> dict[str, int | str | None]:
         "next_offset": report.next_offset,
         "unsealed": report.unsealed,
         "sealing_error": report.sealing_error,
+        **(of_ros if report.streams else {}),
     }

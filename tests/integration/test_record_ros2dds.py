@@ -6,6 +6,7 @@ import math
 import signal
 import socket
 import threading
+import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -521,6 +522,22 @@ def test_what_is_no_topic_is_refused(topic: str) -> None:
         topic_of("/**", "/tf", "--detections")
 
 
+def metrics_text(program: Program) -> str:
+    """What a recorder's ``/metrics`` gives now."""
+    url = program.wait_for("metrics on").split()[-1]
+    with urllib.request.urlopen(url, timeout=DEADLINE_S) as answer:
+        text: str = answer.read().decode()
+    return text
+
+
+def test_messages_under_keys_of_no_topic_are_counted() -> None:
+    """Zenoh lets a publisher use a key expression, which matches the topics that are recorded."""
+    bridge = new_bridge()
+    batch = [BridgedMessage(key, b"x") for key in ("*", "**", "t*", "detections")]
+    assert bridge.take(batch, START, lambda _: iter(())) == []
+    assert (bridge.unknown_keys, bridge.held) == (3, 1)
+
+
 @pytest.mark.seconds
 def test_the_command_records_says_so_and_ends_clean(
     tmp_path: Path, endpoint: str, start_code: Callable[..., Program]
@@ -530,7 +547,7 @@ def test_the_command_records_says_so_and_ends_clean(
         announce_all(bridge)
         program = start_code(
             MAPFOLD, "record", str(log), "--connect", endpoint, "--ros2dds", "--namespace",
-            "/bot1", "--embeddings", "embeddings", "--run-id", "r", "--json",
+            "/bot1", "--embeddings", "embeddings", "--run-id", "r", "--json", "--metrics", "0",
         )  # fmt: skip
         program.wait_for("keyframes of r")
         program.wait_for("Ctrl-C ends it")
@@ -542,9 +559,16 @@ def test_the_command_records_says_so_and_ends_clean(
             seen += event is not None and event.is_envelope
             if seen == 10:
                 break
+        scraped = metrics_text(program)
         assert program.end(signal.SIGINT) == 0
     document = json.loads(program.output())
     assert (document["recorded"], document["messages"]) == (11, len(sent))
+    made = document["streams"]["/bot1/detections"]
+    assert (made["keyframes"], made["without_camera"], made["without_pose"]) == (10, 10, 0)
+    assert made["detections"] == made["with_embedding"] == 10
+    assert document["unknown_keys"] == 0
+    assert 'mapfold_recorder_ros_keyframes_total{topic="/bot1/detections"} 10.0' in scraped
+    assert "mapfold_recorder_ros_unknown_keys_total 0.0" in scraped
     assert any(f"{len(sent)} messages of ROS" in line for line in program.lines)
     counted = "/bot1/detections: 10 keyframes; 10 without the camera's field of view"
     assert any(line.startswith(counted) for line in program.lines), program.lines
