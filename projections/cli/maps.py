@@ -11,10 +11,11 @@ from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 from eventsrc.progress import working
 from eventsrc.text import counted, visible
+from projections.history.known import map_after
 from projections.model.advice import places_advice, space_advice
 from projections.model.digest import map_digest
 from projections.model.export import state_document, state_text
-from projections.model.fold import fold_events, fold_log_cached
+from projections.model.fold import fold_events
 from projections.model.log_commands import read_corrections
 from projections.model.space_vectors import new_map
 from projections.model.view import MapView
@@ -22,6 +23,7 @@ from projections.model.view import MapView
 from .options import (
     JsonOption,
     KnownAtOption,
+    NoCacheOption,
     SetOption,
     SettingsOption,
     W,
@@ -42,8 +44,13 @@ def state(
     known_at: KnownAtOption = None,
     json_: JsonOption = False,
     digest: Annotated[bool, typer.Option("--digest", help="Print only the digest.")] = False,
+    no_digest: Annotated[
+        bool,
+        typer.Option("--no-digest", help="Leave out the digest, which reads the whole map."),
+    ] = False,
     set_: SetOption = None,
     settings_file: SettingsOption = None,
+    no_cache: NoCacheOption = False,
 ) -> None:
     """The map folded to a point in the log.
 
@@ -51,15 +58,21 @@ def state(
     """
     if json_ and digest:
         raise MisuseError("--json and --digest together: --json prints the digest too")
+    if digest and no_digest:
+        raise MisuseError("--digest and --no-digest exclude each other")
     settings_from(settings_file, set_)  # a bad value is an error before the log is opened
     with LogReader(log) as reader:
         end = point(reader, at)
         known = known_point(reader, known_at, end)
         corrections = read_corrections(reader, known)
         settings = settings_from(settings_file, set_, corrections)
-        _, view = fold_log_cached(reader, settings, end, note=say, corrections=corrections)
-    with working("computing the digest"):
-        hexdigits = map_digest(view)
+        view = map_after(
+            reader, settings, end, corrections=corrections, note=say, cache=not no_cache
+        )
+    hexdigits = None
+    if not no_digest:
+        with working("computing the digest"):
+            hexdigits = map_digest(view)
     if json_:
         emit(state_document(view, hexdigits, known))
     elif digest:

@@ -32,6 +32,10 @@ if TYPE_CHECKING:
     from projections.relocalize import Camera, Question
 
 JsonOption = Annotated[bool, typer.Option("--json", help="JSON on stdout.")]
+NoCacheOption = Annotated[
+    bool,
+    typer.Option("--no-cache", help="Neither read nor keep the history beside the log."),
+]
 LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="The log's folder.")]
 
 # Points of a log

@@ -29,6 +29,7 @@ from .options import (
     JsonOption,
     KnownAtOption,
     LogArgument,
+    NoCacheOption,
     SetOption,
     SettingsOption,
     W,
@@ -47,11 +48,16 @@ AtOption = Annotated[str, typer.Option("--at", metavar="W", help=f"Look from her
 
 
 @contextlib.contextmanager
-def _timeline(log: Path, settings_file: Path | None, sets: list[str] | None) -> Iterator[Timeline]:
+def _timeline(
+    log: Path, settings_file: Path | None, sets: list[str] | None, no_cache: bool
+) -> Iterator[Timeline]:
     """The log's timeline under the settings of the command line or the log, with a progress
     bar."""
-    settings = settings_of(settings_file, sets)
-    with Bar() as bar, Timeline(log, settings, progress=bar.show_fold) as timeline:
+    settings, cache = settings_of(settings_file, sets), not no_cache
+    with (
+        Bar() as bar,
+        Timeline(log, settings, progress=bar.show_fold, note=say, cache=cache) as timeline,
+    ):
         yield timeline
 
 
@@ -86,6 +92,7 @@ def merges(
     json_: JsonOption = False,
     set_: SetOption = None,
     settings_file: SettingsOption = None,
+    no_cache: NoCacheOption = False,
 ) -> None:
     """Every merge of places, and which keyframe made it.
 
@@ -99,7 +106,7 @@ def merges(
     picture = out or Path("merge.png")
     if draw is not None:
         check_picture(picture)
-    with _timeline(log, settings_file, set_) as timeline:
+    with _timeline(log, settings_file, set_, no_cache) as timeline:
         end = point(timeline.reader, at)
         known = timeline.knowing(known_point(timeline.reader, known_at, end))
         if refused:
@@ -180,6 +187,7 @@ def why(
     json_: JsonOption = False,
     set_: SetOption = None,
     settings_file: SettingsOption = None,
+    no_cache: NoCacheOption = False,
 ) -> None:
     """Why a place or an object is what it is, event by event.
 
@@ -188,7 +196,7 @@ def why(
     if (thing is None) == (same is None):
         raise MisuseError("give one of PLACE_ID, OBJECT_ID and --same RUN:KEYFRAME RUN:KEYFRAME")
     pair = (thing, other) if thing is not None and other is not None else same
-    with _timeline(log, settings_file, set_) as timeline:
+    with _timeline(log, settings_file, set_, no_cache) as timeline:
         end = point(timeline.reader, at)
         known = timeline.knowing(known_point(timeline.reader, known_at, end))
         found = _explanation(known, thing, pair, end)
@@ -222,12 +230,13 @@ def diff(
     all_: AllOption = False,
     set_: SetOption = None,
     settings_file: SettingsOption = None,
+    no_cache: NoCacheOption = False,
 ) -> None:
     """What changed from one moment of the map to another.
 
     Keyframes, places, objects and adjacency, and the commands recorded in between.
     """
-    with _timeline(log, settings_file, set_) as timeline:
+    with _timeline(log, settings_file, set_, no_cache) as timeline:
         reader = timeline.reader
         span = point(reader, first), point(reader, second)
         known = None if known_at is None else point(reader, known_at)
@@ -267,8 +276,9 @@ def bisect(
     all_: AllOption = False,
     set_: SetOption = None,
     settings_file: SettingsOption = None,
+    no_cache: NoCacheOption = False,
 ) -> None:
-    with _columns_shown(), _timeline(log, settings_file, set_) as timeline:
+    with _columns_shown(), _timeline(log, settings_file, set_, no_cache) as timeline:
         asked = Expression(expression)
         span = point(timeline.reader, start), point(timeline.reader, end)
         known = timeline.knowing(known_point(timeline.reader, known_at, span[1]))

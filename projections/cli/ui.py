@@ -18,6 +18,7 @@ from .options import (
     ConfigOption,
     ConnectOption,
     LogArgument,
+    NoCacheOption,
     SetOption,
     SettingsOption,
     W,
@@ -87,6 +88,7 @@ def ui(
     zenoh_config: ConfigOption = None,
     set_: SetOption = None,
     settings_file: SettingsOption = None,
+    no_cache: NoCacheOption = False,
 ) -> None:
     """Look at a log's map in a browser, and drag time.
 
@@ -128,6 +130,7 @@ def ui(
             truth=scored,
             edits=allow_edits,
             token_needed=not local,
+            cache=not no_cache,
         )
         service = stack.enter_context(UiService(opened))
         watch = stack.enter_context(LiveWatch(service, tails))

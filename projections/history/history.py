@@ -46,7 +46,7 @@ from projections.deltas import (
 from projections.reducers import packed
 from projections.settings import Settings
 
-from .neighbours import Neighbours
+from .neighbours import Neighbours, Posed
 from .records import (
     Cause,
     EdgeChange,
@@ -161,7 +161,7 @@ class History:
         """Neighbourhoods of the keyframes so far; made again when there are more."""
         count = len(self.keyframes)
         if self._neighbours is None or self._neighbours[0] != count:
-            self._neighbours = count, Neighbours(self.keyframes, self.settings)
+            self._neighbours = count, Neighbours(Posed.of(self.keyframes), self.settings)
         return self._neighbours[1]
 
     @property

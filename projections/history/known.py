@@ -1,12 +1,14 @@
 """The history of one log under given settings and the commands recorded before a point.
 
-It folds the log once, at the first question that needs the history, and keeps what happened; after
-that every question is a look-up. An event at offset o, and a merge it causes, shows in
-``at(o + 1)``. A command shows in every map of a history that knows it.
+It folds the log once, at the first question that needs the history, and keeps what happened, in
+memory and beside the log (`projections.history.timeline_cache`); after that every question is a
+look-up. An event at offset o, and a merge it causes, shows in ``at(o + 1)``. A command shows in
+every map of a history that knows it.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import TypeAlias, TypeVar
+from functools import partial
+from typing import TypeVar
 
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
@@ -28,16 +30,15 @@ from .command_entries import (
 )
 from .conditions import Expression
 from .explanation import Explanation, explain_object, explain_place, with_entries
-from .history import History
+from .history_recorder import HistoryRecorder, map_at
+from .history_recorder import Progress as Progress
 from .names import NoSuchThing, find_keyframe, find_object, find_place
-from .past_view import view_at
 from .records import Merge, ObjectMerge, Refusal
 from .same_place import explain_same_place
+from .stored_history import StoredHistory
+from .stored_view import StoredView
+from .timeline_cache import TimelineCache
 
-Progress: TypeAlias = Callable[[int, int], None]
-"""Called with (events folded, events in all) from time to time."""
-
-_PROGRESS_EVERY = 500
 _Caused = TypeVar("_Caused", Merge, Refusal, ObjectMerge)
 
 
@@ -56,8 +57,8 @@ def checked_end(reader: LogReader, end: Offset | None) -> Offset:
 class KnownHistory:
     """What happened to the map, under ``corrections``; an ``end`` is a number of events.
 
-    ``progress`` is called while events are folded, ``note`` with a line about each snapshot that
-    could not be used.
+    ``progress`` is called while events are folded, ``note`` with a line about each snapshot or kept
+    history that could not be used. Without ``cache`` no history is read or kept beside the log.
     """
 
     def __init__(
@@ -68,6 +69,7 @@ class KnownHistory:
         *,
         progress: Progress | None = None,
         note: Callable[[str], None] = lambda _: None,
+        cache: bool = True,
     ) -> None:
         self.reader = reader
         self.settings = settings
@@ -75,9 +77,10 @@ class KnownHistory:
         self._progress = progress
         self._note = note
         self._snapshot_tried = False
-        self._map = new_map(reader, settings, corrections)
-        self._latest = MapView(settings, keep_embeddings=False, corrections=corrections)
-        self._history = History(settings, corrections)
+        cached = TimelineCache(reader, settings, corrections, note) if cache else None
+        self._recorder = HistoryRecorder(reader, settings, corrections, cached, progress)
+        self._history: StoredHistory | None = None
+        self._latest: StoredView | None = None
         self._index: CountIndex | None = None
         self._teller = CommandTeller(reader)
 
@@ -87,35 +90,59 @@ class KnownHistory:
         return self.reader.next_offset
 
     @property
-    def history(self) -> History:
+    def history(self) -> StoredHistory:
         """The history up to `end`; folds new events first. Raises FoldError at a bad event."""
-        if self._history.next_offset < self.end:
-            self._index = None
-            with gc_paused():
-                self._fold_to(self.end)
-        return self._history
+        return self._history_of(self.end)
 
     @property
     def latest(self) -> MapView:
         """The map up to `end`, not to be changed; its observations carry no embeddings."""
-        _ = self.history
+        history = self.history
+        if self._latest is None or self._latest.next_offset != history.next_offset:
+            self._latest = StoredView(history, history.next_offset)
         return self._latest
+
+    def _history_of(self, end: Offset) -> StoredHistory:
+        """The history of ``end`` events or more."""
+        tables = self._recorder.up_to(end)
+        if self._history is None or self._history.next_offset != tables.end:
+            self._index = None
+            self._history = StoredHistory(
+                self.settings, self.corrections, tables, partial(map_at, self.reader)
+            )
+        return self._history
 
     def at(self, end: Offset | None = None) -> MapView:
         """The map after the first ``end`` events, all of them for None; the caller may change it.
 
-        Its observations carry no embeddings, only their checksums. The first call folds from the
-        nearest snapshot beside the log, if there is one; a later call folds the history, from then
-        on it is a look-up.
+        Its observations carry no embeddings, only their checksums. Without a history that was kept,
+        the first call folds from the nearest snapshot beside the log, if there is one; a later call
+        folds the history, from then on it is a look-up.
         """
         wanted = self._checked(end)
-        if self._history.next_offset < wanted and not self._snapshot_tried:
+        if not self._recorder.has(wanted) and not self._snapshot_tried:
             self._snapshot_tried = True
-            if (view := self._from_snapshot(wanted)) is not None:
-                return view
-        history = self.history
+            if self._has_snapshot(wanted):
+                return self.folded(wanted)
+        return self._view(wanted if self._recorder.has(wanted) else self.end, wanted)
+
+    def at_once(self, end: Offset) -> MapView:
+        """`at`, for one question: events from ``end`` on are not folded."""
+        if not self._recorder.has(end) and self._has_snapshot(end):
+            return self.folded(end)
+        return self._view(end, end)
+
+    def folded(self, end: Offset) -> MapView:
+        """The map at ``end``, folded from the nearest snapshot."""
+        return fold_log_cached(
+            self.reader, self.settings, end, note=self._note, corrections=self.corrections
+        )[1]
+
+    def _view(self, known: Offset, end: Offset) -> MapView:
+        """The map at ``end`` from a history of ``known`` events or more."""
+        history = self._history_of(known)
         with gc_paused():
-            return view_at(history, self._latest, wanted)
+            return StoredView(history, end)
 
     def deltas(
         self, start: Offset = FIRST_OFFSET, end: Offset | None = None
@@ -150,7 +177,7 @@ class KnownHistory:
         """
         history, last = self.history, self._checked(end)
         if thing in history.object_ordinals:
-            seen = self._latest.observations.__getitem__
+            seen = self.latest.observations.__getitem__
             explained = explain_object(history, seen, find_object(history, thing), last)
             told = object_commands(self._teller, history, explained.facts["det_ids"])
             return with_entries(explained, told)
@@ -197,23 +224,8 @@ class KnownHistory:
     def _checked(self, end: Offset | None) -> Offset:
         return checked_end(self.reader, end)
 
-    def _fold_to(self, end: Offset) -> None:
-        events = self.reader.read(self._history.next_offset, end)
-        for folded in fold_events(events, self._map, ahead=READ_AHEAD):
-            self._latest.apply_event(folded.offset, folded.deltas)
-            self._history.apply(folded.offset, folded.deltas)
-            if self._progress and folded.offset % _PROGRESS_EVERY == 0:
-                self._progress(folded.offset, end)
-        if self._progress:
-            self._progress(end, end)
-
-    def _from_snapshot(self, end: Offset) -> MapView | None:
-        """The map at ``end`` from the nearest snapshot; None when there is none below."""
-        if not any(offset <= end for offset in self._snapshots().offsets()):
-            return None
-        return fold_log_cached(
-            self.reader, self.settings, end, note=self._note, corrections=self.corrections
-        )[1]
+    def _has_snapshot(self, end: Offset) -> bool:
+        return any(offset <= end for offset in self._snapshots().offsets())
 
     def _snapshots(self) -> SnapshotCache:
         return SnapshotCache(
@@ -223,6 +235,21 @@ class KnownHistory:
             self._note,
             corrections=self.corrections,
         )
+
+
+def map_after(
+    reader: LogReader,
+    settings: Settings,
+    end: Offset,
+    *,
+    corrections: Corrections,
+    note: Callable[[str], None],
+    cache: bool = True,
+) -> MapView:
+    """The map after ``end`` events, for one question: from the history that is kept beside the log,
+    else from the nearest snapshot. Without either the events are folded, and their history kept."""
+    known = KnownHistory(reader, settings, corrections, note=note, cache=cache)
+    return known.at_once(end) if cache else known.folded(end)
 
 
 def _before(records: Sequence[_Caused], end: Offset) -> list[_Caused]:

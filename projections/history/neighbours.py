@@ -5,8 +5,8 @@ core point when at least ``min_samples`` posed keyframes, itself included, are w
 inclusive. Those on two floors never are.
 """
 
-from bisect import bisect_left
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,45 +18,64 @@ from projections.reducers.floors import shift_um
 from projections.settings import Settings
 
 
+class Posed(NamedTuple):
+    """The keyframes that have a pose, in order, as columns: their ordinals, the events that added
+    them, positions in µm, and the floor of each as a number from 0 in the order of the first."""
+
+    numbers: NDArray[np.int64]
+    offsets: NDArray[np.int64]
+    positions: NDArray[np.int64]
+    floors: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, keyframes: Sequence[KeyframeAdded]) -> "Posed":
+        """Of keyframes as records."""
+        posed = [(k, k.pose) for k in keyframes if k.pose is not None]
+        names: dict[str | None, int] = {}
+        return cls(
+            np.array([k.keyframe for k, _ in posed], np.int64),
+            np.array([k.offset for k, _ in posed], np.int64),
+            np.array([(at.x_um, at.y_um) for _, at in posed], np.int64).reshape(-1, 2),
+            np.array([names.setdefault(k.floor, len(names)) for k, _ in posed], np.int64),
+        )
+
+
 class Neighbours:
     """The poses of keyframes in a grid of cell size ε."""
 
-    def __init__(self, keyframes: Sequence[KeyframeAdded], settings: Settings) -> None:
+    def __init__(self, posed: Posed, settings: Settings) -> None:
         self._radius = metres_to_um(settings.eps_m)
         self._min_samples = settings.min_samples
-        posed = [(k.keyframe, k.offset, k.pose) for k in keyframes if k.pose is not None]
-        self._numbers = [n for n, _, _ in posed]
-        self._offsets = [offset for _, offset, _ in posed]
-        self._positions = np.array([(p.x_um, p.y_um) for _, _, p in posed], np.int64).reshape(-1, 2)
-        names: dict[str | None, int] = {}
-        floors = [names.setdefault(k.floor, len(names)) for k in keyframes if k.pose is not None]
-        self._shifts = np.array([shift_um(floor) for floor in floors], np.int64).reshape(-1, 2)
-        self._positions += self._shifts
-        self._row = {number: row for row, number in enumerate(self._numbers)}
+        self._numbers, self._offsets = posed.numbers, posed.offsets
+        floors = int(posed.floors.max()) + 1 if len(posed.floors) else 0
+        shifts = np.array([shift_um(floor) for floor in range(floors)], np.int64).reshape(-1, 2)
+        self._shifts = shifts[posed.floors]
+        self._positions = posed.positions + self._shifts
         self._cells = _rows_by_cell(self._positions // self._radius)
 
     def of(self, keyframe: KeyframeOrdinal, end: Offset) -> list[KeyframeOrdinal]:
         """Ordinals, ascending, of the keyframes within ε of a posed ``keyframe`` after ``end``
         events; itself included."""
-        x, y = self._positions[self._row[keyframe]]
+        x, y = self._positions[self._row(keyframe)]
         column, row = int(x) // self._radius, int(y) // self._radius
         around = [(column + i, row + j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
         rows = np.concatenate([self._cells[cell] for cell in around if cell in self._cells])
-        rows = np.sort(rows[rows < bisect_left(self._offsets, end)])
+        rows = np.sort(rows[rows < np.searchsorted(self._offsets, end)])
         # In these cells a difference is at most 2·10⁹ µm, so its square fits int64.
         near = ((self._positions[rows] - (x, y)) ** 2).sum(axis=1) <= self._radius**2
-        return [self._numbers[row] for row in rows[near]]
+        numbers: list[KeyframeOrdinal] = self._numbers[rows[near]].tolist()
+        return numbers
 
     def is_core(self, keyframe: KeyframeOrdinal, end: Offset) -> bool:
         """Whether it is a core point after ``end`` events; false before it was recorded."""
-        row = self._row.get(keyframe)
+        row = self._find(keyframe)
         if row is None or self._offsets[row] >= end:
             return False
         return len(self.of(keyframe, end)) >= self._min_samples
 
     def made_core(self, bridge: KeyframeOrdinal, offset: Offset) -> list[KeyframeOrdinal]:
         """The keyframes that became core points when ``bridge`` was added at ``offset``."""
-        if bridge not in self._row:
+        if self._find(bridge) is None:
             return []
         return [
             keyframe
@@ -66,12 +85,25 @@ class Neighbours:
 
     def distance_um(self, a: KeyframeOrdinal, b: KeyframeOrdinal) -> int:
         """The distance of two posed keyframes, rounded down."""
-        (ax, ay), (bx, by) = (map(int, self._positions[self._row[k]]) for k in (a, b))
+        (ax, ay), (bx, by) = (map(int, self._positions[self._row(k)]) for k in (a, b))
         return distance_um(ax, ay, bx, by)
+
+    def _find(self, keyframe: KeyframeOrdinal) -> int | None:
+        """The row of a keyframe, None for one without a pose."""
+        row = int(np.searchsorted(self._numbers, keyframe))
+        found = row < len(self._numbers) and self._numbers[row] == keyframe
+        return row if found else None
+
+    def _row(self, keyframe: KeyframeOrdinal) -> int:
+        """The row of a posed keyframe."""
+        row = self._find(keyframe)
+        if row is None:
+            raise KeyError(keyframe)
+        return row
 
     def positions(self, keyframes: Sequence[KeyframeOrdinal]) -> NDArray[np.float64]:
         """Positions of posed keyframes in metres, shape (n, 2)."""
-        rows = [self._row[k] for k in keyframes]
+        rows = [self._row(k) for k in keyframes]
         metres: NDArray[np.float64] = (self._positions[rows] - self._shifts[rows]) / 1e6
         return metres
 

@@ -39,8 +39,9 @@ class Timeline:
 
     ``settings`` are those of every fold, or a function of what is known; by default those that the
     log names. ``progress`` is called while events are folded, ``note`` with a line about each
-    snapshot that could not be used. ``reader`` reads ``log`` instead of a new reader; the timeline
-    closes it. At most ``histories`` are kept.
+    snapshot or kept history that could not be used. ``reader`` reads ``log`` instead of a new
+    reader; the timeline closes it. At most ``histories`` are kept in memory. Without ``cache`` none
+    is read or kept beside the log.
     """
 
     def __init__(
@@ -52,12 +53,14 @@ class Timeline:
         note: Callable[[str], None] = lambda _: None,
         reader: LogReader | None = None,
         histories: int = _MOST_HISTORIES,
+        cache: bool = True,
     ) -> None:
         self._settings = settings
         self.reader = LogReader(log) if reader is None else reader
         self._most = histories
         self._progress = progress
         self._note = note
+        self._cache = cache
         self._commands: list[RecordedCommand] = []
         self._commands_end: Offset | None = None
         self._compiled: dict[int, Corrections] = {}
@@ -106,7 +109,12 @@ class Timeline:
         # By the commands in force, not by what they compile to: `why` names every one.
         key = settings.fingerprint(), tuple(command.offset for command in corrections.in_force)
         found = self._histories.pop(key, None) or KnownHistory(
-            self.reader, settings, corrections, progress=self._progress, note=self._note
+            self.reader,
+            settings,
+            corrections,
+            progress=self._progress,
+            note=self._note,
+            cache=self._cache,
         )
         self._histories[key] = found  # the last one asked is the last one to go
         for old in list(self._histories)[: -self._most]:

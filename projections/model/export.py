@@ -15,8 +15,10 @@ from .records import ObjectRecord
 from .view import MapView
 
 
-def state_document(view: MapView, digest: str, known_at: Offset | None = None) -> dict[str, Any]:
-    """The JSON document. Every list is ordered by ordinal.
+def state_document(
+    view: MapView, digest: str | None, known_at: Offset | None = None
+) -> dict[str, Any]:
+    """The JSON document. Every list is ordered by ordinal. ``digest`` may be left out.
 
     ``known_at`` is the point before which commands were known, by default the map's own.
     """
@@ -167,12 +169,12 @@ def _evidence(view: MapView, found: ObjectRecord) -> dict[str, Any]:
 _MAX_PLACES = 40
 
 
-def state_text(view: MapView, digest: str, known_at: Offset | None = None) -> str:
+def state_text(view: MapView, digest: str | None, known_at: Offset | None = None) -> str:
     """Counts, settings, digest and the first 40 places, for people; ends in a newline."""
     lines = [
         f"after {counted(view.next_offset, 'event')}: {_counts(view)}",
         f"settings {_settings(view.settings)}",
-        f"digest   {digest}",
+        *([] if digest is None else [f"digest   {digest}"]),
     ]
     if view.settings.fusion == "evidence":
         lines.append(f"objects  {_standing(view)}")

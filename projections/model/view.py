@@ -362,7 +362,7 @@ class MapView:
     def counts(self) -> dict[str, int]:
         """How many of everything; the eight in capitals are the graph's edges by label. What
         corrections leave out is counted at the end, where there is any."""
-        posed = sum(k.pose is not None for k in self.keyframes)
+        posed, fused, foreign = self._sums()
         placed = sum(p.keyframe_count for p in self.places.values())
         return {
             "events": self.next_offset,
@@ -377,11 +377,11 @@ class MapView:
             "duplicates": self.skipped["duplicate"],
             "conflicts": self.skipped["conflict"],
             "det_ids_reused": self.skipped["det_id_reused"],
-            "foreign_embeddings": sum(o.foreign_space for o in self.observations),
+            "foreign_embeddings": foreign,
             "HAS_KEYFRAME": len(self.keyframes),
             "HAS_POSE": posed,
             "HAS_OBSERVATION": len(self.observations),
-            "OBSERVES": sum(o.object is not None for o in self.observations),
+            "OBSERVES": fused,
             "LOCATED_IN": sum(o.place is not None for o in self.objects.values()),
             "IN_PLACE": placed,
             "ADJACENT_TO": len(self.adjacency),
@@ -389,3 +389,11 @@ class MapView:
             "buildings": int(bool(self.all_places or self.floors)),
             "PART_OF": len(self.places) + len(self.floors),
         } | {kind: self.skipped[kind] for kind in _BY_CORRECTION if kind in self.skipped}
+
+    def _sums(self) -> tuple[int, int, int]:
+        """How many keyframes have a pose, observations an Object, and a foreign embedding."""
+        return (
+            sum(k.pose is not None for k in self.keyframes),
+            sum(o.object is not None for o in self.observations),
+            sum(o.foreign_space for o in self.observations),
+        )

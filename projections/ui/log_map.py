@@ -53,7 +53,12 @@ class LogMap:
 
         self.reader = PrefixReader(opened.log)
         self.timeline = Timeline(
-            opened.log, settings, progress=progress, reader=self.reader, histories=histories
+            opened.log,
+            settings,
+            progress=progress,
+            reader=self.reader,
+            histories=histories,
+            cache=opened.cache and not sets,  # what somebody tries out is not kept
         )
         self.log_events = LogEvents()
         self.log_id = self.reader.log_id

@@ -13,7 +13,8 @@ class Opened:
 
     ``settings`` gives those of the map under some corrections: of ``settings_file`` or the log,
     changed by ``sets`` (``name=value``). ``truth``, of ``truth_files``, scores what-ifs. ``edits``:
-    the log may be changed. ``token_needed``: every question needs the token.
+    the log may be changed. ``token_needed``: every question needs the token. ``cache``: histories
+    are read and kept beside the log.
     """
 
     log: Path
@@ -24,6 +25,7 @@ class Opened:
     truth: Truth | None = None
     edits: bool = False
     token_needed: bool = False
+    cache: bool = True
 
     def words(self, *sets: str) -> list[str]:
         """The options that give a command the same settings, changed by ``sets``."""

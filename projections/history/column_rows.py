@@ -1,0 +1,177 @@
+"""Deltas as rows of columns, and the stripes that they fill while events are folded."""
+
+import zlib
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
+
+import msgspec
+
+from eventsrc.envelope import Offset
+from projections.deltas import (
+    Delta,
+    EventSkipped,
+    KeyframeAdded,
+    KeyframePlaced,
+    MapGiven,
+    MergeRefused,
+    ObjectClassified,
+    ObjectEstimated,
+    ObjectFound,
+    ObjectMissing,
+    ObjectMoved,
+    ObjectOrdinal,
+    ObjectRelocated,
+    ObjectSeen,
+    ObjectsMerged,
+    ObservationAdded,
+    PlaceChanged,
+    PlaceFormed,
+    PlaceNamed,
+    PlaceOrdinal,
+    PlacesLinked,
+    PlacesMerged,
+    RunSeen,
+)
+
+from .columns import Stripe, stripe_of
+from .records import EdgeChange, Merge, ObjectMerge, Refusal, cause_of
+
+Row = Sequence[Any]
+Pair = tuple[PlaceOrdinal, PlaceOrdinal]
+
+
+def _keyframe(delta: KeyframeAdded) -> Row:
+    at = delta.pose
+    pose = (0, 0, 0, 0.0) if at is None else (1, at.x_um, at.y_um, at.yaw_rad)
+    named = (delta.offset, delta.run, delta.run_id, delta.keyframe_id, delta.timestamp)
+    return (*named, *pose, delta.floor)
+
+
+def _observation(delta: ObservationAdded) -> Row:
+    vector = delta.embedding
+    return (
+        delta.offset,
+        delta.keyframe,
+        delta.det_id,
+        delta.class_name,
+        delta.confidence,
+        *delta.bbox,
+        delta.embedding_model,
+        None if vector is None else zlib.crc32(vector.data),
+        delta.foreign_space,
+    )
+
+
+_all: Final = msgspec.structs.astuple
+_ROWS: Final[Mapping[type, tuple[str, Callable[[Any], Row]]]] = {
+    RunSeen: ("run", _all),
+    KeyframeAdded: ("keyframe", _keyframe),
+    ObservationAdded: ("observation", _observation),
+    EventSkipped: (
+        "skipped",
+        lambda d: (d.offset, d.kind, d.run_id, d.keyframe_id, d.det_id, d.first_offset),
+    ),
+    MapGiven: ("map", lambda d: (d.offset,)),
+    PlaceFormed: ("formed", lambda d: (d.offset, d.place_id, d.founder)),
+    KeyframePlaced: ("placed", _all),
+    PlaceChanged: ("changed", _all),
+    PlaceNamed: ("named", _all),
+    ObjectFound: ("found", lambda d: (d.offset, d.object_id, d.class_name, d.observation)),
+    ObjectSeen: ("seen", _all),
+    ObjectEstimated: ("estimated", _all),
+    ObjectClassified: ("classified", _all),
+    ObjectMissing: ("missing", _all),
+    ObjectRelocated: ("relocated", _all),
+    ObjectMoved: ("moved", _all),
+    PlacesLinked: ("linked", _all),
+}
+
+
+class StripeBuilder:
+    """Collects the rows of events from ``start`` on.
+
+    ``located`` is the place of each object before, ``links`` the shared transitions of each pair
+    of places, ``merges`` the number of merges.
+    """
+
+    def __init__(
+        self,
+        start: Offset,
+        located: Mapping[ObjectOrdinal, PlaceOrdinal | None],
+        links: Mapping[Pair, int],
+        merges: int,
+    ) -> None:
+        self._start = self._end = start
+        self._located, self._links, self._merges = dict(located), dict(links), merges
+        self._rows: defaultdict[str, list[Row]] = defaultdict(list)
+
+    @property
+    def events(self) -> int:
+        """How many events the next stripe has so far."""
+        return self._end - self._start
+
+    def add(self, offset: Offset, deltas: Sequence[Delta]) -> None:
+        """Add the deltas of the event at ``offset``."""
+        self._end = Offset(offset + 1)
+        merges: list[PlacesMerged] = []
+        moves: list[tuple[ObjectOrdinal, PlaceOrdinal | None]] = []
+        links: list[EdgeChange] = []
+        for delta in deltas:
+            if (found := _ROWS.get(type(delta))) is not None:
+                table, row_of = found
+                self._rows[table].append(row_of(delta))
+            if isinstance(delta, ObjectMoved):
+                moves.append((delta.object, self._located.get(delta.object)))
+                self._located[delta.object] = delta.place
+            elif isinstance(delta, PlacesLinked):
+                pair, after = (delta.a, delta.b), delta.shared_transitions
+                links.append(EdgeChange(*pair, self._links.get(pair, 0), after))
+                self._links[pair] = after
+            elif isinstance(delta, PlacesMerged):
+                merges.append(delta)
+            elif isinstance(delta, ObjectsMerged):
+                self._document("object_merge", ObjectMerge(cause_of(offset, deltas), delta))
+            elif isinstance(delta, MergeRefused):
+                cause = cause_of(offset, deltas)
+                told = Refusal(cause, delta.a, delta.b, delta.bridge, delta.link, delta.apart)
+                self._document("refusal", told)
+        for merge in merges:
+            self._places_merged(offset, deltas, merge, moves, links)
+
+    def take(self) -> Stripe:
+        """The stripe of the events since the last one."""
+        stripe = stripe_of(self._start, self._end, self._rows)
+        self._start = self._end
+        self._rows.clear()
+        return stripe
+
+    def _document(self, table: str, record: Merge | Refusal | ObjectMerge) -> None:
+        text = msgspec.json.encode(record).decode()
+        self._rows[table].append((record.cause.offset, text))
+
+    def _places_merged(
+        self,
+        offset: Offset,
+        deltas: Sequence[Delta],
+        delta: PlacesMerged,
+        moves: list[tuple[ObjectOrdinal, PlaceOrdinal | None]],
+        links: list[EdgeChange],
+    ) -> None:
+        places = {delta.survivor, *delta.absorbed}
+        self._merges += 1
+        merge = Merge(
+            number=self._merges,
+            cause=cause_of(offset, deltas),
+            bridge=delta.bridge,
+            survivor=delta.survivor,
+            survivor_size=delta.survivor_count,
+            absorbed=delta.absorbed,
+            absorbed_sizes=delta.absorbed_counts,
+            links=delta.links,
+            objects=tuple(found for found, before in moves if before in delta.absorbed),
+            edges=tuple(link for link in links if link.a in places or link.b in places),
+            joined=delta.joined,
+            drives=delta.drives,
+        )
+        self._document("merge", merge)

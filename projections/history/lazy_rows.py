@@ -1,0 +1,96 @@
+"""Sequences whose items are made from rows of tables when they are asked for."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Final, TypeVar, overload
+
+from numpy.typing import NDArray
+
+_T = TypeVar("_T")
+_KEPT: Final = 64
+_AT_ONCE: Final = 4_096
+
+
+class Chunks(Sequence[_T]):
+    """``count`` items; ``make`` makes those from an index to before another.
+
+    Items that are asked for one by one are kept with their neighbours; a walk over all keeps none.
+    """
+
+    def __init__(self, count: int, make: Callable[[int, int], list[_T]]) -> None:
+        self._count, self._make = count, make
+        self._kept: dict[int, list[_T]] = {}
+
+    def __len__(self) -> int:
+        return self._count
+
+    @overload
+    def __getitem__(self, index: int) -> _T: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[_T]: ...
+    def __getitem__(self, index: int | slice) -> _T | list[_T]:
+        if isinstance(index, slice):
+            first, last, step = index.indices(self._count)
+            if step != 1:
+                return [self[i] for i in range(first, last, step)]
+            return self._make(first, last) if first < last else []
+        at = index + self._count if index < 0 else index
+        if not 0 <= at < self._count:
+            raise IndexError(f"{index} of {self._count}")
+        chunk, within = divmod(at, _KEPT)
+        if chunk not in self._kept:
+            first = chunk * _KEPT
+            self._kept[chunk] = self._make(first, min(first + _KEPT, self._count))
+        return self._kept[chunk][within]
+
+    def __iter__(self) -> Iterator[_T]:
+        for first in range(0, self._count, _AT_ONCE):
+            yield from self._make(first, min(first + _AT_ONCE, self._count))
+
+
+class Items(Sequence[_T]):
+    """The items of ``rows``, all made by ``make`` when the first is asked for."""
+
+    __slots__ = ("_items", "_make", "_rows")
+
+    def __init__(self, rows: NDArray[Any], make: Callable[[NDArray[Any]], list[_T]]) -> None:
+        self._rows, self._make = rows, make
+        self._items: list[_T] | None = None
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    @overload
+    def __getitem__(self, index: int) -> _T: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[_T]: ...
+    def __getitem__(self, index: int | slice) -> _T | list[_T]:
+        return self._all()[index]
+
+    def __iter__(self) -> Iterator[_T]:
+        return iter(self._all())
+
+    def _all(self) -> list[_T]:
+        if self._items is None:
+            self._items = self._make(self._rows) if len(self._rows) else []
+        return self._items
+
+
+class Found(Mapping[Any, Any]):
+    """The ordinals of ``count`` things by name; ``find`` is given a name, ``names`` gives all."""
+
+    def __init__(
+        self, count: int, find: Callable[[Any], int | None], names: Callable[[], Iterator[Any]]
+    ) -> None:
+        self._count, self._find, self._names = count, find, names
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __iter__(self) -> Iterator[Any]:
+        return self._names()
+
+    def __getitem__(self, name: Any) -> Any:
+        found = self._find(name)
+        if found is None:
+            raise KeyError(name)
+        return found

@@ -1,0 +1,164 @@
+"""The map at any offset, made from the columns of a history without folding.
+
+Counts, places and objects are computed from whole columns. Keyframes and observations are made one
+by one when somebody asks for them, and all of them before the view is changed.
+"""
+
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Any, Final, cast
+
+import numpy as np
+
+from eventsrc.envelope import Offset
+from projections.deltas import (
+    Delta,
+    ObservationOrdinal,
+    PlaceOrdinal,
+    SkipKind,
+)
+from projections.model.records import (
+    KeyframeRecord,
+    ObservationRecord,
+)
+from projections.model.view import MapView
+from projections.reducers.survivors import PlaceSurvivors
+
+from .columns import NONE
+from .lazy_rows import Chunks
+from .moment import Moment
+from .stored_history import StoredHistory, keyframes_of
+from .stored_records import adjacency_of, floors_of, objects_of, places_of, runs_of, skipped_of
+
+_LAZY: Final = ("keyframes", "observations")
+
+
+class StoredView(MapView):
+    """The map after ``end`` events of a history of tables; the caller may change it."""
+
+    def __init__(self, history: StoredHistory, end: Offset) -> None:
+        super().__init__(history.settings, keep_embeddings=False, corrections=history.corrections)
+        self._is_changed = False
+        self._moment = moment = Moment(history, end)
+        self.all_places = places_of(moment)
+        for merge in moment.merges:
+            self.survivors.merge(merge.survivor, merge.absorbed)
+        gone = self.survivors.absorbed_by
+        self.places = {p.ordinal: p for p in self.all_places if p.ordinal not in gone}
+        self.all_objects = objects_of(moment)
+        for each in moment.object_merges:
+            self.object_survivors.merge(each.survivor, (each.absorbed,))
+        absorbed = self.object_survivors.absorbed_by
+        self.objects = {o.ordinal: o for o in self.all_objects if o.ordinal not in absorbed}
+        for found in self.objects.values():
+            self.contents.update(found)
+        self.runs = runs_of(moment)
+        self.adjacency = adjacency_of(moment)
+        for kind, count in skipped_of(moment).items():
+            self.skipped[cast("SkipKind", kind)] = count
+        self.floors = {name: number for number, name in enumerate(floors_of(moment))}
+        for given in history.maps[: moment.count("map")] if moment.count("map") else ():
+            self.maps[given.map.floor] = given
+        # Made when somebody asks for them: they are most of a map.
+        del self.keyframes, self.observations
+        self.advance(end)
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in _LAZY or "_moment" not in self.__dict__:
+            raise AttributeError(name)
+        moment, count = self._moment, self._moment.count(name.removesuffix("s"))
+        make: Callable[[int, int], list[Any]]
+        if name == "keyframes":  # not a method: a view in a cycle would stay in memory
+            make = partial(_keyframes, moment, self.survivors)
+        else:
+            make = partial(_observations, moment)
+        found: Chunks[Any] = Chunks(count, make)
+        setattr(self, name, found)
+        return found
+
+    def apply(self, delta: Delta) -> None:
+        """Apply one delta."""
+        self._make_all()
+        super().apply(delta)
+
+    def apply_event(self, offset: Offset, deltas: Iterable[Delta]) -> None:
+        """Apply all deltas of the event at ``offset`` and advance past it."""
+        self._make_all()
+        super().apply_event(offset, deltas)
+
+    def floor_of(self, place: PlaceOrdinal) -> str | None:
+        """The name of the floor that a place is on; None if the log has none."""
+        return super().floor_of(place) if self.floors else None
+
+    @property
+    def first_floor(self) -> str | None:
+        """The floor of the first pose; None also where there is none."""
+        return super().first_floor if self.floors else None
+
+    def _sums(self) -> tuple[int, int, int]:
+        if self._is_changed:
+            return super()._sums()
+        moment = self._moment
+        return (
+            int(np.count_nonzero(moment.column("keyframe", "posed"))),
+            int(np.count_nonzero(moment.is_fused)),
+            int(np.count_nonzero(moment.column("observation", "foreign"))),
+        )
+
+    def _make_all(self) -> None:
+        """Make every record, so that they can be changed."""
+        if not self._is_changed:
+            self._is_changed = True
+            self.keyframes, self.observations = list(self.keyframes), list(self.observations)
+
+
+def _keyframes(
+    moment: Moment, survivors: PlaceSurvivors, first: int, last: int
+) -> list[KeyframeRecord]:
+    _, joined = moment.placed
+    added = keyframes_of(moment.tables, first, last)
+    starts = moment.observation_starts[first : last + 1].tolist()
+    return [
+        KeyframeRecord(
+            k.keyframe,
+            k.offset,
+            k.run,
+            k.run_id,
+            k.keyframe_id,
+            k.timestamp,
+            k.pose,
+            survivors,
+            [ObservationOrdinal(number) for number in range(start, end)] or (),
+            None if place == NONE else place,
+            k.floor,
+        )
+        for k, place, start, end in zip(
+            added, joined[first:last].tolist(), starts[:-1], starts[1:], strict=True
+        )
+    ]
+
+
+def _observations(moment: Moment, first: int, last: int) -> list[ObservationRecord]:
+    objects, similarities = moment.fused
+    rows = moment.tables.rows("observation", first, last)
+    return [
+        ObservationRecord(
+            ObservationOrdinal(number),
+            keyframe,
+            det_id,
+            name,
+            confidence,
+            (x0, y0, x1, y1),
+            model,
+            None,
+            crc,
+            foreign,
+            None if found == NONE else found,
+            None if found == NONE else q40,
+        )
+        for number, (_, keyframe, det_id, name, confidence, x0, y0, x1, y1, model, crc, foreign),
+        found, q40 in zip(
+            range(first, last), rows, objects[first:last].tolist(),
+            similarities[first:last].tolist(), strict=True,
+        )
+    ]  # fmt: skip

@@ -1,0 +1,252 @@
+"""The tables of a history: stripes end to end, looked up by row.
+
+Numbers are read as whole columns, which are put together from the stripes when first used, texts by
+the span of rows. A stripe may lie in a file (`projections.history.part_file`), whose arrays raise
+`DamagedPart` when their checksum does not match; then the stripes are made again from the log and
+the look-up goes on. The same log gives the same rows, so what was read before still holds.
+"""
+
+from bisect import bisect_left
+from collections.abc import Callable, Iterator, Sequence
+from itertools import accumulate
+from typing import Any, Final, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eventsrc.envelope import FIRST_OFFSET, Offset
+
+from .columns import NONE, STRIPE_EVENTS, TABLES, Array, Stripe, joined
+
+Rows = NDArray[np.int64]
+_T = TypeVar("_T")
+_MANY: Final = 4_000
+
+
+class DamagedPart(Exception):
+    """Bytes of a stripe are not those that were written; the message says where."""
+
+
+class Tables:
+    """Stripes in order, the first from the first event on.
+
+    ``again`` makes the stripes up to an offset from the log, where one turns out to be damaged.
+    """
+
+    def __init__(
+        self,
+        stripes: Sequence[Stripe] = (),
+        again: Callable[[Offset, DamagedPart], Sequence[Stripe]] | None = None,
+    ) -> None:
+        self.stripes = list(stripes)
+        self._again = again
+        self._columns: dict[str, Array] = {}
+        self._groups: dict[str, Groups] = {}
+
+    @property
+    def end(self) -> Offset:
+        """The number of events."""
+        return self.stripes[-1].end if self.stripes else FIRST_OFFSET
+
+    def add(self, stripe: Stripe) -> None:
+        """Add the rows of the events after `end`."""
+        self.stripes.append(stripe)
+        self._columns.clear()
+        self._groups.clear()
+
+    def shorten(self, first: int) -> None:
+        """Join stripes from the index ``first`` on where neighbours are short."""
+        while len(self.stripes) > first + 1:
+            *_, one, other = self.stripes
+            events = other.end - other.start
+            if other.end - one.start > STRIPE_EVENTS or 2 * events < one.end - one.start:
+                return
+            self.stripes[-2:] = [joined([one, other])]
+
+    def count(self, table: str) -> int:
+        """The number of rows of a table."""
+        return sum(stripe.rows.get(table, 0) for stripe in self.stripes)
+
+    def before(self, table: str, end: Offset) -> int:
+        """How many rows are of events below ``end``."""
+        return self._safely(lambda: self._before(table, end))
+
+    def column(self, table: str, column: str, count: int | None = None) -> Array:
+        """The first ``count`` values of a column that holds no texts, all for None."""
+        return self._safely(lambda: self._column(table, column, count))
+
+    def integers(self, table: str, column: str, count: int | None = None) -> Rows:
+        """`column` as int64, to compute with."""
+        found = self.column(table, column, count)
+        return found if found.dtype == object else found.astype(np.int64, copy=False)
+
+    def texts(self, table: str, column: str, first: int, last: int) -> list[str | None]:
+        """The texts of the rows from ``first`` to before ``last``."""
+        return self._safely(
+            lambda: [
+                text
+                for stripe, a, b in self._spans(table, first, last)
+                for text in stripe.texts(table, column, a, b)
+            ]
+        )
+
+    def text(self, table: str, column: str, row: int) -> str:
+        """The text of a row that has one."""
+        (found,) = self.texts(table, column, row, row + 1)
+        return found or ""
+
+    def codes(self, table: str, column: str, count: int | None = None) -> tuple[Array, list[str]]:
+        """A column of repeated texts as numbers, and the texts that they stand for; -1 is none."""
+        return self._safely(lambda: self._codes(table, column, count))
+
+    def group(self, table: str, column: str) -> "Groups":
+        """The rows of a table by the value of a column."""
+        key = f"{table}.{column}"
+        if key not in self._groups:
+            self._groups[key] = Groups(self.column(table, column))
+        return self._groups[key]
+
+    def rows(self, table: str, first: int, last: int) -> list[tuple[Any, ...]]:
+        """The rows from ``first`` to before ``last``, each with all its columns in order."""
+        found = self._safely(
+            lambda: [
+                row
+                for stripe, a, b in self._spans(table, first, last)
+                for row in _stripe_rows(stripe, table, a, b)
+            ]
+        )
+        if len(found) >= _MANY:  # on the way through all, which then must not fill the memory
+            for stripe in self.stripes:
+                stripe.release()
+        return found
+
+    def rows_at(self, table: str, numbers: Array) -> list[tuple[Any, ...]]:
+        """These rows, each with all its columns in order."""
+        return self._safely(
+            lambda: list(
+                zip(*(self._picked(table, each, numbers) for each in TABLES[table]), strict=True)
+            )
+        )
+
+    def _before(self, table: str, end: Offset) -> int:
+        count = 0
+        for stripe in self.stripes:
+            if stripe.end > end:
+                if stripe.start < end and table in stripe.rows:
+                    count += bisect_left(stripe.arrays[f"{table}.offset"], end)
+                break
+            count += stripe.rows.get(table, 0)
+        return count
+
+    def _column(self, table: str, column: str, count: int | None) -> Array:
+        name = f"{table}.{column}"
+        wanted = self.count(table) if count is None else count
+        found = self._columns.get(name, _NOTHING)
+        if len(found) < wanted:
+            spans = self._spans(table, 0, wanted)
+            parts = [stripe.arrays[name] for stripe, _, _ in spans]
+            found = parts[0] if len(parts) == 1 else np.concatenate(parts)
+            self._columns[name] = found
+        return found[:wanted]
+
+    def _picked(self, table: str, column: str, numbers: Array) -> list[Any]:
+        """The values of a column in these rows; of each stripe only the rows asked for."""
+        kind, name = TABLES[table][column], f"{table}.{column}"
+        bounds = np.cumsum([0, *(stripe.rows.get(table, 0) for stripe in self.stripes)])
+        within = np.searchsorted(bounds, numbers, "right") - 1
+        found = np.empty(len(numbers), object)
+        for index in np.unique(within).tolist():
+            stripe, here = self.stripes[index], within == index
+            rows = numbers[here] - bounds[index]
+            if kind == "text":
+                values: list[Any] = [stripe.text(table, column, row) for row in rows.tolist()]
+            elif kind == "code":
+                strings = [*stripe.strings, None]
+                values = [strings[code] for code in stripe.arrays[name][rows].tolist()]
+            else:
+                values = _values(stripe.arrays[name][rows], kind)
+            found[here] = values
+        picked: list[Any] = found.tolist()
+        return picked
+
+    def _codes(self, table: str, column: str, count: int | None) -> tuple[Array, list[str]]:
+        strings: list[str] = []
+        parts: list[Array] = [_NOTHING]
+        left = self.count(table) if count is None else count
+        for stripe in self.stripes:
+            if left > 0 and table in stripe.rows:
+                codes = stripe.arrays[f"{table}.{column}"][:left].astype(np.int32)
+                left -= len(codes)
+                parts.append(np.where(codes == NONE, NONE, codes + np.int32(len(strings))))
+                strings += stripe.strings
+        return np.concatenate(parts), strings
+
+    def _spans(self, table: str, first: int, last: int) -> Iterator[tuple[Stripe, int, int]]:
+        """The stripes that have rows of a span, and which of their own."""
+        counts = [stripe.rows.get(table, 0) for stripe in self.stripes]
+        for stripe, count, before in zip(
+            self.stripes, counts, accumulate(counts, initial=0), strict=False
+        ):
+            a, b = max(first - before, 0), min(last - before, count)
+            if a < b:
+                yield stripe, a, b
+
+    def _safely(self, look_up: Callable[[], _T]) -> _T:
+        try:
+            return look_up()
+        except DamagedPart as damage:
+            if self._again is None:
+                raise
+            again, end = self._again, self.end
+            self._again = None
+            try:
+                self.stripes = list(again(end, damage))
+            finally:
+                self._again = again
+            self._columns.clear()
+            return look_up()
+
+
+_NOTHING: Final[Array] = np.zeros(0, np.int8)
+
+
+class Groups:
+    """Indices by their value of 0 or more; with ``items`` these instead of the indices."""
+
+    def __init__(self, values: Array, items: Array | None = None) -> None:
+        order = np.argsort(values, kind="stable").astype(np.int32)
+        self._order = order if items is None else items[order]
+        counts = np.bincount(values) if len(values) else _NOTHING
+        self._ends = np.concatenate([[0], np.cumsum(counts)])
+
+    def __getitem__(self, value: int) -> Array:
+        """Those with this value, in order."""
+        if value + 1 >= len(self._ends):
+            return self._order[:0]
+        return self._order[self._ends[value] : self._ends[value + 1]]
+
+
+def _stripe_rows(stripe: Stripe, table: str, first: int, last: int) -> list[tuple[Any, ...]]:
+    columns: list[Any] = []
+    for column, kind in TABLES[table].items():
+        if kind in ("text", "code"):
+            columns.append(stripe.texts(table, column, first, last))
+        else:
+            columns.append(_values(stripe.arrays[f"{table}.{column}"][first:last], kind))
+    return list(zip(*columns, strict=True))
+
+
+def _values(array: Array, kind: str) -> list[Any]:
+    values: list[Any] = array.tolist()
+    if kind == "flag":
+        return [bool(value) for value in values]
+    if kind == "number?":
+        return [None if value == NONE else value for value in values]
+    return values
+
+
+def last_rows(values: Array, size: int) -> Rows:
+    """For each of 0 … ``size`` - 1 the last index at which ``values`` has it, -1 for none."""
+    found = np.full(size, NONE, np.int64)
+    found[values] = np.arange(len(values))  # of equal indices the last one is kept
+    return found

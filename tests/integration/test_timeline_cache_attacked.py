@@ -1,0 +1,167 @@
+"""The kept history under attack: a full disk, a kill in the middle of writing, many processes at
+once, garbage in its folder, and a log that grows while it is read."""
+
+import os
+import signal
+import subprocess
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from projections.history import Timeline
+from tests import prefork
+from tests.envelopes import detection, envelope
+from tests.fixtures_timetravel import VECTORS, write_log
+from tests.history_answers import expected, told
+from tests.history_process import RULES, answers
+from tests.property.test_timeline_cache import kept_early
+from tests.thorough import rounds
+
+EVENTS = 240
+
+
+def drive(first: int, last: int) -> list[dict[str, Any]]:
+    """To and fro along a corridor, seeing cups."""
+    return [
+        envelope(
+            n,
+            0.6 * (n * 7 % 31),
+            0.1 * (n % 3),
+            detections=[detection("cup", VECTORS["cup"], det_id=f"d{n}")] if n % 2 else [],
+        )
+        for n in range(first, last)
+    ]
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    return write_log(tmp_path / "log", drive(0, EVENTS))
+
+
+@pytest.fixture
+def right(log: Path) -> str:
+    """The answers of the log, without files."""
+    with Timeline(log, RULES, cache=False) as timeline:
+        assert len(timeline.merges()) > 1
+    copy = log.with_name("copy")
+    copy.symlink_to(log)
+    return answers(copy, [])
+
+
+def kept(log: Path) -> list[Path]:
+    return sorted(log.with_name("log.history").glob("*"))
+
+
+def run(log: Path, *how: str) -> "subprocess.CompletedProcess[bytes]":
+    return prefork.run(
+        "tests.history_process:main",
+        ["history", str(log), *how],
+        env=os.environ,
+        cwd=Path.cwd(),
+        timeout=60.0,
+    )
+
+
+def test_a_full_disk_costs_the_cache_alone(log: Path, right: str) -> None:
+    done = run(log, "full")
+    assert done.stdout.decode() == right
+    assert "no history was kept: File too large" in done.stderr.decode()
+    assert [path.suffix for path in kept(log)] in ([], [".fold"])
+    assert answers(log, []) == right
+
+
+def test_a_kill_while_writing_leaves_nothing_that_is_used(log: Path, right: str) -> None:
+    for number in (1, 30, 60)[: rounds(3, 1) + 1]:
+        assert run(log, "killed", str(number)).returncode == -signal.SIGKILL
+        assert [path.suffix for path in kept(log)].count(".npz") == 0
+    assert any(path.suffix == ".new" for path in kept(log))
+    notes: list[str] = []
+    assert answers(log, notes) == right
+    assert answers(log, notes) == right
+    assert notes == []
+
+
+@pytest.mark.seconds
+def test_many_processes_at_once(log: Path, right: str) -> None:
+    with ThreadPoolExecutor(20) as pool:
+        for _ in range(rounds(3, 1)):
+            done = list(pool.map(lambda _: run(log, "plain"), range(20)))
+            assert [(each.returncode, each.stderr, each.stdout.decode()) for each in done] == [
+                (0, b"", right)
+            ] * 20
+            assert sorted(path.suffix for path in kept(log)) == [".fold", ".npz"]
+            write_log(log, drive(EVENTS, EVENTS + 40))
+            right = answers(write_log_copy(log), [])
+
+
+def write_log_copy(log: Path) -> Path:
+    """The same log under a name that has no history."""
+    number = len(list(log.parent.glob("other*")))
+    copy = log.with_name(f"other{number}")
+    copy.symlink_to(log)
+    return copy
+
+
+def test_garbage_in_the_folder(log: Path, right: str) -> None:
+    assert answers(log, []) == right
+    part, fold = (next(p for p in kept(log) if p.suffix == s) for s in (".npz", ".fold"))
+    for path in (part, fold):
+        path.unlink()
+        os.mkfifo(path)
+    (part.parent / "notes.txt").write_text("mine")
+    (part.parent / part.name.replace("0-", "1-")).mkdir()
+    (part.parent / f"{part.stem[:37]}-{'9' * 20}.npz").symlink_to("/dev/zero")
+    notes: list[str] = []
+    assert answers(log, notes) == right
+    assert notes
+    assert answers(log, []) == right
+    assert (part.parent / "notes.txt").read_text() == "mine"
+
+
+def test_a_folder_that_cannot_be_made(log: Path, right: str) -> None:
+    log.with_name("log.history").write_text("a file")
+    notes: list[str] = []
+    assert answers(log, notes) == right
+    assert notes == [f"{log}.history: no history was kept: File exists"]
+
+
+def test_a_log_that_grows_while_it_is_looked_at(log: Path) -> None:
+    with kept_early(), Timeline(log, RULES) as timeline:
+        for first in range(EVENTS, EVENTS + 40, 10):
+            view = timeline.at(EVENTS // 2)
+            write_log(log, drive(first, first + 10))
+            timeline.refresh()
+            ends = [0, EVENTS // 2, first, first + 10]
+            assert told(timeline, ends) == expected(timeline, ends)
+            assert view.counts() == timeline.at(EVENTS // 2).counts()
+
+
+def test_histories_are_few_and_small(log: Path) -> None:
+    """Four choices of settings are kept: those used last."""
+    from projections.history.timeline_cache import MOST_KEPT
+
+    with kept_early():
+        for number in range(MOST_KEPT + 3):
+            rules = RULES.with_assignments([f"eps_m={0.5 + number / 10}"])
+            with Timeline(log, rules) as timeline:
+                assert timeline.history.keyframes
+    assert len({path.name.split("-")[0].split(".")[0] for path in kept(log)}) == MOST_KEPT
+    assert len(kept(log)) == 2 * MOST_KEPT
+
+
+def test_without_a_cache_nothing_is_written(log: Path) -> None:
+    with kept_early(), Timeline(log, RULES, cache=False) as timeline:
+        assert timeline.merges()
+    assert kept(log) == []
+
+
+def test_numpy_reads_a_part(log: Path, right: str) -> None:
+    """It is a plain archive of arrays."""
+    import numpy as np
+
+    assert answers(log, []) == right
+    (part,) = (path for path in kept(log) if path.suffix == ".npz")
+    with np.load(part) as archive:
+        assert archive["0/keyframe.keyframe_id"].tolist() == list(range(EVENTS))
