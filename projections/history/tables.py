@@ -116,8 +116,7 @@ class Tables:
             ]
         )
         if len(found) >= _MANY:  # on the way through all, which then must not fill the memory
-            for stripe in self.stripes:
-                stripe.release()
+            self._release()
         return found
 
     def rows_at(self, table: str, numbers: Array) -> list[tuple[Any, ...]]:
@@ -145,9 +144,17 @@ class Tables:
         if len(found) < wanted:
             spans = self._spans(table, 0, wanted)
             parts = [stripe.arrays[name] for stripe, _, _ in spans]
-            found = parts[0] if len(parts) == 1 else np.concatenate(parts)
+            if len(parts) == 1:
+                found = parts[0]
+            else:
+                found = np.concatenate(parts)
+                self._release()
             self._columns[name] = found
         return found[:wanted]
+
+    def _release(self) -> None:
+        for stripe in self.stripes:
+            stripe.release()
 
     def _picked(self, table: str, column: str, numbers: Array) -> list[Any]:
         """The values of a column in these rows; of each stripe only the rows asked for."""
