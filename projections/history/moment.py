@@ -97,7 +97,7 @@ class Moment:
     def fused(self) -> tuple[Array, Array]:
         """By observation the object that it is part of, -1 for none, and its similarity."""
         size, seen = self.count("observation"), self.column("seen", "observation")
-        objects, similarities = np.full(size, NONE, np.int64), np.zeros(size, np.int64)
+        objects, similarities = np.full(size, NONE, np.int32), np.zeros(size, np.int64)
         objects[seen] = self.object_of_seen
         similarities[seen] = self.column("seen", "similarity_q40")
         return objects, similarities
@@ -108,9 +108,9 @@ class Moment:
         return Groups(self.object_of_seen, self.column("seen", "observation"))
 
 
-def _survivors(count: int, pairs: Sequence[tuple[int, int]]) -> Rows:
+def _survivors(count: int, pairs: Sequence[tuple[int, int]]) -> Array:
     """What each of ``count`` things is part of after these merges (survivor, absorbed)."""
-    found = np.arange(count)
+    found = np.arange(count, dtype=np.int32)
     for survivor, absorbed in reversed(pairs):  # what a survivor is part of is known by then
         found[absorbed] = found[survivor]
     return found

@@ -121,11 +121,13 @@ class Tables:
 
     def rows_at(self, table: str, numbers: Array) -> list[tuple[Any, ...]]:
         """These rows, each with all its columns in order."""
-        return self._safely(
+        found = self._safely(
             lambda: list(
                 zip(*(self._picked(table, each, numbers) for each in TABLES[table]), strict=True)
             )
         )
+        self._release()
+        return found
 
     def _before(self, table: str, end: Offset) -> int:
         count = 0
