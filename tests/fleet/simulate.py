@@ -331,6 +331,7 @@ def main() -> int:
     if not 1 <= args.sites <= args.robots or args.rate <= 0 or args.seconds * args.rate < 1:
         parser.error("at least one site, a robot for each, and a keyframe of each robot")
     plan = Plan(args.sites, args.robots, args.rate, args.seconds, args.kill, args.burst)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # end the programs, too
     with ExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory(dir=args.folder))
         try:
