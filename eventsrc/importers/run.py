@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 from eventsrc.append import Checked, NewMap, check_payloads, checked_event, rejected_event
-from eventsrc.envelope import Offset, RunId
+from eventsrc.envelope import Offset, RunId, has_keyframe_id
 from eventsrc.errors import MisuseError
+from eventsrc.gaps import GapLedger
 from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES, CheckedEnvelope, Rejected
 from eventsrc.log import FsyncPolicy, LogWriter, MessageFormat
 from eventsrc.occupancy_map import InvalidMap, OccupancyMap, decode_map
@@ -77,6 +78,9 @@ class ImportReport:
 
     bags: tuple[BagReport, ...] = ()
     """What was in the bags of ROS 2, and what was used."""
+    repeated: int | None = None
+    """How many of the accepted envelopes are of keyframes that the log had already, of which the
+    fold takes the first; None where it is not known which it had."""
 
 
 class ImportInterrupted(KeyboardInterrupt):
@@ -100,6 +104,7 @@ def import_files(
     given_map: OccupancyMap | None = None,
     topics: TopicChoice = ALL_TOPICS,
     bags: BagOptions = _DEFAULT_BAGS,
+    ledger: GapLedger[RunId] | None = None,
 ) -> ImportReport:
     """Append ``given_map``, if there is one, then every message of ``names`` in order. Messages
     without a key get ``key``. An envelope that does not say when it was received gets its stamp as
@@ -108,12 +113,13 @@ def import_files(
     Messages of topics that are not among ``topics`` are passed over. So are the messages of an MCAP
     file that no importer reads and, unless ``topics`` chooses them, those that do not look like
     envelopes. ``bags`` says what to use of bags of ROS 2. The map is appended when the first
-    message was read.
+    message was read. ``ledger`` knows the keyframes of the log, and learns those that are appended.
 
     ``step`` is entered for each message; one that defers Ctrl-C makes `ImportInterrupted` exact.
     Raises MisuseError and MapfoldError for files that cannot be read.
     """
-    run = _Import(writer, key, on_reject or (lambda _place, _reason: None), given_map, topics)
+    refused = on_reject or (lambda _place, _reason: None)
+    run = _Import(writer, key, refused, given_map, topics, ledger)
     try:
         with ExitStack() as files:
             for name in names:
@@ -161,7 +167,10 @@ class _Import:
         on_reject: OnReject,
         given_map: OccupancyMap | None,
         topics: TopicChoice,
+        ledger: GapLedger[RunId] | None,
     ) -> None:
+        self._ledger = ledger
+        self._repeated_before = 0 if ledger is None else ledger.duplicates
         self._writer = writer
         self._key = key
         self._on_reject = on_reject
@@ -287,6 +296,9 @@ class _Import:
             self.maps += 1
         else:
             self.accepted += 1
+            if self._ledger is not None and has_keyframe_id(checked.version):
+                envelope = checked.result
+                self._ledger.record(envelope.run_id, envelope.keyframe_id, 0)
 
     def _is_for_others(self, message: ImportedMessage) -> bool:
         """Whether a message that is no envelope was never meant to be one."""
@@ -312,6 +324,7 @@ class _Import:
             self.verbatim,
             tuple(PassedOver(*what, count) for what, count in self._passed_over.items()),
             tuple(self.bags),
+            None if self._ledger is None else self._ledger.duplicates - self._repeated_before,
         )
 
 

@@ -8,7 +8,10 @@ from typing import Annotated, Any, Final
 import typer
 
 from eventsrc.advised import advised
-from eventsrc.errors import MisuseError
+from eventsrc.envelope import RunId
+from eventsrc.errors import LogDamaged, MisuseError
+from eventsrc.gap_history import fold_and_save_ledger
+from eventsrc.gaps import GapLedger
 from eventsrc.importers import (
     DEFAULT_KEY,
     IMPORT_FSYNC,
@@ -22,7 +25,7 @@ from eventsrc.importers import (
 from eventsrc.importers.map_yaml import read_map_yaml
 from eventsrc.importers.source import Source
 from eventsrc.importers.topics import NOT_CHOSEN
-from eventsrc.log import LogWriter
+from eventsrc.log import LogReader, LogWriter
 from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS
 from eventsrc.text import counted, visible
 from eventsrc.transport.config import check_key
@@ -141,9 +144,10 @@ def import_(
     )
     rejects = _RejectPrinter()
     try:
-        with LogWriter(log, fsync=IMPORT_FSYNC, imported=True) as writer, FileBars() as bars:
+        with LogWriter(log, fsync=IMPORT_FSYNC, imported=True) as writer:
             say_restart(log, writer)
-            with ctrl_c_between_steps() as step:
+            ledger = _known_keyframes(log)
+            with FileBars() as bars, ctrl_c_between_steps() as step:
                 report = import_files(
                     writer,
                     names,
@@ -154,6 +158,7 @@ def import_(
                     given_map=given_map,
                     topics=topics,
                     bags=bags,
+                    ledger=ledger,
                 )
     except ImportInterrupted as interrupted:
         rejects.say_rest()
@@ -170,6 +175,16 @@ def import_(
         say(line)
     useless = any(bag.is_useless for bag in report.bags)
     finish(findings=report.rejected > 0 or report.nothing_of_something or useless)
+
+
+def _known_keyframes(log: Path) -> GapLedger[RunId] | None:
+    """The keyframes that the log has; None if it is damaged, which does not end the import."""
+    try:
+        with LogReader(log) as reader:
+            return fold_and_save_ledger(reader, note=say)
+    except LogDamaged as error:
+        say(f"keyframes that the log has already are not counted: {error}")
+        return None
 
 
 def _without_bags(report: ImportReport) -> dict[str, Any]:
@@ -209,6 +224,9 @@ def _kept(log: Path, interrupted: ImportInterrupted) -> str:
 
 def _summary(log: Path, report: ImportReport) -> str:
     parts = [f"imported {counted(report.accepted, 'envelope')} into {log}"]
+    if report.repeated:
+        new = report.accepted - report.repeated
+        parts[0] += f" ({new:,} new, {report.repeated:,} of keyframes that it has already)"
     if report.next_offset > report.first_offset:
         parts.append(f"offsets {report.first_offset} to {report.next_offset - 1}")
     if report.maps:

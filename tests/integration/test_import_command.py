@@ -8,7 +8,7 @@ import pytest
 
 from tests.commands import Commands
 from tests.envelopes import envelope, payload
-from tests.fixtures_log import read_log
+from tests.fixtures_log import flip, read_log
 
 PAYLOADS = [payload(envelope(i)) for i in range(1, 6)]
 
@@ -54,6 +54,7 @@ def test_import_prints_its_counts(run: Commands) -> None:
         "maps": 0,
         "passed_over": [],
         "verbatim": 0,
+        "repeated": 0,
         "first_offset": 0,
         "next_offset": 6,
         "recovered_segments": 0,
@@ -61,6 +62,27 @@ def test_import_prints_its_counts(run: Commands) -> None:
         "torn_bytes": 0,
         "torn_events": 0,
     }
+
+
+def test_what_the_log_has_already_is_said_to_be_no_news(run: Commands) -> None:
+    first, other = b"\n".join(PAYLOADS), payload(envelope(77))
+    assert "imported 5 envelopes into a, offsets" in run("import", "a", "-", stdin=first).err
+    said = run("import", "a", "-", stdin=first).err
+    assert "imported 5 envelopes into a (0 new, 5 of keyframes that it has already)" in said
+    said = run("import", "a", "-", "--json", stdin=b"\n".join([*PAYLOADS[:2], other, other]))
+    assert (said.json["accepted"], said.json["repeated"]) == (4, 3)
+    assert "(1 new, 3 of keyframes that it has already)" in said.err
+    events = read_log(run.folder / "a")
+    ids = [(e["run_id"], e["keyframe_id"]) for e in (json.loads(e.payload) for e in events)]
+    assert len(ids) - len(set(ids)) == 5 + 3  # counted again, slowly
+
+
+def test_a_damaged_log_grows_without_that_count(run: Commands) -> None:
+    run("import", "a", "-", stdin=b"\n".join(PAYLOADS))
+    flip(run.folder / "a" / "00000000000000000000.mcap", 500)
+    said = run("import", "a", "-", "--json", stdin=PAYLOADS[0])
+    assert (said.json["accepted"], said.json["repeated"]) == (1, None)
+    assert "keyframes that the log has already are not counted" in said.err
 
 
 def test_torn_gzip_keeps_what_came_before(run: Commands) -> None:
