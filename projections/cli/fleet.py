@@ -12,7 +12,7 @@ import typer
 from eventsrc.errors import MisuseError
 from eventsrc.text import counted, visible
 from projections.fleet.engine import Ended, usable_cores
-from projections.fleet.site_databases import site_databases, template_of
+from projections.fleet.site_databases import check_server, site_databases, template_of
 from projections.fleet.sites import Site
 from projections.settings import Settings
 
@@ -109,6 +109,9 @@ def replay(
             )
             for site in sites
         ]
+        if engine == "local":  # else each site would wait for it
+            for server in databases[sites[0].name].urls:
+                check_server(server)
         with ended_sites(replay_site, requests, sites, engine, jobs) as results:
             for ended in results:
                 site = sites[ended.index]

@@ -9,6 +9,7 @@ import typer
 
 from eventsrc.errors import LogError
 from eventsrc.log import LogReader
+from eventsrc.text import counted
 from projections.fleet.engine import Ended, Task
 from projections.fleet.engines import open_engine
 from projections.fleet.sites import Site, find_sites
@@ -77,7 +78,7 @@ def _shown(
 
     def show(events: int) -> None:
         done = max(events, sum(sizes[index] for index in ended))
-        bar.show(f"{len(ended):,} of {len(sites):,} sites", min(done, total), total)
+        bar.show(counted(len(sites), "site"), min(done, total), total)
 
     for each in run(task, requests, show):
         ended.add(each.index)

@@ -243,6 +243,8 @@ def _advice(error: psycopg.Error, url: str) -> str:
     text = str(error)
     if "requirepeer" in text:
         return "another user's server answers there; stop it, or set MAPFOLD_HOME to another folder"
+    if "too many" in text or "connection slots" in text:
+        return "end other commands, run fewer at once, or raise the server's max_connections"
     log = embedded_log(url)
     if log is not None:
         return f"the embedded server went away; its log: {log}"

@@ -7,6 +7,7 @@ share a database, not in two schemas either; ``{site}`` stands in the database's
 
 import contextlib
 import os
+import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Final
@@ -22,6 +23,7 @@ from projections.database.connection import (
     Connection,
     Targets,
     check_url,
+    connect,
     database_errors,
     describe_target,
     open_targets,
@@ -155,6 +157,12 @@ def exists(url: str) -> bool | None:
         return _is_there(connection, _name(url))
 
 
+def check_server(url: str) -> None:
+    """Raise DatabaseUnavailable when neither a database's server nor the database answers."""
+    if exists(url) is None:
+        connect(url, application="mapfold fleet").close()
+
+
 def create_if_missing(url: str) -> bool:
     """Create the database of a URL; False if it exists, or no server answers whether it does.
 
@@ -175,7 +183,8 @@ def create_if_missing(url: str) -> bool:
             raise DatabaseError(
                 f"{describe_target(url)}: it does not exist, and user {user} may not create it;"
                 f" have a superuser run ALTER ROLE {sql.Identifier(user).as_string()} CREATEDB, or"
-                f" create it with createdb -E UTF8 -T template0 -O {user}"
+                f" create it with createdb -E UTF8 -T template0 -O"
+                f" {shlex.join([user, name])}"
             ) from None
         except (psycopg.errors.DuplicateDatabase, psycopg.errors.UniqueViolation):
             return False  # another process has just created it

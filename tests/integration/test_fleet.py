@@ -1,6 +1,7 @@
 """`mapfold fleet` on a few sites with a real server."""
 
 import json
+import os
 import shlex
 import shutil
 from collections.abc import Iterator
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from psycopg import sql
 from psycopg.conninfo import conninfo_to_dict
 
 from projections.database.connection import connect
@@ -220,10 +222,31 @@ def test_what_cannot_be_is_refused_before_anything_is_done(fleet: Fleet) -> None
         assert wrong in fleet.run("fleet", "replay", fleet.sites, *options, code=2).err
 
 
-def test_a_server_that_is_not_there_is_each_sites_error(fleet: Fleet, tmp_path: Path) -> None:
-    sites = write_sites(tmp_path / "sites", ["a"], 5)
+def test_a_server_that_is_not_there_is_said_once(fleet: Fleet, tmp_path: Path) -> None:
+    sites = write_sites(tmp_path / "sites", ["a", "b"], 5)
     nowhere = f"postgresql:///{{site}}?host={tmp_path}"
-    said = fleet.run("fleet", "replay", sites, "--db", nowhere, code=3)
-    assert "failed: a: database a at " in said.err
+    said = fleet.run("fleet", "replay", sites, "--db", nowhere, code=1)
+    assert said.err.startswith("mapfold: database a at ")
+    assert len(said.err.splitlines()) == 1
     status = fleet.run("fleet", "status", sites, "--db", nowhere, "--json", code=3).json
-    assert status["sites"][0]["sinks"]["graph"]["condition"] == "unreachable"
+    assert [site["sinks"]["graph"]["condition"] for site in status["sites"]] == ["unreachable"] * 2
+
+
+@pytest.mark.seconds
+def test_a_user_who_may_not_create_databases_is_told_what_to_do(
+    pg_server: EmbeddedServer, server_roles: None, tmp_path: Path
+) -> None:
+    if "://postgres@" not in pg_server.url:
+        pytest.skip("the server of MAPFOLD_TEST_DB may want a password")
+    log = write_log(tmp_path / "log", [])
+    user = f"fleet_{os.getpid()}"
+    with connect(pg_server.url, autocommit=True) as connection:
+        connection.execute(sql.SQL("CREATE ROLE {} LOGIN").format(sql.Identifier(user)))
+        try:
+            url = pg_server.url_of(f"{user}_a").replace("://postgres@", f"://{user}@")
+            done = replay_site(ReplayRequest(Site("a", log), SiteDatabases(url, url)), print)
+        finally:
+            connection.execute(sql.SQL("DROP ROLE {}").format(sql.Identifier(user)))
+    assert done.error is not None
+    assert f"it does not exist, and user {user} may not create it" in done.error
+    assert f"createdb -E UTF8 -T template0 -O {user} {user}_a" in done.error
