@@ -160,7 +160,8 @@ def measure(folder: Path, keyframes: int, questions: int) -> tuple[list[Stage], 
 
 def main() -> None:
     """Print a table, or one JSON document."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    about = __doc__.splitlines()[0] if __doc__ else None
+    parser = argparse.ArgumentParser(prog="scripts/measure_stages", description=about)
     parser.add_argument("--keyframes", type=int, default=17_000, help="default 17,000")
     parser.add_argument("--questions", type=int, default=200, help="default 200")
     parser.add_argument("--json", action="store_true", help="one JSON document on stdout")

@@ -11,6 +11,7 @@ import argparse
 import json
 import os
 import signal
+import subprocess
 import sys
 import tempfile
 import threading
@@ -27,6 +28,7 @@ from .programs import Site, read_errors
 from .robots import FLUSH_S
 
 SAMPLE_S = 0.5
+MIN_KILL_S = 10.0
 AWAY_S = 3.0
 """How long a killed recorder is away; a router is away for five times as long."""
 
@@ -184,7 +186,8 @@ class Simulation:
     def _watch(self, begin: float) -> None:
         """Until the robots have ended: sample the queues, and kill what is to be killed."""
         waiting = self._accidents() if self._plan.kill else []
-        with ThreadPoolExecutor(4) as threads:
+        # At one site one after the other: a recorder cannot start while its router is away.
+        with ThreadPoolExecutor(4 if len(self._sites) >= 4 else 1) as threads:
             running: list[Future[None]] = []
             while waiting or running or self._robots_run():
                 now = time.monotonic() - begin
@@ -242,7 +245,11 @@ class Simulation:
 
     def _fill_disk(self, site: Site, away_s: float) -> None:
         site.fill_disk()
-        code = site.recorder.wait()
+        try:
+            code = site.recorder.wait()
+        except subprocess.TimeoutExpired:
+            self._faults.append(f"{site.recorder.name} goes on with a full disk, or got nothing")
+            return
         self._note(f"filled the disk of {site.recorder.name}, which ended with exit {code}")
         if code != 1:
             self._faults.append(f"{site.recorder.name} ended with {code} on a full disk, not 1")
@@ -313,7 +320,8 @@ def simulate(plan: Plan, folder: Path, say: Callable[[str], None]) -> Outcome:
 
 def main() -> int:
     """0 when nothing was lost."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    about = __doc__.splitlines()[0] if __doc__ else None
+    parser = argparse.ArgumentParser(prog="scripts/simulate_fleet", description=about)
     plan = Plan()
     parser.add_argument("--sites", type=int, default=plan.sites, help="default 4")
     parser.add_argument("--robots", type=int, default=plan.robots, help="in all; default 200")
@@ -330,6 +338,8 @@ def main() -> int:
     args = parser.parse_args()
     if not 1 <= args.sites <= args.robots or args.rate <= 0 or args.seconds * args.rate < 1:
         parser.error("at least one site, a robot for each, and a keyframe of each robot")
+    if args.kill and args.seconds < MIN_KILL_S:
+        parser.error(f"--kill needs {MIN_KILL_S:.0f} seconds or more")
     plan = Plan(args.sites, args.robots, args.rate, args.seconds, args.kill, args.burst)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # end the programs, too
     with ExitStack() as stack:
