@@ -89,11 +89,16 @@ def test_the_client_over_zenoh(
 ) -> None:
     code = block('python title="over_zenoh.py"')
     assert DEFAULT_ENDPOINT in code
-    with ZenohService(connected(), answerer, queue):
+    metrics = ServiceMetrics(answerer, queue)
+    with ZenohService(connected(), answerer, queue, metrics.watch):
         assert printed(code.replace(DEFAULT_ENDPOINT, endpoint)) == [PLACE]
         wrong = code.replace('{"class": "toilet"}, ', '{"class": "no such thing"}, ')
         (said,) = printed(wrong.replace(DEFAULT_ENDPOINT, endpoint))
     assert "no object of class 'no such thing'" in said
+    counted = metrics.text().decode()
+    for result in ("answered", "bad_question"):
+        labels = f'question="relocalize",result="{result}",transport="zenoh"'
+        assert f"mapfold_serve_questions_total{{{labels}}} 1.0\n" in counted
 
 
 def test_every_metric_is_on_the_page(answerer: Answerer, queue: FairQueue) -> None:

@@ -489,6 +489,7 @@ class TestKilledServer:
                     status, document = fetch(f"http://127.0.0.1:{port}/{path}", data)
                     assert (status, document["error"]["kind"]) == (503, "database")
             monkeypatch.setattr("projections.serve.pools.OUTAGE_TIMEOUT_S", 2 * DEADLINE_S)
+            assert not answerer.database_up
             begun = time.monotonic()
             with pytest.raises(DatabaseUnavailable, match="start the server"):
                 answerer.relocalize(question(), {})
@@ -496,6 +497,7 @@ class TestKilledServer:
             assert len(told) == 1
             server.start()
             assert answerer.relocalize(question(), {})["places"]
+            assert answerer.database_up
         assert told[1:] == ["the database answers again"]
 
 
