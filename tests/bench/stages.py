@@ -109,15 +109,17 @@ def project(
     whole = found.pop()
     found.append(Stage("fold", whole.own_us - sum(stage.own_us for stage in found)))
     with meter.stage(found, "rebuild without HNSW", keyframes):
-        rebuild(log, targets, Settings(), hnsw=False)
+        rebuild(log, targets, Settings(), hnsw=False, workers=0)
     whole = found.pop()
     made = whole.own_us - sum(stage.own_us for stage in found)
     found.append(Stage("rows and COPY", made, whole.server_us))
+    with meter.stage(found, "rebuild, 2 more processes parse", keyframes):
+        rebuild(log, targets, Settings(), hnsw=False, workers=2)
     rebuild(log, targets, Settings(), until=FIRST_OFFSET)
     with meter.stage(found, "tail when behind, all of it", keyframes):
         tail(log, targets, Settings(), once=True)
     with meter.stage(found, "rebuild with HNSW", keyframes):
-        rebuild(log, targets, Settings())
+        rebuild(log, targets, Settings(), workers=0)
     indexed = found.pop()
     found.append(Stage("HNSW index", 0.0, indexed.server_us - whole.server_us))
     with connect(targets.graph_url) as connection:
