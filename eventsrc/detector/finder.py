@@ -1,7 +1,6 @@
 """Find objects in pictures: an ONNX detector, its head, its labels."""
 
 import ast
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -11,6 +10,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from eventsrc.envelope import Text
 from eventsrc.errors import MisuseError
+from eventsrc.label_files import read_label_file
 from eventsrc.text import visible
 
 from .boxes import Boxes, suppress
@@ -136,22 +136,7 @@ def read_labels(given: str) -> tuple[str, ...]:
     """The classes of ``coco``, or of a file: a line each, or a JSON list. Raises MisuseError."""
     if given == "coco":
         return tuple(name.replace("_", " ") for name in COCO.split())
-    path = Path(given)
-    try:
-        text = path.read_text("utf-8-sig")
-    except OSError as error:
-        raise MisuseError(f"--labels {given}: {error.strerror}; give a file, or coco") from None
-    except UnicodeDecodeError:
-        raise MisuseError(f"--labels {given}: no UTF-8 text; give a line for each class") from None
-    if text.lstrip().startswith("["):
-        try:
-            names = json.loads(text)
-        except (ValueError, RecursionError) as error:
-            raise MisuseError(f"--labels {given}: no JSON list: {error}") from None
-    else:
-        names = [line.strip() for line in text.splitlines()]
-        while names and not names[-1]:
-            names.pop()
+    names = read_label_file(Path(given), "give a file, or coco")
     return _checked(names, f"--labels {given}")
 
 

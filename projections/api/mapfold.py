@@ -16,28 +16,8 @@ if __name__ == "__main__":
     sys.argv[0] = "mapfold"
     main()
 
-from projections.api import (
-    Answer,
-    Event,
-    LogReader,
-    Map,
-    Question,
-    Settings,
-    Timeline,
-    fold,
-    open_log,
-    relocalize,
-)
+from projections import api
+from projections.api import *  # noqa: F403
 
-__all__ = [
-    "Answer",
-    "Event",
-    "LogReader",
-    "Map",
-    "Question",
-    "Settings",
-    "Timeline",
-    "fold",
-    "open_log",
-    "relocalize",
-]
+__all__: list[str] = []
+__all__ += api.__all__

@@ -1,5 +1,6 @@
 """Bags of ROS 2 on the command line: options, the file of labels, and what was found in a bag."""
 
+import functools
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -9,11 +10,11 @@ import typer
 
 from eventsrc.errors import MisuseError
 from eventsrc.importers import BagReport
+from eventsrc.label_files import read_label_file
 from eventsrc.ros.stream import Counts
 from eventsrc.text import counted, visible
 
 _PANEL: Final = "Bags of ROS 2"
-_MOST_LABELS_BYTES: Final = 1_000_000
 _MOST_UNUSED: Final = 10
 _MOST_RUN_ID: Final = 100
 """So that run ids and default detection ids keep within their limits."""
@@ -21,18 +22,45 @@ _NS: Final = 1_000_000_000
 MAX_GAP_S: Final = 3_600.0
 
 
+def ros_option(panel: str, name: str, metavar: str, text: str) -> typer.models.OptionInfo:
+    """An option about messages of ROS, listed under ``panel``; `import` and `record` have them."""
+    option: typer.models.OptionInfo = typer.Option(
+        name, metavar=metavar, help=text, rich_help_panel=panel
+    )
+    return option
+
+
+def labels_option(panel: str) -> typer.models.OptionInfo:
+    """``--labels``."""
+    text = "Names of numbered classes, one a line; the first is that of class 0."
+    return ros_option(panel, "--labels", "FILE", text)
+
+
+def model_option(panel: str) -> typer.models.OptionInfo:
+    """``--embedding-model``."""
+    text = "The model of embeddings that do not name theirs."
+    return ros_option(panel, "--embedding-model", "NAME", text)
+
+
+def heights_option(panel: str) -> typer.models.OptionInfo:
+    """``--heights``."""
+    option: typer.models.OptionInfo = typer.Option(
+        "--heights", help="State the robot's height, which tells floors.", rich_help_panel=panel
+    )
+    return option
+
+
+def max_gap_option(panel: str) -> typer.models.OptionInfo:
+    """``--max-gap``."""
+    text = "Poses farther apart in time are not interpolated between."
+    return ros_option(panel, "--max-gap", "SECONDS", text)
+
+
+_named = functools.partial(ros_option, _PANEL)
+
+
 def _topic(name: str, text: str) -> typer.models.OptionInfo:
-    option: typer.models.OptionInfo = typer.Option(
-        name, metavar="TOPIC", help=text, rich_help_panel=_PANEL
-    )
-    return option
-
-
-def _named(name: str, metavar: str, text: str) -> typer.models.OptionInfo:
-    option: typer.models.OptionInfo = typer.Option(
-        name, metavar=metavar, help=text, rich_help_panel=_PANEL
-    )
-    return option
+    return _named(name, "TOPIC", text)
 
 
 DetectionsOption = Annotated[
@@ -73,26 +101,10 @@ RunIdOption = Annotated[
     str | None,
     _named("--run-id", "ID", "The run of a bag's keyframes. Default: its name and when it began."),
 ]
-LabelsOption = Annotated[
-    Path | None,
-    _named(
-        "--labels", "FILE", "Names of numbered classes, one a line; the first is that of class 0."
-    ),
-]
-ModelOption = Annotated[
-    str | None,
-    _named("--embedding-model", "NAME", "The model of embeddings that do not name theirs."),
-]
-HeightsOption = Annotated[
-    bool,
-    typer.Option(
-        "--heights", help="State the robot's height, which tells floors.", rich_help_panel=_PANEL
-    ),
-]
-MaxGapOption = Annotated[
-    float,
-    _named("--max-gap", "SECONDS", "Poses farther apart in time are not interpolated between."),
-]
+LabelsOption = Annotated[Path | None, labels_option(_PANEL)]
+ModelOption = Annotated[str | None, model_option(_PANEL)]
+HeightsOption = Annotated[bool, heights_option(_PANEL)]
+MaxGapOption = Annotated[float, max_gap_option(_PANEL)]
 
 
 def check_run_id(run_id: str | None) -> str | None:
@@ -112,22 +124,14 @@ def max_gap_ns(seconds: float) -> int:
     return round(seconds * _NS)
 
 
-def read_labels(path: Path | None) -> dict[str, str]:
-    """Class names by number, from a file with one a line. Empty lines name nothing."""
+def labels_by_number(path: Path | None) -> dict[str, str]:
+    """Class names by number, of ``--labels``. Empty lines name nothing."""
     if path is None:
         return {}
-    try:
-        with path.open("rb") as file:
-            content = file.read(_MOST_LABELS_BYTES + 1)
-        text = content.decode()
-    except OSError as error:
-        raise MisuseError(f"--labels {path}: {error.strerror or error}; check the path") from None
-    except UnicodeDecodeError as error:
-        raise MisuseError(f"--labels {path}: is no UTF-8 text: {error}") from None
-    if len(content) > _MOST_LABELS_BYTES:
-        raise MisuseError(f"--labels {path}: larger than {_MOST_LABELS_BYTES:,} bytes")
-    lines = (line.strip() for line in text.splitlines())
-    labels = {str(number): line for number, line in enumerate(lines) if line}
+    names = read_label_file(path)
+    if not all(isinstance(name, str) for name in names):
+        raise MisuseError(f"--labels {path}: no list of names; write one a line")
+    labels = {str(number): name for number, name in enumerate(names) if name}
     if not labels:
         raise MisuseError(f"--labels {path}: names no class; write one a line")
     return labels

@@ -1,5 +1,6 @@
 """`mapfold record --ros2dds`: the options of a bridge from ROS, and what is said at the start."""
 
+import functools
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,7 +21,16 @@ from eventsrc.ros.library import MessageTypes
 from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS, Stream
 from eventsrc.text import counted, visible
 
-from .bag_text import check_run_id, max_gap_ns, read_labels
+from .bag_text import (
+    check_run_id,
+    heights_option,
+    labels_by_number,
+    labels_option,
+    max_gap_ns,
+    max_gap_option,
+    model_option,
+    ros_option,
+)
 from .terminal import say
 
 TF_POSE: Final = "tf"
@@ -31,12 +41,7 @@ _QUIET_S: Final = 5.0
 _PANEL: Final = "Messages of ROS 2, with --ros2dds"
 
 
-def _option(name: str, metavar: str, help_: str) -> typer.models.OptionInfo:
-    option: typer.models.OptionInfo = typer.Option(
-        name, metavar=metavar, help=help_, rich_help_panel=_PANEL
-    )
-    return option
-
+_option = functools.partial(ros_option, _PANEL)
 
 Ros2ddsOption = Annotated[
     bool,
@@ -81,24 +86,10 @@ RunIdOption = Annotated[
         "--run-id", "ID", "The run of the keyframes. [default: namespace and time of the start]"
     ),
 ]
-LabelsOption = Annotated[
-    Path | None,
-    _option("--labels", "FILE", "Names of numbered classes, one a line; the first is of class 0."),
-]
-ModelOption = Annotated[
-    str | None,
-    _option("--embedding-model", "NAME", "The model of embeddings that do not name theirs."),
-]
-HeightsOption = Annotated[
-    bool,
-    typer.Option(
-        "--heights", help="State the robot's height, which tells floors.", rich_help_panel=_PANEL
-    ),
-]
-MaxGapOption = Annotated[
-    float,
-    _option("--max-gap", "SECONDS", "Poses farther apart in time are not interpolated between."),
-]
+LabelsOption = Annotated[Path | None, labels_option(_PANEL)]
+ModelOption = Annotated[str | None, model_option(_PANEL)]
+HeightsOption = Annotated[bool, heights_option(_PANEL)]
+MaxGapOption = Annotated[float, max_gap_option(_PANEL)]
 TopicOption = Annotated[
     list[str] | None,
     _option("--topic", "TOPIC", "Another one to keep, of any type; may be repeated."),
@@ -189,7 +180,7 @@ def recording_of(
     )
     run = check_run_id(choice.run_id) or _run_id(choice.namespace, now_ns)
     by_transforms = choice.pose == TF_POSE
-    labels, gap_ns = read_labels(choice.labels), max_gap_ns(choice.max_gap_s)
+    labels, gap_ns = labels_by_number(choice.labels), max_gap_ns(choice.max_gap_s)
     streams = []
     for topic in detections:
         run_id = RunId(run if len(detections) == 1 else f"{run}:{_camera(topic)}")

@@ -45,7 +45,14 @@ from .detect_checks import (
     timing_of,
 )
 from .detect_text import WITHOUT_MODELS, advice, as_document, metrics_of, show_status, summary
-from .options import ConfigOption, ConnectOption, JsonOption, ListenOption, zenoh_options
+from .options import (
+    ConfigOption,
+    ConnectOption,
+    JsonOption,
+    ListenOption,
+    PublishKeyOption,
+    zenoh_options,
+)
 from .signals import stop_on_signals
 from .terminal import emit, finish, say
 
@@ -230,7 +237,7 @@ def detect(
             rich_help_panel=_KEYFRAMES,
         ),
     ] = None,
-    key: Annotated[str, typer.Option(help="Zenoh key to publish under.")] = "tb/detections",
+    key: PublishKeyOption = "tb/detections",
     out: Annotated[
         Path | None,
         typer.Option(

@@ -46,8 +46,8 @@ from .bag_text import (
     RunIdOption,
     bag_lines,
     check_run_id,
+    labels_by_number,
     max_gap_ns,
-    read_labels,
 )
 from .options import JsonOption
 from .recorder_text import restart_as_json, say_restart
@@ -138,7 +138,7 @@ def import_(
         base_frame,
         check_run_id(run_id),
         embedding_model,
-        read_labels(labels),
+        labels_by_number(labels),
         heights,
         max_gap_ns(max_gap),
     )

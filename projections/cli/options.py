@@ -201,6 +201,7 @@ ConfigOption = Annotated[
         rich_help_panel=_ZENOH_PANEL,
     ),
 ]
+PublishKeyOption = Annotated[str, typer.Option("--key", help="Zenoh key to publish under.")]
 
 
 def zenoh_options(

@@ -20,7 +20,14 @@ from eventsrc.text import counted
 from eventsrc.transport.config import check_key
 from eventsrc.transport.session import ZenohOptions, check_keys, open_session
 
-from .options import ConfigOption, ConnectOption, JsonOption, ListenOption, zenoh_options
+from .options import (
+    ConfigOption,
+    ConnectOption,
+    JsonOption,
+    ListenOption,
+    PublishKeyOption,
+    zenoh_options,
+)
 from .signals import stop_on_signals
 from .terminal import emit, finish, say
 
@@ -39,7 +46,7 @@ def simulate(
             metavar="FILE", help="Write FILE.jsonl or .jsonl.gz (and its truth); publish nothing."
         ),
     ] = None,
-    key: Annotated[str, typer.Option(help="Zenoh key to publish under.")] = "tb/detections",
+    key: PublishKeyOption = "tb/detections",
     speed: Annotated[
         float, typer.Option(help="Times as fast as the robot drives; 0: no waiting.", min=0.0)
     ] = 10.0,

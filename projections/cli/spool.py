@@ -45,7 +45,7 @@ def spool(
         raise MisuseError("--retry and --discard: give one of them")
     path = file or spool_path()
     if not path.is_file():
-        raise MisuseError(f"{path}: no such file; give the spool, as `mapfold detect --spool` has")
+        raise MisuseError(f"{path}: no such file; give the one that --spool of a robot names")
     opened = Spool(path)
     try:
         retried = opened.retry_refused() if retry else 0

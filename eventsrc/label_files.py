@@ -1,0 +1,40 @@
+"""Files of class names, one a line or as a JSON list: the first is that of class 0."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any, Final
+
+from .errors import MisuseError
+
+_MOST_BYTES: Final = 1_000_000
+_NAME_IN_BRACKETS: Final = re.compile(r"\[[^]\",\n]+\][ \t\r]*(\n|$)")
+"""A first line such as ``[background]``, which begins no JSON list."""
+
+
+def read_label_file(path: Path, else_give: str = "check the path") -> list[Any]:
+    """The names in a file, in order, of lines without the space around them. Lines may be empty,
+    but not the last; what a JSON list has may be anything. Raises MisuseError, for a file that
+    cannot be read with ``else_give``."""
+    place = f"--labels {path}"
+    try:
+        with path.open("rb") as file:
+            content = file.read(_MOST_BYTES + 1)
+    except OSError as error:
+        raise MisuseError(f"{place}: {error.strerror or error}; {else_give}") from None
+    if len(content) > _MOST_BYTES:
+        raise MisuseError(f"{place}: larger than {_MOST_BYTES:,} bytes")
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise MisuseError(f"{place}: no UTF-8 text; give a line for each class") from None
+    if text.lstrip().startswith("[") and not _NAME_IN_BRACKETS.match(text.lstrip()):
+        try:
+            names: list[Any] = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise MisuseError(f"{place}: no JSON list: {error}") from None
+        return names
+    lines = [line.strip() for line in text.splitlines()]
+    while lines and not lines[-1]:
+        lines.pop()
+    return lines
