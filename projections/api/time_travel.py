@@ -18,9 +18,10 @@ class Timeline:
     """A context manager over a log. A point is a number of events, a time in ISO 8601,
     ``RUN:KEYFRAME`` or ``end``.
 
-    The log is folded once, at the first question, and kept in memory. ``settings`` are as in
-    `fold`. Answers are the documents that the commands print with ``--json``. Raises LogNotFound,
-    NotALog, LogDamaged or SettingsError, and MisuseError for a point that the log does not have.
+    The log is folded once, at the first question, and its history kept in files beside the log
+    (``LOG.history``, a cache), unless ``cache`` is false. ``settings`` are as in `fold`. Answers
+    are the documents that the commands print with ``--json``. Raises LogNotFound, NotALog,
+    LogDamaged or SettingsError, and MisuseError for a point that the log does not have.
 
     Examples:
         >>> with Timeline("logs/sample", {"eps_m": 0.75, "min_samples": 8}) as timeline:
@@ -30,10 +31,12 @@ class Timeline:
         294 sim-7-a_p8 sim-7-a_p9
     """
 
-    def __init__(self, log: str | Path, settings: SettingsLike = None) -> None:
+    def __init__(
+        self, log: str | Path, settings: SettingsLike = None, *, cache: bool = True
+    ) -> None:
         self._log = Path(log)
         self._chosen = settings_from(settings)
-        self._timeline = history.Timeline(self._log, self._settings)
+        self._timeline = history.Timeline(self._log, self._settings, cache=cache)
 
     def __enter__(self) -> "Timeline":
         return self

@@ -161,7 +161,7 @@ def _keyframe_rows(view: MapView, ids: list[str]) -> Iterable[KeyframeRow]:
 
 
 def _object_rows(view: MapView, ids: list[str]) -> Iterable[ObjectRow]:
-    observations = view.observations
+    det_ids = [each.det_id for each in view.observations]
     for o in view.objects.values():
         yield ObjectRow(
             o.object_id,
@@ -171,7 +171,7 @@ def _object_rows(view: MapView, ids: list[str]) -> Iterable[ObjectRow]:
             None if o.place is None else ids[o.place],
             o.first_seen,
             o.last_seen,
-            tuple(observations[number].det_id for number in o.observations),
+            tuple(det_ids[number] for number in o.observations),
             o.estimate,
             o.missing_in is not None,
             tuple(o.relocations),

@@ -74,7 +74,6 @@ class KnownHistory:
         self.reader = reader
         self.settings = settings
         self.corrections = corrections
-        self._progress = progress
         self._note = note
         self._snapshot_tried = False
         cached = TimelineCache(reader, settings, corrections, note) if cache else None

@@ -128,6 +128,7 @@ def _type(found: PlaceType | None) -> dict[str, Any]:
 
 
 def _objects(view: MapView) -> list[dict[str, Any]]:
+    det_ids = [each.det_id for each in view.observations]
     return [
         {
             "object_id": o.object_id,
@@ -138,7 +139,7 @@ def _objects(view: MapView) -> list[dict[str, Any]]:
             "place_id": view.place_id(o.place),
             "first_seen": o.first_seen,
             "last_seen": o.last_seen,
-            "det_ids": [view.observations[i].det_id for i in o.observations],
+            "det_ids": [det_ids[i] for i in o.observations],
             **(_evidence(view, o) if view.settings.fusion == "evidence" else {}),
         }
         for o in view.objects.values()
