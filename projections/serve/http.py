@@ -216,8 +216,10 @@ def _add_error_handlers(app: FastAPI) -> None:
         message = f"{asked}: {error.detail}; see /docs"
         _, document = refusal(QuestionError(message))
         headers = dict(error.headers or {})
-        if headers.get("Allow") == "GET":
-            headers["Allow"] = "GET, HEAD"
+        if "Allow" in headers:  # of some paths in an order that changes, without HEAD of others
+            methods = set(headers["Allow"].split(", "))
+            methods |= {"HEAD"} if "GET" in methods else set()
+            headers["Allow"] = ", ".join(sorted(methods))
         return JSONResponse(document, error.status_code, headers=headers)
 
     @app.exception_handler(ClientDisconnect)
