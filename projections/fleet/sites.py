@@ -56,12 +56,13 @@ def _in_folder(folder: Path, note: Note) -> list[Site]:
             f"{folder} is one log; give the folder above it, with one log in each subfolder, or"
             " use the command without `fleet`"
         )
+    caches = {f"{name}.{kind}" for name in names for kind in ("history", "snapshots")}
     sites, others = [], []
     for name in names:
         if _holds_log(folder / name):
             check_name(name, str(folder / name))
             sites.append(Site(name, folder / name))
-        else:
+        elif name not in caches:
             others.append(name)
     if others:
         shown = ", ".join(map(visible, others[:_SHOWN])) + (", …" if len(others) > _SHOWN else "")
