@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
+from eventsrc.advised import advised
 from eventsrc.errors import MapfoldError
 from projections.queries.relocalize import CandidateReader
 from projections.relocalize import Answer, Camera, Question, rank
@@ -49,7 +50,7 @@ def _ask(
     """The answer of one site's map, or why there is none."""
     for url in databases.urls:
         if exists(url) is False:
-            return "there is no such database yet; `mapfold fleet replay` makes it"
+            return f"there is no such database yet; `{advised('fleet', 'replay')}` makes it"
     try:
         with CandidateReader(databases.targets) as reader:
             candidates = reader.candidates(question.crops)
