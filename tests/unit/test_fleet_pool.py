@@ -9,9 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from eventsrc.errors import MisuseError
 from projections.fleet.engine import RETRIES, Ended
+from projections.fleet.engines import open_engine
 from projections.fleet.local_pool import LocalPool
-from tests.fleet_tasks import double, fails, killed, wait
+from tests.fleet_tasks import double, fails, killed
 
 WAIT_S = 60.0
 
@@ -104,6 +106,13 @@ def _runs(pid: int) -> bool:
         return False
 
 
-def test_the_tasks_of_tests_are_what_they_say() -> None:
-    assert double(4, lambda _: None) == 8
-    assert callable(wait)
+def test_a_cluster_without_its_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(MisuseError, match=r"pip install 'mapfold\[cluster\]'"):
+        open_engine("dask://h:1", None, 1)
+
+
+@pytest.mark.parametrize("engine", ["ray", "dask", "dask://", "http://h:1", ""])
+def test_other_engines_are_refused(engine: str) -> None:
+    with pytest.raises(MisuseError, match="there are local and dask://HOST:PORT"):
+        open_engine(engine, None, 1)
