@@ -72,7 +72,7 @@ class TimelineCache:
         self._note = note
         self._key = _key(reader.log_id, settings, corrections)
         self._noted: set[str] = set()
-        self._kept_at: Offset | None = None
+        self._kept_at: Offset | None = None  # by this process
 
     def stripes(self, end: Offset) -> list[Stripe]:
         """The history that is kept, of at most ``end`` events, from the first on."""
@@ -93,7 +93,6 @@ class TimelineCache:
                     break
             else:
                 break
-        self._kept_at = at
         if found:
             self._touch(files)
         return found
@@ -119,10 +118,9 @@ class TimelineCache:
 
     def is_worth(self, folded: int) -> bool:
         """Whether to keep a history after ``folded`` more events than are kept: the first time if
-        that took a moment, then each time it has grown by a tenth."""
-        if self._kept_at is None or self._kept_at == FIRST_OFFSET:
-            return folded >= MIN_EVENTS
-        return folded >= max(MIN_EVENTS, self._kept_at // 10)
+        folding them took a moment, then, in a process that goes on, at each tenth more."""
+        grown = 0 if self._kept_at is None else self._kept_at // 10
+        return folded >= max(MIN_EVENTS, grown)
 
     def keep(self, stripes: Sequence[Stripe], semantic_map: SemanticMap) -> None:
         """Keep the history of all events that ``semantic_map`` has folded."""
