@@ -66,13 +66,20 @@ class DaskCluster:
         """See `projections.fleet.engine.Engine`; ``progress`` is not told of events."""
         ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
         name = f"mapfold-{uuid4().hex[:8]}"
-        futures = {}
-        for index, request in enumerate(requests):
+        futures: dict[str, tuple[int, Any]] = {}
+        attempts = [0] * len(requests)
+
+        def submit(index: int) -> None:
+            attempts[index] += 1
+            key = f"{name}-{index}-{attempts[index]}"
             future = self._client.submit(
-                _call, task, request, key=f"{name}-{index}", pure=False, retries=RETRIES
+                _call, task, requests[index], key=key, pure=False, retries=RETRIES
             )
-            futures[future.key] = index, future
+            futures[key] = index, future
             future.add_done_callback(ended.put)
+
+        for number in range(len(requests)):
+            submit(number)
         away_since: float | None = None
         while futures:
             try:
@@ -86,8 +93,13 @@ class DaskCluster:
             if future.status in ("cancelled", "lost"):
                 self._raise_gone(len(futures) + 1, len(requests))
             error = future.exception() if future.status == "error" else None
+            if _was_killed(error) and attempts[index] <= RETRIES:
+                submit(index)  # Dask also blames tasks that a killed worker had not begun
+                continue
             result = None if error is not None else future.result()
-            yield Ended(index, result, None if error is None else _error_text(error), 1)
+            yield Ended(
+                index, result, None if error is None else _error_text(error), attempts[index]
+            )
 
     def _watch(self, away_since: float | None, left: int, total: int) -> float | None:
         """Since when the scheduler is away; raises ClusterError when that is too long."""
@@ -121,8 +133,12 @@ def _unreported(_events: int) -> None:
     """A cluster's tasks report at their end."""
 
 
+def _was_killed(error: BaseException | None) -> bool:
+    return type(error).__name__ == "KilledWorker"
+
+
 def _error_text(error: BaseException) -> str:
-    if type(error).__name__ == "KilledWorker":
+    if _was_killed(error):
         return (
             "the workers that had it were killed, one after the other; for want of memory? Look in"
             " their logs"

@@ -54,9 +54,10 @@ def kill_workers(template: str, sites: Sequence[Site], kills: int = 4) -> None:
         )
 
 
-def killed(template: str, sites: Sequence[Site], name: str, kills: int) -> Killed:
+def killed(template: str, sites: Sequence[Site], name: str, kills: int, every: int = 6) -> Killed:
     """Rebuild all sites after each has another event, and kill workers of the pool or of a cluster
-    meanwhile. Raises AssertionError if a site is not equal to its log then."""
+    meanwhile, one at every so many reports of progress. Raises AssertionError if a site is not
+    equal to its log then."""
     requests = requests_for(template, sites, again=False)
     with LocalPool(WORKERS) as pool:
         replayed(pool, requests)
@@ -64,7 +65,7 @@ def killed(template: str, sites: Sequence[Site], name: str, kills: int) -> Kille
         _grow(request.site.log)
         with connect(request.databases.graph_url, autocommit=True) as connection:
             connection.execute(_AUDIT)
-    killer = _Killer(kills)
+    killer = _Killer(kills, every)
     if name == "pool":
         with LocalPool(WORKERS) as pool:
             ended = _checked(pool.run(replay_site, requests, killer), len(requests))
@@ -92,15 +93,16 @@ def _checked(ended: Iterator[Ended], sites: int) -> list[Ended]:
 
 
 class _Killer:
-    """Called several times a second while sites are rebuilt; kills a worker at every sixth call."""
+    """Called several times a second while sites are rebuilt; kills a worker at every n-th call."""
 
-    def __init__(self, kills: int) -> None:
-        self._kills, self.done, self._calls = kills, 0, 0
+    def __init__(self, kills: int, every: int) -> None:
+        self._kills, self._every = kills, every
+        self.done = self._calls = 0
         self._chance = random.Random(7)
 
     def __call__(self, _events: int) -> None:
         self._calls += 1
-        if self.done < self._kills and self._calls % 6 == 0:
+        if self.done < self._kills and self._calls % self._every == 0:
             workers = _workers_under(os.getpid())
             if workers:
                 os.kill(self._chance.choice(workers), signal.SIGKILL)
