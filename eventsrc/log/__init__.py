@@ -1,7 +1,7 @@
 """The log: an append-only directory of MCAP segments, the only truth (docs/log-format.md)."""
 
 from .durable_files import ALWAYS, GROUP_COMMIT, NEVER, FsyncPolicy, parse_fsync
-from .event import Event, MessageFormat, NewEvent, VerbatimEvent
+from .event import Event, MessageFormat, NewEvent, VerbatimEvent, event_hash
 from .file_fault import FileFault
 from .log_identity import same_but_sealed, segment_signatures
 from .reader import LogReader
@@ -30,6 +30,7 @@ __all__ = [
     "Unreadable",
     "VerbatimEvent",
     "Verification",
+    "event_hash",
     "follow",
     "parse_fsync",
     "recover_log",

@@ -5,6 +5,8 @@ bytes of other programs (a message of ROS in CDR, a JPEG), kept beside them with
 encoding and a schema, so that readers of MCAP show them. No fold reads them.
 """
 
+import hashlib
+import json
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -33,6 +35,15 @@ class Event:
     def is_envelope(self) -> bool:
         """Whether it carries an envelope: it is neither mapfold's own nor a verbatim message."""
         return not is_system_key(self.key)
+
+
+def event_hash(event: Event | None) -> str:
+    """SHA-256 of an event's offset, key, times and payload, in hex; "" for none. The same message
+    recorded again has another: it is logged at another time."""
+    if event is None:
+        return ""
+    head = json.dumps([event.offset, event.key, event.logged_ns, event.stamp_ns]).encode()
+    return hashlib.sha256(head + b"\n" + event.payload).hexdigest()
 
 
 class MessageFormat(NamedTuple):

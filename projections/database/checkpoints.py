@@ -1,6 +1,5 @@
 """Checkpoints, dead letters and the one-writer lock of a database, in its schema ``mapfold``."""
 
-import hashlib
 import json
 import time
 from dataclasses import asdict, dataclass
@@ -38,14 +37,6 @@ class DeadLetter:
     key: str
     run_id: RunId | None
     reason: str
-
-
-def event_hash(event: Event | None) -> str:
-    """SHA-256 over all fields of an event, in hex; "" for none."""
-    if event is None:
-        return ""
-    head = json.dumps([event.offset, event.key, event.logged_ns, event.stamp_ns]).encode()
-    return hashlib.sha256(head + b"\n" + event.payload).hexdigest()
 
 
 def lock_writer(connection: Connection, sink: SinkName) -> None:

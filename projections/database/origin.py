@@ -11,11 +11,10 @@ from pydantic import ValidationError
 
 from eventsrc.advised import advised
 from eventsrc.envelope import FIRST_OFFSET, Offset
-from eventsrc.log import LogReader
+from eventsrc.log import LogReader, event_hash
 from projections.errors import ProjectionMismatch, ProjectionMissing
 from projections.settings import Settings, settings_by_name
 
-from .checkpoints import event_hash
 from .inputs import MapInputs
 from .sink import Checkpoint, SinkName
 

@@ -26,7 +26,7 @@ from typing import Final, TypeAlias
 
 import psycopg
 
-from eventsrc.log import Event
+from eventsrc.log import Event, event_hash
 from projections.errors import DatabaseError
 from projections.model.changes import BatchChanges
 from projections.model.digest import map_digest
@@ -225,7 +225,7 @@ def swap_in_new_map(
             log_id,
             folded.inputs,
             fold.map.next_offset,
-            checkpoints.event_hash(folded.last),
+            event_hash(folded.last),
             digest,
             maps_key(fold.view),
         )

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final, TypeAlias
 
 from eventsrc.envelope import Offset
-from eventsrc.log import Event, LogReader, follow
+from eventsrc.log import Event, LogReader, event_hash, follow
 from eventsrc.system_events import COMMAND_KEY
 from projections.errors import FoldError, ImpossibleCommand, ProjectionMismatch
 from projections.model.fold import SNAPSHOT_MIN_EVENTS
@@ -19,7 +19,7 @@ from projections.model.snapshot_cache import SnapshotCache
 from projections.settings import Settings
 
 from . import checkpoints
-from .checkpoints import DeadLetter, dead_letter, event_hash
+from .checkpoints import DeadLetter, dead_letter
 from .connection import Targets, database_errors
 from .inputs import LogInputs, MapInputs, SettingsOf, commands_between
 from .live_fold import LiveFold, batches

@@ -25,7 +25,7 @@ from typing import Any, Final, NamedTuple
 
 from eventsrc.clock import system_clock
 from eventsrc.envelope import FIRST_OFFSET, Offset
-from eventsrc.log import LogReader, same_but_sealed, segment_signatures
+from eventsrc.log import LogReader, event_hash, same_but_sealed, segment_signatures
 from projections.corrections import Corrections, map_fingerprint
 from projections.model.snapshot import FOLD_VERSION, MalformedSnapshot, pack, unpack
 from projections.model.space_vectors import with_vectors
@@ -220,10 +220,9 @@ class TimelineCache:
             raise DamagedPart("the log has lost events since it was made")
 
     def _event_hash(self, end: Offset) -> str:
-        """The SHA-256 of the last event below ``end``."""
+        """That of the last event below ``end``."""
         (event,) = self._reader.read(Offset(end - 1), end)
-        about = f"{event.offset} {event.key} {event.stamp_ns} ".encode()
-        return hashlib.sha256(about + event.payload).hexdigest()
+        return event_hash(event)
 
     def _files(self) -> list[_File]:
         """The parts of this history."""

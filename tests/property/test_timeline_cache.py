@@ -215,6 +215,28 @@ def test_a_log_that_lost_its_end_and_was_recorded_on(tmp_path: Path) -> None:
         assert any("the log has lost events since it was made" in note for note in notes)
 
 
+def test_a_log_that_lost_its_end_of_which_the_same_came_again(tmp_path: Path) -> None:
+    """Sent again by two robots, in another order: the same log id, segments and last message."""
+    log, before = tmp_path / "log", tmp_path / "before"
+    with kept_early():
+        append(log, [_envelope(n) for n in range(12)])
+        shutil.copytree(log, before)
+        with LogWriter(log, fsync=parse_fsync("never")) as writer:
+            for number in range(12, 30):
+                append_payload(writer, "tb/detections", payload(_envelope(number)))
+            writer.sync()
+            check(log, RULES, [12, 30])
+        shutil.rmtree(log)
+        shutil.copytree(before, log)
+        with LogWriter(log, fsync=parse_fsync("never")) as writer:
+            for number in (13, 12, *range(14, 30)):
+                append_payload(writer, "tb/detections", payload(_envelope(number)))
+            writer.sync()
+            notes: list[str] = []
+            check(log, RULES, [5, 13, 30], notes)
+        assert any("the log has lost events since it was made" in note for note in notes)
+
+
 def _envelope(number: int, step: float = 0.5) -> dict[str, Any]:
     return envelope(number, step * number, 0.0)
 
