@@ -1,5 +1,6 @@
 """The log: an append-only directory of MCAP segments, the only truth (docs/log-format.md)."""
 
+from .cache_folders import cache_folder, cache_sizes, make_cache_folder
 from .durable_files import ALWAYS, GROUP_COMMIT, NEVER, FsyncPolicy, parse_fsync
 from .event import Event, MessageFormat, NewEvent, VerbatimEvent, event_hash
 from .file_fault import FileFault
@@ -30,8 +31,11 @@ __all__ = [
     "Unreadable",
     "VerbatimEvent",
     "Verification",
+    "cache_folder",
+    "cache_sizes",
     "event_hash",
     "follow",
+    "make_cache_folder",
     "parse_fsync",
     "recover_log",
     "same_but_sealed",

@@ -24,6 +24,7 @@ from eventsrc.log import (
     Unreadable,
     VerbatimEvent,
     Verification,
+    cache_sizes,
     recover_log,
     verify_log,
 )
@@ -203,18 +204,8 @@ def info_document(report: LogInfo) -> dict[str, Any]:
         **asdict(report),
         "path": str(report.path),
         "segments": [asdict(s) for s in report.segments],
-        "caches": {path.name: size for path, size in _caches(report.path)},
+        "caches": {path.name: size for path, size in cache_sizes(report.path)},
     }
-
-
-def _caches(log: Path) -> list[tuple[Path, int]]:
-    """The folders beside a log that are safe to delete, and how many bytes are in each."""
-    folders = [log.with_name(f"{log.name}.{kind}") for kind in ("history", "snapshots")]
-    return [
-        (folder, sum(path.stat().st_size for path in folder.iterdir()))
-        for folder in folders
-        if folder.is_dir()
-    ]
 
 
 def _info_text(report: LogInfo) -> str:
@@ -235,7 +226,7 @@ def _info_text(report: LogInfo) -> str:
     rows += [("segment", _segment_text(segment)) for segment in report.segments]
     rows += [
         ("cache", f"{folder.name}: {size:,} bytes, safe to delete")
-        for folder, size in _caches(report.path)
+        for folder, size in cache_sizes(report.path)
     ]
     return "".join(f"{name:<9} {value}\n" for name, value in rows)
 

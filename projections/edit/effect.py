@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from eventsrc.commands import Command
 from eventsrc.envelope import Offset
+from eventsrc.log import cache_folder, make_cache_folder
 from eventsrc.progress import working
 from eventsrc.text import counted
 from projections.corrections import (
@@ -137,7 +138,8 @@ class EffectCache:
         self._note = current.note
         log = current.reader.path
         self._log_id = current.reader.log_id
-        self._path = log.with_name(f"{log.name}.snapshots") / _CACHE
+        self._log = log
+        self._path = cache_folder(log, "snapshots") / _CACHE
         self._effects = self._read()
 
     def get(self, change: Change) -> Effect | None:
@@ -150,7 +152,7 @@ class EffectCache:
         document = {"version": _VERSION, "log_id": self._log_id, "effects": self._effects}
         beside = self._path.with_suffix(f".{os.getpid()}.part")
         try:
-            self._path.parent.mkdir(exist_ok=True)
+            make_cache_folder(self._log, "snapshots")
             beside.write_text(json.dumps(document), "utf-8")
             beside.replace(self._path)
         except OSError as error:

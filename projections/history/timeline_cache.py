@@ -25,7 +25,15 @@ from typing import Any, Final, NamedTuple
 
 from eventsrc.clock import system_clock
 from eventsrc.envelope import FIRST_OFFSET, Offset
-from eventsrc.log import LogReader, event_hash, same_but_sealed, segment_signatures
+from eventsrc.errors import LogError
+from eventsrc.log import (
+    LogReader,
+    cache_folder,
+    event_hash,
+    make_cache_folder,
+    same_but_sealed,
+    segment_signatures,
+)
 from projections.corrections import Corrections, map_fingerprint
 from projections.model.snapshot import FOLD_VERSION, MalformedSnapshot, pack, unpack
 from projections.model.space_vectors import with_vectors
@@ -66,7 +74,7 @@ class TimelineCache:
         self, reader: LogReader, settings: Settings, corrections: Corrections, note: Note
     ) -> None:
         log = reader.path
-        self.folder = log.with_name(f"{log.name}.history")
+        self.folder = cache_folder(log, "history")
         self._reader = reader
         self._settings, self._corrections = settings, corrections
         self._note = note
@@ -108,7 +116,7 @@ class TimelineCache:
             semantic_map.use_names(semantic_map.next_offset, self._corrections)
         except FileNotFoundError:
             return None
-        except (OSError, DamagedPart, MalformedSnapshot, zlib.error) as error:
+        except (OSError, LogError, DamagedPart, MalformedSnapshot, zlib.error) as error:
             self._say(f"{path} is not used: {error}")
             return None
         except (LookupError, TypeError, AttributeError, ValueError, OverflowError) as error:
@@ -126,13 +134,13 @@ class TimelineCache:
         """Keep the history of all events that ``semantic_map`` has folded."""
         end = semantic_map.next_offset
         try:
-            self.folder.mkdir(exist_ok=True)
+            make_cache_folder(self._reader.path, "history")
             self._keep_fold(semantic_map)
             self._keep_part(stripes, end)
             self._tidy(end)
         except OSError as error:
             self._say(f"{self.folder}: no history was kept: {error.strerror}")
-        except Unwritable as error:
+        except (Unwritable, LogError) as error:
             self._say(f"{self.folder}: no history was kept: {error}")
         except DamagedPart as damage:
             self.forget(damage)
@@ -200,6 +208,9 @@ class TimelineCache:
             self._check(opened.about, file.start, file.end)
         except FileNotFoundError:
             raise
+        except LogError as error:  # the events asked for may be before the damage
+            self._say(f"{file.path} is not used: {error}")
+            return None
         except (OSError, DamagedPart) as error:
             self._say(f"{file.path} is not used: {error}")
         except (LookupError, TypeError, AttributeError, ValueError) as error:

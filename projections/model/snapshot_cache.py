@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 
 from eventsrc.envelope import Offset
-from eventsrc.log import segment_signatures
+from eventsrc.log import cache_folder, make_cache_folder, segment_signatures
 from eventsrc.progress import working
 from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.reducers.semantic_map import SemanticMap
@@ -40,7 +40,8 @@ class SnapshotCache:
         *,
         corrections: Corrections = NO_CORRECTIONS,
     ) -> None:
-        self.folder = log.with_name(f"{log.name}.snapshots")
+        self._log = log
+        self.folder = cache_folder(log, "snapshots")
         self._signatures = partial(segment_signatures, log)
         self._log_id = log_id
         self._settings = settings
@@ -86,7 +87,7 @@ class SnapshotCache:
         path = self._path(semantic_map.next_offset)
         beside = path.with_suffix(f".{os.getpid()}.part")
         try:
-            self.folder.mkdir(exist_ok=True)
+            make_cache_folder(self._log, "snapshots")
             if not path.exists() or path in self._unusable:
                 segments = self._signatures(semantic_map.next_offset)
                 with working("keeping a snapshot of the map"):

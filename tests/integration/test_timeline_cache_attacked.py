@@ -10,7 +10,12 @@ from typing import Any
 
 import pytest
 
+from eventsrc.envelope import Offset
+from eventsrc.log import LogReader
+from projections.corrections import NO_CORRECTIONS
 from projections.history import Timeline
+from projections.history.known import map_after
+from projections.model.fold import fold_log
 from tests import prefork
 from tests.envelopes import detection, envelope
 from tests.fixtures_timetravel import VECTORS, write_log
@@ -136,6 +141,30 @@ def test_a_log_that_grows_while_it_is_looked_at(log: Path) -> None:
             ends = [0, EVENTS // 2, first, first + 10]
             assert told(timeline, ends) == expected(timeline, ends)
             assert view.counts() == timeline.at(EVENTS // 2).counts()
+
+
+def test_damage_in_the_log_behind_the_events_asked_for(tmp_path: Path) -> None:
+    """The last event that is kept has rotted; those before it are read, with the cache as without.
+    The kept history is not deleted: the segment may come back from a copy."""
+    log = tmp_path / "log"
+    for first in (0, 20):
+        write_log(log, drive(first, first + 20))
+    with kept_early():
+        assert answers(log, [])
+        write_log(log, drive(40, 43))
+        _, rotten, _ = sorted(log.glob("*.mcap"))
+        sound = rotten.read_bytes()
+        with rotten.open("r+b") as file:
+            file.seek(len(sound) // 8)
+            file.write(bytes(each ^ 1 for each in sound[len(sound) // 8 :][:30]))
+        was, notes = kept(log), list[str]()
+        with LogReader(log) as reader:
+            view = map_after(
+                reader, RULES, Offset(5), corrections=NO_CORRECTIONS, note=notes.append
+            )
+            assert view.counts() == fold_log(reader, RULES, Offset(5))[1].counts()
+        assert ["is not used" in note and "cannot be read" in note for note in notes] == [True]
+        assert set(was) <= set(kept(log))
 
 
 def test_histories_are_few_and_small(log: Path) -> None:

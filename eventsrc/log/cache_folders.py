@@ -1,0 +1,45 @@
+"""The folders of caches beside a log: ``<log>.history`` and ``<log>.snapshots``.
+
+They are no part of the log and safe to delete at any time. Whoever may not read the log may not
+read them either: they hold what it holds.
+"""
+
+import contextlib
+from pathlib import Path
+from typing import Final, Literal, get_args
+
+CacheKind = Literal["history", "snapshots"]
+_KINDS: Final[tuple[CacheKind, ...]] = get_args(CacheKind)
+_OWNER: Final = 0o700
+_OTHERS: Final = 0o077
+
+
+def cache_folder(log: Path, kind: CacheKind) -> Path:
+    """The folder of a cache, which need not be there. A log named by ``.`` or ``..`` has it beside
+    the folder that is meant."""
+    named = log.resolve() if log.name in ("", "..") else log
+    return named.parent / f"{named.name}.{kind}"
+
+
+def make_cache_folder(log: Path, kind: CacheKind) -> Path:
+    """`cache_folder`, made if it is not there: others may do in it at most what they may in the
+    log. Raises OSError."""
+    folder = cache_folder(log, kind)
+    folder.mkdir(mode=_OWNER | (log.stat().st_mode & _OTHERS), exist_ok=True)
+    return folder
+
+
+def cache_sizes(log: Path) -> list[tuple[Path, int]]:
+    """The folders of caches that there are and may be read, and how many bytes are in each."""
+    sizes = []
+    for kind in _KINDS:
+        folder = cache_folder(log, kind)
+        with contextlib.suppress(OSError):
+            sizes.append((folder, sum(map(_size, folder.iterdir()))))
+    return sizes
+
+
+def _size(path: Path) -> int:
+    with contextlib.suppress(FileNotFoundError):  # another process replaced it
+        return path.lstat().st_size
+    return 0
