@@ -34,10 +34,11 @@ DEADLINE_S = 30.0
 
 
 def scrape(port: int) -> dict[str, float]:
-    """The samples a recorder's ``/metrics`` gives now."""
+    """The samples a recorder's ``/metrics`` gives now, by name with labels."""
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=DEADLINE_S) as answer:
         text = answer.read().decode()
-    return {name: float(value) for name, value in re.findall(r"^(\w+) (\S+)$", text, re.MULTILINE)}
+    samples = re.findall(r"^(\w+(?:\{.*\})?) (\S+)$", text, re.MULTILINE)
+    return {name: float(value) for name, value in samples}
 
 
 @pytest.fixture

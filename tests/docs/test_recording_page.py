@@ -21,6 +21,7 @@ from eventsrc.recorder import DEFAULT_QUEUE_SIZE, RecorderReport
 from eventsrc.recorder.queue import DEFAULT_QUEUE_BYTES
 from eventsrc.robot.sender import WINDOW
 from eventsrc.robot.spool import DEFAULT_SPOOL_BYTES
+from eventsrc.ros.stream import Counts
 from eventsrc.transport.config import DEFAULT_ENDPOINT
 from eventsrc.transport.session import ZenohOptions, open_session
 from tests.fixtures_zenoh import Program, scrape
@@ -62,9 +63,12 @@ def test_the_three_terminals_say_what_the_page_says(
 
 
 def test_every_metric_is_on_the_page(tmp_path: Path) -> None:
-    report = RecorderReport(0, 0, 0, 0, 0, 0, 0, 1, 0)
+    topic = "/detections"
+    report = RecorderReport(
+        0, 0, 0, 0, 0, 0, 0, 1, 0, unread=((topic, 1, "why"),), streams=((topic, Counts()),)
+    )
     with serving_metrics(("127.0.0.1", 0), lambda: report, tmp_path) as port:
-        served = set(scrape(port))
+        served = {name.partition("{")[0] for name in scrape(port)}
     assert set(re.findall(r"mapfold_recorder_\w+", PAGE)) == served
 
 
