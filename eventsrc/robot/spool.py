@@ -14,10 +14,10 @@
   removes them.
 """
 
+import contextlib
 import sqlite3
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -167,7 +167,7 @@ class Spool:
         self.max_bytes = max_bytes
         self._lock = threading.Lock()
         self._count = self._bytes = 0
-        with self._spool_errors():
+        with _spool_errors(self.path):
             path.parent.mkdir(parents=True, exist_ok=True)
             self._db = sqlite3.connect(
                 path, timeout=0, isolation_level=None, check_same_thread=False
@@ -177,6 +177,19 @@ class Spool:
             except sqlite3.Error:
                 self._db.close()
                 raise
+
+    @staticmethod
+    def is_spool(path: Path) -> bool:
+        """Whether a file is a spool, or empty as one before its first use: `Spool` would add its
+        tables to any SQLite file. Raises SpoolError for a file that cannot be read."""
+        with (
+            _spool_errors(path),
+            contextlib.closing(
+                sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, timeout=0)
+            ) as db,
+        ):
+            tables = {name for (name,) in db.execute("select name from sqlite_master")}
+        return not tables or "spooled" in tables
 
     def _open_tables(self) -> None:
         self._db.execute("pragma locking_mode = exclusive")
@@ -190,7 +203,7 @@ class Spool:
 
     def add(self, run_id: RunId, keyframe_id: KeyframeId, payload: bytes) -> None:
         """Keep one envelope until it is acknowledged. Raises SpoolFull if there is no room."""
-        with self._spool_errors(), self._lock:
+        with _spool_errors(self.path), self._lock:
             if not self._make_room(len(payload)):
                 raise SpoolFull(
                     f"{self.path}: {self._count} envelopes ({self._bytes} bytes) wait for a "
@@ -213,7 +226,7 @@ class Spool:
 
     def after(self, seq: int, limit: int) -> list[Spooled]:
         """The oldest waiting envelopes after ``seq`` in order, at most ``limit``."""
-        with self._spool_errors(), self._lock:
+        with _spool_errors(self.path), self._lock:
             rows = self._db.execute(
                 "select seq, run_id, keyframe_id, payload from spooled where seq > ? "
                 "order by seq limit ?",
@@ -223,13 +236,13 @@ class Spool:
 
     def oldest(self) -> int | None:
         """The seq of the oldest waiting envelope; None if there is none."""
-        with self._spool_errors(), self._lock:
+        with _spool_errors(self.path), self._lock:
             ((seq,),) = self._db.execute("select min(seq) from spooled")
             return None if seq is None else int(seq)
 
     def waiting_up_to(self, seq: int) -> int:
         """How many envelopes up to ``seq`` still wait."""
-        with self._spool_errors(), self._lock:
+        with _spool_errors(self.path), self._lock:
             rows = self._db.execute("select count(*) from spooled where seq <= ?", (seq,))
             (count,) = rows.fetchone()
             return int(count)
@@ -237,7 +250,7 @@ class Spool:
     def acknowledge(self, ack: Ack) -> int:
         """Remove what ``ack`` names; returns how many waiting envelopes were removed."""
         removed = 0
-        with self._spool_errors(), self._lock, self._transaction():
+        with _spool_errors(self.path), self._lock, self._transaction():
             for sha256 in ack.sha256:
                 rows = self._db.execute(
                     "delete from spooled where sha256 = ? returning length(payload)", (sha256,)
@@ -251,7 +264,7 @@ class Spool:
     def refuse(self, refusals: Refusals, up_to: int) -> int:
         """Quarantine what ``refusals`` name, up to the seq ``up_to``; returns how many."""
         moved = 0
-        with self._spool_errors(), self._lock, self._transaction():
+        with _spool_errors(self.path), self._lock, self._transaction():
             for refusal in refusals.refused:
                 rows = self._db.execute(
                     "select seq, length(payload) from spooled where sha256 = ? and seq <= ?",
@@ -275,13 +288,13 @@ class Spool:
 
     def refused(self, limit: int) -> list[Refused]:
         """The oldest in quarantine, in order, at most ``limit``."""
-        with self._spool_errors(), self._lock:
+        with _spool_errors(self.path), self._lock:
             return self._quarantine.rows(limit)
 
     def retry_refused(self) -> int:
         """Move everything in quarantine that still has its bytes behind the waiting envelopes;
         returns how many."""
-        with self._spool_errors(), self._lock, self._transaction():
+        with _spool_errors(self.path), self._lock, self._transaction():
             count, size = self._quarantine.requeue()
             self._count += count
             self._bytes += size
@@ -289,7 +302,7 @@ class Spool:
 
     def discard_refused(self) -> int:
         """Empty the quarantine; returns how many envelopes were in it."""
-        with self._spool_errors(), self._lock:
+        with _spool_errors(self.path), self._lock:
             return self._quarantine.clear()
 
     def __len__(self) -> int:
@@ -300,7 +313,7 @@ class Spool:
         with self._lock:
             self._db.close()
 
-    @contextmanager
+    @contextlib.contextmanager
     def _transaction(self) -> Iterator[None]:
         """A transaction in the file. After an error the counts here may be wrong; every error ends
         the sender, and the next process counts again."""
@@ -308,20 +321,21 @@ class Spool:
             self._db.execute("begin immediate")
             yield
 
-    @contextmanager
-    def _spool_errors(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise SpoolError(f"spool {self.path}: {error.strerror}") from None
-        except sqlite3.OperationalError as error:
-            hint = "another robot process uses it; give each its own spool"
-            hint = hint if "locked" in str(error) else "check the path, its rights and the disk"
-            raise SpoolError(f"spool {self.path}: {error}; {hint}") from None
-        except sqlite3.DatabaseError as error:
-            raise SpoolError(
-                f"spool {self.path}: {error}; move the file away and publish into a new one"
-            ) from None
+
+@contextlib.contextmanager
+def _spool_errors(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise SpoolError(f"spool {path}: {error.strerror}") from None
+    except sqlite3.OperationalError as error:
+        hint = "another robot process uses it; give each its own spool"
+        hint = hint if "locked" in str(error) else "check the path, its rights and the disk"
+        raise SpoolError(f"spool {path}: {error}; {hint}") from None
+    except sqlite3.DatabaseError as error:
+        raise SpoolError(
+            f"spool {path}: {error}; move the file away and publish into a new one"
+        ) from None
 
 
 def _add_sha256(db: sqlite3.Connection) -> None:

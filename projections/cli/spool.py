@@ -46,6 +46,8 @@ def spool(
     path = file or spool_path()
     if not path.is_file():
         raise MisuseError(f"{path}: no such file; give the one that --spool of a robot names")
+    if not Spool.is_spool(path):
+        raise MisuseError(f"{path}: no spool, but another program's database; give a spool's file")
     opened = Spool(path)
     try:
         retried = opened.retry_refused() if retry else 0

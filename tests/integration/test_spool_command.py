@@ -1,5 +1,7 @@
 """`mapfold spool`: what a recorder has refused is listed, sent again or dropped."""
 
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -68,3 +70,13 @@ def test_what_is_no_spool_is_one_line_and_makes_none(mapfold: Commands, tmp_path
     (tmp_path / "text").write_text("no database, but long enough to be taken for one " * 100)
     assert mapfold("spool", "text", code=1).err.count("\n") == 1
     assert "--retry and --discard" in mapfold("spool", "--retry", "--discard", code=2).err
+
+
+def test_another_programs_database_is_refused_and_left_as_it_is(mapfold: Commands) -> None:
+    other = mapfold.folder / "other #1?.db"
+    with closing(sqlite3.connect(other)) as db:
+        db.execute("create table notes (text)")
+    before = other.read_bytes()
+    said = mapfold("spool", other, "--discard", code=2)
+    assert "another program's database" in said.err
+    assert other.read_bytes() == before
