@@ -18,7 +18,19 @@ from eventsrc.text import visible, visible_json, visible_lines
 EXIT_FAILED = 1
 EXIT_FINDINGS = 3
 
-people = Console(stderr=True, highlight=False, soft_wrap=True, markup=False)
+
+class _People(Console):
+    @property
+    def is_terminal(self) -> bool:
+        """Whether the stream is one. FORCE_COLOR and TTY_COMPATIBLE, by which rich takes a pipe or
+        a file for a terminal, must not put progress bars into it."""
+        try:
+            return self.file.isatty()
+        except ValueError:  # closed
+            return False
+
+
+people = _People(stderr=True, highlight=False, soft_wrap=True, markup=False)
 """Stderr. Without markup, since ids and reasons may hold any text."""
 
 

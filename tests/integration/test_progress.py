@@ -4,6 +4,7 @@
 """
 
 import io
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -273,3 +274,18 @@ def test_nothing_is_told_without_a_terminal(
         begin(bar)
         assert bar._timer is bar._bar is None
     assert screen.getvalue() == ""
+
+
+@pytest.mark.parametrize("variable", ["FORCE_COLOR", "TTY_COMPATIBLE"])
+def test_no_variable_puts_a_bar_into_a_file(
+    variable: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(variable, "1")
+    with (tmp_path / "said").open("w+") as said, monkeypatch.context() as patched:
+        patched.setattr(sys, "stderr", said)
+        with ReadingBar(0.0) as bar, Bar() as own:
+            begin(bar)
+            own.show("reading the log", 10, 100)
+        terminal.say("done")
+        said.seek(0)
+        assert said.read() == "done\n"
