@@ -125,21 +125,14 @@ def _is_given(context: Any, name: str) -> bool:
 
 
 def _as_words(option: str, value: Any) -> list[str]:
+    from projections.database.connection import url_without_secrets
+
     values = value if isinstance(value, list | tuple) else [value]
     words: list[str] = []
     for each in values:
         text = str(getattr(each, "value", each))
-        words += [option, _without_password(text) if option in _DATABASES else text]
+        words += [option, url_without_secrets(text) if option in _DATABASES else text]
     return words
-
-
-def _without_password(url: str) -> str:
-    """A URL without its password, which messages never show: libpq then reads it from ~/.pgpass or
-    PGPASSWORD."""
-    from psycopg.conninfo import conninfo_to_dict, make_conninfo
-
-    parts = conninfo_to_dict(url)  # it was read before: the command has connected
-    return url if parts.pop("password", None) is None else make_conninfo("", **parts)
 
 
 @lru_cache(maxsize=64)

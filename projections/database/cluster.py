@@ -111,6 +111,12 @@ class Cluster:
                 return True
             return True
 
+    def let_in(self) -> None:
+        """Let the server's user into the folders above data and programs. One of them may have been
+        closed since the server started; then a new session cannot load the extensions."""
+        with _server_errors("open the folders of", self.data):
+            let_server_user_enter(self.data, self.programs)
+
     def start(self) -> None:
         """Start the server and wait until it accepts connections."""
         self._refuse_untrusted()

@@ -15,6 +15,7 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Final, LiteralString
+from urllib.parse import unquote
 
 import psycopg
 from psycopg import sql
@@ -58,6 +59,9 @@ _SESSION_SETTINGS: Final[Mapping[str, str]] = {
 }
 _SHOWN_PARTS: Final = ("host", "port", "dbname", "user")
 """Parts of a URL that messages may show."""
+_SECRETS: Final = frozenset(
+    {"password", "sslpassword", "scram_client_key", "scram_server_key", "oauth_client_secret"}
+)
 _PRODUCTS: Final[Mapping[str, str]] = {"age": "Apache AGE", "vector": "pgvector"}
 
 
@@ -214,6 +218,18 @@ def describe_connection(connection: Connection) -> str:
     return describe_target(connection.info.dsn)
 
 
+def url_without_secrets(url: str) -> str:
+    """A URL of `check_url`, without its password and others that libpq takes as parameters, for
+    command lines that are advised; libpq then reads the password from ~/.pgpass or PGPASSWORD."""
+    scheme, _, rest = url.partition("://")
+    rest, question, query = rest.partition("?")
+    authority, slash, path = rest.partition("/")
+    user, at, host = authority.rpartition("@")
+    kept = [each for each in query.split("&") if unquote(each.partition("=")[0]) not in _SECRETS]
+    shown = f"{scheme}://{user.partition(':')[0]}{at}{host}{slash}{path}"
+    return f"{shown}?{'&'.join(kept)}" if question and kept else shown
+
+
 @contextlib.contextmanager
 def database_errors(url: str) -> Iterator[None]:
     """Turn psycopg's errors into ours: one line with the database and the server's message."""
@@ -246,6 +262,11 @@ def _advice(error: psycopg.Error, url: str) -> str:
     if "too many" in text or "connection slots" in text:
         return "end other commands, run fewer at once, or raise the server's max_connections"
     log = embedded_log(url)
+    if isinstance(error, psycopg.errors.UndefinedFile):  # an OperationalError too
+        return (
+            "the server no longer finds that file: was the extension removed, or a folder above it"
+            " closed to the server's user?" + (f" Its log: {log}" if log is not None else "")
+        )
     if log is not None:
         return f"the embedded server went away; its log: {log}"
     if "password" in text or "authentication" in text or "pg_hba" in text:

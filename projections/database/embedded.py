@@ -128,7 +128,9 @@ class EmbeddedServer:
         user."""
         with self._exclusive(), _signals_blocked():
             self._cluster.create()
-            if not self._cluster.running():
+            if self._cluster.running():
+                self._cluster.let_in()
+            else:
                 self._start_with_retries()
             self._refuse_another_server()
             if self._users_lock is None:

@@ -3,9 +3,8 @@
 import contextlib
 from collections.abc import Collection, Iterator, Sequence
 
-from psycopg.conninfo import conninfo_to_dict, make_conninfo
-
 from eventsrc.advised import complete_by
+from projections.database.connection import url_without_secrets
 
 from .site_databases import SiteDatabases
 from .sites import Site
@@ -27,7 +26,7 @@ def advice_for(databases: SiteDatabases) -> Iterator[None]:
             word
             for option, url in given
             if option not in left_out
-            for word in (option, without_password(url))
+            for word in (option, url_without_secrets(url))
         ]
 
     complete_by(complete)
@@ -35,12 +34,6 @@ def advice_for(databases: SiteDatabases) -> Iterator[None]:
         yield
     finally:
         complete_by(None)
-
-
-def without_password(url: str) -> str:
-    """A URL without its password."""
-    parts = conninfo_to_dict(url)
-    return url if parts.pop("password", None) is None else make_conninfo("", **parts)
 
 
 def os_error_text(error: OSError, site: Site) -> str:

@@ -10,8 +10,9 @@ from typing import IO
 import psycopg
 import pytest
 
+from projections.database.connection import connect, database_errors
 from projections.database.embedded import EmbeddedServer
-from projections.errors import EmbeddedServerError
+from projections.errors import DatabaseUnavailable, EmbeddedServerError
 from tests.prefork import Process, start
 from tests.servers import furnish
 
@@ -91,6 +92,17 @@ def test_two_commands_share_it_and_the_last_one_stops_it(home: Path) -> None:
         assert not server.running
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root has the server run as another user")
+def test_a_folder_closed_while_it_runs_is_opened_to_the_servers_user_again(home: Path) -> None:
+    with EmbeddedServer(home) as server:
+        home.chmod(0o700)  # as each new pytest does with the folder above its temporary ones
+        with EmbeddedServer(home), psycopg.connect(server.url) as connection:
+            # By its whole path, as extensions are loaded: the server itself works in the folder.
+            sql = "SELECT pg_read_file(%s)"
+            path = str(server.data / "PG_VERSION")
+            assert connection.execute(sql, [path]).fetchone() is not None
+
+
 def test_db_start_keeps_it_and_db_stop_ends_that(home: Path) -> None:
     server = EmbeddedServer(home).start(keep=True)
     assert server.stop() is True
@@ -159,3 +171,19 @@ def test_a_home_that_cannot_be_made(home: Path) -> None:
     (home / "file").touch()
     with pytest.raises(EmbeddedServerError, match="MAPFOLD_HOME"):
         EmbeddedServer(home / "file" / "below").start()
+
+
+def test_a_missing_library_is_not_taken_for_a_server_that_went_away(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MAPFOLD_HOME", str(home))
+    with (
+        EmbeddedServer(home) as server,
+        connect(server.url) as connection,
+        pytest.raises(DatabaseUnavailable) as told,
+        database_errors(server.url),
+    ):
+        connection.execute("LOAD 'no_such_library'")
+    assert "could not access file" in str(told.value)
+    assert "went away" not in str(told.value)
+    assert "closed to the server's user" in str(told.value)
