@@ -48,10 +48,10 @@ def _ask(
     databases: SiteDatabases, question: Question, *, top: int, camera: Camera | None
 ) -> Answer | str:
     """The answer of one site's map, or why there is none."""
-    for url in databases.urls:
-        if exists(url) is False:
-            return f"there is no such database yet; `{advised('fleet', 'replay')}` makes it"
     try:
+        for url in databases.urls:
+            if exists(url) is False:
+                return f"there is no such database yet; `{advised('fleet', 'replay')}` makes it"
         with CandidateReader(databases.targets) as reader:
             candidates = reader.candidates(question.crops)
         return rank(question, candidates, top=top, camera=camera)

@@ -140,7 +140,8 @@ def _databases(
         of[site.name] = SiteDatabases(_filled(graph, site.name), _filled(vectors, site.name))
         for url in of[site.name].urls:
             parts = conninfo_to_dict(url)
-            key = str(parts.get("host")), str(parts.get("port")), str(parts["dbname"])
+            port = parts.get("port") or os.environ.get("PGPORT") or 5432
+            key = str(parts.get("host")).lower(), str(port), str(parts["dbname"])
             if owners.setdefault(key, site.name) != site.name:
                 raise MisuseError(
                     f"sites {visible(owners[key])} and {visible(site.name)} would both have"
@@ -198,7 +199,8 @@ def _name(url: str) -> str:
 @contextlib.contextmanager
 def _maintenance(url: str) -> Iterator[Connection | None]:
     """A connection to the server's database ``postgres``, None where that is not allowed."""
-    parts = conninfo_to_dict(url) | {"dbname": "postgres"}
+    # In UTF-8 whatever the URL or PGCLIENTENCODING says: a site may have any name.
+    parts = conninfo_to_dict(url) | {"dbname": "postgres", "client_encoding": "UTF8"}
     server = make_conninfo("", **parts)
     try:
         connection = psycopg.connect(

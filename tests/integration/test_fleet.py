@@ -4,6 +4,7 @@ import json
 import os
 import shlex
 import shutil
+import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -15,12 +16,15 @@ from psycopg.conninfo import conninfo_to_dict
 
 from projections.database.connection import connect
 from projections.database.embedded import EmbeddedServer
+from projections.fleet.asking import ask_sites
 from projections.fleet.replaying import ChosenSettings, ReplayRequest, replay_site
-from projections.fleet.site_databases import SiteDatabases
+from projections.fleet.site_databases import SiteDatabases, exists
 from projections.fleet.sites import Site
+from projections.relocalize import read_question
 from tests.commands import Commands
 from tests.fleets import extend, fleet_databases, write_sites, wrong_rows
 from tests.logs import append_raw, bridge, walk, write_log
+from tests.servers import furnish
 
 NAMES = ['a\'; DROP "x" %s', "büro", "lab"]
 
@@ -230,6 +234,27 @@ def test_a_server_that_is_not_there_is_said_once(fleet: Fleet, tmp_path: Path) -
     assert len(said.err.splitlines()) == 1
     status = fleet.run("fleet", "status", sites, "--db", nowhere, "--json", code=3).json
     assert [site["sinks"]["graph"]["condition"] for site in status["sites"]] == ["unreachable"] * 2
+
+
+def test_a_name_of_any_letters_is_asked_for_under_any_encoding(
+    pg_server: EmbeddedServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PGCLIENTENCODING", "LATIN1")
+    assert exists(pg_server.url_of("東京")) is False
+
+
+def test_a_site_whose_server_refuses_the_list_of_databases_is_not_asked(tmp_path: Path) -> None:
+    with tempfile.TemporaryDirectory(prefix="mapfold-test-home-") as home:
+        furnish(Path(home))
+        with EmbeddedServer(Path(home)) as server:
+            with connect(server.url, autocommit=True) as connection:
+                connection.execute("CREATE ROLE asker LOGIN")
+                connection.execute("REVOKE SELECT ON pg_catalog.pg_database FROM PUBLIC")
+            url = server.url_of("a").replace("://postgres@", "://asker@")
+            question = read_question({"crops": [{"class": "chair"}]})
+            sites, databases = [Site("a", tmp_path)], {"a": SiteDatabases(url, url)}
+            answer = ask_sites(sites, databases, question, top=1, camera=None, jobs=1)
+    assert "permission denied" in answer.not_asked["a"]
 
 
 @pytest.mark.seconds

@@ -171,9 +171,10 @@ def test_a_name_that_no_database_can_have_is_refused(
     assert wrong in str(raised.value)
 
 
-def test_two_sites_never_have_one_database() -> None:
-    with pytest.raises(MisuseError, match=r"sites a and x_a would both have database x_a at h"):
-        _urls(["a", "x_a"], "postgresql://h/x_{site}", "postgresql://h/{site}")
+@pytest.mark.parametrize("other", ["h", "h:5432", "H"])
+def test_two_sites_never_have_one_database(other: str) -> None:
+    with pytest.raises(MisuseError, match=r"sites a and x_a would both have database x_a at [hH]"):
+        _urls(["a", "x_a"], "postgresql://h/x_{site}", f"postgresql://{other}/{{site}}")
 
 
 def test_the_templates_come_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
