@@ -2,8 +2,11 @@
 
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator
 from itertools import count
+from pathlib import Path
+from typing import IO
 from urllib.parse import urlsplit, urlunsplit
 
 import psycopg
@@ -12,7 +15,8 @@ from psycopg import sql
 
 from projections.database.connection import Targets, connect, ensure_extension
 from projections.database.embedded import EmbeddedServer
-from tests.servers import CARELESS, RUN_HOME
+from tests.killed_runs import hold_run, remove_killed_runs
+from tests.servers import CARELESS, MEMORY_DISK, RUN_HOME
 
 _TEMPLATE = "mapfold_test_template"
 _numbers = count()
@@ -51,9 +55,22 @@ def pg_server() -> Iterator[EmbeddedServer]:
         yield server
 
 
+_held: list[IO[bytes]] = []
+
+
+def pytest_sessionstart() -> None:
+    """Mark the run's folder as in use; remove those of killed runs, once a run."""
+    _held.append(hold_run(RUN_HOME))
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        for parent in {RUN_HOME.parent, MEMORY_DISK, Path(tempfile.gettempdir())}:
+            remove_killed_runs(parent)
+
+
 @pytest.hookimpl(trylast=True)  # behind xdist's, which waits for the workers
 def pytest_sessionfinish() -> None:
     """Remove the server's folder at the end of the run, when all workers have left it."""
+    while _held:
+        _held.pop().close()
     if "PYTEST_XDIST_WORKER" not in os.environ:
         shutil.rmtree(RUN_HOME, ignore_errors=True)
 

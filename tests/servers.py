@@ -82,7 +82,8 @@ def _data_folder(extensions: bool) -> Path:
 @contextlib.contextmanager
 def server_to_kill() -> Iterator[EmbeddedServer]:
     """A running server of its own, with both extensions, stopped and removed at the end."""
-    home = Path(tempfile.mkdtemp(prefix="mapfold-test-kill-", dir=RUN_HOME.parent))
+    RUN_HOME.mkdir(parents=True, exist_ok=True)
+    home = Path(tempfile.mkdtemp(prefix="kill-", dir=RUN_HOME))
     furnish(home, extensions=True)
     server = EmbeddedServer(home)
     try:
