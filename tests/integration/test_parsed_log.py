@@ -185,6 +185,15 @@ def test_without_processes_the_log_is_read_here(
     assert here == [(0, reader.next_offset)]
 
 
+def test_entries_of_the_module_path_that_python_passes_over(
+    log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(".")
+    sys.path.insert(0, Path())  # type: ignore[arg-type]
+    with parsing(log, 1) as parsed:
+        assert (parsed.started, parsed.lost) == (1, 0)
+
+
 @pytest.mark.slow
 def test_a_process_that_ends_at_once(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parsing_process, "_PROGRAM", "raise SystemExit(1)")
