@@ -136,7 +136,8 @@ class ParsingProcess:
 
 
 def _start(log: Path, log_id: str, connection: int, memory: int) -> subprocess.Popen[bytes]:
-    path = [entry for entry in sys.path if isinstance(entry, str)]  # as the import system does
+    entries: list[object] = [*sys.path]
+    path = [entry for entry in entries if isinstance(entry, str)]  # as the import system does
     arguments = [json.dumps(path), str(log.absolute()), log_id, str(connection), str(memory)]
     return subprocess.Popen(  # noqa: S603 (our own code; the log's path is an argument of it)
         [sys.executable, "-P", "-c", _PROGRAM, *arguments],
