@@ -7,19 +7,29 @@ one.
 Signatures: what is folded from a log (its gap ledger, snapshots of the map) is kept with the
 signatures of the segments it was folded from, and used only while these are the same. A growing
 segment may be sealed and new ones may be added behind; any other change means that events were lost
-(deletion, recovery, a power cut before a sync).
+(deletion, recovery, a power cut before a sync, a log put back from a copy and recorded on).
 """
 
+import contextlib
 import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Final
 
 from eventsrc.advised import advised
 from eventsrc.envelope import Offset
-from eventsrc.errors import LogDamaged, NotALog
+from eventsrc.errors import LogDamaged, LogError, NotALog
 
-from .format import SegmentPath, WrongPlace, head_of, list_growing
+from .format import (
+    BEGUN,
+    HEAD_BYTES,
+    SegmentPath,
+    WrongPlace,
+    head_of,
+    list_growing,
+    read_head,
+)
 
 
 def common_log_id(segments: Iterable[SegmentPath]) -> str | None:
@@ -67,27 +77,45 @@ _FOOTER_BYTES = 12
 """The end of a sealed segment: the CRC of its summary, which lists every chunk, and the magic."""
 
 _SEALED = " sealed "
+_BEGUN: Final = " begun "
 
 
 def segment_signatures(log: Path, next_offset: Offset) -> tuple[str, ...]:
     """The signature of each segment with events before ``next_offset``. Raises OSError."""
+    with contextlib.suppress(FileNotFoundError):  # the growing one was sealed meanwhile
+        return _signatures(log, next_offset)
+    return _signatures(log, next_offset)
+
+
+def _signatures(log: Path, next_offset: Offset) -> tuple[str, ...]:
     return tuple(_signature(segment) for segment in list_growing(log) if segment.base < next_offset)
 
 
 def same_but_sealed(before: Sequence[str], now: Sequence[str]) -> bool:
     """Whether `segment_signatures` for the same offset went from ``before`` to ``now`` by sealing
     alone."""
-    return len(before) == len(now) and all(
-        new == old or (_SEALED not in old and new.startswith(old + _SEALED))
-        for old, new in zip(before, now, strict=True)
-    )
+    return len(before) == len(now) and all(map(_is_same_but_sealed, before, now))
+
+
+def _is_same_but_sealed(old: str, new: str) -> bool:
+    was, _, was_begun = old.partition(_BEGUN)
+    now, _, now_begun = new.partition(_BEGUN)
+    if was_begun and was_begun != now_begun:  # earlier versions did not say
+        return False
+    return now == was or (_SEALED not in was and now.startswith(was + _SEALED))
 
 
 def _signature(segment: SegmentPath) -> str:
-    """The base of a growing segment; for a sealed one also its size and the checksum at its end."""
-    if not segment.sealed:
-        return str(segment.base)
+    """The base of a growing segment; for a sealed one also its size and the checksum at its end.
+    Of both, when it was begun: a segment that was lost and recorded anew has the same base."""
     with segment.path.open("rb") as file:
-        size = os.fstat(file.fileno()).st_size
-        end = os.pread(file.fileno(), _FOOTER_BYTES, max(0, size - _FOOTER_BYTES))
-    return f"{segment.base}{_SEALED}{size} {end.hex()}"
+        try:
+            head = read_head(segment.path, file.read(HEAD_BYTES), segment.base)[0]
+        except LogError:  # whoever reads its events says so
+            head = {}
+        about = str(segment.base)
+        if segment.sealed:
+            size = os.fstat(file.fileno()).st_size
+            end = os.pread(file.fileno(), _FOOTER_BYTES, max(0, size - _FOOTER_BYTES))
+            about += f"{_SEALED}{size} {end.hex()}"
+    return f"{about}{_BEGUN}{head[BEGUN]}" if BEGUN in head else about
