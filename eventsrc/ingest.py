@@ -7,6 +7,7 @@ key that the fold cannot read. The caller writes a rejected payload, with its by
 
 import binascii
 import math
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain, islice
 from typing import Any, Final, NamedTuple, Protocol
@@ -122,15 +123,23 @@ def check_all(
     """Whether `ingest` accepts each, and the reason if not; faster, for callers that only keep the
     bytes."""
     plain = [read_plain(p) if check_cost(p, max_bytes) is None else None for p in payloads]
-    embedded = [d for e in plain if e is not None for d in e.detections if d.embedding is not None]
-    if embedded and _decode_uniform(embedded) is None:
-        plain = [None] * len(payloads)
+    if not _have_vectors([d for e in plain if e is not None for d in e.detections]):
+        plain = [e if e is not None and _have_vectors(e.detections) else None for e in plain]
     return [
         _check(payload, max_bytes)
         if known is None
         else CheckedEnvelope(RunId(known.run_id), KeyframeId(known.keyframe_id), known.stamp_ns)
         for payload, known in zip(payloads, plain, strict=True)
     ]
+
+
+def _have_vectors(detections: Sequence[_Embedded]) -> bool:
+    """Whether all embeddings that there are can be decoded; together those of one dimension."""
+    by_dim: defaultdict[int | None, list[_Embedded]] = defaultdict(list)
+    for detection in detections:
+        if detection.embedding is not None:
+            by_dim[detection.embedding_dim].append(detection)
+    return all(_decode_uniform(each) is not None for each in by_dim.values())
 
 
 def _check(payload: bytes, max_bytes: int) -> CheckedEnvelope | Rejected:

@@ -4,6 +4,7 @@ import json
 import re
 from typing import Any
 
+import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
@@ -134,6 +135,27 @@ def test_usual_envelopes_are_read_quickly() -> None:
         envelope(detections=[detection(det_id="run-a_kf1_d1"), detection()]),
     ):
         assert read_plain(payload(document)) is None, document
+
+
+def test_only_what_must_be_looked_at_is_asked_of_pydantic(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not what was checked together with it: vectors of two models, and bad ones of another."""
+    three, two = [1.0, 2.0, 3.0], [0.5, 0.25]
+    sound = [
+        payload(envelope(n, detections=[detection("cup", vector) for vector in vectors]))
+        for n, vectors in enumerate(([three, three], [two], [two, three], [None, two], []))
+    ]
+    bad = payload(envelope(9, detections=[detection("cup", [0.0, 0.0, 0.0])]))
+    asked: list[bytes] = []
+
+    def asking(raw: bytes, **options: Any) -> Any:
+        asked.append(raw)
+        return ingest(raw, **options)
+
+    monkeypatch.setattr("eventsrc.ingest.ingest", asking)
+    assert check_all(sound) == [checked(raw) for raw in sound]
+    assert asked == []
+    assert check_all([*sound, bad, *sound]) == [checked(raw) for raw in [*sound, bad, *sound]]
+    assert asked == [bad]
 
 
 def test_the_fields_are_those_of_the_models() -> None:
