@@ -31,6 +31,12 @@ def choose(page: Page, which: str) -> None:
     page.get_by_role("radio", name=f"As known {which}").check(force=True)
 
 
+def shown(page: Page) -> None:
+    """Wait until the map is the one chosen; until it is loaded the page shows the other."""
+    busy = page.get_by_role("group", name="Corrections in force")
+    expect(busy).to_have_attribute("aria-busy", "false")
+
+
 def check(page: Page, mapfold: Commands, log: Path, at: int, *words: str) -> None:
     """The digest shown is that of ``state``."""
     said = mapfold("state", log, *WIDE, "--at", str(at), *words, "--digest").out.strip()
@@ -84,6 +90,7 @@ def test_marks_of_the_timeline_are_those_of_what_is_known(
     corrected: Corrected, visit: Visit
 ) -> None:
     page = visit(corrected[1], "#at=0&known=then")
+    shown(page)
     for _ in range(2):
         page.keyboard.press("m")
     assert moment(page) == MERGE + 1

@@ -66,7 +66,7 @@ function Transport() {
       <span class="space" />
       {corrected && <span class="dim known">as known</span>}
       {corrected && (
-        <fieldset class="segments" title="then: under the corrections recorded before this moment; now: under all of them">
+        <fieldset class="segments" aria-busy={store.wantedKnownAt.value !== store.shownKnownAt.value} title="then: under the corrections recorded before this moment; now: under all of them">
           <legend class="hidden">Corrections in force</legend>
           {(["then", "now"] as const).map((each) => (
             <label key={each} class={store.known.value === each ? "on" : ""}>
