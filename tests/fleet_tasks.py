@@ -2,7 +2,7 @@
 
 import os
 import signal
-import time
+import threading
 from pathlib import Path
 from typing import NoReturn
 
@@ -34,5 +34,4 @@ def wait(folder: Path, _: Progress) -> None:
     """Write the process's id, then wait for ever."""
     (folder / "pid.new").write_text(str(os.getpid()))
     (folder / "pid.new").rename(folder / "pid")
-    while True:
-        time.sleep(60)
+    threading.Event().wait()
