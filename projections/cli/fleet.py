@@ -5,7 +5,7 @@ all the same.
 """
 
 from dataclasses import asdict
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 
@@ -44,6 +44,8 @@ from .terminal import display, emit, finish, say
 fleet_app = typer.Typer(
     help="Many sites at once, each with a log and a database of its own.", no_args_is_help=True
 )
+
+_NAMED: Final = 10
 
 
 def _chosen(file: Any, assignments: list[str] | None) -> Any:
@@ -299,7 +301,9 @@ def url(
     """
     sites = sites_of(place)
     if site not in {each.name for each in sites}:
-        raise MisuseError(f"{place}: no site {visible(site)!r}; there are {len(sites):,}")
+        names = ", ".join(visible(each.name) for each in sites[:_NAMED])
+        more = f" and {len(sites) - _NAMED:,} more" if len(sites) > _NAMED else ""
+        raise MisuseError(f"{place}: no site {visible(site)!r}; there are {names}{more}")
     with sigterm_unwinds(), site_databases(sites, db, None) as databases:
         display(databases[site].graph_url)
 

@@ -43,7 +43,7 @@ def _row(site: Site, found: SiteStatus) -> list[str]:
     published = [key for key in info.keys if not key.startswith("mapfold/")]
     return [
         visible(site.name),
-        "ok" if found.healthy else "look",
+        "ok" if found.healthy else "findings",
         f"{info.events:,}",
         f"{info.size_bytes / _MB:,.1f}",
         f"{len(published):,}",
@@ -66,6 +66,8 @@ def _sink_cell(sink: SinkStatus) -> str:
 
 def which_site_text(which: WhichSite) -> str:
     """The likeliest site, then all of them with place and probabilities."""
+    if not which.sites:
+        return "no site could be asked\n"
     best = which.best
     if best is None:
         first = f"none of these sites (probability {which.none:.2f})"

@@ -14,6 +14,7 @@ MAX_LIST_BYTES: Final = 16 * 1024 * 1024
 MAX_NAME_BYTES: Final = 255
 """What a file system allows for a folder's name. A database's name has fewer (`site_databases`)."""
 _SHOWN: Final = 8
+_SHOWN_OF_NAME: Final = 60
 
 Note = Callable[[str], None]
 """Receives one line of text for people."""
@@ -139,6 +140,11 @@ def check_name(name: str, where: str) -> None:
         or size > MAX_NAME_BYTES
     ):
         raise MisuseError(
-            f"{visible(where)}: {visible(name)!r} cannot be a site's name, which is printable text"
+            f"{visible(where)}: {_excerpt(name)!r} cannot be a site's name, which is printable text"
             f" without / of at most {MAX_NAME_BYTES} bytes; name it in a list: NAME PATH"
         )
+
+
+def _excerpt(name: str) -> str:
+    """``name``, or the beginning of a long one, as of a file that is no list at all."""
+    return visible(name if len(name) <= _SHOWN_OF_NAME else f"{name[:_SHOWN_OF_NAME]}…")

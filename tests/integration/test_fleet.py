@@ -143,7 +143,7 @@ def test_status_is_a_table_of_all_sites(fleet: Fleet, tmp_path: Path) -> None:
     assert head[:3] == ["site", "state", "events"]
     assert rows[0][:3] == ["lab", "ok", "60"]
     assert rows[0][-2:] == ["idle", "idle"]
-    assert rows[1][:3] == ["new", "look", "20"]
+    assert rows[1][:3] == ["new", "findings", "20"]
     assert rows[1][-2:] == ["missing", "missing"]
     assert rows[2][:2] == ["gone", "failed"]
     assert f"failed: gone: no log at {tmp_path / 'gone'}" in said.err
@@ -203,6 +203,10 @@ def test_relocalize_ranks_the_sites(fleet: Fleet, tmp_path: Path) -> None:
     alone = fleet.run("relocalize", query, "--db", fleet.url("lab"), "--json").json
     assert {k: v for k, v in sites["lab"].items() if k not in ("site", "probability")} == alone
 
+    listed.write_text(lines[0].replace(NAMES[1], "new"))
+    text = fleet.run("fleet", "relocalize", listed, query, code=3)
+    assert text.out == "no site could be asked\n"
+
     text = fleet.run("fleet", "relocalize", fleet.sites / "..", query, code=None)
     assert text.code == 2  # the folder above the sites has no log in its subfolders
     text = fleet.run("fleet", "relocalize", fleet.sites, query)
@@ -213,7 +217,7 @@ def test_relocalize_ranks_the_sites(fleet: Fleet, tmp_path: Path) -> None:
 def test_url_is_that_of_the_site(fleet: Fleet) -> None:
     assert fleet.run("fleet", "url", fleet.sites, "lab").out == fleet.url("lab") + "\n"
     refused = fleet.run("fleet", "url", fleet.sites, "nowhere", code=2)
-    assert "no site 'nowhere'" in refused.err
+    assert f"no site 'nowhere'; there are {', '.join(NAMES)}" in refused.err
 
 
 def test_what_cannot_be_is_refused_before_anything_is_done(fleet: Fleet) -> None:
