@@ -10,7 +10,7 @@ log that the next writer holds.
 One JSON document a line: a plan goes in, ``{"sha256": …, "temporary": …}`` or an error comes out.
 
 The process is in a process group of its own, so Ctrl-C in a terminal reaches the writer only, which
-ends it. It imports modules from where the writer does, and not from the current folder.
+ends it.
 """
 
 import contextlib
@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import IO, Any, Final, cast
 
 from eventsrc.errors import LogDamaged
+from eventsrc.own_process import python_command
 
 from .active_file import ActiveFile
 from .durable_files import replace_durably, unlink_quietly
@@ -30,10 +31,7 @@ from .seal import SegmentPlan, write_sealed
 
 _NICE: Final = 10
 """Recording has priority, but not so much that sealing starves on a busy machine."""
-_PROGRAM: Final = (
-    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
-    "from eventsrc.log.seal_process import main; main()"
-)
+_PROGRAM: Final = "from eventsrc.log.seal_process import main; main()"
 
 
 class ProcessGone(Exception):
@@ -46,7 +44,7 @@ class SealingProcess:
     def __init__(self) -> None:
         try:
             self._process = subprocess.Popen(  # noqa: S603 (our own code, no input in it)
-                [sys.executable, "-P", "-c", _PROGRAM, json.dumps(sys.path)],
+                python_command(_PROGRAM),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,  # the writer fails at the same, and reports it

@@ -15,12 +15,10 @@ died. It is in a process group of its own, so Ctrl-C in a terminal reaches that 
 
 import contextlib
 import gc
-import json
 import mmap
 import os
 import struct
 import subprocess
-import sys
 import tempfile
 from collections import deque
 from collections.abc import Iterator
@@ -34,6 +32,7 @@ from typing import Final, Self
 from eventsrc.envelope import Offset
 from eventsrc.errors import MapfoldError
 from eventsrc.log import Event, LogReader
+from eventsrc.own_process import python_command
 
 from .parsed_bytes import NoRoom, Packed, pack, unpack
 from .parsing import READ_AHEAD, ParsedEvent
@@ -46,8 +45,7 @@ used only as far as it is written."""
 PATIENCE_S: Final = 60.0
 """How long to wait for one range, of which an idle machine parses a hundred a second."""
 _PROGRAM: Final = (
-    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
-    "from projections.model.parsing_process import main; main(*sys.argv[2:])"
+    "import sys; from projections.model.parsing_process import main; main(*sys.argv[1:])"
 )
 _QUESTION: Final = struct.Struct("<qqq")
 """Slot, first offset, offset after the last one."""
@@ -136,11 +134,9 @@ class ParsingProcess:
 
 
 def _start(log: Path, log_id: str, connection: int, memory: int) -> subprocess.Popen[bytes]:
-    entries: list[object] = [*sys.path]
-    path = [entry for entry in entries if isinstance(entry, str)]  # as the import system does
-    arguments = [json.dumps(path), str(log.absolute()), log_id, str(connection), str(memory)]
+    arguments = [str(log.absolute()), log_id, str(connection), str(memory)]
     return subprocess.Popen(  # noqa: S603 (our own code; the log's path is an argument of it)
-        [sys.executable, "-P", "-c", _PROGRAM, *arguments],
+        python_command(_PROGRAM, *arguments),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,  # the process that folds fails at the same, and reports it

@@ -55,6 +55,17 @@ def test_it_writes_the_bytes_that_the_writer_would_write(tmp_path: Path) -> None
     assert {p.name for p in plan.log.iterdir()} == {"lock", sealed.name, active.name}
 
 
+def test_it_starts_where_the_module_path_has_entries_that_python_passes_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = killed_writer(tmp_path / "log")
+    monkeypatch.syspath_prepend(".")
+    sys.path.insert(0, Path())  # type: ignore[arg-type]
+    process = SealingProcess()
+    assert process.seal(plan)
+    process.close()
+
+
 class Watched:
     """Notes what is sealed in processes; ``before`` is called before each."""
 
