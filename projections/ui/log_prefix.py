@@ -41,6 +41,11 @@ class PrefixReader(LogReader):
             super().refresh()
         return self.next_offset
 
+    def check_end(self) -> None:
+        """Like that of a `LogReader`; segments behind the limit are none that is missing."""
+        if not self.is_limited:
+            super().check_end()
+
     def read(
         self,
         start: Offset = FIRST_OFFSET,

@@ -11,9 +11,10 @@ from projections.settings import Settings
 from projections.ui import log_map
 from projections.ui.log_events import LogEvents
 from projections.ui.log_map import LogMap
+from projections.ui.log_prefix import PrefixReader
 from projections.ui.opened import Opened
 from tests.envelopes import envelope, payload
-from tests.logs import write_log
+from tests.logs import walk, write_log
 
 LOSS = payload({"publisher": "p", "first": 1, "last": 3, "count": 3, "cause": "queue_full"})
 JUNK = RejectedPayload.encode("k", "no JSON", b"?")
@@ -57,3 +58,14 @@ def test_what_is_left_out_is_said(log: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert problems(5) == [
         "the timeline marks the first 5 rejected payloads and losses, not the 7 after them"
     ]
+
+
+def test_segments_behind_the_limit_are_not_taken_for_missing_ones(tmp_path: Path) -> None:
+    log = write_log(tmp_path / "log", walk(6))
+    with PrefixReader(log) as reader:
+        for _ in range(2):  # the first is there when the limit is set, the second is not read
+            write_log(log, walk(3, first=reader.refresh()))
+            reader.refresh()
+            reader.limit = Offset(4)
+            reader.check_end()
+            assert reader.next_offset == 4
