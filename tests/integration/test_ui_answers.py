@@ -91,6 +91,7 @@ def test_under_other_settings_too(mapfold: Commands, server: UiServer, sample: P
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)  # it starts two hundred programs
 def test_on_a_real_house(mapfold: Commands, tmp_path: Path) -> None:
     house = [json.loads(line) for line in shared_run("house-a")]
     log = write_log(tmp_path / "log", house)
