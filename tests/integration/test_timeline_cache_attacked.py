@@ -96,7 +96,11 @@ def test_many_processes_at_once(log: Path, right: str) -> None:
             assert [(each.returncode, each.stderr, each.stdout.decode()) for each in done] == [
                 (0, b"", right)
             ] * 20
-            assert sorted(path.suffix for path in kept(log)) == [".fold", ".npz"]
+            files = [path.name.replace(".", "-").split("-") for path in kept(log)]
+            parts = sorted((int(f[1]), int(f[2])) for f in files if f[-1] == "npz")
+            (fold,) = (int(f[1]) for f in files if f[-1] == "fold")
+            assert [0, *(end for _, end in parts)] == [*(start for start, _ in parts), fold]
+            assert len(parts) + 1 == len(files)
             write_log(log, drive(EVENTS, EVENTS + 40))
             right = answers(write_log_copy(log), [])
 
