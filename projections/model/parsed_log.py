@@ -18,9 +18,10 @@ from typing import Final
 
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
+from projections.worker_process import ProcessGone
 
 from .parsing import ParsedEvent, parsed_stretches
-from .parsing_process import ParsingProcess, ProcessGone
+from .parsing_process import ParsingProcess
 
 MAX_WORKERS: Final = 64
 DEFAULT_WORKERS: Final = 4

@@ -3,36 +3,23 @@
 It is asked for a range of offsets, parses it into one of the slots of a shared memory, and answers
 where in the slot. It writes nothing else anywhere, so it may be killed at any moment. If it cannot
 read a range, it says so and no more: who asked reads that range again and finds out why.
-
-Not `multiprocessing`: its processes import the caller's main module again (the whole command line,
-or a script that has no ``if __name__ == "__main__"``), and it starts another process to remove
-named shared memory, which is in ``/dev/shm``, and stays there when both are killed. This memory
-has no name: it is gone with the processes that use it, and not bounded by ``/dev/shm``.
-
-The process ends as soon as it finds its connection closed, as it is when the process that folds has
-died. It is in a process group of its own, so Ctrl-C in a terminal reaches that process only.
 """
 
 import contextlib
 import gc
 import mmap
-import os
 import struct
-import subprocess
-import tempfile
 from collections import deque
 from collections.abc import Iterator
 from itertools import islice
-from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from pathlib import Path
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 from eventsrc.envelope import Offset
 from eventsrc.errors import MapfoldError
 from eventsrc.log import Event, LogReader
-from eventsrc.own_process import python_command
+from projections.worker_process import ProcessGone, WorkerProcess, unnamed_memory
 
 from .parsed_bytes import NoRoom, Packed, pack, unpack
 from .parsing import READ_AHEAD, ParsedEvent
@@ -53,11 +40,7 @@ _ANSWER: Final = struct.Struct("<qq")
 _UNREADABLE: Final = Packed(-1, 0)
 
 
-class ProcessGone(Exception):
-    """The process cannot be started, has died or does not answer."""
-
-
-class ParsingProcess:
+class ParsingProcess(WorkerProcess):
     """A context manager. Raises ProcessGone if the process cannot be started."""
 
     def __init__(self, log: Path, log_id: str) -> None:
@@ -65,11 +48,9 @@ class ParsingProcess:
         self._asked: deque[int] = deque()
         self._is_ready = False
         try:
-            with _shared_memory() as shared:
+            with unnamed_memory(SLOTS * SLOT_BYTES) as shared:
                 self._memory = memoryview(mmap.mmap(shared, SLOTS * SLOT_BYTES))
-                self._connection, theirs = Pipe()
-                with theirs:
-                    self._process = _start(log, log_id, theirs.fileno(), shared)
+                super().__init__(_PROGRAM, str(log.absolute()), log_id, memory=shared)
         except OSError as error:
             raise ProcessGone(str(error)) from error
 
@@ -80,8 +61,8 @@ class ParsingProcess:
 
     def can_take_more(self) -> bool:
         """Whether it has started, and has a slot that is free. Raises ProcessGone."""
-        if not self._is_ready and self._has_answer(0.0):
-            self._receive()
+        if not self._is_ready and self.has_answer():
+            self.receive()
             self._is_ready = True
         return self._is_ready and bool(self._slots)
 
@@ -89,17 +70,14 @@ class ParsingProcess:
         """Have it parse a range. Raises ProcessGone."""
         slot = self._slots.popleft()
         self._asked.append(slot)
-        try:
-            self._connection.send_bytes(_QUESTION.pack(slot, start, end))
-        except OSError as error:
-            raise ProcessGone(str(error)) from error
+        self.send(_QUESTION.pack(slot, start, end))
 
     def take(self) -> Iterator[list[ParsedEvent]] | None:
         """The range that was asked for first, to be read to its end before another is taken; None
         if the process could not read it. Raises ProcessGone."""
-        if not self._has_answer(PATIENCE_S):
+        if not self.has_answer(PATIENCE_S):
             raise ProcessGone(f"no answer for {PATIENCE_S:.0f} s")
-        packed = Packed(*_ANSWER.unpack(self._receive()))
+        packed = Packed(*_ANSWER.unpack(self.receive()))
         slot = self._asked.popleft()
         if packed == _UNREADABLE:
             self._slots.append(slot)
@@ -109,54 +87,6 @@ class ParsingProcess:
     def _read(self, slot: int, packed: Packed) -> Iterator[list[ParsedEvent]]:
         yield from unpack(packed, _slot(self._memory, slot))
         self._slots.append(slot)
-
-    def _has_answer(self, timeout_s: float) -> bool:
-        try:
-            return self._connection.poll(timeout_s)
-        except OSError as error:
-            raise ProcessGone(str(error)) from error
-
-    def _receive(self) -> bytes:
-        try:
-            return self._connection.recv_bytes()
-        except (EOFError, OSError) as error:
-            raise ProcessGone(str(error)) from error
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
-    ) -> None:
-        self._connection.close()
-        self._process.kill()  # it has nothing to lose
-        self._process.wait()
-
-
-def _start(log: Path, log_id: str, connection: int, memory: int) -> subprocess.Popen[bytes]:
-    arguments = [str(log.absolute()), log_id, str(connection), str(memory)]
-    return subprocess.Popen(  # noqa: S603 (our own code; the log's path is an argument of it)
-        python_command(_PROGRAM, *arguments),
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,  # the process that folds fails at the same, and reports it
-        pass_fds=(connection, memory),
-        process_group=0,
-        env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
-    )
-
-
-@contextlib.contextmanager
-def _shared_memory() -> Iterator[int]:
-    """A file without a name, of all slots; where the system has such files, in memory."""
-    has_memory_files = hasattr(os, "memfd_create")
-    with (
-        os.fdopen(os.memfd_create("mapfold"), "r+b")
-        if has_memory_files
-        else tempfile.TemporaryFile() as file
-    ):
-        file.truncate(SLOTS * SLOT_BYTES)
-        yield file.fileno()
 
 
 def _slot(memory: memoryview, slot: int) -> memoryview:
