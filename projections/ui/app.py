@@ -25,7 +25,7 @@ from projections.serve.http import read_body
 
 from .answers import digest_answer, history_answer, walls_answer
 from .binary import encoded
-from .comparisons import bisect_answer, conditions_answer, diff_answer, merges_answer
+from .comparisons import bisect_answer, conditions_answer, diff_answer, merges_answer, whatif_answer
 from .edits import MOST_BYTES as MOST_EDIT_BYTES
 from .edits import Editor, corrections_answer, read_edit
 from .live import MOST_STREAMS, LiveWatch
@@ -37,7 +37,6 @@ from .service import GoOn, UiService
 from .static_files import static_files
 from .stories import why_answer
 from .token_gate import EDIT_PATH
-from .whatif_answer import whatif_answer
 
 _BINARY = "application/octet-stream"
 _MAX_SHOWN = 200

@@ -1,17 +1,31 @@
-"""Two moments compared, and the event that made a condition true."""
+"""Two moments compared, the map under other settings compared with the log's own, and the event that
+made a condition true.
+"""
 
+from collections.abc import Callable
+from time import perf_counter
 from typing import Any, Final
 
 from starlette.datastructures import QueryParams
 
+from eventsrc.envelope import Offset
+from eventsrc.errors import MisuseError
+from eventsrc.log.seek import resolve
 from eventsrc.text import visible_lines
+from projections.corrections import compile_corrections
 from projections.history import Expression, ExpressionError
 from projections.history.condition_functions import FUNCTIONS
 from projections.history.merges import merge_document
+from projections.history.parallel import Rules
 from projections.history.rendering import difference_text, search_text
+from projections.history.whatif import alternatives, command_trials, setting_trials, what_if
+from projections.history.whatif_rendering import whatif_text
+from projections.model.log_commands import read_commands
 
 from .log_map import LogMap
+from .log_prefix import PrefixReader
 from .moment import Moment, command_line
+from .opened import Opened
 from .requests import assignments_of, text_of
 
 MOST_LINES: Final = 200
@@ -91,4 +105,43 @@ def merges_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
         **moment.document(),
         "merges": [merge_document(known.history, merge) for merge in known.merges(moment.end)],
         "command": moment.command("merges"),
+    }
+
+
+_OPTIONS = ("try", "grid", "without")
+
+
+def whatif_answer(
+    opened: Opened, through: Offset, query: QueryParams, go_on: Callable[[], None]
+) -> dict[str, Any]:
+    """``set`` together make one alternative; each ``try``, ``grid`` and ``without`` as the options
+    of ``mapfold whatif``. Says how long the folds took: ``seconds``, and each its own."""
+    started = perf_counter()
+    sets = assignments_of(query)
+    tries, grids, without = (query.getlist(name) for name in _OPTIONS)
+    with PrefixReader(opened.log, through, go_on) as reader:
+        end = resolve(reader, text_of(query, "at", "end"))
+        known_at = resolve(reader, text_of(query, "known_at", str(end)))
+        commands = read_commands(reader, known_at)
+    corrections = compile_corrections(commands)
+    base = Rules(opened.settings(corrections), corrections)
+    trials = setting_trials(base, alternatives(base.settings, sets, tries, grids))
+    trials += command_trials(commands, without, opened.settings)
+    if not trials:
+        raise MisuseError("nothing to try; give set, try, grid or without")
+    found = what_if(opened.log, base, trials, end, truth=opened.truth, progress=lambda *_: go_on())
+    words = [w for name in _OPTIONS for text in query.getlist(name) for w in (f"--{name}", text)]
+    words += [word for text in sets for word in ("--set", text)]
+    words += [*opened.base_words(), "--at", str(end)]
+    if known_at != end:
+        words += ["--known-at", str(known_at)]
+    return {
+        "through": through,
+        "at": end,
+        "known_at": known_at,
+        **found.document(),
+        "names": [each.name for each in found.all],
+        "lines": visible_lines(whatif_text(found, most=MOST_LINES)).splitlines(),
+        "seconds": round(perf_counter() - started, 3),
+        "command": command_line(opened, "whatif", *words),
     }

@@ -19,12 +19,12 @@ from projections.history.parallel import Rules, fold_all
 from projections.model.digest import map_digest
 from projections.model.fold import fold_log
 from projections.settings import Settings
+from projections.ui.comparisons import whatif_answer
 from projections.ui.edits import Edit, Editor
 from projections.ui.live import LiveWatch
 from projections.ui.log_map import MOST_ALTERNATIVES, LogMap
 from projections.ui.opened import Opened
 from projections.ui.service import GivenUp, UiService
-from projections.ui.whatif_answer import whatif_answer
 from tests.logs import walk, write_log
 
 WAIT_S = 60.0
