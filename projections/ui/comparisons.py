@@ -1,5 +1,5 @@
-"""Two moments compared, the map under other settings compared with the log's own, and the event that
-made a condition true.
+"""Two moments compared, the map under other settings or without a command compared with the log's
+own, and the event that made a condition true.
 """
 
 from collections.abc import Callable
