@@ -7,10 +7,13 @@ of `UiService` answer them.
 import asyncio
 import contextlib
 import functools
+import hashlib
+import mimetypes
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from html import escape
-from typing import Any
+from pathlib import Path
+from typing import Any, Final, NamedTuple
 
 from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse, Response, StreamingResponse
@@ -34,9 +37,43 @@ from .log_map import LogMap
 from .requests import assignments_of, refusal
 from .search import keyframe_answer, search_answer
 from .service import GoOn, UiService
-from .static_files import static_files
 from .stories import why_answer
 from .token_gate import EDIT_PATH
+
+_FOLDER: Final = Path(__file__).with_name("static")
+_TYPES: Final = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
+_NO_PAGE: Final = b"""<!doctype html><meta charset="utf-8"><title>mapfold</title>
+<p>The page is not built in this installation; its interface answers below /api/.</p>
+"""
+
+
+class StaticFile(NamedTuple):
+    """A file as it is sent."""
+
+    content: bytes
+    media_type: str
+    etag: str
+
+
+def static_files(folder: Path = _FOLDER) -> dict[str, StaticFile]:
+    """The files by URL path; ``/`` is index.html."""
+    found = {
+        f"/{path.relative_to(folder).as_posix()}": _read(path)
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and not path.name.startswith(".")
+    }
+    found["/"] = found.get("/index.html") or _static(_NO_PAGE, "text/html")
+    return found
+
+
+def _read(path: Path) -> StaticFile:
+    guessed = _TYPES.get(path.suffix) or mimetypes.guess_type(path.name)[0]
+    return _static(path.read_bytes(), guessed or "application/octet-stream")
+
+
+def _static(content: bytes, media_type: str) -> StaticFile:
+    return StaticFile(content, media_type, f'"{hashlib.sha256(content).hexdigest()[:16]}"')
+
 
 _BINARY = "application/octet-stream"
 _MAX_SHOWN = 200
