@@ -21,13 +21,12 @@ from projections.deltas import PlaceOrdinal
 
 from .camera import Camera
 from .candidates import Candidates, Match
-from .certainty import UNKNOWN_BELOW, known_probability
+from .certainty import UNKNOWN_BELOW, known_probability, thinness
 from .floors import Hypotheses, Layout
 from .likelihood import Scene
 from .model import MODEL, Model
 from .pose import Posterior, locate
 from .question import Crop, Question, View
-from .thin import thinness
 
 Method = Literal["joint", "plain"]
 DEFAULT_CAMERA: Final = Camera()

@@ -7,7 +7,7 @@ from eventsrc.envelope import RunId
 from projections.deltas import ObservationOrdinal
 from projections.relocalize import NEIGHBOURS, Crop, Match, rank
 from projections.relocalize.candidates import Candidates
-from projections.relocalize.thin import thinness
+from projections.relocalize.certainty import thinness
 
 CROP = Crop(np.ones(1, dtype=np.float32))
 
