@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from projections.deltas import ObjectOrdinal
-from projections.reducers import assignment
-from projections.reducers.assignment import Match, assign
+from projections.reducers.evidence_matching import Match, assign
 
 _VALUES = st.one_of(st.sampled_from([1.0, 2.0, 3.0]), st.floats(1e-6, 30.0))
 _WANTED = st.lists(st.dictionaries(st.integers(0, 5), _VALUES, max_size=5), max_size=5)
